@@ -1,0 +1,44 @@
+# Two commands: `make report` runs the main job on the embedded data, `make test` passes the tests.
+# Both set everything up in .venv first and reuse it afterwards.
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+OUT ?= out/he2019
+
+.PHONY: report test test-slow lint format clean
+
+report: $(READY)
+	$(BIN)/calib report --out $(OUT) --overwrite
+
+test: $(READY)
+	$(BIN)/python -m pytest
+
+test-slow: $(READY)
+	$(BIN)/python -m pytest -m slow
+
+lint: $(READY)
+	$(BIN)/ruff check calib tests
+	$(BIN)/ruff format --check calib tests
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(READY)
+	$(BIN)/ruff check --fix calib tests
+	$(BIN)/ruff format calib tests
+
+$(READY): pyproject.toml constraints.txt
+	@python=$$(for p in python3.12 python3.13 python3.14 python3 python; do \
+	  $$p -c 'import sys; raise SystemExit(sys.version_info < (3, 12))' >/dev/null 2>&1 \
+	    && echo $$p && break; done); \
+	if [ -z "$$python" ]; then \
+	  echo "calib needs Python 3.12 or newer; found $$(python3 --version 2>&1 || echo none). Install a newer Python and run make again." >&2; \
+	  exit 1; \
+	fi; \
+	set -e; \
+	$(BIN)/python -c 'import sys; raise SystemExit(sys.version_info < (3, 12))' >/dev/null 2>&1 \
+	  || $$python -m venv --clear $(VENV); \
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'; \
+	touch $@
+
+clean:
+	rm -rf $(VENV) out

@@ -1,0 +1,1 @@
+"""Probabilistic calibration of tyre-soil models."""

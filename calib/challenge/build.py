@@ -1,0 +1,258 @@
+"""Draw one case: a stage, and a truth at a strength that the stage can show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.challenge.design import Tier
+from calib.challenge.effects import (
+    ABSORBABLE,
+    NONE,
+    SHIFT,
+    UNKNOWN,
+    UNLISTED,
+    kind_of,
+    needs_of,
+)
+from calib.challenge.identify import Identifiability, identify, isolable_nats
+from calib.challenge.mechanics import Reality
+from calib.challenge.mechanism import DENSITY, EffectKind, Readings
+from calib.challenge.shift import draw_shift, shifted
+from calib.challenge.stage import LACK_OF_FIT, Stage, draw_stage, rms
+from calib.challenge.surrogate import misfit, recalibrate
+
+type Array = NDArray[np.float64]
+type AtStrength = Callable[[float], Reality]
+type Kinds = tuple[EffectKind, ...]
+
+SMALLEST_GAP, LARGEST_GAP = 2.0, 6.0
+OWN_GAP = 1.0
+ISOLABLE_NATS, ABSORBABLE_NATS, RIVAL_NATS = 6.0, 2.0, 2.0
+_UNLISTED_NATS = {"easy": 12.0, "hard": 8.0}
+_CLOSE = 0.04
+
+
+@dataclass(frozen=True)
+class DrawnCase:
+    """A finished case, noise-free, with what the key says about it.
+
+    Attributes
+    ----------
+    stage : Stage
+        Design, conditions and readings without mechanisms.
+    truth, mechanism : str
+        The name of the contract and one sentence.
+    field_truth, fresh_truth : dict
+        Noise-free readings as the field really was.
+    gap_over_noise : float
+        Rms of the gap in noise sd.
+    told : Identifiability
+        What the gap allows to tell.
+    """
+
+    stage: Stage
+    truth: str
+    mechanism: str
+    field_truth: Readings
+    fresh_truth: Readings
+    gap_over_noise: float
+    told: Identifiability
+
+
+def scale_to(
+    stage: Stage, at: AtStrength, bounds: tuple[float, float], low: float, high: float, place: float
+) -> Reality | None:
+    """Return the reality whose gap is the wanted one.
+
+    Parameters
+    ----------
+    stage : Stage
+        Where the gap is measured.
+    at : callable
+        Reality at a strength.
+    bounds : tuple of float
+        Smallest and largest sensible strength.
+    low, high : float
+        Smallest and largest gap wanted, in noise sd.
+    place : float
+        In [0, 1]: how far between the two on a logarithmic scale; where the largest strength
+        gives less than `high`, between `low` and that.
+
+    Returns
+    -------
+    Reality or None
+        None where no sensible strength gives such a gap. Within 4 % of the wanted gap.
+    """
+
+    def log_gap(log_strength: float) -> float:
+        return float(np.log(max(rms(stage.gap(stage.in_field(at(np.exp(log_strength))))), 1e-9)))
+
+    x0, x1 = float(np.log(bounds[0])), float(np.log(bounds[1]))
+    y0, y1 = log_gap(x0), log_gap(x1)
+    floor, ceiling = float(np.log(low)), min(float(np.log(high)), y1 - _CLOSE)
+    goal = floor + place * (ceiling - floor)
+    if ceiling < floor or y0 > goal:
+        return None
+    for step in range(14):
+        share = 0.5 if step % 3 == 2 else float(np.clip((goal - y0) / (y1 - y0), 0.05, 0.95))
+        x = x0 + share * (x1 - x0)
+        y = log_gap(x)
+        if abs(y - goal) < _CLOSE:
+            return at(float(np.exp(x)))
+        x0, y0, x1, y1 = (x, y, x1, y1) if y < goal else (x0, y0, x, y)
+    return None
+
+
+def _effect(
+    rng: np.random.Generator, stage: Stage, kind: EffectKind, low: float, place: float
+) -> Reality | None:
+    """Draw a variant and a sign of an effect, at the strength whose gap is wanted."""
+    family = kind.draw(rng)
+    sign = float(rng.choice(np.array(family.signs)))
+
+    def at(strength: float) -> Reality:
+        return stage.reality.with_mechanisms(family.at(sign * strength))
+
+    return scale_to(stage, at, (family.low, family.high), low, LARGEST_GAP, place)
+
+
+def _shift(rng: np.random.Generator, stage: Stage, place: float) -> tuple[Reality, str] | None:
+    change, sentence = draw_shift(rng)
+
+    def at(amount: float) -> Reality:
+        return shifted(stage.reality, change, amount)
+
+    reality = scale_to(stage, at, (0.03, 1.5), 1.06 * SMALLEST_GAP, LARGEST_GAP, place)
+    return None if reality is None else (reality, sentence)
+
+
+def _pair(
+    rng: np.random.Generator, stage: Stage, kinds: Kinds, place: float
+) -> tuple[Reality, str] | None:
+    """Draw two effects that both matter: neither vanishes on its own nor beside the other."""
+    places = (place, float(np.clip(place + rng.uniform(-0.3, 0.3), 0.0, 1.0)))
+    singles = []
+    for kind, each in zip(kinds, places, strict=True):
+        single = _effect(rng, stage, kind, 1.3 * OWN_GAP, 0.85 * each)
+        if single is None:
+            return None
+        singles.append(single)
+    mechanisms = tuple(single.mechanisms[0] for single in singles)
+    both = stage.reality.with_mechanisms(*mechanisms)
+    got = stage.in_field(both)
+    beside = [rms(stage.gap(got, stage.in_field(single))) for single in singles]
+    if rms(stage.gap(got)) < SMALLEST_GAP or min(beside) < OWN_GAP:
+        return None
+    return both, "; ".join(mechanism.sentence for mechanism in mechanisms)
+
+
+def _reality(
+    rng: np.random.Generator, stage: Stage, truth: str, kinds: Kinds
+) -> tuple[Reality, str] | None:
+    """Draw what the field really is."""
+    place = float(rng.uniform())
+    if truth == NONE:
+        return stage.reality, "nothing acts in the field that did not act in the lab"
+    if truth == SHIFT:
+        return _shift(rng, stage, place)
+    if len(kinds) > 1:
+        return _pair(rng, stage, kinds, place)
+    reality = _effect(rng, stage, kinds[0], 1.06 * SMALLEST_GAP, place)
+    return None if reality is None else (reality, reality.mechanisms[0].sentence)
+
+
+def _recalibration_closes(stage: Stage, field: Readings, fresh: Readings) -> bool:
+    """Whether the same models with other parameters describe field and fresh."""
+    noise = stage.design.noise
+    fresh_sd = {name: noise.sd(name, value, stage.fresh.slip) for name, value in fresh.items()}
+    refit = recalibrate(stage.simulator, stage.field, field, stage.field_sd)
+    return (
+        misfit(refit, stage.field, field, stage.field_sd) < LACK_OF_FIT
+        and misfit(refit, stage.fresh, fresh, fresh_sd) < 2.0 * LACK_OF_FIT
+    )
+
+
+def _telling(
+    rng: np.random.Generator, stage: Stage, gap: Array, truth: str, kinds: Kinds
+) -> Identifiability | None:
+    """Return what the gap tells; None where it tells less than the tier promises.
+
+    In the easy tier a listed effect has to beat recalibration and its nearest rival by some
+    nats; in the hard tier this is only recorded. What is not listed has to be told from
+    recalibration and from every listed effect in both.
+    """
+    tier, named = stage.design.tier, truth not in (NONE, SHIFT, UNKNOWN)
+    if truth == NONE:
+        return Identifiability(0.0, 0.0, "", 0.0, 0.0)
+    absorbable = any(kind.name in ABSORBABLE for kind in kinds)
+    needed = ABSORBABLE_NATS if absorbable else ISOLABLE_NATS
+    if tier == "easy" and named and isolable_nats(stage, gap) < needed:
+        return None
+    told = identify(rng, stage, gap, truth)
+    if tier == "easy" and named and told.rival_nats < RIVAL_NATS:
+        return None
+    return None if truth == UNKNOWN and told.rival_nats < _UNLISTED_NATS[tier] else told
+
+
+def unlisted_order(rng: np.random.Generator) -> list[EffectKind]:
+    """Return the unlisted mechanisms in random order, those of wheels mostly first.
+
+    A density gauge is one instrument among many: its oddities are the rarer ones.
+    """
+    weights = np.array([0.4 if kind.outputs == (DENSITY,) else 1.0 for kind in UNLISTED])
+    order = rng.choice(len(UNLISTED), len(UNLISTED), replace=False, p=weights / weights.sum())
+    return [UNLISTED[int(i)] for i in order]
+
+
+def _kinds(rng: np.random.Generator, truth: str) -> Kinds:
+    if truth == UNKNOWN:
+        return (unlisted_order(rng)[0],)
+    return () if truth in (NONE, SHIFT) else tuple(kind_of(name) for name in truth.split("+"))
+
+
+def try_case(
+    rng: np.random.Generator, tier: Tier, truth: str, unlisted: EffectKind | None = None
+) -> DrawnCase | None:
+    """Draw a case once.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of randomness.
+    tier : str
+        ``easy`` or ``hard``.
+    truth : str
+        ``none``, ``unknown``, ``parameter_shift``, a listed effect or two joined by ``+``.
+    unlisted : EffectKind, optional
+        Which unlisted mechanism acts where the truth is ``unknown``; any by default.
+
+    Returns
+    -------
+    DrawnCase or None
+        None where the draw is not fair or cannot show its truth.
+
+    Raises
+    ------
+    CalibError
+        If the truth has no such name.
+    """
+    kinds = (unlisted,) if truth == UNKNOWN and unlisted else _kinds(rng, truth)
+    stage = draw_stage(rng, tier, needs_of(kinds))
+    made = None if stage is None else _reality(rng, stage, truth, kinds)
+    if stage is None or made is None:
+        return None
+    reality, sentence = made
+    field, fresh = stage.in_field(reality), stage.on_fresh(reality)
+    gap = stage.gap(field)
+    if not all(np.isfinite(part).all() for part in (*field.values(), *fresh.values())):
+        return None
+    if truth == SHIFT and not _recalibration_closes(stage, field, fresh):
+        return None
+    told = _telling(rng, stage, gap, truth, kinds)
+    if told is None:
+        return None
+    return DrawnCase(stage, truth, sentence, field, fresh, rms(gap), told)

@@ -1,0 +1,125 @@
+"""How much a drawn gap tells: what recalibration leaves of it, and its nearest wrong answer."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.challenge.effects import LISTED, SHIFT, acts_on
+from calib.challenge.mechanism import RUT, EffectKind
+from calib.challenge.stage import Stage, rms
+from calib.challenge.surrogate import full_jacobian, recalibration_span
+
+type Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Identifiability:
+    """What a gap allows to tell; gaps are rms in noise sd, nats are expected log-likelihoods.
+
+    Attributes
+    ----------
+    isolable_gap : float
+        What is left after the best smooth recalibration, whatever its size.
+    isolable_nats : float
+        Cost of explaining the gap by a recalibration of plausible size.
+    rival : str
+        The wrong single answer that comes nearest, or ``parameter_shift``.
+    rival_nats : float
+        What the truth is ahead of that rival, the lab's parameter uncertainty allowed for.
+    rival_gap : float
+        The least that any listed effect together with a recalibration leaves.
+    """
+
+    isolable_gap: float
+    isolable_nats: float
+    rival: str
+    rival_nats: float
+    rival_gap: float
+
+
+def remaining(gap: Array, span: Array) -> float:
+    """Return the rms of a gap in noise sd that no combination of `span` removes.
+
+    Parameters
+    ----------
+    gap : array
+        Shape ``(M,)``.
+    span : array
+        Shape ``(K, M)``.
+    """
+    coefficients = np.linalg.lstsq(span.T, gap, rcond=1e-10)[0]
+    return rms(gap - coefficients @ span)
+
+
+def _whitener(span: Array) -> Array:
+    """Return the inverse covariance of unit noise plus unit-normal amounts of `span`, (M, M)."""
+    return np.asarray(np.linalg.inv(np.eye(span.shape[1]) + span.T @ span), dtype=np.float64)
+
+
+def _lab_uncertainty(stage: Stage) -> Array:
+    """Return what one sd of the lab's posterior does to the field, shape ``(K, M)``."""
+    lab = full_jacobian(stage.simulator, stage.lab, stage.lab_sd)
+    field = full_jacobian(stage.simulator, stage.field, stage.field_sd)
+    values, vectors = np.linalg.eigh(lab @ lab.T)
+    keep = values > 1e-10 * values[-1]
+    return np.asarray((vectors[:, keep] / np.sqrt(values[keep])).T @ field, dtype=np.float64)
+
+
+def _signature(rng: np.random.Generator, stage: Stage, kind: EffectKind, size: float) -> Array:
+    """Return an effect's gap on the stage at about a size, shape ``(M,)``."""
+    family = kind.draw(rng)
+    strength, signature = float(np.sqrt(family.low * family.high)), np.zeros(1)
+    for _ in range(2):
+        trial = stage.reality.with_mechanisms(family.at(strength))
+        signature = stage.gap(stage.in_field(trial))
+        grown = strength * size / max(rms(signature), 1e-6)
+        strength = float(np.clip(grown, family.low, family.high))
+    return signature
+
+
+def _can_rival(stage: Stage, kind: EffectKind, truth: str) -> bool:
+    has_already = kind.name == "slip_sinkage" and stage.design.models.get(RUT) != "bekker"
+    able = acts_on(kind, stage.design.outputs, stage.design.varying)
+    return able and not has_already and kind.name not in truth.split("+")
+
+
+def identify(rng: np.random.Generator, stage: Stage, gap: Array, truth: str) -> Identifiability:
+    """Return what a gap allows to tell on a stage.
+
+    Every listed effect's signature is taken at about the gap's size in one of its variants and
+    scaled freely; so the figures are close bounds, not exact ones.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of randomness, for the rivals' variants.
+    stage : Stage
+        Design and undisturbed reality.
+    gap : array
+        In noise sd, shape ``(n_outputs * N,)``.
+    truth : str
+        The true hypothesis, which is no rival of itself.
+    """
+    span = recalibration_span(stage.simulator, stage.field, stage.field_sd)
+    isolable_nats = float(0.5 * gap @ _whitener(span) @ gap)
+    white = _whitener(_lab_uncertainty(stage))
+    rival, nats = SHIFT, isolable_nats
+    rival_gap = remaining(gap, span)
+    for name, kind in LISTED.items():
+        if not _can_rival(stage, kind, truth):
+            continue
+        signature = _signature(rng, stage, kind, rms(gap))
+        along, own = float(gap @ white @ signature), float(signature @ white @ signature)
+        left = float(0.5 * (gap @ white @ gap)) - 0.5 * along**2 / max(own, 1e-12)
+        rival, nats = (name, left) if left < nats else (rival, nats)
+        rival_gap = min(rival_gap, remaining(gap, np.vstack([span, signature])))
+    return Identifiability(remaining(gap, span), isolable_nats, rival, nats, rival_gap)
+
+
+def isolable_nats(stage: Stage, gap: Array) -> float:
+    """Return the cost of explaining a gap by a recalibration of plausible size, in nats."""
+    span = recalibration_span(stage.simulator, stage.field, stage.field_sd)
+    return float(0.5 * gap @ _whitener(span) @ gap)

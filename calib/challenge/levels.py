@@ -1,0 +1,59 @@
+"""The level that a diagnosis is asked to reach, per tier and figure of merit."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Level:
+    """One line of the table of levels.
+
+    Attributes
+    ----------
+    name : str
+        Attribute of `calib.challenge.score.TierScore`.
+    label : str
+        What it is, for people.
+    direction : int
+        1 where more is better, -1 where less is, 0 for a band.
+    easy, hard : tuple of float
+        Lower and upper limit in each tier.
+    """
+
+    name: str
+    label: str
+    direction: int
+    easy: tuple[float, float]
+    hard: tuple[float, float]
+
+    def limits(self, tier: str) -> tuple[float, float]:
+        """Return the limits in a tier."""
+        return self.easy if tier == "easy" else self.hard
+
+    def met(self, tier: str, value: float) -> bool:
+        """Whether a value reaches the level; a missing value (NaN) does not."""
+        low, high = self.limits(tier)
+        return low <= value <= high
+
+
+def _at_least(name: str, label: str, easy: float, hard: float) -> Level:
+    return Level(name, label, 1, (easy, 1.0), (hard, 1.0))
+
+
+def _at_most(name: str, label: str, easy: float, hard: float) -> Level:
+    return Level(name, label, -1, (0.0, easy), (0.0, hard))
+
+
+LEVELS: tuple[Level, ...] = (
+    _at_least("top_1", "right hypothesis first", 0.95, 0.75),
+    _at_least("top_2", "right hypothesis among the first two", 0.98, 0.88),
+    _at_least("truth_probability", "mean probability of the truth", 0.90, 0.65),
+    _at_most("false_alarm", "verdict other than none on nulls", 0.02, 0.03),
+    _at_least("unlisted_recognised", "unlisted effect called unknown or ambiguous", 0.90, 0.75),
+    _at_most("listed_called_unknown", "listed effect called unknown", 0.02, 0.08),
+    _at_most("confidently_wrong", "a wrong hypothesis at 0.9 or more", 0.01, 0.03),
+    _at_least("localisation_auc", "localisation AUC, median", 0.95, 0.95),
+    Level("shrink_coverage", "90 % shrink interval covers", 0, (0.83, 0.96), (0.83, 0.96)),
+    _at_least("actual_shrink", "actual shrink on fresh conditions, median", 0.75, 0.70),
+)

@@ -1,0 +1,62 @@
+"""The score as text: every figure with its interval, its count and the level asked for."""
+
+from __future__ import annotations
+
+from calib.challenge.levels import LEVELS, Level
+from calib.challenge.score import Average, Proportion, Score, TierScore
+
+_EXTRA = (
+    ("top_1_all", "right hypothesis first, nulls included"),
+    ("truth_probability_all", "mean probability of the truth, nulls included"),
+    ("no_shrink_interval", "outputs with a gap without a shrink interval"),
+    ("brier", "Brier score (0 best, 2 worst)"),
+)
+
+
+def _figure(tier: TierScore, name: str) -> Proportion | Average:
+    figure: Proportion | Average = getattr(tier, name)
+    return figure
+
+
+def asked(level: Level, tier: str) -> str:
+    """Return a level in words."""
+    low, high = level.limits(tier)
+    if level.direction == 0:
+        return f"{low:.2f}-{high:.2f}"
+    return f">= {low:.2f}" if level.direction > 0 else f"<= {high:.2f}"
+
+
+def _line(label: str, figure: Proportion | Average, asked_for: str, mark: str) -> str:
+    low, high = figure.interval
+    count = f"{figure.successes}/{figure.n}" if isinstance(figure, Proportion) else f"n={figure.n}"
+    if figure.n == 0:
+        return f"  {label:<47} {'-':>6} {'':>14} {count:>8}  {asked_for:>10}"
+    span = f"[{low:.2f}, {high:.2f}]"
+    return f"  {label:<47} {figure.value:6.3f} {span:>14} {count:>8}  {asked_for:>10} {mark}"
+
+
+def tier_table(tier: TierScore) -> str:
+    """Return one tier's table."""
+    lines = [f"{tier.tier}: {tier.n_cases} cases, {tier.n_failed} failed"]
+    lines.append(f"  {'':<47} {'value':>6} {'95 % interval':>14} {'count':>8}  {'asked':>10}")
+    for level in LEVELS:
+        figure = _figure(tier, level.name)
+        mark = "met" if level.met(tier.tier, figure.value) else "MISSED"
+        lines.append(_line(level.label, figure, asked(level, tier.tier), mark))
+    lines += [_line(label, _figure(tier, name), "", "") for name, label in _EXTRA]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def text_table(score: Score) -> str:
+    """Return the table of all tiers, and the cases that failed.
+
+    Parameters
+    ----------
+    score : Score
+        From `calib.challenge.score.score`.
+    """
+    parts = [tier_table(tier) for tier in score.tiers.values()]
+    failed = [f"  {a.case}: {a.problem}" for a in score.answers if a.problem]
+    if failed:
+        parts.append("\n".join(["without a readable diagnosis, counted as wrong:", *failed]))
+    return "\n\n".join(parts)

@@ -1,0 +1,42 @@
+"""The `calib` command: thin, every verb one call into the package, heavy imports only when used."""
+
+from __future__ import annotations
+
+import os
+import sys
+
+import typer
+
+from calib.cli import calibration
+
+__all__ = ["app", "main"]
+
+app = typer.Typer(
+    name="calib",
+    help="Probabilistic calibration of tyre-soil models.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+calibration.register(app)
+
+
+def main() -> None:
+    """Run the command line: what the user can mend ends with exit code 2 and no traceback."""
+    from calib.errors import CalibError
+
+    # A figure is never shown on a screen: no display, no toolkit.
+    os.environ.setdefault("MPLBACKEND", "Agg")
+    try:
+        app()
+    except CalibError as error:
+        print(f"calib: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("calib: interrupted; nothing was written", file=sys.stderr)
+        raise SystemExit(130) from None
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(0) from None

@@ -1,0 +1,255 @@
+"""Verbs of calibration: fit, predict, report, data, template, priors, models."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from calib.errors import CalibError
+
+if TYPE_CHECKING:
+    from calib.study import HoldOut
+
+__all__ = ["register"]
+
+_Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
+_Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
+_HoldOut = Annotated[
+    str | None,
+    typer.Option("--hold-out", help="Rows kept for validation, e.g. inflation_pressure_psi=30."),
+]
+_MaxSteps = Annotated[int, typer.Option(help="Where extending the chains stops.", min=100)]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs to an app."""
+    for verb in (report, fit, predict, data, template, priors, models):
+        app.command()(verb)
+
+
+def report(
+    files: Annotated[
+        list[Path] | None, typer.Argument(help="Your CSV files; the embedded data if none.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-report"),
+    seed: _Seed = 2019,
+    hold_out: _HoldOut = None,
+    overwrite: _Overwrite = False,
+    max_steps: _MaxSteps = 25_600,
+) -> None:
+    """Calibrate, predict, validate and write a report folder with an index.html."""
+    from calib.cli.display import progress_bars
+    from calib.data import read_table
+    from calib.folders import check_folder
+    from calib.outputs import OUTPUTS
+    from calib.report import write_report
+    from calib.sampling.sampler import SamplerSettings
+    from calib.study import he2019_tasks, plan_tasks, run_study
+
+    check_folder(out, overwrite=overwrite)
+    if files:
+        tasks = plan_tasks(
+            [read_table(f, allow_missing=tuple(OUTPUTS.values())) for f in files],
+            _parse_hold_out(hold_out),
+        )
+        title = "Calibration report"
+    else:
+        tasks = he2019_tasks()
+        title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
+    settings = SamplerSettings(max_steps=max_steps)
+    with progress_bars() as tell:
+        study = run_study(tasks, seed, settings=settings, progress=tell)
+        page = write_report(
+            study, out, settings=settings, command=_command(), title=title, overwrite=overwrite,
+            progress=tell,
+        )  # fmt: skip
+    for key, result in study.successes.items():
+        ninety = result.validation.scores.coverage[0.9]
+        state = "converged" if result.calibration.converged else "NOT CONVERGED"
+        print(f"{key}: {state}; 90 % band covers {ninety.hits} of {ninety.n} rows not fitted")
+    for key, failure in study.failures.items():
+        print(f"{key}: FAILED: {failure.error}", file=sys.stderr)
+    print(page)
+    if study.failures:
+        raise typer.Exit(1)
+
+
+def fit(
+    file: Annotated[Path, typer.Argument(help="CSV whose column names carry units.")],
+    model: Annotated[str, typer.Option(help="See `calib models`.")],
+    out: Annotated[Path, typer.Option(help="Run folder to write.")] = Path("calib-run"),
+    priors: Annotated[Path | None, typer.Option(help="Prior file; see `calib priors`.")] = None,
+    seed: _Seed = 2019,
+    hold_out: _HoldOut = None,
+    overwrite: _Overwrite = False,
+    max_steps: _MaxSteps = 25_600,
+) -> None:
+    """Calibrate one model on one file and save the posterior."""
+    from calib.calibrate import calibrate
+    from calib.cli.display import posterior_table, progress_bars, verdict_line
+    from calib.data import hold_out as split
+    from calib.data import read_for_model
+    from calib.estimate import estimate
+    from calib.folders import check_folder, fresh_folder
+    from calib.models import get_model
+    from calib.problem import build_problem
+    from calib.sampling.sampler import SamplerSettings
+    from calib.store import save_calibration
+    from calib.streams import generator
+    from calib.validate import validate_held_out
+
+    chosen = get_model(model)
+    check_folder(out, overwrite=overwrite)
+    table = read_for_model(file, (*chosen.conditions, chosen.output))
+    kept = _parse_hold_out(hold_out)
+    fitted, held = split(table, kept.column, kept.value) if kept else (table, None)
+    problem = build_problem(model, fitted, priors)
+    point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
+    with progress_bars() as tell:
+        calibration = calibrate(
+            problem, seed, estimates=(point,), settings=SamplerSettings(max_steps=max_steps),
+            progress=lambda done, planned: tell("sampling", done, planned),
+        )  # fmt: skip
+    with fresh_folder(out, overwrite=overwrite) as folder:
+        save_calibration(calibration, folder)
+    posterior_table(calibration)
+    print(verdict_line(calibration))
+    if held is not None:
+        scores = validate_held_out(calibration, held).scores
+        ninety = scores.coverage[0.9]
+        print(
+            f"held out ({kept}): 90 % band covers {ninety.hits} of {ninety.n}, "
+            f"RMSE {scores.rmse:.3g}, CRPS {scores.crps:.3g}"
+        )
+    print(f"run folder: {out}")
+    if not calibration.converged:
+        raise typer.Exit(3)
+
+
+def predict(
+    run: Annotated[Path, typer.Argument(help="Run folder of `calib fit`.")],
+    at: Annotated[Path, typer.Option(help="CSV with the conditions.")],
+    out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
+) -> None:
+    """Predict with 50, 90 and 95 % bands at new conditions."""
+    from calib.data import read_for_model, write_table
+    from calib.predict import predict as predict_at
+    from calib.predict import prediction_columns
+    from calib.store import load_calibration
+
+    calibration = load_calibration(run)
+    if not calibration.converged:
+        print("calib: this calibration did not converge; its bands are not to be used",
+              file=sys.stderr)  # fmt: skip
+    table = read_for_model(at, calibration.problem.bound.model.conditions)
+    prediction = predict_at(calibration, table)
+    columns = prediction_columns(prediction, table)
+    outside = sum(bool(flags) for flags in prediction.outside)
+    if out is not None:
+        write_table(out, columns)
+        print(f"{len(table)} rows written to {out}; {outside} outside the calibrated range")
+        return
+    print(",".join(columns))
+    for row in zip(*columns.values(), strict=True):
+        print(",".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in row))
+    if outside:
+        print(f"calib: {outside} rows lie outside the calibrated range", file=sys.stderr)
+
+
+def data(
+    name: Annotated[str, typer.Argument(help="he2019")],
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("he2019"),
+    overwrite: _Overwrite = False,
+) -> None:
+    """Write the embedded, reconstructed data as CSV files."""
+    from calib.datasets import he2019
+
+    if name != "he2019":
+        raise CalibError(f"there is no data set {name!r}", allowed="he2019")
+    existing = [f"{key}.csv" for key in he2019.tables() if (out / f"{key}.csv").exists()]
+    if existing and not overwrite:
+        raise CalibError(
+            f"{', '.join(existing)} exist there already", where=str(out),
+            mend="choose another --out, or pass --overwrite",
+        )  # fmt: skip
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise CalibError(
+            f"the folder cannot be written ({error.strerror})", where=str(out),
+            mend="choose another --out",
+        ) from None  # fmt: skip
+    for path in he2019.write(out):
+        print(f"{path} (reconstructed from published results, not measured)")
+
+
+def template(
+    model: Annotated[str, typer.Argument(help="See `calib models`.")],
+    out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
+) -> None:
+    """Write an example CSV of a model to fill in."""
+    from calib.models import get_model
+    from calib.templates import template_csv
+
+    _emit(template_csv(get_model(model).name), out)
+
+
+def priors(
+    model: Annotated[str, typer.Argument(help="See `calib models`.")],
+    out: Annotated[Path | None, typer.Option(help="TOML to write; printed if none.")] = None,
+) -> None:
+    """Write the shipped priors of a model, to copy and edit."""
+    from calib.models import get_model
+    from calib.priors import default_prior_path
+
+    _emit(default_prior_path(get_model(model).name).read_text(encoding="utf-8"), out)
+
+
+def models() -> None:
+    """List the models with their equations and columns."""
+    from calib.models import MODELS
+
+    for model in MODELS.values():
+        print(f"{model.name}: {model.title}\n  {model.equation}")
+        print(f"  needs {', '.join(model.conditions)}; gives {model.output}")
+
+
+def _emit(text: str, out: Path | None) -> None:
+    if out is None:
+        sys.stdout.write(text)
+        return
+    if out.exists():
+        raise CalibError("the file exists already", where=str(out), mend="choose another --out")
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CalibError(
+            f"the file cannot be written ({error.strerror})", where=str(out),
+            mend="choose another --out",
+        ) from None  # fmt: skip
+    print(out)
+
+
+def _parse_hold_out(text: str | None) -> HoldOut | None:
+    from calib.study import HoldOut
+
+    if text is None:
+        return None
+    column, equals, value = text.partition("=")
+    try:
+        if not equals:
+            raise ValueError
+        return HoldOut(column.strip(), float(value))
+    except ValueError:
+        raise CalibError(
+            f"cannot read --hold-out {text!r}",
+            allowed="COLUMN=VALUE, for instance inflation_pressure_psi=30",
+        ) from None
+
+
+def _command() -> list[str]:
+    """Return the command line without the folder the program was started from."""
+    return ["calib", *sys.argv[1:]]

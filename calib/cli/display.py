@@ -1,0 +1,75 @@
+"""Progress bars and tables on the terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+from calib.calibrate import Calibration
+from calib.page.numbers import format_value
+
+__all__ = ["posterior_table", "progress_bars", "verdict_line"]
+
+
+@contextmanager
+def progress_bars() -> Iterator[Callable[[str, int, int], None]]:
+    """Yield a callback ``(what, done, planned)`` that draws one bar for each kind of work."""
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    columns = (
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+        TimeElapsedColumn(), TimeRemainingColumn(),
+    )  # fmt: skip
+    tasks: dict[str, object] = {}
+    with Progress(*columns, console=Console(stderr=True)) as bars:
+
+        def tell(what: str, done: int, planned: int) -> None:
+            if what not in tasks:
+                tasks[what] = bars.add_task(what, total=planned)
+            bars.update(tasks[what], completed=done, total=planned)  # type: ignore[arg-type]
+
+        yield tell
+
+
+def posterior_table(calibration: Calibration) -> None:
+    """Print a calibration's posterior as a table."""
+    from rich.console import Console
+    from rich.table import Table as RichTable
+
+    model = calibration.problem.bound.model
+    table = RichTable(title=f"{model.name}: posterior of {len(calibration.problem.table)} rows")
+    for heading in ("parameter", "unit", "mean ± sd", "95 % HDI", "ESS bulk/tail", "R-hat", ""):
+        table.add_column(
+            heading, justify="left" if heading in ("parameter", "unit", "") else "right"
+        )
+    for s in calibration.summary.values():
+        table.add_row(
+            s.name, s.unit, format_value(s.mean, s.sd),
+            f"{s.hdi_lower:.4g} to {s.hdi_upper:.4g}", f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}",
+            f"{s.rhat:.3f}", "set by the prior" if s.sd_ratio > 0.9 else "",
+        )  # fmt: skip
+    Console().print(table)
+
+
+def verdict_line(calibration: Calibration) -> str:
+    """Say whether a calibration passed the gate, and what to do if not."""
+    report = calibration.draws.report
+    if report.passed:
+        return (
+            f"converged: {calibration.draws.t.shape[0]} ensembles, {report.steps} steps, "
+            f"R-hat at most {report.rhat.max():.4f}, ESS at least "
+            f"{min(report.ess_bulk.min(), report.ess_tail.min()):.0f}"
+        )
+    return (
+        "NOT CONVERGED, do not use these numbers: "
+        + "; ".join(report.reasons[:3])
+        + ". Raise --max-steps, or give tighter priors for parameters the data do not determine."
+    )

@@ -1,0 +1,214 @@
+"""CSV files as people have them: what separates the cells, how they are encoded, where they end."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import hashlib
+import io
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calib.errors import CalibError
+
+__all__ = ["CsvFile", "open_csv", "write_table"]
+
+_A_CSV = "a CSV file in UTF-8: a line of column names, then one line per row"
+
+
+@dataclass(frozen=True)
+class CsvFile:
+    """A file that was found readable as CSV.
+
+    Parameters
+    ----------
+    source : str
+        Path as given.
+    header : tuple of str
+    header_line : int
+        Its line, counted from 1.
+    delimiter : str
+    sha256 : str
+        Of the bytes.
+    rows : iterator of (int, list of str)
+        Line number and cells of each row that is not blank; not checked for their number.
+    """
+
+    source: str
+    header: tuple[str, ...]
+    header_line: int
+    delimiter: str
+    sha256: str
+    rows: Iterator[tuple[int, list[str]]]
+
+
+def open_csv(path: str | os.PathLike[str]) -> CsvFile:
+    """Read a file and its header line.
+
+    Raises
+    ------
+    CalibError
+        If it cannot be read, is not text in UTF-8, is empty or has no line of column names.
+    """
+    source = os.fspath(path)
+    raw = _read_bytes(source)
+    text = _decode(raw, source)
+    delimiter = _delimiter(text)
+    rows = _rows(text, delimiter, source)
+    line, header = next(rows, (0, []))
+    if not header:
+        raise CalibError(
+            "the file is empty", where=source, allowed=_A_CSV,
+            mend="`calib template MODEL` writes an example",
+        )  # fmt: skip
+    if all(map(_is_number, header)):
+        raise CalibError(
+            "the first line holds numbers, not column names",
+            where=f"{source}, line {line}",
+            allowed=_A_CSV,
+            mend="put a line of column names such as slip_ratio,drawbar_pull_kn on top",
+        )
+    names = tuple(cell.strip() for cell in header)
+    return CsvFile(source, names, line, delimiter, hashlib.sha256(raw).hexdigest(), rows)
+
+
+def _read_bytes(source: str) -> bytes:
+    try:
+        return Path(source).read_bytes()
+    except FileNotFoundError:
+        near = sorted(p.name for p in Path(source).parent.glob("*.csv"))[:5]
+        beside = f"; its folder holds {', '.join(near)}" if near else ""
+        raise CalibError(
+            "there is no such file", where=source, allowed=_A_CSV,
+            mend=f"check the path{beside}",
+        ) from None  # fmt: skip
+    except IsADirectoryError:
+        raise CalibError(
+            "this is a folder, not a file", where=source, allowed=_A_CSV,
+            mend="name a CSV file inside it",
+        ) from None  # fmt: skip
+    except (OSError, ValueError) as error:
+        raise CalibError(
+            f"the file cannot be read ({error})", where=source, allowed=_A_CSV,
+            mend="check the path and the permissions",
+        ) from None  # fmt: skip
+
+
+def _decode(raw: bytes, source: str) -> str:
+    mend = "save it again as CSV in UTF-8 (Excel: `CSV UTF-8`)"
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        raise CalibError("the file is in UTF-16", where=source, allowed=_A_CSV, mend=mend)
+    if raw.startswith(b"PK\x03\x04") or b"\x00" in raw:
+        raise CalibError(
+            "this is a binary file, such as a workbook, not text",
+            where=source, allowed=_A_CSV, mend=mend,
+        )  # fmt: skip
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = raw.count(b"\n", 0, error.start) + 1
+        raise CalibError(
+            f"byte 0x{raw[error.start]:02x} is not UTF-8",
+            where=f"{source}, line {line}", allowed=_A_CSV, mend=mend,
+        ) from None  # fmt: skip
+
+
+def _delimiter(text: str) -> str:
+    """Return the one of comma, semicolon and tab that the first line has most of."""
+    first = next((line for line in io.StringIO(text) if line.strip()), "")
+    return max(",;\t", key=first.count)
+
+
+def _rows(text: str, delimiter: str, source: str) -> Iterator[tuple[int, list[str]]]:
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, strict=True)
+    try:
+        for row in reader:
+            if any(map(str.strip, row)):
+                yield reader.line_num, row
+    except csv.Error as error:
+        raise CalibError(
+            f"the line cannot be split into cells ({error})",
+            where=f"{source}, line {reader.line_num}",
+            allowed=_A_CSV,
+            mend="look for a quotation mark that is opened and not closed",
+        ) from None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell.replace(",", "."))
+    except ValueError:
+        return False
+    return True
+
+
+def write_table(
+    path: str | os.PathLike[str],
+    columns: Mapping[str, ArrayLike | Sequence[str]],
+    *,
+    decimals: int | Mapping[str, int] | None = None,
+) -> None:
+    """Write columns as CSV, whole or not at all.
+
+    Parameters
+    ----------
+    path : path-like
+        File to write; its folder must exist. An existing file is replaced.
+    columns : mapping of str to (n,) array
+        Column name, with its unit, to values. Text is written as it is, whole numbers without
+        a point, NaN as an empty cell.
+    decimals : int or mapping of str to int, optional
+        Decimal places, of all columns or by name; by default as many as reading the same
+        number back takes.
+
+    Raises
+    ------
+    CalibError
+        If the columns differ in length or the file cannot be written.
+    """
+    places = decimals if isinstance(decimals, Mapping) else dict.fromkeys(columns, decimals)
+    cells = {name: _format(values, places.get(name)) for name, values in columns.items()}
+    lengths = {name: len(column) for name, column in cells.items()}
+    if len(set(lengths.values())) > 1:
+        raise CalibError(
+            f"the columns differ in length: {lengths}", where=os.fspath(path),
+            allowed="columns of one length", mend="pass arrays of shape (n,)",
+        )  # fmt: skip
+    target = Path(path)
+    # In the folder of the target, so that the final step only renames.
+    scratch = target.with_name(f".{target.name}.{os.getpid()}.tmp")
+    try:
+        with scratch.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(cells)
+            writer.writerows(zip(*cells.values(), strict=True))
+        scratch.replace(target)
+    except OSError as error:
+        raise CalibError(
+            f"the file cannot be written ({error.strerror})", where=str(target),
+            allowed="a file in an existing folder that you may write to",
+            mend="make the folder, change its permissions or name another file",
+        ) from None  # fmt: skip
+    finally:
+        with contextlib.suppress(OSError):
+            scratch.unlink(missing_ok=True)
+
+
+def _format(values: ArrayLike | Sequence[str], places: int | None) -> list[str]:
+    array: np.ndarray[Any, np.dtype[Any]] = np.atleast_1d(np.asarray(values))
+    if array.dtype.kind not in "fiub":
+        return [str(value) for value in array.tolist()]
+    if array.dtype.kind != "f":
+        return [str(int(value)) for value in array.tolist()]
+    if places is None:
+        return ["" if math.isnan(value) else repr(value) for value in array.tolist()]
+    # Adding zero turns the -0.0 of a small negative number into 0.0.
+    rounded = (np.round(array, places) + 0.0).tolist()
+    return ["" if math.isnan(value) else f"{value:.{places}f}" for value in rounded]

@@ -1,0 +1,95 @@
+"""The data set reconstructed from He, Sandu & Osorio (2019): three outputs, one folder of CSVs.
+
+No raw data of the source are available. Conditions follow its description, with assumptions
+where it is silent; outputs are the published models plus noise, drawn with fixed seeds and moved
+as little as makes a fit return the published figures. It says what the source says and nothing
+more: never take it for a measurement, and show `LABEL` wherever it is shown.
+
+References
+----------
+doi:10.1016/j.jterra.2019.07.003; the published figures are in `calib.datasets.published`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+
+from calib.datasets import density, drawbar, rut
+from calib.datasets.reconstruct import Array
+
+__all__ = ["LABEL", "bulk_density", "drawbar_pull", "rut_depth", "tables", "write"]
+
+LABEL = "reconstructed"
+
+# Decimals of every column; they carry the printed digits through the files.
+_DECIMALS: Mapping[str, int] = MappingProxyType(
+    {
+        "cone_index_kpa": 1,
+        "gravimetric_water_content": 4,
+        "bulk_density_g_cm3": density.DECIMALS,
+        "inflation_pressure_psi": 0,
+        "nominal_slip_ratio": 3,
+        "slip_ratio": 3,
+        "drawbar_pull_kn": drawbar.DECIMALS,
+        "average_ground_pressure_kpa": 2,
+        "rut_depth_mm": rut.DECIMALS,
+    }
+)
+
+
+@cache
+def bulk_density() -> Mapping[str, Array]:
+    """Return cone index, water content and bulk density, 36 samples."""
+    return MappingProxyType(density.bulk_density())
+
+
+@cache
+def drawbar_pull() -> Mapping[str, Array]:
+    """Return drawbar pull at 3 inflation pressures and 14 slips."""
+    return MappingProxyType(drawbar.drawbar_pull())
+
+
+@cache
+def rut_depth() -> Mapping[str, Array]:
+    """Return rut depth at 3 inflation pressures and 9 slips."""
+    return MappingProxyType(rut.rut_depth())
+
+
+_TABLES: Mapping[str, Callable[[], Mapping[str, Array]]] = MappingProxyType(
+    {"bulk_density": bulk_density, "drawbar_pull": drawbar_pull, "rut_depth": rut_depth}
+)
+
+
+def tables() -> dict[str, Mapping[str, Array]]:
+    """Return all three outputs by name; columns are read-only arrays."""
+    return {name: table() for name, table in _TABLES.items()}
+
+
+def _csv(columns: Mapping[str, Array]) -> str:
+    texts = [[f"{x:.{_DECIMALS[name]}f}" for x in column] for name, column in columns.items()]
+    rows = [list(columns), *zip(*texts, strict=True)]
+    return "".join(",".join(row) + "\n" for row in rows)
+
+
+def write(out_dir: Path) -> list[Path]:
+    """Write one CSV per output, and return their paths.
+
+    Parameters
+    ----------
+    out_dir : Path
+        Folder, made if it is missing; files of the same names are replaced.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be made or written to.
+    """
+    # All text is worked out first: a failure there leaves no files behind.
+    texts = {out_dir / f"{name}.csv": _csv(columns) for name, columns in tables().items()}
+    out_dir.mkdir(parents=True, exist_ok=True)
+    for path, text in texts.items():
+        path.write_text(text, encoding="ascii", newline="\n")
+    return list(texts)

@@ -1,0 +1,124 @@
+"""Names and units as a reader writes them, for axes (mathtext) and sentences (plain text)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from calib.columns import QUANTITIES
+from calib.models.base import Array
+
+__all__ = [
+    "Axis", "axis_of", "joined", "parameter_label", "percent", "short", "symbol", "unit_text",
+]  # fmt: skip
+
+_GREEK = {"sigma": r"\sigma", "gamma": r"\gamma", "theta": r"\theta"}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """How a canonical column is drawn.
+
+    Parameters
+    ----------
+    name, unit : str
+        In words.
+    factor : float
+        From the canonical unit to the drawn one.
+    """
+
+    name: str
+    unit: str
+    factor: float = 1.0
+
+    @property
+    def label(self) -> str:
+        """For an axis."""
+        return f"{self.name} ({self.unit})"
+
+    def scale(self, values: Array) -> Array:
+        """Convert from the canonical unit."""
+        return np.asarray(values) * self.factor
+
+
+_AXES: Mapping[str, Axis] = MappingProxyType(
+    {
+        "slip_ratio": Axis("Slip", "%", 100.0),
+        "nominal_slip_ratio": Axis("Nominal slip", "%", 100.0),
+        "inflation_pressure_psi": Axis("Inflation pressure", "psi"),
+        "average_ground_pressure_kpa": Axis("Ground pressure", "kPa"),
+        "cone_index_kpa": Axis("Cone index", "kPa"),
+        "gravimetric_water_content": Axis("Water content", "% of dry mass", 100.0),
+        "volumetric_water_content": Axis("Water content", "% of volume", 100.0),
+        "drawbar_pull_kn": Axis("Drawbar pull", "kN"),
+        "rut_depth_mm": Axis("Rut depth", "mm"),
+        "bulk_density_g_cm3": Axis("Dry bulk density", "g/cm³"),
+    }
+)
+
+
+def axis_of(column: str) -> Axis:
+    """Return how a canonical column is drawn."""
+    if column in _AXES:
+        return _AXES[column]
+    quantity = QUANTITIES.get(column)
+    if quantity is None:
+        return Axis(column.replace("_", " ").capitalize(), "–")
+    unit = quantity.unit.replace("**", "^").replace("dimensionless", "–")
+    return Axis(quantity.stem.replace("_", " ").capitalize(), unit)
+
+
+def symbol(name: str) -> str:
+    """Return a parameter's symbol in mathtext: ``K_lo`` as K with a subscript."""
+    stem, _, below = name.partition("_")
+    digits = re.fullmatch(r"([A-Za-z]+)(\d+)", stem)
+    if digits and not below:
+        stem, below = digits.groups()
+    if not below and len(stem) == 2 and stem[0].isupper() and stem[1].islower():
+        stem, below = stem[0], stem[1]
+    stem = _GREEK.get(stem, stem)
+    return f"${stem}_\\mathrm{{{below}}}$" if below else f"${stem}$"
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit in mathtext: powers raised; an en dash where there is none."""
+    if unit in ("1", "", "dimensionless"):
+        return "–"
+    raised = re.sub(r"\^(-?\w+)", r"$^{\1}$", unit)
+    return raised.replace("%", "%")
+
+
+def parameter_label(name: str, unit: str, *, log: bool = False) -> str:
+    """Return symbol and unit of a parameter for an axis."""
+    inside = symbol(name)
+    if log:
+        inside = f"ln {inside}"
+    return f"{inside} ({unit_text(unit)})"
+
+
+def short(value: float, digits: int = 2) -> str:
+    """Write a number with few significant digits and without exponent where that is readable."""
+    if not np.isfinite(value):
+        return "–"
+    if value == 0.0:
+        return "0"
+    size = int(np.floor(np.log10(abs(float(f"{value:.{digits - 1}e}")))))
+    if -4 <= size < 5:
+        text = f"{value:.{max(0, digits - 1 - size)}f}"
+    else:
+        text = f"{value:.{digits - 1}e}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
+    return text.replace("-", "−")
+
+
+def percent(fraction: float) -> str:
+    """Write a fraction as a percentage with two significant digits."""
+    return f"{short(100.0 * fraction)} %"
+
+
+def joined(words: list[str]) -> str:
+    """Join words as a sentence does."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

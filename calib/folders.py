@@ -1,0 +1,93 @@
+"""Output folders that appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from calib.errors import CalibError
+
+__all__ = ["check_folder", "fresh_folder"]
+
+# Files by which a folder is known to be one of ours, and may be replaced.
+_OURS = ("manifest.json", "run.json", "diagnosis.json")
+
+
+@contextmanager
+def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
+    """Yield a scratch folder that becomes `out` once the block succeeds.
+
+    Parameters
+    ----------
+    out : Path
+    overwrite : bool
+        Replace an existing folder; only one that was written by this package.
+
+    Raises
+    ------
+    CalibError
+        If `out` exists and may not be replaced, or cannot be written.
+    """
+    out = Path(out)
+    check_folder(out, overwrite=overwrite)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    except OSError as error:
+        raise CalibError(
+            f"the output folder cannot be written ({error.strerror})",
+            where=str(out),
+            mend="choose another folder with --out, or change its permissions",
+        ) from None
+    try:
+        yield scratch
+        scratch.chmod(0o777 & ~_umask())
+        if out.exists():
+            old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
+            out.replace(old / "old")
+            scratch.replace(out)
+            shutil.rmtree(old)
+        else:
+            scratch.replace(out)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def check_folder(out: Path, *, overwrite: bool = False) -> None:
+    """Check, before long work, that a folder may be written.
+
+    Raises
+    ------
+    CalibError
+        If it exists and may not be replaced.
+    """
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise CalibError(
+            "the output folder is an existing file", where=str(out), mend="choose another --out"
+        )
+    if not any(out.iterdir()):
+        return
+    if not overwrite:
+        raise CalibError(
+            "the output folder exists and is not empty",
+            where=str(out),
+            mend="choose another --out, or pass --overwrite to replace it",
+        )
+    if not any((out / name).exists() for name in _OURS):
+        raise CalibError(
+            "the output folder was not written by calib, so it is not replaced",
+            where=str(out),
+            mend="choose another --out, or delete the folder yourself",
+        )

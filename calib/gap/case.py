@@ -1,0 +1,193 @@
+"""A case: a calibrated simulator, the campaign it was calibrated on, and the one it misses."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.data import Table, read_table
+from calib.errors import CalibError
+from calib.gap.effects import View
+from calib.models.base import Array
+from calib.outputs import OUTPUTS
+from calib.priors import Priors
+from calib.problem import Problem, build_problem
+
+__all__ = ["Campaigns", "Case", "OutputData", "campaigns", "read_case"]
+
+
+@dataclass(frozen=True)
+class Case:
+    """The tables and models of a diagnosis.
+
+    Parameters
+    ----------
+    name : str
+    lab, field : Table
+        The campaign of the calibration, and the one the simulator is used for.
+    models : mapping of str to str
+        Output (`calib.outputs.OUTPUTS`) to model.
+    fresh : Table, optional
+        Conditions to predict.
+    warnings : tuple of str
+        What a reader must know about the input.
+    """
+
+    name: str
+    lab: Table
+    field: Table
+    models: Mapping[str, str]
+    fresh: Table | None = None
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class OutputData:
+    """One modelled output: the simulator's problem on the lab rows, and the field rows.
+
+    Parameters
+    ----------
+    name : str
+        Key of `calib.outputs.OUTPUTS`.
+    problem : Problem
+        On the lab rows that have the output.
+    priors : Priors
+        Of the model's parameters, without the noise scale.
+    rows : ndarray of int
+        Field rows that have the output.
+    field : ndarray
+        Their outputs on the scale of the response.
+    """
+
+    name: str
+    problem: Problem
+    priors: Priors
+    rows: NDArray[np.int64]
+    field: Array
+
+
+@dataclass(frozen=True)
+class Campaigns:
+    """A case made ready for inference."""
+
+    outputs: tuple[OutputData, ...]
+    view: View
+    lab_slips: Mapping[str, Array]
+    case: Case
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Outputs in order."""
+        return tuple(o.name for o in self.outputs)
+
+    def at(self, table: Table) -> View:
+        """Return the view of other conditions, with the same references."""
+        return replace(self.view, conditions=dict(table.columns))
+
+
+def read_case(folder: Path) -> Case:
+    """Read a case folder.
+
+    Parameters
+    ----------
+    folder : Path
+        With ``case.toml`` and the CSV files it names.
+
+    Raises
+    ------
+    CalibError
+        Naming what is missing or wrong, and where.
+    """
+    folder = Path(folder)
+    path = folder / "case.toml"
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise CalibError(
+            f"the case cannot be read ({error.strerror})", where=str(path),
+            mend="give a folder with a case.toml in it",
+        ) from None  # fmt: skip
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
+    models = content.get("models")
+    files = {key: content.get(key) for key in ("calibration", "field")}
+    if (
+        not isinstance(models, dict)
+        or not models
+        or not all(isinstance(f, str) for f in files.values())
+    ):
+        raise CalibError(
+            "calibration, field or [models] is missing", where=str(path),
+            allowed='calibration = "lab.csv", field = "field.csv", [models] output = "model"',
+            mend="add it",
+        )  # fmt: skip
+    unknown = [key for key in models if key not in OUTPUTS]
+    if unknown:
+        raise CalibError(
+            f"unknown output {', '.join(unknown)}", where=f"{path}, [models]",
+            allowed=", ".join(OUTPUTS), mend="correct the name",
+        )  # fmt: skip
+    missing_ok = tuple(OUTPUTS.values())
+    lab = read_table(folder / str(files["calibration"]), allow_missing=missing_ok)
+    field = read_table(folder / str(files["field"]), allow_missing=missing_ok)
+    fresh = read_table(folder / content["predict"]) if content.get("predict") else None
+    return Case(folder.name, lab, field, models, fresh)
+
+
+def campaigns(case: Case) -> Campaigns:
+    """Bind a case's models to its lab rows and gather its field rows.
+
+    Raises
+    ------
+    CalibError
+        If no output is in both campaigns, or there are too few rows.
+    """
+    outputs = tuple(_output(case, name, model) for name, model in case.models.items())
+    lab, field = case.lab, case.field
+    load = lab.columns.get("normal_load_kn", field.columns.get("normal_load_kn", np.array([5.0])))
+    order = field.columns.get("run_order", np.array([0.0, 1.0]))
+    view = View(
+        conditions=dict(field.columns),
+        lab={name: float(np.nanmedian(values)) for name, values in lab.columns.items()},
+        load_kn=float(np.median(load)),
+        ground_exponent=_ground_exponent(lab, field),
+        order_range=(float(order.min()), float(order.max())),
+    )
+    slips = {
+        o.name: o.problem.table.columns.get("slip_ratio", np.zeros(len(o.problem.table)))
+        for o in outputs
+    }
+    return Campaigns(outputs, view, slips, case)
+
+
+def _output(case: Case, name: str, model: str) -> OutputData:
+    column = OUTPUTS[name]
+    for table in (case.lab, case.field):
+        if column not in table or not np.isfinite(table[column]).any():
+            raise CalibError(
+                f"the case models {name}, but there are no values of {column}",
+                where=table.source, mend="add the column, or take the model out of case.toml",
+            )  # fmt: skip
+    lab = case.lab.take(np.isfinite(case.lab[column]))
+    problem = build_problem(model, lab)
+    problem.bound.model.select(case.field.columns)
+    rows = np.flatnonzero(np.isfinite(case.field[column]))
+    response = problem.bound.to_response(case.field[column][rows])
+    # The noise scale is not a parameter of the simulator: it is inferred beside it.
+    return OutputData(name, problem, Priors(problem.priors.entries[:-1]), rows, response)
+
+
+def _ground_exponent(lab: Table, field: Table) -> float:
+    """D ln(ground pressure)/d ln(inflation pressure), 0.5 where the data cannot tell."""
+    names = ("inflation_pressure_psi", "average_ground_pressure_kpa")
+    for table in (lab, field):
+        if all(name in table for name in names):
+            x, y = (np.log(table[name]) for name in names)
+            if np.ptp(x) > 1e-6:
+                return float(np.clip(np.polyfit(x, y, 1)[0], 0.0, 1.5))
+    return 0.5

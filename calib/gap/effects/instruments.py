@@ -1,0 +1,144 @@
+"""Effects of instruments: the reading is wrong, the soil is not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.gap.effects.base import DENSITY, DRAWBAR, RUT, Effect, View
+from calib.models.base import Array
+
+__all__ = [
+    "ConeIndexBias", "ForceOffset", "PressureGaugeBias", "SensorDrift", "SlipZeroShift",
+    "WaterContentBias",
+]  # fmt: skip
+
+
+class SlipZeroShift(Effect):
+    """A rolling radius wrong by a factor: 1 - s_true = (1 - s_recorded)(1 - error)."""
+
+    name = "slip_zero_shift"
+    title = "the rolling radius behind the recorded slip is wrong"
+    parameters = ("radius_error",)
+    outputs = (DRAWBAR, RUT)
+    covariates = ("slip_ratio",)
+    varies = False
+
+    def on_conditions(
+        self, phi: Array, output: str, conditions: dict[str, Array], view: View
+    ) -> dict[str, Array]:
+        """Shift the slip."""
+        if "slip_ratio" not in conditions:
+            return conditions
+        slip = conditions["slip_ratio"]
+        return {**conditions, "slip_ratio": 1.0 - (1.0 - slip) * (1.0 - phi[:, :1])}
+
+
+class ForceOffset(Effect):
+    """A constant error of the drawbar reading."""
+
+    name = "force_offset"
+    title = "the drawbar reading is off by a constant"
+    parameters = ("offset",)
+    outputs = (DRAWBAR,)
+    varies = False
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Add the offset (kN)."""
+        return location + phi[:, :1] if output == DRAWBAR else location
+
+
+class SensorDrift(Effect):
+    """A drift of the drawbar reading with run order, of any curvature, from any zero."""
+
+    name = "sensor_drift"
+    title = "the drawbar reading drifts with run order"
+    parameters = ("drift", "curvature", "zero_at")
+    form = ("shape",)
+    outputs = (DRAWBAR,)
+    covariates = ("run_order",)
+
+    def _progress(self, view: View) -> Array:
+        first, last = view.order_range
+        span = max(last - first, 1.0)
+        return np.clip((view.conditions["run_order"] - first) / span, 0.0, 1.2)
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Add the drift (kN from the first run to the last)."""
+        if output != DRAWBAR:
+            return location
+        drift, curvature, zero_at = phi[:, :1], phi[:, 1:2], phi[:, 2:3]
+        u = np.maximum(self._progress(view), 1e-3)
+        return np.asarray(location + drift * (u**curvature - zero_at))
+
+    def shape(self, view: View) -> Array | None:
+        """Run order."""
+        return self._progress(view)
+
+
+class PressureGaugeBias(Effect):
+    """True inflation pressure differs from the gauge's by a gain and an offset."""
+
+    name = "pressure_gauge_bias"
+    title = "true inflation pressure differs from the recorded one"
+    parameters = ("gain", "offset")
+    outputs = (DRAWBAR, RUT)
+    covariates = ("inflation_pressure_psi",)
+    varies = False
+
+    def on_conditions(
+        self, phi: Array, output: str, conditions: dict[str, Array], view: View
+    ) -> dict[str, Array]:
+        """Correct the inflation pressure, and the ground pressure that goes with it."""
+        recorded = view.conditions["inflation_pressure_psi"]
+        true = np.maximum(recorded * np.exp(phi[:, :1]) + phi[:, 1:2], 0.2 * recorded)
+        changed = dict(conditions)
+        if "inflation_pressure_psi" in conditions:
+            changed["inflation_pressure_psi"] = true
+        if "average_ground_pressure_kpa" in conditions:
+            ratio = (true / recorded) ** view.ground_exponent
+            changed["average_ground_pressure_kpa"] = (
+                conditions["average_ground_pressure_kpa"] * ratio
+            )
+        return changed
+
+
+class ConeIndexBias(Effect):
+    """A cone penetrometer that reads wrong by a gain and an offset."""
+
+    name = "cone_index_bias"
+    title = "the cone penetrometer reads wrong"
+    parameters = ("gain", "offset")
+    outputs = (DENSITY,)
+    covariates = ("cone_index_kpa",)
+    varies = False
+
+    def on_conditions(
+        self, phi: Array, output: str, conditions: dict[str, Array], view: View
+    ) -> dict[str, Array]:
+        """Correct the cone index."""
+        if "cone_index_kpa" not in conditions:
+            return conditions
+        recorded = conditions["cone_index_kpa"]
+        true = recorded * np.exp(phi[:, :1]) + phi[:, 1:2] * view.lab["cone_index_kpa"]
+        return {**conditions, "cone_index_kpa": np.maximum(true, 0.02 * recorded)}
+
+
+class WaterContentBias(Effect):
+    """A moisture probe that reads wrong by a gain and an offset."""
+
+    name = "water_content_bias"
+    title = "the moisture probe reads wrong"
+    parameters = ("gain", "offset")
+    outputs = (DENSITY,)
+    varies = False
+
+    def on_conditions(
+        self, phi: Array, output: str, conditions: dict[str, Array], view: View
+    ) -> dict[str, Array]:
+        """Correct the water content."""
+        changed = dict(conditions)
+        for name in ("gravimetric_water_content", "volumetric_water_content"):
+            if name in conditions:
+                true = conditions[name] * np.exp(phi[:, :1]) + phi[:, 1:2]
+                changed[name] = np.maximum(true, 0.0)
+        return changed

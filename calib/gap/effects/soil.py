@@ -1,0 +1,94 @@
+"""Effects of soil state: its strength depends on a covariate the simulator does not see.
+
+Stronger soil raises the whole traction curve, steepens it, lowers the motion resistance and makes
+the rut shallower. Each of the three effects does this along its own covariate h, which is zero at
+the laboratory's value:
+
+    pull'(s) = exp(a_pull h) pull(s exp(a_slope h)) + a_resistance h W
+    ln rut' = ln rut + (a_rut + a_rut_slip s) h
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.gap.effects.base import DRAWBAR, RUT, Effect, View
+from calib.models.base import Array
+
+__all__ = ["MoistureSoftening", "MultipassCompaction", "RateEffect"]
+
+
+class _SoilStrength(Effect):
+    """Common form; subclasses give the covariate."""
+
+    parameters = ("pull", "slope", "resistance", "rut", "rut_slip")
+    form = ("slip", "pressure", "shape")
+    outputs = (DRAWBAR, RUT)
+
+    def covariate(self, view: View) -> Array:
+        """Covariate h, zero at the laboratory's value, shape (n,)."""
+        raise NotImplementedError
+
+    def on_conditions(
+        self, phi: Array, output: str, conditions: dict[str, Array], view: View
+    ) -> dict[str, Array]:
+        """Stretch the slip axis of the traction curve."""
+        if output != DRAWBAR or "slip_ratio" not in conditions:
+            return conditions
+        stretch = np.exp(np.clip(phi[:, 1:2] * self.covariate(view), -2.0, 2.0))
+        return {**conditions, "slip_ratio": conditions["slip_ratio"] * stretch}
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Scale the pull and shift the resistance; shift the logarithm of the rut."""
+        h = self.covariate(view)
+        if output == DRAWBAR:
+            factor = np.exp(np.clip(phi[:, :1] * h, -2.0, 2.0))
+            return np.asarray(location * factor + phi[:, 2:3] * h * view.load_kn)
+        if output == RUT:
+            slip = np.maximum(view.slip(), 0.0)
+            return np.asarray(location + (phi[:, 3:4] + phi[:, 4:5] * slip) * h)
+        return location
+
+    def shape(self, view: View) -> Array | None:
+        """The covariate."""
+        return self.covariate(view)
+
+
+class MultipassCompaction(_SoilStrength):
+    """Earlier passes in the same rut have compacted the soil: h = ln(pass number)."""
+
+    name = "multipass_compaction"
+    title = "earlier passes in the same rut have compacted the soil"
+    covariates = ("pass_number",)
+
+    def covariate(self, view: View) -> Array:
+        """Logarithm of the pass number over the laboratory's."""
+        return np.log(view.conditions["pass_number"] / view.lab.get("pass_number", 1.0))
+
+
+class RateEffect(_SoilStrength):
+    """Soil strength changes with speed: h = ln(speed/laboratory speed)."""
+
+    name = "rate_effect"
+    title = "soil strength changes with speed"
+    covariates = ("speed_m_s",)
+
+    def covariate(self, view: View) -> Array:
+        """Logarithm of the speed over the laboratory's."""
+        speed = view.conditions["speed_m_s"]
+        lab = max(view.lab.get("speed_m_s", float(np.median(speed))), 1e-3)
+        return np.log(np.maximum(speed, 1e-3) / lab)
+
+
+class MoistureSoftening(_SoilStrength):
+    """Soil strength changes with water content: h = (w - laboratory w)/0.02."""
+
+    name = "moisture_softening"
+    title = "soil strength changes with water content"
+    covariates = ("gravimetric_water_content",)
+
+    def covariate(self, view: View) -> Array:
+        """Water content above the laboratory's, in steps of 0.02 g/g."""
+        water = view.conditions["gravimetric_water_content"]
+        lab = view.lab.get("gravimetric_water_content", float(np.median(water)))
+        return (water - lab) / 0.02

@@ -1,0 +1,172 @@
+"""Effects of wheel-soil mechanics that the simulator leaves out."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.gap.effects.base import DRAWBAR, RUT, Effect, View
+from calib.models.base import Array
+
+__all__ = [
+    "BulldozingResistance", "LoadTransfer", "LugThrust", "PostPeakSoftening", "RutRebound",
+    "SlipSinkage",
+]  # fmt: skip
+
+
+class BulldozingResistance(Effect):
+    """The wheel pushes soil ahead of it: resistance W b (z/30 mm)^c (1 + g s)."""
+
+    name = "bulldozing_resistance"
+    title = "the wheel pushes soil ahead of it, more as it sinks and slips"
+    parameters = ("resistance", "sinkage_exponent", "slip_growth")
+    form = ("slip", "pressure")
+    outputs = (DRAWBAR,)
+    varies = False
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Subtract the resistance from the pull."""
+        if output != DRAWBAR:
+            return location
+        resistance, exponent, growth = phi[:, :1], phi[:, 1:2], phi[:, 2:3]
+        slip = np.maximum(view.slip(), 0.0)
+        sunk = np.minimum(view.sinkage(), 20.0) ** exponent
+        return np.asarray(location - view.load_kn * resistance * sunk * (1.0 + growth * slip))
+
+    def shape(self, view: View) -> Array | None:
+        """Slip."""
+        return view.slip()
+
+
+class LugThrust(Effect):
+    """Lugs shear soil beside and between them: thrust W t (1 - exp(-s/s0)); they also dig."""
+
+    name = "lug_thrust"
+    title = "tread lugs or grousers add thrust as slip grows"
+    parameters = ("thrust", "slip_scale", "digging")
+    form = ("slip", "pressure")
+    outputs = (DRAWBAR, RUT)
+    covariates = ("slip_ratio",)
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Add the thrust to the pull, the digging to the logarithm of the rut."""
+        slip = np.maximum(view.slip(), 0.0)
+        if output == DRAWBAR:
+            grown = 1.0 - np.exp(-slip / phi[:, 1:2])
+            return np.asarray(location + view.load_kn * phi[:, :1] * grown)
+        if output == RUT:
+            return np.asarray(location + phi[:, 2:3] * slip)
+        return location
+
+    def shape(self, view: View) -> Array | None:
+        """Slip."""
+        return view.slip()
+
+
+class SlipSinkage(Effect):
+    """Slip digs the wheel in beyond the model: ln z + a s^c; compacting more soil costs pull."""
+
+    name = "slip_sinkage"
+    title = "sinkage grows with slip beyond what the model has"
+    parameters = ("growth", "slip_exponent", "pull_loss")
+    form = ("slip", "pressure")
+    outputs = (RUT,)
+    covariates = ("slip_ratio",)
+
+    def _deepening(self, phi: Array, view: View) -> Array:
+        slip = np.maximum(view.slip(), 1e-4)
+        return np.asarray(phi[:, :1] * slip ** phi[:, 1:2])
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Deepen the rut; take the extra compaction resistance from the pull."""
+        deeper = self._deepening(phi, view)
+        if output == RUT:
+            return location + deeper
+        if output == DRAWBAR:
+            extra = view.sinkage() * np.expm1(np.minimum(deeper, 3.0))
+            return np.asarray(location - view.load_kn * phi[:, 2:3] * extra)
+        return location
+
+    def shape(self, view: View) -> Array | None:
+        """Slip."""
+        return view.slip()
+
+
+class RutRebound(Effect):
+    """Part of the sinkage springs back: ln z - a0 - a s^c."""
+
+    name = "rut_rebound"
+    title = "part of the sinkage springs back, more at high slip"
+    parameters = ("towed", "growth", "slip_exponent")
+    form = ("slip", "pressure")
+    outputs = (RUT,)
+    covariates = ("slip_ratio",)
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Make the rut shallower."""
+        if output != RUT:
+            return location
+        slip = np.maximum(view.slip(), 1e-4)
+        return np.asarray(location - phi[:, :1] - phi[:, 1:2] * slip ** phi[:, 2:3])
+
+    def shape(self, view: View) -> Array | None:
+        """Slip."""
+        return view.slip()
+
+
+class PostPeakSoftening(Effect):
+    """Shear strength falls past its peak: pull (1 - a (1 - exp(-(s - sp)/s1))) beyond slip sp."""
+
+    name = "post_peak_softening"
+    title = "shear strength falls past its peak"
+    parameters = ("loss", "peak_slip", "slip_scale")
+    form = ("slip", "pressure")
+    outputs = (DRAWBAR,)
+    covariates = ("slip_ratio",)
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Lower the pull past the peak."""
+        if output != DRAWBAR:
+            return location
+        beyond = np.maximum(view.slip() - phi[:, 1:2], 0.0) / phi[:, 2:3]
+        return np.asarray(location * (1.0 - phi[:, :1] * -np.expm1(-beyond)))
+
+    def shape(self, view: View) -> Array | None:
+        """Slip."""
+        return view.slip()
+
+
+class LoadTransfer(Effect):
+    """Pull times hitch height over wheelbase changes the load: N = W (1 + t pull/W)."""
+
+    name = "load_transfer"
+    title = "drawbar pull changes the normal load"
+    parameters = ("transfer", "pull_exponent", "pressure_exponent")
+    form = ("slip",)
+    outputs = (DRAWBAR, RUT)
+    varies = False
+
+    def _ln_load(self, phi: Array, view: View) -> Array:
+        ratio = 1.0 + phi[:, :1] * view.base[DRAWBAR] / view.load_kn
+        return np.log(np.clip(ratio, 0.2, 5.0))
+
+    def on_conditions(
+        self, phi: Array, output: str, conditions: dict[str, Array], view: View
+    ) -> dict[str, Array]:
+        """Raise the ground pressure with the load."""
+        if output != RUT or "average_ground_pressure_kpa" not in conditions:
+            return conditions
+        factor = np.exp(phi[:, 2:3] * self._ln_load(phi, view))
+        pressure = conditions["average_ground_pressure_kpa"] * factor
+        return {**conditions, "average_ground_pressure_kpa": pressure}
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Scale the pull with the load."""
+        if output != DRAWBAR:
+            return location
+        return np.asarray(location * np.exp(phi[:, 1:2] * self._ln_load(phi, view)))
+
+    def not_testable(self, view: View, outputs: tuple[str, ...]) -> str | None:
+        """It needs the pull to be modelled."""
+        if DRAWBAR not in outputs:
+            return "no drawbar_pull output"
+        return super().not_testable(view, outputs)

@@ -1,0 +1,299 @@
+"""Fit a hypothesis to both campaigns at once: mode, curvature and evidence.
+
+Gauss-Newton on the joint posterior of simulator, effect and form errors, with the noise scales
+re-estimated between steps. Conditional on the noise the model is close to linear in psi where the
+posterior has its mass, so the evidence is Laplace's:
+
+    ln Z = ln p(y | psi^, sigma^) + ln p(psi^) + (d/2) ln 2 pi - (1/2) ln |H| + bounds
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr
+
+from calib.gap.case import Campaigns
+from calib.gap.forward import Forward
+from calib.models.base import Array
+from calib.sampling.mode import prior_widths
+
+__all__ = ["Fit", "Noise", "fit"]
+
+# Growth of the noise with slip: sigma (1 + rho s), and the prior probability of each.
+RHO = np.array([0.0, 1.0, 2.5, 5.0])
+LN_RHO_PRIOR = np.log(np.array([0.5, 0.2, 0.15, 0.15]))
+# The noise of an output is known beforehand to this factor (sd of its logarithm).
+SIGMA_SD_LOG = 1.0
+_MAX_STEPS = 40
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of one output: sd sigma (1 + rho slip) on the scale of the response."""
+
+    sigma: float
+    rho: float
+
+    def sd(self, slip: Array) -> Array:
+        """Noise sd at slips, shape (n,)."""
+        return self.sigma * (1.0 + self.rho * np.maximum(slip, 0.0))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The posterior of a hypothesis as a normal about its mode.
+
+    Parameters
+    ----------
+    forward : Forward
+    psi : ndarray, shape (d,)
+    covariance : ndarray, shape (d, d)
+    noise : mapping of str to Noise
+    log_evidence : float
+    log_likelihood : float
+    field_residuals : mapping of str to ndarray
+        Standardised residuals of the field rows of each output.
+    """
+
+    forward: Forward
+    psi: Array
+    covariance: Array
+    noise: Mapping[str, Noise]
+    log_evidence: float
+    log_likelihood: float
+    field_residuals: Mapping[str, Array]
+
+    def draws(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw psi within its bounds, shape (size, d)."""
+        values, vectors = np.linalg.eigh(self.covariance)
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        drawn = self.psi + rng.standard_normal((size, self.psi.size)) @ root.T
+        _, _, lower, upper, _ = self.forward.priors._arrays
+        return np.clip(drawn, lower, upper)
+
+
+def fit(
+    data: Campaigns,
+    forward: Forward,
+    start: Array,
+    noise: Mapping[str, Noise],
+    *,
+    starts: Array | None = None,
+) -> Fit:
+    """Fit a hypothesis.
+
+    Parameters
+    ----------
+    data : Campaigns
+    forward : Forward
+    start : ndarray, shape (d,)
+        First guess, the simulator's part of it fitted to the lab.
+    noise : mapping of str to Noise
+        First guess.
+    starts : ndarray, shape (k, d), optional
+        More guesses, screened in one call; the best is polished.
+    """
+    problem = _Residuals(data, forward)
+    psi = problem.clip(start)
+    if starts is not None:
+        psi = problem.best(np.concatenate([psi[None], problem.clip(starts)]), noise)
+    noise = dict(noise)
+    damping = 1e-3
+    cost = problem.cost(psi, noise)
+    quiet = 0
+    for _ in range(_MAX_STEPS):
+        jacobian, residual = problem.jacobian(psi, noise)
+        gradient = jacobian.T @ residual
+        hessian = jacobian.T @ jacobian
+        step, new_cost, damping = _step(problem, psi, noise, hessian, gradient, cost, damping)
+        gained = cost - new_cost
+        psi = problem.clip(psi + step)
+        new_noise = problem.update_noise(psi, hessian, noise)
+        changed = max(
+            abs(np.log(new_noise[o].sigma / noise[o].sigma)) + abs(new_noise[o].rho - noise[o].rho)
+            for o in noise
+        )
+        noise = new_noise
+        cost = problem.cost(psi, noise)
+        quiet = quiet + 1 if gained < 1e-3 and changed < 1e-2 else 0
+        if quiet >= 2:
+            break
+    return problem.finish(psi, noise)
+
+
+def _step(
+    problem: _Residuals, psi: Array, noise: Mapping[str, Noise], hessian: Array, gradient: Array,
+    cost: float, damping: float,
+) -> tuple[Array, float, float]:  # fmt: skip
+    """One Levenberg-Marquardt step: several dampings tried in one batched call."""
+    # A coordinate that nothing depends on at this point still needs a finite step.
+    diagonal = np.diag(np.diag(hessian) + 1e-2 / problem.width**2)
+    dampings = damping * 10.0 ** np.arange(-1.0, 5.0)
+    # At a bound, a coordinate that would leave is held there.
+    free = ~problem.blocked(psi, -gradient)
+    steps = np.zeros((dampings.size, psi.size))
+    for i, value in enumerate(dampings):
+        h = (hessian + value * diagonal)[np.ix_(free, free)]
+        steps[i, free] = -np.linalg.solve(h, gradient[free])
+    steps = problem.clip(psi + steps) - psi
+    costs = problem.costs(psi + steps, noise)
+    best = int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))
+    if not costs[best] < cost:
+        return np.zeros_like(psi), cost, min(dampings[-1] * 10.0, 1e6)
+    return steps[best], float(costs[best]), max(dampings[best], 1e-9)
+
+
+class _Residuals:
+    """Standardised residuals of lab, field and prior as functions of psi."""
+
+    def __init__(self, data: Campaigns, forward: Forward) -> None:
+        self.data = data
+        self.forward = forward
+        loc, _, lower, upper, precision = forward.priors._arrays
+        self.loc, self.precision = np.where(precision > 0, loc, 0.0), precision
+        self.lower, self.upper = lower, upper
+        self.width = prior_widths(forward.priors)
+        field_slip = data.view.slip()
+        self.slips = {
+            o.name: np.concatenate([data.lab_slips[o.name], field_slip[o.rows]])
+            for o in data.outputs
+        }
+        self.observed = {
+            o.name: np.concatenate([o.problem.response, o.field]) for o in data.outputs
+        }
+
+    def clip(self, psi: Array) -> Array:
+        margin = 1e-7 * self.width
+        return np.clip(psi, self.lower + margin, self.upper - margin)
+
+    def blocked(self, psi: Array, direction: Array) -> NDArray[np.bool_]:
+        tiny = 2e-7 * self.width
+        return ((psi <= self.lower + tiny) & (direction < 0)) | (
+            (psi >= self.upper - tiny) & (direction > 0)
+        )
+
+    def raw(self, psi: Array) -> dict[str, Array]:
+        """Observed minus predicted of lab then field rows, shapes (k, n)."""
+        with np.errstate(all="ignore"):
+            lab = self.forward.lab(psi)
+            field = self.forward.field(psi, self.data.view)
+        return {
+            o.name: self.observed[o.name]
+            - np.concatenate([lab[o.name], field[o.name][:, o.rows]], axis=1)
+            for o in self.data.outputs
+        }
+
+    def standardised(self, psi: Array, noise: Mapping[str, Noise]) -> Array:
+        """All residuals over their sds, the priors' included, shape (k, N)."""
+        parts = [r / noise[o].sd(self.slips[o]) for o, r in self.raw(psi).items()]
+        parts.append((psi - self.loc) * self.precision)
+        return np.concatenate(parts, axis=1)
+
+    def _ln_sds(self, noise: Mapping[str, Noise]) -> float:
+        return float(sum(np.log(noise[o].sd(s)).sum() for o, s in self.slips.items()))
+
+    def costs(self, psi: Array, noise: Mapping[str, Noise]) -> Array:
+        r = self.standardised(psi, noise)
+        return np.asarray(0.5 * np.square(r).sum(axis=1) + self._ln_sds(noise))
+
+    def cost(self, psi: Array, noise: Mapping[str, Noise]) -> float:
+        return float(self.costs(psi[None], noise)[0])
+
+    def best(self, candidates: Array, noise: Mapping[str, Noise]) -> Array:
+        costs = self.costs(candidates, noise)
+        picked: Array = candidates[int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))]
+        return picked
+
+    def jacobian(self, psi: Array, noise: Mapping[str, Noise]) -> tuple[Array, Array]:
+        d = psi.size
+        h = 1e-4 * self.width
+        sign = np.where(psi + h > self.upper, -1.0, 1.0)
+        points = np.concatenate([psi[None], psi + np.diag(sign * h)])
+        r = self.standardised(points, noise)
+        r = np.where(np.isfinite(r), r, r[0])
+        return ((r[1:] - r[0]) / (sign * h)[:, None]).T.reshape(-1, d), r[0]
+
+    def update_noise(
+        self, psi: Array, hessian: Array, noise: Mapping[str, Noise]
+    ) -> dict[str, Noise]:
+        """Noise scales that maximise the marginal likelihood, parameters allowed for."""
+        jacobian, _ = self.jacobian(psi, noise)
+        factor = np.linalg.solve(hessian + np.diag(1e-6 / self.width**2), jacobian.T)
+        leverage = np.einsum("nd,dn->n", jacobian, factor)
+        raw = self.raw(psi[None])
+        updated, start = {}, 0
+        for o, r in raw.items():
+            n = r.shape[1]
+            rows = slice(start, start + n)
+            start += n
+            # Each residual lost the part of its variance that the parameters took up.
+            corrected = np.square(r[0]) / np.clip(1.0 - leverage[rows], 0.1, 1.0)
+            updated[o] = _best_noise(corrected, self.slips[o])
+        return updated
+
+    def finish(self, psi: Array, noise: dict[str, Noise]) -> Fit:
+        jacobian, residual = self.jacobian(psi, noise)
+        hessian = jacobian.T @ jacobian
+        gradient = jacobian.T @ residual
+        d = psi.size
+        n = sum(s.size for s in self.slips.values())
+        data_part = residual[:n]
+        log_likelihood = (
+            -0.5 * float(data_part @ data_part) - self._ln_sds(noise) - 0.5 * n * np.log(2 * np.pi)
+        )
+        log_prior = float(self.forward.priors.log_prob(psi[None])[0])
+        # A flat direction is as wide as its prior.
+        hessian += np.diag(np.where(self.precision > 0, 0.0, 1.0 / self.width**2) * 1e-6)
+        sign, log_det = np.linalg.slogdet(hessian)
+        covariance = np.linalg.inv(hessian)
+        evidence = log_likelihood + log_prior + 0.5 * d * np.log(2 * np.pi) - 0.5 * log_det
+        evidence += self._bounds_correction(psi, gradient, covariance)
+        evidence += float(sum(self._rho_prior(v) for v in noise.values()))
+        residuals, start = {}, 0
+        for o in self.data.outputs:
+            n_lab, n_all = o.problem.response.size, self.slips[o.name].size
+            residuals[o.name] = data_part[start + n_lab : start + n_all]
+            start += n_all
+        return Fit(
+            self.forward, psi, covariance, noise,
+            float(evidence) if np.isfinite(evidence) and sign > 0 else -np.inf,
+            log_likelihood, residuals,
+        )  # fmt: skip
+
+    def _rho_prior(self, noise: Noise) -> float:
+        return float(LN_RHO_PRIOR[int(np.argmin(np.abs(RHO - noise.rho)))])
+
+    def _bounds_correction(self, psi: Array, gradient: Array, covariance: Array) -> float:
+        """Mass of the normal that lies inside the bounds, one coordinate at a time."""
+        sd = np.sqrt(np.diag(covariance))
+        total = 0.0
+        for i in range(psi.size):
+            low, high = self.lower[i], self.upper[i]
+            if not (np.isfinite(low) or np.isfinite(high)):
+                continue
+            to_low, to_high = (psi[i] - low) / sd[i], (high - psi[i]) / sd[i]
+            if min(to_low, to_high) < 0.01:
+                # Held at a bound with a slope: a one-sided exponential-normal integral.
+                slope = abs(gradient[i]) * sd[i]
+                total += min(0.5 * slope**2 + float(log_ndtr(-slope)), 0.0)
+            else:
+                inside = 1.0 - np.exp(log_ndtr(-to_low)) - np.exp(log_ndtr(-to_high))
+                total += float(np.log(max(inside, 1e-6)))
+        return total
+
+
+def _best_noise(squared: Array, slip: Array) -> Noise:
+    """Maximise the likelihood over rho on a grid, sigma in closed form."""
+    best, found = -np.inf, Noise(1.0, 0.0)
+    n = squared.size
+    for rho, prior in zip(RHO, LN_RHO_PRIOR, strict=True):
+        growth = 1.0 + rho * np.maximum(slip, 0.0)
+        variance = max(float((squared / growth**2).mean()), 1e-18)
+        value = -0.5 * n * np.log(variance) - np.log(growth).sum() + prior
+        if value > best:
+            best, found = value, Noise(float(np.sqrt(variance)), float(rho))
+    return found

@@ -1,0 +1,268 @@
+"""The joint forward model of a hypothesis: simulator in the lab, with effects in the field.
+
+The vector psi of a hypothesis stacks, all with (truncated) normal or uniform priors:
+
+    simulator parameters of each output (internal coordinates)
+    parameters of each effect
+    form errors: the effect's size departs from its formula by 1 + sum_j c_j b_j(x)
+    shifts of the simulator's parameters in the field (parameter_shift only)
+    coefficients of a free smooth discrepancy (unknown only)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from calib.gap.case import Campaigns
+from calib.gap.effects import Effect, View
+from calib.models.base import Array
+from calib.priors import Prior, Priors
+
+__all__ = ["FORM_ERROR", "Forward", "Hypothesis"]
+
+# Relative size by which a formula may misrepresent its effect along one direction.
+FORM_ERROR = 0.3
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What may cause the gap.
+
+    Parameters
+    ----------
+    name : str
+        Contract name, pairs in alphabetical order.
+    effects : tuple of Effect
+    effect_priors : tuple of Priors
+    shift : float
+        Prior sd of parameter shifts in units of the parameters' own prior sds; 0 for none.
+    smooth : float
+        Prior sd of a free discrepancy, in units of the noise; 0 for none.
+    """
+
+    name: str
+    effects: tuple[Effect, ...] = ()
+    effect_priors: tuple[Priors, ...] = ()
+    shift: float = 0.0
+    smooth: float = 0.0
+
+
+class Forward:
+    """Predictions and priors of a hypothesis on a pair of campaigns.
+
+    Parameters
+    ----------
+    data : Campaigns
+    hypothesis : Hypothesis
+    noise : mapping of str to float
+        Typical noise sd of each output on the scale of the response; the unit of a free
+        discrepancy.
+    """
+
+    def __init__(self, data: Campaigns, hypothesis: Hypothesis, noise: Mapping[str, float]) -> None:
+        self.data = data
+        self.hypothesis = hypothesis
+        self.noise = noise
+        entries: list[Prior] = []
+        self.theta_slices: dict[str, slice] = {}
+        for o in data.outputs:
+            self.theta_slices[o.name] = _append(entries, o.priors.free, o.name)
+        self.phi_slices = [
+            _append(entries, p.free, e.name)
+            for e, p in zip(hypothesis.effects, hypothesis.effect_priors, strict=True)
+        ]
+        self.form_slices: dict[str, slice] = {}
+        for o in data.outputs:
+            m = self._form(data.view).shape[1]
+            self.form_slices[o.name] = _append(entries, [_normal("form", FORM_ERROR)] * m, o.name)
+        self.shift_slices: dict[str, slice] = {}
+        for o in data.outputs:
+            if hypothesis.shift > 0.0:
+                widths = [
+                    p.scale if np.isfinite(p.scale) else 0.25 * (p.upper - p.lower)
+                    for p in o.priors.free
+                ]
+                shifts = [_normal("shift", hypothesis.shift * w) for w in widths]
+                self.shift_slices[o.name] = _append(entries, shifts, o.name)
+        self.smooth_slices: dict[str, slice] = {}
+        for o in data.outputs:
+            if hypothesis.smooth > 0.0:
+                weights = self._smooth(data.view)[1]
+                sd = hypothesis.smooth * noise[o.name]
+                self.smooth_slices[o.name] = _append(
+                    entries, [_normal("smooth", sd * w) for w in weights], o.name
+                )
+        self.priors = Priors(tuple(entries))
+
+    @property
+    def n_dim(self) -> int:
+        """Length of psi."""
+        return len(self.priors.free)
+
+    @cached_property
+    def _ranges(self) -> dict[str, Array]:
+        lab = self.data.case.lab.columns
+        return {
+            name: np.concatenate([values, lab.get(name, values)])
+            for name, values in self.data.view.conditions.items()
+        }
+
+    def _scaled(self, view: View, name: str, transform: str = "") -> Array | None:
+        if name not in view.conditions:
+            return None
+        values, reference = view.conditions[name], self._ranges[name]
+        if transform == "log":
+            values, reference = (
+                np.log(np.maximum(values, 1e-6)),
+                np.log(np.maximum(reference, 1e-6)),
+            )
+        if np.ptp(reference) < 1e-9 * max(1.0, abs(reference).max()):
+            return None
+        mid, half = 0.5 * (reference.max() + reference.min()), 0.5 * np.ptp(reference)
+        return np.clip((values - mid) / half, -1.5, 1.5)
+
+    def _form(self, view: View) -> Array:
+        """Basis of the form error, shape (n, m)."""
+        wanted = {kind for e in self.hypothesis.effects for kind in e.form}
+        n = view.slip().size
+        basis: list[Array] = []
+        slip = self._scaled(view, "slip_ratio")
+        pressure = self._scaled(view, "inflation_pressure_psi")
+        if pressure is None:
+            pressure = self._scaled(view, "average_ground_pressure_kpa")
+        if "slip" in wanted and slip is not None:
+            basis += [slip, 1.5 * slip**2 - 0.5]
+        if "pressure" in wanted and pressure is not None:
+            basis.append(pressure)
+        if "shape" in wanted:
+            for e in self.hypothesis.effects:
+                values = e.shape(view) if "shape" in e.form else None
+                reference = e.shape(self.data.view) if values is not None else None
+                if values is not None and reference is not None and np.ptp(reference) > 1e-9:
+                    mid = 0.5 * (reference.max() + reference.min())
+                    basis.append(np.clip((values - mid) / (0.5 * np.ptp(reference)), -1.5, 1.5))
+        return np.stack(basis, axis=1) if basis else np.empty((n, 0))
+
+    def _smooth(self, view: View) -> tuple[Array, Array]:
+        """Basis of a free discrepancy, shape (n, m), and the sds of its coefficients."""
+        slip = self._scaled(view, "slip_ratio")
+        pressure = self._scaled(view, "inflation_pressure_psi")
+        if pressure is None:
+            pressure = self._scaled(view, "average_ground_pressure_kpa")
+        order = self._scaled(view, "run_order")
+        n = next(iter(view.conditions.values())).size
+        basis, weights = [np.ones(n)], [1.0]
+
+        def cosines(u: Array | None, most: int, scale: float) -> list[tuple[Array, float]]:
+            if u is None:
+                return []
+            angle = 0.5 * np.pi * (np.clip(u, -1.2, 1.2) + 1.0)
+            return [
+                (np.sqrt(2.0) * np.cos(j * angle), scale / (1.0 + (j / 4.0) ** 2))
+                for j in range(1, most + 1)
+            ]
+
+        slips = cosines(slip, 10, 0.7)
+        terms = list(slips)
+        terms += cosines(order, 6, 0.5)
+        if pressure is not None:
+            terms.append((pressure, 0.7))
+            terms += [(pressure * b, 0.6 * w) for b, w in slips[:4]]
+        for name, transform in (
+            ("speed_m_s", "log"), ("pass_number", "log"), ("gravimetric_water_content", ""),
+            ("normal_load_kn", "log"), ("cone_index_kpa", "log"),
+            ("volumetric_water_content", ""),
+        ):  # fmt: skip
+            u = self._scaled(view, name, transform)
+            if u is not None:
+                terms += cosines(u, 3, 0.4)
+                if slip is not None:
+                    terms.append((u * slip, 0.4))
+        for b, w in terms:
+            basis.append(b)
+            weights.append(w)
+        return np.stack(basis, axis=1), np.array(weights)
+
+    def theta(self, psi: Array, output: str, *, field: bool) -> Array:
+        """Natural simulator parameters, shape (k, d)."""
+        index = [o.name for o in self.data.outputs].index(output)
+        o = self.data.outputs[index]
+        t = psi[:, self.theta_slices[output]]
+        if field and output in self.shift_slices:
+            t = t + psi[:, self.shift_slices[output]]
+        return o.priors.to_natural(t)
+
+    def lab(self, psi: Array) -> dict[str, Array]:
+        """Predict the lab rows on the scale of the response, shapes (k, n_lab)."""
+        return {
+            o.name: o.problem.bound.location(
+                self.theta(psi, o.name, field=False), o.problem.conditions
+            )
+            for o in self.data.outputs
+        }
+
+    def simulator(self, psi: Array, view: View) -> dict[str, Array]:
+        """Predict with the calibrated simulator alone, on the scale of the response."""
+        return {
+            o.name: o.problem.bound.location(
+                self.theta(psi, o.name, field=False), o.problem.bound.model.select(view.conditions)
+            )
+            for o in self.data.outputs
+        }
+
+    def field(self, psi: Array, view: View) -> dict[str, Array]:
+        """Predict field rows with the hypothesis in force, on the scale of the response."""
+        plain: dict[str, Array] = {}
+        for o in self.data.outputs:
+            theta = self.theta(psi, o.name, field=True)
+            conditions = o.problem.bound.model.select(view.conditions)
+            plain[o.name] = o.problem.bound.location(theta, conditions)
+        if self.hypothesis.effects:
+            plain = self._with_effects(psi, view, plain)
+        if self.smooth_slices:
+            basis = self._smooth(view)[0]
+            plain = {
+                name: location + psi[:, self.smooth_slices[name]] @ basis.T
+                for name, location in plain.items()
+            }
+        return plain
+
+    def _with_effects(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
+        outputs = {o.name: o for o in self.data.outputs}
+        base = {name: outputs[name].problem.bound.from_response(v) for name, v in plain.items()}
+        view = replace(view, base=base)
+        phis = [
+            p.to_natural(psi[:, s])
+            for p, s in zip(self.hypothesis.effect_priors, self.phi_slices, strict=True)
+        ]
+        form = self._form(view)
+        changed = {}
+        for name, o in outputs.items():
+            original: dict[str, Array] = o.problem.bound.model.select(view.conditions)
+            conditions = original
+            for effect, phi in zip(self.hypothesis.effects, phis, strict=True):
+                conditions = effect.on_conditions(phi, name, conditions, view)
+            location = plain[name]
+            if conditions is not original:
+                location = o.problem.bound.location(self.theta(psi, name, field=True), conditions)
+            for effect, phi in zip(self.hypothesis.effects, phis, strict=True):
+                location = effect.on_output(phi, name, location, view)
+            if form.shape[1]:
+                factor = 1.0 + psi[:, self.form_slices[name]] @ form.T
+                location = plain[name] + (location - plain[name]) * factor
+            changed[name] = location
+        return changed
+
+
+def _append(entries: list[Prior], new: list[Prior] | tuple[Prior, ...], prefix: str) -> slice:
+    start = len(entries)
+    entries += [replace(p, name=f"{prefix}.{p.name}") for p in new]
+    return slice(start, len(entries))
+
+
+def _normal(name: str, sd: float) -> Prior:
+    return Prior(name, "1", "", "", f"normal(0, {sd:g})", False, 0.0, sd)

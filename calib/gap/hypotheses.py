@@ -1,0 +1,61 @@
+"""Which hypotheses a case is tested against, and how probable each is before the data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from calib.gap.case import Campaigns
+from calib.gap.effects import EFFECTS, Effect
+from calib.gap.forward import Hypothesis
+from calib.priors import Priors, default_prior_path, read_priors
+
+__all__ = ["LN_PRIOR", "effect_priors", "pair", "singles", "testable"]
+
+# Prior probabilities of the kinds; singles and pairs share theirs equally.
+PRIOR = {"none": 0.40, "unknown": 0.07, "parameter_shift": 0.07, "single": 0.36, "pair": 0.10}
+LN_PRIOR: Mapping[str, float] = {k: float(np.log(v)) for k, v in PRIOR.items()}
+SHIFTS = (0.1, 0.35)
+SMOOTHS = (2.0, 6.0)
+
+
+def testable(
+    data: Campaigns, effects: Mapping[str, Effect] = EFFECTS
+) -> tuple[dict[str, Effect], dict[str, str]]:
+    """Split the effects into those the data can show and those they cannot, with the reason."""
+    able, unable = {}, {}
+    for name, effect in effects.items():
+        reason = effect.not_testable(data.view, data.names)
+        if reason is None:
+            able[name] = effect
+        else:
+            unable[name] = reason
+    return able, unable
+
+
+def effect_priors(data: Campaigns, effect: Effect) -> Priors:
+    """Read an effect's priors, forces relative to the case's load."""
+    path = default_prior_path(f"effects/{effect.name}")
+    loads = {"normal_load_kn": data.view.load_kn}
+    return read_priors(path, effect.name, effect.parameters, loads)
+
+
+def singles(data: Campaigns, effects: Mapping[str, Effect]) -> list[Hypothesis]:
+    """One hypothesis for each effect."""
+    return [Hypothesis(name, (e,), (effect_priors(data, e),)) for name, e in effects.items()]
+
+
+def pair(a: Hypothesis, b: Hypothesis) -> Hypothesis:
+    """Two effects at once, named in alphabetical order."""
+    first, second = sorted((a, b), key=lambda h: h.name)
+    return Hypothesis(
+        f"{first.name}+{second.name}",
+        first.effects + second.effects,
+        first.effect_priors + second.effect_priors,
+    )
+
+
+def pairs_of(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """All pairs of different effects."""
+    return [pair(a, b) for i, a in enumerate(hypotheses) for b in hypotheses[i + 1 :]]

@@ -1,0 +1,129 @@
+"""Rut depth from ground pressure and slip: Bekker and its slip-sinkage extension (Eqs 17-21).
+
+    p = k z^n,  k = kc/b + kphi,  n = n0 + n1 s,   so   ln z = (ln p - ln k)/(n0 + n1 s)
+
+with p in kPa, z in m, k in kPa/m^n and slip s as a fraction. ln k and n are almost collinear at
+the centimetre sinkages of a tyre (d ln k/dn = -ln z, about 4), so the sinkage z_ref of a towed
+wheel at the mean calibrated pressure is sampled in the place of k. The noise is on ln z: ground
+pressure is set, rut depth is measured.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from calib.models.base import Array, Conditions, Model, References, columns
+
+__all__ = ["BEKKER", "MODIFIED_BEKKER", "rut_depth"]
+
+LN_MM_PER_M = float(np.log(1000.0))
+
+
+def rut_depth(
+    pressure_kpa: Array, slip_ratio: Array | float, k: Array | float, n0: Array | float,
+    n1: Array | float = 0.0,
+) -> Array:  # fmt: skip
+    """Evaluate Eq 21, zt = (pgr/k)^(1/(n0 + n1 s)), in metres.
+
+    Parameters
+    ----------
+    pressure_kpa, slip_ratio : ndarray
+        Average ground pressure (kPa) and slip (fraction).
+    k : ndarray or float
+        Sinkage modulus, kPa/m^n.
+    n0, n1 : ndarray or float
+        Sinkage exponent and its growth with slip.
+
+    References
+    ----------
+    He, Sandu & Osorio (2019), Eqs 17-21, doi:10.1016/j.jterra.2019.07.003.
+    """
+    return np.asarray((pressure_kpa / k) ** (1.0 / (n0 + n1 * slip_ratio)))
+
+
+def _ln_rut_mm(
+    pressure: Array, slip: Array | float, z_ref_mm: Array, n0: Array, n1: Array | float,
+    references: References,
+) -> Array:  # fmt: skip
+    exponent = n0 + n1 * slip
+    ln_z_ref = np.log(z_ref_mm) - LN_MM_PER_M
+    ln_pressure = np.log(pressure / references["p_ref_kpa"])
+    ln_z = (ln_pressure + n0 * ln_z_ref) / exponent
+    return np.asarray(np.where(exponent > 0.0, ln_z + LN_MM_PER_M, np.nan))
+
+
+def _references(conditions: Conditions) -> dict[str, float]:
+    return {"p_ref_kpa": float(np.exp(np.log(conditions["average_ground_pressure_kpa"]).mean()))}
+
+
+def _location_bekker(theta: Array, conditions: Conditions, references: References) -> Array:
+    z_ref, n = columns(theta)
+    return _ln_rut_mm(conditions["average_ground_pressure_kpa"], 0.0, z_ref, n, 0.0, references)
+
+
+def _location_modified(theta: Array, conditions: Conditions, references: References) -> Array:
+    z_ref, n0, n1 = columns(theta)
+    return _ln_rut_mm(
+        conditions["average_ground_pressure_kpa"], conditions["slip_ratio"], z_ref, n0, n1,
+        references,
+    )  # fmt: skip
+
+
+def _k(z_ref_mm: Array, n0: Array, references: References) -> Array:
+    return np.asarray(references["p_ref_kpa"] * (z_ref_mm / 1000.0) ** -n0)
+
+
+def _z_ref(k: float, n0: float, references: References) -> float:
+    return float(1000.0 * (references["p_ref_kpa"] / k) ** (1.0 / n0))
+
+
+def _report_bekker(theta: Array, references: References) -> dict[str, Array]:
+    z_ref, n = theta.T
+    return {"n": n, "k": _k(z_ref, n, references)}
+
+
+def _report_modified(theta: Array, references: References) -> dict[str, Array]:
+    z_ref, n0, n1 = theta.T
+    return {"n0": n0, "n1": n1, "k": _k(z_ref, n0, references)}
+
+
+def _theta_bekker(reported: Mapping[str, float], references: References) -> Array:
+    return np.array([_z_ref(reported["k"], reported["n"], references), reported["n"]])
+
+
+def _theta_modified(reported: Mapping[str, float], references: References) -> Array:
+    n0 = reported["n0"]
+    return np.array([_z_ref(reported["k"], n0, references), n0, reported["n1"]])
+
+
+BEKKER = Model(
+    name="bekker",
+    title="Bekker pressure-sinkage",
+    equation="z0 = (pgr/k)^(1/n), k = kc/b + kphi  (Eqs 17, 19, 20)",
+    output="rut_depth_mm",
+    conditions=("average_ground_pressure_kpa",),
+    parameters=("z_ref", "n"),
+    reported={"n": "1", "k": "kPa/m^n"},
+    response="log",
+    location=_location_bekker,
+    report_theta=_report_bekker,
+    theta_from_reported=_theta_bekker,
+    bind_references=_references,
+)
+
+MODIFIED_BEKKER = Model(
+    name="modified_bekker",
+    title="Bekker with slip sinkage",
+    equation="zt = (pgr/k)^(1/(n0 + n1 s)), k = kc/b + kphi  (Eqs 18, 20, 21)",
+    output="rut_depth_mm",
+    conditions=("average_ground_pressure_kpa", "slip_ratio"),
+    parameters=("z_ref", "n0", "n1"),
+    reported={"n0": "1", "n1": "1", "k": "kPa/m^n"},
+    response="log",
+    location=_location_modified,
+    report_theta=_report_modified,
+    theta_from_reported=_theta_modified,
+    bind_references=_references,
+)

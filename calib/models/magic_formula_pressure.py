@@ -1,0 +1,180 @@
+"""Drawbar pull by the Magic Formula with pressure-dependent coefficients (Eqs 12-15).
+
+The paper makes the initial slope K = B C D, the peak D and the curvature factor E quadratics in
+inflation pressure p (psi) and keeps C = b0. The nine coefficients c1..c9 of monomials in p are
+almost collinear, so each quadratic is sampled through its values at the lowest and the highest
+calibrated pressure and its curvature,
+
+    Q(p) = Q_lo (1 - u)/2 + Q_hi (1 + u)/2 + q (u^2 - 1),   u = (p - p_mid)/p_half,
+
+which is the same quadratic: two pressures determine Q_lo and Q_hi and leave q to its prior; q is
+relative to the mean of the end values. The quadratics are K, D and G = 1 - E, all of which must be
+positive over the calibrated pressures: a negative stiffness or peak has no meaning, and E <= 1
+keeps the curve single-peaked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.errors import CalibError
+from calib.models.base import Array, Conditions, Model, References, columns
+from calib.models.magic_formula import magic_formula
+
+__all__ = ["MAGIC_FORMULA_PRESSURE", "coefficients_at"]
+
+
+def _quadratic(u: Array, low: Array, high: Array, bend: Array) -> Array:
+    mean = 0.5 * (low + high)
+    return mean + 0.5 * (high - low) * u + bend * mean * (u * u - 1.0)
+
+
+def _positive(low: Array, high: Array, bend: Array) -> NDArray[np.bool_]:
+    """Whether a quadratic is positive over -1 <= u <= 1."""
+    mean, half = 0.5 * (low + high), 0.5 * (high - low)
+    curvature = bend * mean
+    vertex_inside = (curvature > 0.0) & (np.abs(half) < 2.0 * curvature)
+    lowest = mean - curvature - half**2 / np.where(vertex_inside, 4.0 * curvature, 1.0)
+    return np.asarray(
+        (low > 0.0) & (high > 0.0) & (~vertex_inside | (lowest > 0.0)), dtype=np.bool_
+    )
+
+
+def _at(theta: tuple[Array, ...], u: Array) -> tuple[Array, Array, Array, Array]:
+    K_lo, K_hi, K_bend, D_lo, D_hi, D_bend, G_lo, G_hi, G_bend, C = theta
+    allowed = (
+        _positive(K_lo, K_hi, K_bend)
+        & _positive(D_lo, D_hi, D_bend)
+        & _positive(G_lo, G_hi, G_bend)
+    )
+    K = _quadratic(u, K_lo, K_hi, K_bend)
+    D = np.where(allowed, _quadratic(u, D_lo, D_hi, D_bend), np.nan)
+    return K, C, D, 1.0 - _quadratic(u, G_lo, G_hi, G_bend)
+
+
+def coefficients_at(theta: Array, pressure_psi: Array, references: References) -> dict[str, Array]:
+    """Return B (1/%), C, D (kN) and E at given pressures.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (k, 10)
+        Sampled parameters.
+    pressure_psi : ndarray, shape (n,)
+
+    Returns
+    -------
+    dict of ndarray, shape (k, n)
+    """
+    u = (np.asarray(pressure_psi) - references["p_mid_psi"]) / references["p_half_psi"]
+    K, C, D, E = _at(columns(np.atleast_2d(theta)), u)
+    return {"B": K / (C * D), "C": np.broadcast_to(C, D.shape), "D": D, "E": E}
+
+
+def _location(theta: Array, conditions: Conditions, references: References) -> Array:
+    pressure = conditions["inflation_pressure_psi"]
+    if pressure.ndim == 1:
+        # Few pressures, many slips: the quadratics are worked out once per distinct pressure.
+        distinct, inverse = np.unique(pressure, return_inverse=True)
+    else:
+        # A pressure for every parameter vector and row, as an uncertain gauge gives.
+        distinct, inverse = pressure, np.arange(pressure.shape[1])
+    u = (distinct - references["p_mid_psi"]) / references["p_half_psi"]
+    K, C, D, E = _at(columns(theta), u)
+    # Extrapolated to other pressures, the quadratics may still turn negative.
+    D = np.where((D > 0.0) & (K > 0.0), D, np.nan)
+    B = K / (C * D)
+    slip_percent = 100.0 * conditions["slip_ratio"]
+    return magic_formula(slip_percent, B[:, inverse], C, D[:, inverse], E[:, inverse])
+
+
+def _monomials(low: Array, high: Array, bend: Array, references: References) -> tuple[Array, ...]:
+    mid, half = references["p_mid_psi"], references["p_half_psi"]
+    mean = 0.5 * (low + high)
+    slope, curvature = 0.5 * (high - low) / half, bend * mean / half**2
+    constant = mean * (1.0 - bend)
+    return (
+        constant - slope * mid + curvature * mid**2,
+        slope - 2.0 * curvature * mid,
+        curvature,
+    )
+
+
+def _report(theta: Array, references: References) -> dict[str, Array]:
+    K_lo, K_hi, K_bend, D_lo, D_hi, D_bend, G_lo, G_hi, G_bend, C = theta.T
+    c1, c2, c3 = _monomials(D_lo, D_hi, D_bend, references)
+    c4, c5, c6 = _monomials(K_lo, K_hi, K_bend, references)
+    g7, g8, g9 = _monomials(G_lo, G_hi, G_bend, references)
+    return {
+        "c1": c1, "c2": c2, "c3": c3, "c4": c4, "c5": c5,
+        "c6": c6, "c7": 1.0 - g7, "c8": -g8, "c9": -g9, "b0": C,
+    }  # fmt: skip
+
+
+def _from_reported(reported: Mapping[str, float], references: References) -> Array:
+    mid, half = references["p_mid_psi"], references["p_half_psi"]
+
+    def ends(constant: float, linear: float, square: float) -> tuple[float, float, float]:
+        low, high = (constant + linear * p + square * p * p for p in (mid - half, mid + half))
+        return low, high, 2.0 * square * half**2 / (low + high)
+
+    D = ends(reported["c1"], reported["c2"], reported["c3"])
+    K = ends(reported["c4"], reported["c5"], reported["c6"])
+    G = ends(1.0 - reported["c7"], -reported["c8"], -reported["c9"])
+    return np.array([*K, *D, *G, reported["b0"]])
+
+
+def _references(conditions: Conditions) -> dict[str, float]:
+    pressure = conditions["inflation_pressure_psi"]
+    low, high = float(pressure.min()), float(pressure.max())
+    if not high > low * (1.0 + 1e-9):
+        raise CalibError(
+            f"model magic_formula_pressure found one inflation pressure only ({low:g} psi)",
+            where="column inflation_pressure",
+            allowed="at least two distinct inflation pressures",
+            mend="add tests at another pressure, or fit the model magic_formula",
+        )
+    return {"p_mid_psi": 0.5 * (low + high), "p_half_psi": 0.5 * (high - low)}
+
+
+MAGIC_FORMULA_PRESSURE = Model(
+    name="magic_formula_pressure",
+    title="Magic Formula with inflation pressure",
+    equation=(
+        "Y = D sin(C arctan(Bx - E(Bx - arctan Bx))), BCD = c4 + c5 p + c6 p^2, C = b0, "
+        "D = c1 + c2 p + c3 p^2, E = c7 + c8 p + c9 p^2  (Eqs 12-15)"
+    ),
+    output="drawbar_pull_kn",
+    conditions=("slip_ratio", "inflation_pressure_psi"),
+    parameters=(
+        "K_lo",
+        "K_hi",
+        "K_bend",
+        "D_lo",
+        "D_hi",
+        "D_bend",
+        "G_lo",
+        "G_hi",
+        "G_bend",
+        "C",
+    ),
+    reported={
+        "c1": "kN",
+        "c2": "kN/psi",
+        "c3": "kN/psi^2",
+        "c4": "kN/%",
+        "c5": "kN/%/psi",
+        "c6": "kN/%/psi^2",
+        "c7": "1",
+        "c8": "1/psi",
+        "c9": "1/psi^2",
+        "b0": "1",
+    },
+    response="identity",
+    location=_location,
+    report_theta=_report,
+    theta_from_reported=_from_reported,
+    bind_references=_references,
+)

@@ -1,0 +1,398 @@
+"""Priors: read from TOML, checked, and evaluated for many parameter vectors at once.
+
+Every distribution on offer is a (truncated) normal or a uniform, on the parameter or on its
+logarithm. That is enough for physical priors, and it lets one array expression evaluate all
+parameters. Sampling happens in *internal* coordinates: the logarithm for log-normal parameters,
+the parameter itself otherwise.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from scipy.special import log_ndtr, ndtr, ndtri
+
+from calib.errors import CalibError
+from calib.models.base import Array
+
+__all__ = ["Prior", "Priors", "default_prior_path", "parse_priors", "read_priors"]
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    unit: str
+    reason: str = Field(min_length=1)
+    source: str = Field(min_length=1)
+    relative_to: str | None = None
+    default_reference: float = Field(default=1.0, gt=0.0)
+
+
+class _Normal(_Entry):
+    dist: Literal["normal"]
+    mean: float
+    sd: float = Field(gt=0.0)
+    lower: float | None = None
+    upper: float | None = None
+
+
+class _LogNormal(_Entry):
+    dist: Literal["lognormal"]
+    median: float = Field(gt=0.0)
+    sd_log: float = Field(gt=0.0)
+    lower: float | None = Field(default=None, gt=0.0)
+    upper: float | None = Field(default=None, gt=0.0)
+
+
+class _HalfNormal(_Entry):
+    dist: Literal["half_normal"]
+    sd: float = Field(gt=0.0)
+
+
+class _Uniform(_Entry):
+    dist: Literal["uniform"]
+    lower: float
+    upper: float
+
+
+class _Fixed(_Entry):
+    dist: Literal["fixed"]
+    value: float
+
+
+type _AnyEntry = Annotated[
+    _Normal | _LogNormal | _HalfNormal | _Uniform | _Fixed, Field(discriminator="dist")
+]
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    model: str
+    parameters: dict[str, _AnyEntry]
+
+
+_FILE: TypeAdapter[_File] = TypeAdapter(_File)
+
+
+@dataclass(frozen=True)
+class Prior:
+    """One parameter's prior in internal coordinates.
+
+    Parameters
+    ----------
+    name, unit, reason, source, text : str
+        What it is, why, after whom, and the distribution in words.
+    log : bool
+        Whether the internal coordinate is the logarithm.
+    loc, scale : float
+        Of the normal; an infinite scale makes it uniform between the bounds, zero fixes it.
+    lower, upper : float
+        Bounds of the internal coordinate.
+    """
+
+    name: str
+    unit: str
+    reason: str
+    source: str
+    text: str
+    log: bool
+    loc: float
+    scale: float
+    lower: float = -np.inf
+    upper: float = np.inf
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the parameter is not sampled."""
+        return self.scale == 0.0
+
+
+@dataclass(frozen=True)
+class Priors:
+    """The joint prior of a problem, evaluated on the free parameters.
+
+    Parameters
+    ----------
+    entries : tuple of Prior
+        In the order of the model's parameters, the noise scale ``sigma`` last.
+    text : str
+        The TOML it was read from.
+    source : str
+        The file's name.
+    """
+
+    entries: tuple[Prior, ...]
+    text: str = ""
+    source: str = ""
+    free: tuple[Prior, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "free", tuple(p for p in self.entries if not p.fixed))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return tuple(p.name for p in self.free)
+
+    @cached_property
+    def _arrays(self) -> tuple[Array, ...]:
+        loc, scale, lower, upper = (
+            np.array([getattr(p, a) for p in self.free]) for a in ("loc", "scale", "lower", "upper")
+        )
+        normal = np.isfinite(scale)
+        precision = np.where(normal, 1.0 / scale, 0.0)
+        return loc, scale, lower, upper, precision
+
+    @cached_property
+    def _log_normaliser(self) -> float:
+        loc, scale, lower, upper, precision = self._arrays
+        normal = precision > 0.0
+        a, b = (lower - loc) * precision, (upper - loc) * precision
+        # The mass between the bounds, in the tail where it is accurate.
+        swap = a > 0.0
+        a, b = np.where(swap, -b, a), np.where(swap, -a, b)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mass = log_ndtr(b) + np.log1p(-np.exp(log_ndtr(a) - log_ndtr(b)))
+            normals = -np.log(scale) - 0.5 * np.log(2.0 * np.pi) - mass
+            uniforms = -np.log(upper - lower)
+        return float(np.where(normal, normals, uniforms).sum())
+
+    def log_prob(self, t: Array) -> Array:
+        """Log prior density of internal coordinates.
+
+        Parameters
+        ----------
+        t : ndarray, shape (k, d)
+
+        Returns
+        -------
+        ndarray, shape (k,)
+            ``-inf`` outside the bounds.
+        """
+        loc, _, lower, upper, precision = self._arrays
+        z = (t - loc) * precision
+        inside = ((t >= lower) & (t <= upper)).all(axis=1)
+        value = -0.5 * np.einsum("kd,kd->k", z, z) + self._log_normaliser
+        return np.where(inside, value, -np.inf)
+
+    def ppf(self, u: Array) -> Array:
+        """Map the unit cube to internal coordinates, shape (k, d) to (k, d)."""
+        loc, scale, lower, upper, precision = self._arrays
+        normal = precision > 0.0
+        a, b = ndtr((lower - loc) * precision), ndtr((upper - loc) * precision)
+        with np.errstate(invalid="ignore"):
+            normals = loc + scale * ndtri(a + u * (b - a))
+            uniforms = lower + u * (upper - lower)
+        return np.where(normal, normals, uniforms)
+
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw internal coordinates, shape (size, d)."""
+        return self.ppf(rng.uniform(size=(size, len(self.free))))
+
+    def to_natural(self, t: Array) -> Array:
+        """Return all parameters, fixed ones included, shape (k, d) to (k, d_all)."""
+        t = np.atleast_2d(t)
+        full = np.empty((t.shape[0], len(self.entries)))
+        j = 0
+        for i, prior in enumerate(self.entries):
+            if prior.fixed:
+                full[:, i] = prior.loc
+            else:
+                full[:, i] = np.exp(np.minimum(t[:, j], 700.0)) if prior.log else t[:, j]
+                j += 1
+        return full
+
+    def to_internal(self, natural: Array, margin: float = 1e-9) -> Array:
+        """Map all natural parameters, shape (k, d_all), inside the bounds, shape (k, d)."""
+        natural = np.atleast_2d(natural)
+        picked = []
+        for i, prior in enumerate(self.entries):
+            if not prior.fixed:
+                x = natural[:, i]
+                t = np.log(np.maximum(x, 1e-300)) if prior.log else x
+                picked.append(np.clip(t, prior.lower + margin, prior.upper - margin))
+        return np.stack(picked, axis=1)
+
+    def fix(self, values: Mapping[str, float]) -> Priors:
+        """Return the same priors with some natural parameters held at values."""
+        unknown = set(values) - {p.name for p in self.entries}
+        if unknown:
+            raise CalibError(
+                f"cannot fix {', '.join(sorted(unknown))}",
+                where=self.source,
+                allowed=", ".join(p.name for p in self.entries),
+            )
+        return Priors(
+            tuple(
+                Prior(
+                    p.name, p.unit, "held fixed for this fit", "this call", f"fixed at "
+                    f"{values[p.name]:g}", False, float(values[p.name]), 0.0,
+                )
+                if p.name in values
+                else p
+                for p in self.entries
+            ),
+            self.text,
+            self.source,
+        )  # fmt: skip
+
+
+def default_prior_path(model_name: str) -> Path:
+    """Return the path of the shipped priors of a model."""
+    packaged = Path(str(resources.files("calib"))) / "_priors"
+    # An editable install has no packaged copy: the priors then lie beside the package.
+    folder = packaged if packaged.is_dir() else Path(__file__).resolve().parents[1] / "priors"
+    return folder / f"{model_name}.toml"
+
+
+def read_priors(
+    path: Path, model_name: str, parameters: Sequence[str], references: Mapping[str, float]
+) -> Priors:
+    """Read and check a prior file.
+
+    Parameters
+    ----------
+    path : Path
+        TOML file with ``model`` and a table ``parameters.NAME`` for each parameter.
+    model_name : str
+        The model it must be for.
+    parameters : sequence of str
+        The parameters it must give, in order; the noise scale ``sigma`` among them.
+    references : mapping of str to float
+        Values of the columns that priors may be relative to (a median normal load).
+
+    Raises
+    ------
+    CalibError
+        If the file is missing, is not TOML, or gives unknown, missing or impossible entries.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibError(
+            f"the prior file cannot be read ({error})",
+            where=str(path),
+            mend="give the path of a readable TOML file",
+        ) from None
+    return parse_priors(text, str(path), model_name, parameters, references)
+
+
+def parse_priors(
+    text: str,
+    source: str,
+    model_name: str,
+    parameters: Sequence[str],
+    references: Mapping[str, float],
+) -> Priors:
+    """Check the text of a prior file; see `read_priors`."""
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise CalibError(
+            f"the prior file is not valid TOML: {error}", where=source, mend="correct that line"
+        ) from None
+    # A misspelt name is reported before its content: it is the likelier mistake.
+    _check_names(content, source, model_name, parameters)
+    try:
+        file = _FILE.validate_python(content)
+    except ValidationError as error:
+        raise _explain(error, source) from None
+    entries = tuple(_prior(name, file.parameters[name], source, references) for name in parameters)
+    return Priors(entries, text, source)
+
+
+def _check_names(
+    content: Mapping[str, Any], source: str, model_name: str, parameters: Sequence[str]
+) -> None:
+    if content.get("model") != model_name:
+        raise CalibError(
+            f"the priors are for model {content.get('model')!r}, not {model_name!r}",
+            where=source,
+            allowed=f'model = "{model_name}"',
+            mend="pass the prior file of this model",
+        )
+    given = content.get("parameters")
+    given = given if isinstance(given, Mapping) else {}
+    unknown = [name for name in given if name not in parameters]
+    missing = [name for name in parameters if name not in given]
+    if unknown or missing:
+        found = "; ".join(
+            f"{what} {', '.join(names)}"
+            for what, names in (("unknown parameter", unknown), ("missing parameter", missing))
+            if names
+        )
+        raise CalibError(
+            found,
+            where=f"{source}, [parameters]",
+            allowed=", ".join(parameters),
+            mend="give exactly these parameters; copy the shipped file and edit it",
+        )
+
+
+def _explain(error: ValidationError, source: str) -> CalibError:
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"] if not str(part).startswith("_"))
+    return CalibError(
+        f"{first['msg']} (found {first.get('input')!r})",
+        where=f"{source}, {place}",
+        allowed="dist = normal (mean, sd > 0), lognormal (median > 0, sd_log > 0), half_normal "
+        "(sd > 0), uniform (lower < upper) or fixed (value); each with unit, reason, source",
+        mend="correct this entry",
+    )
+
+
+def _prior(name: str, entry: _AnyEntry, source: str, references: Mapping[str, float]) -> Prior:
+    reference = 1.0
+    suffix = ""
+    if entry.relative_to is not None:
+        reference = references.get(entry.relative_to, entry.default_reference)
+        suffix = f" x {reference:g} ({entry.relative_to})"
+    log, loc, scale, lower, upper, text = _internal(entry, reference)
+    if not lower < upper:
+        raise CalibError(
+            f"lower bound {lower:g} is not below upper bound {upper:g}",
+            where=f"{source}, parameters.{name}",
+            mend="give lower < upper",
+        )
+    return Prior(
+        name, entry.unit, entry.reason, entry.source, text + suffix, log, loc, scale, lower, upper
+    )
+
+
+def _internal(entry: _AnyEntry, reference: float) -> tuple[bool, float, float, float, float, str]:
+    """Return (log, loc, scale, lower, upper, text) of an entry in internal coordinates."""
+    inf = np.inf
+    match entry:
+        case _Normal(mean=mean, sd=sd, lower=lower, upper=upper):
+            low = -inf if lower is None else lower * reference
+            high = inf if upper is None else upper * reference
+            text = f"normal({mean:g}, {sd:g})" + _bounds_text(lower, upper)
+            return False, mean * reference, sd * reference, low, high, text
+        case _LogNormal(median=median, sd_log=sd_log, lower=lower, upper=upper):
+            low = -inf if lower is None else float(np.log(lower * reference))
+            high = inf if upper is None else float(np.log(upper * reference))
+            text = f"lognormal({median:g}, {sd_log:g})" + _bounds_text(lower, upper)
+            return True, float(np.log(median * reference)), sd_log, low, high, text
+        case _HalfNormal(sd=sd):
+            return False, 0.0, sd * reference, 0.0, inf, f"half_normal({sd:g})"
+        case _Uniform(lower=lower, upper=upper):
+            low, high = lower * reference, upper * reference
+            return False, 0.5 * (low + high), inf, low, high, f"uniform({lower:g}, {upper:g})"
+        case _Fixed(value=value):
+            fixed = value * reference
+            return False, fixed, 0.0, -inf, inf, f"fixed({value:g})"
+
+
+def _bounds_text(lower: float | None, upper: float | None) -> str:
+    if lower is None and upper is None:
+        return ""
+    low = "-inf" if lower is None else f"{lower:g}"
+    high = "inf" if upper is None else f"{upper:g}"
+    return f" on [{low}, {high}]"

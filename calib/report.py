@@ -1,0 +1,134 @@
+"""Write a study as one folder: page, figures, numbers, posteriors, manifest. It only formats."""
+
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from calib.data import write_table
+from calib.figures import Plate, plates
+from calib.folders import fresh_folder
+from calib.manifest import build_manifest, file_hashes, sha256
+from calib.page import render_page
+from calib.priors import default_prior_path
+from calib.sampling.sampler import SamplerSettings
+from calib.store import to_datatree, write_netcdf
+from calib.study import Study
+from calib.summary import summarise
+
+__all__ = ["write_report"]
+
+type Progress = Callable[[str, int, int], None]
+
+
+def write_report(
+    study: Study,
+    out: Path,
+    *,
+    settings: SamplerSettings,
+    command: Sequence[str],
+    title: str,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+) -> Path:
+    """Write a report folder.
+
+    Parameters
+    ----------
+    study : Study
+    out : Path
+        Appears whole or not at all.
+    settings : SamplerSettings
+        Of the study, for the manifest.
+    command : sequence of str
+        The command line, for the manifest.
+    title : str
+    overwrite : bool
+        Replace an earlier report.
+    progress : callable, optional
+
+    Returns
+    -------
+    Path
+        Of ``index.html``.
+
+    Raises
+    ------
+    CalibError
+        If the folder exists or cannot be written.
+    """
+    tell = progress or (lambda what, done, planned: None)
+    with fresh_folder(out, overwrite=overwrite) as folder:
+        inputs = _copy_inputs(study, folder)
+        (folder / "summary.json").write_text(json.dumps(summarise(study), indent=1) + "\n")
+        drawn: dict[str, list[Plate]] = {}
+        images: dict[str, bytes] = {}
+        (folder / "figures").mkdir()
+        successes = study.successes
+        for i, (key, result) in enumerate(successes.items()):
+            tell("drawing figures", i, len(successes))
+            write_netcdf(to_datatree(result.calibration), folder / f"{key}.nc")
+            drawn[key] = plates(result, published=_embedded(study, key))
+            for plate in drawn[key]:
+                if plate.figure is not None:
+                    name = f"{key}_{plate.name}.png"
+                    images[name] = _png(plate)
+                    (folder / "figures" / name).write_bytes(images[name])
+        tell("drawing figures", len(successes), len(successes))
+        manifest = build_manifest(study, settings, command, inputs)
+        page = render_page(
+            study,
+            drawn,
+            images,
+            manifest=manifest,
+            title=title,
+            reconstructed=any(r.task.table.label for r in study.results.values()),
+        )
+        (folder / "index.html").write_text(page, encoding="utf-8")
+        manifest["files"] = file_hashes(folder)
+        (folder / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
+    return Path(out) / "index.html"
+
+
+def _embedded(study: Study, key: str) -> bool:
+    return study.results[key].task.table.label != ""
+
+
+def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
+    """Copy data and priors into the report, so that it can be computed again from itself."""
+    (folder / "data").mkdir()
+    (folder / "priors").mkdir()
+    inputs = {}
+    for key, result in study.results.items():
+        task = result.task
+        prior_path = task.prior_path or default_prior_path(task.model)
+        write_table(folder / "data" / f"{key}.csv", task.table.columns)
+        data = (folder / "data" / f"{key}.csv").read_bytes()
+        priors = prior_path.read_bytes()
+        (folder / "priors" / f"{key}.toml").write_bytes(priors)
+        inputs[key] = {
+            "data": {
+                "file": f"data/{key}.csv",
+                "sha256": sha256(data),
+                "source": Path(task.table.source).name,
+                "source_sha256": task.table.sha256,
+            },
+            "priors": {
+                "file": f"priors/{key}.toml",
+                "sha256": sha256(priors),
+                "source": prior_path.name,
+            },
+        }
+    return inputs
+
+
+def _png(plate: Plate) -> bytes:
+    buffer = io.BytesIO()
+    figure = plate.figure
+    if figure is None:
+        return b""
+    figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
+    return buffer.getvalue()

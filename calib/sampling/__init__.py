@@ -1,0 +1,1 @@
+"""Sampling with emcee: mode, proposal, moves, gate, sampler."""

@@ -1,0 +1,88 @@
+"""The convergence gate that every posterior passes before it is shown as one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from calib.chains import ess, rhat
+from calib.models.base import Array
+
+__all__ = ["Gate", "GateReport", "judge"]
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What a set of ensembles must reach, for every parameter.
+
+    Parameters
+    ----------
+    rhat_max : float
+        Largest rank-normalised split R-hat between ensembles.
+    ess_min : float
+        Smallest bulk and tail effective sample size.
+    taus_min : float
+        Shortest chain in integrated autocorrelation times.
+
+    References
+    ----------
+    Vehtari et al. (2021), doi:10.1214/20-BA1221.
+    """
+
+    rhat_max: float = 1.01
+    ess_min: float = 400.0
+    taus_min: float = 50.0
+
+
+@dataclass(frozen=True)
+class GateReport:
+    """Convergence figures of each parameter, arrays of shape (d,), and the verdict."""
+
+    names: tuple[str, ...]
+    rhat: Array
+    ess_bulk: Array
+    ess_tail: Array
+    tau: Array
+    steps: int
+    passed: bool
+    reasons: tuple[str, ...]
+
+
+def judge(
+    draws: Array, names: tuple[str, ...], gate: Gate, *, tau: Array, min_ensembles: int = 4
+) -> GateReport:
+    """Judge draws of independently seeded ensembles.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (ensembles, walkers, steps, d)
+    names : tuple of str, length d
+    gate : Gate
+    tau : ndarray, shape (d,)
+        Integrated autocorrelation time in steps, the worst of the ensembles.
+    min_ensembles : int
+        Fewer cannot be compared.
+
+    Notes
+    -----
+    Walkers of one ensemble are not independent chains, so R-hat compares whole ensembles: each is
+    one chain, its halves the earlier and the later steps. Effective sample sizes take each walker
+    as a chain, for autocorrelation runs along its steps.
+    """
+    ensembles, walkers, steps, d = draws.shape
+    by_ensemble = draws.transpose(0, 2, 1, 3).reshape(ensembles, steps * walkers, d)
+    by_walker = draws.reshape(ensembles * walkers, steps, d)
+    r, bulk, tail = rhat(by_ensemble), ess(by_walker, "bulk"), ess(by_walker, "tail")
+    reasons = []
+    if ensembles < min_ensembles:
+        reasons.append(f"{ensembles} ensembles, at least {min_ensembles} are needed")
+    # Written so that NaN fails.
+    for label, value, good, limit in (
+        ("R-hat", r, r <= gate.rhat_max, f"at most {gate.rhat_max}"),
+        ("bulk ESS", bulk, bulk >= gate.ess_min, f"at least {gate.ess_min:.0f}"),
+        ("tail ESS", tail, tail >= gate.ess_min, f"at least {gate.ess_min:.0f}"),
+        ("steps/tau", steps / tau, steps / tau >= gate.taus_min, f"at least {gate.taus_min:.0f}"),
+    ):
+        for name, v, ok in zip(names, value, good, strict=True):
+            if not ok:
+                reasons.append(f"{label} of {name} is {v:.4g}, {limit} is needed")
+    return GateReport(names, r, bulk, tail, tau, steps, not reasons, tuple(reasons))

@@ -1,0 +1,122 @@
+"""Scores of predictive draws against observations: pure functions of arrays.
+
+`draws` always has shape (n_draws, n): predictive draws of n observations, noise included.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import beta
+
+from calib.models.base import Array
+
+__all__ = ["LEVELS", "Coverage", "Scores", "coverage", "crps", "pit", "score"]
+
+LEVELS = (0.5, 0.9, 0.95)
+# Relative errors of a pull near zero say nothing: rows below this part of the largest are left out.
+RELATIVE_ERROR_FLOOR = 0.05
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """How many observations a band covered, with the 95 % Jeffreys interval of the proportion."""
+
+    level: float
+    hits: int
+    n: int
+    lower: float
+    upper: float
+
+    @property
+    def proportion(self) -> float:
+        """Covered part."""
+        return self.hits / self.n
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores of one set of observations.
+
+    Parameters
+    ----------
+    rmse : float
+        Of the predictive median, in the unit of the output.
+    crps : float
+        Mean continuous ranked probability score, in the unit of the output.
+    relative_error : ndarray, shape (n,)
+        (median - observed)/observed; NaN where the observation is below a twentieth of the
+        largest.
+    coverage : mapping of float to Coverage
+    pit : ndarray, shape (n,)
+        Probability integral transform.
+    median : ndarray, shape (n,)
+    """
+
+    n: int
+    rmse: float
+    crps: float
+    relative_error: Array
+    coverage: Mapping[float, Coverage]
+    pit: Array
+    median: Array
+
+    @property
+    def max_relative_error(self) -> float:
+        """Largest absolute relative error."""
+        return float(np.nanmax(np.abs(self.relative_error)))
+
+
+def crps(draws: Array, observed: Array) -> Array:
+    """Continuous ranked probability score of each observation, shape (n,).
+
+    References
+    ----------
+    Gneiting & Raftery (2007), doi:10.1198/016214506000001437, Eq 21, with the sorted form of
+    the mean absolute difference.
+    """
+    m = draws.shape[0]
+    ordered = np.sort(draws, axis=0)
+    weight = (2.0 * np.arange(1, m + 1) - m - 1.0) / m**2
+    return np.asarray(np.abs(draws - observed).mean(axis=0) - weight @ ordered)
+
+
+def pit(draws: Array, observed: Array) -> Array:
+    """Part of the draws below each observation, shape (n,)."""
+    return np.asarray((draws < observed).mean(axis=0))
+
+
+def coverage(draws: Array, observed: Array, level: float) -> Coverage:
+    """Count the observations inside the central band of a level."""
+    low, high = np.quantile(draws, [0.5 - level / 2.0, 0.5 + level / 2.0], axis=0)
+    hits = int(((observed >= low) & (observed <= high)).sum())
+    n = int(observed.size)
+    interval = beta(hits + 0.5, n - hits + 0.5)
+    lower = 0.0 if hits == 0 else float(interval.ppf(0.025))
+    upper = 1.0 if hits == n else float(interval.ppf(0.975))
+    return Coverage(level, hits, n, lower, upper)
+
+
+def score(draws: Array, observed: Array) -> Scores:
+    """Score predictive draws.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (n_draws, n)
+    observed : ndarray, shape (n,)
+    """
+    median = np.median(draws, axis=0)
+    large = np.abs(observed) > RELATIVE_ERROR_FLOOR * np.abs(observed).max()
+    relative = np.full(observed.size, np.nan)
+    relative[large] = (median[large] - observed[large]) / observed[large]
+    return Scores(
+        n=int(observed.size),
+        rmse=float(np.sqrt(np.mean(np.square(median - observed)))),
+        crps=float(crps(draws, observed).mean()),
+        relative_error=relative,
+        coverage={level: coverage(draws, observed, level) for level in LEVELS},
+        pit=pit(draws, observed),
+        median=median,
+    )

@@ -1,0 +1,216 @@
+"""Save and load calibrations: a run folder, and posteriors as ArviZ DataTrees.
+
+A run folder holds everything that is needed to predict from it and to compute it again:
+`posterior.nc`, `data.csv` (the fitted rows), `priors.toml` and `run.json`.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from calib.calibrate import Calibration
+from calib.data import Table, read_for_model, write_table
+from calib.errors import CalibError
+from calib.models import BoundModel, get_model
+from calib.models.base import Array
+from calib.priors import parse_priors
+from calib.problem import Problem
+from calib.sampling.gate import GateReport
+from calib.sampling.sampler import Draws
+from calib.streams import generator
+
+__all__ = ["load_calibration", "save_calibration", "to_datatree", "write_netcdf"]
+
+SCHEMA = "calib/run/1"
+N_PRIOR = 2000
+
+
+def to_datatree(calibration: Calibration) -> xr.DataTree:
+    """Return a calibration as an ArviZ DataTree.
+
+    Chains are walkers (`sample_stats.ensemble` says of which ensemble), so that effective sample
+    sizes computed from the file are those of the gate. Groups: posterior, prior,
+    posterior_predictive, log_likelihood, sample_stats, observed_data, constant_data.
+    """
+    import arviz as az
+
+    problem = calibration.problem
+    draws = calibration.draws
+    chains, steps = calibration.natural.shape[:2]
+    shape = (chains, steps, problem.response.size)
+    output = problem.bound.model.output
+    natural = calibration.natural.reshape(-1, calibration.natural.shape[-1])
+    location = problem.bound.location(natural[:, :-1], problem.conditions)
+    rng = generator(calibration.seed, calibration.label, "posterior_predictive")
+    noisy = location + natural[:, -1:] * rng.standard_normal(location.shape)
+    prior = problem.theta(
+        problem.priors.sample(generator(calibration.seed, calibration.label, "prior"), N_PRIOR)
+    )
+    ensembles = np.repeat(np.arange(draws.t.shape[0]), draws.t.shape[1])
+    tree: xr.DataTree = az.from_dict(
+        {
+            "posterior": dict(calibration.parameters),
+            "prior": _prior_group(calibration, prior),
+            "posterior_predictive": {
+                output: problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
+            },
+            "log_likelihood": {output: problem.log_likelihood_rows(draws.flat).reshape(shape)},
+            "sample_stats": {
+                "lp": draws.log_prob.reshape(chains, steps),
+                "ensemble": np.repeat(ensembles[:, None], steps, axis=1),
+            },
+            "observed_data": {output: problem.observed},
+            "constant_data": dict(problem.conditions),
+        },
+        dims={
+            output: ["row"],
+            **{name: ["row"] for name in problem.conditions},
+        },
+        attrs={"/": {"run": json.dumps(_describe(calibration))}},
+    )
+    return tree
+
+
+def _prior_group(calibration: Calibration, natural: Array) -> dict[str, Array]:
+    problem = calibration.problem
+    named = {p.name: natural[:, i] for i, p in enumerate(problem.priors.entries) if not p.fixed}
+    with np.errstate(all="ignore"):
+        derived = problem.bound.report(natural[:, :-1])
+    both = {name: v for name, v in derived.items() if name in calibration.parameters} | named
+    return {name: both[name][None] for name in calibration.parameters}
+
+
+def _describe(calibration: Calibration) -> dict[str, Any]:
+    problem, report = calibration.problem, calibration.draws.report
+    return {
+        "schema": SCHEMA,
+        "model": problem.bound.model.name,
+        "output": problem.bound.model.output,
+        "references": dict(problem.bound.references),
+        "fixed": {p.name: p.loc for p in problem.priors.entries if p.fixed},
+        "prior_file": problem.priors.source,
+        "prior_text": problem.priors.text,
+        "prior_references": _loads(problem.table),
+        "seed": calibration.seed,
+        "label": calibration.label,
+        "shape": list(calibration.draws.t.shape),
+        "mode": calibration.draws.mode.tolist(),
+        "log_evidence": calibration.draws.log_evidence,
+        "efficiency": calibration.draws.efficiency,
+        "acceptance": calibration.draws.acceptance,
+        "evaluations": calibration.draws.evaluations,
+        "seconds": calibration.draws.seconds,
+        "data_source": problem.table.source,
+        "data_label": problem.table.label,
+        "gate": {
+            "passed": report.passed,
+            "reasons": list(report.reasons),
+            "steps": report.steps,
+            "names": list(report.names),
+            **{k: getattr(report, k).tolist() for k in ("rhat", "ess_bulk", "ess_tail", "tau")},
+        },
+    }
+
+
+def _loads(table: Table) -> dict[str, float]:
+    name = "normal_load_kn"
+    return {name: float(np.median(table[name]))} if name in table else {}
+
+
+def write_netcdf(tree: xr.DataTree, path: Path) -> None:
+    """Write a DataTree, compressed, without time stamps, so equal results give equal content."""
+    encoding = {
+        f"/{group}": {str(name): {"zlib": True, "complevel": 1} for name in node.data_vars}
+        for group, node in tree.children.items()
+    }
+    for node in tree.subtree:
+        node.attrs.pop("created_at", None)
+    tree.to_netcdf(path, engine="h5netcdf", encoding=encoding)
+
+
+def save_calibration(calibration: Calibration, folder: Path) -> None:
+    """Write a run folder into an existing, empty folder."""
+    problem = calibration.problem
+    write_netcdf(to_datatree(calibration), folder / "posterior.nc")
+    (folder / "run.json").write_text(json.dumps(_describe(calibration), indent=1) + "\n")
+    (folder / "priors.toml").write_text(problem.priors.text)
+    write_table(folder / "data.csv", problem.table.columns)
+
+
+def load_calibration(folder: Path) -> Calibration:
+    """Read a run folder.
+
+    Raises
+    ------
+    CalibError
+        If the folder is not one, or a file in it is damaged.
+    """
+    import arviz as az
+
+    folder = Path(folder)
+    meta = _read_meta(folder)
+    try:
+        tree = az.from_netcdf(folder / "posterior.nc", engine="h5netcdf")
+        posterior = {str(k): v.values for k, v in tree["posterior"].data_vars.items()}
+        log_prob = tree["sample_stats"]["lp"].values
+    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        raise CalibError(
+            f"the posterior cannot be read ({type(error).__name__})",
+            where=str(folder / "posterior.nc"),
+            mend="the file is damaged or incomplete: run `calib fit` again",
+        ) from None
+    model = get_model(meta["model"])
+    priors = parse_priors(
+        meta["prior_text"], meta["prior_file"], model.name,
+        (*model.parameters, "sigma"), meta["prior_references"],
+    )  # fmt: skip
+    if meta["fixed"]:
+        priors = priors.fix(meta["fixed"])
+    table = read_for_model(folder / "data.csv", (*model.conditions, model.output))
+    problem = Problem(BoundModel(model, meta["references"]), table, priors)
+    shape = tuple(meta["shape"])
+    natural = np.stack(
+        [
+            np.full(shape[:-1], p.loc) if p.fixed else posterior[p.name].reshape(shape[:-1])
+            for p in priors.entries
+        ],
+        axis=-1,
+    )
+    t = priors.to_internal(natural.reshape(-1, natural.shape[-1]), margin=0.0).reshape(shape)
+    return Calibration(problem, _draws(meta, t, log_prob.reshape(shape[:-1])), meta["seed"],
+                       meta["label"])  # fmt: skip
+
+
+def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:
+    gate = meta["gate"]
+    figures = {k: np.array(gate[k]) for k in ("rhat", "ess_bulk", "ess_tail", "tau")}
+    report = GateReport(
+        names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
+        reasons=tuple(gate["reasons"]), **figures,
+    )  # fmt: skip
+    return Draws(
+        t, log_prob, report, np.array(meta["mode"]),
+        *(meta[k] for k in ("log_evidence", "efficiency", "acceptance", "evaluations", "seconds")),
+    )  # fmt: skip
+
+
+def _read_meta(folder: Path) -> dict[str, Any]:
+    path = folder / "run.json"
+    try:
+        meta: dict[str, Any] = json.loads(path.read_text())
+        known = meta.get("schema") == SCHEMA
+    except (OSError, ValueError, AttributeError):
+        known = False
+    if not known:
+        raise CalibError(
+            "this is not a run folder (no readable run.json in it)",
+            where=str(folder),
+            allowed="a folder written by `calib fit`",
+            mend="give the folder that `calib fit ... --out` named",
+        )
+    return meta

@@ -1,0 +1,319 @@
+"""The main job: calibrate each output, predict it with bands, validate it, compare estimates.
+
+A study is what a report shows. Each output is worked out on its own: one that fails is kept as a
+`Failure`, and the others still come.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from calib.calibrate import Calibration, calibrate
+from calib.data import Table, hold_out, table_from_arrays
+from calib.errors import CalibError
+from calib.estimate import PointEstimate, estimate, methods_for
+from calib.headers import parse_header
+from calib.models.base import Array
+from calib.outputs import OUTPUTS
+from calib.predict import predictive_draws
+from calib.problem import Problem, build_problem
+from calib.sampling.sampler import SamplerSettings
+from calib.streams import generator
+from calib.validate import Validation, leave_one_out, validate_held_out
+
+__all__ = [
+    "Failure", "HoldOut", "OutputResult", "Study", "Task", "choose_model",
+    "he2019_tasks", "plan_tasks", "run_study",
+]  # fmt: skip
+
+N_PRIOR_PREDICTIVE = 1000
+
+type Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class HoldOut:
+    """Rows kept for validation: a column as a header would name it, and its value."""
+
+    column: str
+    value: float
+
+    def __str__(self) -> str:
+        return f"{self.column} = {self.value:g}"
+
+    def applies_to(self, table: Table) -> bool:
+        """Whether a table has the column at all."""
+        column = parse_header(self.column)
+        return column is not None and column.quantity.canonical in table
+
+
+@dataclass(frozen=True)
+class Task:
+    """One output to calibrate.
+
+    Parameters
+    ----------
+    output : str
+        Key of `OUTPUTS`.
+    model : str
+    table : Table
+        All rows.
+    held_out : HoldOut, optional
+        Validation by held-out rows; by leave-one-out where there is none.
+    prior_path : Path, optional
+    """
+
+    output: str
+    model: str
+    table: Table
+    held_out: HoldOut | None = None
+    prior_path: Path | None = None
+
+
+@dataclass(frozen=True)
+class OutputResult:
+    """What a study found for one output.
+
+    Parameters
+    ----------
+    task : Task
+    calibration : Calibration
+        On the rows that are not held out.
+    validation : Validation
+    estimates : tuple of PointEstimate
+        Every applicable method, on all rows the source fitted.
+    by_pressure : mapping of float to tuple of PointEstimate
+        The Magic Formula at each inflation pressure (psi) on its own; empty for other models.
+    prior_predictive : ndarray, shape (draws, n)
+        Measurements the prior alone expects, at the calibration conditions.
+    posterior_predictive : ndarray, shape (draws, n)
+    seconds : mapping of str to float
+        Of each stage.
+    """
+
+    task: Task
+    calibration: Calibration
+    validation: Validation
+    estimates: tuple[PointEstimate, ...]
+    by_pressure: Mapping[float, tuple[PointEstimate, ...]]
+    prior_predictive: Array
+    posterior_predictive: Array
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An output that could not be worked out, and why."""
+
+    task: Task
+    error: str
+
+
+@dataclass(frozen=True)
+class Study:
+    """Results of all outputs, by the keys of `OUTPUTS`."""
+
+    results: Mapping[str, OutputResult | Failure]
+    seed: int
+    seconds: float
+
+    @property
+    def successes(self) -> dict[str, OutputResult]:
+        """The outputs that were worked out."""
+        return {k: r for k, r in self.results.items() if isinstance(r, OutputResult)}
+
+    @property
+    def failures(self) -> dict[str, Failure]:
+        """The outputs that were not."""
+        return {k: r for k, r in self.results.items() if isinstance(r, Failure)}
+
+
+def choose_model(output: str, table: Table) -> str:
+    """Pick the model that a table's columns allow for an output (a key of `OUTPUTS`)."""
+    if output == "bulk_density":
+        gravimetric = "gravimetric_water_content" in table
+        return "ayers_perumpral" if gravimetric else "ayers_perumpral_volumetric"
+    if output == "drawbar_pull":
+        pressure = "inflation_pressure_psi"
+        several = pressure in table and np.unique(table[pressure]).size > 1
+        return "magic_formula_pressure" if several else "magic_formula"
+    slips = "slip_ratio" in table and np.ptp(table["slip_ratio"]) > 0.0
+    return "modified_bekker" if slips else "bekker"
+
+
+def plan_tasks(
+    tables: Sequence[Table], held_out: HoldOut | None = None, prior_path: Path | None = None
+) -> tuple[Task, ...]:
+    """Find the outputs in some tables and choose a model for each.
+
+    Raises
+    ------
+    CalibError
+        If no table has an output, or two have the same.
+    """
+    tasks: dict[str, Task] = {}
+    for table in tables:
+        found = [key for key, column in OUTPUTS.items() if column in table]
+        if not found:
+            raise CalibError(
+                "there is no output to calibrate",
+                where=table.source,
+                allowed=", ".join(OUTPUTS.values()) + " (in any known unit)",
+                mend="add a column with the measured output",
+            )
+        for key in found:
+            if key in tasks:
+                raise CalibError(
+                    f"two files give the output {key}",
+                    where=f"{tasks[key].table.source}, {table.source}",
+                    mend="report one of them, or join them into one file",
+                )
+            rows = table.take(np.isfinite(table[OUTPUTS[key]]))
+            usable = held_out if held_out is not None and held_out.applies_to(rows) else None
+            tasks[key] = Task(key, choose_model(key, rows), rows, usable, prior_path)
+    return tuple(tasks[key] for key in OUTPUTS if key in tasks)
+
+
+def he2019_tasks() -> tuple[Task, ...]:
+    """Return the paper's three calibrations on the embedded, reconstructed data.
+
+    The 30 psi rows of drawbar pull and rut depth are held out.
+    """
+    from calib.datasets import he2019
+
+    held = HoldOut("inflation_pressure_psi", 30.0)
+    models = {
+        "bulk_density": ("ayers_perumpral", None),
+        "drawbar_pull": ("magic_formula_pressure", held),
+        "rut_depth": ("modified_bekker", held),
+    }
+    tables = {
+        key: table_from_arrays(columns, source=f"he2019 {key}", label=he2019.LABEL)
+        for key, columns in he2019.tables().items()
+    }
+    return tuple(Task(key, model, tables[key], rows) for key, (model, rows) in models.items())
+
+
+def run_study(
+    tasks: Sequence[Task],
+    seed: int,
+    *,
+    settings: SamplerSettings | None = None,
+    progress: Progress | None = None,
+) -> Study:
+    """Work every task out.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+    seed : int
+    settings : SamplerSettings, optional
+    progress : callable, optional
+        Called with what is being done, steps done and steps planned.
+    """
+    began = time.perf_counter()
+    results: dict[str, OutputResult | Failure] = {}
+    for task in tasks:
+        try:
+            results[task.output] = _work_out(task, seed, settings, progress or _silent)
+        except (CalibError, np.linalg.LinAlgError, ValueError, ArithmeticError) as error:
+            results[task.output] = Failure(task, f"{type(error).__name__}: {error}")
+    return Study(results, seed, time.perf_counter() - began)
+
+
+def _silent(what: str, done: int, planned: int) -> None:
+    pass
+
+
+def _work_out(
+    task: Task, seed: int, settings: SamplerSettings | None, progress: Progress
+) -> OutputResult:
+    seconds: dict[str, float] = {}
+    fitted, held = (
+        hold_out(task.table, task.held_out.column, task.held_out.value)
+        if task.held_out is not None
+        else (task.table, None)
+    )
+    problem = build_problem(task.model, fitted, task.prior_path)
+    clock = time.perf_counter()
+    seeding = (estimate(problem, "least_squares", generator(seed, task.output, "seeding")),)
+    estimates = _estimates(task, problem, seed, progress)
+    by_pressure = _by_pressure(task, seed) if task.model == "magic_formula_pressure" else {}
+    seconds["estimate"] = time.perf_counter() - clock
+    clock = time.perf_counter()
+    calibration = calibrate(
+        problem,
+        seed,
+        label=task.output,
+        estimates=seeding,
+        settings=settings,
+        progress=lambda done, planned: progress(f"{task.output}: sampling", done, planned),
+    )
+    seconds["sample"] = time.perf_counter() - clock
+    clock = time.perf_counter()
+    if held is not None:
+        validation = validate_held_out(calibration, held)
+    else:
+        validation = leave_one_out(
+            calibration,
+            settings=settings,
+            progress=lambda done, n: progress(f"{task.output}: leaving rows out", done, n),
+        )
+    seconds["validate"] = time.perf_counter() - clock
+    _, replicated = predictive_draws(
+        calibration, problem.conditions, generator(seed, task.output, "replicate")
+    )
+    return OutputResult(
+        task,
+        calibration,
+        validation,
+        estimates,
+        by_pressure,
+        _prior_predictive(problem, generator(seed, task.output, "prior")),
+        replicated,
+        seconds,
+    )
+
+
+def _estimates(
+    task: Task, fitted: Problem, seed: int, progress: Progress
+) -> tuple[PointEstimate, ...]:
+    # The paper fitted drawbar pull at all pressures, rut depth at the two outer ones.
+    everything = task.model.startswith("magic_formula")
+    problem = build_problem(task.model, task.table, task.prior_path) if everything else fitted
+    methods = methods_for(task.model)
+    found = []
+    for i, method in enumerate(methods):
+        progress(f"{task.output}: estimating", i, len(methods))
+        # A method that cannot read these data (no peak, one pressure) is left out of the table.
+        with suppress(CalibError):
+            found.append(estimate(problem, method, generator(seed, task.output, method)))
+    progress(f"{task.output}: estimating", len(methods), len(methods))
+    return tuple(found)
+
+
+def _by_pressure(task: Task, seed: int) -> dict[float, tuple[PointEstimate, ...]]:
+    found = {}
+    for psi in np.unique(task.table["inflation_pressure_psi"]):
+        rows = task.table.take(np.isclose(task.table["inflation_pressure_psi"], psi))
+        if len(rows) < 6:
+            continue
+        problem = build_problem("magic_formula", rows, fixed={"Sh": 0.0, "Sv": 0.0})
+        found[float(psi)] = tuple(
+            estimate(problem, method, generator(seed, task.output, method, f"{psi:g}"))
+            for method in methods_for("magic_formula")
+        )
+    return found
+
+
+def _prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
+    natural = problem.theta(problem.priors.sample(rng, N_PRIOR_PREDICTIVE))
+    location = problem.bound.location(natural[:, :-1], problem.conditions)
+    noise = natural[:, -1:] * rng.standard_normal(location.shape)
+    return problem.bound.from_response(location + noise)

@@ -1,0 +1,140 @@
+"""`summary.json`: every number of a study, with its uncertainty, for machines."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from calib.calibrate import Calibration
+from calib.estimate import PointEstimate
+from calib.scores import Scores
+from calib.study import OutputResult, Study
+
+__all__ = ["SCHEMA", "summarise"]
+
+SCHEMA = "calib/summary/1"
+
+
+def summarise(study: Study) -> dict[str, Any]:
+    """Return a study's numbers as plain dictionaries.
+
+    Keys under ``models.<output>``: ``estimates.<method>.<parameter>``, ``fit.<method>``,
+    ``posterior.<parameter>``, ``validation``, ``sampling``; a failed output has ``error`` alone.
+    """
+    models: dict[str, Any] = {k: _output(r) for k, r in study.successes.items()}
+    models |= {k: {"model": f.task.model, "error": f.error} for k, f in study.failures.items()}
+    document = {
+        "schema": SCHEMA,
+        "seed": study.seed,
+        "seconds": study.seconds,
+        "models": {key: models[key] for key in study.results},
+    }
+    plain: dict[str, Any] = _finite(document)
+    return plain
+
+
+def _output(result: OutputResult) -> dict[str, Any]:
+    problem = result.calibration.problem
+    return {
+        "model": problem.bound.model.name,
+        "output": problem.bound.model.output,
+        "data": {
+            "source": problem.table.source,
+            "label": problem.table.label,
+            "n": len(problem.table),
+            "held_out": None if result.task.held_out is None else str(result.task.held_out),
+        },
+        "references": dict(problem.bound.references),
+        "estimates": {e.method: dict(e.reported) for e in result.estimates},
+        "fit": {e.method: _fit(e) for e in result.estimates},
+        "by_pressure": {
+            f"{psi:g} psi": {e.method: {**e.reported, "cost": e.cost} for e in estimates}
+            for psi, estimates in result.by_pressure.items()
+        },
+        "posterior": _posterior(result.calibration),
+        "validation": _validation(result),
+        "sampling": _sampling(result.calibration),
+    }
+
+
+def _fit(e: PointEstimate) -> dict[str, Any]:
+    return {
+        "cost": e.cost,
+        "rmse": e.rmse,
+        "r_squared": e.r_squared,
+        "evaluations": e.n_evaluations,
+        "converged": e.converged,
+        "note": e.note,
+    }
+
+
+def _posterior(calibration: Calibration) -> dict[str, Any]:
+    return {
+        name: {
+            "unit": s.unit,
+            "mean": s.mean,
+            "sd": s.sd,
+            "median": s.median,
+            "hdi_lower": s.hdi_lower,
+            "hdi_upper": s.hdi_upper,
+            "ess_bulk": s.ess_bulk,
+            "ess_tail": s.ess_tail,
+            "rhat": s.rhat,
+            "mcse_mean": s.mcse_mean,
+            "posterior_to_prior_sd": s.sd_ratio,
+        }
+        for name, s in calibration.summary.items()
+    }
+
+
+def _validation(result: OutputResult) -> dict[str, Any]:
+    v = result.validation
+    return {"method": v.method, **_scores(v.scores)} | (
+        {"elpd": v.elpd, "elpd_se": v.elpd_se, "refitted": list(v.refitted)}
+        if v.method == "leave_one_out"
+        else {}
+    )
+
+
+def _scores(s: Scores) -> dict[str, Any]:
+    return {
+        "n": s.n,
+        "rmse": s.rmse,
+        "crps": s.crps,
+        "max_relative_error": s.max_relative_error,
+        "n_relative_error_above_6_percent": int((abs(s.relative_error) > 0.06).sum()),
+        "coverage": {f"{100 * level:g}": c.proportion for level, c in s.coverage.items()},
+        "coverage_interval": {
+            f"{100 * level:g}": [c.lower, c.upper] for level, c in s.coverage.items()
+        },
+        "pit": s.pit.tolist(),
+    }
+
+
+def _sampling(calibration: Calibration) -> dict[str, Any]:
+    d = calibration.draws
+    return {
+        "converged": d.report.passed,
+        "reasons": list(d.report.reasons),
+        "ensembles": d.t.shape[0],
+        "walkers": d.t.shape[1],
+        "steps": d.report.steps,
+        "tau": float(max(d.report.tau)),
+        "acceptance": d.acceptance,
+        "evaluations": d.evaluations,
+        "log_evidence": d.log_evidence,
+        "seconds": d.seconds,
+    }
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN: what is undefined is null."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "item"):
+        return _finite(value.item())
+    return value

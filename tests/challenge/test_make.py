@@ -1,0 +1,190 @@
+"""Cases must follow the contract, be fair, and be the same for the same seed."""
+
+from __future__ import annotations
+
+import csv
+import json
+import tomllib
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calib.challenge.build import try_case
+from calib.challenge.effects import LISTED
+from calib.challenge.files import OUTPUT_COLUMNS
+from calib.challenge.make import make, make_case, plan
+from calib.challenge.seal import open_key, sha256
+from calib.errors import CalibError
+
+from .conftest import BlindTest
+
+CONTRACT_COLUMNS = (
+    "run_order", "slip_ratio", "inflation_pressure_kpa", "inflation_pressure_psi",
+    "normal_load_kn", "speed_m_s", "pass_number", "gravimetric_water_content",
+    "average_ground_pressure_kpa", "cone_index_kpa", *OUTPUT_COLUMNS.values(),
+)  # fmt: skip
+
+
+def table(path: Path) -> tuple[list[str], np.ndarray]:
+    """Return header and values of a CSV file."""
+    with path.open(newline="", encoding="utf-8") as file:
+        header, *rows = list(csv.reader(file))
+    return header, np.array(rows, dtype=float)
+
+
+def each_case(blind_test: BlindTest) -> list[tuple[Path, dict[str, Any]]]:
+    """Return folders with their entries in the key."""
+    cases = open_key(blind_test.cases, blind_test.key)["cases"]
+    return [(blind_test.cases / name, entry) for name, entry in cases.items()]
+
+
+def test_folders_hold_exactly_the_contracts_files(blind_test: BlindTest) -> None:
+    """Four files per case, a manifest and a hash beside them, numbered from zero."""
+    names = sorted(path.name for path in blind_test.cases.iterdir())
+    assert names == ["HASH", *(f"case-{i:03d}" for i in range(6)), "manifest.json"]
+    for folder, _ in each_case(blind_test):
+        files = sorted(path.name for path in folder.iterdir())
+        assert files == ["case.toml", "field.csv", "fresh.csv", "lab.csv"]
+
+
+def test_tables_have_the_contracts_columns(blind_test: BlindTest) -> None:
+    """Columns are known, equal in lab and field, and without outputs in fresh."""
+    for folder, entry in each_case(blind_test):
+        (lab, _), (field, rows), (fresh, unseen) = (
+            table(folder / f"{name}.csv") for name in ("lab", "field", "fresh")
+        )
+        outputs = [OUTPUT_COLUMNS[name] for name in entry["noise_sd"]]
+        assert lab == field == [c for c in CONTRACT_COLUMNS if c in field]
+        assert set(field) <= set(CONTRACT_COLUMNS)
+        assert field[len(fresh) :] == outputs
+        assert field[: len(fresh)] == fresh
+        for name, sd in entry["noise_sd"].items():
+            assert len(sd) == len(entry["field_truth"][name]) == len(rows)
+            assert len(entry["fresh_truth"][name]) == len(unseen)
+        assert len(rows) == 36 if entry["tier"] == "easy" else 14 <= len(rows) <= 36
+
+
+def test_case_file_names_files_and_models(blind_test: BlindTest) -> None:
+    """The case file is TOML as the contract shows it."""
+    allowed = {
+        "drawbar_pull": {"magic_formula", "magic_formula_pressure"},
+        "rut_depth": {"bekker", "modified_bekker"},
+        "bulk_density": {"ayers_perumpral"},
+    }
+    for folder, entry in each_case(blind_test):
+        case = tomllib.loads((folder / "case.toml").read_text(encoding="utf-8"))
+        assert case["calibration"] == "lab.csv"
+        assert (case["field"], case["predict"]) == ("field.csv", "fresh.csv")
+        assert list(case["models"]) == list(entry["noise_sd"])
+        assert all(model in allowed[output] for output, model in case["models"].items())
+
+
+def test_readings_scatter_about_the_truth_by_the_stated_noise(blind_test: BlindTest) -> None:
+    """Field readings less the key's truth, over its noise sd, are standard normal."""
+    z = []
+    for folder, entry in each_case(blind_test):
+        header, rows = table(folder / "field.csv")
+        for name, sd in entry["noise_sd"].items():
+            reading = rows[:, header.index(OUTPUT_COLUMNS[name])]
+            z.append((reading - np.array(entry["field_truth"][name])) / np.array(sd))
+    pooled = np.concatenate(z)
+    # Rounding adds a little, sampling more: five standard errors of the sd.
+    assert np.std(pooled) == pytest.approx(1.0, abs=5.0 / np.sqrt(2 * pooled.size))
+    assert abs(np.mean(pooled)) < 5.0 / np.sqrt(pooled.size)
+
+
+def test_gaps_are_as_large_as_promised(blind_test: BlindTest) -> None:
+    """Nulls have no gap at all, everything else at least two noise sds."""
+    for _, entry in each_case(blind_test):
+        parts = [
+            (np.array(entry["field_truth"][n]) - np.array(entry["field_without"][n])) / np.array(sd)
+            for n, sd in entry["noise_sd"].items()
+        ]
+        gap = float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+        assert gap == pytest.approx(entry["gap_over_noise"], abs=1e-9)
+        assert gap == 0.0 if entry["truth"] == "none" else gap >= 2.0
+
+
+def test_no_case_gives_its_answer_away(blind_test: BlindTest) -> None:
+    """Neither truth, mechanism nor seed stands in anything that is published."""
+    key = open_key(blind_test.cases, blind_test.key)
+    words = {entry["truth"] for entry in key["cases"].values()} - {"none"}
+    words |= {entry["mechanism"] for entry in key["cases"].values()} | {key["salt"]}
+    for path in blind_test.cases.rglob("*"):
+        if path.is_file():
+            text = path.read_text(encoding="utf-8")
+            assert not any(word in text for word in words)
+
+
+def test_same_seed_same_bytes(blind_test: BlindTest, tmp_path: Path) -> None:
+    """Two processes write what one wrote, byte for byte; another seed does not."""
+    again = make(tmp_path / "c", tmp_path / "key.json", seed=5, n_cases=6, workers=2)
+    assert again == blind_test.digest
+    assert (tmp_path / "key.json").read_bytes() == blind_test.key.read_bytes()
+    for path in blind_test.cases.rglob("*"):
+        if path.is_file():
+            twin = tmp_path / "c" / path.relative_to(blind_test.cases)
+            assert twin.read_bytes() == path.read_bytes()
+    a, b = (make_case(np.random.SeedSequence(seed), "hard", "none") for seed in (1, 2))
+    assert a.files["lab.csv"] != b.files["lab.csv"]
+
+
+def test_hash_is_that_of_the_key(blind_test: BlindTest) -> None:
+    """The hash returned, published twice, and computed agree."""
+    assert sha256(blind_test.key.read_bytes()) == blind_test.digest
+    assert (blind_test.cases / "HASH").read_text(encoding="utf-8").strip() == blind_test.digest
+    manifest = json.loads((blind_test.cases / "manifest.json").read_text(encoding="utf-8"))
+    assert manifest["key_sha256"] == blind_test.digest
+    assert manifest["n_cases"] == 6
+    assert "seed" not in manifest
+
+
+def test_plan_has_the_promised_shares() -> None:
+    """A third of nulls, an eighth unlisted, a tenth shifts, every effect, pairs only if hard."""
+    planned = plan(np.random.default_rng(0), 480, ("easy", "hard"))
+    for tier in ("easy", "hard"):
+        truths = Counter(truth for at, truth in planned if at == tier)
+        assert truths["none"] == 80
+        assert truths["unknown"] == 30
+        assert truths["parameter_shift"] == 24
+        assert all(truths[name] > 0 for name in LISTED)
+        pairs = [name for name in truths if "+" in name]
+        assert bool(pairs) == (tier == "hard")
+        assert all(name == "+".join(sorted(name.split("+"))) for name in pairs)
+
+
+def test_key_is_never_among_the_cases(tmp_path: Path) -> None:
+    """A key inside the cases' folder, an old folder or an old key are refused."""
+    with pytest.raises(CalibError, match="must not lie with the cases"):
+        make(tmp_path / "c", tmp_path / "c" / "key.json", seed=1, n_cases=1)
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "x").write_text("x", encoding="utf-8")
+    with pytest.raises(CalibError, match="not empty"):
+        make(tmp_path / "old", tmp_path / "key.json", seed=1, n_cases=1)
+    (tmp_path / "key.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(CalibError, match="a key is there already"):
+        make(tmp_path / "new", tmp_path / "key.json", seed=1, n_cases=1)
+
+
+@pytest.mark.parametrize(("n_cases", "tiers"), [(0, ("easy",)), (1, ("middling",)), (1, ())])
+def test_bad_numbers_are_refused(tmp_path: Path, n_cases: int, tiers: tuple[str, ...]) -> None:
+    """No cases or unknown tiers raise before anything is written."""
+    with pytest.raises(CalibError):
+        make(tmp_path / "c", tmp_path / "k.json", seed=1, n_cases=n_cases, tiers=tiers)  # type: ignore[arg-type]
+    assert not (tmp_path / "c").exists()
+
+
+def test_drawn_lab_is_described_by_the_cases_models() -> None:
+    """The calibrated models miss the noise-free lab and null field by a third of the noise."""
+    rng = np.random.default_rng(12)
+    drawn = [case for case in (try_case(rng, "hard", "none") for _ in range(6)) if case]
+    assert drawn
+    for case in drawn:
+        stage = case.stage
+        predicted = stage.simulator.predict(stage.field)
+        for name, sd in stage.field_sd.items():
+            miss = (predicted[name] - stage.field_without[name]) / sd
+            assert np.sqrt(np.mean(miss**2)) < 0.35

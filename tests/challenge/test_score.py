@@ -1,0 +1,282 @@
+"""Scores of diagnoses made by hand, whose right answers are known."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib.challenge.answers import auc
+from calib.challenge.figures import confusion_figure, levels_figure, reliability_figure
+from calib.challenge.files import OUTPUT_COLUMNS
+from calib.challenge.levels import LEVELS
+from calib.challenge.score import Proportion, score
+from calib.challenge.seal import KEY_SCHEMA, open_key, publish, seal
+from calib.challenge.table import text_table
+from calib.errors import CalibError
+
+Answer = Callable[[dict[str, Any]], dict[str, Any]]
+TRUTHS = ("none", "none", "unknown", "rate_effect", "force_offset+rate_effect", "parameter_shift")
+
+
+def entry(truth: str, tier: str) -> dict[str, Any]:
+    """Return a key's entry with a gap of three noise sds in the first half of the rows."""
+    gap = [0.0 if truth == "none" or i >= 5 else 0.3 for i in range(10)]
+    base = [0.5] * 10
+    return {
+        "tier": tier,
+        "truth": truth,
+        "noise_sd": {"drawbar_pull": [0.1] * 10},
+        "field_truth": {"drawbar_pull": [b + g for b, g in zip(base, gap, strict=True)]},
+        "field_without": {"drawbar_pull": base},
+        "fresh_truth": {"drawbar_pull": [b + g for b, g in zip(base, gap, strict=True)]},
+        "fresh_without": {"drawbar_pull": base},
+    }
+
+
+@pytest.fixture
+def sealed(tmp_path: Path) -> tuple[Path, Path]:
+    """Return cases' folder and key of a test with six cases per tier."""
+    cases = {
+        f"case-{i:03d}": entry(truth, tier)
+        for i, (tier, truth) in enumerate((t, n) for t in ("easy", "hard") for n in TRUTHS)
+    }
+    key = {"schema": KEY_SCHEMA, "seed": 1, "salt": "ab", "cases": cases}
+    (tmp_path / "cases").mkdir()
+    digest = seal(key, tmp_path / "key.json")
+    publish(tmp_path / "cases", key, digest, ("easy", "hard"))
+    return tmp_path / "cases", tmp_path / "key.json"
+
+
+def perfect(case: dict[str, Any]) -> dict[str, Any]:
+    """Answer as one who has read the key."""
+    truth = case["truth"]
+    gap = np.array(case["field_truth"]["drawbar_pull"]) - 0.5
+    return {
+        "verdict": truth if truth in ("none", "unknown") else "effect",
+        "effects": [{"name": truth, "probability": 1.0}, {"name": "other", "probability": 0.0}],
+        "where": [
+            {"output": "drawbar_pull", "row": i, "probability": float(g > 0.1)}
+            for i, g in enumerate(gap)
+        ],
+        "shrink": {"drawbar_pull": {"interval": [0.9, 1.0]}},
+        "after": case["fresh_truth"]["drawbar_pull"],
+    }
+
+
+def worst(case: dict[str, Any]) -> dict[str, Any]:
+    """Answer wrongly, and with certainty."""
+    right = perfect(case)
+    null = case["truth"] == "none"
+    return {
+        "verdict": "effect" if null or case["truth"] == "unknown" else "unknown",
+        "effects": [
+            {"name": "lug_thrust", "probability": 1.0},
+            {"name": "load_transfer", "probability": 0.0},
+            {"name": case["truth"], "probability": 0.0},
+        ],
+        "where": [{**w, "probability": 1.0 - w["probability"]} for w in right["where"]],
+        "shrink": right["shrink"],
+        "after": [0.5 - (x - 0.5) for x in right["after"]],
+    }
+
+
+def write(results: Path, key: Path, answer: Answer, skip: tuple[str, ...] = ()) -> None:
+    """Write diagnoses and predictions of every case but some."""
+    for name, case in json.loads(key.read_text(encoding="utf-8"))["cases"].items():
+        if name in skip:
+            continue
+        given = answer(case)
+        after = given.pop("after")
+        (results / name).mkdir(parents=True)
+        (results / name / "diagnosis.json").write_text(json.dumps(given), encoding="utf-8")
+        column = OUTPUT_COLUMNS["drawbar_pull"]
+        with (results / name / "fresh_prediction.csv").open("w", newline="") as file:
+            rows = csv.writer(file)
+            rows.writerow(["slip_ratio", f"{column}_before", f"{column}_after"])
+            rows.writerows([0.1, 0.5, value] for value in after)
+
+
+def test_perfect_diagnoses_reach_every_level(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    """Nothing but right answers gives the best value everywhere."""
+    write(tmp_path / "r", sealed[1], perfect)
+    got = score(sealed[0], tmp_path / "r", sealed[1])
+    for tier in got.tiers.values():
+        assert tier.top_1 == tier.top_2 == Proportion(4, 4)
+        assert tier.top_1_all == Proportion(6, 6)
+        assert tier.truth_probability.value == 1.0
+        assert tier.false_alarm == Proportion(0, 2)
+        assert tier.unlisted_recognised == Proportion(1, 1)
+        assert tier.listed_called_unknown == Proportion(0, 3)
+        assert tier.confidently_wrong == Proportion(0, 6)
+        assert tier.localisation_auc.value == 1.0
+        assert tier.shrink_coverage == Proportion(4, 4)
+        assert tier.actual_shrink.value == 1.0
+        assert tier.brier.value == 0.0
+        assert tier.n_failed == 0
+    assert all(
+        truth == got.confusion["hard"].calls[int(np.argmax(row))]
+        for truth, row in zip(
+            got.confusion["hard"].truths, got.confusion["hard"].counts, strict=True
+        )
+    )
+
+
+def test_worst_diagnoses_reach_none(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    """Nothing but wrong certainties gives the worst value everywhere."""
+    write(tmp_path / "r", sealed[1], worst)
+    for tier in score(sealed[0], tmp_path / "r", sealed[1]).tiers.values():
+        assert tier.top_1 == tier.top_2 == Proportion(0, 4)
+        assert tier.truth_probability.value == 0.0
+        assert tier.false_alarm == Proportion(2, 2)
+        assert tier.unlisted_recognised == Proportion(0, 1)
+        assert tier.listed_called_unknown == Proportion(3, 3)
+        assert tier.confidently_wrong == Proportion(6, 6)
+        assert tier.localisation_auc.value == 0.0
+        assert tier.shrink_coverage == Proportion(0, 4)
+        assert tier.actual_shrink.value == pytest.approx(-1.0)
+        assert tier.brier.value == 2.0
+        assert not any(level.met(tier.tier, getattr(tier, level.name).value) for level in LEVELS)
+
+
+@pytest.mark.parametrize("broken", ["missing", "not json", "no effects", "probability 3"])
+def test_failed_cases_count_as_failures(
+    sealed: tuple[Path, Path], tmp_path: Path, broken: str
+) -> None:
+    """A case without a readable diagnosis stays in every denominator, as wrong."""
+    bad = ("case-000", "case-003")
+    write(tmp_path / "r", sealed[1], perfect, skip=bad if broken == "missing" else ())
+    text = {
+        "not json": "{",
+        "no effects": '{"verdict": "none"}',
+        "probability 3": '{"verdict": "none", "effects": [{"name": "none", "probability": 3}]}',
+    }
+    for name in bad if broken in text else ():
+        (tmp_path / "r" / name / "diagnosis.json").write_text(text[broken], encoding="utf-8")
+    got = score(sealed[0], tmp_path / "r", sealed[1])
+    easy = got.tiers["easy"]
+    assert (easy.n_cases, easy.n_failed) == (6, 2)
+    assert easy.top_1 == Proportion(3, 4)
+    assert easy.false_alarm == Proportion(1, 2)
+    assert easy.listed_called_unknown == Proportion(1, 3)
+    assert easy.localisation_auc.n == 4
+    assert easy.no_shrink_interval == Proportion(1, 4)
+    assert easy.brier.value == pytest.approx(2 / 6)
+    assert "case-003" in text_table(got)
+
+
+def test_names_of_a_pair_count_in_any_order(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    """A pair counts when both are named, half of it does not."""
+
+    def swapped(case: dict[str, Any]) -> dict[str, Any]:
+        given = perfect(case)
+        given["effects"][0]["name"] = "+".join(case["truth"].split("+")[::-1])
+        return given
+
+    def half(case: dict[str, Any]) -> dict[str, Any]:
+        given = perfect(case)
+        given["effects"][0]["name"] = case["truth"].split("+")[0]
+        return given
+
+    write(tmp_path / "a", sealed[1], swapped)
+    write(tmp_path / "b", sealed[1], half)
+    assert score(sealed[0], tmp_path / "a", sealed[1]).tiers["hard"].top_1 == Proportion(4, 4)
+    assert score(sealed[0], tmp_path / "b", sealed[1]).tiers["hard"].top_1 == Proportion(3, 4)
+
+
+def test_changed_key_is_refused(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    """A key that was edited, is missing, or has no published hash cannot score."""
+    cases, key = sealed
+    text = key.read_text(encoding="utf-8")
+    key.write_text(text.replace("rate_effect", "lug_thrust"), encoding="utf-8")
+    with pytest.raises(CalibError, match="SHA-256"):
+        score(cases, tmp_path, key)
+    with pytest.raises(CalibError, match="cannot be read"):
+        score(cases, tmp_path, tmp_path / "nowhere.json")
+    key.write_text(text, encoding="utf-8")
+    assert open_key(cases, key)["salt"] == "ab"
+    (cases / "manifest.json").unlink()
+    with pytest.raises(CalibError, match="published"):
+        score(cases, tmp_path, key)
+
+
+@given(st.integers(0, 60), st.integers(0, 60))
+def test_jeffreys_interval_holds_the_share(successes: int, failures: int) -> None:
+    """The interval lies in [0, 1], holds the share, and is closed where all agree."""
+    share = Proportion(successes, successes + failures)
+    low, high = share.interval
+    assert 0.0 <= low <= high <= 1.0
+    if share.n:
+        assert low <= share.value <= high
+        assert (low == 0.0) == (successes == 0)
+    else:
+        assert math.isnan(share.value)
+
+
+def test_jeffreys_interval_of_a_known_case() -> None:
+    """Brown, Cai and DasGupta: 5 of 20 gives 0.102 to 0.464."""
+    assert Proportion(5, 20).interval == pytest.approx((0.1024, 0.4641), abs=2e-3)
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.booleans()), min_size=2, max_size=40))
+def test_auc_is_the_share_of_ordered_pairs(rows: list[tuple[int, bool]]) -> None:
+    """Ranks give what counting all pairs gives, ties as halves."""
+    values = np.array([float(v) for v, _ in rows])
+    positive = np.array([p for _, p in rows])
+    got = auc(values, positive)
+    pairs = [
+        1.0 if a > b else 0.5 if a == b else 0.0
+        for a in values[positive]
+        for b in values[~positive]
+    ]
+    if pairs:
+        assert got == pytest.approx(np.mean(pairs))
+    else:
+        assert got is None
+
+
+def test_reliability_bins_hold_every_case(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    """Each case is in the range of its confidence, right or wrong."""
+
+    def unsure(case: dict[str, Any]) -> dict[str, Any]:
+        given = perfect(case)
+        given["effects"] = [
+            {"name": case["truth"], "probability": 0.45},
+            {"name": "lug_thrust", "probability": 0.55},
+        ]
+        return given
+
+    write(tmp_path / "r", sealed[1], unsure)
+    tier = score(sealed[0], tmp_path / "r", sealed[1]).tiers["easy"]
+    assert tier.reliability[5].correct == Proportion(0, 6)
+    assert tier.reliability[5].confidence == pytest.approx(0.55)
+    assert sum(b.correct.n for b in tier.reliability) == 6
+    assert tier.top_2 == Proportion(4, 4)
+    assert tier.brier.value == pytest.approx(0.55**2 + 0.55**2)
+
+
+def test_table_and_figures_show_the_score(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    """Every level has a line; figures are drawn with labels and all counts."""
+    write(tmp_path / "r", sealed[1], worst, skip=("case-002",))
+    got = score(sealed[0], tmp_path / "r", sealed[1])
+    text = text_table(got)
+    assert all(text.count(level.label) >= 2 for level in LEVELS)
+    assert "MISSED" in text
+    matrix = confusion_figure(got.confusion["easy"], "easy")
+    drawn = sum(int(t.get_text()) for t in matrix.axes[0].texts)
+    assert drawn == 6
+    assert matrix.axes[0].get_xlabel() == "called first"
+    summary = levels_figure(list(got.tiers.values()))
+    assert len(summary.axes) == 2
+    reliability = reliability_figure(got.tiers["easy"].reliability, "easy")
+    for i, figure in enumerate((matrix, summary, reliability)):
+        figure.savefig(tmp_path / f"{i}.png")
+        assert (tmp_path / f"{i}.png").stat().st_size > 5000
