@@ -19,8 +19,8 @@ from calib.headers import Column, match_headers
 from calib.table import MAX_TEXT_ROWS, Table, check_enough, check_varies, hold_out
 
 __all__ = [
-    "Table", "check_enough", "check_varies", "hold_out", "read_for_model", "read_table", "table_from_arrays",
-    "write_table",
+    "Table", "check_enough", "check_varies", "hold_out", "read_for_model", "read_table",
+    "table_from_arrays", "write_table",
 ]  # fmt: skip
 
 _BATCH = 65_536

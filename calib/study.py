@@ -287,14 +287,28 @@ def _estimates(
     # The paper fitted drawbar pull at all pressures, rut depth at the two outer ones.
     everything = task.model.startswith("magic_formula")
     problem = build_problem(task.model, task.table, task.prior_path) if everything else fitted
-    methods = methods_for(task.model)
+    return _all_methods(
+        problem,
+        seed,
+        (task.output,),
+        lambda done, n: progress(f"{task.output}: estimating", done, n),
+    )
+
+
+def _all_methods(
+    problem: Problem,
+    seed: int,
+    labels: tuple[str, ...],
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[PointEstimate, ...]:
+    """Estimate by every method; one that cannot read these data is left out of the table."""
+    methods = methods_for(problem.bound.model.name)
     found = []
     for i, method in enumerate(methods):
-        progress(f"{task.output}: estimating", i, len(methods))
-        # A method that cannot read these data (no peak, one pressure) is left out of the table.
         with suppress(CalibError):
-            found.append(estimate(problem, method, generator(seed, task.output, method)))
-    progress(f"{task.output}: estimating", len(methods), len(methods))
+            found.append(estimate(problem, method, generator(seed, *labels, method)))
+        if progress is not None:
+            progress(i + 1, len(methods))
     return tuple(found)
 
 
@@ -305,10 +319,7 @@ def _by_pressure(task: Task, seed: int) -> dict[float, tuple[PointEstimate, ...]
         if len(rows) < 6:
             continue
         problem = build_problem("magic_formula", rows, fixed={"Sh": 0.0, "Sv": 0.0})
-        found[float(psi)] = tuple(
-            estimate(problem, method, generator(seed, task.output, method, f"{psi:g}"))
-            for method in methods_for("magic_formula")
-        )
+        found[float(psi)] = _all_methods(problem, seed, (task.output, f"{psi:g}"))
     return found
 
 

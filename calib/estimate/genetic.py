@@ -81,8 +81,9 @@ def minimise_genetic(
     costs = cost(population)
     lead = int(costs.argmin())
     history = [float(costs[lead])]
-    # An exact fit has no lowest cost to compare with: rounding then ends the run.
-    floor = 1e-24 * float(np.median(costs[np.isfinite(costs)])) if np.isfinite(costs).any() else 0.0
+    # An exact fit has no lowest cost to compare with: the costs' rounding then ends the run.
+    finite = costs[np.isfinite(costs)]
+    floor = 1e-24 * float(np.median(finite)) if finite.size else 0.0
     calm = 0
     for generation in range(s.max_iterations):
         row = generation % _BLOCK
@@ -97,7 +98,8 @@ def minimise_genetic(
         lead = int(costs.argmin())
         lowest = float(costs[lead])
         history.append(lowest)
-        calm = calm + 1 if costs.max() - lowest <= s.tolerance * lowest + floor else 0
+        alike = costs.max() <= lowest * (1.0 + s.tolerance) + floor < np.inf
+        calm = calm + 1 if alike else 0
         if calm == s.patience:
             break
     n_evaluations = s.NP * len(history)

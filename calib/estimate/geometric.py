@@ -19,7 +19,7 @@ _LEAST_G = 0.01
 
 def estimate_geometric(
     problem: Problem,
-    rng: np.random.Generator | None = None,  # noqa: ARG001 - the signature of every method
+    rng: np.random.Generator | None = None,
     *,
     slope_slip_percent: float = 5.0,
 ) -> PointEstimate:
@@ -61,7 +61,7 @@ def estimate_geometric(
 
 
 def _inside(problem: Problem, values: dict[str, float]) -> Array:
-    """Natural parameters within the prior's bounds, shape (1, d_all); its locations for the rest."""
+    """Natural parameters within the bounds, shape (1, d_all); prior locations for the rest."""
     entries = problem.priors.entries
     natural = np.array([[values.get(p.name, _location(problem, p.name)) for p in entries]])
     # Fixed parameters take their value on the way.

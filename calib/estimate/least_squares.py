@@ -44,13 +44,16 @@ class _Descent:
         self.lower = (np.array([p.lower for p in problem.priors.free]) - self.location) / self.width
         self.upper = (np.array([p.upper for p in problem.priors.free]) - self.location) / self.width
         self.n_evaluations = 0
+        # The tolerances below are meant for residuals of the order of one, whatever the unit.
+        scatter = float(np.linalg.norm(problem.response - problem.response.mean()))
+        self.scale = scatter if scatter > 0.0 else 1.0
 
     def natural(self, z: Array) -> Array:
         self.n_evaluations += z.shape[0]
         return self.problem.theta(self.location + z * self.width)
 
     def residuals(self, z: Array) -> Array:
-        return np.asarray(residuals(self.problem, self.natural(z[None]))[0])
+        return np.asarray(residuals(self.problem, self.natural(z[None]))[0] / self.scale)
 
     def jacobian(self, z: Array) -> Array:
         # All differences in one model evaluation; one-sided on a bound.
@@ -58,7 +61,7 @@ class _Descent:
         ahead, behind = np.minimum(z + step, self.upper), np.maximum(z - step, self.lower)
         span = np.diagonal(ahead) - np.diagonal(behind)
         r = residuals(self.problem, self.natural(np.concatenate([ahead, behind])))
-        slope = (r[: z.size] - r[z.size :]) / span[:, None]
+        slope = (r[: z.size] - r[z.size :]) / (self.scale * span[:, None])
         # A step beyond where the model has a value says nothing about that direction.
         return np.asarray(np.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0).T)
 
@@ -112,7 +115,7 @@ def estimate_least_squares(
     rough = _Descent(representative_rows(reduced))
     polished = [rough.polish(start) for start in _starts(rough, rng, n_screen, n_polish)]
     best = min(polished, key=lambda p: p.cost)
-    n_agree = sum(p.cost <= best.cost * (1.0 + _PRECISE) + 1e-18 for p in polished)
+    n_agree = sum(p.cost <= best.cost * (1.0 + _PRECISE) + _PRECISE**2 for p in polished)
     fine = rough
     if rough.problem is not reduced:
         fine = _Descent(reduced)
@@ -130,6 +133,7 @@ def estimate_least_squares(
         converged=best.converged,
         notes=(
             f"{n_agree} of {len(polished)} starts end at the lowest cost",
+            "" if best.converged else "the cost still falls along a valley without end in sight",
             held_note(held),
             edges,
             _far_note(reduced, x),

@@ -108,7 +108,7 @@ def rut_regression(problem: Problem, max_slip: float = 0.2) -> RutRegression:
 
 def estimate_published_regression(
     problem: Problem,
-    rng: np.random.Generator | None = None,  # noqa: ARG001 - the signature of every method
+    rng: np.random.Generator | None = None,
     *,
     max_slip: float = 0.2,
 ) -> PointEstimate:

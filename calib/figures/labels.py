@@ -13,7 +13,8 @@ from calib.columns import QUANTITIES
 from calib.models.base import Array
 
 __all__ = [
-    "Axis", "axis_of", "joined", "parameter_label", "percent", "short", "symbol", "unit_text",
+    "Axis", "axis_of", "joined", "parameter_label", "percent", "plain", "short", "symbol",
+    "unit_text",
 ]  # fmt: skip
 
 _GREEK = {"sigma": r"\sigma", "gamma": r"\gamma", "theta": r"\theta"}
@@ -84,19 +85,25 @@ def symbol(name: str) -> str:
     return f"${stem}_\\mathrm{{{below}}}$" if below else f"${stem}$"
 
 
+def plain(name: str) -> str:
+    """Return a parameter's symbol for a sentence."""
+    stem, _, below = name.partition("_")
+    stem = {"sigma": "σ", "gamma": "γ", "theta": "θ"}.get(stem, stem)
+    return f"{stem}_{below}" if below else stem
+
+
 def unit_text(unit: str) -> str:
     """Return a unit in mathtext: powers raised; an en dash where there is none."""
     if unit in ("1", "", "dimensionless"):
         return "–"
-    raised = re.sub(r"\^(-?\w+)", r"$^{\1}$", unit)
-    return raised.replace("%", "%")
+    return re.sub(r"\^(-?\w+)", r"$^{\1}$", unit)
 
 
 def parameter_label(name: str, unit: str, *, log: bool = False) -> str:
     """Return symbol and unit of a parameter for an axis."""
     inside = symbol(name)
     if log:
-        inside = f"ln {inside}"
+        inside = f"log$_{{10}}$ {inside}"
     return f"{inside} ({unit_text(unit)})"
 
 

@@ -71,19 +71,19 @@ def published_sampled(bound: BoundModel) -> dict[str, float]:
     if low is None or mid is None or high is None:
         return {}
     found = {}
-    for i, name in enumerate("KDE"):
+    for i, name in enumerate("KDG"):
         mean = 0.5 * (low[i] + high[i])
-        found |= {f"{name}_lo": low[i], f"{name}_hi": high[i]}
-        found[f"{name}_bend"] = (mean - mid[i]) / (1.0 if name == "E" else mean)
-    return found
+        found |= {f"{name}_lo": low[i], f"{name}_hi": high[i], f"{name}_bend": 1.0 - mid[i] / mean}
+    return {name: value for name, value in found.items() if name in bound.model.parameters}
 
 
 def _slope_peak_curvature(psi: float) -> tuple[float, float, float] | None:
+    """K = BCD, D and G = 1 - E of Table 4."""
     table = PUBLISHED.genetic.get(round(psi))
     if table is None or abs(psi - round(psi)) > 1e-6:
         return None
     v = table.values
-    return v["B"] * v["C"] * v["D"], v["D"], v["E"]
+    return v["B"] * v["C"] * v["D"], v["D"], 1.0 - v["E"]
 
 
 def limits(model: str) -> tuple[Limit, ...]:

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import numpy as np
 
@@ -42,6 +43,10 @@ class Hypothesis:
         Prior sd of parameter shifts in units of the parameters' own prior sds; 0 for none.
     smooth : float
         Prior sd of a free discrepancy, in units of the noise; 0 for none.
+    smooth_outputs : tuple of str
+        Outputs that have the free discrepancy.
+    smooth_over : {"slip", "all"}
+        Conditions that it may vary with.
     """
 
     name: str
@@ -49,6 +54,8 @@ class Hypothesis:
     effect_priors: tuple[Priors, ...] = ()
     shift: float = 0.0
     smooth: float = 0.0
+    smooth_outputs: tuple[str, ...] = ()
+    smooth_over: Literal["slip", "all"] = "all"
 
 
 class Forward:
@@ -90,7 +97,7 @@ class Forward:
                 self.shift_slices[o.name] = _append(entries, shifts, o.name)
         self.smooth_slices: dict[str, slice] = {}
         for o in data.outputs:
-            if hypothesis.smooth > 0.0:
+            if o.name in hypothesis.smooth_outputs:
                 weights = self._smooth(data.view)[1]
                 sd = hypothesis.smooth * noise[o.name]
                 self.smooth_slices[o.name] = _append(
@@ -168,7 +175,9 @@ class Forward:
 
         slips = cosines(slip, 10, 0.7)
         terms = list(slips)
-        terms += cosines(order, 6, 0.5)
+        everything = self.hypothesis.smooth_over == "all"
+        if everything:
+            terms += cosines(order, 6, 0.5)
         if pressure is not None:
             terms.append((pressure, 0.7))
             terms += [(pressure * b, 0.6 * w) for b, w in slips[:4]]
@@ -178,7 +187,7 @@ class Forward:
             ("volumetric_water_content", ""),
         ):  # fmt: skip
             u = self._scaled(view, name, transform)
-            if u is not None:
+            if u is not None and everything:
                 terms += cosines(u, 3, 0.4)
                 if slip is not None:
                     terms.append((u * slip, 0.4))
@@ -227,6 +236,8 @@ class Forward:
             basis = self._smooth(view)[0]
             plain = {
                 name: location + psi[:, self.smooth_slices[name]] @ basis.T
+                if name in self.smooth_slices
+                else location
                 for name, location in plain.items()
             }
         return plain

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from typing import Literal
+
 import numpy as np
 
 from calib.gap.case import Campaigns
@@ -11,16 +13,16 @@ from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Hypothesis
 from calib.priors import Priors, default_prior_path, read_priors
 
-__all__ = ["LN_PRIOR", "effect_priors", "pair", "singles", "testable"]
+__all__ = ["LN_PRIOR", "effect_priors", "pair", "singles", "split_testable", "unknowns"]
 
 # Prior probabilities of the kinds; singles and pairs share theirs equally.
 PRIOR = {"none": 0.40, "unknown": 0.07, "parameter_shift": 0.07, "single": 0.36, "pair": 0.10}
 LN_PRIOR: Mapping[str, float] = {k: float(np.log(v)) for k, v in PRIOR.items()}
 SHIFTS = (0.1, 0.35)
-SMOOTHS = (2.0, 6.0)
+SMOOTHS = (1.5, 5.0)
 
 
-def testable(
+def split_testable(
     data: Campaigns, effects: Mapping[str, Effect] = EFFECTS
 ) -> tuple[dict[str, Effect], dict[str, str]]:
     """Split the effects into those the data can show and those they cannot, with the reason."""
@@ -44,6 +46,21 @@ def effect_priors(data: Campaigns, effect: Effect) -> Priors:
 def singles(data: Campaigns, effects: Mapping[str, Effect]) -> list[Hypothesis]:
     """One hypothesis for each effect."""
     return [Hypothesis(name, (e,), (effect_priors(data, e),)) for name, e in effects.items()]
+
+
+def unknowns(data: Campaigns) -> list[Hypothesis]:
+    """Free smooth discrepancies: of one output or all, over slip or everything, small or large."""
+    names = data.names
+    touched = [(name,) for name in names] + ([names] if len(names) > 1 else [])
+    overs: tuple[Literal["slip", "all"], ...] = ("slip", "all")
+    if "slip_ratio" not in data.view.conditions:
+        overs = ("all",)
+    return [
+        Hypothesis("unknown", smooth=size, smooth_outputs=outputs, smooth_over=over)
+        for outputs in touched
+        for over in overs
+        for size in SMOOTHS
+    ]
 
 
 def pair(a: Hypothesis, b: Hypothesis) -> Hypothesis:

@@ -12,7 +12,8 @@ from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit, Noise, fit
 from calib.gap.forward import Forward, Hypothesis
-from calib.gap.hypotheses import LN_PRIOR, SHIFTS, SMOOTHS, pairs_of, singles, testable
+from calib.gap.relevance import relevance
+from calib.gap.hypotheses import LN_PRIOR, SHIFTS, pairs_of, singles, split_testable, unknowns
 from calib.models.base import Array
 from calib.sampling.mode import find_mode
 from calib.streams import generator
@@ -53,11 +54,11 @@ def rank(
     data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS, temperature: float = 1.0
 ) -> Ranking:
     """Fit every hypothesis and rank them."""
-    able, unable = testable(data, effects)
+    able, unable = split_testable(data, effects)
     lab_mode, noise = _calibrate_lab(data, seed)
     worker = _Worker(data, lab_mode, noise, seed)
     fits: dict[str, tuple[Fit, ...]] = {"none": (worker.fit(Hypothesis("none")),)}
-    fits["unknown"] = tuple(worker.fit(Hypothesis("unknown", smooth=s)) for s in SMOOTHS)
+    fits["unknown"] = tuple(worker.fit(h) for h in unknowns(data))
     fits["parameter_shift"] = tuple(
         worker.fit(Hypothesis("parameter_shift", shift=s)) for s in SHIFTS
     )
@@ -67,7 +68,9 @@ def rank(
     for h in _promising_pairs(single, fits):
         fits[h.name] = (worker.fit(h),)
     log_evidence = {
-        name: float(logsumexp([f.log_evidence for f in group]) - np.log(len(group)))
+        name: float(
+            logsumexp([f.log_evidence + relevance(f, seed) for f in group]) - np.log(len(group))
+        )
         for name, group in fits.items()
     }
     return Ranking(

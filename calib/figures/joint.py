@@ -1,0 +1,77 @@
+"""What the predictive draws themselves say of many rows at once.
+
+Held-out rows of one test share the uncertainty of one curve, so they are not independent: when it
+is off, it is off for all of them. Every draw is a set of rows that the model deems possible, so
+treating draws as observations gives the reference that a binomial or Kolmogorov law would give
+for independent rows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.models.base import Array
+
+__all__ = ["coverage_probability", "effective_rows", "ks_distance", "pit_half_width"]
+
+_MAX_REPLICATES = 2000
+
+
+def ks_distance(pit: Array) -> Array:
+    """Largest distance of the ECDF of PIT values from uniform, shape (..., n) to (...)."""
+    ordered = np.sort(pit, axis=-1)
+    n = ordered.shape[-1]
+    above = np.arange(1, n + 1) / n - ordered
+    below = ordered - np.arange(n) / n
+    return np.maximum(above.max(axis=-1), below.max(axis=-1))
+
+
+def pit_half_width(draws: Array, level: float = 0.95) -> float:
+    """Half the width of the simultaneous band that PIT values of possible rows stay inside.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (size, n)
+    level : float
+    """
+    return float(np.quantile(ks_distance(_pit_of_draws(draws)), level))
+
+
+def coverage_probability(draws: Array, hits: int, level: float) -> float:
+    """Probability of covering no more rows than were covered, were the predictions right.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (size, n)
+    hits : int
+        Rows inside their central band.
+    level : float
+        Of the band.
+    """
+    covered = (np.abs(_pit_of_draws(draws) - 0.5) <= 0.5 * level).sum(axis=1)
+    # The draw that was observed counts among those possible, so it is never 0.
+    return float((1 + (covered <= hits).sum()) / (1 + covered.size))
+
+
+def effective_rows(draws: Array) -> float:
+    """Number of independent rows that would say as much on whether the predictions are off.
+
+    That is n/(1 + (n - 1) r) with r the mean correlation between rows.
+    """
+    good = _complete(draws)
+    n = good.shape[1]
+    if n < 2:
+        return float(n)
+    correlation = np.corrcoef(good, rowvar=False)
+    mean = (correlation.sum() - n) / (n * (n - 1))
+    return float(n / (1.0 + (n - 1) * max(0.0, mean)))
+
+
+def _complete(draws: Array) -> Array:
+    return draws[np.isfinite(draws).all(axis=1)]
+
+
+def _pit_of_draws(draws: Array) -> Array:
+    good = _complete(draws)
+    rank = good.argsort(axis=0).argsort(axis=0)
+    return np.asarray((rank[:_MAX_REPLICATES] + 0.5) / good.shape[0])

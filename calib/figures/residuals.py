@@ -1,0 +1,172 @@
+"""Is the noise what the likelihood says: standardised residuals, normality, replicated data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from scipy.stats import beta, norm, shapiro
+
+from calib.figures.labels import axis_of, plain, short
+from calib.figures.plate import Plate
+from calib.figures.rows import data_word, groups, held_table, x_column
+from calib.figures.style import BLACK, BLUE, CYCLE, DASHES, GREY, MARKERS, legend_below, panels
+from calib.models.base import Array
+from calib.study import OutputResult
+
+__all__ = ["Standardised", "residuals_plate", "standardise"]
+
+_N_DRAWS = 1000
+
+
+@dataclass(frozen=True)
+class Standardised:
+    """Residuals over the noise scale, posterior means, of some rows.
+
+    Parameters
+    ----------
+    residual, predicted : ndarray, shape (n,)
+        In noise sds, on the scale of the response; the prediction is in the output's unit.
+    """
+
+    residual: Array
+    predicted: Array
+
+
+def standardise(result: OutputResult, *, held: bool = False) -> Standardised | None:
+    """Work residuals out at the posterior; of the held-out rows if wanted and if there are any."""
+    calibration = result.calibration
+    problem = calibration.problem
+    if held:
+        table = held_table(result)
+        if table is None:
+            return None
+        problem = problem.with_table(table)
+    natural = problem.theta(calibration.subset(_N_DRAWS))
+    location = problem.bound.location(natural[:, :-1], problem.conditions)
+    residual = np.nanmean((problem.response - location) / natural[:, -1:], axis=0)
+    return Standardised(residual, problem.bound.from_response(np.nanmedian(location, axis=0)))
+
+
+def residuals_plate(result: OutputResult) -> Plate:
+    """Draw residuals against prediction and condition, their quantiles, and replicated data.
+
+    Parameters
+    ----------
+    result : OutputResult
+    """
+    fig, axes = panels(2, 2, height=46.0, left=14.0, bottom=22.0, gap_x=17.0, gap_y=15.0)
+    fitted, held = standardise(result), standardise(result, held=True)
+    assert fitted is not None
+    problem, x = result.calibration.problem, x_column(result)
+    y_axis, x_axis = axis_of(problem.bound.model.output), axis_of(x)
+    handles = _scatter(axes[0, 0], result, fitted.predicted, held and held.predicted)
+    other = held_table(result)
+    _scatter(
+        axes[0, 1], result, x_axis.scale(problem.table[x]),
+        None if other is None else x_axis.scale(other[x]),
+    )  # fmt: skip
+    axes[0, 0].set_xlabel(f"Predicted {y_axis.name.lower()} ({y_axis.unit})")
+    axes[0, 1].set_xlabel(x_axis.label)
+    for ax in axes[0]:
+        ax.set_ylabel("Residual (noise sd)")
+    _quantiles(axes[1, 0], fitted.residual)
+    handles |= _replicated(axes[1, 1], result)
+    for ax, title in zip(
+        axes.flat,
+        ("Residuals against prediction", f"Residuals against {x_axis.name.lower()}",
+         "Are they normal?", "Data against replicated data"),
+        strict=True,
+    ):  # fmt: skip
+        ax.set_title(title, loc="left")
+    legend_below(fig, list(handles.values()), list(handles), 4)
+    return Plate(fig, "residuals", _caption(result, fitted, held), "Residuals")
+
+
+def _scatter(
+    ax: Axes, result: OutputResult, fitted: Array, held: Array | None
+) -> dict[str, Any]:
+    mine, theirs = standardise(result), standardise(result, held=True)
+    handles: dict[str, Any] = {}
+    ax.axhspan(-2.0, 2.0, color="#eeeeee", lw=0.0)
+    ax.axhline(0.0, color=GREY, lw=0.6)
+    for k, group in enumerate(groups(result)):
+        colour, marker = CYCLE[k % len(CYCLE)], MARKERS[k % len(MARKERS)]
+        name = group.title or data_word(result)
+        if mine is not None and group.fitted.any():
+            (handles[name],) = ax.plot(
+                fitted[group.fitted], mine.residual[group.fitted], marker, color=colour, ms=4.2,
+                mec="white", mew=0.4,
+            )  # fmt: skip
+        if theirs is not None and held is not None and group.held_out.any():
+            (handles[name if group.held else f"{name}, held out"],) = ax.plot(
+                held[group.held_out], theirs.residual[group.held_out], marker, mfc="white",
+                mec=colour, mew=1.1, ms=4.2,
+            )  # fmt: skip
+    top = max(2.6, 1.08 * max(np.abs(s.residual).max() for s in (mine, theirs) if s is not None))
+    ax.set_ylim(-top, top)
+    return handles
+
+
+def _quantiles(ax: Axes, residual: Array) -> None:
+    n = residual.size
+    i = np.arange(1, n + 1)
+    theory = norm.ppf((i - 0.375) / (n + 0.25))
+    low, high = (norm.ppf(beta.ppf(p, i, n + 1 - i)) for p in (0.025, 0.975))
+    ax.fill_between(theory, low, high, color="#e4e4e4", lw=0.0)
+    ax.plot(theory, theory, color=GREY, lw=0.9, ls=DASHES[2])
+    ax.plot(theory, np.sort(residual), "o", color=BLUE, ms=3.8, mec="white", mew=0.4)
+    ax.set_xlabel("Normal quantile (sd)")
+    ax.set_ylabel("Residual (noise sd)")
+
+
+def _replicated(ax: Axes, result: OutputResult) -> dict[str, Any]:
+    observed = np.sort(result.calibration.problem.observed)
+    replicated = np.sort(result.posterior_predictive[:400], axis=1)
+    complete = replicated[np.isfinite(replicated).all(axis=1)]
+    level = np.arange(1, observed.size + 1) / observed.size
+    low, high = np.quantile(complete, [0.025, 0.975], axis=0)
+    handles: dict[str, Any] = {
+        "95 % expected": ax.fill_betweenx(level, low, high, color="#e4e4e4", lw=0.0, step="post")
+    }
+    (handles[f"{data_word(result)}, calibrated"],) = ax.step(
+        observed, level, where="post", color=BLACK, lw=1.2
+    )
+    axis = axis_of(result.calibration.problem.bound.model.output)
+    ax.set_xlabel(axis.label)
+    ax.set_ylabel("Part of the data below (–)")
+    ax.set_ylim(0.0, 1.02)
+    return handles
+
+
+def _caption(result: OutputResult, fitted: Standardised, held: Standardised | None) -> str:
+    n, large = fitted.residual.size, int((np.abs(fitted.residual) > 2.0).sum())
+    p = float(shapiro(fitted.residual).pvalue) if n >= 3 else float("nan")
+    x = result.calibration.problem.table[x_column(result)]
+    runs, expected = _runs(result, fitted.residual, x)
+    text = (
+        f"{large} of {n} residuals exceed 2 noise sds ({short(0.046 * n)} are expected); they "
+        f"{'are compatible with' if p > 0.05 else 'depart from'} a normal law (Shapiro-Wilk p = "
+        f"{short(p)}) and change sign {runs} times along {axis_of(x_column(result)).name.lower()} "
+        f"where independent ones would do so about {short(expected)} times."
+    )
+    sigma = result.calibration.summary.get("sigma")
+    if sigma is not None:
+        unit = "" if sigma.unit == "1" else f" {sigma.unit}"
+        scale = " of ln output" if result.calibration.problem.bound.model.response == "log" else ""
+        text += f" One noise sd {plain('sigma')} is {short(sigma.mean)}{unit}{scale}."
+    if held is not None:
+        text += f" Held-out rows (open) lie {short(float(held.residual.mean()))} noise sds off on average."
+    return text
+
+
+def _runs(result: OutputResult, residual: Array, x: Array) -> tuple[int, float]:
+    """Sign changes along x within each group, and how many independent signs would show."""
+    changes, pairs = 0, 0
+    for group in groups(result):
+        sign = np.sign(residual[group.fitted][np.argsort(x[group.fitted], kind="stable")])
+        changes += int((sign[1:] != sign[:-1]).sum())
+        pairs += max(0, sign.size - 1)
+    return changes, 0.5 * pairs

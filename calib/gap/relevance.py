@@ -1,0 +1,96 @@
+"""An effect that nobody could notice is no effect: hypotheses are about gaps that matter.
+
+Every hypothesis but `none` is the claim that its effect is *relevant*: that over the field rows
+its root-mean-square size is at least `RELEVANT` noise sds (of a pair: that each of the two is).
+Restricting its prior to relevant sizes multiplies its evidence by
+
+    P(relevant | data, hypothesis) / P(relevant | hypothesis),
+
+both estimated from draws. It keeps the probability of `none` from being shared out among effects
+too small to see, and that of one effect among pairs whose other half is idle.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from calib.gap.fit import Fit
+from calib.gap.forward import Forward
+from calib.models.base import Array
+from calib.streams import generator
+
+__all__ = ["RELEVANT", "relevance", "sizes"]
+
+RELEVANT = 1.0
+_N_DRAWS = 160
+
+
+def relevance(fit: Fit, seed: int) -> float:
+    """Log of the factor by which restricting a hypothesis to relevant sizes changes its evidence.
+
+    Parameters
+    ----------
+    fit : Fit
+    seed : int
+    """
+    hypothesis = fit.forward.hypothesis
+    if hypothesis.name == "none":
+        return 0.0
+    rng = generator(seed, "gap", "relevance", hypothesis.name)
+    posterior = fit.draws(rng, _N_DRAWS)
+    # Prior draws of the effect about the simulator as it was fitted.
+    prior = np.repeat(fit.psi[None], _N_DRAWS, axis=0)
+    drawn = fit.forward.priors.sample(rng, _N_DRAWS)
+    first_effect = max(s.stop for s in fit.forward.theta_slices.values())
+    prior[:, first_effect:] = drawn[:, first_effect:]
+    return _log_share(sizes(fit, posterior)) - _log_share(sizes(fit, prior))
+
+
+def _log_share(size: Array) -> float:
+    relevant = np.isfinite(size).all(axis=1) & (size >= RELEVANT).all(axis=1)
+    return float(np.log((relevant.sum() + 0.2) / (size.shape[0] + 0.4)))
+
+
+def sizes(fit: Fit, psi: Array) -> Array:
+    """Size of each effect in noise sds, rms over field rows and outputs, shape (k, n_effects).
+
+    A parameter shift or a free discrepancy counts as one effect.
+    """
+    forward = fit.forward
+    hypothesis = forward.hypothesis
+    data = forward.data
+    with np.errstate(all="ignore"):
+        full = forward.field(psi, data.view)
+        if len(hypothesis.effects) <= 1:
+            without = [forward.simulator(psi, data.view)]
+        else:
+            without = [_lone(forward, psi, i) for i in range(len(hypothesis.effects))]
+    slip = data.view.slip()
+    columns = []
+    for other in without:
+        squares = [
+            np.square((full[o.name] - other[o.name])[:, o.rows] / fit.noise[o.name].sd(slip[o.rows]))
+            for o in data.outputs
+        ]
+        columns.append(np.sqrt(np.concatenate(squares, axis=1).mean(axis=1)))
+    return np.stack(columns, axis=1)
+
+
+def _lone(forward: Forward, psi: Array, idle: int) -> dict[str, Array]:
+    """Predict the field with one effect of a pair left out."""
+    keep = 1 - idle
+    hypothesis = forward.hypothesis
+    alone = replace(
+        hypothesis,
+        name=hypothesis.effects[keep].name,
+        effects=(hypothesis.effects[keep],),
+        effect_priors=(hypothesis.effect_priors[keep],),
+    )
+    reduced = Forward(forward.data, alone, forward.noise)
+    short = np.zeros((psi.shape[0], reduced.n_dim))
+    for name, s in reduced.theta_slices.items():
+        short[:, s] = psi[:, forward.theta_slices[name]]
+    short[:, reduced.phi_slices[0]] = psi[:, forward.phi_slices[keep]]
+    return reduced.field(short, forward.data.view)
