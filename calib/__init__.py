@@ -1,1 +1,83 @@
-"""Probabilistic calibration of tyre-soil models."""
+"""Probabilistic calibration of tyre-soil models, and diagnosis of their sim-to-real gap.
+
+Two nouns, `Problem` and `Calibration`, and a few verbs. Names are imported when they are first
+used, so that ``import calib`` and ``calib --help`` stay quick.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from calib.calibrate import Calibration, calibrate
+    from calib.data import Table, hold_out, read_table, table_from_arrays
+    from calib.datasets.he2019 import load_he2019
+    from calib.errors import CalibError
+    from calib.estimate import PointEstimate, estimate
+    from calib.models import MODELS
+    from calib.predict import Prediction, predict
+    from calib.problem import Problem, build_problem
+    from calib.sampling.sampler import SamplerSettings
+    from calib.store import load_calibration, save_calibration, to_datatree
+    from calib.validate import Validation, leave_one_out, validate_held_out
+
+_HOME = {
+    "Calibration": "calib.calibrate",
+    "calibrate": "calib.calibrate",
+    "Table": "calib.data",
+    "hold_out": "calib.data",
+    "read_table": "calib.data",
+    "table_from_arrays": "calib.data",
+    "load_he2019": "calib.datasets.he2019",
+    "CalibError": "calib.errors",
+    "PointEstimate": "calib.estimate",
+    "estimate": "calib.estimate",
+    "MODELS": "calib.models",
+    "Prediction": "calib.predict",
+    "predict": "calib.predict",
+    "Problem": "calib.problem",
+    "build_problem": "calib.problem",
+    "SamplerSettings": "calib.sampling.sampler",
+    "load_calibration": "calib.store",
+    "save_calibration": "calib.store",
+    "to_datatree": "calib.store",
+    "Validation": "calib.validate",
+    "leave_one_out": "calib.validate",
+    "validate_held_out": "calib.validate",
+}
+
+__all__ = [
+    "MODELS",
+    "CalibError",
+    "Calibration",
+    "PointEstimate",
+    "Prediction",
+    "Problem",
+    "SamplerSettings",
+    "Table",
+    "Validation",
+    "build_problem",
+    "calibrate",
+    "estimate",
+    "hold_out",
+    "leave_one_out",
+    "load_calibration",
+    "load_he2019",
+    "predict",
+    "read_table",
+    "save_calibration",
+    "table_from_arrays",
+    "to_datatree",
+    "validate_held_out",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'calib' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -51,5 +51,6 @@ def psis(log_ratio: Array) -> tuple[Array, Array]:
     ----------
     Vehtari et al. (2024), Pareto smoothed importance sampling, JMLR 25(72).
     """
-    log_weight, k = _stats().psislw(log_ratio)
+    # ArviZ takes log likelihoods, of which it forms the ratios of leave-one-out itself.
+    log_weight, k = _stats().psislw(-log_ratio)
     return np.asarray(log_weight), np.asarray(k)

@@ -38,11 +38,7 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         out.parent.mkdir(parents=True, exist_ok=True)
         scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     except OSError as error:
-        raise CalibError(
-            f"the output folder cannot be written ({error.strerror})",
-            where=str(out),
-            mend="choose another folder with --out, or change its permissions",
-        ) from None
+        raise _unwritable(out, str(error.strerror)) from None
     try:
         yield scratch
         scratch.chmod(0o777 & ~_umask())
@@ -57,6 +53,22 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
+def _unwritable(out: Path, why: str) -> CalibError:
+    return CalibError(
+        f"the output folder cannot be written ({why})",
+        where=str(out),
+        mend="choose another folder with --out, or change its permissions",
+    )
+
+
+def _check_parent(out: Path) -> None:
+    parent = next(p for p in out.absolute().parents if p.exists())
+    if not parent.is_dir():
+        raise _unwritable(out, f"{parent} is a file")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise _unwritable(out, f"no permission to write in {parent}")
+
+
 def _umask() -> int:
     mask = os.umask(0)
     os.umask(mask)
@@ -69,15 +81,27 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
     Raises
     ------
     CalibError
-        If it exists and may not be replaced.
+        If it exists and may not be replaced, or could not be made.
     """
-    if not out.exists():
+    try:
+        exists = out.exists()
+    except OSError as error:  # a name that is too long, a folder that may not be searched
+        raise _unwritable(out, str(error.strerror)) from None
+    if not exists:
+        _check_parent(out)
         return
     if not out.is_dir():
         raise CalibError(
             "the output folder is an existing file", where=str(out), mend="choose another --out"
         )
+    if out.resolve() == Path.cwd():
+        raise CalibError(
+            "the output folder is the current folder, which cannot be replaced",
+            where=str(out),
+            mend="choose another --out, such as a new folder inside it",
+        )
     if not any(out.iterdir()):
+        _check_parent(out)
         return
     if not overwrite:
         raise CalibError(

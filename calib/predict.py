@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -97,13 +98,16 @@ def predict(calibration: Calibration, table: Table) -> Prediction:
 
 def bands(draws: Array) -> Bands:
     """Median and central bands of draws, shape (size, n)."""
-    # A parameter vector for which the equation has no value there is left out, not spread.
     edges = [
         0.5,
         *(0.5 - level / 2.0 for level in LEVELS),
         *(0.5 + level / 2.0 for level in LEVELS),
     ]
-    quantiles = np.nanquantile(draws, edges, axis=0)
+    # A parameter vector for which the equation has no value there is left out, not spread; where
+    # none has a value, neither have the bands.
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
+        quantiles = np.nanquantile(draws, edges, axis=0)
     k = len(LEVELS)
     return Bands(
         quantiles[0],

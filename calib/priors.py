@@ -31,7 +31,7 @@ class _Entry(BaseModel):
     unit: str
     reason: str = Field(min_length=1)
     source: str = Field(min_length=1)
-    relative_to: str | None = None
+    relative_to: Literal["normal_load_kn"] | None = None
     default_reference: float = Field(default=1.0, gt=0.0)
 
 
@@ -186,11 +186,16 @@ class Priors:
         """Map the unit cube to internal coordinates, shape (k, d) to (k, d)."""
         loc, scale, lower, upper, precision = self._arrays
         normal = precision > 0.0
-        a, b = ndtr((lower - loc) * precision), ndtr((upper - loc) * precision)
+        a, b = (lower - loc) * precision, (upper - loc) * precision
+        # In the tail where the normal's mass is accurate, as for the normaliser.
+        swap = a > 0.0
+        a, b = np.where(swap, -b, a), np.where(swap, -a, b)
+        below, above = ndtr(a), ndtr(b)
+        z = ndtri(below + np.where(swap, 1.0 - u, u) * (above - below))
         with np.errstate(invalid="ignore"):
-            normals = loc + scale * ndtri(a + u * (b - a))
+            normals = loc + scale * np.where(swap, -z, z)
             uniforms = lower + u * (upper - lower)
-        return np.where(normal, normals, uniforms)
+        return np.asarray(np.clip(np.where(normal, normals, uniforms), lower, upper))
 
     def sample(self, rng: np.random.Generator, size: int) -> Array:
         """Draw internal coordinates, shape (size, d)."""

@@ -91,14 +91,17 @@ class Problem:
         natural = self.theta(t)
         n = self.response.size
         rows_at_once = max(1, _CHUNK_CELLS // n)
-        sse = np.concatenate(
-            [
-                np.square(self.residuals(natural[i : i + rows_at_once])).sum(axis=1)
-                for i in range(0, natural.shape[0], rows_at_once)
-            ]
-        )
         sigma = natural[:, -1]
-        value = -n * (np.log(sigma) + _HALF_LN_2PI) - 0.5 * sse / sigma**2 + self._ln_jacobian.sum()
+        # A prior may admit sigma <= 0 or predictions beyond all bounds: they become -inf below.
+        with np.errstate(all="ignore"):
+            sse = np.concatenate(
+                [
+                    np.square(self.residuals(natural[i : i + rows_at_once])).sum(axis=1)
+                    for i in range(0, natural.shape[0], rows_at_once)
+                ]
+            )
+            value = -n * (np.log(sigma) + _HALF_LN_2PI) - 0.5 * sse / sigma**2
+        value += self._ln_jacobian.sum()
         return np.where(np.isfinite(value), value, -np.inf)
 
     def log_likelihood_rows(self, t: Array) -> Array:
@@ -175,5 +178,14 @@ def build_problem(
         (*model.parameters, "sigma"),
         loads,
     )
-    problem = Problem(model.bind(table.columns), table, priors)
+    try:
+        bound = model.bind(table.columns)
+    except CalibError as error:
+        raise CalibError(
+            error.message,
+            where=", ".join(filter(None, (table.source, error.where))),
+            allowed=error.allowed,
+            mend=error.mend,
+        ) from None
+    problem = Problem(bound, table, priors)
     return problem.with_fixed(fixed) if fixed else problem

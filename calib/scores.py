@@ -65,8 +65,9 @@ class Scores:
 
     @property
     def max_relative_error(self) -> float:
-        """Largest absolute relative error."""
-        return float(np.nanmax(np.abs(self.relative_error)))
+        """Largest absolute relative error; NaN where every observation is near zero."""
+        defined = self.relative_error[~np.isnan(self.relative_error)]
+        return float(np.abs(defined).max()) if defined.size else float("nan")
 
 
 def crps(draws: Array, observed: Array) -> Array:

@@ -7,6 +7,9 @@ A run folder holds everything that is needed to predict from it and to compute i
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +21,7 @@ from calib.data import Table, read_for_model, write_table
 from calib.errors import CalibError
 from calib.models import BoundModel, get_model
 from calib.models.base import Array
-from calib.priors import parse_priors
+from calib.priors import Priors, parse_priors
 from calib.problem import Problem
 from calib.sampling.gate import GateReport
 from calib.sampling.sampler import Draws
@@ -138,7 +141,7 @@ def save_calibration(calibration: Calibration, folder: Path) -> None:
     problem = calibration.problem
     write_netcdf(to_datatree(calibration), folder / "posterior.nc")
     (folder / "run.json").write_text(json.dumps(_describe(calibration), indent=1) + "\n")
-    (folder / "priors.toml").write_text(problem.priors.text)
+    (folder / "priors.toml").write_text(problem.priors.text, encoding="utf-8")
     write_table(folder / "data.csv", problem.table.columns)
 
 
@@ -150,20 +153,33 @@ def load_calibration(folder: Path) -> Calibration:
     CalibError
         If the folder is not one, or a file in it is damaged.
     """
-    import arviz as az
-
     folder = Path(folder)
     meta = _read_meta(folder)
+    with _damage(folder / "run.json"):
+        problem = _problem(meta, folder / "data.csv")
+        shape = tuple(meta["shape"])
+        seed, label = meta["seed"], meta["label"]
+    with _damage(folder / "posterior.nc"):
+        t, log_prob = _read_posterior(folder / "posterior.nc", problem.priors, shape)
+    with _damage(folder / "run.json"):
+        draws = _draws(meta, t, log_prob)
+    return Calibration(problem, draws, seed, label)
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
     try:
-        tree = az.from_netcdf(folder / "posterior.nc", engine="h5netcdf")
-        posterior = {str(k): v.values for k, v in tree["posterior"].data_vars.items()}
-        log_prob = tree["sample_stats"]["lp"].values
-    except (OSError, KeyError, ValueError, RuntimeError) as error:
+        yield
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CalibError(
-            f"the posterior cannot be read ({type(error).__name__})",
-            where=str(folder / "posterior.nc"),
+            f"the file cannot be read ({type(error).__name__})",
+            where=str(path),
+            allowed="the file as `calib fit` wrote it",
             mend="the file is damaged or incomplete: run `calib fit` again",
         ) from None
+
+
+def _problem(meta: dict[str, Any], data: Path) -> Problem:
     model = get_model(meta["model"])
     priors = parse_priors(
         meta["prior_text"], meta["prior_file"], model.name,
@@ -171,19 +187,30 @@ def load_calibration(folder: Path) -> Calibration:
     )  # fmt: skip
     if meta["fixed"]:
         priors = priors.fix(meta["fixed"])
-    table = read_for_model(folder / "data.csv", (*model.conditions, model.output))
-    problem = Problem(BoundModel(model, meta["references"]), table, priors)
-    shape = tuple(meta["shape"])
-    natural = np.stack(
-        [
-            np.full(shape[:-1], p.loc) if p.fixed else posterior[p.name].reshape(shape[:-1])
-            for p in priors.entries
-        ],
-        axis=-1,
-    )
+    table = read_for_model(data, (*model.conditions, model.output))
+    # What is reconstructed stays labelled so.
+    table = replace(table, label=meta["data_label"])
+    return Problem(BoundModel(model, meta["references"]), table, priors)
+
+
+def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Return the internal coordinates, of a shape, and their log densities."""
+    import arviz as az
+
+    with az.from_netcdf(path, engine="h5netcdf") as tree:
+        posterior = tree["posterior"]
+        natural = np.stack(
+            [
+                np.full(shape[:-1], p.loc)
+                if p.fixed
+                else posterior[p.name].values.reshape(shape[:-1])
+                for p in priors.entries
+            ],
+            axis=-1,
+        )
+        log_prob = np.asarray(tree["sample_stats"]["lp"].values.reshape(shape[:-1]))
     t = priors.to_internal(natural.reshape(-1, natural.shape[-1]), margin=0.0).reshape(shape)
-    return Calibration(problem, _draws(meta, t, log_prob.reshape(shape[:-1])), meta["seed"],
-                       meta["label"])  # fmt: skip
+    return t, log_prob
 
 
 def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:

@@ -90,7 +90,12 @@ def _posterior(calibration: Calibration) -> dict[str, Any]:
 def _validation(result: OutputResult) -> dict[str, Any]:
     v = result.validation
     return {"method": v.method, **_scores(v.scores)} | (
-        {"elpd": v.elpd, "elpd_se": v.elpd_se, "refitted": list(v.refitted)}
+        {
+            "elpd": v.elpd,
+            "elpd_se": v.elpd_se,
+            "refitted": list(v.refitted),
+            "refits_not_converged": list(v.unconverged),
+        }
         if v.method == "leave_one_out"
         else {}
     )

@@ -9,6 +9,7 @@ import numpy as np
 from calib.calibrate import Calibration
 from calib.chains import psis
 from calib.data import Table
+from calib.errors import CalibError
 from calib.models.base import Array
 from calib.predict import N_DRAWS, predictive_draws
 from calib.sampling.sampler import Progress, SamplerSettings, sample_posterior
@@ -40,6 +41,8 @@ class Validation:
         Rows that were left out by fitting again.
     elpd, elpd_se : float
         Expected log predictive density of leave-one-out and its standard error; NaN otherwise.
+    unconverged : tuple of int
+        Those of `refitted` whose posterior did not pass the gate.
     """
 
     method: str
@@ -51,6 +54,7 @@ class Validation:
     refitted: tuple[int, ...] = ()
     elpd: float = float("nan")
     elpd_se: float = float("nan")
+    unconverged: tuple[int, ...] = ()
 
 
 def validate_held_out(calibration: Calibration, held_out: Table) -> Validation:
@@ -61,10 +65,28 @@ def validate_held_out(calibration: Calibration, held_out: Table) -> Validation:
     calibration : Calibration
     held_out : Table
         With the model's conditions and its output.
+
+    Raises
+    ------
+    CalibError
+        If the calibrated model has no value there, however uncertain its parameters.
+
+    Notes
+    -----
+    A parameter vector for which the equation has no value at one of the rows (a quadratic in
+    pressure that is negative beyond the calibrated ones) is left out.
     """
     model = calibration.problem.bound.model
     rng = generator(calibration.seed, calibration.label, "validate")
     _, draws = predictive_draws(calibration, model.select(held_out.columns), rng)
+    draws = draws[np.isfinite(draws).all(axis=1)]
+    if not draws.size:
+        raise CalibError(
+            f"the calibrated model {model.name} has no value at the held-out rows",
+            where=held_out.source,
+            allowed="conditions to which the equation can be extrapolated",
+            mend="hold out rows inside the range of the others",
+        )
     observed = held_out[model.output]
     return Validation("held_out", held_out, observed, draws, score(draws, observed))
 
@@ -97,7 +119,7 @@ def leave_one_out(
     n = problem.response.size
     drawn = np.empty((N_DRAWS, n))
     elpd = np.empty(n)
-    refitted = []
+    refitted, unconverged = [], []
     for i in range(n):
         row = problem.table.take(np.arange(n) == i)
         if k[i] <= PARETO_K_MAX:
@@ -112,9 +134,14 @@ def leave_one_out(
             again = sample_posterior(
                 rest, seed, starts=calibration.draws.mode[None], settings=settings
             )
+            if not again.report.passed:
+                unconverged.append(i)
             sample = again.flat[np.linspace(0, again.flat.shape[0] - 1, N_DRAWS).astype(int)]
             held = problem.with_table(row).log_likelihood_rows(sample)[:, 0]
-            elpd[i] = _log_mean(held, np.zeros_like(held))
+            # Without this row, the equation may have no value at it: density zero there.
+            defined = np.isfinite(held)
+            elpd[i] = _log_mean(np.where(defined, held, -np.inf), np.zeros_like(held))
+            sample = sample[np.resize(np.flatnonzero(defined), N_DRAWS)]
         natural = problem.theta(sample)
         location = problem.bound.location(natural[:, :-1], problem.bound.model.select(row.columns))
         noisy = location[:, 0] + natural[:, -1] * rng.standard_normal(N_DRAWS)
@@ -124,6 +151,7 @@ def leave_one_out(
     return Validation(
         "leave_one_out", problem.table, problem.observed, drawn, score(drawn, problem.observed),
         k, tuple(refitted), float(elpd.sum()), float(np.sqrt(n * elpd.var(ddof=1))),
+        tuple(unconverged),
     )  # fmt: skip
 
 

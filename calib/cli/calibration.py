@@ -169,20 +169,20 @@ def data(
 
     if name != "he2019":
         raise CalibError(f"there is no data set {name!r}", allowed="he2019")
-    existing = [f"{key}.csv" for key in he2019.tables() if (out / f"{key}.csv").exists()]
-    if existing and not overwrite:
-        raise CalibError(
-            f"{', '.join(existing)} exist there already", where=str(out),
-            mend="choose another --out, or pass --overwrite",
-        )  # fmt: skip
     try:
-        out.mkdir(parents=True, exist_ok=True)
+        existing = [f"{key}.csv" for key in he2019.tables() if (out / f"{key}.csv").exists()]
+        if existing and not overwrite:
+            raise CalibError(
+                f"{', '.join(existing)} exist there already", where=str(out),
+                mend="choose another --out, or pass --overwrite",
+            )  # fmt: skip
+        written = he2019.write(out)
     except OSError as error:
         raise CalibError(
             f"the folder cannot be written ({error.strerror})", where=str(out),
             mend="choose another --out",
         ) from None  # fmt: skip
-    for path in he2019.write(out):
+    for path in written:
         print(f"{path} (reconstructed from published results, not measured)")
 
 
@@ -221,9 +221,9 @@ def _emit(text: str, out: Path | None) -> None:
     if out is None:
         sys.stdout.write(text)
         return
-    if out.exists():
-        raise CalibError("the file exists already", where=str(out), mend="choose another --out")
     try:
+        if out.exists():
+            raise CalibError("the file exists already", where=str(out), mend="choose another --out")
         out.write_text(text, encoding="utf-8")
     except OSError as error:
         raise CalibError(

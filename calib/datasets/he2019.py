@@ -17,10 +17,12 @@ from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
+from calib.data import Table, table_from_arrays
 from calib.datasets import density, drawbar, rut
 from calib.datasets.reconstruct import Array
+from calib.errors import CalibError
 
-__all__ = ["LABEL", "bulk_density", "drawbar_pull", "rut_depth", "tables", "write"]
+__all__ = ["LABEL", "bulk_density", "drawbar_pull", "load_he2019", "rut_depth", "tables", "write"]
 
 LABEL = "reconstructed"
 
@@ -66,6 +68,23 @@ _TABLES: Mapping[str, Callable[[], Mapping[str, Array]]] = MappingProxyType(
 def tables() -> dict[str, Mapping[str, Array]]:
     """Return all three outputs by name; columns are read-only arrays."""
     return {name: table() for name, table in _TABLES.items()}
+
+
+def load_he2019(output: str) -> Table:
+    """Return one output's table, labelled reconstructed.
+
+    Parameters
+    ----------
+    output : {"bulk_density", "drawbar_pull", "rut_depth"}
+
+    Raises
+    ------
+    CalibError
+        If there is no such output.
+    """
+    if output not in tables():
+        raise CalibError(f"there is no output {output!r}", allowed=", ".join(tables()))
+    return table_from_arrays(tables()[output], source=f"he2019 {output}", label=LABEL)
 
 
 def _csv(columns: Mapping[str, Array]) -> str:

@@ -94,9 +94,7 @@ def _panel(ax: Axes, result: OutputResult, group: Group, published: bool) -> dic
     x, y = x_column(result), problem.bound.model.output
     conditions = grid(result, group)
     scale = axis_of(x).scale
-    handles = fill_bands(
-        ax, scale(conditions[x]), *smooth_bands(result.calibration, conditions)
-    )
+    handles = fill_bands(ax, scale(conditions[x]), *smooth_bands(result.calibration, conditions))
     curve = published_curve(problem.bound.model.name, conditions) if published else None
     if curve is not None:
         (handles[f"published fit ({curve[1]})"],) = ax.plot(

@@ -61,7 +61,8 @@ def _against_cone_index(ax: Axes, fig: Figure, result: OutputResult) -> dict[str
             result.calibration, {"cone_index_kpa": x, water: np.full_like(x, at)}
         )
         scaled = axis_of(water).factor * at
-        (line,) = ax.plot(x, mean.median, ls=dashes, lw=1.4, color=points.to_rgba([scaled])[0])
+        colour = points.to_rgba(np.array([scaled]))[0]
+        (line,) = ax.plot(x, mean.median, ls=dashes, lw=1.4, color=colour)
         handles[f"median, water {short(scaled)} {axis_of(water).unit}"] = line
         if quantile == 0.5:
             handles["90 % predictive there"] = ax.fill_between(
@@ -71,7 +72,7 @@ def _against_cone_index(ax: Axes, fig: Figure, result: OutputResult) -> dict[str
     ax.set_ylabel(axis_of(problem.bound.model.output).label)
     bar = fig.colorbar(points, ax=ax, cax=ax.inset_axes((1.03, 0.0, 0.035, 1.0)))
     bar.set_label(axis_of(water).label)
-    bar.outline.set_linewidth(0.4)  # type: ignore[operator]
+    bar.outline.set_linewidth(0.4)
     return handles
 
 

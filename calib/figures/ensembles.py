@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from scipy.stats import rankdata
 
-from calib.figures.labels import parameter_label, plain, short
+from calib.figures.labels import NO_UNIT, parameter_label, plain, short
 from calib.figures.plate import Plate
 from calib.figures.style import CYCLE, DASHES, legend_below
 from calib.models.base import Array
@@ -62,12 +62,12 @@ def ensembles_plate(result: OutputResult) -> Plate:
         trace.set_ylabel(parameter_label(prior.name, prior.unit))
         _ranks(ranks, natural.reshape(natural.shape[0], -1), ess[prior.name] / natural.shape[0])
         if j >= len(free) - per_row:
-            trace.set_xlabel("Stored step (–)")
-            ranks.set_xlabel("Rank (part of all draws, –)")
+            trace.set_xlabel(f"Step ({NO_UNIT})")
+            ranks.set_xlabel(f"Rank ({NO_UNIT})")
         else:
             trace.tick_params(labelbottom=False)
             ranks.tick_params(labelbottom=False)
-    handles["expected (95 %)"] = pairs[0][1].collections[0]
+    handles["rank count over expected count, 95 % range"] = pairs[0][1].collections[0]
     legend_below(fig, list(handles.values()), list(handles), len(handles))
     return Plate(fig, "ensembles", _caption(result), "Convergence of the ensembles")
 
@@ -78,7 +78,7 @@ def _pairs(rows: int, per_row: int, n: int) -> tuple[Figure, list[tuple[Axes, Ax
     cell = 180.0 / per_row
     total = top + bottom + rows * height + (rows - 1) * gap_y
     fig = Figure(figsize=(180.0 / 25.4, total / 25.4))
-    left, between, right = 14.5, 8.0, 2.0
+    left, between, right = 14.5, 10.0, 2.5
     span = cell - left - between - right
     found = []
     for k in range(n):
@@ -103,6 +103,7 @@ def _trace(ax: Axes, natural: Array) -> dict[str, Any]:
             ls=DASHES[e % len(DASHES)], lw=0.7,
         )  # fmt: skip
     ax.set_xlim(0, max(1, steps[-1]))
+    ax.xaxis.set_major_locator(MaxNLocator(2))
     ax.yaxis.set_major_locator(MaxNLocator(3))
     return handles
 
@@ -119,7 +120,8 @@ def _ranks(ax: Axes, values: Array, effective: float) -> None:
     ax.set_ylim(0.0, max(2.0, 1.05 * heights.max()))
     ax.set_xlim(0.0, 1.0)
     ax.set_xticks([0.0, 0.5, 1.0], ["0", "½", "1"])
-    ax.set_ylabel("Count/expected (–)", fontsize=6.5)
+    ax.set_yticks([0.0, 1.0, 2.0], ["0", "1", "2"])
+    ax.set_ylabel(f"Ratio ({NO_UNIT})", fontsize=7.0, labelpad=1.0)
 
 
 def _caption(result: OutputResult) -> str:

@@ -23,7 +23,7 @@ def ks_distance(pit: Array) -> Array:
     n = ordered.shape[-1]
     above = np.arange(1, n + 1) / n - ordered
     below = ordered - np.arange(n) / n
-    return np.maximum(above.max(axis=-1), below.max(axis=-1))
+    return np.asarray(np.maximum(above.max(axis=-1), below.max(axis=-1)))
 
 
 def pit_half_width(draws: Array, level: float = 0.95) -> float:

@@ -13,11 +13,21 @@ from calib.columns import QUANTITIES
 from calib.models.base import Array
 
 __all__ = [
-    "Axis", "axis_of", "joined", "parameter_label", "percent", "plain", "short", "symbol",
-    "unit_text",
+    "MINUS", "NO_UNIT", "Axis", "axis_of", "joined", "parameter_label", "percent", "plain",
+    "short", "symbol", "unit_plain", "unit_text",
 ]  # fmt: skip
 
+NO_UNIT = "\N{EN DASH}"
+MINUS = "\N{MINUS SIGN}"
+
 _GREEK = {"sigma": r"\sigma", "gamma": r"\gamma", "theta": r"\theta"}
+
+
+_GREEK_PLAIN = {
+    "sigma": "\N{GREEK SMALL LETTER SIGMA}",
+    "gamma": "\N{GREEK SMALL LETTER GAMMA}",
+    "theta": "\N{GREEK SMALL LETTER THETA}",
+}
 
 
 @dataclass(frozen=True)
@@ -68,8 +78,8 @@ def axis_of(column: str) -> Axis:
         return _AXES[column]
     quantity = QUANTITIES.get(column)
     if quantity is None:
-        return Axis(column.replace("_", " ").capitalize(), "–")
-    unit = quantity.unit.replace("**", "^").replace("dimensionless", "–")
+        return Axis(column.replace("_", " ").capitalize(), NO_UNIT)
+    unit = quantity.unit.replace("**", "^").replace("dimensionless", NO_UNIT)
     return Axis(quantity.stem.replace("_", " ").capitalize(), unit)
 
 
@@ -88,15 +98,22 @@ def symbol(name: str) -> str:
 def plain(name: str) -> str:
     """Return a parameter's symbol for a sentence."""
     stem, _, below = name.partition("_")
-    stem = {"sigma": "σ", "gamma": "γ", "theta": "θ"}.get(stem, stem)
+    stem = _GREEK_PLAIN.get(stem, stem)
     return f"{stem}_{below}" if below else stem
 
 
 def unit_text(unit: str) -> str:
     """Return a unit in mathtext: powers raised; an en dash where there is none."""
     if unit in ("1", "", "dimensionless"):
-        return "–"
+        return NO_UNIT
     return re.sub(r"\^(-?\w+)", r"$^{\1}$", unit)
+
+
+def unit_plain(unit: str) -> str:
+    """Return a unit for a sentence: small powers as superscripts, nothing where there is none."""
+    if unit in ("1", "", "dimensionless"):
+        return ""
+    return unit.replace("^2", "²").replace("^3", "³")
 
 
 def parameter_label(name: str, unit: str, *, log: bool = False) -> str:
@@ -110,15 +127,16 @@ def parameter_label(name: str, unit: str, *, log: bool = False) -> str:
 def short(value: float, digits: int = 2) -> str:
     """Write a number with few significant digits and without exponent where that is readable."""
     if not np.isfinite(value):
-        return "–"
+        return NO_UNIT
     if value == 0.0:
         return "0"
     size = int(np.floor(np.log10(abs(float(f"{value:.{digits - 1}e}")))))
     if -4 <= size < 5:
         text = f"{value:.{max(0, digits - 1 - size)}f}"
     else:
-        text = f"{value:.{digits - 1}e}".replace("e+0", "e").replace("e-0", "e-").replace("e+", "e")
-    return text.replace("-", "−")
+        mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
+        text = f"{mantissa}e{int(power)}"
+    return text.replace("-", MINUS)
 
 
 def percent(fraction: float) -> str:

@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 from calib.figures.bands import FILLS, scatter_points
 from calib.figures.labels import axis_of, short
 from calib.figures.plate import Plate
-from calib.figures.rows import Group, data_word, groups, x_column
+from calib.figures.rows import Group, data_word, grid, groups, smooth_bands, x_column
 from calib.figures.style import GREY, legend_below, panels
-from calib.predict import bands
 from calib.study import OutputResult
 
 __all__ = ["prior_predictive_plate"]
@@ -58,18 +57,19 @@ def prior_predictive_plate(result: OutputResult) -> Plate:
 
 def _panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]:
     problem = result.calibration.problem
-    x = axis_of(x_column(result)).scale(problem.table[x_column(result)][group.fitted])
-    order = np.argsort(x, kind="stable")
-    expected = bands(result.prior_predictive[:, group.fitted][:, order])
+    x, scale = x_column(result), axis_of(x_column(result)).scale
+    conditions = grid(result, group)
+    _, expected = smooth_bands(result.calibration, conditions, prior=True)
+    along = scale(conditions[x])
     handles: dict[str, Any] = {
         f"prior, {100 * level:g} %": ax.fill_between(
-            x[order], expected.lower[level], expected.upper[level], color=grey, lw=0.0
+            along, expected.lower[level], expected.upper[level], color=grey, lw=0.0
         )
         for level, grey in zip(FILLS, ("#ececec", "#d9d9d9", "#bdbdbd"), strict=True)
     }
-    (handles["prior median"],) = ax.plot(x[order], expected.median, color=GREY, lw=1.3)
+    (handles["prior median"],) = ax.plot(along, expected.median, color=GREY, lw=1.3)
     handles[data_word(result)] = scatter_points(
-        ax, x, problem.observed[group.fitted], held=False
+        ax, scale(problem.table[x][group.fitted]), problem.observed[group.fitted], held=False
     )
     return handles
 

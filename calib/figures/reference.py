@@ -6,14 +6,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.datasets.published import PUBLISHED, Figure
+from calib.datasets.published import PUBLISHED, Figure, FittedTable
 from calib.models.ayers_perumpral import bulk_density
 from calib.models.base import Array, BoundModel
 from calib.models.bekker import rut_depth
 from calib.models.magic_formula import magic_formula
 
 __all__ = ["Limit", "limits", "published_curve", "published_parameters", "published_sampled",
-           "published_source"]  # fmt: skip
+           "published_source", "published_table"]  # fmt: skip
 
 type Limit = tuple[float, str]
 
@@ -27,6 +27,11 @@ _TABLES = {
 def published_parameters(model: str) -> Mapping[str, Figure]:
     """Return the published parameters of a model, empty where there are none."""
     return _TABLES[model].estimates if model in _TABLES else {}
+
+
+def published_table(model: str) -> FittedTable | None:
+    """Return the published table of a model, if there is one."""
+    return _TABLES.get(model)
 
 
 def published_source(model: str) -> str:
@@ -70,7 +75,7 @@ def published_sampled(bound: BoundModel) -> dict[str, float]:
     low, mid, high = (_slope_peak_curvature(p) for p in (middle - half, middle, middle + half))
     if low is None or mid is None or high is None:
         return {}
-    found = {}
+    found: dict[str, float] = {}
     for i, name in enumerate("KDG"):
         mean = 0.5 * (low[i] + high[i])
         found |= {f"{name}_lo": low[i], f"{name}_hi": high[i], f"{name}_bend": 1.0 - mid[i] / mean}

@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.stats import beta, norm, shapiro
 
-from calib.figures.labels import axis_of, plain, short
+from calib.figures.labels import NO_UNIT, axis_of, plain, short, unit_plain
 from calib.figures.plate import Plate
 from calib.figures.rows import data_word, groups, held_table, x_column
 from calib.figures.style import BLACK, BLUE, CYCLE, DASHES, GREY, MARKERS, legend_below, panels
 from calib.models.base import Array
+from calib.problem import Problem
 from calib.study import OutputResult
 
 __all__ = ["Standardised", "residuals_plate", "standardise"]
@@ -35,16 +36,16 @@ class Standardised:
     predicted: Array
 
 
-def standardise(result: OutputResult, *, held: bool = False) -> Standardised | None:
-    """Work residuals out at the posterior; of the held-out rows if wanted and if there are any."""
-    calibration = result.calibration
-    problem = calibration.problem
-    if held:
-        table = held_table(result)
-        if table is None:
-            return None
-        problem = problem.with_table(table)
-    natural = problem.theta(calibration.subset(_N_DRAWS))
+def standardise(result: OutputResult, problem: Problem) -> Standardised:
+    """Work residuals out at the posterior.
+
+    Parameters
+    ----------
+    result : OutputResult
+    problem : Problem
+        Its rows: the calibrated ones or, by ``with_table``, others.
+    """
+    natural = problem.theta(result.calibration.subset(_N_DRAWS))
     location = problem.bound.location(natural[:, :-1], problem.conditions)
     residual = np.nanmean((problem.response - location) / natural[:, -1:], axis=0)
     return Standardised(residual, problem.bound.from_response(np.nanmedian(location, axis=0)))
@@ -58,14 +59,17 @@ def residuals_plate(result: OutputResult) -> Plate:
     result : OutputResult
     """
     fig, axes = panels(2, 2, height=46.0, left=14.0, bottom=22.0, gap_x=17.0, gap_y=15.0)
-    fitted, held = standardise(result), standardise(result, held=True)
-    assert fitted is not None
-    problem, x = result.calibration.problem, x_column(result)
+    problem, other = result.calibration.problem, held_table(result)
+    fitted = standardise(result, problem)
+    held = None if other is None else standardise(result, problem.with_table(other))
+    x = x_column(result)
     y_axis, x_axis = axis_of(problem.bound.model.output), axis_of(x)
-    handles = _scatter(axes[0, 0], result, fitted.predicted, held and held.predicted)
-    other = held_table(result)
+    residuals = (fitted.residual, None if held is None else held.residual)
+    handles = _scatter(
+        axes[0, 0], result, residuals, fitted.predicted, None if held is None else held.predicted
+    )
     _scatter(
-        axes[0, 1], result, x_axis.scale(problem.table[x]),
+        axes[0, 1], result, residuals, x_axis.scale(problem.table[x]),
         None if other is None else x_axis.scale(other[x]),
     )  # fmt: skip
     axes[0, 0].set_xlabel(f"Predicted {y_axis.name.lower()} ({y_axis.unit})")
@@ -86,26 +90,29 @@ def residuals_plate(result: OutputResult) -> Plate:
 
 
 def _scatter(
-    ax: Axes, result: OutputResult, fitted: Array, held: Array | None
-) -> dict[str, Any]:
-    mine, theirs = standardise(result), standardise(result, held=True)
+    ax: Axes, result: OutputResult, residuals: tuple[Array, Array | None], fitted: Array,
+    held: Array | None,
+) -> dict[str, Any]:  # fmt: skip
+    """Draw residuals of fitted (filled) and held-out (open) rows at their abscissas."""
+    mine, theirs = residuals
     handles: dict[str, Any] = {}
     ax.axhspan(-2.0, 2.0, color="#eeeeee", lw=0.0)
     ax.axhline(0.0, color=GREY, lw=0.6)
     for k, group in enumerate(groups(result)):
         colour, marker = CYCLE[k % len(CYCLE)], MARKERS[k % len(MARKERS)]
         name = group.title or data_word(result)
-        if mine is not None and group.fitted.any():
+        if group.fitted.any():
             (handles[name],) = ax.plot(
-                fitted[group.fitted], mine.residual[group.fitted], marker, color=colour, ms=4.2,
+                fitted[group.fitted], mine[group.fitted], marker, color=colour, ms=4.2,
                 mec="white", mew=0.4,
             )  # fmt: skip
         if theirs is not None and held is not None and group.held_out.any():
             (handles[name if group.held else f"{name}, held out"],) = ax.plot(
-                held[group.held_out], theirs.residual[group.held_out], marker, mfc="white",
+                held[group.held_out], theirs[group.held_out], marker, mfc="white",
                 mec=colour, mew=1.1, ms=4.2,
             )  # fmt: skip
-    top = max(2.6, 1.08 * max(np.abs(s.residual).max() for s in (mine, theirs) if s is not None))
+    largest = max(float(np.abs(r).max()) for r in residuals if r is not None)
+    top = max(2.6, 1.08 * largest)
     ax.set_ylim(-top, top)
     return handles
 
@@ -136,7 +143,7 @@ def _replicated(ax: Axes, result: OutputResult) -> dict[str, Any]:
     )
     axis = axis_of(result.calibration.problem.bound.model.output)
     ax.set_xlabel(axis.label)
-    ax.set_ylabel("Part of the data below (–)")
+    ax.set_ylabel(f"Part of the data below ({NO_UNIT})")
     ax.set_ylim(0.0, 1.02)
     return handles
 
@@ -147,18 +154,20 @@ def _caption(result: OutputResult, fitted: Standardised, held: Standardised | No
     x = result.calibration.problem.table[x_column(result)]
     runs, expected = _runs(result, fitted.residual, x)
     text = (
-        f"{large} of {n} residuals exceed 2 noise sds ({short(0.046 * n)} are expected); they "
+        f"Beyond 2 noise sds lie {large} of {n} residuals ({short(0.046 * n)} expected); they "
         f"{'are compatible with' if p > 0.05 else 'depart from'} a normal law (Shapiro-Wilk p = "
         f"{short(p)}) and change sign {runs} times along {axis_of(x_column(result)).name.lower()} "
-        f"where independent ones would do so about {short(expected)} times."
+        f"where independent ones would do so about {expected:.0f} times."
     )
     sigma = result.calibration.summary.get("sigma")
     if sigma is not None:
-        unit = "" if sigma.unit == "1" else f" {sigma.unit}"
+        unit = "" if sigma.unit == "1" else f" {unit_plain(sigma.unit)}"
         scale = " of ln output" if result.calibration.problem.bound.model.response == "log" else ""
         text += f" One noise sd {plain('sigma')} is {short(sigma.mean)}{unit}{scale}."
     if held is not None:
-        text += f" Held-out rows (open) lie {short(float(held.residual.mean()))} noise sds off on average."
+        mean = float(held.residual.mean())
+        side = "above" if mean > 0.0 else "below"
+        text += f" Held-out rows (open) lie {short(abs(mean))} noise sds {side} their prediction."
     return text
 
 

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from calib.calibrate import Calibration
@@ -16,7 +17,8 @@ from calib.streams import generator
 from calib.study import OutputResult
 from calib.table import Table
 
-__all__ = ["Group", "data_word", "group_column", "groups", "held_table", "smooth_bands", "x_column"]
+__all__ = ["Group", "data_word", "grid", "group_column", "groups", "held_table", "smooth_bands",
+           "x_column"]  # fmt: skip
 
 MAX_PANELS = 6
 _N_DRAWS = 1000
@@ -44,8 +46,8 @@ class Group:
     held: bool
     column: str | None
     value: float
-    fitted: Array
-    held_out: Array
+    fitted: NDArray[np.bool_]
+    held_out: NDArray[np.bool_]
 
     @property
     def size(self) -> int:
@@ -109,8 +111,9 @@ def groups(result: OutputResult) -> list[Group]:
 
 def _title(axis: Axis, low: float, high: float, held: bool) -> str:
     a, b = axis.factor * low, axis.factor * high
+    name = "water " if axis.name == "Water content" else ""
     value = f"{a:.4g}" if f"{a:.4g}" == f"{b:.4g}" else f"{a:.3g} to {b:.3g}"
-    return f"{value} {axis.unit}, held out" if held else f"{value} {axis.unit}"
+    return f"{name}{value} {axis.unit}{', held out' if held else ''}"
 
 
 def _bins(values: Array) -> list[tuple[float, float, float]]:
@@ -139,15 +142,26 @@ def grid(result: OutputResult, group: Group) -> dict[str, Array]:
     return conditions
 
 
-def smooth_bands(calibration: Calibration, conditions: Mapping[str, Array]) -> tuple[Bands, Bands]:
+def smooth_bands(
+    calibration: Calibration, conditions: Mapping[str, Array], *, prior: bool = False
+) -> tuple[Bands, Bands]:
     """Bands of the mean output and of a measurement along a curve.
 
     Each draw has one noise value for the whole curve, so that its quantiles are smooth in x.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    conditions : mapping of str to ndarray
+    prior : bool
+        Of the prior instead of the posterior.
     """
     problem = calibration.problem
-    natural = problem.theta(calibration.subset(_N_DRAWS))
+    rng = generator(calibration.seed, calibration.label, "figures")
+    t = problem.priors.sample(rng, _N_DRAWS) if prior else calibration.subset(_N_DRAWS)
+    natural = problem.theta(t)
     size = natural.shape[0]
-    z = ndtri((generator(0, "figures").permutation(size) + 0.5) / size)[:, None]
+    z = ndtri((rng.permutation(size) + 0.5) / size)[:, None]
     location = problem.bound.location(natural[:, :-1], conditions)
     back = problem.bound.from_response
     return bands(back(location)), bands(back(location + natural[:, -1:] * z))

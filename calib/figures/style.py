@@ -1,4 +1,4 @@
-"""How every figure looks: sizes for print, fonts, colours that survive greyscale and colour blindness.
+"""How every figure looks: sizes for print, fonts, and colours that survive greyscale.
 
 Colours are those of Okabe & Ito (2008); whatever a colour says, a marker, a line style or a label
 says too.
@@ -30,7 +30,7 @@ DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)
 SINGLE_MM, DOUBLE_MM = 90.0, 180.0
 _MM = 1.0 / 25.4
 
-_RC: dict[str, Any] = {
+_RC: dict[Any, Any] = {
     "font.family": "sans-serif",
     "font.size": 8.0,
     "axes.titlesize": 8.0,
@@ -64,7 +64,8 @@ def style() -> Iterator[None]:
     """Draw in the project's style, whatever the user's own settings are."""
     with mpl.rc_context():
         mpl.rcParams.update({k: v for k, v in mpl.rcParamsDefault.items() if k != "backend"})
-        mpl.rcParams.update(_RC)
+        for key, value in _RC.items():
+            mpl.rcParams[key] = value
         yield
 
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from calib.figures.density import draw_predicted_observed
 from calib.figures.joint import effective_rows, ks_distance, pit_half_width
-from calib.figures.labels import axis_of, percent, short
+from calib.figures.labels import MINUS, NO_UNIT, axis_of, percent, short
 from calib.figures.plate import Plate
 from calib.figures.reference import limits, published_curve
 from calib.figures.rows import data_word, held_table, x_column
@@ -19,12 +19,10 @@ from calib.figures.style import (
     DASHES,
     GREY,
     ORANGE,
-    VERMILION,
     legend_below,
     note,
     panels,
 )
-from calib.models.base import Array
 from calib.study import OutputResult
 
 __all__ = ["validation_plate"]
@@ -39,16 +37,14 @@ def validation_plate(result: OutputResult, *, published: bool) -> Plate:
     published : bool
         Whether to add the published fit's errors and the limits that the source states.
     """
-    fig, axes = panels(
-        2, 2, height=52.0, left=15.0, bottom=22.0, gap_x=17.0, gap_y=15.0, top=6.0
-    )
+    fig, axes = panels(2, 2, height=52.0, left=15.0, bottom=22.0, gap_x=17.0, gap_y=15.0, top=6.0)
     handles = draw_predicted_observed(axes[0, 0], result)
     handles |= _relative_errors(axes[0, 1], result, published)
     _pit(axes[1, 0], result)
     handles |= _coverage(axes[1, 1], result)
     for ax, title in zip(
         axes.flat,
-        ("Predicted against observed", "(Predicted − observed)/observed",
+        ("Predicted against observed", f"(Predicted {MINUS} observed)/observed",
          "Are the bands calibrated? (PIT)", "Coverage of the bands"),
         strict=True,
     ):  # fmt: skip
@@ -97,8 +93,8 @@ def _pit(ax: Axes, result: OutputResult) -> None:
     note(ax, "grey: where 95 % of such\nrows stay if the bands are right", x=0.98, y=0.04)
     ax.set_xlim(0.0, 1.0)
     ax.set_ylim(0.0, 1.02)
-    ax.set_xlabel("Predictive probability below the observation (–)")
-    ax.set_ylabel("Part of the rows (–)")
+    ax.set_xlabel(f"Predictive probability below the observation ({NO_UNIT})")
+    ax.set_ylabel(f"Part of the rows ({NO_UNIT})")
 
 
 def _coverage(ax: Axes, result: OutputResult) -> dict[str, Any]:
@@ -132,9 +128,7 @@ def _caption(result: OutputResult) -> str:
         f"{s.n} rows, each predicted without itself ({data_word(result)})"
     )  # fmt: skip
     left = f" ({missing} rows near zero are not judged)" if missing else ""
-    cover = "; ".join(
-        f"{100 * c.level:g} % band {c.hits} of {c.n}" for c in s.coverage.values()
-    )
+    cover = "; ".join(f"{100 * c.level:g} % band {c.hits} of {c.n}" for c in s.coverage.values())
     above = int((np.abs(s.relative_error) > 0.06).sum())
     text = (
         f"Over {who} the median is wrong by {short(s.rmse)} {axis.unit} rms and by "
@@ -150,4 +144,3 @@ def _caption(result: OutputResult) -> str:
     if v.pareto_k is not None:
         text += f" {len(v.refitted)} of {s.n} rows needed a refit (Pareto k above 0.7)."
     return text
-

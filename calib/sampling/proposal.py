@@ -206,16 +206,14 @@ def adapt(
         if stage >= _SINGLE_ROUNDS and efficiency > _GOOD:
             break
         weight = _tempered(weight)
-        if stage < _SINGLE_ROUNDS - 1:
+        last_single = _SINGLE_ROUNDS - 1
+        if stage < last_single or (stage == last_single and efficiency > _GOOD):
             proposal = _refit_single(proposal, draws, weight)
-        elif stage == _SINGLE_ROUNDS - 1:
+        elif len(proposal.components) == 1:
             single = _refit_single(proposal, draws, weight)
-            if efficiency > _GOOD:
-                proposal = single
-            else:
-                proposal = _split(single.components[0], draws, weight, rng, components)
-                proposal = _expectation_maximisation(proposal, draws, weight)
-                size = 2 * size
+            proposal = _split(single.components[0], draws, weight, rng, components)
+            proposal = _expectation_maximisation(proposal, draws, weight)
+            size = 2 * size
         else:
             proposal = _expectation_maximisation(proposal, draws, weight)
     return proposal, log_evidence, efficiency

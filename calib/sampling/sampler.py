@@ -189,7 +189,7 @@ def sample_density(
     count = log_prob if isinstance(log_prob, _Counter) else _Counter(log_prob)
     proposal, log_evidence, efficiency = adapt(count, first, rng)
     samplers = [_Ensemble(count, proposal, efficiency, seed, settings) for seed in seeds[1:]]
-    target = settings.steps
+    target = min(settings.steps, settings.max_steps)
     while True:
         planned = target + target // 4
         for i, sampler in enumerate(samplers):

@@ -1,0 +1,201 @@
+"""The posterior in pairs: every two sampled parameters against each other."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.ticker import MaxNLocator
+
+from calib.calibrate import Calibration
+from calib.figures.labels import parameter_label, plain, short
+from calib.figures.plate import Plate
+from calib.figures.reference import published_sampled
+from calib.figures.style import BLACK, BLUE, DASHES, ORANGE
+from calib.models.base import Array
+from calib.priors import Prior
+from calib.study import OutputResult
+
+__all__ = ["corner_plate"]
+
+MAX_PARAMETERS = 11
+_N_DRAWS = 4000
+# A positive parameter this wide (98 % over 2 % point) is drawn by its logarithm.
+_WIDE = 2.5
+# Part of a cell that its panel takes.
+_FILL = 0.93
+
+
+class _Cells:
+    """Panels as cells of one pair of axes: creating axes is what takes the time of a corner plot.
+
+    Panel (i, j) is column j of row i from the top; a parameter's range maps onto its cell.
+    """
+
+    def __init__(self, draws: Array) -> None:
+        self.d = draws.shape[1]
+        self.low, self.high = np.quantile(draws, [0.001, 0.999], axis=0)
+
+    def part(self, j: int, value: Array | float) -> Array:
+        """Map a parameter's values onto 0 to `_FILL`."""
+        return np.asarray(_FILL * (value - self.low[j]) / (self.high[j] - self.low[j]))
+
+    def x(self, j: int, value: Array | float) -> Array:
+        """Abscissa of values of parameter j."""
+        return np.asarray(j + self.part(j, value))
+
+    def bottom(self, i: int) -> float:
+        """Ordinate of the foot of row i."""
+        return float(self.d - 1 - i)
+
+    def ticks(self, j: int, most: int) -> Array:
+        """A few round values inside the range."""
+        values = np.asarray(MaxNLocator(most).tick_values(self.low[j], self.high[j]))
+        return np.asarray(values[(values >= self.low[j]) & (values <= self.high[j])])
+
+
+def corner_plate(result: OutputResult, *, published: bool) -> Plate:
+    """Draw every pair of sampled parameters.
+
+    Parameters
+    ----------
+    result : OutputResult
+    published : bool
+        Whether to mark what the published figures amount to.
+    """
+    draws, priors, wide = _sampled(result.calibration)
+    marks = published_sampled(result.calibration.problem.bound) if published else {}
+    at = [
+        np.log10(marks[p.name]) if w and p.name in marks else marks.get(p.name)
+        for p, w in zip(priors, wide, strict=True)
+    ]
+    labels = [parameter_label(p.name, p.unit, log=w) for p, w in zip(priors, wide, strict=True)]
+    cells = _Cells(draws)
+    fig, ax = _frame(cells)
+    for i in range(cells.d):
+        _marginal(ax, cells, i, draws[:, i])
+        for j in range(i):
+            _pair(ax, cells, i, j, draws)
+    _marks(ax, cells, at)
+    _ticks(ax, cells, labels)
+    note = "contours hold 50 % and 90 %" + ("\ndashed: published" if marks else "")
+    ax.text(1.1, cells.d - 0.1, note, va="top", fontsize=7.0)
+    ax.set_xlim(0.0, cells.d)
+    ax.set_ylim(0.0, cells.d)
+    caption = _caption(draws, [p.name for p in priors], bool(marks))
+    return Plate(fig, "corner", caption, "Posterior, in pairs")
+
+
+def _sampled(calibration: Calibration) -> tuple[Array, list[Prior], list[bool]]:
+    """Thinned draws of the first free parameters, by their decimal logarithm where wide."""
+    entries = calibration.problem.priors.entries
+    free = [i for i, p in enumerate(entries) if not p.fixed][:MAX_PARAMETERS]
+    natural = calibration.problem.theta(calibration.subset(_N_DRAWS))[:, free]
+    low, high = np.quantile(natural, [0.02, 0.98], axis=0)
+    wide = [bool(entries[i].log and high[j] > _WIDE * low[j]) for j, i in enumerate(free)]
+    natural[:, wide] = np.log10(natural[:, wide])
+    return natural, [entries[i] for i in free], wide
+
+
+def _frame(cells: _Cells) -> tuple[Figure, Axes]:
+    """One pair of axes without spines; every panel gets a left and a lower edge."""
+    edge = cells.d * (14.5 if cells.d > 7 else min(30.0, 125.0 / cells.d))
+    margin, rest = 17.0, 2.0
+    total = edge + margin + rest
+    fig = Figure(figsize=(total / 25.4, total / 25.4))
+    ax = fig.add_axes((margin / total, margin / total, edge / total, edge / total))
+    ax.set_axis_off()
+    edges = []
+    for i in range(cells.d):
+        for j in range(i + 1):
+            y = cells.bottom(i)
+            edges.append([(j, y), (j + _FILL, y)])
+            if i != j:
+                edges.append([(j, y), (j, y + _FILL)])
+    ax.add_collection(LineCollection(edges, colors=BLACK, linewidths=0.6, clip_on=False))
+    return fig, ax
+
+
+def _marginal(ax: Axes, cells: _Cells, i: int, draws: Array) -> None:
+    counts, edges = np.histogram(draws, 30, (cells.low[i], cells.high[i]))
+    height = cells.bottom(i) + 0.85 * counts / counts.max()
+    ax.stairs(height, cells.x(i, edges), baseline=cells.bottom(i), color=BLUE, lw=1.0)
+
+
+def _pair(ax: Axes, cells: _Cells, i: int, j: int, draws: Array) -> None:
+    from corner import hist2d
+
+    y = cells.bottom(i)
+    before = len(ax.collections)
+    hist2d(
+        cells.x(j, draws[:, j]), y + cells.part(i, draws[:, i]), bins=24, ax=ax,
+        levels=(0.5, 0.9), smooth=1.0, range=[(j, j + _FILL), (y, y + _FILL)],
+        plot_datapoints=False, plot_density=False, fill_contours=True, color=BLUE,
+        contour_kwargs={"linewidths": 0.6},
+    )  # fmt: skip
+    # Smoothed contours reach a little beyond the range.
+    for contour in ax.collections[before:]:
+        contour.set_clip_path(Rectangle((j, y), _FILL, _FILL, transform=ax.transData))
+
+
+def _marks(ax: Axes, cells: _Cells, at: list[float | None]) -> None:
+    """Published values as dashed lines across their row and column, where they lie inside."""
+    lines = []
+    for k, value in enumerate(at):
+        if value is not None and cells.low[k] <= value <= cells.high[k]:
+            part = float(cells.part(k, value))
+            y = cells.bottom(k)
+            lines += [
+                [(k + part, cells.bottom(i)), (k + part, cells.bottom(i) + _FILL)]
+                for i in range(k, cells.d)
+            ]
+            lines += [[(j, y + part), (j + _FILL, y + part)] for j in range(k)]
+    ax.add_collection(LineCollection(lines, colors=ORANGE, linewidths=0.9, linestyles=[DASHES[1]]))
+
+
+def _ticks(ax: Axes, cells: _Cells, labels: list[str]) -> None:
+    many = cells.d > 7
+    size, most, tick = (6.5, 2, 0.05) if many else (8.0, 3, 0.03)
+    style: dict[str, Any] = {"fontsize": size - 0.5, "clip_on": False}
+    # Distances from the panels are in cells, so they grow with the number of panels.
+    away = (11.5 if many else 11.0) / (14.5 if many else min(30.0, 125.0 / cells.d))
+    lines = []
+    for k, label in enumerate(labels):
+        y = cells.bottom(k)
+        for value in cells.ticks(k, most):
+            part = float(cells.part(k, value))
+            text = _tick_text(float(value))
+            lines.append([(k + part, 0.0), (k + part, -tick)])
+            ax.text(k + part, -1.6 * tick, text, ha="center", va="top",
+                    rotation=90 if many else 45, **style)  # fmt: skip
+            if k > 0:
+                lines.append([(0.0, y + part), (-tick, y + part)])
+                ax.text(-1.6 * tick, y + part, text, ha="right", va="center", **style)
+        ax.text(k + 0.5 * _FILL, -away, label, ha="center", va="center", fontsize=size)
+        if k > 0:
+            ax.text(-away, y + 0.5 * _FILL, label, rotation=90, ha="right", va="center",
+                    fontsize=size)  # fmt: skip
+    ax.add_collection(LineCollection(lines, colors=BLACK, linewidths=0.6, clip_on=False))
+
+
+def _tick_text(value: float) -> str:
+    """Write a tick's value."""
+    return f"{value:.6g}".replace("-", "\N{MINUS SIGN}")
+
+
+def _caption(draws: Array, names: list[str], marked: bool) -> str:
+    correlation = np.corrcoef(draws, rowvar=False) - np.eye(len(names))
+    i, j = np.unravel_index(np.abs(correlation).argmax(), correlation.shape)
+    strong = int((np.abs(np.tril(correlation)) > 0.8).sum())
+    pairs = len(names) * (len(names) - 1) // 2
+    marks = " Dashed: what the published figures amount to." if marked else ""
+    verb = "exceeds" if strong in (0, 1) else "exceed"
+    few = f"{strong} of {pairs} pairs" if strong else f"none of the {pairs} pairs"
+    return (
+        f"{plain(names[j])} and {plain(names[i])} are tied most closely (correlation "
+        f"{short(float(correlation[i, j]))}); {few} {verb} 0.8.{marks}"
+    )

@@ -1,0 +1,178 @@
+"""What the page says of every output, ready for the template."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from pathlib import PurePath
+from typing import Any
+
+from calib.figures import Plate
+from calib.figures.labels import axis_of, percent, short
+from calib.figures.rows import held_table
+from calib.models import get_model
+from calib.page.equations import equation, likelihood, parametrisation, prose
+from calib.page.numbers import format_number
+from calib.page.tables import (
+    estimates_grid,
+    posterior_rows,
+    pressure_grids,
+    prior_rows,
+    sampling_facts,
+    validation_facts,
+)
+from calib.page.verdict import Level, gather, judge_evidence
+from calib.study import Failure, OutputResult
+
+__all__ = ["MARKS", "failed_section", "section"]
+
+# A shape beside every colour.
+MARKS: Mapping[str, str] = {
+    Level.FINE: "\N{HEAVY CHECK MARK}",
+    Level.CARE: "\N{BLACK UP-POINTING TRIANGLE}",
+    Level.NO: "\N{HEAVY BALLOT X}",
+    Level.FAILED: "\N{HEAVY BALLOT X}",
+}
+
+_NAMES = {
+    "bulk_density": "Bulk density",
+    "drawbar_pull": "Drawbar pull",
+    "rut_depth": "Rut depth",
+}
+
+
+def output_name(key: str) -> str:
+    """Return the heading of an output."""
+    return _NAMES.get(key, key.replace("_", " ").capitalize())
+
+
+def failed_section(key: str, failure: Failure) -> dict[str, Any]:
+    """Return what there is to say of an output that could not be worked out."""
+    return {
+        "key": key,
+        "name": output_name(key),
+        "model": get_model(failure.task.model).title,
+        "failed": True,
+        "error": failure.error,
+        "level": str(Level.FAILED.value),
+        "mark": MARKS[Level.FAILED],
+        "headline": "Failed",
+        "source": PurePath(failure.task.table.source).name,
+        "label": failure.task.table.label,
+        "rows": len(failure.task.table),
+    }
+
+
+def section(
+    key: str, result: OutputResult, plates: Sequence[Plate], images: Mapping[str, bytes]
+) -> dict[str, Any]:
+    """Return everything that is said of an output.
+
+    Parameters
+    ----------
+    key : str
+    result : OutputResult
+    plates : sequence of Plate
+    images : mapping of str to bytes
+        PNG files by name, ``{key}_{plate.name}.png``.
+    """
+    calibration = result.calibration
+    problem = calibration.problem
+    evidence = gather(result)
+    verdict = judge_evidence(evidence)
+    published = bool(problem.table.label)
+    names = [*problem.bound.model.reported, *(p.name for p in problem.priors.entries)]
+    bound = problem.bound
+    return {
+        "key": key,
+        "name": output_name(key),
+        "model": bound.model.title,
+        "failed": False,
+        "level": str(verdict.level.value),
+        "mark": MARKS[verdict.level],
+        "headline": verdict.headline,
+        "trust": prose(verdict.trust, names),
+        "doubt": prose(verdict.doubt, names),
+        "label": problem.table.label,
+        "facts": _card_facts(result),
+        "equation": equation(bound),
+        "likelihood": prose(likelihood(bound, axis_of(bound.model.output).name.lower()), names),
+        "parametrisation": prose(parametrisation(bound), names),
+        "data": _data_facts(result),
+        "priors": prior_rows(result),
+        "prior_source": PurePath(problem.priors.source).name,
+        "estimates": estimates_grid(result, published=published),
+        "by_pressure": pressure_grids(result, published=published),
+        "posterior": posterior_rows(result),
+        "sampling": sampling_facts(result),
+        "validation": validation_facts(result, evidence.effective, evidence.low_coverage_p),
+        "validation_title": _validation_title(result),
+        "figures": {p.name: _figure(key, p, images, names) for p in plates},
+        "converged": calibration.converged,
+        "seconds": {k: format_number(v, 2) for k, v in result.seconds.items()},
+    }
+
+
+def _validation_title(result: OutputResult) -> str:
+    held = result.task.held_out
+    if held_table(result) is None or held is None:
+        return "Validation: each row predicted without itself (leave-one-out)"
+    name, _, unit = held.column.rpartition("_")
+    return f"Validation on held-out rows: {name.replace('_', ' ')} {held.value:g} {unit}"
+
+
+def _card_facts(result: OutputResult) -> list[list[str]]:
+    """The few numbers that belong on the card."""
+    calibration, s = result.calibration, result.validation.scores
+    report, c = calibration.draws.report, s.coverage[0.9]
+    axis = axis_of(calibration.problem.bound.model.output)
+    held = held_table(result) is not None
+    state = "yes" if calibration.converged else "NO"
+    how = f"R-hat {max(report.rhat):.3f}, ESS {min(report.ess_bulk):.0f} or more"
+    error = f"{short(s.rmse)} {axis.unit} rms"
+    largest = gather(result).max_relative_error
+    return [
+        ["Converged", f"{state} ({how})"],
+        ["Calibrated on", f"{len(calibration.problem.table)} rows"],
+        [
+            f"90 % band on {s.n} {'held-out' if held else 'left-out'} rows",
+            f"covered {c.hits} of {c.n} (95 % interval {100 * c.lower:.0f} to "
+            f"{100 * c.upper:.0f} %)",
+        ],
+        ["Error of the median there", f"{error}, {percent(largest)} at most"],
+    ]
+
+
+def _data_facts(result: OutputResult) -> list[list[str]]:
+    problem, held = result.calibration.problem, held_table(result)
+    table = problem.table
+    rows = f"{len(table)} calibrated"
+    if held is not None:
+        rows += f", {len(held)} held out ({result.task.held_out})"
+    facts = [["Source", PurePath(table.source).name], ["Rows", rows]]
+    for name in (*problem.bound.model.conditions, problem.bound.model.output):
+        axis = axis_of(name)
+        low, high = (axis.factor * float(f(table[name])) for f in (min, max))
+        facts.append([axis.name, f"{short(low, 3)} to {short(high, 3)} {axis.unit}"])
+    if table.ignored:
+        facts.append(["Columns not used", ", ".join(table.ignored)])
+    facts.append(["SHA-256", table.sha256])
+    return facts
+
+
+def _figure(
+    key: str, plate: Plate, images: Mapping[str, bytes], names: Sequence[str]
+) -> dict[str, Any]:
+    image = images.get(f"{key}_{plate.name}.png")
+    return {
+        "heading": plate.heading or plate.name.replace("_", " ").capitalize(),
+        "caption": prose(plate.caption, names),
+        "alt": plate.caption,
+        "uri": f"data:image/png;base64,{base64.b64encode(image).decode()}" if image else "",
+        "size": png_size(image) if image else (0, 0),
+    }
+
+
+def png_size(image: bytes) -> tuple[int, int]:
+    """Return width and height of a PNG file, which keep the page from jumping while it loads."""
+    return int.from_bytes(image[16:20]), int.from_bytes(image[20:24])

@@ -1,0 +1,81 @@
+"""Render a study as one self-contained page."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from functools import cache
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
+from markupsafe import Markup
+
+from calib.figures import Plate
+from calib.page.content import failed_section, section
+from calib.study import OutputResult, Study
+
+__all__ = ["render_page"]
+
+
+@cache
+def _template() -> Template:
+    environment = Environment(
+        loader=PackageLoader("calib.page", "."),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("report.html.j2")
+
+
+def render_page(
+    study: Study,
+    plates: Mapping[str, Sequence[Plate]],
+    images: Mapping[str, bytes],
+    *,
+    manifest: Mapping[str, Any],
+    title: str,
+    reconstructed: bool,
+    audit_html: str | None = None,
+) -> str:
+    """Render the report.
+
+    Parameters
+    ----------
+    study : Study
+    plates : mapping of str to sequence of Plate
+        Figures of every output that was worked out.
+    images : mapping of str to bytes
+        PNG files by name, ``{output}_{plate.name}.png``.
+    manifest : mapping
+        As `calib.manifest.build_manifest` returns it.
+    title : str
+    reconstructed : bool
+        Whether any data were reconstructed from published results.
+    audit_html : str, optional
+        A section to be placed before the appendix, as trusted HTML.
+
+    Returns
+    -------
+    str
+        HTML that makes no request: style and images are inside.
+    """
+    sections = [
+        section(key, result, plates.get(key, ()), images)
+        if isinstance(result, OutputResult)
+        else failed_section(key, result)
+        for key, result in study.results.items()
+    ]
+    return _template().render(
+        title=title,
+        sections=sections,
+        reconstructed=reconstructed,
+        audit=Markup(audit_html) if audit_html else None,
+        seed=study.seed,
+        seconds=study.seconds,
+        command=shlex.join(str(part) for part in manifest.get("command", ())),
+        versions=manifest.get("versions", {}),
+        settings=manifest.get("settings", {}),
+        tasks=manifest.get("tasks", {}),
+    )

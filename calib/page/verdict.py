@@ -1,0 +1,201 @@
+"""The verdict on one output, by explicit rules, from a few numbers.
+
+The first rule that applies decides:
+
+1. not converged: the convergence gate was not passed;
+2. not scored: the validation has no finite error;
+3. miscovered: unseen rows fell outside the 90 % band more often than chance allows;
+4. extrapolated: the prior, not the data, sets what the prediction of unseen rows hangs on;
+5. fine.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+import numpy as np
+from scipy.stats import binomtest
+
+from calib.figures.joint import coverage_probability, effective_rows
+from calib.figures.labels import axis_of, joined, percent, plain, short
+from calib.figures.roles import MOVED, PRIOR, role
+from calib.figures.rows import held_table
+from calib.study import OutputResult
+
+__all__ = ["Evidence", "Level", "Verdict", "gather", "judge_evidence"]
+
+_SIGNIFICANT = 0.05
+
+
+class Level(StrEnum):
+    """How far a result can be trusted."""
+
+    FINE = "fine"
+    CARE = "with care"
+    NO = "do not use"
+    FAILED = "failed"
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a verdict is made from.
+
+    Parameters
+    ----------
+    converged : bool
+    reasons : sequence of str
+        Why not.
+    held_out : bool
+        Whether rows were held out; otherwise each was left out in turn.
+    hits, n : int
+        Unseen rows inside the 90 % band, and all.
+    low_coverage_p : float
+        Probability of covering no more than that, were the bands right.
+    effective : float
+        Independent rows that would say as much.
+    rmse : float
+    unit : str
+        Of the output.
+    max_relative_error : float
+        NaN where no row is large enough to be judged.
+    prior_set : sequence of str
+        Parameters whose width is the prior's.
+    two_pressures : bool
+        Whether a quadratic in pressure was calibrated at two pressures.
+    inside : str
+        The calibrated range in words.
+    label : str
+        Of the data.
+    """
+
+    converged: bool
+    reasons: Sequence[str]
+    held_out: bool
+    hits: int
+    n: int
+    low_coverage_p: float
+    effective: float
+    rmse: float
+    unit: str
+    max_relative_error: float
+    prior_set: Sequence[str]
+    two_pressures: bool
+    inside: str
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What a busy reader needs.
+
+    Parameters
+    ----------
+    level : Level
+    rule : str
+        Which rule decided.
+    headline : str
+        Two or three words.
+    trust, doubt : str
+        What to trust, and what not.
+    """
+
+    level: Level
+    rule: str
+    headline: str
+    trust: str
+    doubt: str
+
+
+def binomial_p(hits: int, n: int, level: float = 0.9) -> float:
+    """Probability of so few hits or fewer among n independent rows."""
+    return float(binomtest(hits, n, level, alternative="less").pvalue) if n else float("nan")
+
+
+def judge_evidence(e: Evidence) -> Verdict:
+    """Apply the rules."""
+    unseen = f"{e.hits} of {e.n} {'held-out rows' if e.held_out else 'left-out rows'}"
+    error = f"{short(e.rmse)} {e.unit} rms"
+    if math.isfinite(e.max_relative_error):
+        error += f", {percent(e.max_relative_error)} at most"
+    if not e.converged:
+        return Verdict(
+            Level.NO, "not converged", "NOT CONVERGED", "nothing yet",
+            f"any number of this output: {'; '.join(e.reasons[:2])}. Run it with more steps, or "
+            f"give priors that rule out what makes no sense",
+        )  # fmt: skip
+    if not math.isfinite(e.rmse):
+        return Verdict(
+            Level.NO, "not scored", "Not validated", f"the fit inside {e.inside}",
+            "predictions of unseen rows: they could not be scored, since the model has no value "
+            "for part of the posterior there",
+        )  # fmt: skip
+    few = f" (as much as {short(e.effective)} independent ones)" if e.effective < 0.5 * e.n else ""
+    if e.low_coverage_p < _SIGNIFICANT:
+        return Verdict(
+            Level.CARE, "miscovered", "Bands too narrow", f"the median, to {error}",
+            f"the width of the bands: the 90 % band covered only {unseen}, which happens with "
+            f"probability {short(e.low_coverage_p)} if it is right",
+        )  # fmt: skip
+    names = joined([plain(name) for name in e.prior_set]) if e.prior_set else ""
+    if e.two_pressures and e.prior_set:
+        return Verdict(
+            Level.CARE, "extrapolated", "Curvature from the prior",
+            f"the curves at the calibrated pressures; between them the 90 % band, which covered "
+            f"{unseen}{few}",
+            f"the median between the pressures (off by {error}) or anything outside {e.inside}: "
+            f"two pressures do not determine a quadratic, so {names} come from the prior",
+        )  # fmt: skip
+    trust = f"predictions inside {e.inside}, to {error}; the 90 % band covered {unseen}{few}"
+    doubt = f"anything outside {e.inside}"
+    if e.prior_set:
+        doubt += f"; the values of {names}, which the data did not narrow"
+    return Verdict(Level.FINE, "fine", "Sound", trust, doubt)
+
+
+def gather(result: OutputResult) -> Evidence:
+    """Collect the evidence of a result."""
+    calibration, v = result.calibration, result.validation
+    problem, report = calibration.problem, calibration.draws.report
+    covered = v.scores.coverage[0.9]
+    held = held_table(result) is not None
+    complete = bool(np.isfinite(v.draws).all(axis=1).any())
+    pressure = "inflation_pressure_psi"
+    quadratic = problem.bound.model.name == "magic_formula_pressure"
+    return Evidence(
+        converged=report.passed,
+        reasons=report.reasons,
+        held_out=held,
+        hits=covered.hits,
+        n=covered.n,
+        low_coverage_p=(
+            # Held-out rows share a curve, so the binomial law would raise false alarms.
+            coverage_probability(v.draws, covered.hits, 0.9)
+            if held and complete
+            else binomial_p(covered.hits, covered.n)
+        ),
+        effective=effective_rows(v.draws) if complete else float("nan"),
+        rmse=v.scores.rmse,
+        unit=axis_of(problem.bound.model.output).unit,
+        max_relative_error=_largest(v.scores.relative_error),
+        prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
+        two_pressures=quadratic and np.unique(problem.table[pressure]).size == 2,
+        inside=_range_words(result),
+        label=problem.table.label,
+    )
+
+
+def _largest(relative: np.ndarray) -> float:
+    judged = np.abs(relative[np.isfinite(relative)])
+    return float(judged.max()) if judged.size else float("nan")
+
+
+def _range_words(result: OutputResult) -> str:
+    parts = []
+    for name, values in result.calibration.problem.conditions.items():
+        axis = axis_of(name)
+        low, high = axis.factor * float(values.min()), axis.factor * float(values.max())
+        parts.append(f"{axis.name.lower()} {short(low, 3)} to {short(high, 3)} {axis.unit}")
+    return joined(parts)

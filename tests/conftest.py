@@ -1,0 +1,51 @@
+"""Calibrations that many tests read, sampled once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.calibrate import Calibration, calibrate
+from calib.data import Table, hold_out, table_from_arrays
+from calib.datasets import he2019
+from calib.estimate import estimate
+from calib.problem import build_problem
+
+SEED = 2019
+
+
+def he2019_table(name: str) -> Table:
+    columns = he2019.tables()[name]
+    return table_from_arrays(columns, source=f"he2019 {name}", label=he2019.LABEL)
+
+
+def _calibrated(model: str, table: Table) -> Calibration:
+    problem = build_problem(model, table)
+    point = estimate(problem, "least_squares", np.random.default_rng(SEED))
+    return calibrate(problem, SEED, estimates=(point,))
+
+
+@pytest.fixture(scope="session")
+def rut_tables() -> tuple[Table, Table]:
+    """Rows of 18 and 42 psi, and those of 30 psi."""
+    return hold_out(he2019_table("rut_depth"), "inflation_pressure_psi", 30.0)
+
+
+@pytest.fixture(scope="session")
+def pull_tables() -> tuple[Table, Table]:
+    return hold_out(he2019_table("drawbar_pull"), "inflation_pressure_psi", 30.0)
+
+
+@pytest.fixture(scope="session")
+def rut_calibration(rut_tables: tuple[Table, Table]) -> Calibration:
+    return _calibrated("modified_bekker", rut_tables[0])
+
+
+@pytest.fixture(scope="session")
+def pull_calibration(pull_tables: tuple[Table, Table]) -> Calibration:
+    return _calibrated("magic_formula_pressure", pull_tables[0])
+
+
+@pytest.fixture(scope="session")
+def density_calibration() -> Calibration:
+    return _calibrated("ayers_perumpral", he2019_table("bulk_density"))

@@ -1,0 +1,54 @@
+"""Random parameter vectors and conditions of every model, over their physical ranges."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.models import MODELS, Array, BoundModel
+
+# Ranges of the sampled parameters. The density ones keep the implicit equation monotone (a root
+# is then the only one): A2 exceeds the steepest the water term can be, w/sqrt(A3).
+THETA = {
+    "magic_formula": {
+        "K": (0.02, 0.4), "C": (1.0, 2.0), "D": (0.2, 3.0), "G": (0.1, 20.0),
+        "Sh": (-3.0, 3.0), "Sv": (-0.3, 0.3),
+    },
+    "magic_formula_pressure": {
+        "K_lo": (0.05, 0.4), "K_hi": (0.05, 0.4), "K_bend": (-0.3, 0.2),
+        "D_lo": (0.3, 3.0), "D_hi": (0.3, 3.0), "D_bend": (-0.3, 0.1),
+        "G_lo": (1.0, 9.0), "G_hi": (1.0, 9.0), "G_bend": (-0.5, 0.1), "C": (1.0, 2.0),
+    },
+    "bekker": {"z_ref": (3.0, 200.0), "n": (0.4, 3.0)},
+    "modified_bekker": {"z_ref": (3.0, 200.0), "n0": (0.8, 3.0), "n1": (-0.5, 3.0)},
+    "ayers_perumpral": {
+        "gamma_ref": (1.0, 2.0), "C2": (1e-3, 0.05), "C3": (0.02, 0.7), "C4": (5.0, 45.0),
+    },
+    "ayers_perumpral_volumetric": {
+        "gamma_ref": (1.0, 2.0), "A2": (8.0, 45.0), "A3": (3e-3, 0.05), "A4": (0.02, 0.7),
+    },
+}  # fmt: skip
+CONDITIONS = {
+    "slip_ratio": (-0.05, 0.8),
+    "inflation_pressure_psi": (18.0, 42.0),
+    "average_ground_pressure_kpa": (40.0, 250.0),
+    "cone_index_kpa": (200.0, 2500.0),
+    "gravimetric_water_content": (0.0, 0.3),
+    "volumetric_water_content": (0.0, 0.4),
+}
+REFERENCES = {
+    "p_mid_psi": 30.0, "p_half_psi": 12.0, "p_ref_kpa": 120.0, "ci_ref_kpa": 700.0,
+    "water_ref": 0.08,
+}  # fmt: skip
+
+
+def draw(
+    seed: int, name: str, k: int = 3, n: int = 5
+) -> tuple[BoundModel, Array, dict[str, Array]]:
+    """Random parameter vectors, conditions and references of a model, bound."""
+    rng = np.random.default_rng(seed)
+    model = MODELS[name]
+    theta = np.stack([rng.uniform(*THETA[name][p], k) for p in model.parameters], axis=1)
+    conditions = {c: rng.uniform(*CONDITIONS[c], n) for c in model.conditions}
+    needed = model.bind_references(conditions)
+    references = {r: REFERENCES[r] for r in needed}
+    return BoundModel(model, references), theta, conditions

@@ -1,0 +1,189 @@
+"""The whole sampler against posteriors in closed form.
+
+A random number generator and a seed fix every run; tolerances are five Monte Carlo standard errors.
+"""
+
+from __future__ import annotations
+
+import emcee
+import numpy as np
+import pytest
+from scipy import stats
+
+from calib.data import Table
+from calib.errors import CalibError
+from calib.problem import build_problem
+from calib.sampling import sampler as sampler_module
+from calib.sampling.sampler import Draws, SamplerSettings, sample_posterior
+
+from .closed_form import assert_distributed, evidence_error, linear, run
+
+QUICK = SamplerSettings(steps=100, max_steps=100, keep=50)
+
+
+def test_a_normal_posterior_with_known_noise() -> None:
+    model = linear()
+    draws = run(model.log_prob_known, np.zeros(3), np.eye(3))
+    assert draws.report.passed
+    for i in range(3):
+        assert_distributed(draws, lambda t, i=i: t[:, i], model.marginal_known(i))
+    exact = np.linalg.inv(model.precision)
+    size = draws.report.ess_bulk.min()
+    scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
+    # The sd of a sample covariance of normals is at most sqrt(2/size) of the product of sds.
+    error = np.abs(np.cov(draws.flat.T) - exact) / scale
+    assert error.max() < 5.0 * np.sqrt(2.0 / size)
+    assert abs(draws.log_evidence - model.log_evidence_known()) < 5.0 * evidence_error(draws)
+
+
+def test_an_unknown_noise_scale() -> None:
+    model = linear()
+    draws = run(model.log_prob_unknown, np.zeros(4), np.eye(4))
+    assert draws.report.passed
+    for i in range(3):
+        assert_distributed(draws, lambda t, i=i: t[:, i], model.marginal_unknown(i))
+    assert_distributed(draws, lambda t: np.exp(2.0 * t[:, 3]), model.sigma2())
+    assert abs(draws.log_evidence - model.log_evidence_unknown()) < 5.0 * evidence_error(draws)
+
+
+def test_a_banana() -> None:
+    def log_prob(t):
+        bent = t[:, 1] - t[:, 0] ** 2
+        return stats.norm.logpdf(t[:, 0]) + stats.norm.logpdf(bent, 0.0, 0.4)
+
+    draws = run(log_prob, np.zeros(2), np.eye(2))
+    assert draws.report.passed
+    assert_distributed(draws, lambda t: t[:, 0], stats.norm())
+    assert_distributed(draws, lambda t: t[:, 1] - t[:, 0] ** 2, stats.norm(0.0, 0.4))
+
+
+def test_heavy_tails() -> None:
+    target = stats.multivariate_t([1.0, -1.0], [[1.0, 0.6], [0.6, 2.0]], df=3)
+    draws = run(target.logpdf, np.zeros(2), np.eye(2))
+    assert draws.report.passed
+    assert_distributed(draws, lambda t: t[:, 0], stats.t(3, 1.0))
+    assert_distributed(draws, lambda t: t[:, 1], stats.t(3, -1.0, np.sqrt(2.0)))
+
+
+def two_modes(distance: float):
+    def log_prob(t):
+        one, other = (
+            stats.norm.logpdf(t[:, 0] - sign * distance).clip(-1e300) for sign in (-1, 1)
+        )
+        rest = stats.norm.logpdf(t[:, 1])
+        return np.logaddexp(np.log(0.3) + one, np.log(0.7) + other) + rest
+
+    return log_prob
+
+
+def test_two_overlapping_modes_come_out_in_their_proportions() -> None:
+    draws = run(two_modes(2.5), np.array([-2.5, 0.0]), np.eye(2))
+    assert draws.report.passed
+    left = (draws.t[..., 0] < 0.0).mean(axis=(1, 2))  # of each ensemble
+    # Phi(-2.5) of either mode lies on the other side.
+    expected = 0.3 * stats.norm.cdf(2.5) + 0.7 * stats.norm.cdf(-2.5)
+    assert abs(left.mean() - expected) < 5.0 * np.sqrt(0.25 / draws.report.ess_bulk.min())
+
+
+def test_modes_that_are_never_left_are_refused() -> None:
+    """Started in the lesser of two modes 16 sd apart, ensembles disagree, and the gate says so."""
+    short = SamplerSettings(max_steps=800)
+    draws = run(two_modes(8.0), np.array([-8.0, 0.0]), np.eye(2), settings=short)
+    assert not draws.report.passed
+    assert any("R-hat of x0" in reason for reason in draws.report.reasons)
+
+
+def test_the_numbers_follow_from_the_seed(rut_tables: tuple[Table, Table]) -> None:
+    problem = build_problem("modified_bekker", rut_tables[0])
+    first, again, other = (
+        sample_posterior(problem, seed, settings=QUICK) for seed in (3, 3, 4)
+    )  # fmt: skip
+    np.testing.assert_array_equal(first.t, again.t)
+    np.testing.assert_array_equal(first.log_prob, again.log_prob)
+    assert (first.log_evidence, first.efficiency) == (again.log_evidence, again.efficiency)
+    assert not np.isclose(first.t, other.t).any()
+
+
+def test_ensembles_are_seeded_independently(rut_calibration) -> None:
+    t = rut_calibration.draws.t
+    for i in range(t.shape[0]):
+        for j in range(i):
+            assert not np.isclose(t[i], t[j], rtol=1e-12, atol=0.0).any()
+
+
+def test_log_densities_belong_to_the_draws(rut_calibration) -> None:
+    draws: Draws = rut_calibration.draws
+    picked = draws.t[:, ::10, ::20]
+    expected = rut_calibration.problem.log_prob(picked.reshape(-1, picked.shape[-1]))
+    np.testing.assert_allclose(draws.log_prob[:, ::10, ::20].ravel(), expected, rtol=1e-10)
+
+
+def test_a_run_extends_itself_until_the_gate_passes() -> None:
+    model = linear()
+    short = SamplerSettings(steps=10, max_steps=10_000)
+    draws = run(model.log_prob_known, np.zeros(3), np.eye(3), settings=short)
+    assert draws.report.passed
+    assert draws.report.steps > 10
+    assert draws.t.shape == (4, 20, min(200, draws.report.steps), 3)
+
+
+@pytest.mark.parametrize(("steps", "most", "done"), [(10, 39, 20), (200, 30, 30)])
+def test_extension_stops_where_it_is_told_to(steps: int, most: int, done: int) -> None:
+    settings = SamplerSettings(steps=steps, max_steps=most)
+    draws = run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=settings)
+    assert draws.report.steps == done
+    assert not draws.report.passed
+    assert any("steps/tau" in reason for reason in draws.report.reasons)
+
+
+def test_progress_counts_up_to_what_is_planned(rut_tables: tuple[Table, Table]) -> None:
+    seen: list[tuple[int, int]] = []
+    problem = build_problem("modified_bekker", rut_tables[0])
+    told = sample_posterior(
+        problem, 3, settings=QUICK, progress=lambda done, planned: seen.append((done, planned))
+    )
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+    assert seen[-1][0] == seen[-1][1]
+    untold = sample_posterior(problem, 3, settings=QUICK)
+    np.testing.assert_array_equal(told.t, untold.t)
+
+
+def test_emcee_takes_the_random_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Emcee ignores a bad state silently; that must be noticed."""
+
+    class Deaf(emcee.EnsembleSampler):
+        @property
+        def random_state(self):
+            return self._random.get_state()
+
+        @random_state.setter
+        def random_state(self, state):
+            pass
+
+    monkeypatch.setattr(sampler_module.emcee, "EnsembleSampler", Deaf)
+    with pytest.raises(RuntimeError, match="did not take the random state"):
+        run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=QUICK)
+
+
+def test_no_parameters_of_positive_probability(rut_tables: tuple[Table, Table]) -> None:
+    problem = build_problem("modified_bekker", rut_tables[0], fixed={"sigma": -1.0})
+    with pytest.raises(CalibError, match="no parameter values of positive probability") as caught:
+        sample_posterior(problem, 1)
+    assert "he2019 rut_depth" in str(caught.value)
+    assert "to mend:" in str(caught.value)
+
+
+def test_a_density_that_is_almost_nowhere_positive_cannot_be_started() -> None:
+    def log_prob(t):
+        return np.where((t == 0.0).all(axis=1), 0.0, -np.inf)
+
+    with pytest.raises(CalibError, match="could not be started"):
+        run(log_prob, np.zeros(2), np.eye(2), settings=QUICK)
+
+
+def test_flat_draws_keep_their_vectors(rut_calibration) -> None:
+    draws: Draws = rut_calibration.draws
+    np.testing.assert_array_equal(draws.flat[0], draws.t[0, 0, 0])
+    np.testing.assert_array_equal(draws.flat[-1], draws.t[-1, -1, -1])
+    assert 0.0 < draws.acceptance < 1.0
+    assert draws.evaluations > draws.t[..., 0].size
