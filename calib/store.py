@@ -7,6 +7,7 @@ A run folder holds everything that is needed to predict from it and to compute i
 from __future__ import annotations
 
 import json
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -55,27 +56,30 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
         problem.priors.sample(generator(calibration.seed, calibration.label, "prior"), N_PRIOR)
     )
     ensembles = np.repeat(np.arange(draws.t.shape[0]), draws.t.shape[1])
-    tree: xr.DataTree = az.from_dict(
-        {
-            "posterior": dict(calibration.parameters),
-            "prior": _prior_group(calibration, prior),
-            "posterior_predictive": {
-                output: problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
+    with warnings.catch_warnings():
+        # Walkers are chains, of which there are more than draws in a short run.
+        warnings.filterwarnings("ignore", "Found chain dimension to be longer", UserWarning)
+        tree: xr.DataTree = az.from_dict(
+            {
+                "posterior": dict(calibration.parameters),
+                "prior": _prior_group(calibration, prior),
+                "posterior_predictive": {
+                    output: problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
+                },
+                "log_likelihood": {output: problem.log_likelihood_rows(draws.flat).reshape(shape)},
+                "sample_stats": {
+                    "lp": draws.log_prob.reshape(chains, steps),
+                    "ensemble": np.repeat(ensembles[:, None], steps, axis=1),
+                },
+                "observed_data": {output: problem.observed},
+                "constant_data": dict(problem.conditions),
             },
-            "log_likelihood": {output: problem.log_likelihood_rows(draws.flat).reshape(shape)},
-            "sample_stats": {
-                "lp": draws.log_prob.reshape(chains, steps),
-                "ensemble": np.repeat(ensembles[:, None], steps, axis=1),
+            dims={
+                output: ["row"],
+                **{name: ["row"] for name in problem.conditions},
             },
-            "observed_data": {output: problem.observed},
-            "constant_data": dict(problem.conditions),
-        },
-        dims={
-            output: ["row"],
-            **{name: ["row"] for name in problem.conditions},
-        },
-        attrs={"/": {"run": json.dumps(_describe(calibration))}},
-    )
+            attrs={"/": {"run": json.dumps(_describe(calibration))}},
+        )
     return tree
 
 
@@ -162,8 +166,7 @@ def load_calibration(folder: Path) -> Calibration:
     with _damage(folder / "posterior.nc"):
         t, log_prob = _read_posterior(folder / "posterior.nc", problem.priors, shape)
     with _damage(folder / "run.json"):
-        draws = _draws(meta, t, log_prob)
-    return Calibration(problem, draws, seed, label)
+        return Calibration(problem, _draws(meta, t, log_prob), seed, label)
 
 
 @contextmanager

@@ -208,9 +208,7 @@ def he2019_tasks() -> tuple[Task, ...]:
         "drawbar_pull": ("magic_formula_pressure", held),
         "rut_depth": ("modified_bekker", held),
     }
-    return tuple(
-        Task(key, model, load_he2019(key), rows) for key, (model, rows) in models.items()
-    )
+    return tuple(Task(key, model, load_he2019(key), rows) for key, (model, rows) in models.items())
 
 
 def run_study(

@@ -54,9 +54,7 @@ def test_the_posterior_is_prior_times_likelihood(rut_problem: Problem) -> None:
     assert rut_problem.log_prob(t[0]).shape == (1,)
 
 
-def test_chunks_make_no_difference(
-    pull_problem: Problem, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_chunks_make_no_difference(pull_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
     t = near(pull_problem)
     whole = pull_problem.log_likelihood(t)
     for cells in (1, 3 * len(pull_problem.table)):  # one vector, and three, at a time

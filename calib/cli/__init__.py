@@ -30,7 +30,7 @@ def main() -> None:
     # A figure is never shown on a screen: no display, no toolkit.
     os.environ.setdefault("MPLBACKEND", "Agg")
     try:
-        app()
+        app(prog_name="calib")
     except CalibError as error:
         print(f"calib: {error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -168,7 +168,9 @@ def data(
     from calib.datasets import he2019
 
     if name != "he2019":
-        raise CalibError(f"there is no data set {name!r}", allowed="he2019")
+        raise CalibError(
+            f"there is no data set {name!r}", allowed="he2019", mend="use this name"
+        )  # fmt: skip
     try:
         existing = [f"{key}.csv" for key in he2019.tables() if (out / f"{key}.csv").exists()]
         if existing and not overwrite:
@@ -247,6 +249,7 @@ def _parse_hold_out(text: str | None) -> HoldOut | None:
         raise CalibError(
             f"cannot read --hold-out {text!r}",
             allowed="COLUMN=VALUE, for instance inflation_pressure_psi=30",
+            mend="name a column with its unit, an equals sign and one number",
         ) from None
 
 

@@ -74,11 +74,12 @@ def ensembles_plate(result: OutputResult) -> Plate:
 
 def _pairs(rows: int, per_row: int, n: int) -> tuple[Figure, list[tuple[Axes, Axes]]]:
     """Axes in pairs, trace wider than ranks, laid out in millimetres."""
-    height, gap_y, top, bottom = (21.0 if per_row == 3 else 24.0), 5.0, 3.0, 17.0
+    height, gap_y, top, bottom = (21.0 if per_row == 3 else 24.0), 5.5, 5.5, 17.0
     cell = 180.0 / per_row
     total = top + bottom + rows * height + (rows - 1) * gap_y
     fig = Figure(figsize=(180.0 / 25.4, total / 25.4))
-    left, between, right = 14.5, 10.0, 2.5
+    # Two in a row leave room for longer tick labels.
+    left, between, right = (14.5, 10.0, 2.5) if per_row == 3 else (20.0, 11.0, 3.0)
     span = cell - left - between - right
     found = []
     for k in range(n):

@@ -140,10 +140,12 @@ def _caption(result: OutputResult, reported: Mapping[str, Array], published: boo
         n: float(distances(reported[n].ravel(), np.array([best.reported[n]]))[0][0]) for n in names
     }
     far = max(names, key=lambda n: abs(off[n]))
+    distance = abs(off[far])
+    how = f"within {short(distance)}" if distance < 100.0 else "up to more than 100"
     text = (
         f"The lowest cost, {short(best.cost, 3)}, is that of "
-        f"{METHOD_NAMES.get(best.method, best.method)}; its estimates lie within "
-        f"{short(abs(off[far]))} posterior sds of the posterior mean ({plain(far)} is farthest)."
+        f"{METHOD_NAMES.get(best.method, best.method)}; its estimates lie "
+        f"{how} posterior sds of the posterior mean ({plain(far)} is farthest)."
     )
     printed = published_parameters(result.calibration.problem.bound.model.name)
     if published and printed:
@@ -188,6 +190,7 @@ def by_pressure_plate(result: OutputResult, *, published: bool) -> Plate | None:
     for ax, name in zip(axes[0], "BCDE", strict=True):
         handles |= _coefficient(ax, result, name, joint[name], published)
         ax.set_xticks(range(len(pressures)), [f"{p:g}" for p in pressures])
+        ax.tick_params(axis="x", labelsize=7.0 if len(pressures) <= 5 else 5.5)
         ax.set_xlim(-0.5, len(pressures) - 0.5)
         ax.set_xlabel("Pressure (psi)")
         ax.set_ylabel(parameter_label(name, units[name]))

@@ -55,6 +55,17 @@ class Axis:
         """Convert from the canonical unit."""
         return np.asarray(values) * self.factor
 
+    def range_text(self, values: Array) -> str:
+        """Say from where to where values go."""
+        low, high = (self.value_text(float(f(values))) for f in (np.min, np.max))
+        return f"{low} to {high} {self.unit}"
+
+    def value_text(self, value: float) -> str:
+        """Write one value, without the unit: whole numbers whole."""
+        scaled = self.factor * value
+        text = f"{scaled:.0f}" if abs(scaled) >= 1000.0 else f"{scaled:.3g}"
+        return text.replace("-", MINUS)
+
 
 _AXES: Mapping[str, Axis] = MappingProxyType(
     {

@@ -11,13 +11,13 @@ from scipy.stats import beta, norm, shapiro
 
 from calib.figures.labels import NO_UNIT, axis_of, plain, short, unit_plain
 from calib.figures.plate import Plate
-from calib.figures.rows import data_word, groups, held_table, x_column
+from calib.figures.rows import Group, data_word, groups, held_table, x_column
 from calib.figures.style import BLACK, BLUE, CYCLE, DASHES, GREY, MARKERS, legend_below, panels
 from calib.models.base import Array
 from calib.problem import Problem
 from calib.study import OutputResult
 
-__all__ = ["Standardised", "residuals_plate", "standardise"]
+__all__ = ["Standardised", "residuals_plate", "sign_changes", "standardise"]
 
 _N_DRAWS = 1000
 
@@ -98,7 +98,7 @@ def _scatter(
     handles: dict[str, Any] = {}
     ax.axhspan(-2.0, 2.0, color="#eeeeee", lw=0.0)
     ax.axhline(0.0, color=GREY, lw=0.6)
-    for k, group in enumerate(groups(result)):
+    for k, group in enumerate(_groups(result)):
         colour, marker = CYCLE[k % len(CYCLE)], MARKERS[k % len(MARKERS)]
         name = group.title or data_word(result)
         if group.fitted.any():
@@ -115,6 +115,15 @@ def _scatter(
     top = max(2.6, 1.08 * largest)
     ax.set_ylim(-top, top)
     return handles
+
+
+def _groups(result: OutputResult) -> list[Group]:
+    """Every row in a group; in one, where there are more groups than looks."""
+    found = groups(result, most=False)
+    if len(found) <= len(CYCLE):
+        return found
+    fitted, held = (np.any([getattr(g, a) for g in found], axis=0) for a in ("fitted", "held_out"))
+    return [Group("", False, None, float("nan"), fitted, held)]
 
 
 def _quantiles(ax: Axes, residual: Array) -> None:
@@ -151,13 +160,12 @@ def _replicated(ax: Axes, result: OutputResult) -> dict[str, Any]:
 def _caption(result: OutputResult, fitted: Standardised, held: Standardised | None) -> str:
     n, large = fitted.residual.size, int((np.abs(fitted.residual) > 2.0).sum())
     p = float(shapiro(fitted.residual).pvalue) if n >= 3 else float("nan")
-    x = result.calibration.problem.table[x_column(result)]
-    runs, expected = _runs(result, fitted.residual, x)
+    runs, pairs = sign_changes(result, fitted.residual)
     text = (
         f"Beyond 2 noise sds lie {large} of {n} residuals ({short(0.046 * n)} expected); they "
         f"{'are compatible with' if p > 0.05 else 'depart from'} a normal law (Shapiro-Wilk p = "
         f"{short(p)}) and change sign {runs} times along {axis_of(x_column(result)).name.lower()} "
-        f"where independent ones would do so about {expected:.0f} times."
+        f"where independent ones would do so about {0.5 * pairs:.0f} times."
     )
     sigma = result.calibration.summary.get("sigma")
     if sigma is not None:
@@ -171,11 +179,16 @@ def _caption(result: OutputResult, fitted: Standardised, held: Standardised | No
     return text
 
 
-def _runs(result: OutputResult, residual: Array, x: Array) -> tuple[int, float]:
-    """Sign changes along x within each group, and how many independent signs would show."""
+def sign_changes(result: OutputResult, residual: Array) -> tuple[int, int]:
+    """Count sign changes of residuals along x within each group, and neighbours in all.
+
+    Independent residuals change sign between half of the neighbours; a curve that misses a
+    pattern leaves long runs of one sign.
+    """
+    x = result.calibration.problem.table[x_column(result)]
     changes, pairs = 0, 0
-    for group in groups(result):
+    for group in groups(result, most=False):
         sign = np.sign(residual[group.fitted][np.argsort(x[group.fitted], kind="stable")])
         changes += int((sign[1:] != sign[:-1]).sum())
         pairs += max(0, sign.size - 1)
-    return changes, 0.5 * pairs
+    return changes, pairs

@@ -22,7 +22,7 @@ __all__ = ["Group", "data_word", "grid", "group_column", "groups", "held_table",
 
 MAX_PANELS = 6
 _N_DRAWS = 1000
-_GRID = 60
+_GRID = 100
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,16 @@ def group_column(result: OutputResult) -> str | None:
     return second[0] if second else None
 
 
-def groups(result: OutputResult) -> list[Group]:
+def groups(result: OutputResult, *, most: bool = True) -> list[Group]:
     """Split the rows into at most six panels: those held out and the most populated others.
 
-    More distinct values than panels are pooled into thirds of the rows.
+    More distinct values than twice that are pooled into thirds of the rows.
+
+    Parameters
+    ----------
+    result : OutputResult
+    most : bool
+        Whether to stop at six; otherwise every row is in a group.
     """
     column = group_column(result)
     fitted, held = result.calibration.problem.table, held_table(result)
@@ -105,14 +111,28 @@ def groups(result: OutputResult) -> list[Group]:
         found.append(
             Group(_title(axis, low, high, only_held), only_held, column, value, mine, theirs)
         )
-    kept = sorted(found, key=lambda g: (not g.held, -g.size))[:MAX_PANELS]
-    return sorted(kept, key=lambda g: g.value)
+    return _kept(found) if most else found
+
+
+def _kept(found: list[Group]) -> list[Group]:
+    """At most six: those held out first, then the most populated; of equals, spread out."""
+    if len(found) <= MAX_PANELS:
+        return found
+    held = [g for g in found if g.held][:MAX_PANELS]
+    others = [g for g in found if not g.held]
+    room = MAX_PANELS - len(held)
+    if len({g.size for g in others}) == 1:
+        picked = np.linspace(0, len(others) - 1, room).round().astype(int).tolist()
+        others = [others[i] for i in picked]
+    else:
+        others = sorted(others, key=lambda g: -g.size)[:room]
+    return sorted([*held, *others], key=lambda g: g.value)
 
 
 def _title(axis: Axis, low: float, high: float, held: bool) -> str:
-    a, b = axis.factor * low, axis.factor * high
+    a, b = axis.value_text(low), axis.value_text(high)
     name = "water " if axis.name == "Water content" else ""
-    value = f"{a:.4g}" if f"{a:.4g}" == f"{b:.4g}" else f"{a:.3g} to {b:.3g}"
+    value = a if a == b else f"{a} to {b}"
     return f"{name}{value} {axis.unit}{', held out' if held else ''}"
 
 

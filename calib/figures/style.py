@@ -55,7 +55,9 @@ _RC: dict[Any, Any] = {
     "savefig.facecolor": "white",
     "mathtext.fontset": "dejavusans",
     "axes.unicode_minus": True,
-    "path.simplify": True,
+    # Long tick labels would push the axis label off the figure: a common power of ten instead.
+    "axes.formatter.limits": (-2, 4),
+    "axes.formatter.use_mathtext": True,
 }
 
 

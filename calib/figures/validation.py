@@ -19,11 +19,13 @@ from calib.figures.style import (
     DASHES,
     GREY,
     ORANGE,
+    VERMILION,
     legend_below,
     note,
     panels,
 )
 from calib.study import OutputResult
+from calib.validate import PARETO_K_MAX
 
 __all__ = ["validation_plate"]
 
@@ -37,20 +39,37 @@ def validation_plate(result: OutputResult, *, published: bool) -> Plate:
     published : bool
         Whether to add the published fit's errors and the limits that the source states.
     """
-    fig, axes = panels(2, 2, height=52.0, left=15.0, bottom=22.0, gap_x=17.0, gap_y=15.0, top=6.0)
-    handles = draw_predicted_observed(axes[0, 0], result)
+    fig, axes = panels(2, 2, height=52.0, left=15.0, bottom=22.0, gap_x=17.0, gap_y=15.0, top=10.0)
+    density = result.calibration.problem.bound.model.output == "bulk_density_g_cm3"
+    if density and result.validation.pareto_k is not None:
+        # The density figure before this one has predicted against observed already.
+        first, handles = "Can rows be left out by reweighting?", _pareto(axes[0, 0], result)
+    else:
+        first, handles = "Predicted against observed", draw_predicted_observed(axes[0, 0], result)
     handles |= _relative_errors(axes[0, 1], result, published)
     _pit(axes[1, 0], result)
     handles |= _coverage(axes[1, 1], result)
     for ax, title in zip(
         axes.flat,
-        ("Predicted against observed", f"(Predicted {MINUS} observed)/observed",
+        (first, f"(Predicted {MINUS} observed)/observed",
          "Are the bands calibrated? (PIT)", "Coverage of the bands"),
         strict=True,
     ):  # fmt: skip
         ax.set_title(title, loc="left")
     legend_below(fig, list(handles.values()), list(handles), 3)
     return Plate(fig, "validation", _caption(result), "Validation on rows that were not fitted")
+
+
+def _pareto(ax: Axes, result: OutputResult) -> dict[str, Any]:
+    v, axis = result.validation, axis_of(x_column(result))
+    k = np.zeros(0) if v.pareto_k is None else v.pareto_k
+    x = axis.scale(v.table[x_column(result)])
+    (points,) = ax.plot(x, k, "o", color=BLACK, ms=3.8, mec="white", mew=0.4)
+    line = ax.axhline(PARETO_K_MAX, color=VERMILION, lw=1.0, ls=DASHES[1])
+    ax.set_ylim(min(0.0, 1.1 * float(k.min())), max(0.8, 1.1 * float(k.max())))
+    ax.set_xlabel(axis.label)
+    ax.set_ylabel(f"Pareto k ({NO_UNIT})")
+    return {f"Pareto k ({data_word(result)})": points, "above: fitted again": line}
 
 
 def _relative_errors(ax: Axes, result: OutputResult, published: bool) -> dict[str, Any]:
@@ -124,15 +143,15 @@ def _caption(result: OutputResult) -> str:
     held = held_table(result) is not None
     outside = bool(ks_distance(s.pit) > pit_half_width(v.draws))
     missing = int(np.isnan(s.relative_error).sum())
-    who = f"{s.n} held-out rows ({data_word(result)})" if held else (
-        f"{s.n} rows, each predicted without itself ({data_word(result)})"
-    )  # fmt: skip
+    label = f" ({data_word(result)})" if result.task.table.label else ""
+    who = f"{s.n} held-out rows" if held else f"{s.n} rows, each predicted without itself,"
     left = f" ({missing} rows near zero are not judged)" if missing else ""
     cover = "; ".join(f"{100 * c.level:g} % band {c.hits} of {c.n}" for c in s.coverage.values())
     above = int((np.abs(s.relative_error) > 0.06).sum())
+    many = "no row" if above == 0 else "1 row" if above == 1 else f"{above} rows"
     text = (
-        f"Over {who} the median is wrong by {short(s.rmse)} {axis.unit} rms and by "
-        f"{percent(s.max_relative_error)} at most{left}, {above} rows by more than 6 %. "
+        f"Over {who}{label} the median is wrong by {short(s.rmse)} {axis.unit} rms and by "
+        f"{percent(s.max_relative_error)} at most{left}, {many} by more than 6 %. "
         f"Covered: {cover}. The PIT {'leaves' if outside else 'stays inside'} its 95 % band."
     )
     effective = effective_rows(v.draws)

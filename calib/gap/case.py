@@ -87,7 +87,11 @@ class Campaigns:
 
     def at(self, table: Table) -> View:
         """Return the view of other conditions, with the same references."""
-        return replace(self.view, conditions=dict(table.columns))
+        return self.at_conditions(table.columns)
+
+    def at_conditions(self, conditions: Mapping[str, Array]) -> View:
+        """Return the view of conditions given as canonical columns."""
+        return replace(self.view, conditions=dict(conditions))
 
 
 def read_case(folder: Path) -> Case:

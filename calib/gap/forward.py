@@ -141,6 +141,8 @@ class Forward:
         pressure = self._scaled(view, "inflation_pressure_psi")
         if pressure is None:
             pressure = self._scaled(view, "average_ground_pressure_kpa")
+        if "size" in wanted:
+            basis.append(np.ones(n))
         if "slip" in wanted and slip is not None:
             basis += [slip, 1.5 * slip**2 - 0.5]
         if "pressure" in wanted and pressure is not None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-
 from typing import Literal
 
 import numpy as np
@@ -13,12 +12,22 @@ from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Hypothesis
 from calib.priors import Priors, default_prior_path, read_priors
 
-__all__ = ["LN_PRIOR", "effect_priors", "pair", "singles", "split_testable", "unknowns"]
+__all__ = [
+    "LN_PAIR_TO_SINGLE",
+    "LN_PRIOR",
+    "effect_priors",
+    "pair",
+    "singles",
+    "split_testable",
+    "unknowns",
+]
 
-# Prior probabilities of the kinds; singles and pairs share theirs equally.
-PRIOR = {"none": 0.40, "unknown": 0.07, "parameter_shift": 0.07, "single": 0.36, "pair": 0.10}
+# Prior probabilities of the kinds; singles share theirs equally, and a given pair is a twentieth
+# as probable as a given single effect.
+PRIOR = {"none": 0.42, "unknown": 0.08, "parameter_shift": 0.08, "single": 0.42}
+LN_PAIR_TO_SINGLE = float(np.log(0.05))
 LN_PRIOR: Mapping[str, float] = {k: float(np.log(v)) for k, v in PRIOR.items()}
-SHIFTS = (0.1, 0.35)
+SHIFTS = (0.1, 0.25, 0.6)
 SMOOTHS = (1.5, 5.0)
 
 

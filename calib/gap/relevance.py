@@ -1,7 +1,8 @@
 """An effect that nobody could notice is no effect: hypotheses are about gaps that matter.
 
 Every hypothesis but `none` is the claim that its effect is *relevant*: that over the field rows
-its root-mean-square size is at least `RELEVANT` noise sds (of a pair: that each of the two is).
+its root-mean-square size is at least `RELEVANT` noise sds (of a pair: that each of the two alone is
+at least `RELEVANT_IN_PAIR`).
 Restricting its prior to relevant sizes multiplies its evidence by
 
     P(relevant | data, hypothesis) / P(relevant | hypothesis),
@@ -23,7 +24,8 @@ from calib.streams import generator
 
 __all__ = ["RELEVANT", "relevance", "sizes"]
 
-RELEVANT = 1.0
+RELEVANT = 1.25
+RELEVANT_IN_PAIR = 0.8
 _N_DRAWS = 160
 
 
@@ -49,7 +51,10 @@ def relevance(fit: Fit, seed: int) -> float:
 
 
 def _log_share(size: Array) -> float:
-    relevant = np.isfinite(size).all(axis=1) & (size >= RELEVANT).all(axis=1)
+    # Draws for which the model has no value say nothing either way.
+    size = size[np.isfinite(size).all(axis=1)]
+    threshold = RELEVANT if size.shape[1] == 1 else RELEVANT_IN_PAIR
+    relevant = (size >= threshold).all(axis=1)
     return float(np.log((relevant.sum() + 0.2) / (size.shape[0] + 0.4)))
 
 
@@ -71,7 +76,9 @@ def sizes(fit: Fit, psi: Array) -> Array:
     columns = []
     for other in without:
         squares = [
-            np.square((full[o.name] - other[o.name])[:, o.rows] / fit.noise[o.name].sd(slip[o.rows]))
+            np.square(
+                (full[o.name] - other[o.name])[:, o.rows] / fit.noise[o.name].sd(slip[o.rows])
+            )
             for o in data.outputs
         ]
         columns.append(np.sqrt(np.concatenate(squares, axis=1).mean(axis=1)))

@@ -12,8 +12,17 @@ from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit, Noise, fit
 from calib.gap.forward import Forward, Hypothesis
+from calib.gap.hypotheses import (
+    LN_PAIR_TO_SINGLE,
+    LN_PRIOR,
+    SHIFTS,
+    pairs_of,
+    singles,
+    split_testable,
+    unknowns,
+)
+from calib.gap.isolate import Isolability, isolability
 from calib.gap.relevance import relevance
-from calib.gap.hypotheses import LN_PRIOR, SHIFTS, pairs_of, singles, split_testable, unknowns
 from calib.models.base import Array
 from calib.sampling.mode import find_mode
 from calib.streams import generator
@@ -37,12 +46,18 @@ class Ranking:
         Sums to one.
     not_testable : mapping of str to str
         Effect to reason.
+    lab_mode : mapping of str to ndarray
+        Internal parameters of each simulator as the lab calibrated it.
+    isolability : Isolability
+        What the design could show before its outcomes were looked at.
     """
 
     fits: Mapping[str, tuple[Fit, ...]]
     log_evidence: Mapping[str, float]
     probability: Mapping[str, float]
     not_testable: Mapping[str, str]
+    lab_mode: Mapping[str, Array]
+    isolability: Isolability
 
     @property
     def order(self) -> list[str]:
@@ -56,13 +71,14 @@ def rank(
     """Fit every hypothesis and rank them."""
     able, unable = split_testable(data, effects)
     lab_mode, noise = _calibrate_lab(data, seed)
+    single = singles(data, able)
+    design = isolability(data, single, lab_mode, noise, seed)
     worker = _Worker(data, lab_mode, noise, seed)
     fits: dict[str, tuple[Fit, ...]] = {"none": (worker.fit(Hypothesis("none")),)}
     fits["unknown"] = tuple(worker.fit(h) for h in unknowns(data))
     fits["parameter_shift"] = tuple(
         worker.fit(Hypothesis("parameter_shift", shift=s)) for s in SHIFTS
     )
-    single = singles(data, able)
     for h in single:
         fits[h.name] = (worker.fit(h),)
     for h in _promising_pairs(single, fits):
@@ -73,22 +89,20 @@ def rank(
         )
         for name, group in fits.items()
     }
-    return Ranking(
-        fits, log_evidence, probabilities(log_evidence, len(single), temperature), unable
-    )
+    probability = probabilities(log_evidence, len(single), temperature)
+    return Ranking(fits, log_evidence, probability, unable, lab_mode, design)
 
 
 def probabilities(
     log_evidence: Mapping[str, float], n_single: int, temperature: float
 ) -> dict[str, float]:
     """Posterior probabilities of hypotheses from their evidence."""
-    n_pairs = max(n_single * (n_single - 1) // 2, 1)
     score = {}
     for name, value in log_evidence.items():
         if name in ("none", "unknown", "parameter_shift"):
             prior = LN_PRIOR[name]
         elif "+" in name:
-            prior = LN_PRIOR["pair"] - np.log(n_pairs)
+            prior = LN_PRIOR["single"] - np.log(max(n_single, 1)) + LN_PAIR_TO_SINGLE
         else:
             prior = LN_PRIOR["single"] - np.log(max(n_single, 1))
         score[name] = value / temperature + prior

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
@@ -20,8 +21,9 @@ from calib.page.tables import (
     prior_rows,
     sampling_facts,
     validation_facts,
+    worst_row,
 )
-from calib.page.verdict import Level, gather, judge_evidence
+from calib.page.verdict import Evidence, Level, gather, judge_evidence
 from calib.study import Failure, OutputResult
 
 __all__ = ["MARKS", "failed_section", "section"]
@@ -53,7 +55,7 @@ def failed_section(key: str, failure: Failure) -> dict[str, Any]:
         "name": output_name(key),
         "model": get_model(failure.task.model).title,
         "failed": True,
-        "error": failure.error,
+        "error": failure.error.removeprefix("CalibError: "),
         "level": str(Level.FAILED.value),
         "mark": MARKS[Level.FAILED],
         "headline": "Failed",
@@ -94,7 +96,7 @@ def section(
         "trust": prose(verdict.trust, names),
         "doubt": prose(verdict.doubt, names),
         "label": problem.table.label,
-        "facts": _card_facts(result),
+        "facts": _card_facts(result, evidence),
         "equation": equation(bound),
         "likelihood": prose(likelihood(bound, axis_of(bound.model.output).name.lower()), names),
         "parametrisation": prose(parametrisation(bound), names),
@@ -121,7 +123,7 @@ def _validation_title(result: OutputResult) -> str:
     return f"Validation on held-out rows: {name.replace('_', ' ')} {held.value:g} {unit}"
 
 
-def _card_facts(result: OutputResult) -> list[list[str]]:
+def _card_facts(result: OutputResult, evidence: Evidence) -> list[list[str]]:
     """The few numbers that belong on the card."""
     calibration, s = result.calibration, result.validation.scores
     report, c = calibration.draws.report, s.coverage[0.9]
@@ -130,16 +132,24 @@ def _card_facts(result: OutputResult) -> list[list[str]]:
     state = "yes" if calibration.converged else "NO"
     how = f"R-hat {max(report.rhat):.3f}, ESS {min(report.ess_bulk):.0f} or more"
     error = f"{short(s.rmse)} {axis.unit} rms"
-    largest = gather(result).max_relative_error
+    if math.isfinite(evidence.max_relative_error):
+        error += f", {percent(evidence.max_relative_error)} at most"
+        error += f" (at {worst_row(result, first=True)})"
+    # An interval for independent rows would claim too much for rows that share a curve.
+    worth = (
+        f"as much evidence as {short(evidence.effective)} independent "
+        f"{'row' if evidence.effective < 1.05 else 'rows'}"
+        if evidence.effective < 0.5 * s.n
+        else f"95 % interval {100 * c.lower:.0f} to {100 * c.upper:.0f} %"
+    )
     return [
         ["Converged", f"{state} ({how})"],
         ["Calibrated on", f"{len(calibration.problem.table)} rows"],
         [
             f"90 % band on {s.n} {'held-out' if held else 'left-out'} rows",
-            f"covered {c.hits} of {c.n} (95 % interval {100 * c.lower:.0f} to "
-            f"{100 * c.upper:.0f} %)",
+            f"covered {c.hits} of {c.n} ({worth})",
         ],
-        ["Error of the median there", f"{error}, {percent(largest)} at most"],
+        ["Error of the median there", error],
     ]
 
 
@@ -152,8 +162,7 @@ def _data_facts(result: OutputResult) -> list[list[str]]:
     facts = [["Source", PurePath(table.source).name], ["Rows", rows]]
     for name in (*problem.bound.model.conditions, problem.bound.model.output):
         axis = axis_of(name)
-        low, high = (axis.factor * float(f(table[name])) for f in (min, max))
-        facts.append([axis.name, f"{short(low, 3)} to {short(high, 3)} {axis.unit}"])
+        facts.append([axis.name, axis.range_text(table[name])])
     if table.ignored:
         facts.append(["Columns not used", ", ".join(table.ignored)])
     facts.append(["SHA-256", table.sha256])

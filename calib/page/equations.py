@@ -8,10 +8,12 @@ from string import ascii_letters
 
 from markupsafe import Markup, escape
 
-from calib.figures.labels import plain
+from calib.figures.labels import MINUS, plain
 from calib.models import BoundModel
 
-__all__ = ["equation", "likelihood", "parametrisation", "prose", "symbol_html", "unit_html"]
+__all__ = [
+    "equation", "likelihood", "parametrisation", "prose", "symbol_html", "unbroken", "unit_html",
+]  # fmt: skip
 
 _GREEK = {"sigma": Markup("&sigma;"), "gamma": Markup("&gamma;"), "theta": Markup("&theta;")}
 
@@ -43,7 +45,7 @@ def prose(text: str, names: Iterable[str]) -> Markup:
     """
     spellings = {plain(name): name for name in names} | {name: name for name in names}
     telling = sorted((s for s in spellings if len(s) > 1 or s not in ascii_letters), key=len)
-    escaped = str(escape(text))
+    escaped = str(escape(unbroken(text)))
     if telling:
         pattern = "|".join(re.escape(s) for s in reversed(telling))
         escaped = re.sub(
@@ -52,6 +54,11 @@ def prose(text: str, names: Iterable[str]) -> Markup:
             escaped,
         )
     return Markup(escaped)
+
+
+def unbroken(text: str) -> str:
+    """Keep numbers and their units on one line."""
+    return re.sub(r"(\d) (%|kN|mm|psi|kPa|g/cm³|rows?\b)", "\\1\N{NO-BREAK SPACE}\\2", text)
 
 
 _MAGIC = (
@@ -119,14 +126,14 @@ _PARAMETRISATIONS: Mapping[str, str] = {
     "bekker": _DEPTH,
     "modified_bekker": _DEPTH,
     "magic_formula": (
-        "The initial slope K = BCD is sampled in the place of B, and G = 1 - E in that of E; B "
-        "and E follow."
+        "The initial slope K = BCD is sampled in the place of B, and G = 1 {minus} E in that "
+        "of E; B and E follow."
     ),
     "magic_formula_pressure": (
         "Each quadratic in pressure is sampled through its values at the lowest (_lo) and highest "
         "(_hi) calibrated pressure, {p_low:g} and {p_high:g} psi, and its relative curvature "
-        "between them (_bend): K = BCD, D and G = 1 - E. The coefficients c1 to c9 of the source "
-        "follow."
+        "between them (_bend): K = BCD, D and G = 1 {minus} E. The coefficients c1 to c9 of "
+        "the source follow."
     ),
 }
 
@@ -141,6 +148,7 @@ def parametrisation(bound: BoundModel) -> str:
     words = {
         "first": "A1" if name.endswith("volumetric") else "C1",
         "exponent": "n" if name == "bekker" else "n0",
+        "minus": MINUS,
     }
     template = _PARAMETRISATIONS.get(name, "The parameters of the equation are sampled.")
     return template.format(**references, **words)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from decimal import Decimal
 
-__all__ = ["NOTHING", "format_interval", "format_like", "format_number", "format_value"]
+__all__ = ["NOTHING", "TIMES", "format_interval", "format_like", "format_number", "format_value"]
 
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"
+TIMES = "\N{MULTIPLICATION SIGN}"
 _SUPERSCRIPTS = str.maketrans("-0123456789", "\N{SUPERSCRIPT MINUS}⁰¹²³⁴⁵⁶⁷⁸⁹")
 # Powers of ten outside this range are written as such.
 _PLAIN = range(-3, 5)
@@ -24,7 +25,8 @@ def format_value(mean: float, sd: float) -> str:
     Returns
     -------
     str
-        Such as ``1.648 ± 0.025`` or ``(3.3 ± 1.2)×10⁵``; a dash where a value is not finite.
+        Such as ``1.648 ± 0.025``, with a power of ten set apart where numbers are large or
+        small; a dash where a value is not finite.
     """
     if not math.isfinite(mean) or not math.isfinite(sd):
         return NOTHING
@@ -32,7 +34,7 @@ def format_value(mean: float, sd: float) -> str:
         return format_number(mean, 6)
     last, power = _scale(mean, sd)
     pair = f"{_rounded(mean, last, power)} ± {_rounded(sd, last, power)}"
-    return pair if power == 0 else f"({pair})×10{str(power).translate(_SUPERSCRIPTS)}"
+    return pair if power == 0 else f"({pair}){_times(power)}"
 
 
 def format_interval(lower: float, upper: float, sd: float) -> str:
@@ -43,7 +45,7 @@ def format_interval(lower: float, upper: float, sd: float) -> str:
         return f"{format_number(lower)} to {format_number(upper)}"
     last, power = _scale(max(abs(lower), abs(upper)), sd)
     pair = f"{_rounded(lower, last, power)} to {_rounded(upper, last, power)}"
-    return pair if power == 0 else f"({pair})×10{str(power).translate(_SUPERSCRIPTS)}"
+    return pair if power == 0 else f"({pair}){_times(power)}"
 
 
 def format_number(value: float, digits: int = 3) -> str:
@@ -55,7 +57,7 @@ def format_number(value: float, digits: int = 3) -> str:
     size = _exponent(value, digits)
     power = 0 if size in _PLAIN else size
     text = _rounded(value, size - digits + 1, power)
-    return text if power == 0 else f"{text}×10{str(power).translate(_SUPERSCRIPTS)}"
+    return text if power == 0 else f"{text}{_times(power)}"
 
 
 def format_like(value: float, printed: str) -> str:
@@ -66,7 +68,11 @@ def format_like(value: float, printed: str) -> str:
     power = int(exponent) if exponent else 0
     last = int(Decimal(mantissa).as_tuple().exponent) + power
     text = _rounded(value, last, power)
-    return f"{text}×10{str(power).translate(_SUPERSCRIPTS)}" if exponent else text
+    return f"{text}{_times(power)}" if exponent else text
+
+
+def _times(power: int) -> str:
+    return f"{TIMES}10{str(power).translate(_SUPERSCRIPTS)}"
 
 
 def _exponent(value: float, digits: int) -> int:
@@ -85,9 +91,6 @@ def _rounded(value: float, last: int, power: int) -> str:
     """Write value/10^power, rounded at the digit of 10^last."""
     decimals = power - last
     shown = Decimal(repr(float(value))).scaleb(-power)
-    if decimals >= 0:
-        text = f"{shown:.{decimals}f}"
-    else:
-        text = f"{round(shown, decimals):.0f}"
+    text = f"{shown:.{decimals}f}" if decimals >= 0 else f"{round(shown, decimals):.0f}"
     zero = Decimal(text) == 0
     return text.lstrip("-") if zero else text.replace("-", _MINUS)

@@ -12,6 +12,7 @@ from markupsafe import Markup
 
 from calib.figures import Plate
 from calib.page.content import failed_section, section
+from calib.page.equations import unbroken
 from calib.study import OutputResult, Study
 
 __all__ = ["render_page"]
@@ -26,6 +27,7 @@ def _template() -> Template:
         trim_blocks=True,
         lstrip_blocks=True,
     )
+    environment.filters["unbroken"] = unbroken
     return environment.get_template("report.html.j2")
 
 

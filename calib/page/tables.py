@@ -18,6 +18,7 @@ from calib.figures.roles import role
 from calib.page.equations import symbol_html, unit_html
 from calib.page.numbers import (
     NOTHING,
+    TIMES,
     format_interval,
     format_like,
     format_number,
@@ -27,7 +28,7 @@ from calib.study import OutputResult
 
 __all__ = [
     "Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows",
-    "sampling_facts", "validation_facts",
+    "sampling_facts", "validation_facts", "worst_row",
 ]  # fmt: skip
 
 _TICK = "\N{CHECK MARK}"
@@ -107,11 +108,20 @@ def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
     varying = [name for name, v in result.calibration.reported.items() if np.ptp(v) > 0.0]
     rows = [_estimate_row(result, name, unit, table) for name, unit in model.reported.items()
             if name in varying]  # fmt: skip
-    notes = [f"{METHOD_NAMES.get(e.method, e.method)}: {e.note}" for e in result.estimates if e.note]
+    notes = [
+        f"{METHOD_NAMES.get(e.method, e.method)}: {e.note}" for e in result.estimates if e.note
+    ]
+    fitted, shown = len(result.calibration.problem.table), len(result.task.table)
+    if fitted < shown and model.name.startswith("magic_formula"):
+        notes.insert(
+            0,
+            f"The estimates are of all {shown} rows, as in the source; the posterior is of the "
+            f"{fitted} that were not held out.",
+        )
     if table:
         notes.insert(0, f"{_TICK}: equal to {table.source} in every printed digit.")
         notes += [f"{table.source}: {table.note}"] if table.note else []
-    return Grid("Point estimates", head, rows, _quality_rows(result.estimates, table), notes)
+    return Grid("", head, rows, _quality_rows(result.estimates, table), notes)
 
 
 def _estimate_row(
@@ -126,17 +136,21 @@ def _estimate_row(
         if printed is None:
             row.append(format_number(value, 4))
         else:
-            agrees = f" {_TICK}" if printed.agrees(value) else ""
-            row.append(_as_printed(value, printed.text) + agrees)
+            row.append(_ticked(_as_printed(value, printed.text), printed.agrees(value)))
     s = result.calibration.summary[name]
     row.append(format_value(s.mean, s.sd))
     return row
 
 
+def _ticked(text: str, agrees: bool) -> Markup:
+    """A number with a tick, or with the room for one, so that digits stay aligned."""
+    return Markup('{}<span class="tick">{}</span>').format(text, _TICK if agrees else "")
+
+
 def _as_printed(value: float, printed: str) -> str:
     """As printed, unless that would leave no digit of an estimate that is far smaller."""
     text = format_like(value, printed)
-    return text if any(c in "123456789" for c in text.split("×")[0]) else format_number(value, 3)
+    return text if any(c in "123456789" for c in text.split(TIMES)[0]) else format_number(value, 3)
 
 
 def _quality_rows(
@@ -154,7 +168,7 @@ def _quality_rows(
         row("RMSE", NOTHING, "rmse", [format_number(e.rmse, 3) for e in estimates]),
         row("R²", NOTHING, "r_squared", [format_number(e.r_squared, 3) for e in estimates]),
         row("Evaluations", NOTHING, "", [f"{e.n_evaluations:,}" for e in estimates]),
-        row("Time", "s", "", [format_number(e.seconds, 2) for e in estimates]),
+        row("Time", "s", "", [f"{e.seconds:.2f}" for e in estimates]),
         row("Stopped by its own rule", NOTHING, "",
             ["yes" if e.converged else "NO" for e in estimates]),
     ]  # fmt: skip
@@ -192,7 +206,7 @@ def _pressure_row(name: str, e: PointEstimate, beside: FittedTable | None) -> li
     return [
         name,
         *(
-            format_like(v, printed[k].text) + (f" {_TICK}" if printed[k].agrees(v) else "")
+            _ticked(format_like(v, printed[k].text), printed[k].agrees(v))
             for k, v in values.items()
         ),
     ]
@@ -208,18 +222,21 @@ def validation_facts(result: OutputResult, effective: float, low_p: float) -> li
     ]
     judged = np.abs(s.relative_error[np.isfinite(s.relative_error)])
     if judged.size:
-        at_row = percent(float(judged.max()))
+        at_row = percent(float(judged.max())) + f", at {worst_row(result)}"
         left = s.n - judged.size
         facts.append([
             "Largest relative error",
             at_row + (f" ({left} rows near zero left out)" if left else ""),
         ])  # fmt: skip
-        facts.append(["Rows off by more than 6 %", f"{int((judged > 0.06).sum())} of {judged.size}"])
+        facts.append(
+            ["Rows off by more than 6 %", f"{int((judged > 0.06).sum())} of {judged.size}"]
+        )
+    if_independent = ", were the rows independent" if effective < 0.5 * s.n else ""
     for level, c in s.coverage.items():
         share, low, high = (f"{100 * x:.0f}" for x in (c.proportion, c.lower, c.upper))
         facts.append([
             f"Covered by the {100 * level:g} % band",
-            f"{c.hits} of {c.n} = {share} % (95 % interval {low} to {high} %)",
+            f"{c.hits} of {c.n} = {share} % (95 % interval {low} to {high} %{if_independent})",
         ])  # fmt: skip
     facts.append(["Chance of covering so few at 90 %, or fewer", format_number(low_p, 2)])
     if np.isfinite(effective):
@@ -233,6 +250,18 @@ def validation_facts(result: OutputResult, effective: float, low_p: float) -> li
     return facts
 
 
+def worst_row(result: OutputResult, *, first: bool = False) -> str:
+    """Conditions, or the first of them, of the row with the largest relative error."""
+    v = result.validation
+    i = int(np.nanargmax(np.abs(v.scores.relative_error)))
+    names = result.calibration.problem.bound.model.conditions[: 1 if first else None]
+    axes = {name: axis_of(name) for name in names}
+    return ", ".join(
+        f"{a.name.lower()} {a.value_text(float(v.table[name][i]))} {a.unit}"
+        for name, a in axes.items()
+    )
+
+
 def sampling_facts(result: OutputResult) -> list[list[str]]:
     """Label and value of everything that is known of the sampling."""
     d = result.calibration.draws
@@ -240,7 +269,9 @@ def sampling_facts(result: OutputResult) -> list[list[str]]:
     ensembles, walkers, stored, _ = d.t.shape
     facts: Mapping[str, str] = {
         "Convergence gate": "passed" if r.passed else f"NOT PASSED: {'; '.join(r.reasons)}",
-        "Ensembles × walkers × steps": f"{ensembles} × {walkers} × {r.steps} ({stored} stored)",
+        f"Ensembles {TIMES} walkers {TIMES} steps": (
+            f"{ensembles} {TIMES} {walkers} {TIMES} {r.steps} ({stored} stored)"
+        ),
         "Largest R-hat (at most 1.01)": f"{np.max(r.rhat):.4f}",
         "Smallest ESS, bulk and tail (at least 400)": (
             f"{np.min(r.ess_bulk):.0f} and {np.min(r.ess_tail):.0f}"

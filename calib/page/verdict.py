@@ -5,8 +5,10 @@ The first rule that applies decides:
 1. not converged: the convergence gate was not passed;
 2. not scored: the validation has no finite error;
 3. miscovered: unseen rows fell outside the 90 % band more often than chance allows;
-4. extrapolated: the prior, not the data, sets what the prediction of unseen rows hangs on;
-5. fine.
+4. misfit: residuals keep their sign along the curve for longer than chance allows;
+5. extrapolated: the prior, not the data, sets what the prediction of unseen rows hangs on;
+6. weak: the median is hardly better than the mean of the calibrated rows;
+7. fine.
 """
 
 from __future__ import annotations
@@ -21,13 +23,15 @@ from scipy.stats import binomtest
 
 from calib.figures.joint import coverage_probability, effective_rows
 from calib.figures.labels import axis_of, joined, percent, plain, short
+from calib.figures.residuals import sign_changes, standardise
 from calib.figures.roles import MOVED, PRIOR, role
-from calib.figures.rows import held_table
+from calib.figures.rows import held_table, x_column
 from calib.study import OutputResult
 
 __all__ = ["Evidence", "Level", "Verdict", "gather", "judge_evidence"]
 
 _SIGNIFICANT = 0.05
+_WEAK_SKILL = 0.5
 
 
 class Level(StrEnum):
@@ -65,6 +69,12 @@ class Evidence:
         Parameters whose width is the prior's.
     two_pressures : bool
         Whether a quadratic in pressure was calibrated at two pressures.
+    skill : float
+        Part of the scatter of unseen rows about the calibrated mean that the median removes.
+    sign_changes, neighbours : int
+        Of the residuals along the curve.
+    along : str
+        What the curve runs along.
     inside : str
         The calibrated range in words.
     label : str
@@ -83,6 +93,10 @@ class Evidence:
     max_relative_error: float
     prior_set: Sequence[str]
     two_pressures: bool
+    skill: float
+    sign_changes: int
+    neighbours: int
+    along: str
     inside: str
     label: str = ""
 
@@ -132,27 +146,38 @@ def judge_evidence(e: Evidence) -> Verdict:
             "predictions of unseen rows: they could not be scored, since the model has no value "
             "for part of the posterior there",
         )  # fmt: skip
-    few = f" (as much as {short(e.effective)} independent ones)" if e.effective < 0.5 * e.n else ""
     if e.low_coverage_p < _SIGNIFICANT:
         return Verdict(
             Level.CARE, "miscovered", "Bands too narrow", f"the median, to {error}",
             f"the width of the bands: the 90 % band covered only {unseen}, which happens with "
             f"probability {short(e.low_coverage_p)} if it is right",
         )  # fmt: skip
+    if e.neighbours and binomial_p(e.sign_changes, e.neighbours, 0.5) < _SIGNIFICANT:
+        return Verdict(
+            Level.CARE, "misfit", "Curve misses a pattern", f"the order of magnitude, to {error}",
+            f"the shape of the curve: residuals change sign {e.sign_changes} times along "
+            f"{e.along}, where about {e.neighbours / 2:.0f} changes would be chance",
+        )  # fmt: skip
     names = joined([plain(name) for name in e.prior_set]) if e.prior_set else ""
     if e.two_pressures and e.prior_set:
         return Verdict(
             Level.CARE, "extrapolated", "Curvature from the prior",
-            f"the curves at the calibrated pressures; between them the 90 % band, which covered "
-            f"{unseen}{few}",
-            f"the median between the pressures (off by {error}) or anything outside {e.inside}: "
-            f"two pressures do not determine a quadratic, so {names} come from the prior",
+            f"the curves at the two calibrated pressures, and the width of the band between them, "
+            f"for {e.inside}",
+            f"the median between the two pressures, off by {error}: two pressures do not "
+            f"determine a quadratic, so {names} come from the prior",
         )  # fmt: skip
-    trust = f"predictions inside {e.inside}, to {error}; the 90 % band covered {unseen}{few}"
-    doubt = f"anything outside {e.inside}"
+    if e.skill < _WEAK_SKILL:
+        return Verdict(
+            Level.CARE, "weak", "Explains little", f"the bands for {e.inside}",
+            f"the median as a prediction: it removes only {percent(max(0.0, e.skill))} of the "
+            f"scatter (variance) of rows it has not seen",
+        )  # fmt: skip
+    trust = f"median and bands for {e.inside}"
+    doubt = "anything outside that range"
     if e.prior_set:
         doubt += f"; the values of {names}, which the data did not narrow"
-    return Verdict(Level.FINE, "fine", "Sound", trust, doubt)
+    return Verdict(Level.FINE, "fine", "Holds on unseen rows", trust, doubt)
 
 
 def gather(result: OutputResult) -> Evidence:
@@ -164,6 +189,8 @@ def gather(result: OutputResult) -> Evidence:
     complete = bool(np.isfinite(v.draws).all(axis=1).any())
     pressure = "inflation_pressure_psi"
     quadratic = problem.bound.model.name == "magic_formula_pressure"
+    changes, neighbours = sign_changes(result, standardise(result, problem).residual)
+    scatter = float(np.mean(np.square(v.observed - problem.observed.mean())))
     return Evidence(
         converged=report.passed,
         reasons=report.reasons,
@@ -182,6 +209,10 @@ def gather(result: OutputResult) -> Evidence:
         max_relative_error=_largest(v.scores.relative_error),
         prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
         two_pressures=quadratic and np.unique(problem.table[pressure]).size == 2,
+        skill=1.0 - v.scores.rmse**2 / scatter if scatter > 0.0 else float("nan"),
+        sign_changes=changes,
+        neighbours=neighbours,
+        along=axis_of(x_column(result)).name.lower(),
         inside=_range_words(result),
         label=problem.table.label,
     )
@@ -196,6 +227,5 @@ def _range_words(result: OutputResult) -> str:
     parts = []
     for name, values in result.calibration.problem.conditions.items():
         axis = axis_of(name)
-        low, high = axis.factor * float(values.min()), axis.factor * float(values.max())
-        parts.append(f"{axis.name.lower()} {short(low, 3)} to {short(high, 3)} {axis.unit}")
+        parts.append(f"{axis.name.lower()} {axis.range_text(values)}")
     return joined(parts)

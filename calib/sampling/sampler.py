@@ -272,8 +272,9 @@ class _Ensemble:
 
     def tau(self, target: int) -> Array:
         chain = self.sampler.get_chain()[-target:]
-        tau = emcee.autocorr.integrated_time(chain, quiet=True, tol=0)
         # A constant chain has no autocorrelation time; it must fail the gate.
+        with np.errstate(invalid="ignore"):
+            tau = emcee.autocorr.integrated_time(chain, quiet=True, tol=0)
         return np.where(np.isfinite(tau), np.maximum(tau, 1.0), np.inf)
 
     @property

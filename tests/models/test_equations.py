@@ -73,6 +73,7 @@ SCALAR = {
     "ayers_perumpral_volumetric": scalar_ayers_perumpral_volumetric,
 }
 
+
 @pytest.mark.parametrize("name", MODELS)
 @settings(max_examples=25, deadline=None)
 @given(seed=SEEDS)

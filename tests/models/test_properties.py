@@ -175,7 +175,7 @@ def test_the_two_density_relations_agree_at_their_common_water(seed: int) -> Non
     for i in range(theta.shape[0]):
         A2, A3 = float(theta[i, 3]), float(theta[i, 1])
         volume_water = conditions["gravimetric_water_content"] * gravimetric[i]
-        if A2 < volume_water.max() / np.sqrt(A3):
+        if volume_water.max() / np.sqrt(A3) > A2:
             continue  # the implicit equation may then have several roots
         other = MODELS["ayers_perumpral_volumetric"].bind(
             {"cone_index_kpa": conditions["cone_index_kpa"],

@@ -66,9 +66,7 @@ def test_a_chain_of_the_move_alone_has_the_targets_distribution() -> None:
 
 def test_a_perfect_proposal_is_always_accepted() -> None:
     q = proposal()
-    sampler = emcee.EnsembleSampler(
-        10, 1, q.log_prob, vectorize=True, moves=[IndependenceMove(q)]
-    )
+    sampler = emcee.EnsembleSampler(10, 1, q.log_prob, vectorize=True, moves=[IndependenceMove(q)])
     sampler.random_state = np.random.RandomState(4).get_state()
     sampler.run_mcmc(q.sample(np.random.default_rng(1), 10), 50)
     assert sampler.acceptance_fraction.min() == 1.0

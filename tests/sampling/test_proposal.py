@@ -48,9 +48,7 @@ def test_a_mixture_has_the_weighted_density() -> None:
     t = np.random.default_rng(1).normal(1.0, 4.0, (50, 3))
     one = stats.multivariate_t(MEAN, SCALE, 5.0).pdf(t)
     other = stats.multivariate_t(MEAN + 4.0, SCALE, 20.0).pdf(t)
-    np.testing.assert_allclose(
-        mixture().log_prob(t), np.log(0.25 * one + 0.75 * other), rtol=1e-10
-    )
+    np.testing.assert_allclose(mixture().log_prob(t), np.log(0.25 * one + 0.75 * other), rtol=1e-10)
 
 
 def test_draws_of_a_mixture_follow_its_density() -> None:

@@ -81,6 +81,7 @@ class PressureGaugeBias(Effect):
     name = "pressure_gauge_bias"
     title = "true inflation pressure differs from the recorded one"
     parameters = ("gain", "offset")
+    form = ("size", "slip")
     outputs = (DRAWBAR, RUT)
     covariates = ("inflation_pressure_psi",)
     varies = False

@@ -1,0 +1,120 @@
+"""Diagnose a case: isolability, where, which, how far."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.gap.case import Campaigns, Case, campaigns
+from calib.gap.effects import EFFECTS, Effect, View
+from calib.gap.mixture import Mixture, Truth, mixture
+from calib.gap.next_measurement import NextMeasurement, next_measurements
+from calib.gap.shrink import FreshPrediction, Shrink, predict_fresh, shrink
+from calib.gap.where import Region, RowGap, regions, row_gaps
+from calib.gap.which import Ranking, rank
+from calib.models.base import Array
+
+__all__ = ["Diagnosis", "diagnose", "verdict"]
+
+# A single hypothesis is named when it is at least this probable.
+NAMED = 0.5
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found for a case.
+
+    Parameters
+    ----------
+    data : Campaigns
+    ranking : Ranking
+    verdict : {"effect", "none", "unknown", "ambiguous"}
+    truth : Truth
+        At the field rows.
+    gaps : tuple of RowGap
+    regions : tuple of Region
+    shrink : mapping of str to Shrink
+    fresh : mapping of str to FreshPrediction
+        Empty without conditions to predict.
+    next_measurements : tuple of NextMeasurement
+        What would separate hypotheses that are still in play.
+    mixture : Mixture
+        To predict at other conditions.
+    seed : int
+    """
+
+    data: Campaigns
+    ranking: Ranking
+    verdict: str
+    truth: Truth
+    gaps: tuple[RowGap, ...]
+    regions: tuple[Region, ...]
+    shrink: Mapping[str, Shrink]
+    fresh: Mapping[str, FreshPrediction]
+    next_measurements: tuple[NextMeasurement, ...]
+    mixture: Mixture
+    seed: int
+
+
+def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFECTS) -> Diagnosis:
+    """Find where a calibrated simulator misses, which effect it lacks, and what adding it gains.
+
+    Parameters
+    ----------
+    case : Case
+    seed : int
+        Same seed, same numbers.
+    effects : mapping of str to Effect, optional
+        The effects to consider, by name.
+
+    Returns
+    -------
+    Diagnosis
+
+    Raises
+    ------
+    CalibError
+        If the case cannot be diagnosed: an output or a condition is missing, too few rows.
+    """
+    data = campaigns(case)
+    ranking = rank(data, seed, effects=effects)
+    mixed = mixture(data, ranking, seed)
+    truth = mixed.at(data.view)
+    gaps = row_gaps(data, truth)
+    # Without conditions to predict, the field's own are the best guess at where it will be used.
+    target = data.view if case.fresh is None else data.at(case.fresh)
+    at_target = truth if case.fresh is None else mixed.at(target)
+    before = _calibrated(data, ranking, target)
+    return Diagnosis(
+        data,
+        ranking,
+        verdict(ranking.probability),
+        truth,
+        gaps,
+        regions(data, truth, gaps),
+        shrink(data, at_target, before),
+        {} if case.fresh is None else predict_fresh(at_target, before),
+        next_measurements(data, ranking, seed),
+        mixed,
+        seed,
+    )
+
+
+def verdict(probability: Mapping[str, float]) -> str:
+    """Name the outcome: a hypothesis at least `NAMED` probable, or `ambiguous`."""
+    best = max(probability, key=lambda name: probability[name])
+    if probability[best] < NAMED:
+        return "none" if best == "none" else "ambiguous"
+    return best if best in ("none", "unknown") else "effect"
+
+
+def _calibrated(data: Campaigns, ranking: Ranking, view: View) -> dict[str, Array]:
+    """Predict with the simulator as the lab calibrated it, in the outputs' units."""
+    predicted = {}
+    for o in data.outputs:
+        theta = o.priors.to_natural(ranking.lab_mode[o.name][None])
+        conditions = o.problem.bound.model.select(view.conditions)
+        predicted[o.name] = np.asarray(o.problem.bound.predict(theta, conditions)[0])
+    return predicted

@@ -1,0 +1,111 @@
+"""What a diagnosis writes: diagnosis.json, fresh_prediction.csv (see the contract)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.data import write_table
+from calib.gap.diagnose import Diagnosis
+from calib.gap.fit import Fit
+from calib.models.base import Array
+from calib.outputs import OUTPUTS
+
+__all__ = ["SCHEMA", "document", "write_diagnosis"]
+
+SCHEMA = "calib/diagnosis/1"
+
+
+def document(found: Diagnosis) -> dict[str, Any]:
+    """Return a diagnosis as the contract's JSON document."""
+    ranking = found.ranking
+    return {
+        "schema": SCHEMA,
+        "verdict": found.verdict,
+        "effects": [
+            {
+                "name": name,
+                "probability": ranking.probability[name],
+                "parameters": _parameters(ranking.fits[name][0]),
+            }
+            for name in ranking.order
+        ],
+        "not_testable": [{"name": n, "reason": r} for n, r in ranking.not_testable.items()],
+        "where": [
+            {
+                "output": g.output,
+                "row": int(row),
+                "gap": float(gap),
+                "gap_sd": float(sd),
+                "probability": float(p),
+            }
+            for g in found.gaps
+            for row, gap, sd, p in zip(g.rows, g.gap, g.sd, g.probability, strict=True)
+        ],
+        "regions": [
+            {
+                "output": r.output,
+                "conditions": {k: list(v) for k, v in r.conditions.items()},
+                "gap": r.gap,
+                "probability": r.probability,
+            }
+            for r in found.regions
+        ],
+        "shrink": {
+            name: {
+                "rmse_before": s.rmse_before,
+                "rmse_after": s.rmse_after,
+                "fraction": s.fraction,
+                "interval": list(s.interval),
+                "noise_floor": s.noise_floor,
+            }
+            for name, s in found.shrink.items()
+        },
+        "next_measurement": [
+            {
+                "separates": list(m.separates),
+                "conditions": dict(m.conditions),
+                "gain_nats": m.gain_nats,
+            }
+            for m in found.next_measurements
+        ],
+    }
+
+
+def _parameters(fit: Fit) -> dict[str, dict[str, float]]:
+    """Effect parameters with their sds, natural scale, prefixed with the effect in a pair."""
+    sd = np.sqrt(np.diag(fit.covariance))
+    effects = fit.forward.hypothesis.effects
+    found = {}
+    for effect, priors, part in zip(
+        effects, fit.forward.hypothesis.effect_priors, fit.forward.phi_slices, strict=True
+    ):
+        natural = priors.to_natural(fit.psi[None, part])[0]
+        for prior, value, s in zip(priors.entries, natural, sd[part], strict=True):
+            name = prior.name if len(effects) == 1 else f"{effect.name}.{prior.name}"
+            # A log-normal parameter's sd is that of its logarithm times its value.
+            found[name] = {"mean": float(value), "sd": float(s * value if prior.log else s)}
+    return found
+
+
+def write_diagnosis(found: Diagnosis, folder: Path) -> None:
+    """Write the files of a diagnosis into an existing folder."""
+    (folder / "diagnosis.json").write_text(json.dumps(document(found), indent=1) + "\n")
+    fresh = found.data.case.fresh
+    if fresh is None:
+        return
+    columns: dict[str, Array | list[str]] = {
+        name: [row[j] for row in fresh.text] for j, name in enumerate(fresh.header)
+    }
+    if not fresh.text:
+        columns = dict(fresh.columns)
+    for name, prediction in found.fresh.items():
+        column = OUTPUTS[name]
+        columns[f"{column}_before"] = prediction.before
+        columns[f"{column}_after"] = prediction.after
+        columns[f"{column}_after_lower"] = prediction.lower
+        columns[f"{column}_after_upper"] = prediction.upper
+    write_table(folder / "fresh_prediction.csv", columns)

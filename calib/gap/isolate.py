@@ -1,0 +1,153 @@
+"""What a design could show, worked out before any field outcome is looked at.
+
+Each effect is drawn from its prior and its signature computed on the field's conditions, in noise
+sds of the laboratory. What the simulator's parameters could take up instead, given how well the
+lab determined them, is projected out with the metric C^-1, C = I + J S J', where J is the
+simulator's sensitivity and S the lab's posterior covariance. Left are: the part that is absorbed,
+the smallest size that can be named, and the effects that look alike.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.gap.case import Campaigns
+from calib.gap.fit import Noise
+from calib.gap.forward import Forward, Hypothesis
+from calib.gap.hypotheses import LN_PRIOR
+from calib.models.base import Array
+from calib.sampling.mode import prior_widths
+from calib.sampling.proposal import hessian_scale
+from calib.streams import generator
+
+__all__ = ["Isolability", "isolability"]
+
+_N_DRAWS = 64
+_Z_POWER = 0.8416  # 80 % power
+_LN_ODDS = float(np.log(10.0))  # an effect is named when it is ten times as probable as none
+ALIKE = 0.95
+
+
+@dataclass(frozen=True)
+class Isolability:
+    """What the design can show.
+
+    Parameters
+    ----------
+    absorbed : mapping of str to float
+        Part of each effect's signature (squared) that the simulator's parameters take up.
+    detectable : mapping of str to float
+        Smallest size that is named with 80 % power, in noise sds rms over the field rows.
+    likeness : mapping of (str, str) to float
+        Cosine between what is left of two effects, best match over their priors.
+    """
+
+    absorbed: Mapping[str, float]
+    detectable: Mapping[str, float]
+    likeness: Mapping[tuple[str, str], float]
+
+    @property
+    def alike(self) -> list[tuple[str, str]]:
+        """Pairs that this design cannot tell apart."""
+        return [pair for pair, value in self.likeness.items() if value >= ALIKE]
+
+
+def isolability(
+    data: Campaigns,
+    single: list[Hypothesis],
+    lab_mode: Mapping[str, Array],
+    noise: Mapping[str, Noise],
+    seed: int,
+) -> Isolability:
+    """Work out what each effect would do on a design.
+
+    Parameters
+    ----------
+    data : Campaigns
+        Of which only conditions and lab outcomes are used.
+    single : list of Hypothesis
+    lab_mode, noise : mapping
+        Of the simulators, from the lab alone.
+    seed : int
+    """
+    root = _metric_root(data, lab_mode, noise)
+    raw = {h.name: _signatures(data, h, lab_mode, noise, seed) for h in single}
+    left = {name: g @ root.T for name, g in raw.items()}
+    absorbed, detectable = {}, {}
+    ln_odds = _LN_ODDS + LN_PRIOR["none"] - LN_PRIOR["single"] + np.log(max(len(single), 1))
+    needed = (_Z_POWER + np.sqrt(_Z_POWER**2 + 2.0 * ln_odds)) ** 2
+    for name, g in raw.items():
+        size = np.square(g).sum(axis=1)
+        kept = np.square(left[name]).sum(axis=1) / np.maximum(size, 1e-300)
+        share = float(np.median(kept[size > 1e-12])) if (size > 1e-12).any() else 0.0
+        absorbed[name] = 1.0 - share
+        detectable[name] = float(np.sqrt(needed / (g.shape[1] * max(share, 1e-6))))
+    return Isolability(absorbed, detectable, _likeness(left))
+
+
+def _likeness(left: Mapping[str, Array]) -> dict[tuple[str, str], float]:
+    unit = {}
+    for name, g in left.items():
+        length = np.linalg.norm(g, axis=1, keepdims=True)
+        unit[name] = (g / np.maximum(length, 1e-300))[length[:, 0] > 1e-6]
+    names = sorted(unit)
+    found = {}
+    for i, a in enumerate(names):
+        for b in names[i + 1 :]:
+            if unit[a].size and unit[b].size:
+                cosine = unit[a] @ unit[b].T
+                found[a, b] = float(
+                    max(np.median(cosine.max(axis=1)), np.median(cosine.max(axis=0)))
+                )
+    return found
+
+
+def _signatures(
+    data: Campaigns, h: Hypothesis, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise],
+    seed: int,
+) -> Array:  # fmt: skip
+    """Signatures of prior draws over all field rows and outputs, shape (draws, N)."""
+    forward = Forward(data, h, {o: n.sigma for o, n in noise.items()})
+    psi = forward.priors.sample(generator(seed, "gap", "isolability", h.name), _N_DRAWS)
+    for o in data.outputs:
+        psi[:, forward.theta_slices[o.name]] = lab_mode[o.name]
+    with np.errstate(all="ignore"):
+        full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
+    parts = [
+        (full[o.name] - plain[o.name])[:, o.rows] / noise[o.name].sd(data.view.slip()[o.rows])
+        for o in data.outputs
+    ]
+    g = np.concatenate(parts, axis=1)
+    return g[np.isfinite(g).all(axis=1)]
+
+
+def _metric_root(
+    data: Campaigns, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise]
+) -> Array:
+    """A root R of C^-1 (R'R = C^-1), block by output, shape (N, N)."""
+    blocks = []
+    for o in data.outputs:
+        mode = np.append(lab_mode[o.name], np.log(noise[o.name].sigma))
+        width = prior_widths(o.problem.priors)
+        covariance = hessian_scale(o.problem.log_prob, mode, width)[:-1, :-1]
+        step = 1e-4 * width[:-1]
+        points = lab_mode[o.name] + np.concatenate([np.diag(step), -np.diag(step)])
+        conditions = o.problem.bound.model.select(data.view.conditions)
+        location = o.problem.bound.location(o.priors.to_natural(points), conditions)[:, o.rows]
+        d = step.size
+        sensitivity = ((location[:d] - location[d:]) / (2.0 * step[:, None])).T
+        sensitivity = np.nan_to_num(sensitivity) / noise[o.name].sd(
+            data.view.slip()[o.rows]
+        ).reshape(-1, 1)
+        c = np.eye(o.rows.size) + sensitivity @ covariance @ sensitivity.T
+        blocks.append(np.linalg.inv(np.linalg.cholesky(c)))
+    total = sum(b.shape[0] for b in blocks)
+    root = np.zeros((total, total))
+    start = 0
+    for b in blocks:
+        root[start : start + b.shape[0], start : start + b.shape[0]] = b
+        start += b.shape[0]
+    return root

@@ -1,0 +1,95 @@
+"""How far the gap shrinks: judged on conditions that were not fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.gap.case import Campaigns
+from calib.gap.mixture import Truth
+from calib.models.base import Array
+
+__all__ = ["FreshPrediction", "Shrink", "predict_fresh", "shrink"]
+
+# A gap smaller than this part of the noise (rms) is not one that could shrink.
+_SMALLEST = 0.5
+
+
+@dataclass(frozen=True)
+class Shrink:
+    """Root-mean-square error of the noise-free prediction before and after the correction."""
+
+    rmse_before: float
+    rmse_after: float
+    fraction: float
+    interval: tuple[float, float]
+    noise_floor: float
+
+
+@dataclass(frozen=True)
+class FreshPrediction:
+    """Predictions of one output at new conditions; the band is the 90 % predictive one."""
+
+    before: Array
+    after: Array
+    lower: Array
+    upper: Array
+
+
+def predict_fresh(truth: Truth, before: Mapping[str, Array]) -> dict[str, FreshPrediction]:
+    """Predict with the calibrated simulator and with the corrected one.
+
+    Parameters
+    ----------
+    truth : Truth
+        At the new conditions.
+    before : mapping of str to ndarray, shape (n,)
+        The simulator as it was calibrated in the lab.
+    """
+    return {
+        name: FreshPrediction(
+            before[name],
+            truth.mean(values),
+            truth.quantile(truth.measured[name], 0.05),
+            truth.quantile(truth.measured[name], 0.95),
+        )
+        for name, values in truth.truth.items()
+    }
+
+
+def shrink(data: Campaigns, truth: Truth, before: Mapping[str, Array]) -> dict[str, Shrink]:
+    """Posterior of the shrink of every output that probably has a gap.
+
+    Parameters
+    ----------
+    data : Campaigns
+    truth : Truth
+        At conditions that were not fitted.
+    before : mapping of str to ndarray, shape (n,)
+    """
+    found = {o.name: _shrink_of(truth, before[o.name], o.name) for o in data.outputs}
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def _shrink_of(truth: Truth, before: Array, name: str) -> Shrink | None:
+    values = truth.truth[name]
+    floor = np.sqrt(np.square(truth.noise[name]).mean(axis=1))
+    gap = np.sqrt(np.square(values - truth.simulator[name]).mean(axis=1))
+    if float(truth.weight @ (gap > _SMALLEST * floor)) < 0.5:
+        return None
+    before_error = np.sqrt(np.square(values - before).mean(axis=1))
+    after_error = np.sqrt(np.square(values - truth.mean(values)).mean(axis=1))
+    fraction = 1.0 - after_error / np.maximum(before_error, 1e-12)
+
+    def quantile(draws: Array, q: float) -> float:
+        return float(truth.quantile(draws[:, None], q)[0])
+
+    return Shrink(
+        quantile(before_error, 0.5),
+        quantile(after_error, 0.5),
+        quantile(fraction, 0.5),
+        (quantile(fraction, 0.05), quantile(fraction, 0.95)),
+        quantile(floor, 0.5),
+    )

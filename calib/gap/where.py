@@ -1,0 +1,119 @@
+"""Where the gap lies: every row, and contiguous regions of the conditions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.gap.case import Campaigns
+from calib.gap.mixture import Truth
+from calib.models.base import Array
+
+__all__ = ["Region", "RowGap", "regions", "row_gaps"]
+
+_REGION_CONDITIONS = (
+    "slip_ratio", "inflation_pressure_psi", "average_ground_pressure_kpa", "speed_m_s",
+    "pass_number", "gravimetric_water_content", "volumetric_water_content", "cone_index_kpa",
+    "normal_load_kn", "run_order",
+)  # fmt: skip
+_MIN_ROWS = 3
+_MOST = 3
+
+
+@dataclass(frozen=True)
+class RowGap:
+    """Gap of one output at the rows of the field campaign.
+
+    Parameters
+    ----------
+    output : str
+    rows : ndarray of int, shape (n,)
+    gap, sd : ndarray, shape (n,)
+        Posterior mean and sd of truth minus simulator, in the output's unit.
+    probability : ndarray, shape (n,)
+        That the true gap is larger than the noise. Hypotheses without a gap count with their
+        probability, so that a null campaign stays quiet over all of its rows at once.
+    """
+
+    output: str
+    rows: NDArray[np.int64]
+    gap: Array
+    sd: Array
+    probability: Array
+
+
+@dataclass(frozen=True)
+class Region:
+    """A stretch of one condition over which the gap exceeds the noise."""
+
+    output: str
+    conditions: Mapping[str, tuple[float, float]]
+    gap: float
+    probability: float
+
+
+def row_gaps(data: Campaigns, truth: Truth) -> tuple[RowGap, ...]:
+    """Gap at every field row that has the output."""
+    found = []
+    for o in data.outputs:
+        gap = (truth.truth[o.name] - truth.simulator[o.name])[:, o.rows]
+        noise = truth.noise[o.name][:, o.rows]
+        mean = truth.mean(gap)
+        sd = np.sqrt(np.maximum(truth.mean(np.square(gap)) - mean**2, 0.0))
+        probability = truth.mean((np.abs(gap) > noise).astype(np.float64))
+        found.append(RowGap(o.name, o.rows, mean, sd, np.clip(probability, 0.0, 1.0)))
+    return tuple(found)
+
+
+def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Region, ...]:
+    """Contiguous stretches of a condition in which rows probably have a gap of one sign."""
+    found: list[Region] = []
+    for o, row_gap in zip(data.outputs, gaps, strict=True):
+        draws = (truth.truth[o.name] - truth.simulator[o.name])[:, o.rows]
+        noise = truth.noise[o.name][:, o.rows]
+        own: list[Region] = []
+        for name in _REGION_CONDITIONS:
+            values = data.view.conditions.get(name)
+            if values is None or np.ptp(values[o.rows]) == 0.0:
+                continue
+            stretch = _longest(values[o.rows], row_gap)
+            if stretch is None:
+                continue
+            inside = (values[o.rows] >= stretch[0]) & (values[o.rows] <= stretch[1])
+            mean = draws[:, inside].mean(axis=1)
+            beyond = np.abs(mean) > noise[:, inside].mean(axis=1)
+            own.append(
+                Region(
+                    o.name,
+                    {name: stretch},
+                    float(truth.weight @ mean),
+                    min(float(truth.weight @ beyond), 1.0),
+                )
+            )
+        own.sort(key=lambda r: -r.probability * abs(r.gap))
+        found += [r for r in own if r.probability > 0.5][:_MOST]
+    return tuple(found)
+
+
+def _longest(values: Array, gap: RowGap) -> tuple[float, float] | None:
+    """The stretch of distinct values with the most rows that probably have a gap of one sign."""
+    distinct = np.unique(values)
+    groups = np.array_split(distinct, min(8, distinct.size))
+    best: tuple[int, float, float] | None = None
+    for sign in (1.0, -1.0):
+        start: float | None = None
+        rows = 0
+        for group in groups:
+            inside = (values >= group[0]) & (values <= group[-1])
+            likely = float(gap.probability[inside].mean()) > 0.5
+            if likely and float(np.sign(gap.gap[inside].mean())) == sign:
+                start = float(group[0]) if start is None else start
+                rows += int(inside.sum())
+                if rows >= _MIN_ROWS and (best is None or rows > best[0]):
+                    best = (rows, start, float(group[-1]))
+            else:
+                start, rows = None, 0
+    return None if best is None else (best[1], best[2])

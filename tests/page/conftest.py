@@ -1,0 +1,1 @@
+from figures.fixtures import density, drawbar, plate, rut, unconverged  # noqa: F401

@@ -1,0 +1,324 @@
+"""Studies: which model for which columns, what is held out, what becomes of a failure."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calib.study as study_module
+from calib.data import Table, read_table, table_from_arrays
+from calib.datasets.published import PUBLISHED
+from calib.errors import CalibError
+from calib.manifest import build_manifest, file_hashes, sha256, versions
+from calib.outputs import OUTPUTS
+from calib.sampling.sampler import SamplerSettings
+from calib.study import (
+    Failure,
+    HoldOut,
+    OutputResult,
+    Study,
+    Task,
+    choose_model,
+    he2019_tasks,
+    plan_tasks,
+    run_study,
+)
+from calib.summary import summarise
+
+HELD = HoldOut("inflation_pressure_psi", 30.0)
+
+
+def table(source: str = "my.csv", **columns) -> Table:
+    return table_from_arrays(columns, source=source, allow_missing=tuple(OUTPUTS.values()))
+
+
+def pulls(psi=(18.0, 30.0, 42.0), n: int = 8, source: str = "my.csv", scale: float = 0.6) -> Table:
+    slip = np.tile(np.linspace(0.0, 0.6, n), len(psi))
+    pressure = np.repeat(psi, n)
+    rng = np.random.default_rng(1)
+    pull = scale * np.sin(1.5 * np.arctan(12 * slip)) * (60 - pressure) / 30
+    pull += 0.01 * rng.standard_normal(slip.size)
+    return table(source, slip_ratio=slip, inflation_pressure_psi=pressure, drawbar_pull_kn=pull)
+
+
+@pytest.fixture(scope="module")
+def study() -> Study:
+    """Rut depth and bulk density of the embedded data, and an output that cannot be had."""
+    tasks = {task.output: task for task in he2019_tasks()}
+    few = tasks["drawbar_pull"].table.take([0, 1])
+    broken = replace(tasks["drawbar_pull"], table=few, held_out=None)
+    return run_study([tasks["bulk_density"], broken, tasks["rut_depth"]], 2019)
+
+
+# Planning
+
+
+@pytest.mark.parametrize(
+    ("output", "columns", "model"),
+    [
+        ("drawbar_pull", {"slip_ratio": [0.1, 0.2]}, "magic_formula"),
+        ("drawbar_pull", {"inflation_pressure_psi": [30, 30]}, "magic_formula"),
+        ("drawbar_pull", {"inflation_pressure_psi": [18, 30]}, "magic_formula_pressure"),
+        ("rut_depth", {"average_ground_pressure_kpa": [100, 120]}, "bekker"),
+        ("rut_depth", {"slip_ratio": [0.1, 0.1]}, "bekker"),
+        ("rut_depth", {"slip_ratio": [0.1, 0.2]}, "modified_bekker"),
+        ("bulk_density", {"gravimetric_water_content": [0.1, 0.2]}, "ayers_perumpral"),
+        ("bulk_density", {"volumetric_water_content": [0.1, 0.2]}, "ayers_perumpral_volumetric"),
+    ],
+)
+def test_the_columns_choose_the_model(output: str, columns, model: str) -> None:
+    assert (
+        choose_model(output, table(**{k: np.array(v, float) for k, v in columns.items()})) == model
+    )
+
+
+def test_the_embedded_tasks_hold_30_psi_out() -> None:
+    tasks = he2019_tasks()
+    assert [t.output for t in tasks] == list(OUTPUTS)
+    assert [t.held_out for t in tasks] == [None, HELD, HELD]
+    assert all(t.table.label == "reconstructed" for t in tasks)
+
+
+def test_one_file_may_give_several_outputs_with_gaps() -> None:
+    nan = np.nan
+    both = table(
+        slip_ratio=np.linspace(0, 0.3, 6),
+        average_ground_pressure_kpa=np.full(6, 100.0),
+        drawbar_pull_kn=np.array([0.0, 0.2, nan, 0.4, 0.5, 0.5]),
+        rut_depth_mm=np.array([nan, 20.0, 21.0, 22.0, 23.0, nan]),
+    )
+    tasks = plan_tasks([both])
+    assert [(t.output, t.model, len(t.table)) for t in tasks] == [
+        ("drawbar_pull", "magic_formula", 5), ("rut_depth", "modified_bekker", 4),
+    ]  # fmt: skip
+    assert all(t.held_out is None for t in tasks)
+
+
+def test_the_hold_out_goes_to_the_outputs_that_have_the_column() -> None:
+    density = table(
+        "density.csv",
+        cone_index_kpa=np.linspace(300, 900, 6),
+        gravimetric_water_content=np.full(6, 0.1),
+        bulk_density_g_cm3=np.linspace(1.4, 1.6, 6),
+    )
+    tasks = plan_tasks([pulls(), density], HELD)
+    assert {t.output: t.held_out for t in tasks} == {"bulk_density": None, "drawbar_pull": HELD}
+
+
+@pytest.mark.parametrize(
+    ("tables", "held", "words"),
+    [
+        ([table("a.csv", slip_ratio=np.array([0.1]))], None, ["a.csv", "no output",
+         "drawbar_pull_kn"]),
+        ([pulls(source="a.csv"), pulls(source="b.csv")], None, ["a.csv, b.csv", "drawbar_pull"]),
+        ([pulls()], HoldOut("speed_m_s", 1.0), ["my.csv", "speed_m_s", "inflation_pressure_psi"]),
+        ([pulls()], HoldOut("spede", 1.0), ["my.csv", "spede"]),
+        ([pulls()], HoldOut("inflation_pressure_psi", 31.0), ["my.csv", "31", "18, 30, 42"]),
+        ([pulls()], HoldOut("inflation_pressure", 30.0), ["inflation_pressure", "unit"]),
+        ([pulls(psi=(30.0,))], HELD, ["my.csv", "every row"]),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_planned_is_told_before_the_work(tables, held, words: list[str]) -> None:
+    with pytest.raises(CalibError) as caught:
+        plan_tasks(tables, held)
+    for word in [*words, "to mend:"]:
+        assert word in str(caught.value)
+
+
+def test_an_output_column_without_a_value_fails_alone() -> None:
+    empty = table(
+        slip_ratio=np.array([0.1, 0.2]),
+        average_ground_pressure_kpa=np.array([100.0, 120.0]),
+        rut_depth_mm=np.full(2, np.nan),
+    )
+    (task,) = plan_tasks([empty])
+    found = run_study([task], 1).failures["rut_depth"]
+    assert "0 rows cannot calibrate" in found.error
+
+
+# Results
+
+
+def test_a_failure_leaves_the_others(study: Study) -> None:
+    assert list(study.results) == ["bulk_density", "drawbar_pull", "rut_depth"]
+    assert set(study.failures) == {"drawbar_pull"}
+    assert set(study.successes) == {"bulk_density", "rut_depth"}
+    assert "2 rows cannot calibrate magic_formula_pressure" in study.failures["drawbar_pull"].error
+
+
+@pytest.mark.parametrize("error", [KeyError("x"), RuntimeError("x"), MemoryError("x")])
+def test_any_error_of_one_output_leaves_the_others(
+    error: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*args: object) -> OutputResult:
+        raise error
+
+    monkeypatch.setattr(study_module, "_work_out", fail)
+    found = run_study(he2019_tasks(), 1)
+    assert set(found.failures) == set(OUTPUTS)
+    assert all(type(error).__name__ in f.error for f in found.failures.values())
+
+
+def test_an_interruption_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def interrupt(*args: object) -> OutputResult:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study_module, "_work_out", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        run_study(he2019_tasks(), 1)
+
+
+def test_rut_depth_is_validated_on_30_psi_and_density_by_leaving_one_out(study: Study) -> None:
+    rut, density = (study.results[k] for k in ("rut_depth", "bulk_density"))
+    assert isinstance(rut, OutputResult)
+    assert isinstance(density, OutputResult)
+    assert rut.validation.method == "held_out"
+    assert set(rut.validation.table["inflation_pressure_psi"]) == {30.0}
+    assert set(rut.calibration.problem.table["inflation_pressure_psi"]) == {18.0, 42.0}
+    assert density.validation.method == "leave_one_out"
+    assert len(density.validation.observed) == len(density.task.table) == 36
+    assert rut.prior_predictive.shape == (1000, 18)
+    assert rut.posterior_predictive.shape == (4000, 18)
+    assert rut.by_pressure == {}
+
+
+def test_the_prior_predictive_is_wide_and_the_posterior_predictive_is_not(study: Study) -> None:
+    rut = study.results["rut_depth"]
+    assert isinstance(rut, OutputResult)
+    prior, posterior = (
+        np.nanstd(np.log(draws), axis=0).mean()
+        for draws in (rut.prior_predictive, rut.posterior_predictive)
+    )
+    # By the priors: sd of ln z about 1; by 18 rows: the noise, about 0.1.
+    assert prior > 0.7
+    assert posterior < 0.2
+
+
+def test_the_published_regression_comes_out(study: Study) -> None:
+    rut = study.results["rut_depth"]
+    assert isinstance(rut, OutputResult)
+    regression = next(e for e in rut.estimates if e.method == "published_regression")
+    for name, figure in PUBLISHED.rut_depth.estimates.items():
+        assert figure.agrees(regression.reported[name]), name
+
+
+def test_pressures_that_cannot_be_fitted_alone_are_left_out() -> None:
+    """Six rows at one pressure, as many as parameters; a constant pull at another."""
+    full = pulls()
+    psi = full["inflation_pressure_psi"]
+    columns = {name: np.array(v) for name, v in full.columns.items()}
+    columns["drawbar_pull_kn"][psi == 42.0] = 0.3
+    keep = np.ones(len(psi), dtype=bool)
+    keep[np.flatnonzero(psi == 30.0)[6:]] = False
+    tasks = plan_tasks([table(**columns).take(keep)])
+    (task,) = tasks
+    assert task.model == "magic_formula_pressure"
+    found = study_module._by_pressure(task, 1)
+    assert set(found) == {18.0}
+    assert {e.method for e in found[18.0]} >= {"least_squares", "genetic"}
+
+
+def test_progress_names_what_is_done() -> None:
+    seen: list[tuple[str, int, int]] = []
+    task = next(t for t in he2019_tasks() if t.output == "rut_depth")
+    run_study([task], 1, settings=SamplerSettings(steps=50, max_steps=50),
+              progress=lambda *told: seen.append(told))  # fmt: skip
+    assert {what for what, _, _ in seen} == {"rut_depth: estimating", "rut_depth: sampling"}
+    last = {what: (done, planned) for what, done, planned in seen}
+    assert all(done == planned for done, planned in last.values())
+
+
+# Numbers for machines
+
+
+def test_the_summary_carries_what_was_promised(study: Study) -> None:
+    document = summarise(study)
+    models = document["models"]
+    assert list(models) == ["bulk_density", "drawbar_pull", "rut_depth"]
+    assert set(models["drawbar_pull"]) == {"model", "error"}
+    for key in ("bulk_density", "rut_depth"):
+        entry = models[key]
+        result = study.results[key]
+        assert isinstance(result, OutputResult)
+        for parameter, s in result.calibration.summary.items():
+            found = entry["posterior"][parameter]
+            for name in ("mean", "sd", "hdi_lower", "hdi_upper", "ess_bulk", "ess_tail", "rhat"):
+                assert found[name] == getattr(s, name)
+        assert set(entry["validation"]["coverage"]) == {"50", "90", "95"}
+        scores = result.validation.scores
+        for name in ("n", "rmse", "crps", "max_relative_error"):
+            assert entry["validation"][name] == getattr(scores, name)
+        assert entry["validation"]["coverage"]["90"] == scores.coverage[0.9].proportion
+        assert entry["sampling"]["converged"] is True
+        assert entry["sampling"]["ensembles"] >= 4
+        assert entry["sampling"]["steps"] >= 200
+        assert entry["sampling"]["seconds"] > 0.0
+        for e in result.estimates:
+            assert entry["estimates"][e.method] == e.reported
+        assert entry["data"]["label"] == "reconstructed"
+    assert models["rut_depth"]["data"]["held_out"] == "inflation_pressure_psi = 30"
+    assert models["bulk_density"]["validation"]["refits_not_converged"] == []
+
+
+def test_the_summary_is_strict_json(study: Study) -> None:
+    text = json.dumps(summarise(study), allow_nan=False)
+
+    def numbers(value):
+        if isinstance(value, dict):
+            for v in value.values():
+                yield from numbers(v)
+        elif isinstance(value, list):
+            for v in value:
+                yield from numbers(v)
+        elif isinstance(value, float):
+            yield value
+
+    assert all(math.isfinite(x) for x in numbers(json.loads(text)))
+    # A derived parameter has no prior of its own.
+    posterior = json.loads(text)["models"]["rut_depth"]["posterior"]
+    assert posterior["k"]["posterior_to_prior_sd"] is None
+
+
+def test_the_manifest_says_what_a_result_was_made_from(study: Study, tmp_path: Path) -> None:
+    inputs = {key: {"data": {"file": f"data/{key}.csv"}} for key in study.results}
+    settings = SamplerSettings(max_steps=1000)
+    found = build_manifest(study, settings, ["calib", "report"], inputs)
+    assert json.loads(json.dumps(found)) == found
+    assert found["command"] == ["calib", "report"]
+    assert found["seed"] == 2019
+    assert found["settings"]["max_steps"] == 1000
+    assert found["settings"]["gate"]["rhat_max"] == 1.01
+    assert set(versions()) >= {"python", "numpy", "emcee", "arviz"}
+    task = found["tasks"]["rut_depth"]
+    assert task["held_out"] == {"column": "inflation_pressure_psi", "value": 30.0}
+    assert task["label"] == "reconstructed"
+    assert task["data"] == {"file": "data/rut_depth.csv"}
+
+
+def test_hashes_are_of_every_file_but_the_manifest(tmp_path: Path) -> None:
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "a.png").write_bytes(b"abc")
+    (tmp_path / "manifest.json").write_text("{}")
+    # FIPS 180-2, appendix B.1.
+    digest = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert file_hashes(tmp_path) == {"figures/a.png": digest}
+    assert sha256(b"abc") == digest
+
+
+def test_failures_and_tasks_are_plain_records() -> None:
+    task = Task("rut_depth", "bekker", pulls())
+    assert Failure(task, "x").task is task
+    assert str(HELD) == "inflation_pressure_psi = 30"
+
+
+def test_read_files_are_planned_as_arrays_are(tmp_path: Path) -> None:
+    path = tmp_path / "my.csv"
+    path.write_text("slip_percent,drawbar_pull_n,rut_depth_mm\n0,1,\n10,300,\n20,,\n")
+    read = read_table(path, allow_missing=tuple(OUTPUTS.values()))
+    tasks = plan_tasks([read])
+    assert [(t.output, len(t.table)) for t in tasks] == [("drawbar_pull", 2), ("rut_depth", 0)]
