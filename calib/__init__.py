@@ -10,32 +10,32 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calib.calibrate import Calibration, calibrate
+    from calib.calibration import Calibration, calibrate
     from calib.data import Table, hold_out, read_table, table_from_arrays
     from calib.datasets.he2019 import load_he2019
     from calib.errors import CalibError
-    from calib.estimate import PointEstimate, estimate
+    from calib.estimators import PointEstimate, estimate
     from calib.models import MODELS
-    from calib.predict import Prediction, predict
+    from calib.prediction import Prediction, predict
     from calib.problem import Problem, build_problem
     from calib.sampling.sampler import SamplerSettings
     from calib.store import load_calibration, save_calibration, to_datatree
     from calib.validate import Validation, leave_one_out, validate_held_out
 
 _HOME = {
-    "Calibration": "calib.calibrate",
-    "calibrate": "calib.calibrate",
+    "Calibration": "calib.calibration",
+    "calibrate": "calib.calibration",
     "Table": "calib.data",
     "hold_out": "calib.data",
     "read_table": "calib.data",
     "table_from_arrays": "calib.data",
     "load_he2019": "calib.datasets.he2019",
     "CalibError": "calib.errors",
-    "PointEstimate": "calib.estimate",
-    "estimate": "calib.estimate",
+    "PointEstimate": "calib.estimators",
+    "estimate": "calib.estimators",
     "MODELS": "calib.models",
-    "Prediction": "calib.predict",
-    "predict": "calib.predict",
+    "Prediction": "calib.prediction",
+    "predict": "calib.prediction",
     "Problem": "calib.problem",
     "build_problem": "calib.problem",
     "SamplerSettings": "calib.sampling.sampler",

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from calib.calibrate import Calibration
+from calib.calibration import Calibration
 from calib.data import Table, read_for_model, write_table
 from calib.errors import CalibError
 from calib.models import BoundModel, get_model

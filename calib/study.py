@@ -14,14 +14,14 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.calibrate import Calibration, calibrate
+from calib.calibration import Calibration, calibrate
 from calib.data import Table, hold_out
 from calib.errors import CalibError
-from calib.estimate import PointEstimate, estimate, methods_for
+from calib.estimators import PointEstimate, estimate, methods_for
 from calib.headers import parse_header
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
-from calib.predict import predictive_draws
+from calib.prediction import predictive_draws
 from calib.problem import Problem, build_problem
 from calib.sampling.sampler import SamplerSettings
 from calib.streams import generator

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from calib.calibrate import Calibration
-from calib.estimate import PointEstimate
+from calib.calibration import Calibration
+from calib.estimators import PointEstimate
 from calib.scores import Scores
 from calib.study import OutputResult, Study
 

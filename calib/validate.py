@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.calibrate import Calibration
+from calib.calibration import Calibration
 from calib.chains import psis
 from calib.data import Table
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.predict import N_DRAWS, predictive_draws
+from calib.prediction import N_DRAWS, predictive_draws
 from calib.sampling.sampler import Progress, SamplerSettings, sample_posterior
 from calib.scores import Scores, score
 from calib.streams import generator, stream

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.calibrate import Calibration, calibrate
+from calib.calibration import Calibration, calibrate
 from calib.data import Table, hold_out, table_from_arrays
 from calib.datasets import he2019
-from calib.estimate import estimate
+from calib.estimators import estimate
 from calib.problem import build_problem
 
 SEED = 2019

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.calibrate import calibrate
+from calib.calibration import calibrate
 from calib.data import Table, table_from_arrays
 from calib.problem import Problem, build_problem
 

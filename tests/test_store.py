@@ -11,10 +11,10 @@ import arviz as az
 import numpy as np
 import pytest
 
-from calib.calibrate import Calibration, calibrate
+from calib.calibration import Calibration, calibrate
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
-from calib.predict import predict
+from calib.prediction import predict
 from calib.problem import build_problem
 from calib.sampling.sampler import SamplerSettings
 from calib.store import load_calibration, save_calibration, to_datatree

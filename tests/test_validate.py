@@ -8,7 +8,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 import calib.validate as validate_module
-from calib.calibrate import Calibration, calibrate
+from calib.calibration import Calibration, calibrate
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
 from calib.problem import build_problem

@@ -7,7 +7,7 @@ import sys
 
 import typer
 
-from calib.cli import calibration
+from calib.cli import calibration, gap
 
 __all__ = ["app", "main"]
 
@@ -21,6 +21,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 calibration.register(app)
+gap.register(app)
 
 
 def main() -> None:

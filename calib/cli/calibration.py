@@ -88,11 +88,11 @@ def fit(
     max_steps: _MaxSteps = 25_600,
 ) -> None:
     """Calibrate one model on one file and save the posterior."""
-    from calib.calibrate import calibrate
+    from calib.calibration import calibrate
     from calib.cli.display import posterior_table, progress_bars, verdict_line
     from calib.data import hold_out as split
     from calib.data import read_for_model
-    from calib.estimate import estimate
+    from calib.estimators import estimate
     from calib.folders import check_folder, fresh_folder
     from calib.models import get_model
     from calib.problem import build_problem
@@ -136,8 +136,8 @@ def predict(
 ) -> None:
     """Predict with 50, 90 and 95 % bands at new conditions."""
     from calib.data import read_for_model, write_table
-    from calib.predict import predict as predict_at
-    from calib.predict import prediction_columns
+    from calib.prediction import predict as predict_at
+    from calib.prediction import prediction_columns
     from calib.store import load_calibration
 
     calibration = load_calibration(run)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from calib.calibrate import Calibration
+from calib.calibration import Calibration
 from calib.page.numbers import format_value
 
 __all__ = ["posterior_table", "progress_bars", "verdict_line"]
@@ -56,7 +57,9 @@ def posterior_table(calibration: Calibration) -> None:
             f"{s.hdi_lower:.4g} to {s.hdi_upper:.4g}", f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}",
             f"{s.rhat:.3f}", "set by the prior" if s.sd_ratio > 0.9 else "",
         )  # fmt: skip
-    Console().print(table)
+    # A pipe has no width of its own: wide enough for whole rows.
+    width = None if sys.stdout.isatty() else 120
+    Console(width=width).print(table)
 
 
 def verdict_line(calibration: Calibration) -> str:

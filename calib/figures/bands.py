@@ -22,7 +22,7 @@ from calib.figures.rows import (
 )
 from calib.figures.style import BLACK, BLUE, DASHES, ORANGE, VERMILION, legend_below, panels
 from calib.models.base import Array
-from calib.predict import Bands
+from calib.prediction import Bands
 from calib.study import OutputResult
 
 __all__ = ["FILLS", "bands_plate", "fill_bands", "observed_words", "scatter_points"]

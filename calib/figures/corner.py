@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from calib.calibrate import Calibration
+from calib.calibration import Calibration
 from calib.figures.labels import parameter_label, plain, short
 from calib.figures.plate import Plate
 from calib.figures.reference import published_sampled

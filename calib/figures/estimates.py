@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from calib.datasets.published import PUBLISHED
-from calib.estimate import PointEstimate
+from calib.estimators import PointEstimate
 from calib.figures.labels import NO_UNIT, joined, parameter_label, plain, short, symbol
 from calib.figures.plate import Plate
 from calib.figures.reference import published_parameters, published_source
@@ -143,7 +143,7 @@ def _caption(result: OutputResult, reported: Mapping[str, Array], published: boo
     distance = abs(off[far])
     how = f"within {short(distance)}" if distance < 100.0 else "up to more than 100"
     text = (
-        f"The lowest cost, {short(best.cost, 3)}, is that of "
+        f"The lowest cost, {short(best.cost, 3)}, was found by "
         f"{METHOD_NAMES.get(best.method, best.method)}; its estimates lie "
         f"{how} posterior sds of the posterior mean ({plain(far)} is farthest)."
     )

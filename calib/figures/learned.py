@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import NullLocator
 from scipy.stats import gaussian_kde
 
-from calib.calibrate import Calibration
+from calib.calibration import Calibration
 from calib.figures.labels import joined, parameter_label, plain, short
 from calib.figures.plate import Plate
 from calib.figures.reference import published_sampled

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.calibrate import Calibration
+from calib.calibration import Calibration
 
 __all__ = ["BOTH", "DATA", "MOVED", "PRIOR", "ROLES", "role", "role_of", "shift"]
 

@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from calib.calibrate import Calibration
+from calib.calibration import Calibration
 from calib.figures.labels import Axis, axis_of
 from calib.models.base import Array
-from calib.predict import Bands, bands
+from calib.prediction import Bands, bands
 from calib.streams import generator
 from calib.study import OutputResult
 from calib.table import Table

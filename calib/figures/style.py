@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, Literal
 
 import matplotlib as mpl
 import numpy as np
@@ -83,8 +83,8 @@ def panels(
     bottom: float = 10.0,
     gap_x: float = 4.0,
     gap_y: float = 6.0,
-    sharex: bool = False,
-    sharey: bool = False,
+    sharex: bool | Literal["col", "row"] = False,
+    sharey: bool | Literal["col", "row"] = False,
 ) -> tuple[Figure, NDArray[np.object_]]:
     """Return a figure and its panels, laid out in millimetres.
 
@@ -101,7 +101,7 @@ def panels(
         Margins about the panels.
     gap_x, gap_y : float
         Between panels.
-    sharex, sharey : bool
+    sharex, sharey : bool or {"col", "row"}
 
     Returns
     -------

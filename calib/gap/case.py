@@ -17,8 +17,9 @@ from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.priors import Priors
 from calib.problem import Problem, build_problem
+from calib.store import load_calibration
 
-__all__ = ["Campaigns", "Case", "OutputData", "campaigns", "read_case"]
+__all__ = ["Campaigns", "Case", "OutputData", "campaigns", "case_from_run", "read_case"]
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,53 @@ def read_case(folder: Path) -> Case:
     lab = read_table(folder / str(files["calibration"]), allow_missing=missing_ok)
     field = read_table(folder / str(files["field"]), allow_missing=missing_ok)
     fresh = read_table(folder / content["predict"]) if content.get("predict") else None
-    return Case(folder.name, lab, field, models, fresh)
+    return Case(folder.name, lab, field, models, fresh, _warnings(lab, field, models))
+
+
+def _warnings(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, ...]:
+    """Say what looks odd about a pair of campaigns, without refusing it."""
+    said = []
+    states = ("speed_m_s", "pass_number", "gravimetric_water_content")
+    both = [n for n in states if n in lab and n in field]
+    varied = [n for n in both if np.ptp(lab[n]) > 0.0 and np.ptp(field[n]) == 0.0]
+    if varied:
+        said.append(
+            f"{', '.join(varied)}: it varies in the calibration and not in the field; were the two "
+            "swapped?"
+        )
+    extra = [n for n in field if n not in lab and n not in OUTPUTS.values()]
+    if extra:
+        said.append(
+            f"the calibration has no {', '.join(extra)}: its effects are taken about the field's "
+            "median, and a constant difference from the calibration cannot be seen"
+        )
+    for output in models:
+        missing = int(np.isnan(field[OUTPUTS[output]]).sum()) if OUTPUTS[output] in field else 0
+        if missing:
+            said.append(f"{missing} of {len(field)} field rows have no {output}")
+    return tuple(said)
+
+
+def case_from_run(run: Path, field: Path) -> Case:
+    """Make a case of an earlier calibration and a field campaign.
+
+    Parameters
+    ----------
+    run : Path
+        Run folder of `calib fit`.
+    field : Path
+        CSV with the model's conditions and its output.
+
+    Raises
+    ------
+    CalibError
+        If either cannot be read.
+    """
+    problem = load_calibration(run).problem
+    model = problem.bound.model
+    output = next(key for key, column in OUTPUTS.items() if column == model.output)
+    table = read_table(field, allow_missing=tuple(OUTPUTS.values()))
+    return Case(Path(run).name, problem.table, table, {output: model.name})
 
 
 def campaigns(case: Case) -> Campaigns:

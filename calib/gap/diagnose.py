@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,11 +15,15 @@ from calib.gap.shrink import FreshPrediction, Shrink, predict_fresh, shrink
 from calib.gap.where import Region, RowGap, regions, row_gaps
 from calib.gap.which import Ranking, rank
 from calib.models.base import Array
+from calib.outputs import OUTPUTS
 
 __all__ = ["Diagnosis", "diagnose", "verdict"]
 
 # A single hypothesis is named when it is at least this probable.
 NAMED = 0.5
+# Standardised residual beyond which a row is set aside, and how often that is repeated.
+OUTLIER = 5.0
+_MOST_ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,7 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
     CalibError
         If the case cannot be diagnosed: an output or a condition is missing, too few rows.
     """
-    data = campaigns(case)
-    ranking = rank(data, seed, effects=effects)
+    data, ranking = _rank_without_outliers(case, seed, effects)
     mixed = mixture(data, ranking, seed)
     truth = mixed.at(data.view)
     gaps = row_gaps(data, truth)
@@ -100,6 +103,45 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
         mixed,
         seed,
     )
+
+
+def _rank_without_outliers(
+    case: Case, seed: int, effects: Mapping[str, Effect]
+) -> tuple[Campaigns, Ranking]:
+    """Rank; set rows aside that no hypothesis explains, however good it is for the others."""
+    data = campaigns(case)
+    ranking = rank(data, seed, effects=effects)
+    for _ in range(_MOST_ROUNDS):
+        far = _outliers(data, ranking)
+        if not far:
+            break
+        case = _without(case, far)
+        data = campaigns(case)
+        ranking = rank(data, seed, effects=effects)
+    return data, ranking
+
+
+def _outliers(data: Campaigns, ranking: Ranking) -> dict[str, list[int]]:
+    best = max(ranking.fits[ranking.order[0]], key=lambda f: f.log_evidence)
+    found = {}
+    for o in data.outputs:
+        far = np.abs(best.field_residuals[o.name]) > OUTLIER
+        # Many such rows are a gap that is not understood, not outliers.
+        if 0 < far.sum() <= max(1, o.rows.size // 10):
+            found[o.name] = [int(row) for row in o.rows[far]]
+    return found
+
+
+def _without(case: Case, far: Mapping[str, list[int]]) -> Case:
+    columns = {name: np.array(values) for name, values in case.field.columns.items()}
+    said = list(case.warnings)
+    for output, rows in far.items():
+        columns[OUTPUTS[output]][rows] = np.nan
+        said.append(
+            f"field row {', '.join(map(str, rows))}: {output} lies more than {OUTLIER:g} noise sds "
+            "off whatever the hypothesis; it was left out as an outlier"
+        )
+    return replace(case, field=replace(case.field, columns=columns), warnings=tuple(said))
 
 
 def verdict(probability: Mapping[str, float]) -> str:

@@ -47,7 +47,7 @@ def split_testable(
 
 def effect_priors(data: Campaigns, effect: Effect) -> Priors:
     """Read an effect's priors, forces relative to the case's load."""
-    path = default_prior_path(f"effects/{effect.name}")
+    path = effect.prior_file or default_prior_path(f"effects/{effect.name}")
     loads = {"normal_load_kn": data.view.load_kn}
     return read_priors(path, effect.name, effect.parameters, loads)
 

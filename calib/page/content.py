@@ -13,15 +13,13 @@ from calib.figures.labels import axis_of, percent, short
 from calib.figures.rows import held_table
 from calib.models import get_model
 from calib.page.equations import equation, likelihood, parametrisation, prose
+from calib.page.facts import sampling_facts, validation_facts, worst_row
 from calib.page.numbers import format_number
 from calib.page.tables import (
     estimates_grid,
     posterior_rows,
     pressure_grids,
     prior_rows,
-    sampling_facts,
-    validation_facts,
-    worst_row,
 )
 from calib.page.verdict import Evidence, Level, gather, judge_evidence
 from calib.study import Failure, OutputResult
@@ -55,7 +53,7 @@ def failed_section(key: str, failure: Failure) -> dict[str, Any]:
         "name": output_name(key),
         "model": get_model(failure.task.model).title,
         "failed": True,
-        "error": failure.error.removeprefix("CalibError: "),
+        "error": failure.error.removeprefix("x"),
         "level": str(Level.FAILED.value),
         "mark": MARKS[Level.FAILED],
         "headline": "Failed",
@@ -134,7 +132,7 @@ def _card_facts(result: OutputResult, evidence: Evidence) -> list[list[str]]:
     error = f"{short(s.rmse)} {axis.unit} rms"
     if math.isfinite(evidence.max_relative_error):
         error += f", {percent(evidence.max_relative_error)} at most"
-        error += f" (at {worst_row(result, first=True)})"
+        error += f" (at {worst_row(result, along=True)})"
     # An interval for independent rows would claim too much for rows that share a curve.
     worth = (
         f"as much evidence as {short(evidence.effective)} independent "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +9,8 @@ import numpy as np
 from markupsafe import Markup
 
 from calib.datasets.published import PUBLISHED, FittedTable
-from calib.estimate import PointEstimate
+from calib.estimators import PointEstimate
 from calib.figures.estimates import METHOD_NAMES
-from calib.figures.labels import axis_of, percent
 from calib.figures.reference import published_table
 from calib.figures.roles import role
 from calib.page.equations import symbol_html, unit_html
@@ -28,7 +26,6 @@ from calib.study import OutputResult
 
 __all__ = [
     "Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows",
-    "sampling_facts", "validation_facts", "worst_row",
 ]  # fmt: skip
 
 _TICK = "\N{CHECK MARK}"
@@ -189,7 +186,8 @@ def pressure_grids(result: OutputResult, *, published: bool) -> list[Grid]:
             rows.append(_pressure_row(METHOD_NAMES.get(e.method, e.method), e, beside))
             if beside is not None and e.method in ("geometric", "genetic"):
                 shown = {**beside.estimates, **beside.quality}
-                cells = [format_like(shown[k].value, shown[k].text) for k in (*"BCDE", "cost")]
+                printed = [shown[k] for k in (*"BCDE", "cost")]
+                cells = [_ticked(format_like(f.value, f.text), False) for f in printed]
                 rows.append([f"published ({beside.source.partition(',')[0]})", *cells])
         head: list[Any] = ["Method", *(Markup("<i>{}</i>").format(k) for k in "BCDE"), "Cost (kN²)"]
         head[1] += " (1/%)"
@@ -210,78 +208,3 @@ def _pressure_row(name: str, e: PointEstimate, beside: FittedTable | None) -> li
             for k, v in values.items()
         ),
     ]
-
-
-def validation_facts(result: OutputResult, effective: float, low_p: float) -> list[list[str]]:
-    """Label and value of every validation figure."""
-    v, s = result.validation, result.validation.scores
-    unit = axis_of(result.calibration.problem.bound.model.output).unit
-    facts = [
-        ["Root mean square error of the median", f"{format_number(s.rmse, 3)} {unit}"],
-        ["Mean CRPS", f"{format_number(s.crps, 3)} {unit}"],
-    ]
-    judged = np.abs(s.relative_error[np.isfinite(s.relative_error)])
-    if judged.size:
-        at_row = percent(float(judged.max())) + f", at {worst_row(result)}"
-        left = s.n - judged.size
-        facts.append([
-            "Largest relative error",
-            at_row + (f" ({left} rows near zero left out)" if left else ""),
-        ])  # fmt: skip
-        facts.append(
-            ["Rows off by more than 6 %", f"{int((judged > 0.06).sum())} of {judged.size}"]
-        )
-    if_independent = ", were the rows independent" if effective < 0.5 * s.n else ""
-    for level, c in s.coverage.items():
-        share, low, high = (f"{100 * x:.0f}" for x in (c.proportion, c.lower, c.upper))
-        facts.append([
-            f"Covered by the {100 * level:g} % band",
-            f"{c.hits} of {c.n} = {share} % (95 % interval {low} to {high} %{if_independent})",
-        ])  # fmt: skip
-    facts.append(["Chance of covering so few at 90 %, or fewer", format_number(low_p, 2)])
-    if np.isfinite(effective):
-        facts.append(["Independent rows that would say as much", format_number(effective, 2)])
-    if v.pareto_k is not None:
-        facts += [
-            ["Expected log predictive density", format_value(v.elpd, v.elpd_se)],
-            ["Largest Pareto k", format_number(float(np.max(v.pareto_k)), 2)],
-            ["Rows refitted (k above 0.7)", f"{len(v.refitted)} of {s.n}"],
-        ]
-    return facts
-
-
-def worst_row(result: OutputResult, *, first: bool = False) -> str:
-    """Conditions, or the first of them, of the row with the largest relative error."""
-    v = result.validation
-    i = int(np.nanargmax(np.abs(v.scores.relative_error)))
-    names = result.calibration.problem.bound.model.conditions[: 1 if first else None]
-    axes = {name: axis_of(name) for name in names}
-    return ", ".join(
-        f"{a.name.lower()} {a.value_text(float(v.table[name][i]))} {a.unit}"
-        for name, a in axes.items()
-    )
-
-
-def sampling_facts(result: OutputResult) -> list[list[str]]:
-    """Label and value of everything that is known of the sampling."""
-    d = result.calibration.draws
-    r = d.report
-    ensembles, walkers, stored, _ = d.t.shape
-    facts: Mapping[str, str] = {
-        "Convergence gate": "passed" if r.passed else f"NOT PASSED: {'; '.join(r.reasons)}",
-        f"Ensembles {TIMES} walkers {TIMES} steps": (
-            f"{ensembles} {TIMES} {walkers} {TIMES} {r.steps} ({stored} stored)"
-        ),
-        "Largest R-hat (at most 1.01)": f"{np.max(r.rhat):.4f}",
-        "Smallest ESS, bulk and tail (at least 400)": (
-            f"{np.min(r.ess_bulk):.0f} and {np.min(r.ess_tail):.0f}"
-        ),
-        "Steps over autocorrelation time (at least 50)": format_number(
-            float(np.min(r.steps / r.tau)), 3
-        ),
-        "Acceptance": f"{100 * d.acceptance:.0f} %",
-        "Log evidence": format_number(d.log_evidence, 4),
-        "Density evaluations": f"{d.evaluations:,}",
-        "Time": f"{d.seconds:.1f} s",
-    }
-    return [[label, value] for label, value in facts.items()]

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.calibrate import Calibration, calibrate
+from calib.calibration import Calibration, calibrate
 from calib.data import Table, table_from_arrays
 from calib.problem import build_problem
 from calib.study import OutputResult

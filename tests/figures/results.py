@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.calibrate import Calibration
+from calib.calibration import Calibration
 from calib.data import Table
-from calib.estimate import PointEstimate, estimate
+from calib.estimators import PointEstimate, estimate
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
-from calib.predict import predictive_draws
+from calib.prediction import predictive_draws
 from calib.problem import Problem, build_problem
 from calib.study import HoldOut, OutputResult, Task
 from calib.validate import leave_one_out, validate_held_out

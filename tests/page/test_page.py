@@ -15,7 +15,8 @@ from calib.models.base import BoundModel
 from calib.page import render_page
 from calib.page.content import png_size
 from calib.page.equations import equation, parametrisation, prose, symbol_html, unit_html
-from calib.page.tables import estimates_grid, posterior_rows, pressure_grids, validation_facts
+from calib.page.facts import validation_facts
+from calib.page.tables import estimates_grid, posterior_rows, pressure_grids
 from calib.study import Failure, Study
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\x00\x02\x00\x00\x00\x03\x08\x06\x00\x00\x00rest"

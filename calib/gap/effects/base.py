@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -78,6 +79,8 @@ class Effect:
     form : tuple of {"size", "slip", "pressure", "shape"}
         Along what its size may depart from its formula, by the form error of the diagnosis;
         empty where the formula is exact.
+    prior_file : Path, optional
+        Where its priors are, if not among the shipped ones.
     """
 
     name: str = ""
@@ -87,6 +90,7 @@ class Effect:
     covariates: tuple[str, ...] = ()
     varies: bool = True
     form: tuple[str, ...] = ()
+    prior_file: Path | None = None
 
     def on_conditions(
         self,

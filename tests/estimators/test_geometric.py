@@ -8,8 +8,8 @@ from scipy.optimize import brentq
 
 from calib.data import table_from_arrays
 from calib.errors import CalibError
-from calib.estimate import estimate
-from calib.estimate.features import Features, coefficients, read_features
+from calib.estimators import estimate
+from calib.estimators.features import Features, coefficients, read_features
 from calib.models.magic_formula import magic_formula
 from calib.problem import build_problem
 
@@ -61,9 +61,7 @@ def test_equations_as_printed():
     assert D == 1.6
     assert pytest.approx(2 - 2 / np.pi * np.arcsin(1.2 / 1.6)) == C
     assert pytest.approx(0.2 / (C * D)) == B
-    assert pytest.approx(
-        (B * 12 - np.tan(np.pi / (2 * C))) / (B * 12 - np.arctan(B * 12))
-    ) == E
+    assert pytest.approx((B * 12 - np.tan(np.pi / (2 * C))) / (B * 12 - np.arctan(B * 12))) == E
 
 
 @pytest.mark.parametrize("psi", TABLE_3)

@@ -1,6 +1,6 @@
 """The genetic algorithm of the source (Eqs 10-11, Table 2), after Cabrera et al. (2004).
 
-What one generation does, and what the source leaves open of it, is in `calib.estimate.generation`.
+One generation, and what the source leaves open of it, is in `calib.estimators.generation`.
 The source runs 4000 generations at most; here a run ends once the whole population has converged.
 Its mutations do not lead out of a local optimum that all of it has converged on.
 """
@@ -12,14 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calib.estimate.base import PointEstimate
-from calib.estimate.generation import (
+from calib.estimators.base import PointEstimate
+from calib.estimators.generation import (
     GeneticDraws,
     GeneticSettings,
     descendants,
     draw_generations,
 )
-from calib.estimate.search import Box, Found, SearchSpace, search_in_box
+from calib.estimators.search import Box, Found, SearchSpace, search_in_box
 from calib.models.base import Array
 from calib.problem import Problem
 
@@ -126,7 +126,7 @@ def estimate_genetic(
     settings : GeneticSettings, optional
         Table 2 by default.
     box : mapping of str to (lower, upper), optional
-        As for `calib.estimate.search.search_space`.
+        As for `calib.estimators.search.search_space`.
     restarts : int
         Further runs from fresh populations, the best of all being returned. Not in the source: a
         population that has converged on a local optimum never leaves it, however long it runs.
@@ -147,8 +147,6 @@ def estimate_genetic(
         if not polish:
             return Found(best.x, n_evaluations, best.converged, note)
         polished = space.polish(best.x)
-        return Found(
-            polished.x, n_evaluations + polished.n_evaluations, True, f"{note}, polished"
-        )
+        return Found(polished.x, n_evaluations + polished.n_evaluations, True, f"{note}, polished")
 
     return search_in_box(problem, "genetic", box, minimise)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError
-from calib.estimate import estimate
-from calib.estimate.identified import hold_unidentified
+from calib.estimators import estimate
+from calib.estimators.identified import hold_unidentified
 from calib.problem import build_problem
 
 from .conftest import SLIPS, TRUTH

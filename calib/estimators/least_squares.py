@@ -9,15 +9,15 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from calib.errors import CalibError
-from calib.estimate.base import PointEstimate, goodness, residuals, sum_of_squares
-from calib.estimate.identified import (
+from calib.estimators.base import PointEstimate, goodness, residuals, sum_of_squares
+from calib.estimators.identified import (
     central_interval,
     hold_unidentified,
     location,
     representative_rows,
     widths,
 )  # fmt: skip
-from calib.estimate.search import edge_notes, held_note
+from calib.estimators.search import edge_notes, held_note
 from calib.models.base import Array
 from calib.problem import Problem
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.calibrate import Calibration
+from calib.calibration import Calibration
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
-from calib.predict import bands, predict, prediction_columns, predictive_draws
+from calib.prediction import bands, predict, prediction_columns, predictive_draws
 from calib.scores import LEVELS
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from calib.data import table_from_arrays
 from calib.errors import CalibError
-from calib.estimate import estimate, rut_regression
+from calib.estimators import estimate, rut_regression
 from calib.problem import build_problem
 
 

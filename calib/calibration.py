@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 
 from calib.chains import ess, hdi, rhat
-from calib.estimate import PointEstimate
+from calib.estimators import PointEstimate
 from calib.models.base import Array
 from calib.problem import Problem
 from calib.sampling.sampler import Draws, Progress, SamplerSettings, sample_posterior

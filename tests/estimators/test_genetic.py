@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError
-from calib.estimate import GeneticSettings, estimate, minimise_genetic
-from calib.estimate.generation import GeneticDraws, descendants, draw_generations
+from calib.estimators import GeneticSettings, estimate, minimise_genetic
+from calib.estimators.generation import GeneticDraws, descendants, draw_generations
 
 TABLE_2 = GeneticSettings()
 

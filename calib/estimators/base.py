@@ -24,7 +24,7 @@ class PointEstimate:
     Parameters
     ----------
     method : str
-        One of `calib.estimate.METHODS`.
+        One of `calib.estimators.METHODS`.
     theta : ndarray, shape (d_model,)
         The sampled parameters in natural units, without the noise scale.
     reported : dict of str to float

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.calibrate import Calibration
+from calib.calibration import Calibration
 from calib.data import Table
 from calib.models.base import Array
 from calib.scores import LEVELS

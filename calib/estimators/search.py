@@ -12,8 +12,8 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from calib.errors import CalibError
-from calib.estimate.base import PointEstimate, goodness, residuals, sum_of_squares
-from calib.estimate.identified import central_interval, hold_unidentified
+from calib.estimators.base import PointEstimate, goodness, residuals, sum_of_squares
+from calib.estimators.identified import central_interval, hold_unidentified
 from calib.models.base import Array
 from calib.problem import Problem
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 
 from calib.errors import CalibError
-from calib.estimate.base import PointEstimate
-from calib.estimate.differential_evolution import estimate_differential_evolution
-from calib.estimate.genetic import GeneticSettings, estimate_genetic, minimise_genetic
-from calib.estimate.geometric import estimate_geometric
-from calib.estimate.least_squares import estimate_least_squares
-from calib.estimate.rut_regression import (
+from calib.estimators.base import PointEstimate
+from calib.estimators.differential_evolution import estimate_differential_evolution
+from calib.estimators.genetic import GeneticSettings, estimate_genetic, minimise_genetic
+from calib.estimators.geometric import estimate_geometric
+from calib.estimators.least_squares import estimate_least_squares
+from calib.estimators.rut_regression import (
     RutRegression,
     estimate_published_regression,
     rut_regression,

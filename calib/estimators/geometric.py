@@ -6,8 +6,8 @@ import time
 
 import numpy as np
 
-from calib.estimate.base import PointEstimate, goodness, sum_of_squares
-from calib.estimate.features import coefficients, read_features
+from calib.estimators.base import PointEstimate, goodness, sum_of_squares
+from calib.estimators.features import coefficients, read_features
 from calib.models.base import Array
 from calib.problem import Problem
 
@@ -95,9 +95,7 @@ def _peak_note(has_peak: bool) -> str:
     return "" if has_peak else "no peak inside the range: C is the prior's"
 
 
-def _several_pressures(
-    problem: Problem, up_to: float
-) -> tuple[dict[str, float], tuple[str, ...]]:
+def _several_pressures(problem: Problem, up_to: float) -> tuple[dict[str, float], tuple[str, ...]]:
     mid, half = (problem.bound.references[f"p_{name}_psi"] for name in ("mid", "half"))
     u = (problem.conditions["inflation_pressure_psi"] - mid) / half
     slip = 100.0 * problem.conditions["slip_ratio"]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.errors import CalibError
-from calib.estimate.base import PointEstimate, goodness
+from calib.estimators.base import PointEstimate, goodness
 from calib.problem import Problem
 
 __all__ = ["RutRegression", "estimate_published_regression", "rut_regression"]

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.linalg import qr
 
-from calib.estimate.base import residuals
+from calib.estimators.base import residuals
 from calib.models.base import Array
 from calib.problem import Problem
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from scipy.optimize import differential_evolution
 
-from calib.estimate.base import PointEstimate
-from calib.estimate.search import Box, Found, SearchSpace, search_in_box
+from calib.estimators.base import PointEstimate
+from calib.estimators.search import Box, Found, SearchSpace, search_in_box
 from calib.models.base import Array
 from calib.problem import Problem
 
@@ -37,7 +37,7 @@ def estimate_differential_evolution(
     problem : Problem
     rng : Generator
     box : mapping of str to (lower, upper), optional
-        As for `calib.estimate.search.search_space`.
+        As for `calib.estimators.search.search_space`.
     polish : bool
         Whether L-BFGS-B follows.
     tol, popsize, maxiter

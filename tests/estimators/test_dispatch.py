@@ -7,7 +7,7 @@ import pytest
 
 from calib.data import table_from_arrays
 from calib.errors import CalibError
-from calib.estimate import METHODS, compare, estimate, methods_for
+from calib.estimators import METHODS, compare, estimate, methods_for
 from calib.models import MODELS
 from calib.problem import build_problem
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.calibrate import Calibration, calibrate
+from calib.calibration import Calibration, calibrate
 from calib.chains import ess
 from calib.data import Table
-from calib.estimate import estimate
+from calib.estimators import estimate
 from calib.problem import build_problem
 from calib.sampling.sampler import SamplerSettings
 

@@ -1,0 +1,153 @@
+"""Verbs of the diagnosis: diagnose a case, and the blind test that proves it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from calib.errors import CalibError
+
+__all__ = ["register"]
+
+_Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
+_Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs to an app."""
+    app.command()(diagnose)
+    challenge = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.")
+    challenge.command("make")(make)
+    challenge.command("run")(run)
+    challenge.command("score")(score)
+    app.add_typer(challenge, name="challenge")
+
+
+def diagnose(
+    case: Annotated[Path | None, typer.Argument(help="Case folder with a case.toml.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-diagnosis"),
+    seed: _Seed = 1,
+    run: Annotated[Path | None, typer.Option(help="Run folder of `calib fit`.")] = None,
+    field: Annotated[Path | None, typer.Option(help="CSV of the field campaign.")] = None,
+    effects: Annotated[Path | None, typer.Option(help="Python file with your effects.")] = None,
+    overwrite: _Overwrite = False,
+) -> None:
+    """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
+    from calib.folders import check_folder, fresh_folder
+    from calib.gap.case import case_from_run, read_case
+    from calib.gap.diagnose import diagnose as find
+    from calib.gap.effects import EFFECTS
+    from calib.gap.effects.load import load_effects
+    from calib.gap.files import write_diagnosis
+    from calib.page.diagnosis import write_page
+
+    check_folder(out, overwrite=overwrite)
+    if case is not None and run is None and field is None:
+        given = read_case(case)
+    elif case is None and run is not None and field is not None:
+        given = case_from_run(run, field)
+    else:
+        raise CalibError(
+            "it is not clear what to diagnose",
+            allowed="a case folder, or --run RUN together with --field CSV",
+            mend="give one of the two",
+        )
+    known = {**EFFECTS, **load_effects(effects)} if effects is not None else EFFECTS
+    found = find(given, seed, effects=known)
+    manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
+    with fresh_folder(out, overwrite=overwrite) as folder:
+        write_diagnosis(found, folder)
+        write_page(found, folder, manifest)
+    for warning in found.data.case.warnings:
+        print(f"calib: {warning}", file=sys.stderr)
+    print(f"verdict: {found.verdict}")
+    for name in found.ranking.order[:4]:
+        print(f"  {found.ranking.probability[name]:6.3f}  {name}")
+    for output, s in found.shrink.items():
+        low, high = s.interval
+        print(
+            f"{output}: error {s.rmse_before:.3g} -> {s.rmse_after:.3g}, shrink "
+            f"{100 * s.fraction:.0f} % ({100 * low:.0f} to {100 * high:.0f}), "
+            f"noise {s.noise_floor:.3g}"
+        )
+    print(out / "index.html")
+
+
+def make(
+    out: Annotated[Path, typer.Option(help="Folder for the cases.")],
+    key: Annotated[Path, typer.Option(help="File for the sealed answers, outside it.")],
+    seed: _Seed,
+    cases: Annotated[int, typer.Option(help="How many.", min=1)] = 300,
+    tier: Annotated[Literal["both", "easy", "hard"], typer.Option(help="Difficulty.")] = "both",
+    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 2,
+) -> None:
+    """Write cases of known cause, and their answers into a sealed key."""
+    from calib.challenge.make import make as make_cases
+    from calib.cli.display import progress_bars
+
+    with progress_bars() as tell:
+        digest = make_cases(
+            out, key, seed=seed, n_cases=cases, workers=workers,
+            tiers=("easy", "hard") if tier == "both" else (tier,),
+            progress=lambda done, n: tell("making cases", done, n),
+        )  # fmt: skip
+    print(f"{cases} cases in {out}; the key's SHA-256 is {digest}")
+
+
+def run(
+    folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
+    out: Annotated[Path, typer.Option(help="Folder for the diagnoses; resumed if it is there.")],
+    seed: _Seed = 1,
+    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 2,
+) -> None:
+    """Diagnose every case of a folder; run again to resume."""
+    from calib.cli.display import progress_bars
+    from calib.gap.batch import case_folders, diagnose_cases
+
+    cases = case_folders(folder)
+    with progress_bars() as tell:
+        failed = diagnose_cases(
+            cases, out, seed, workers=workers,
+            progress=lambda done, n: tell("diagnosing", done, n),
+        )  # fmt: skip
+    for name, error in failed.items():
+        print(f"calib: {name} failed: {error}", file=sys.stderr)
+    print(f"{len(cases) - len(failed)} of {len(cases)} cases diagnosed in {out}")
+    if failed:
+        raise typer.Exit(1)
+
+
+def score(
+    folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
+    results: Annotated[Path, typer.Option(help="Folder with the diagnoses.")],
+    key: Annotated[Path, typer.Option(help="The sealed answers.")],
+    out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
+    overwrite: _Overwrite = False,
+) -> None:
+    """Compare diagnoses with the sealed answers."""
+    from calib.challenge.figures import confusion_figure, levels_figure, reliability_figure
+    from calib.challenge.score import score as score_all
+    from calib.challenge.table import text_table
+    from calib.folders import check_folder, fresh_folder
+
+    if out is not None:
+        check_folder(out, overwrite=overwrite)
+    found = score_all(folder, results, key)
+    table = text_table(found)
+    print(table)
+    if out is None:
+        return
+    with fresh_folder(out, overwrite=overwrite) as scratch:
+        (scratch / "score.txt").write_text(table + "\n", encoding="utf-8")
+        levels_figure(list(found.tiers.values())).savefig(scratch / "levels.png", dpi=150)
+        for tier, confusion in found.confusion.items():
+            figure = confusion_figure(confusion, f"{tier} cases")
+            figure.savefig(scratch / f"confusion_{tier}.png", dpi=150)
+            bins = found.tiers[tier].reliability
+            reliability_figure(bins, f"{tier} cases").savefig(
+                scratch / f"reliability_{tier}.png", dpi=150
+            )
+    print(out)

@@ -1,0 +1,61 @@
+"""Effects from a user's own Python file: a class for each, its priors in a TOML file beside it."""
+
+from __future__ import annotations
+
+import importlib.util
+import inspect
+from pathlib import Path
+
+from calib.errors import CalibError
+from calib.gap.effects.base import Effect
+
+__all__ = ["load_effects"]
+
+
+def load_effects(path: Path) -> dict[str, Effect]:
+    """Load the effects that a Python file defines.
+
+    Parameters
+    ----------
+    path : Path
+        Python file with subclasses of `calib.gap.effects.Effect`; ``NAME.toml`` beside it holds
+        the priors of the effect of that name.
+
+    Raises
+    ------
+    CalibError
+        If the file cannot be run, defines no effect, or priors are missing.
+    """
+    path = Path(path)
+    spec = importlib.util.spec_from_file_location(f"calib_user_{path.stem}", path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise CalibError(
+            "the effects cannot be read", where=str(path), allowed="a Python file ending in .py",
+            mend="give the path of such a file",
+        )  # fmt: skip
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise CalibError(
+            f"the file does not run: {type(error).__name__}: {error}",
+            where=str(path),
+            mend="correct it",
+        ) from error
+    found: dict[str, Effect] = {}
+    for _, kind in inspect.getmembers(module, inspect.isclass):
+        if issubclass(kind, Effect) and kind.__module__ == module.__name__ and kind.name:
+            effect = kind()
+            effect.prior_file = path.with_name(f"{effect.name}.toml")
+            if not effect.prior_file.is_file():
+                raise CalibError(
+                    f"the effect {effect.name} has no priors", where=str(effect.prior_file),
+                    mend="write this file after the example of priors/effects/rate_effect.toml",
+                )  # fmt: skip
+            found[effect.name] = effect
+    if not found:
+        raise CalibError(
+            "the file defines no effect", where=str(path),
+            allowed="a subclass of calib.gap.effects.Effect with a name",
+        )  # fmt: skip
+    return found
