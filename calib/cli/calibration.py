@@ -130,7 +130,7 @@ def fit(
 
 
 def predict(
-    run: Annotated[Path, typer.Argument(help="Run folder of `calib fit`.")],
+    run: Annotated[Path, typer.Argument(help="Folder of `calib fit` or `calib diagnose`.")],
     at: Annotated[Path, typer.Option(help="CSV with the conditions.")],
     out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
 ) -> None:
@@ -140,6 +140,9 @@ def predict(
     from calib.prediction import prediction_columns
     from calib.store import load_calibration
 
+    if (run / "corrected.json").exists():
+        _predict_corrected(run, at, out)
+        return
     calibration = load_calibration(run)
     if not calibration.converged:
         print("calib: this calibration did not converge; its bands are not to be used",
@@ -157,6 +160,23 @@ def predict(
         print(",".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in row))
     if outside:
         print(f"calib: {outside} rows lie outside the calibrated range", file=sys.stderr)
+
+
+def _predict_corrected(run: Path, at: Path, out: Path | None) -> None:
+    """Predict with the corrected model of a diagnosis, beside the calibrated simulator."""
+    from calib.data import read_for_model, write_table
+    from calib.gap.corrected import load_corrected, predict_columns
+
+    corrected = load_corrected(run)
+    used = {c for o in corrected.data.outputs for c in o.problem.bound.model.conditions}
+    columns = predict_columns(corrected, read_for_model(at, sorted(used)))
+    if out is not None:
+        write_table(out, columns)
+        print(out)
+        return
+    print(",".join(columns))
+    for row in zip(*columns.values(), strict=True):
+        print(",".join(f"{value:.6g}" for value in row))
 
 
 def data(

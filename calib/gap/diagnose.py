@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calib.gap.case import Campaigns, Case, campaigns
-from calib.gap.effects import EFFECTS, Effect, View
-from calib.gap.mixture import Mixture, Truth, mixture
+from calib.gap.corrected import Corrected
+from calib.gap.effects import EFFECTS, Effect
+from calib.gap.mixture import Truth, mixture
 from calib.gap.next_measurement import NextMeasurement, next_measurements
 from calib.gap.shrink import FreshPrediction, Shrink, predict_fresh, shrink
 from calib.gap.where import Region, RowGap, regions, row_gaps
 from calib.gap.which import Ranking, rank
-from calib.models.base import Array
 from calib.outputs import OUTPUTS
 
 __all__ = ["Diagnosis", "diagnose", "verdict"]
@@ -44,7 +44,7 @@ class Diagnosis:
         Empty without conditions to predict.
     next_measurements : tuple of NextMeasurement
         What would separate hypotheses that are still in play.
-    mixture : Mixture
+    corrected : Corrected
         To predict at other conditions.
     seed : int
     """
@@ -58,7 +58,7 @@ class Diagnosis:
     shrink: Mapping[str, Shrink]
     fresh: Mapping[str, FreshPrediction]
     next_measurements: tuple[NextMeasurement, ...]
-    mixture: Mixture
+    corrected: Corrected
     seed: int
 
 
@@ -89,7 +89,8 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
     # Without conditions to predict, the field's own are the best guess at where it will be used.
     target = data.view if case.fresh is None else data.at(case.fresh)
     at_target = truth if case.fresh is None else mixed.at(target)
-    before = _calibrated(data, ranking, target)
+    corrected = Corrected(mixed, ranking.lab_mode)
+    before = corrected.calibrated(target.conditions)
     return Diagnosis(
         data,
         ranking,
@@ -100,7 +101,7 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
         shrink(data, at_target, before),
         {} if case.fresh is None else predict_fresh(at_target, before),
         next_measurements(data, ranking, seed),
-        mixed,
+        corrected,
         seed,
     )
 
@@ -150,13 +151,3 @@ def verdict(probability: Mapping[str, float]) -> str:
     if probability[best] < NAMED:
         return "none" if best == "none" else "ambiguous"
     return best if best in ("none", "unknown") else "effect"
-
-
-def _calibrated(data: Campaigns, ranking: Ranking, view: View) -> dict[str, Array]:
-    """Predict with the simulator as the lab calibrated it, in the outputs' units."""
-    predicted = {}
-    for o in data.outputs:
-        theta = o.priors.to_natural(ranking.lab_mode[o.name][None])
-        conditions = o.problem.bound.model.select(view.conditions)
-        predicted[o.name] = np.asarray(o.problem.bound.predict(theta, conditions)[0])
-    return predicted

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.data import write_table
+from calib.gap.corrected import save_corrected
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
 from calib.models.base import Array
@@ -94,6 +95,7 @@ def _parameters(fit: Fit) -> dict[str, dict[str, float]]:
 def write_diagnosis(found: Diagnosis, folder: Path) -> None:
     """Write the files of a diagnosis into an existing folder."""
     (folder / "diagnosis.json").write_text(json.dumps(document(found), indent=1) + "\n")
+    save_corrected(found.corrected, folder)
     fresh = found.data.case.fresh
     if fresh is None:
         return

@@ -147,6 +147,14 @@ class Forward:
             basis += [slip, 1.5 * slip**2 - 0.5]
         if "pressure" in wanted and pressure is not None:
             basis.append(pressure)
+        for kind, name, transform in (
+            ("cone", "cone_index_kpa", "log"),
+            ("water", "gravimetric_water_content", ""),
+            ("water", "volumetric_water_content", ""),
+        ):
+            values = self._scaled(view, name, transform) if kind in wanted else None
+            if values is not None:
+                basis.append(values)
         if "shape" in wanted:
             for e in self.hypothesis.effects:
                 values = e.shape(view) if "shape" in e.form else None

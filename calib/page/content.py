@@ -53,7 +53,7 @@ def failed_section(key: str, failure: Failure) -> dict[str, Any]:
         "name": output_name(key),
         "model": get_model(failure.task.model).title,
         "failed": True,
-        "error": failure.error.removeprefix("x"),
+        "error": failure.error.removeprefix("CalibError: "),
         "level": str(Level.FAILED.value),
         "mark": MARKS[Level.FAILED],
         "headline": "Failed",

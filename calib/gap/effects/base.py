@@ -76,7 +76,7 @@ class Effect:
         Columns it needs.
     varies : bool
         Whether the (first) covariate must vary in the field, or differ from the laboratory's.
-    form : tuple of {"size", "slip", "pressure", "shape"}
+    form : tuple of {"size", "slip", "pressure", "cone", "water", "shape"}
         Along what its size may depart from its formula, by the form error of the diagnosis;
         empty where the formula is exact.
     prior_file : Path, optional

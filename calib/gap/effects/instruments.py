@@ -109,6 +109,7 @@ class ConeIndexBias(Effect):
     name = "cone_index_bias"
     title = "the cone penetrometer reads wrong"
     parameters = ("gain", "offset")
+    form = ("size", "cone", "water")
     outputs = (DENSITY,)
     covariates = ("cone_index_kpa",)
     varies = False
@@ -130,6 +131,7 @@ class WaterContentBias(Effect):
     name = "water_content_bias"
     title = "the moisture probe reads wrong"
     parameters = ("gain", "offset")
+    form = ("size", "cone", "water")
     outputs = (DENSITY,)
     varies = False
 

@@ -1,0 +1,53 @@
+"""All figures of a diagnosis, in reading order; one that fails does not stop the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from calib.figures.gap_design import isolability_plate, left_over_plate
+from calib.figures.gap_shrink import how_far_plate
+from calib.figures.gap_where import conditions_plate, where_plate
+from calib.figures.gap_which import placebo_plate, which_plate
+from calib.figures.plate import Plate
+from calib.figures.style import style
+from calib.gap.diagnose import Diagnosis
+
+__all__ = ["gap_plates"]
+
+type _Draw = Callable[[Diagnosis], Plate | None]
+
+_DRAWINGS: dict[str, _Draw] = {
+    "isolability": isolability_plate,
+    "where": where_plate,
+    "where_conditions": conditions_plate,
+    "which": which_plate,
+    "how_far": how_far_plate,
+    "placebo": placebo_plate,
+    "left_over": left_over_plate,
+}
+
+
+def gap_plates(found: Diagnosis) -> list[Plate]:
+    """Draw the figures of a diagnosis.
+
+    Parameters
+    ----------
+    found : Diagnosis
+
+    Returns
+    -------
+    list of Plate
+        In reading order. A figure that failed has ``figure=None`` and a caption saying why.
+    """
+    with style():
+        drawn = [_attempt(name, draw, found) for name, draw in _DRAWINGS.items()]
+    return [plate for plate in drawn if plate is not None]
+
+
+def _attempt(name: str, draw: _Draw, found: Diagnosis) -> Plate | None:
+    try:
+        return draw(found)
+    except Exception as error:
+        # Any failure: a page without one figure is worth more than no page.
+        why = f"{type(error).__name__}: {error}"
+        return Plate(None, name, f"This figure could not be drawn ({why}).")

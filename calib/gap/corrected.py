@@ -1,0 +1,192 @@
+"""The corrected model: saved with a diagnosis, loaded again to predict at new conditions.
+
+It is the mixture of hypotheses, each a normal about its mode, with the two campaigns it was fitted
+to. A correction is only as good as the diagnosis: its bands hold the doubt about the cause too.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.data import Table, write_table
+from calib.errors import CalibError
+from calib.gap.case import Campaigns, campaigns, read_case
+from calib.gap.effects import EFFECTS, Effect
+from calib.gap.fit import Fit, Noise
+from calib.gap.forward import Forward, Hypothesis
+from calib.gap.hypotheses import effect_priors
+from calib.gap.mixture import Mixture
+from calib.gap.shrink import predict_fresh
+from calib.models.base import Array
+from calib.outputs import OUTPUTS
+
+__all__ = ["Corrected", "load_corrected", "predict_columns", "save_corrected"]
+
+SCHEMA = "calib/corrected/1"
+
+
+class Corrected:
+    """A mixture of hypotheses and the simulator as the lab calibrated it.
+
+    Parameters
+    ----------
+    mixture : Mixture
+    lab_mode : mapping of str to ndarray
+        Internal parameters of each simulator.
+    """
+
+    def __init__(self, mixture: Mixture, lab_mode: Mapping[str, Array]) -> None:
+        self.mixture = mixture
+        self.lab_mode = lab_mode
+
+    @property
+    def data(self) -> Campaigns:
+        """The campaigns it was fitted to."""
+        return self.mixture.data
+
+    def calibrated(self, conditions: Mapping[str, Array]) -> dict[str, Array]:
+        """Predict with the simulator alone, in the outputs' units, shapes (n,)."""
+        predicted = {}
+        for o in self.data.outputs:
+            theta = o.priors.to_natural(self.lab_mode[o.name][None])
+            selected = o.problem.bound.model.select(conditions)
+            predicted[o.name] = np.asarray(o.problem.bound.predict(theta, selected)[0])
+        return predicted
+
+
+def save_corrected(corrected: Corrected, folder: Path) -> None:
+    """Write ``corrected.json`` and the campaigns into an existing folder."""
+    case = corrected.data.case
+    inner = folder / "case"
+    inner.mkdir()
+    write_table(inner / "lab.csv", case.lab.columns)
+    write_table(inner / "field.csv", case.field.columns)
+    models = "\n".join(f'{output} = "{model}"' for output, model in case.models.items())
+    (inner / "case.toml").write_text(
+        f'calibration = "lab.csv"\nfield = "field.csv"\n\n[models]\n{models}\n', encoding="utf-8"
+    )
+    content = {
+        "schema": SCHEMA,
+        "seed": corrected.mixture.seed,
+        "lab_mode": {name: t.tolist() for name, t in corrected.lab_mode.items()},
+        "fits": [
+            _fit_document(fit, probability)
+            for fit, probability in zip(
+                corrected.mixture.fits, corrected.mixture.probability, strict=True
+            )
+        ],
+    }
+    (folder / "corrected.json").write_text(json.dumps(content) + "\n", encoding="utf-8")
+
+
+def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
+    h = fit.forward.hypothesis
+    return {
+        "name": h.name,
+        "effects": [e.name for e in h.effects],
+        "shift": h.shift,
+        "smooth": h.smooth,
+        "smooth_outputs": list(h.smooth_outputs),
+        "smooth_over": h.smooth_over,
+        "probability": probability,
+        "psi": fit.psi.tolist(),
+        "covariance": fit.covariance.tolist(),
+        "noise": {o: {"sigma": n.sigma, "rho": n.rho} for o, n in fit.noise.items()},
+    }
+
+
+def load_corrected(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> Corrected:
+    """Load the corrected model of a diagnosis.
+
+    Parameters
+    ----------
+    folder : Path
+        Written by `calib diagnose`.
+    effects : mapping of str to Effect, optional
+        Must hold the effects that were considered.
+
+    Raises
+    ------
+    CalibError
+        If the folder has no corrected model, or it is damaged.
+    """
+    path = Path(folder) / "corrected.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        if content["schema"] != SCHEMA:
+            raise ValueError
+        data = campaigns(read_case(Path(folder) / "case"))
+        lab_mode = {name: np.array(t) for name, t in content["lab_mode"].items()}
+        fits = tuple(_load_fit(data, f, effects) for f in content["fits"])
+        probability = tuple(float(f["probability"]) for f in content["fits"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise CalibError(
+            f"there is no readable corrected model ({type(error).__name__})", where=str(path),
+            allowed="a folder written by `calib diagnose`", mend="run the diagnosis again",
+        ) from None  # fmt: skip
+    return Corrected(Mixture(data, fits, probability, int(content["seed"])), lab_mode)
+
+
+def _load_fit(data: Campaigns, document: dict[str, Any], effects: Mapping[str, Effect]) -> Fit:
+    unknown = [name for name in document["effects"] if name not in effects]
+    if unknown:
+        raise CalibError(
+            f"the corrected model uses the effect {', '.join(unknown)}, which is not known here",
+            allowed=", ".join(effects),
+            mend="pass the Python file that defines it",
+        )
+    chosen = tuple(effects[name] for name in document["effects"])
+    hypothesis = Hypothesis(
+        document["name"], chosen, tuple(effect_priors(data, e) for e in chosen),
+        document["shift"], document["smooth"], tuple(document["smooth_outputs"]),
+        document["smooth_over"],
+    )  # fmt: skip
+    noise = {o: Noise(n["sigma"], n["rho"]) for o, n in document["noise"].items()}
+    forward = Forward(data, hypothesis, {o: n.sigma for o, n in noise.items()})
+    psi, covariance = np.array(document["psi"]), np.array(document["covariance"])
+    if psi.shape != (forward.n_dim,) or covariance.shape != (forward.n_dim, forward.n_dim):
+        raise ValueError("shape")
+    return Fit(forward, psi, covariance, noise, 0.0, 0.0, {})
+
+
+def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array]:
+    """Lay out a prediction at new conditions: conditions, before, after, 90 % predictive band.
+
+    Parameters
+    ----------
+    corrected : Corrected
+    table : Table
+        With the conditions of all models and the covariates of the effects.
+
+    Raises
+    ------
+    CalibError
+        If a condition is missing.
+    """
+    needed = corrected.data.view.conditions
+    missing = [n for n in needed if n not in table and n not in (*OUTPUTS.values(), "run_order")]
+    if missing:
+        raise CalibError(
+            f"the corrected model needs {', '.join(missing)}", where=table.source,
+            allowed="the conditions and covariates of the field campaign", mend="add the columns",
+        )  # fmt: skip
+    conditions = dict(table.columns)
+    if "run_order" in needed and "run_order" not in conditions:
+        # A drift is predicted as it stood at the end of the campaign.
+        conditions["run_order"] = np.full(len(table), corrected.data.view.order_range[1])
+    truth = corrected.mixture.at(corrected.data.at_conditions(conditions))
+    columns: dict[str, Array] = {
+        n: v for n, v in table.columns.items() if n not in OUTPUTS.values()
+    }
+    for name, p in predict_fresh(truth, corrected.calibrated(conditions)).items():
+        column = OUTPUTS[name]
+        columns |= {
+            f"{column}_before": p.before, f"{column}_after": p.after,
+            f"{column}_after_lower": p.lower, f"{column}_after_upper": p.upper,
+        }  # fmt: skip
+    return columns
