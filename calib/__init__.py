@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from calib.datasets.he2019 import load_he2019
     from calib.errors import CalibError
     from calib.estimators import PointEstimate, estimate
+    from calib.gap.case import Case, read_case
+    from calib.gap.diagnose import Diagnosis, diagnose
     from calib.models import MODELS
     from calib.prediction import Prediction, predict
     from calib.problem import Problem, build_problem
@@ -33,6 +35,10 @@ _HOME = {
     "CalibError": "calib.errors",
     "PointEstimate": "calib.estimators",
     "estimate": "calib.estimators",
+    "Case": "calib.gap.case",
+    "read_case": "calib.gap.case",
+    "Diagnosis": "calib.gap.diagnose",
+    "diagnose": "calib.gap.diagnose",
     "MODELS": "calib.models",
     "Prediction": "calib.prediction",
     "predict": "calib.prediction",
@@ -51,6 +57,8 @@ __all__ = [
     "MODELS",
     "CalibError",
     "Calibration",
+    "Case",
+    "Diagnosis",
     "PointEstimate",
     "Prediction",
     "Problem",
@@ -59,12 +67,14 @@ __all__ = [
     "Validation",
     "build_problem",
     "calibrate",
+    "diagnose",
     "estimate",
     "hold_out",
     "leave_one_out",
     "load_calibration",
     "load_he2019",
     "predict",
+    "read_case",
     "read_table",
     "save_calibration",
     "table_from_arrays",

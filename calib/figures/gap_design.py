@@ -35,7 +35,7 @@ def isolability_plate(found: Diagnosis) -> Plate | None:
     n = len(names)
     side = max(5.0 * n, 30.0)
     fig, axes = panels(
-        1, 3, height=side, left=40.0, right=4.0, top=6.0, bottom=36.0, gap_x=6.0, sharey=False
+        1, 3, height=side, left=40.0, right=4.0, top=6.0, bottom=32.0, gap_x=6.0, sharey=False
     )
     total = fig.get_figwidth() * 25.4
     height = fig.get_figheight() * 25.4
@@ -44,7 +44,7 @@ def isolability_plate(found: Diagnosis) -> Plate | None:
     width = min(side, 86.0)
     left = 40.0
     for ax, w in zip(axes[0], (width, strip, strip), strict=True):
-        ax.set_position((left / total, 36.0 / height, w / total, side / height))
+        ax.set_position((left / total, 32.0 / height, w / total, side / height))
         left += w + 8.0
     _matrix(axes[0, 0], design, names)
     y = np.arange(n)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
-from calib.figures.labels import Axis, axis_of, short
+from calib.figures.labels import Axis, axis_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
@@ -16,8 +16,9 @@ from calib.models.base import Array
 from calib.outputs import OUTPUTS
 
 __all__ = [
-    "PROBABLE", "OutputRows", "axis_name", "best_fit", "best_of", "output_rows", "output_word",
-    "panel_groups", "short_name", "title_of",
+    "PROBABLE", "OutputRows", "axis_name", "best_fit", "best_of", "output_axis", "output_rows",
+    "output_word", "panel_groups", "short_name", "title_of",
+    "unit_after",
 ]  # fmt: skip
 
 # White to dark: how probable it is that a gap exceeds the noise. It survives greyscale.
@@ -36,6 +37,8 @@ _AXES = {
     "run_order": Axis("Run order", "number"),
 }
 _MOST_PANELS = 4
+# Pulls below this (kN) are those of a single small wheel, written in newtons.
+_SMALL_PULL = 0.1
 
 
 def short_name(name: str) -> str:
@@ -60,6 +63,11 @@ def axis_name(column: str) -> Axis:
     return _AXES.get(column) or axis_of(column)
 
 
+def unit_after(axis: Axis) -> str:
+    """Return a unit to be put after a number; nothing for counts."""
+    return "" if axis.unit == "number" else f" {axis.unit}"
+
+
 def output_word(output: str) -> str:
     """Return an output's name in a sentence."""
     return output.replace("_", " ")
@@ -77,7 +85,7 @@ def best_of(found: Diagnosis) -> str:
 
 @dataclass(frozen=True)
 class OutputRows:
-    """Field rows of one output, in its unit.
+    """Field rows of one output, as they are drawn.
 
     Parameters
     ----------
@@ -85,7 +93,7 @@ class OutputRows:
     axis : Axis
     rows : ndarray of int, shape (n,)
     measured, before, after : ndarray, shape (n,)
-        The reading; the calibrated simulator; the corrected one.
+        On the scale of the axis: the reading; the calibrated simulator; the corrected one.
     noise : ndarray, shape (n,)
         Sd of a reading.
     gap, sd, probability : ndarray, shape (n,)
@@ -114,7 +122,7 @@ def output_rows(found: Diagnosis) -> list[OutputRows]:
         gathered.append(
             OutputRows(
                 o.name,
-                axis_of(OUTPUTS[o.name]),
+                output_axis(found, o.name),
                 o.rows,
                 found.data.case.field[OUTPUTS[o.name]][o.rows],
                 np.asarray(before)[o.rows],
@@ -125,7 +133,23 @@ def output_rows(found: Diagnosis) -> list[OutputRows]:
                 gap.probability,
             )
         )
-    return gathered
+    return [_rescaled(own) for own in gathered]
+
+
+def output_axis(found: Diagnosis, output: str) -> Axis:
+    """Return how an output is written: drawbar pulls of a small wheel in newtons."""
+    axis = axis_of(OUTPUTS[output])
+    if axis.unit == "kN" and np.nanmax(np.abs(found.data.case.field[OUTPUTS[output]])) < _SMALL_PULL:
+        return Axis(axis.name, "N", 1000.0)
+    return axis
+
+
+def _rescaled(own: OutputRows) -> OutputRows:
+    """Put the values on the scale of the axis."""
+    if own.axis.factor == 1.0:
+        return own
+    names = ("measured", "before", "after", "noise", "gap", "sd")
+    return replace(own, **{name: own.axis.scale(getattr(own, name)) for name in names})
 
 
 def panel_groups(
@@ -138,12 +162,12 @@ def panel_groups(
         return [("", everything)]
     distinct = np.unique(pressure)
     if distinct.size <= _MOST_PANELS:
-        return [(f"{short(float(p), 3)} psi", pressure[rows] == p) for p in distinct]
+        return [(f"{float(p):.3g} psi", pressure[rows] == p) for p in distinct]
     edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
     groups = []
     for low, high in zip(edges[:-1], edges[1:], strict=True):
         inside = (pressure[rows] >= low) & (pressure[rows] <= high)
         if low > edges[0]:
             inside &= pressure[rows] > low
-        groups.append((f"{short(float(low), 3)} to {short(float(high), 3)} psi", inside))
+        groups.append((f"{low:.3g} to {high:.3g} psi", inside))
     return groups

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,10 @@ from calib.figures.labels import percent, short
 from calib.figures.plate import Plate
 from calib.figures.style import BLACK, BLUE, GREY, VERMILION, legend_below, panels
 from calib.gap.diagnose import Diagnosis
+from calib.gap.shrink import Shrink
 from calib.models.base import Array
 
-__all__ = ["how_far_plate"]
+__all__ = ["how_far_plate", "scaled_shrink"]
 
 
 def how_far_plate(found: Diagnosis) -> Plate:
@@ -36,7 +38,7 @@ def how_far_plate(found: Diagnosis) -> Plate:
     axes[0, 0].set_title("Data against prediction", loc="left")
     axes[0, 1].set_title("Error at the field rows", loc="left")
     where = "new conditions" if found.data.case.fresh is not None else "field conditions"
-    axes[0, 2].set_title(f"Expected error, {where}", loc="left")
+    axes[0, 2].set_title(f"Expected at {where}", loc="left")
     legend_below(fig, list(handles.values()), list(handles), 4)
     return Plate(fig, "how_far", _caption(found, outputs), "How far: before and after")
 
@@ -77,9 +79,11 @@ def _errors(ax: Axes, x: Array, own: OutputRows) -> None:
 
 def _bars(ax: Axes, found: Diagnosis, own: OutputRows) -> None:
     """Draw rms errors with the noise floor, or say that there is no gap to shrink."""
-    s = found.shrink.get(own.name)
+    s = scaled_shrink(found, own)
     ax.set_ylabel(f"Error of the prediction, rms ({own.axis.unit})")
     if s is None:
+        ax.set_ylabel("")
+        ax.axis("off")
         ax.set_xticks([])
         ax.set_yticks([])
         ax.text(
@@ -97,6 +101,8 @@ def _bars(ax: Axes, found: Diagnosis, own: OutputRows) -> None:
     ax.axhline(s.noise_floor, color=BLACK, lw=0.9, ls=(0, (1, 1)))
     top = 1.3 * max(s.rmse_before, s.noise_floor, high)
     ax.set_ylim(0.0, top)
+    if top > 0.01:
+        ax.ticklabel_format(axis="y", style="plain")
     ax.text(
         1.47, s.noise_floor + 0.012 * top, "noise", ha="right", va="bottom", fontsize=6.5
     )
@@ -107,6 +113,17 @@ def _bars(ax: Axes, found: Diagnosis, own: OutputRows) -> None:
     ax.tick_params(axis="x", length=0.0)
 
 
+def scaled_shrink(found: Diagnosis, own: OutputRows) -> Shrink | None:
+    """Return the shrink of an output on the scale of its axis."""
+    s, factor = found.shrink.get(own.name), own.axis.factor
+    if s is None:
+        return None
+    return replace(
+        s, rmse_before=s.rmse_before * factor, rmse_after=s.rmse_after * factor,
+        noise_floor=s.noise_floor * factor,
+    )  # fmt: skip
+
+
 def _interval(interval: tuple[float, float]) -> str:
     low, high = (f"{100.0 * v:.0f}".replace("-", "−") for v in interval)
     return f"{low} to {high} %"
@@ -115,7 +132,7 @@ def _interval(interval: tuple[float, float]) -> str:
 def _caption(found: Diagnosis, outputs: list[OutputRows]) -> str:
     parts = []
     for o in outputs:
-        s = found.shrink.get(o.name)
+        s = scaled_shrink(found, o)
         if s is None:
             parts.append(f"{output_word(o.name)} has no gap that could shrink")
             continue

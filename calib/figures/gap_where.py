@@ -18,6 +18,7 @@ from calib.figures.gap_rows import (
     output_rows,
     output_word,
     panel_groups,
+    unit_after,
 )
 from calib.figures.labels import percent, short
 from calib.figures.plate import Plate
@@ -83,7 +84,7 @@ def conditions_plate(found: Diagnosis) -> Plate | None:
         return None
     outputs = output_rows(found)
     fig, axes = panels(
-        len(outputs), len(names), height=34.0, left=16.0, right=4.0, top=4.0, bottom=25.0,
+        len(outputs), len(names), height=34.0, left=19.0, right=4.0, top=4.0, bottom=28.0,
         gap_x=3.0, gap_y=5.0, sharex="col", sharey="row",
     )  # fmt: skip
     for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
@@ -205,7 +206,8 @@ def _region_caption(found: Diagnosis) -> str:
         own = next(o for o in output_rows(found) if o.name == r.output)
         parts.append(
             f"{output_word(r.output)} over {axis.name.lower()} {axis.value_text(low)} to "
-            f"{axis.value_text(high)} {axis.unit}: {short(r.gap)} {own.axis.unit} "
+            f"{axis.value_text(high)}{unit_after(axis)}: {short(r.gap * own.axis.factor)} "
+            f"{own.axis.unit} "
             f"(probability {percent(r.probability) if r.probability < 0.995 else 'above 99 %'})"
         )
     return (

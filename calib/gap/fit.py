@@ -112,7 +112,7 @@ def fit(
         step, new_cost, damping = _step(problem, psi, noise, hessian, gradient, cost, damping)
         gained = cost - new_cost
         psi = problem.clip(psi + step)
-        new_noise = problem.update_noise(psi, hessian, noise)
+        new_noise = problem.update_noise(psi, jacobian, hessian)
         changed = max(
             abs(np.log(new_noise[o].sigma / noise[o].sigma)) + abs(new_noise[o].rho - noise[o].rho)
             for o in noise
@@ -217,11 +217,8 @@ class _Residuals:
         r = np.where(np.isfinite(r), r, r[0])
         return ((r[1:] - r[0]) / (sign * h)[:, None]).T.reshape(-1, d), r[0]
 
-    def update_noise(
-        self, psi: Array, hessian: Array, noise: Mapping[str, Noise]
-    ) -> dict[str, Noise]:
+    def update_noise(self, psi: Array, jacobian: Array, hessian: Array) -> dict[str, Noise]:
         """Noise scales that maximise the marginal likelihood, parameters allowed for."""
-        jacobian, _ = self.jacobian(psi, noise)
         factor = np.linalg.solve(hessian + np.diag(1e-6 / self.width**2), jacobian.T)
         leverage = np.einsum("nd,dn->n", jacobian, factor)
         raw = self.raw(psi[None])

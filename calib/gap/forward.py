@@ -82,9 +82,12 @@ class Forward:
             _append(entries, p.free, e.name)
             for e, p in zip(hypothesis.effects, hypothesis.effect_priors, strict=True)
         ]
+        # Worked out once for the field rows, which every step of a fit predicts.
+        self._field_form = self._form_basis(data.view)
+        self._field_smooth = self._smooth_basis(data.view) if hypothesis.smooth_outputs else None
         self.form_slices: dict[str, slice] = {}
         for o in data.outputs:
-            m = self._form(data.view).shape[1]
+            m = self._field_form.shape[1]
             self.form_slices[o.name] = _append(entries, [_normal("form", FORM_ERROR)] * m, o.name)
         self.shift_slices: dict[str, slice] = {}
         for o in data.outputs:
@@ -133,6 +136,16 @@ class Forward:
         return np.clip((values - mid) / half, -1.5, 1.5)
 
     def _form(self, view: View) -> Array:
+        same = view.conditions is self.data.view.conditions
+        return self._field_form if same else self._form_basis(view)
+
+    def _smooth(self, view: View) -> tuple[Array, Array]:
+        same = view.conditions is self.data.view.conditions
+        if same and self._field_smooth is not None:
+            return self._field_smooth
+        return self._smooth_basis(view)
+
+    def _form_basis(self, view: View) -> Array:
         """Basis of the form error, shape (n, m)."""
         wanted = {kind for e in self.hypothesis.effects for kind in e.form}
         n = view.slip().size
@@ -164,7 +177,7 @@ class Forward:
                     basis.append(np.clip((values - mid) / (0.5 * np.ptp(reference)), -1.5, 1.5))
         return np.stack(basis, axis=1) if basis else np.empty((n, 0))
 
-    def _smooth(self, view: View) -> tuple[Array, Array]:
+    def _smooth_basis(self, view: View) -> tuple[Array, Array]:
         """Basis of a free discrepancy, shape (n, m), and the sds of its coefficients."""
         slip = self._scaled(view, "slip_ratio")
         pressure = self._scaled(view, "inflation_pressure_psi")
