@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.axes import Axes
 from scipy.cluster.hierarchy import leaves_list, linkage
 from scipy.spatial.distance import squareform
 
 from calib.figures.gap_rows import axis_name, best_fit, best_of, output_word, short_name
-from calib.figures.labels import joined, percent, short
+from calib.figures.labels import NO_UNIT, joined, percent, short
 from calib.figures.plate import Plate
 from calib.figures.style import (
     BLACK,
@@ -51,7 +52,7 @@ def isolability_plate(found: Diagnosis) -> Plate | None:
     absorbed = np.array([design.absorbed[name] for name in names])
     axes[0, 1].barh(y, absorbed, color=ORANGE, height=0.6)
     axes[0, 1].set_xlim(0.0, 1.0)
-    axes[0, 1].set_xlabel("Absorbed by the\nparameters (–)")
+    axes[0, 1].set_xlabel(f"Absorbed by the\nparameters ({NO_UNIT})")
     size = np.array([design.detectable[name] for name in names])
     shown = np.minimum(size, 4.0)
     axes[0, 2].hlines(y, 0.0, shown, color="#c9c9c9", lw=1.0)
@@ -72,7 +73,7 @@ def isolability_plate(found: Diagnosis) -> Plate | None:
     return Plate(fig, "isolability", _design_caption(design), "What this design can tell apart")
 
 
-def _matrix(ax, design: Isolability, names: list[str]) -> None:  # type: ignore[no-untyped-def]
+def _matrix(ax: Axes, design: Isolability, names: list[str]) -> None:
     n = len(names)
     cosine = np.full((n, n), np.nan)
     for i, a in enumerate(names):

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
-from calib.figures.labels import Axis, axis_of
+from calib.figures.labels import MINUS, Axis, axis_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
+from calib.gap.where import Region
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 
 __all__ = [
     "PROBABLE", "OutputRows", "axis_name", "best_fit", "best_of", "output_axis", "output_rows",
-    "output_word", "panel_groups", "short_name", "title_of",
+    "output_word", "panel_groups", "region_text", "short_name", "title_of",
     "unit_after",
 ]  # fmt: skip
 
@@ -66,6 +68,22 @@ def axis_name(column: str) -> Axis:
 def unit_after(axis: Axis) -> str:
     """Return a unit to be put after a number; nothing for counts."""
     return "" if axis.unit == "number" else f" {axis.unit}"
+
+
+def region_text(region: Region) -> str:
+    """Say over which stretch of which condition a region lies."""
+    column, ends = next(iter(region.conditions.items()))
+    axis = axis_name(column)
+    low, high = (_stretch_end(column, axis.scale(np.array(v)).item()) for v in ends)
+    span = low if low == high else f"{low} to {high}"
+    return f"{axis.name.lower()} {span}{unit_after(axis)}"
+
+
+def _stretch_end(column: str, value: float) -> str:
+    text = f"{value:.0f}" if column in ("slip_ratio", "run_order") else f"{value:.3g}"
+    if abs(value) < 10.0 and column not in ("slip_ratio", "run_order"):
+        text = f"{value:.2g}"
+    return text.replace("-", MINUS)
 
 
 def output_word(output: str) -> str:
@@ -139,7 +157,10 @@ def output_rows(found: Diagnosis) -> list[OutputRows]:
 def output_axis(found: Diagnosis, output: str) -> Axis:
     """Return how an output is written: drawbar pulls of a small wheel in newtons."""
     axis = axis_of(OUTPUTS[output])
-    if axis.unit == "kN" and np.nanmax(np.abs(found.data.case.field[OUTPUTS[output]])) < _SMALL_PULL:
+    if (
+        axis.unit == "kN"
+        and np.nanmax(np.abs(found.data.case.field[OUTPUTS[output]])) < _SMALL_PULL
+    ):
         return Axis(axis.name, "N", 1000.0)
     return axis
 
@@ -148,8 +169,16 @@ def _rescaled(own: OutputRows) -> OutputRows:
     """Put the values on the scale of the axis."""
     if own.axis.factor == 1.0:
         return own
-    names = ("measured", "before", "after", "noise", "gap", "sd")
-    return replace(own, **{name: own.axis.scale(getattr(own, name)) for name in names})
+    scale = own.axis.scale
+    return replace(
+        own,
+        measured=scale(own.measured),
+        before=scale(own.before),
+        after=scale(own.after),
+        noise=scale(own.noise),
+        gap=scale(own.gap),
+        sd=scale(own.sd),
+    )
 
 
 def panel_groups(
@@ -165,7 +194,7 @@ def panel_groups(
         return [(f"{float(p):.3g} psi", pressure[rows] == p) for p in distinct]
     edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
     groups = []
-    for low, high in zip(edges[:-1], edges[1:], strict=True):
+    for low, high in pairwise(edges):
         inside = (pressure[rows] >= low) & (pressure[rows] <= high)
         if low > edges[0]:
             inside &= pressure[rows] > low

@@ -10,17 +10,19 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from calib.figures.gap_rows import (
     PROBABLE,
     OutputRows,
     axis_name,
+    output_axis,
     output_rows,
     output_word,
     panel_groups,
-    unit_after,
+    region_text,
 )
-from calib.figures.labels import percent, short
+from calib.figures.labels import NO_UNIT, Axis, percent, short
 from calib.figures.plate import Plate
 from calib.figures.style import BLACK, GREY, ORANGE, VERMILION, panels
 from calib.gap.diagnose import Diagnosis
@@ -56,10 +58,12 @@ def where_plate(found: Diagnosis) -> Plate:
             _noise_band(ax, x[own.rows][mask], own.noise[mask])
             for region in found.regions:
                 if region.output == own.name and "slip_ratio" in region.conditions:
-                    _span(ax, region, x_axis.factor)
+                    _span(ax, region, x_axis, found.data.view.conditions["slip_ratio"])
                     break
             _points(ax, x[own.rows][mask], own, mask)
             ax.set_ylim(-top, top)
+            if top > 0.01:
+                ax.ticklabel_format(axis="y", style="plain")
             if i == 0:
                 ax.set_title(title, loc="left", fontweight="bold")
             if i == len(outputs) - 1:
@@ -94,12 +98,14 @@ def conditions_plate(found: Diagnosis) -> Plate | None:
             ax.axhspan(-1.0, 1.0, color=_BAND, lw=0.0, zorder=0)
             for region in found.regions:
                 if region.output == own.name and name in region.conditions:
-                    _span(ax, region, axis.factor)
+                    _span(ax, region, axis, conditions[name])
             scaled = _in_noise(own)
             _points(ax, axis.scale(conditions[name][own.rows]), scaled, np.ones(own.rows.size, "?"))
             ax.set_ylim(-top, top)
             if i == len(outputs) - 1:
                 ax.set_xlabel(f"{axis.name}\n({axis.unit})")
+                ax.xaxis.set_major_locator(MaxNLocator(3))
+                ax.ticklabel_format(axis="x", style="plain", useOffset=False)
         row[0].set_ylabel(f"Gap in {output_word(own.name)}\n(noise sd)")
     _key(fig, regions=bool(found.regions))
     return Plate(fig, "where_conditions", _region_caption(found), "Where: the gap over conditions")
@@ -136,14 +142,16 @@ def _noise_band(ax: Axes, x: Array, noise: Array) -> None:
     ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
 
 
-def _span(ax: Axes, region: Region, factor: float) -> None:
-    low, high = next(iter(region.conditions.values()))
-    ax.axvspan(
-        low * factor, high * factor, facecolor=ORANGE, alpha=0.13, lw=0.0, zorder=0,
-    )  # fmt: skip
+def _span(ax: Axes, region: Region, axis: Axis, values: Array) -> None:
+    low, high = (float(v) for v in axis.scale(np.array(next(iter(region.conditions.values())))))
+    # A region at a single value still needs a width.
+    least = 0.03 * float(np.ptp(axis.scale(values)))
+    if high - low < least:
+        low, high = low - 0.5 * least, high + 0.5 * least
+    ax.axvspan(low, high, facecolor=ORANGE, alpha=0.13, lw=0.0, zorder=0)
     ax.plot(
-        [low * factor, high * factor], [0.985, 0.985], transform=ax.get_xaxis_transform(),
-        color=VERMILION, lw=2.2, solid_capstyle="butt", clip_on=False,
+        [low, high], [0.985, 0.985], transform=ax.get_xaxis_transform(), color=VERMILION, lw=2.2,
+        solid_capstyle="butt", clip_on=False,
     )  # fmt: skip
 
 
@@ -165,8 +173,8 @@ def _key(fig: Figure, *, regions: bool) -> None:
     bar = fig.add_axes((0.56, 7.0 / height, 0.28, 2.4 / height))
     scale = fig.colorbar(ScalarMappable(_NORM, PROBABLE), cax=bar, orientation="horizontal")
     scale.set_ticks([0.0, 0.5, 1.0])
-    scale.outline.set_linewidth(0.5)  # type: ignore[operator]
-    bar.set_title("Probability that the gap exceeds the noise (–)", fontsize=7.0, pad=2.5)
+    scale.outline.set_linewidth(0.5)
+    bar.set_title(f"Probability that the gap exceeds the noise ({NO_UNIT})", fontsize=7.0, pad=2.5)
     bar.set_xlabel("")
     handles: list[Any] = [Patch(color=_BAND)]
     labels = ["±1 noise sd of a single reading"]
@@ -201,15 +209,10 @@ def _region_caption(found: Diagnosis) -> str:
         return "Over no stretch of any condition does the gap probably exceed the noise."
     parts = []
     for r in found.regions:
-        (name, (low, high)) = next(iter(r.conditions.items()))
-        axis = axis_name(name)
-        own = next(o for o in output_rows(found) if o.name == r.output)
-        parts.append(
-            f"{output_word(r.output)} over {axis.name.lower()} {axis.value_text(low)} to "
-            f"{axis.value_text(high)}{unit_after(axis)}: {short(r.gap * own.axis.factor)} "
-            f"{own.axis.unit} "
-            f"(probability {percent(r.probability) if r.probability < 0.995 else 'above 99 %'})"
-        )
+        axis = output_axis(found, r.output)
+        p = percent(r.probability) if r.probability < 0.995 else "above 99 %"
+        gap = f"{short(r.gap * axis.factor)} {axis.unit}"
+        parts.append(f"{output_word(r.output)} at {region_text(r)}: {gap} (probability {p})")
     return (
         "Each row once in every panel of its output, in units of the noise. Marked regions, with "
         f"their mean gap: {'; '.join(parts)}."

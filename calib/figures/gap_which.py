@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.figures.gap_rows import best_fit, best_of, output_rows, short_name
-from calib.figures.labels import joined, percent, short
+from calib.figures.labels import MINUS, NO_UNIT, joined, percent, short
 from calib.figures.plate import Plate
 from calib.figures.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, note, panels
 from calib.gap.diagnose import Diagnosis
@@ -62,7 +62,7 @@ def which_plate(found: Diagnosis) -> Plate:
     ax.set_xlim(0.0, 1.0)
     ax.axvline(0.5, color=GREY, lw=0.7, ls=(0, (4, 2)), zorder=0)
     ax.tick_params(axis="y", length=0.0)
-    ax.set_xlabel("Probability (–)")
+    ax.set_xlabel(f"Probability ({NO_UNIT})")
     if len(tied) > 1:
         note(ax, "hatched: not far apart,\nread them as a tie", x=0.98, y=0.05, color=BLACK)
     return Plate(fig, "which", _which_caption(found, tied), "Which: the hypotheses")
@@ -155,7 +155,7 @@ def placebo_plate(found: Diagnosis) -> Plate:
             zorder=3,
         )  # fmt: skip
         ax.text(
-            1.015, yi, f"{100.0 * placebo.shrink(name):.0f} %".replace("-", "−"),
+            1.015, yi, f"{100.0 * placebo.shrink(name):.0f} %".replace("-", MINUS),
             transform=ax.get_yaxis_transform(), va="center", fontsize=7.0,
             fontweight="bold" if best else "normal",
         )  # fmt: skip

@@ -122,7 +122,7 @@ def load_corrected(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> Cor
             raise ValueError
         data = campaigns(read_case(Path(folder) / "case"))
         lab_mode = {name: np.array(t) for name, t in content["lab_mode"].items()}
-        fits = tuple(_load_fit(data, f, effects) for f in content["fits"])
+        fits = tuple(_load_fit(data, f, effects, lab_mode) for f in content["fits"])
         probability = tuple(float(f["probability"]) for f in content["fits"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CalibError(
@@ -132,7 +132,12 @@ def load_corrected(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> Cor
     return Corrected(Mixture(data, fits, probability, int(content["seed"])), lab_mode)
 
 
-def _load_fit(data: Campaigns, document: dict[str, Any], effects: Mapping[str, Effect]) -> Fit:
+def _load_fit(
+    data: Campaigns,
+    document: dict[str, Any],
+    effects: Mapping[str, Effect],
+    lab_mode: Mapping[str, Array],
+) -> Fit:
     unknown = [name for name in document["effects"] if name not in effects]
     if unknown:
         raise CalibError(
@@ -147,7 +152,7 @@ def _load_fit(data: Campaigns, document: dict[str, Any], effects: Mapping[str, E
         document["smooth_over"],
     )  # fmt: skip
     noise = {o: Noise(n["sigma"], n["rho"]) for o, n in document["noise"].items()}
-    forward = Forward(data, hypothesis, {o: n.sigma for o, n in noise.items()})
+    forward = Forward(data, hypothesis, {o: n.sigma for o, n in noise.items()}, lab_mode)
     psi, covariance = np.array(document["psi"]), np.array(document["covariance"])
     if psi.shape != (forward.n_dim,) or covariance.shape != (forward.n_dim, forward.n_dim):
         raise ValueError("shape")

@@ -22,11 +22,14 @@ from calib.gap.case import Campaigns
 from calib.gap.effects import Effect, View
 from calib.models.base import Array
 from calib.priors import Prior, Priors
+from calib.sampling.mode import prior_widths
 
 __all__ = ["FORM_ERROR", "Forward", "Hypothesis"]
 
 # Relative size by which a formula may misrepresent its effect along one direction.
 FORM_ERROR = 0.3
+# Shifts that differ between pressures, relative to those that are common to them.
+SHIFT_DIFFERENCE = 0.35
 
 
 @dataclass(frozen=True)
@@ -45,8 +48,9 @@ class Hypothesis:
         Prior sd of a free discrepancy, in units of the noise; 0 for none.
     smooth_outputs : tuple of str
         Outputs that have the free discrepancy.
-    smooth_over : {"slip", "all"}
-        Conditions that it may vary with.
+    smooth_over : {"slip", "level", "all"}
+        What it may vary with: slip, the level of the predicted output (as a saturating
+        instrument would), or every condition.
     """
 
     name: str
@@ -55,7 +59,7 @@ class Hypothesis:
     shift: float = 0.0
     smooth: float = 0.0
     smooth_outputs: tuple[str, ...] = ()
-    smooth_over: Literal["slip", "all"] = "all"
+    smooth_over: Literal["slip", "level", "all"] = "all"
 
 
 class Forward:
@@ -68,9 +72,19 @@ class Forward:
     noise : mapping of str to float
         Typical noise sd of each output on the scale of the response; the unit of a free
         discrepancy.
+    lab_mode : mapping of str to ndarray, optional
+        Internal parameters of the simulators as the lab calibrated them; for a discrepancy that
+        varies with the level of the output.
     """
 
-    def __init__(self, data: Campaigns, hypothesis: Hypothesis, noise: Mapping[str, float]) -> None:
+    def __init__(
+        self,
+        data: Campaigns,
+        hypothesis: Hypothesis,
+        noise: Mapping[str, float],
+        lab_mode: Mapping[str, Array] | None = None,
+    ) -> None:
+        self.lab_mode = lab_mode or {}
         self.data = data
         self.hypothesis = hypothesis
         self.noise = noise
@@ -90,13 +104,15 @@ class Forward:
             m = self._field_form.shape[1]
             self.form_slices[o.name] = _append(entries, [_normal("form", FORM_ERROR)] * m, o.name)
         self.shift_slices: dict[str, slice] = {}
+        self._shift_maps: dict[str, Array] = {}
         for o in data.outputs:
             if hypothesis.shift > 0.0:
-                widths = [
-                    p.scale if np.isfinite(p.scale) else 0.25 * (p.upper - p.lower)
-                    for p in o.priors.free
+                widths = prior_widths(o.priors)
+                self._shift_maps[o.name], relative = _shift_map(o.priors.names)
+                shifts = [
+                    _normal("shift", hypothesis.shift * w * r)
+                    for w, r in zip(widths, relative, strict=True)
                 ]
-                shifts = [_normal("shift", hypothesis.shift * w) for w in widths]
                 self.shift_slices[o.name] = _append(entries, shifts, o.name)
         self.smooth_slices: dict[str, slice] = {}
         for o in data.outputs:
@@ -196,6 +212,11 @@ class Forward:
                 for j in range(1, most + 1)
             ]
 
+        if self.hypothesis.smooth_over == "level":
+            for b, w in cosines(self._level(view), 8, 0.8):
+                basis.append(b)
+                weights.append(w)
+            return np.stack(basis, axis=1), np.array(weights)
         slips = cosines(slip, 10, 0.7)
         terms = list(slips)
         everything = self.hypothesis.smooth_over == "all"
@@ -219,13 +240,30 @@ class Forward:
             weights.append(w)
         return np.stack(basis, axis=1), np.array(weights)
 
+    def _level(self, view: View) -> Array | None:
+        """Predicted level of the (first) output with a discrepancy, scaled to the field's range."""
+        if not self.lab_mode:
+            return None
+        name = self.hypothesis.smooth_outputs[0]
+        o = next(o for o in self.data.outputs if o.name == name)
+        theta = o.priors.to_natural(self.lab_mode[name][None])
+
+        def predicted(conditions: Mapping[str, Array]) -> Array:
+            selected = o.problem.bound.model.select(conditions)
+            return np.asarray(o.problem.bound.location(theta, selected)[0])
+
+        reference = predicted(self.data.view.conditions)
+        low, high = float(np.nanmin(reference)), float(np.nanmax(reference))
+        level = np.nan_to_num(predicted(view.conditions), nan=low)
+        return np.clip((level - low) / max(high - low, 1e-12) * 2.0 - 1.0, -1.5, 1.5)
+
     def theta(self, psi: Array, output: str, *, field: bool) -> Array:
         """Natural simulator parameters, shape (k, d)."""
         index = [o.name for o in self.data.outputs].index(output)
         o = self.data.outputs[index]
         t = psi[:, self.theta_slices[output]]
         if field and output in self.shift_slices:
-            t = t + psi[:, self.shift_slices[output]]
+            t = t + psi[:, self.shift_slices[output]] @ self._shift_maps[output].T
         return o.priors.to_natural(t)
 
     def lab(self, psi: Array) -> dict[str, Array]:
@@ -290,6 +328,22 @@ class Forward:
                 location = plain[name] + (location - plain[name]) * factor
             changed[name] = location
         return changed
+
+
+def _shift_map(names: tuple[str, ...]) -> tuple[Array, list[float]]:
+    """Map shift coordinates to shifts of parameters, and the relative sds of the coordinates.
+
+    Another soil or tyre changes the traction curve at all pressures much alike: the values at the
+    two end pressures share one shift, and differ, as the bends do, by less.
+    """
+    matrix = np.eye(len(names))
+    relative = [SHIFT_DIFFERENCE if name.endswith("_bend") else 1.0 for name in names]
+    for i, name in enumerate(names):
+        if name.endswith("_lo") and f"{name[:-3]}_hi" in names:
+            j = names.index(f"{name[:-3]}_hi")
+            matrix[i, j], matrix[j, i], matrix[j, j] = -1.0, 1.0, 1.0
+            relative[j] = SHIFT_DIFFERENCE
+    return matrix, relative
 
 
 def _append(entries: list[Prior], new: list[Prior] | tuple[Prior, ...], prefix: str) -> slice:

@@ -24,7 +24,7 @@ __all__ = [
 
 # Prior probabilities of the kinds; singles share theirs equally, and a given pair is a twentieth
 # as probable as a given single effect.
-PRIOR = {"none": 0.42, "unknown": 0.08, "parameter_shift": 0.08, "single": 0.42}
+PRIOR = {"none": 0.40, "unknown": 0.10, "parameter_shift": 0.10, "single": 0.40}
 LN_PAIR_TO_SINGLE = float(np.log(0.05))
 LN_PRIOR: Mapping[str, float] = {k: float(np.log(v)) for k, v in PRIOR.items()}
 SHIFTS = (0.1, 0.25, 0.6)
@@ -61,14 +61,16 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
     """Free smooth discrepancies: of one output or all, over slip or everything, small or large."""
     names = data.names
     touched = [(name,) for name in names] + ([names] if len(names) > 1 else [])
-    overs: tuple[Literal["slip", "all"], ...] = ("slip", "all")
+    overs: tuple[Literal["slip", "level", "all"], ...] = ("slip", "level", "all")
     if "slip_ratio" not in data.view.conditions:
-        overs = ("all",)
+        overs = ("level", "all")
     return [
         Hypothesis("unknown", smooth=size, smooth_outputs=outputs, smooth_over=over)
         for outputs in touched
         for over in overs
         for size in SMOOTHS
+        # The level is that of one output.
+        if over != "level" or len(outputs) == 1
     ]
 
 

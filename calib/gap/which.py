@@ -139,7 +139,7 @@ class _Worker:
 
     def fit(self, hypothesis: Hypothesis) -> Fit:
         scale = {o: n.sigma for o, n in self.noise.items()}
-        forward = Forward(self.data, hypothesis, scale)
+        forward = Forward(self.data, hypothesis, scale, self.lab_mode)
         start = np.array([p.loc for p in forward.priors.free])
         for o in self.data.outputs:
             start[forward.theta_slices[o.name]] = self.lab_mode[o.name]

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from calib.figures.labels import joined
@@ -93,7 +93,7 @@ class GapEvidence:
     sizes : sequence of str
         What the best hypothesis amounts to.
     where : sequence of WhereFact
-        Strongest first.
+        One of each output that has any.
     shrink : sequence of ShrinkFact
     unfitted : bool
         Whether the shrink was judged at conditions other than the fitted ones.
@@ -141,6 +141,14 @@ class GapVerdict:
 
 def judge_gap(e: GapEvidence) -> GapVerdict:
     """Apply the rules."""
+    found = _judge(e)
+    headline = found.headline[0].upper() + found.headline[1:]
+    return replace(
+        found, headline=headline, facts=[(k, v[0].upper() + v[1:]) for k, v in found.facts]
+    )
+
+
+def _judge(e: GapEvidence) -> GapVerdict:
     best = e.ranked[0]
     if e.verdict == "none":
         return _no_gap(e, best)
@@ -152,7 +160,7 @@ def judge_gap(e: GapEvidence) -> GapVerdict:
         )  # fmt: skip
     if e.verdict == "ambiguous":
         words = [c.words for c in _tied(e)]
-        headline = f"There is a gap, but the data cannot tell {_or(words)} apart"
+        headline = f"There is a gap, but the data cannot tell {joined(words)} apart"
         if len(words) == 1:
             headline = f"There may be a gap; {words[0]} is the likeliest of many explanations"
         return GapVerdict(Tone.CARE, "tie", "Not told apart", headline, facts)
@@ -173,8 +181,8 @@ def judge_gap(e: GapEvidence) -> GapVerdict:
 def _no_gap(e: GapEvidence, best: Candidate) -> GapVerdict:
     sure = best.probability >= SURE
     size = "" if math.isnan(e.smallest) else (
-        f"; effects from about {e.smallest:.1f} noise sd (rms) up would have been named in four "
-        "of five campaigns like this one"
+        f"; an effect of {e.smallest:.1f} noise sd (rms) or more would have shown in four of five "
+        "campaigns like this one"
     )  # fmt: skip
     facts = [("Which", f"No gap, probability {odds_text(best.probability)}{size}")]
     others = [c for c in e.ranked[1:4] if c.probability >= 0.05]
@@ -218,7 +226,7 @@ def _which(e: GapEvidence) -> str:
 def _where(e: GapEvidence) -> str:
     if not e.where:
         return "In no stretch of the conditions does the gap probably exceed the noise"
-    return "; ".join(f"{w.place}: {w.gap} ({odds_text(w.probability)})" for w in e.where[:2])
+    return "; ".join(f"{w.place}: {w.gap} ({odds_text(w.probability)})" for w in e.where)
 
 
 def _how_far(e: GapEvidence) -> str:
@@ -232,7 +240,7 @@ def _how_far(e: GapEvidence) -> str:
             f"{_per_cent(s.fraction)} % (90 % interval {low} to {high} %)"
         )
         if s.interval[0] <= 0.0:
-            part += ", which may be nothing"
+            part += ", so it may not shrink at all"
         parts.append(part)
     where = "" if e.unfitted else ", at the field's own conditions"
     return "; ".join(parts) + where
@@ -277,10 +285,6 @@ def odds_text(p: float) -> str:
 def _tied(e: GapEvidence) -> list[Candidate]:
     best = e.ranked[0].probability
     return [c for c in e.ranked if c.probability >= TIE * best][:_MOST_TIED]
-
-
-def _or(words: list[str]) -> str:
-    return joined(words)
 
 
 def _hedge(sure: bool) -> str:

@@ -80,8 +80,7 @@ class PressureGaugeBias(Effect):
 
     name = "pressure_gauge_bias"
     title = "true inflation pressure differs from the recorded one"
-    parameters = ("gain", "offset")
-    form = ("size", "slip")
+    parameters = ("gain", "offset", "ground_response")
     outputs = (DRAWBAR, RUT)
     covariates = ("inflation_pressure_psi",)
     varies = False
@@ -96,7 +95,7 @@ class PressureGaugeBias(Effect):
         if "inflation_pressure_psi" in conditions:
             changed["inflation_pressure_psi"] = true
         if "average_ground_pressure_kpa" in conditions:
-            ratio = (true / recorded) ** view.ground_exponent
+            ratio = (true / recorded) ** (view.ground_exponent * phi[:, 2:3])
             changed["average_ground_pressure_kpa"] = (
                 conditions["average_ground_pressure_kpa"] * ratio
             )

@@ -1,0 +1,177 @@
+"""How large an effect is, in the units of what it changes: sentences from posterior draws."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.figures.gap_rows import (
+    axis_name,
+    best_fit,
+    output_axis,
+    output_word,
+    unit_after,
+)
+from calib.gap.diagnose import Diagnosis
+from calib.gap.effects import Effect
+from calib.gap.fit import Fit
+from calib.models.base import Array
+from calib.page.numbers import format_value
+from calib.streams import generator
+
+__all__ = ["size_sentences"]
+
+_N_DRAWS = 400
+# A mean change below this part of the noise is not worth a sentence.
+_SMALL = 0.3
+# The part of the rows at an end of a condition that stands for the end.
+_END = 0.2
+_READINGS = ("force_offset", "sensor_drift")
+
+
+@dataclass(frozen=True)
+class _Change:
+    """Draws of truth minus simulator under one hypothesis, (draws, rows), and the noise there."""
+
+    draws: Array
+    noise: Array
+
+
+def size_sentences(found: Diagnosis, name: str) -> list[str]:
+    """Say what a hypothesis amounts to on the field's conditions.
+
+    Parameters
+    ----------
+    found : Diagnosis
+    name : str
+        Of a fitted hypothesis; ``none`` has no size.
+    """
+    if name == "none":
+        return []
+    fit = best_fit(found, name)
+    psi = fit.draws(generator(found.seed, "gap", "size", name), _N_DRAWS)
+    changes = _changes(found, fit, psi)
+    effects = fit.forward.hypothesis.effects
+    if len(effects) != 1:
+        return _rms_sentences(found, changes, together=len(effects) > 1)
+    effect = effects[0]
+    if type(effect).on_output is Effect.on_output:
+        phi = fit.forward.hypothesis.effect_priors[0].to_natural(psi[:, fit.forward.phi_slices[0]])
+        sentences = _instrument_sentences(found, effect, phi)
+        if sentences:
+            return sentences
+    return _end_sentences(found, effect, changes)
+
+
+def _changes(found: Diagnosis, fit: Fit, psi: Array) -> dict[str, _Change]:
+    view, slip = found.data.view, found.data.view.slip()
+    with np.errstate(all="ignore"):
+        full, plain = fit.forward.field(psi, view), fit.forward.simulator(psi, view)
+    changes = {}
+    for o in found.data.outputs:
+        bound, factor = o.problem.bound, output_axis(found, o.name).factor
+        before, after = (bound.from_response(v[o.name])[:, o.rows] for v in (plain, full))
+        noise = fit.noise[o.name].sd(slip[o.rows])
+        if bound.model.response == "log":
+            noise = noise * np.nanmedian(before, axis=0)
+        good = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)
+        if good.sum() > 10:
+            changes[o.name] = _Change(factor * (after - before)[good], factor * noise)
+    return changes
+
+
+def _rms_sentences(
+    found: Diagnosis, changes: Mapping[str, _Change], *, together: bool
+) -> list[str]:  # fmt: skip
+    sentences = []
+    for output, change in changes.items():
+        rms = np.sqrt(np.square(change.draws).mean(axis=1))
+        if rms.mean() < _SMALL * change.noise.mean():
+            continue
+        unit = output_axis(found, output).unit
+        amount = format_value(float(rms.mean()), float(rms.std()))
+        sentences.append(f"{output_word(output)} changes by {amount} {unit} rms")
+    if sentences:
+        sentences[0] = ("together: " if together else "") + sentences[0]
+        sentences[-1] += " over the field rows"
+    return sentences
+
+
+def _instrument_sentences(found: Diagnosis, effect: Effect, phi: Array) -> list[str]:
+    """Compare conditions that truly held with the recorded ones."""
+    sentences: dict[str, str] = {}
+    view = found.data.view
+    for o in found.data.outputs:
+        recorded = dict(o.problem.bound.model.select(view.conditions))
+        true = effect.on_conditions(phi, o.name, recorded, view)
+        for column, values in recorded.items():
+            if true[column] is values or column in sentences:
+                continue
+            axis = axis_name(column)
+            shift = axis.scale((true[column] - values).mean(axis=1))
+            unit = "percentage points" if column == "slip_ratio" else axis.unit
+            way = "above" if shift.mean() > 0.0 else "below"
+            amount = format_value(abs(float(shift.mean())), float(shift.std()))
+            sentences[column] = (
+                f"true {axis.name.lower()} is {amount} {unit} {way} the recorded one on average"
+            )
+    # Ground pressure only follows from inflation pressure.
+    if "inflation_pressure_psi" in sentences:
+        sentences.pop("average_ground_pressure_kpa", None)
+    return list(sentences.values())
+
+
+def _end_sentences(
+    found: Diagnosis, effect: Effect, changes: Mapping[str, _Change]
+) -> list[str]:  # fmt: skip
+    """Say what the effect does at the end of its condition where it does most."""
+    column = next((c for c in effect.covariates if c in found.data.view.conditions), None)
+    if column is None and effect.form and "slip_ratio" in found.data.view.conditions:
+        column = "slip_ratio"
+    sentences = []
+    for output, change in changes.items():
+        rows = next(o.rows for o in found.data.outputs if o.name == output)
+        where, inside = _end(found, column, rows, change)
+        mean = change.draws[:, inside].mean(axis=1)
+        centre, sd = float(mean.mean()), float(mean.std())
+        if abs(centre) < _SMALL * float(change.noise[inside].mean()):
+            continue
+        unit = output_axis(found, output).unit
+        amount = f"{format_value(abs(centre), sd)} {unit}"
+        if effect.name in _READINGS:
+            text = f"{output_word(output)} reads {amount} {'high' if centre > 0.0 else 'low'}"
+        else:
+            way = _way(output, centre > 0.0)
+            text = f"{output_word(output)} is {amount} {way} than simulated"
+        sentences.append(f"{text} {where}")
+    return sentences
+
+
+def _way(output: str, up: bool) -> str:
+    if output == "rut_depth":
+        return "deeper" if up else "shallower"
+    return "higher" if up else "lower"
+
+
+def _end(
+    found: Diagnosis, column: str | None, rows: NDArray[np.int64], change: _Change
+) -> tuple[str, NDArray[np.bool_]]:
+    everything = np.ones(rows.size, dtype=np.bool_)
+    if column is None:
+        return "in all runs", everything
+    values = found.data.view.conditions[column][rows]
+    if np.ptp(values) == 0.0:
+        return "in all runs", everything
+    ends = (values <= np.quantile(values, _END), values >= np.quantile(values, 1.0 - _END))
+    size = [abs(float(change.draws[:, m].mean())) / float(change.noise[m].mean()) for m in ends]
+    last = int(size[1] >= size[0])
+    inside = ends[last]
+    if column == "run_order":
+        return ("at the start of the campaign", "by the end of the campaign")[last], inside
+    axis = axis_name(column)
+    low, high = (axis.value_text(float(f(values[inside]))) for f in (np.min, np.max))
+    span = low if low == high else f"{low} to {high}"
+    return f"at {axis.name.lower()} {span}{unit_after(axis)}", inside

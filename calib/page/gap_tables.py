@@ -1,0 +1,178 @@
+"""Tables of a diagnosis: hypotheses with their sizes, what cannot be tested, what to measure."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from calib.figures.gap_rows import (
+    axis_name,
+    best_fit,
+    short_name,
+    title_of,
+    unit_after,
+)
+from calib.figures.gap_which import placebos
+from calib.figures.labels import MINUS
+from calib.gap.diagnose import Diagnosis
+from calib.gap.fit import Fit
+from calib.page.gap_verdict import TIE, odds_text, repeats_needed
+from calib.page.numbers import format_number, format_value
+from calib.priors import Prior
+
+__all__ = ["conditions_text", "hypothesis_groups", "next_rows", "parameter_text"]
+
+_POSSIBLE = 0.01
+# An sd above this part of the prior's says that the data did not narrow the parameter.
+_NOT_NARROWED = 0.9
+
+
+def hypothesis_groups(found: Diagnosis) -> list[dict[str, Any]]:
+    """Return the hypotheses with what is known of each, grouped by how probable they are."""
+    p, order = found.ranking.probability, found.ranking.order
+    tied = [n for n in order if p[n] >= TIE * p[order[0]]]
+    rest = [n for n in order if n not in tied]
+    possible = [n for n in rest if p[n] >= _POSSIBLE]
+    out = [n for n in rest if p[n] < _POSSIBLE and "+" not in n]
+    pairs = [n for n in rest if p[n] < _POSSIBLE and "+" in n]
+    left = placebos(found).left
+    groups = (
+        ("Most probable" if len(tied) == 1 else "Tied: the data do not tell these apart", tied),
+        ("Less probable", possible),
+        ("Ruled out (below 1 %)", out),
+        (f"Pairs ruled out (below 1 %): {len(pairs)}", pairs),
+    )
+    return [
+        {
+            "heading": heading,
+            "folded": heading.startswith("Pairs"),
+            "rows": [_row(found, name, left) for name in names],
+        }
+        for heading, names in groups
+        if names
+    ]
+
+
+def _row(found: Diagnosis, name: str, left: dict[str, float]) -> dict[str, Any]:
+    ranking = found.ranking
+    relative = ranking.log_evidence[name] - ranking.log_evidence["none"]
+    return {
+        "name": name,
+        "words": short_name(name),
+        "title": title_of(found, name),
+        "probability": odds_text(ranking.probability[name]),
+        "width": f"{100.0 * ranking.probability[name]:.1f}",
+        "evidence": f"{relative:+.1f}".replace("-", MINUS) if name != "none" else "0",
+        "left": f"{left[name]:.2f}" if name in left else "",
+        "sizes": _sizes(found, name),
+    }
+
+
+def _sizes(found: Diagnosis, name: str) -> list[Markup]:
+    fit = best_fit(found, name)
+    hypothesis = fit.forward.hypothesis
+    if hypothesis.shift > 0.0:
+        return _shifts(found, fit)
+    sd = np.sqrt(np.diag(fit.covariance))
+    sizes = []
+    for priors, part in zip(hypothesis.effect_priors, fit.forward.phi_slices, strict=True):
+        for prior, value, s in zip(priors.free, fit.psi[part], sd[part], strict=True):
+            sizes.append(
+                Markup("{} {}").format(
+                    prior.name.replace("_", " "), parameter_text(prior, float(value), float(s))
+                )
+            )
+    return sizes
+
+
+def parameter_text(prior: Prior, value: float, sd: float) -> str:
+    """Write a parameter with its sd and unit.
+
+    Parameters
+    ----------
+    prior : Prior
+    value, sd : float
+        In internal coordinates.
+
+    Returns
+    -------
+    str
+        A parameter that cannot be told from its bound at zero is an upper limit (95 %); one that
+        the data did not narrow is called so.
+    """
+    unit = "" if prior.unit in ("1", "", "dimensionless") else f" {prior.unit}"
+    narrow = math.isfinite(prior.scale) and sd > _NOT_NARROWED * prior.scale
+    half = prior.lower == 0.0 and prior.loc == 0.0
+    spread = prior.scale * (math.sqrt(1.0 - 2.0 / math.pi) if half else 1.0)
+    narrow = math.isfinite(prior.scale) and sd > _NOT_NARROWED * spread
+    mark = " (prior)" if narrow else ""
+    if prior.log:
+        centre = math.exp(value)
+        if sd < 0.35:
+            return f"{format_value(centre, centre * sd)}{unit}{mark}"
+        low, high = (math.exp(value + z * sd) for z in (-1.645, 1.645))
+        return (
+            f"{format_number(centre, 2)} ({format_number(low, 2)} to {format_number(high, 2)})"
+            f"{unit}{mark}"
+        )
+    if prior.lower == 0.0 and value < sd:
+        return f"< {format_number(value + 1.645 * sd, 2)}{unit}{mark}"
+    return f"{format_value(value, sd)}{unit}{mark}"
+
+
+def _shifts(found: Diagnosis, fit: Fit) -> list[Markup]:
+    """Shifts of the simulator's parameters that stand out from their own sd."""
+    sd = np.sqrt(np.diag(fit.covariance))
+    sizes = []
+    for o in found.data.outputs:
+        part = fit.forward.shift_slices[o.name]
+        for prior, value, s in zip(o.priors.free, fit.psi[part], sd[part], strict=True):
+            if abs(value) < 1.645 * s:
+                continue
+            factor = 100.0 if prior.log else 1.0
+            unit = " %" if prior.log else "" if prior.unit == "1" else f" {prior.unit}"
+            sign = "+" if value > 0.0 else ""
+            sizes.append(
+                Markup("{} {}{}{}").format(
+                    prior.name, sign, format_value(factor * float(value), factor * float(s)), unit
+                )
+            )
+    return sizes or [Markup("no parameter moves clearly")]
+
+
+def conditions_text(found: Diagnosis, conditions: dict[str, float]) -> str:
+    """Write conditions of a measurement, those that vary in either campaign."""
+    field, lab = found.data.view.conditions, found.data.case.lab.columns
+    parts = []
+    for column, value in conditions.items():
+        both = np.concatenate([field[column], lab.get(column, field[column])])
+        follows = column == "average_ground_pressure_kpa" and "inflation_pressure_psi" in conditions
+        if np.ptp(both) == 0.0 or follows or column == "run_order":
+            continue
+        axis = axis_name(column)
+        shown = f"{100.0 * value:.0f}" if column == "slip_ratio" else _rounded(axis.factor * value)
+        parts.append(f"{axis.name.lower()} {shown.replace('-', MINUS)}{unit_after(axis)}")
+    return ", ".join(parts) or "the conditions of the field campaign"
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.2g}" if abs(value) < 10.0 else f"{value:.3g}"
+
+
+def next_rows(found: Diagnosis) -> list[list[str]]:
+    """Return what would separate hypotheses: which, where, how telling, how many."""
+    rows = []
+    for m in found.next_measurements:
+        repeats = repeats_needed(m.gain_nats)
+        rows.append(
+            [
+                f"{short_name(m.separates[0])} from {short_name(m.separates[1])}",
+                conditions_text(found, dict(m.conditions)),
+                f"{m.gain_nats:.2f}",
+                "out of reach" if repeats is None else str(repeats),
+            ]
+        )
+    return rows

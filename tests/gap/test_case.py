@@ -1,0 +1,120 @@
+"""Reading a case: what is wrong is named, and rows without an output are left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.data import table_from_arrays, write_table
+from calib.errors import CalibError
+from calib.gap.case import Case, campaigns, read_case
+from gap.cases import MODELS, PULL_ONLY, make_case, table_without, write_case
+
+
+def test_a_written_case_is_read_back(tmp_path):
+    case = make_case("force_offset", n_fresh=4)
+    found = read_case(write_case(case, tmp_path / "a-case"))
+    assert found.name == "a-case"
+    assert dict(found.models) == MODELS
+    assert found.fresh is not None
+    assert len(found.fresh) == 4
+    for name, values in case.field.columns.items():
+        np.testing.assert_allclose(found.field[name], values, rtol=1e-12)
+
+
+def test_units_in_column_names_are_converted(tmp_path):
+    folder = write_case(make_case(), tmp_path / "case")
+    columns = dict(make_case().field.columns)
+    columns["inflation_pressure_kpa"] = columns.pop("inflation_pressure_psi") * 6.894757293168361
+    write_table(folder / "field.csv", columns)
+    psi = read_case(folder).field["inflation_pressure_psi"]
+    np.testing.assert_allclose(np.unique(psi.round(6)), [18.0, 30.0, 42.0])
+
+
+@pytest.mark.parametrize(
+    ("toml", "words"),
+    [
+        (None, "cannot be read"),
+        ("calibration = ", "not valid TOML"),
+        ('calibration = "lab.csv"\nfield = "field.csv"\n', "[models] is missing"),
+        ('field = "field.csv"\n[models]\nrut_depth = "bekker"\n', "calibration"),
+        ('calibration = 3\nfield = "field.csv"\n[models]\nrut_depth = "bekker"\n', "calibration"),
+        (
+            'calibration = "lab.csv"\nfield = "field.csv"\n[models]\nsinkage = "bekker"\n',
+            "unknown output sinkage",
+        ),
+        (
+            'calibration = "nowhere.csv"\nfield = "field.csv"\n[models]\nrut_depth = "bekker"\n',
+            "nowhere.csv",
+        ),
+    ],
+)
+def test_what_is_wrong_with_a_case_is_named(tmp_path, toml, words):
+    folder = write_case(make_case(), tmp_path / "case")
+    (folder / "case.toml").unlink()
+    if toml is not None:
+        (folder / "case.toml").write_text(toml)
+    with pytest.raises(CalibError) as caught:
+        read_case(folder)
+    assert words in str(caught.value)
+
+
+@pytest.mark.parametrize("campaign", ["lab", "field"])
+def test_a_missing_output_is_named(campaign):
+    case = make_case()
+    table = table_without(getattr(case, campaign), "rut_depth_mm")
+    with pytest.raises(CalibError, match="no values of rut_depth_mm"):
+        campaigns(replace(case, **{campaign: table}))
+
+
+def test_an_unknown_model_is_named():
+    with pytest.raises(CalibError, match="no model 'spring'"):
+        campaigns(replace(make_case(), models={"drawbar_pull": "spring"}))
+
+
+def test_a_condition_that_the_model_needs_is_named():
+    case = make_case(models=PULL_ONLY)
+    with pytest.raises(CalibError, match="slip_ratio"):
+        campaigns(replace(case, field=table_without(case.field, "slip_ratio")))
+
+
+def test_rows_without_an_output_are_left_out_of_that_output_alone():
+    case = make_case()
+    columns = {k: v.copy() for k, v in case.field.columns.items()}
+    columns["drawbar_pull_kn"][[2, 5]] = np.nan
+    holed = table_from_arrays(columns, allow_missing=("drawbar_pull_kn",))
+    data = campaigns(replace(case, field=holed))
+    pull, rut = data.outputs
+    assert set(range(27)) - set(pull.rows.tolist()) == {2, 5}
+    assert rut.rows.size == 27
+    assert np.isfinite(pull.field).all()
+    np.testing.assert_allclose(rut.field, np.log(case.field["rut_depth_mm"]))
+
+
+def test_references_come_from_the_laboratory():
+    case = make_case()
+    view = campaigns(case).view
+    assert view.lab["speed_m_s"] == 0.3
+    assert view.load_kn == 5.0
+    assert view.order_range == (0.0, 26.0)
+
+
+def test_ground_pressure_follows_inflation_pressure_as_in_the_data():
+    # The cases have ground pressure 30 p^0.5.
+    assert campaigns(make_case()).view.ground_exponent == pytest.approx(0.5, abs=1e-9)
+    case = make_case()
+    columns = dict(case.lab.columns)
+    columns["average_ground_pressure_kpa"] = 5.0 * columns["inflation_pressure_psi"] ** 0.8
+    steeper = Case(case.name, table_from_arrays(columns), case.field, case.models)
+    assert campaigns(steeper).view.ground_exponent == pytest.approx(0.8, abs=1e-9)
+
+
+def test_without_pressures_the_exponent_is_a_half():
+    case = make_case(models=PULL_ONLY)
+    bare = [
+        table_without(t, "inflation_pressure_psi", "average_ground_pressure_kpa")
+        for t in (case.lab, case.field)
+    ]
+    assert campaigns(Case("bare", *bare, PULL_ONLY)).view.ground_exponent == 0.5

@@ -1,0 +1,266 @@
+"""Each effect does nothing at zero size, and otherwise what its title says, where it says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.gap.effects import EFFECTS, View
+from calib.priors import default_prior_path, read_priors
+from gap.cases import make_case, parameters, simulate
+
+OUTPUTS = ("drawbar_pull", "rut_depth", "bulk_density")
+# Parameters that make an effect vanish when they are zero; those of its shape keep some value.
+SIZES = {
+    "slip_zero_shift": ("radius_error",),
+    "force_offset": ("offset",),
+    "sensor_drift": ("drift",),
+    "pressure_gauge_bias": ("gain", "offset"),
+    "multipass_compaction": ("pull", "slope", "resistance", "rut", "rut_slip"),
+    "rate_effect": ("pull", "slope", "resistance", "rut", "rut_slip"),
+    "moisture_softening": ("pull", "slope", "resistance", "rut", "rut_slip"),
+    "bulldozing_resistance": ("resistance",),
+    "lug_thrust": ("thrust", "digging"),
+    "slip_sinkage": ("growth",),
+    "rut_rebound": ("towed", "growth"),
+    "post_peak_softening": ("loss",),
+    "load_transfer": ("transfer",),
+    "cone_index_bias": ("gain", "offset"),
+    "water_content_bias": ("gain", "offset"),
+}
+# A size, and the sign of the change it must make in pull and rut (None: none at all).
+SOME: Mapping[str, tuple[Mapping[str, float], int | None, int | None]] = {
+    "slip_zero_shift": ({"radius_error": 0.05}, 1, 1),
+    "force_offset": ({"offset": 0.2}, 1, None),
+    "sensor_drift": ({"drift": 0.2, "curvature": 1.0, "zero_at": 0.0}, 1, None),
+    "pressure_gauge_bias": ({"gain": 0.3}, -1, 1),
+    "multipass_compaction": ({"pull": 0.1, "rut": -0.1}, 1, -1),
+    "rate_effect": ({"pull": 0.1, "rut": -0.1}, 1, -1),
+    "moisture_softening": ({"pull": -0.1, "rut": 0.1}, -1, 1),
+    "bulldozing_resistance": ({"resistance": 0.05}, -1, None),
+    "lug_thrust": ({"thrust": 0.1, "digging": 0.3}, 1, 1),
+    "slip_sinkage": ({"growth": 0.8, "pull_loss": 0.05}, -1, 1),
+    "rut_rebound": ({"towed": 0.05, "growth": 0.5, "slip_exponent": 1.0}, None, -1),
+    "post_peak_softening": ({"loss": 0.4, "peak_slip": 0.2, "slip_scale": 0.2}, -1, None),
+    "load_transfer": ({"transfer": 0.4}, 1, 1),
+}
+K = 3
+
+
+@pytest.fixture(scope="module")
+def view() -> View:
+    """Twenty rows with every covariate, all at or above the laboratory's values."""
+    n = 20
+    slip = np.linspace(0.05, 0.6, n)
+    base = {
+        "drawbar_pull": np.tile(1.4 * (1.0 - np.exp(-slip / 0.1)), (K, 1)),
+        "rut_depth": np.tile(30.0 * (1.0 + slip), (K, 1)),
+        "bulk_density": np.full((K, n), 1.5),
+    }
+    return View(
+        conditions={
+            "run_order": np.arange(n, dtype=float),
+            "slip_ratio": slip,
+            "inflation_pressure_psi": np.resize([18.0, 30.0, 42.0], n),
+            "average_ground_pressure_kpa": np.resize([110.0, 140.0, 178.0], n),
+            "speed_m_s": np.resize([0.5, 1.0, 2.0], n),
+            "pass_number": np.resize([2.0, 3.0, 4.0], n),
+            "gravimetric_water_content": np.linspace(0.07, 0.12, n),
+            "cone_index_kpa": np.linspace(300.0, 900.0, n),
+        },
+        lab={"speed_m_s": 0.3, "pass_number": 1.0, "gravimetric_water_content": 0.06,
+             "cone_index_kpa": 500.0},
+        load_kn=5.0,
+        ground_exponent=0.5,
+        order_range=(0.0, n - 1.0),
+        base=base,
+    )  # fmt: skip
+
+
+def predict(output: str, conditions: dict[str, np.ndarray]) -> np.ndarray:
+    """Predict by simple laws: pull rises with slip and falls with pressure, the rut grows."""
+    slip, psi = conditions["slip_ratio"], conditions["inflation_pressure_psi"]
+    if output == "drawbar_pull":
+        return 1.4 * (1.0 - np.exp(-slip / 0.1)) - 0.01 * psi
+    if output == "rut_depth":
+        return np.log(30.0 * (1.0 + slip) * (conditions["average_ground_pressure_kpa"] / 140.0))
+    return 1.2 + 1e-4 * conditions["cone_index_kpa"] + conditions["gravimetric_water_content"]
+
+
+def apply(name: str, size: Mapping[str, float], output: str, view: View) -> np.ndarray:
+    """Return the change that an effect makes, shape (k, n)."""
+    effect = EFFECTS[name]
+    phi = np.tile(parameters(name, size), (K, 1))
+    plain = np.tile(predict(output, dict(view.conditions)), (K, 1))
+    conditions = effect.on_conditions(phi, output, dict(view.conditions), view)
+    location = predict(output, conditions) * np.ones((K, 1))
+    changed = effect.on_output(phi, output, location, view)
+    assert changed.shape == (K, 20)
+    return changed - plain
+
+
+def test_every_effect_is_tested_here():
+    assert set(SIZES) == set(EFFECTS)
+    assert set(SOME) | {"cone_index_bias", "water_content_bias"} == set(EFFECTS)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+@pytest.mark.parametrize("output", OUTPUTS)
+def test_nothing_happens_at_zero_size(name, output, view):
+    # Rounding only: a few units in the last place of numbers of size one.
+    np.testing.assert_allclose(
+        apply(name, dict.fromkeys(SIZES[name], 0.0), output, view), 0.0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_it_acts_in_its_direction_on_its_outputs(name, view):
+    size, *signs = SOME[name]
+    for output, sign in zip(("drawbar_pull", "rut_depth"), signs, strict=True):
+        change = apply(name, size, output, view)
+        if sign is None:
+            np.testing.assert_allclose(change, 0.0, atol=1e-12)
+        else:
+            assert (sign * change >= -1e-12).all()
+            assert (sign * change).max() > 0.01
+    np.testing.assert_allclose(apply(name, size, "bulk_density", view), 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", SOME)
+def test_outputs_that_it_changes_are_the_ones_it_states(name, view):
+    changed = {
+        o for o in ("drawbar_pull", "rut_depth") if np.abs(apply(name, SOME[name][0], o, view)).max()
+        > 1e-9
+    }  # fmt: skip
+    stated = set(EFFECTS[name].outputs)
+    # Digging deeper costs pull, but pull alone could not show slip sinkage: it states the rut.
+    allowed = {"drawbar_pull"} if name == "slip_sinkage" else set()
+    assert stated <= changed <= stated | allowed
+
+
+def test_amounts(view):
+    np.testing.assert_allclose(apply("force_offset", {"offset": 0.2}, "drawbar_pull", view), 0.2)
+    drift = apply(
+        "sensor_drift", {"drift": 0.2, "curvature": 1.0, "zero_at": 0.25}, "drawbar_pull", view
+    )[0]
+    # Linear from the first run to the last, about its zero; the first run is taken at u = 0.001.
+    np.testing.assert_allclose(drift, 0.2 * (np.arange(20) / 19.0 - 0.25), atol=3e-4)
+    rate = apply("rate_effect", {"rut": 0.5}, "rut_depth", view)[0]
+    np.testing.assert_allclose(rate, 0.5 * np.log(view.conditions["speed_m_s"] / 0.3))
+    rut = apply(
+        "rut_rebound", {"towed": 0.1, "growth": 0.5, "slip_exponent": 1.0}, "rut_depth", view
+    )[0]
+    np.testing.assert_allclose(rut, -0.1 - 0.5 * view.slip())
+    lug = apply("lug_thrust", {"thrust": 0.1, "slip_scale": 0.2}, "drawbar_pull", view)[0]
+    np.testing.assert_allclose(lug, 0.5 * -np.expm1(-view.slip() / 0.2))
+
+
+def test_true_slip_from_a_wrong_rolling_radius(view):
+    phi = parameters("slip_zero_shift", {"radius_error": 0.1})
+    changed = EFFECTS["slip_zero_shift"].on_conditions(
+        phi, "drawbar_pull", dict(view.conditions), view
+    )
+    np.testing.assert_allclose(1.0 - changed["slip_ratio"][0], 0.9 * (1.0 - view.slip()))
+
+
+def test_pressure_drags_ground_pressure_along(view):
+    phi = parameters("pressure_gauge_bias", {"gain": np.log(1.21), "offset": 0.0, "ground": 1.0})
+    changed = EFFECTS["pressure_gauge_bias"].on_conditions(
+        phi, "rut_depth", dict(view.conditions), view
+    )
+    # Twenty-one per cent, to the power of a half.
+    ratio = changed["average_ground_pressure_kpa"] / view.conditions["average_ground_pressure_kpa"]
+    np.testing.assert_allclose(ratio, 1.1)
+
+
+@pytest.mark.parametrize(
+    ("name", "column"),
+    [("cone_index_bias", "cone_index_kpa"),
+     ("water_content_bias", "gravimetric_water_content")],
+)  # fmt: skip
+def test_probes_change_what_they_read(name, column, view):
+    up = EFFECTS[name].on_conditions(
+        parameters(name, {"gain": 0.2, "offset": 0.0}), "bulk_density", dict(view.conditions), view
+    )
+    np.testing.assert_allclose(up[column][0], np.exp(0.2) * view.conditions[column])
+    others = {k: v for k, v in up.items() if k != column}
+    assert all(v is view.conditions[k] for k, v in others.items())
+
+
+def test_softening_begins_past_the_peak(view):
+    change = apply(
+        "post_peak_softening",
+        {"loss": 0.4, "peak_slip": 0.3, "slip_scale": 0.2},
+        "drawbar_pull",
+        view,
+    )[0]
+    np.testing.assert_allclose(change[view.slip() <= 0.3], 0.0, atol=1e-12)
+    assert (np.diff(change[view.slip() > 0.3]) < 0.0).all()
+
+
+def test_bulldozing_grows_with_sinkage_and_slip(view):
+    size = {"resistance": 0.05, "sinkage_exponent": 1.0, "slip_growth": 1.0}
+    change = apply("bulldozing_resistance", size, "drawbar_pull", view)[0]
+    assert (np.diff(change) < 0.0).all()
+    shallow = replace(view, base={**view.base, "rut_depth": 0.5 * view.base["rut_depth"]})
+    halved = apply("bulldozing_resistance", size, "drawbar_pull", shallow)[0]
+    np.testing.assert_allclose(halved, 0.5 * change)
+
+
+def test_soil_effects_vanish_at_the_laboratorys_covariate(view):
+    at_lab = {"pass_number": 1.0, "speed_m_s": 0.3, "gravimetric_water_content": 0.06}
+    same = replace(
+        view, conditions={**view.conditions, **{k: np.full(20, v) for k, v in at_lab.items()}}
+    )
+    for name in ("multipass_compaction", "rate_effect", "moisture_softening"):
+        for output in ("drawbar_pull", "rut_depth"):
+            change = apply(name, dict.fromkeys(SIZES[name], 0.2), output, same)
+            np.testing.assert_allclose(change, 0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_every_effect_has_priors_with_units_and_reasons(name):
+    priors = read_priors(
+        default_prior_path(f"effects/{name}"), name, EFFECTS[name].parameters, {"normal_load_kn": 5}
+    )
+    assert [p.name for p in priors.entries] == list(EFFECTS[name].parameters)
+    for p in priors.entries:
+        assert p.unit
+        assert len(p.reason) > 10
+        assert len(p.source) > 3
+
+
+def test_reasons_why_an_effect_cannot_be_tested(view):
+    both = ("drawbar_pull", "rut_depth")
+    reason = EFFECTS["cone_index_bias"].not_testable(view, both)
+    assert reason == "no bulk_density output"
+    slow = {k: v for k, v in view.conditions.items() if k != "speed_m_s"}
+    reason = EFFECTS["rate_effect"].not_testable(replace(view, conditions=slow), both)
+    assert reason == "the data lack speed_m_s"
+    still = {**view.conditions, "speed_m_s": np.full(20, 0.3)}
+    reason = EFFECTS["rate_effect"].not_testable(replace(view, conditions=still), both)
+    assert reason is not None
+    assert "the same in every row, as in the calibration" in reason
+    # Constant in the field, but not what it was in the laboratory: that can be seen.
+    fast = {**view.conditions, "speed_m_s": np.full(20, 2.0)}
+    assert EFFECTS["rate_effect"].not_testable(replace(view, conditions=fast), both) is None
+    assert EFFECTS["load_transfer"].not_testable(view, ("rut_depth",)) == "no drawbar_pull output"
+    for effect in EFFECTS.values():
+        assert effect.not_testable(view, OUTPUTS) is None
+
+
+def test_signs_hold_with_the_simulators_own_curves():
+    draft = make_case(noise=0.0)
+    plain = simulate(draft, None)[1]
+    for name in ("force_offset", "lug_thrust", "rut_rebound", "bulldozing_resistance"):
+        size, *signs = SOME[name]
+        acted = simulate(draft, name, size)[1]
+        for output, sign in zip(("drawbar_pull", "rut_depth"), signs, strict=True):
+            change = acted[output] - plain[output]
+            if sign is None:
+                np.testing.assert_allclose(change, 0.0, atol=1e-12)
+            else:
+                assert (sign * change > 0.0).all()

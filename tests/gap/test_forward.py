@@ -1,0 +1,132 @@
+"""The joint model: the simulator alone in the laboratory, effects in the field."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.gap.effects import EFFECTS
+from calib.gap.forward import Forward, Hypothesis
+from calib.gap.hypotheses import effect_priors, pair, singles, unknowns
+from gap.cases import NOISE, campaigns_of
+
+SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}
+
+
+@pytest.fixture(scope="module")
+def data():
+    return campaigns_of(None)
+
+
+def single(data, name: str) -> Hypothesis:
+    return Hypothesis(name, (EFFECTS[name],), (effect_priors(data, EFFECTS[name]),))
+
+
+def centre(forward: Forward, k: int = 2) -> np.ndarray:
+    """Return the middle of the priors, with the effect's own coordinates at zero size."""
+    psi = np.array([p.loc for p in forward.priors.free])
+    return np.tile(psi, (k, 1))
+
+
+def test_shapes(data):
+    for h in (Hypothesis("none"), single(data, "lug_thrust"), unknowns(data)[0]):
+        forward = Forward(data, h, SIGMA)
+        psi = centre(forward, 4)
+        assert psi.shape[1] == forward.n_dim
+        for o in data.outputs:
+            assert forward.lab(psi)[o.name].shape == (4, 30)
+            assert forward.field(psi, data.view)[o.name].shape == (4, 27)
+
+
+def test_none_is_the_simulator_in_both_campaigns(data):
+    forward = Forward(data, Hypothesis("none"), SIGMA)
+    psi = centre(forward)
+    full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
+    for o in data.names:
+        np.testing.assert_array_equal(full[o], plain[o])
+
+
+@pytest.mark.parametrize("kind", ["parameter_shift", "unknown"])
+def test_the_other_hypotheses_reduce_to_it(data, kind):
+    h = (
+        Hypothesis("parameter_shift", shift=0.25)
+        if kind == "parameter_shift"
+        else unknowns(data)[-1]
+    )
+    forward = Forward(data, h, SIGMA)
+    psi = centre(forward)  # shifts and coefficients are zero in the middle of their priors
+    full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
+    for o in data.names:
+        np.testing.assert_allclose(full[o], plain[o], rtol=1e-12)
+    slices = forward.shift_slices if kind == "parameter_shift" else forward.smooth_slices
+    moved = psi.copy()
+    moved[:, slices["drawbar_pull"].start] += 0.1
+    changed = forward.field(moved, data.view)
+    assert np.abs(changed["drawbar_pull"] - plain["drawbar_pull"]).max() > 1e-3
+    np.testing.assert_allclose(changed["rut_depth"], plain["rut_depth"], rtol=1e-12)
+
+
+def test_an_effect_acts_in_the_field_only(data):
+    forward = Forward(data, single(data, "force_offset"), SIGMA)
+    psi = centre(forward)
+    moved = psi.copy()
+    moved[:, forward.phi_slices[0]] = 0.3
+    for o in data.names:
+        np.testing.assert_array_equal(forward.lab(moved)[o], forward.lab(psi)[o])
+    gap = (
+        forward.field(moved, data.view)["drawbar_pull"]
+        - forward.simulator(moved, data.view)["drawbar_pull"]
+    )
+    np.testing.assert_allclose(gap, 0.3)
+
+
+def test_a_pair_does_what_both_do(data):
+    a, b = single(data, "force_offset"), single(data, "sensor_drift")
+    both = pair(b, a)
+    assert both.name == "force_offset+sensor_drift"
+    sizes = ((0.1,), (0.2, 0.0, 0.3))  # internal: the curvature is a logarithm
+
+    def gap(h: Hypothesis, phis) -> np.ndarray:
+        forward = Forward(data, h, SIGMA)
+        psi = centre(forward, 1)
+        for part, phi in zip(forward.phi_slices, phis, strict=True):
+            psi[:, part] = phi
+        return (forward.field(psi, data.view)["drawbar_pull"]
+                - forward.simulator(psi, data.view)["drawbar_pull"])  # fmt: skip
+
+    # Both are added to the reading, so their gaps add up.
+    expected = gap(a, sizes[:1]) + gap(b, sizes[1:])
+    np.testing.assert_allclose(gap(both, sizes), expected, atol=1e-12)
+
+
+def test_form_error_scales_the_effect_and_nothing_else(data):
+    forward = Forward(data, single(data, "lug_thrust"), SIGMA)
+    part = forward.form_slices["drawbar_pull"]
+    assert part.stop > part.start
+    psi = centre(forward)
+    psi[:, part] = 0.5
+    full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
+    # At zero thrust and digging, the form error has nothing to scale.
+    for s in forward.phi_slices:
+        psi[:, s.start] = psi[:, s.stop - 1] = 0.0
+    zero = forward.field(psi, data.view)
+    np.testing.assert_allclose(zero["drawbar_pull"], plain["drawbar_pull"], rtol=1e-12)
+    assert full["drawbar_pull"].shape == (2, 27)
+
+
+def test_other_conditions_use_the_same_references(data):
+    forward = Forward(data, single(data, "rate_effect"), SIGMA)
+    psi = centre(forward)
+    psi[:, forward.phi_slices[0].start] = 0.2
+    rows = {k: v[:5] for k, v in data.view.conditions.items()}
+    part = forward.field(psi, data.at_conditions(rows))
+    whole = forward.field(psi, data.view)
+    for o in data.names:
+        np.testing.assert_allclose(part[o], whole[o][:, :5], rtol=1e-12)
+
+
+def test_every_single_effect_has_a_prior_for_each_parameter(data):
+    for h in singles(data, {n: EFFECTS[n] for n in ("lug_thrust", "rate_effect")}):
+        forward = Forward(data, h, SIGMA)
+        part = forward.phi_slices[0]
+        assert part.stop - part.start == len(h.effects[0].parameters)
