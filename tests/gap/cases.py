@@ -106,7 +106,9 @@ def make_case(
         tables.append(table_from_arrays(columns | measured))
     fresh = None
     if n_fresh:
-        fresh = table_from_arrays(conditions(n_fresh, seed + 2, varied=True))
+        later = conditions(n_fresh, seed + 2, varied=True)
+        later["run_order"] += n_field - n_fresh
+        fresh = table_from_arrays(later)
     return Case(effect or "null", tables[0], tables[1], models, fresh)
 
 

@@ -1,0 +1,85 @@
+"""Isolability: known before any outcome of the field, and right where the answer is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.data import table_from_arrays
+from calib.gap.case import campaigns
+from calib.gap.effects import EFFECTS
+from calib.gap.fit import Noise
+from calib.gap.hypotheses import singles
+from calib.gap.isolate import ALIKE, isolability
+from calib.gap.which import rank
+from gap.cases import CHOICE, campaigns_of, make_case, ranking_of
+
+
+def test_shares_sizes_and_cosines_are_in_their_ranges():
+    design = ranking_of(None).isolability
+    assert set(design.absorbed) == set(design.detectable) == set(CHOICE)
+    for name in CHOICE:
+        assert 0.0 <= design.absorbed[name] <= 1.0
+        assert 0.05 < design.detectable[name] < 20.0
+    for (a, b), cosine in design.likeness.items():
+        assert a < b
+        assert -1.0 - 1e-9 <= cosine <= 1.0 + 1e-9
+    assert len(design.likeness) == len(CHOICE) * (len(CHOICE) - 1) // 2
+
+
+def test_alike_are_the_pairs_above_the_limit():
+    design = ranking_of(None).isolability
+    assert set(design.alike) == {p for p, v in design.likeness.items() if v >= ALIKE}
+
+
+def test_field_outcomes_do_not_matter():
+    case = make_case(models={"drawbar_pull": "magic_formula"})
+    columns = dict(case.field.columns)
+    columns["drawbar_pull_kn"] = columns["drawbar_pull_kn"][::-1] + 3.0
+    other = replace(case, field=table_from_arrays(columns))
+    few = {n: EFFECTS[n] for n in ("force_offset", "lug_thrust")}
+    a, b = (rank(campaigns(c), 1, effects=few).isolability for c in (case, other))
+    assert a == b
+
+
+def test_two_names_of_one_effect_are_alike():
+    data = campaigns_of(None, "pull")
+    effect = EFFECTS["force_offset"]
+    one, two = singles(data, {"force_offset": effect})[0], singles(data, {"same": effect})[0]
+    mode = {"drawbar_pull": ranking_of_pull().lab_mode["drawbar_pull"]}
+    design = isolability(data, [one, two], mode, {"drawbar_pull": Noise(0.03, 0.0)}, 1)
+    assert design.likeness["force_offset", "same"] == pytest.approx(1.0)
+    assert design.absorbed["same"] == pytest.approx(design.absorbed["force_offset"])
+
+
+def ranking_of_pull():
+    few = {n: EFFECTS[n] for n in ("force_offset",)}
+    return rank(campaigns_of(None, "pull"), 1, effects=few)
+
+
+def test_what_parameters_can_imitate_is_absorbed():
+    """The model of one pressure has a vertical shift: it takes up an offset, not a drift."""
+    data = campaigns_of(None, "pull")
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")}
+    mode = {"drawbar_pull": ranking_of_pull().lab_mode["drawbar_pull"]}
+    design = isolability(data, singles(data, few), mode, {"drawbar_pull": Noise(0.03, 0.0)}, 1)
+    assert design.absorbed["force_offset"] > design.absorbed["sensor_drift"]
+    # With a laboratory that leaves more noise, everything is harder to see.
+    noisy = isolability(data, singles(data, few), mode, {"drawbar_pull": Noise(0.3, 0.0)}, 1)
+    assert noisy.absorbed["force_offset"] != design.absorbed["force_offset"]
+
+
+def test_more_rows_show_smaller_effects():
+    few = {n: EFFECTS[n] for n in ("force_offset", "lug_thrust")}
+    models = {"drawbar_pull": "magic_formula"}
+    sizes = []
+    for n_field in (12, 48):
+        data = campaigns(make_case(models=models, n_field=n_field))
+        sizes.append(rank(data, 1, effects=few).isolability.detectable)
+    for name in few:
+        ratio = sizes[0][name] / sizes[1][name]
+        # Four times the rows halve the size at fixed absorption; more rows are absorbed more.
+        assert 1.2 < ratio < 2.2
+    assert np.isfinite(list(sizes[1].values())).all()

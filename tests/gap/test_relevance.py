@@ -1,0 +1,57 @@
+"""Relevance: hypotheses are about effects large enough to matter."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.gap.relevance import relevance, sizes
+from gap.cases import ranking_of
+
+
+def fit_of(case: str | None, name: str):
+    return ranking_of(case).fits[name][0]
+
+
+def test_none_has_no_size_to_restrict():
+    assert relevance(fit_of(None, "none"), 1) == 0.0
+
+
+def test_size_is_in_noise_sds_over_all_rows_and_outputs():
+    fit = fit_of("force_offset", "force_offset")
+    psi = np.tile(fit.psi, (2, 1))
+    part = fit.forward.phi_slices[0]
+    psi[0, part], psi[1, part] = 0.0, 0.1
+    size = sizes(fit, psi)
+    assert size.shape == (2, 1)
+    assert size[0, 0] == pytest.approx(0.0, abs=1e-12)
+    # Half of the values are ruts, which an offset of the pull does not touch.
+    slip = fit.forward.data.view.slip()
+    in_noise = 0.1 / fit.noise["drawbar_pull"].sd(slip)
+    assert size[1, 0] == pytest.approx(np.sqrt(0.5 * np.mean(np.square(in_noise))))
+
+
+def test_each_of_a_pair_has_its_own_size():
+    fit = fit_of("force_offset", "force_offset+sensor_drift")
+    psi = fit.psi[None].copy()
+    offset, drift = fit.forward.phi_slices
+    psi[:, drift.start] = 0.0
+    psi[:, offset] = 0.2
+    for part in fit.forward.form_slices.values():
+        psi[:, part] = 0.0
+    size = sizes(fit, psi)
+    assert size.shape == (1, 2)
+    # One column for each effect left out: without the drift nothing changes.
+    assert sorted(size[0] > 1e-9) == [False, True]
+
+
+def test_a_large_effect_gains_and_an_invisible_one_loses():
+    # A large one is relevant for certain, so that its evidence is divided by the prior share.
+    assert relevance(fit_of("lug_thrust", "lug_thrust"), 1) >= 0.0
+    # On a null campaign, the posterior of an offset is far below one noise sd.
+    assert relevance(fit_of(None, "force_offset"), 1) < -1.0
+
+
+def test_it_is_the_same_for_the_same_seed():
+    fit = fit_of(None, "rate_effect")
+    assert relevance(fit, 5) == relevance(fit, 5)

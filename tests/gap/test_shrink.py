@@ -1,0 +1,97 @@
+"""How far: errors before and after, from draws whose answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.gap.mixture import Truth
+from calib.gap.shrink import predict_fresh, shrink
+from gap.cases import campaigns_of, diagnosis_of, make_case
+
+N = 27
+
+
+@pytest.fixture(scope="module")
+def data():
+    return campaigns_of(None, "pull")
+
+
+def truth(gap: float, spread: float, noise: float = 0.05, draws: int = 2000) -> Truth:
+    rng = np.random.default_rng(0)
+    plain = np.ones((draws, N))
+    true = plain + gap + spread * rng.standard_normal((draws, 1))
+    sd = np.full_like(plain, noise)
+    measured = true + sd * rng.standard_normal(true.shape)
+    return Truth(
+        {"drawbar_pull": plain}, {"drawbar_pull": true}, {"drawbar_pull": sd},
+        {"drawbar_pull": measured}, np.full(draws, 1.0 / draws),
+    )  # fmt: skip
+
+
+def test_a_known_gap_shrinks_to_what_is_not_known_of_it(data):
+    found = shrink(data, truth(0.2, 0.01), {"drawbar_pull": np.ones(N)})["drawbar_pull"]
+    assert found.rmse_before == pytest.approx(0.2, abs=0.002)
+    # The median of |normal| is 0.674 sd.
+    assert found.rmse_after == pytest.approx(0.00674, rel=0.1)
+    assert found.fraction == pytest.approx(1.0 - 0.0337, abs=0.01)
+    low, high = found.interval
+    # The 95th percentile of |normal| is 1.96 sd.
+    assert low == pytest.approx(1.0 - 1.96 * 0.01 / 0.2, abs=0.02)
+    assert low < found.fraction < high <= 1.0
+    assert found.noise_floor == pytest.approx(0.05)
+
+
+def test_before_is_the_simulator_as_it_was_calibrated(data):
+    before = {"drawbar_pull": np.full(N, 0.9)}
+    found = shrink(data, truth(0.2, 0.01), before)["drawbar_pull"]
+    assert found.rmse_before == pytest.approx(0.3, abs=0.002)
+
+
+def test_what_is_small_beside_the_noise_is_no_gap(data):
+    assert shrink(data, truth(0.01, 0.0), {"drawbar_pull": np.ones(N)}) == {}
+
+
+def test_fresh_predictions_have_the_noise_in_their_band(data):
+    band = predict_fresh(truth(0.2, 0.0), {"drawbar_pull": np.full(N, 0.9)})["drawbar_pull"]
+    np.testing.assert_array_equal(band.before, np.full(N, 0.9))
+    np.testing.assert_allclose(band.after, 1.2)
+    # 2000 draws: the sd of a 5 % quantile is 0.047 sd of the noise.
+    np.testing.assert_allclose(band.upper - 1.2, 1.645 * 0.05, atol=4 * 0.047 * 0.05)
+    np.testing.assert_allclose(1.2 - band.lower, 1.645 * 0.05, atol=4 * 0.047 * 0.05)
+
+
+def test_quantiles_follow_the_weights():
+    draws = truth(0.2, 0.01)
+    values = np.arange(2000.0)[:, None] * np.ones((1, 2))
+    assert draws.quantile(values, 0.5) == pytest.approx([999.0, 999.0], abs=1.0)
+    first = np.zeros(2000)
+    first[7] = 1.0
+    single = Truth(draws.simulator, draws.truth, draws.noise, draws.measured, first)
+    assert single.quantile(values, 0.05).tolist() == [7.0, 7.0]
+
+
+def test_the_correction_of_a_large_drift_predicts_new_conditions():
+    found = diagnosis_of("sensor_drift")
+    s = found.shrink["drawbar_pull"]
+    assert s.fraction > 0.5
+    assert 0.0 < s.interval[0] < s.fraction < s.interval[1] <= 1.0
+    # The true field at the fresh conditions, from the generator.
+    from calib.gap.case import Case
+    from gap.cases import simulate
+
+    case = make_case("sensor_drift", n_fresh=9)
+    assert case.fresh is not None
+    columns = dict(case.fresh.columns) | {
+        c: np.linspace(1.0, 2.0, 9) for c in ("drawbar_pull_kn", "rut_depth_mm")
+    }
+    from calib.data import table_from_arrays
+
+    fresh = table_from_arrays(columns)
+    # The drift of the generator at the place that the rows have in the campaign.
+    actual = simulate(Case("fresh", case.lab, fresh, case.models), None)[1]["drawbar_pull"]
+    actual = actual + 0.25 * fresh["run_order"] / 26.0
+    band = found.fresh["drawbar_pull"]
+    before = np.sqrt(np.mean(np.square(band.before - actual)))
+    after = np.sqrt(np.mean(np.square(band.after - actual)))
+    assert after < 0.6 * before

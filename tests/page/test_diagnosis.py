@@ -1,0 +1,292 @@
+"""The page of a diagnosis: its rules, its words, and that it is complete in itself."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+
+import pytest
+from gap.cases import diagnosis_of, pull_diagnosis
+
+from calib.page.diagnosis import gap_evidence, render_diagnosis, write_page
+from calib.page.gap_sizes import size_sentences
+from calib.page.gap_tables import conditions_text, hypothesis_groups, parameter_text
+from calib.page.gap_verdict import (
+    Candidate,
+    GapEvidence,
+    NextFact,
+    ShrinkFact,
+    Tone,
+    WhereFact,
+    judge_gap,
+    odds_text,
+    repeats_needed,
+)
+from calib.priors import Prior
+
+from .test_page import Reader
+
+
+def candidates(**probabilities: float) -> list[Candidate]:
+    return [
+        Candidate(n, n.replace("_", " "), f"what {n} does", p) for n, p in probabilities.items()
+    ]
+
+
+def evidence(verdict: str, **probabilities: float) -> GapEvidence:
+    return GapEvidence(
+        verdict,
+        candidates(**probabilities),
+        ["pull reads 0.13 ± 0.04 kN high"],
+        [WhereFact("drawbar pull at slip 30 to 60 %", "0.1 kN above the simulator", 0.97)],
+        [ShrinkFact("drawbar pull", "0.11", "0.04 kN", "0.03 kN", 0.63, (0.45, 0.8))],
+        True,
+        [NextFact(("lug thrust", "drift"), "slip 65 %", 1.2)],
+        smallest=0.7,
+    )
+
+
+@pytest.mark.parametrize(
+    ("verdict", "probabilities", "rule", "tone"),
+    [
+        ("none", {"none": 0.97, "drift": 0.03}, "none", Tone.FINE),
+        ("none", {"none": 0.6, "drift": 0.4}, "not shown", Tone.CARE),
+        ("none", {"none": 0.4, "drift": 0.35, "lug_thrust": 0.25}, "not shown", Tone.CARE),
+        ("unknown", {"unknown": 0.95, "none": 0.05}, "unknown", Tone.NO),
+        ("ambiguous", {"lug_thrust": 0.45, "drift": 0.4, "none": 0.02}, "tie", Tone.CARE),
+        ("effect", {"parameter_shift": 0.95, "none": 0.05}, "recalibrate", Tone.FINE),
+        ("effect", {"parameter_shift": 0.6, "none": 0.4}, "recalibrate", Tone.CARE),
+        ("effect", {"drift": 0.93, "lug_thrust": 0.07}, "named", Tone.FINE),
+        ("effect", {"drift": 0.7, "lug_thrust": 0.3}, "likely", Tone.CARE),
+    ],
+)
+def test_rules(verdict, probabilities, rule, tone):
+    found = judge_gap(evidence(verdict, **probabilities))
+    assert found.rule == rule
+    assert found.tone is tone
+    assert found.headline[0].isupper()
+    assert all(value[0].isupper() or not value[0].isalpha() for _, value in found.facts)
+
+
+def test_a_named_effect_says_everything_at_once():
+    found = judge_gap(evidence("effect", drift=0.93, lug_thrust=0.04))
+    facts = dict(found.facts)
+    assert found.headline == "What drift does"
+    assert facts["Which"] == "Drift, probability 93 %; nothing else reaches 5 %"
+    assert facts["How large"] == "Pull reads 0.13 ± 0.04 kN high"
+    assert facts["Where"].endswith("0.1 kN above the simulator (97 %)")
+    assert "0.11 to 0.04 kN rms (noise 0.03 kN): it shrinks by 63 %" in facts["How far"]
+    assert "90 % interval 45 to 80 %" in facts["How far"]
+    assert "Next" not in facts
+
+
+def test_less_than_sure_is_hedged_with_rivals_and_a_measurement():
+    found = judge_gap(evidence("effect", drift=0.7, lug_thrust=0.25))
+    facts = dict(found.facts)
+    assert found.headline.startswith("Probably ")
+    assert "also possible: lug thrust (25 %)" in facts["Which"]
+    # ln 20 = 3.0 nats at 1.2 each.
+    assert facts["Next"] == "To separate lug thrust from drift: about 3 measurements at slip 65 %"
+
+
+def test_a_tie_names_its_members_and_not_the_rest():
+    found = judge_gap(evidence("ambiguous", lug_thrust=0.45, drift=0.4, none=0.02))
+    assert "cannot tell lug thrust and drift apart" in found.headline
+    assert "none" not in found.headline
+
+
+def test_two_effects_are_said_to_be_two():
+    assert "two effects at once" in judge_gap(evidence("effect", **{"a+b": 0.95})).headline.lower()
+
+
+def test_a_shrink_that_may_be_nothing_says_so():
+    e = evidence("effect", drift=0.95)
+    shaky = replace(e, shrink=[replace(e.shrink[0], interval=(-0.3, 0.7))], unfitted=False)
+    text = dict(judge_gap(shaky).facts)["How far"]
+    assert "\N{MINUS SIGN}30 to 70 %" in text
+    assert "may not shrink at all" in text
+    assert "field's own conditions" in text
+
+
+def test_nothing_to_show_is_said():
+    bare = replace(evidence("unknown", unknown=0.9), sizes=[], where=[], shrink=[], next_facts=[])
+    facts = dict(judge_gap(bare).facts)
+    assert "How large" not in facts
+    assert facts["Where"].startswith("In no stretch")
+    assert facts["How far"] == "No output has a gap that could shrink"
+
+
+def test_a_null_says_what_would_have_been_seen():
+    facts = dict(judge_gap(evidence("none", none=0.97)).facts)
+    assert "0.7 noise sd" in facts["Which"]
+    assert set(facts) == {"Which"}
+
+
+def test_measurements_that_cannot_help_are_not_asked_for():
+    assert repeats_needed(1.2) == 3
+    assert repeats_needed(5.0) == 1
+    assert repeats_needed(0.001) is None
+    assert repeats_needed(0.0) is None
+    assert repeats_needed(math.nan) is None
+    e = replace(
+        evidence("ambiguous", a=0.4, b=0.4), next_facts=[NextFact(("a", "b"), "slip 1 %", 1e-4)]
+    )
+    assert dict(judge_gap(e).facts)["Next"].startswith("No single condition")
+
+
+def test_no_probability_is_certain():
+    assert odds_text(1.0) == "above 99 %"
+    assert odds_text(0.0) == "below 1 %"
+    assert odds_text(0.5) == "50 %"
+
+
+def prior(**changes) -> Prior:
+    base = {"name": "a", "unit": "kN", "reason": "", "source": "", "text": "", "log": False,
+            "loc": 0.0, "scale": 1.0}  # fmt: skip
+    return Prior(**(base | changes))
+
+
+@pytest.mark.parametrize(
+    ("given", "value", "sd", "text"),
+    [
+        (prior(), 0.1312, 0.041, "0.131 ± 0.041 kN"),
+        (prior(unit="1"), 0.1312, 0.041, "0.131 ± 0.041"),
+        (prior(lower=0.0), 0.0, 0.02, "< 0.033 kN"),
+        (prior(lower=0.0), 0.1, 0.02, "0.100 ± 0.020 kN"),
+        (prior(), 0.1, 0.98, "0.10 ± 0.98 kN (prior)"),
+        (prior(log=True, loc=0.0), math.log(2.0), 0.1, "2.00 ± 0.20 kN"),
+        (prior(log=True, loc=0.0), math.log(2.0), 0.7, "2.0 (0.63 to 6.3) kN"),
+        # A half-normal's sd is 0.60 of its scale: one of 0.58 has learnt nothing.
+        (prior(lower=0.0), 0.0, 0.58, "< 0.95 kN (prior)"),
+    ],
+)
+def test_parameters_are_as_precise_as_they_are_known(given, value, sd, text):
+    assert parameter_text(given, value, sd) == text
+
+
+@pytest.fixture(scope="module")
+def found():
+    return diagnosis_of("sensor_drift")
+
+
+@pytest.fixture(scope="module")
+def page(found, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    write_page(found, folder, {"command": ["calib", "diagnose", "a b"], "versions": {"numpy": "2"}})
+    html = (folder / "index.html").read_text(encoding="utf-8")
+    reader = Reader()
+    reader.feed(html)
+    return folder, html, reader
+
+
+def test_it_is_well_formed_and_makes_no_request(page):
+    _, html, reader = page
+    assert reader.open == []
+    assert not re.search(r"https?://|@import|url\(", html)
+    assert all(a.startswith(("#", "data:")) for a in reader.addresses)
+    assert "script" not in reader.tags
+
+
+def test_every_link_has_its_target_and_ids_are_unique(page):
+    _, _, reader = page
+    targets = {a[1:] for a in reader.addresses if a.startswith("#")}
+    assert targets == {"before", "where", "which", "how-far", "next", "reproduce"}
+    assert targets <= set(reader.ids)
+    assert len(reader.ids) == len(set(reader.ids))
+
+
+def test_figures_are_in_the_page_and_beside_it(page):
+    folder, _, reader = page
+    files = sorted(p.name for p in (folder / "figures").iterdir())
+    assert len(files) == len(reader.images) == 7
+    assert all((folder / "figures" / f).read_bytes().startswith(b"\x89PNG") for f in files)
+    assert all(int(image["width"]) > 800 and image["alt"] for image in reader.images)
+
+
+def test_the_verdict_comes_first_with_the_whole_story(found, page):
+    _, _, reader = page
+    opening = reader.text[: reader.text.index("Before the outcomes")]
+    for words in ("drawbar reading drifts", "probability", "by the end of the campaign", "rms"):
+        assert words in opening
+    assert reader.ids[0] == "verdict"
+
+
+def test_every_hypothesis_is_in_the_table(found, page):
+    _, _, reader = page
+    rows = [r["name"] for g in hypothesis_groups(found) for r in g["rows"]]
+    assert sorted(rows) == sorted(found.ranking.probability)
+    for words in ("none (noise)", "unknown effect", "parameter shift", "lug thrust"):
+        assert words in reader.text
+    evidence_of = {r["name"]: r["evidence"] for g in hypothesis_groups(found) for r in g["rows"]}
+    assert evidence_of["none"] == "0"
+    assert evidence_of["sensor_drift"].startswith("+")
+
+
+def test_the_footer_says_how_to_get_it_again(found, page):
+    _, _, reader = page
+    for words in ("calib diagnose 'a b'", found.data.case.field.sha256, "numpy 2", "Seed"):
+        assert words in reader.text
+
+
+def test_the_size_is_that_of_the_drift(found):
+    (sentence,) = size_sentences(found, "sensor_drift")
+    match = re.fullmatch(
+        r"drawbar pull reads ([\d.]+) ± ([\d.]+) kN high by the end of the campaign", sentence
+    )
+    assert match
+    # The last fifth of a drift of 0.25 kN: 0.9 of it on average.
+    assert abs(float(match[1]) - 0.225) < 4.0 * float(match[2])
+
+
+def test_sizes_of_other_kinds_of_effect():
+    (sentence,) = size_sentences(diagnosis_of("slip_zero_shift"), "slip_zero_shift")
+    match = re.fullmatch(
+        r"true slip is ([\d.]+) ± ([\d.]+) percentage points above the recorded one on average",
+        sentence,
+    )
+    assert match
+    # 5 % of (1 - slip), whose mean is 0.665.
+    assert abs(float(match[1]) - 3.3) < 4.0 * float(match[2])
+    assert size_sentences(diagnosis_of(None), "none") == []
+    pair = size_sentences(diagnosis_of("sensor_drift"), "force_offset+sensor_drift")
+    assert pair[0].startswith("together: drawbar pull changes by ")
+
+
+def test_a_null_has_a_quiet_page(tmp_path):
+    null = pull_diagnosis(None)
+    write_page(null, tmp_path, {})
+    reader = Reader()
+    reader.feed((tmp_path / "index.html").read_text(encoding="utf-8"))
+    assert "The calibrated simulator holds" in reader.text
+    assert "No output has a gap that could shrink." in reader.text
+    assert reader.open == []
+
+
+def test_warnings_and_names_of_the_case_are_shown_and_escaped(found):
+    case = replace(found.data.case, name="a <b>", warnings=("mind the <gap>",))
+    other = replace(found, data=replace(found.data, case=case))
+    html = render_diagnosis(other, [], {}, manifest={})
+    assert "mind the &lt;gap&gt;" in html
+    assert "a &lt;b&gt;" in html
+    assert "<b>" not in html
+
+
+def test_evidence_is_gathered_from_the_records(found):
+    e = gap_evidence(found)
+    assert e.verdict == found.verdict
+    assert [c.probability for c in e.ranked] == sorted(
+        found.ranking.probability.values(), reverse=True
+    )
+    assert len(e.where) <= len(found.data.outputs)
+    assert e.unfitted
+    assert [s.fraction for s in e.shrink] == [s.fraction for s in found.shrink.values()]
+
+
+def test_conditions_that_do_not_vary_are_not_asked_for(found):
+    text = conditions_text(
+        found,
+        {"slip_ratio": 0.651, "normal_load_kn": 5.0, "inflation_pressure_psi": 42.0,
+         "average_ground_pressure_kpa": 178.0, "speed_m_s": 2.0, "run_order": 26.0},
+    )  # fmt: skip
+    assert text == "slip 65 %, inflation pressure 42 psi, speed 2 m/s"
