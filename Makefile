@@ -4,11 +4,19 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 OUT ?= out/he2019
+# Small matrices: threads of the linear algebra would only wait for each other.
+export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: report test test-slow lint format clean
+.PHONY: report reference test test-slow lint format clean
 
 report: $(READY)
 	$(BIN)/calib report --out $(OUT) --overwrite
+
+# The committed reference report: everything but the posteriors, which are megabytes.
+reference: report
+	rm -rf reports/he2019
+	mkdir -p reports/he2019
+	cp -r $(OUT)/index.html $(OUT)/summary.json $(OUT)/manifest.json $(OUT)/figures $(OUT)/data $(OUT)/priors reports/he2019/
 
 test: $(READY)
 	$(BIN)/python -m pytest

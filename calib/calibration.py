@@ -40,7 +40,7 @@ class ParameterSummary:
     """Posterior over prior standard deviation; near 1 the data say nothing. NaN if derived."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Calibration:
     """A calibrated model.
 
@@ -64,6 +64,11 @@ class Calibration:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "summary", MappingProxyType(_summarise(self)))
+
+    def __repr__(self) -> str:
+        state = "converged" if self.converged else "NOT CONVERGED"
+        name, n = self.problem.bound.model.name, len(self.problem.table)
+        return f"<Calibration of {name} on {n} rows, {state}>"
 
     @property
     def converged(self) -> bool:

@@ -14,7 +14,15 @@ from calib.errors import CalibError
 __all__ = ["check_folder", "fresh_folder"]
 
 # Files by which a folder is known to be one of ours, and may be replaced.
-_OURS = ("manifest.json", "run.json", "diagnosis.json")
+_OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt")
+_WRITTEN = (
+    *_OURS, "index.html", "summary.json", "figures", "data", "priors", "case", "corrected.json",
+    "fresh_prediction.csv", "priors.toml", "data.csv",
+)  # fmt: skip
+
+
+def _is_ours(name: str) -> bool:
+    return name in _WRITTEN or name.endswith((".nc", ".png"))
 
 
 @contextmanager
@@ -114,4 +122,11 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
             "the output folder was not written by calib, so it is not replaced",
             where=str(out),
             mend="choose another --out, or delete the folder yourself",
+        )
+    foreign = sorted(p.name for p in out.iterdir() if not _is_ours(p.name))
+    if foreign:
+        raise CalibError(
+            f"the output folder holds files that calib did not write: {', '.join(foreign[:5])}",
+            where=str(out),
+            mend="move them elsewhere, or choose another --out",
         )

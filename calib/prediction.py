@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtri
 
 from calib.calibration import Calibration
 from calib.data import Table
+from calib.errors import CalibError
+from calib.headers import parse_header
 from calib.models.base import Array
 from calib.scores import LEVELS
 from calib.streams import generator
@@ -17,6 +20,9 @@ from calib.streams import generator
 __all__ = ["Bands", "Prediction", "bands", "predict", "prediction_columns", "predictive_draws"]
 
 N_DRAWS = 4000
+MIN_DEFINED = 0.95
+_ROWS_AT_ONCE = 2000
+_NOISE_REPEATS = 4
 
 
 @dataclass(frozen=True)
@@ -43,6 +49,9 @@ class Prediction:
         With the noise: where a measurement would lie.
     outside : tuple of tuple of str
         For every row, the conditions that leave the calibrated range.
+    defined : ndarray, shape (n,)
+        Part of the posterior for which the equation has a value there; below `MIN_DEFINED`
+        median and bands are NaN.
     """
 
     output: str
@@ -50,6 +59,7 @@ class Prediction:
     parameter: Bands
     predictive: Bands
     outside: tuple[tuple[str, ...], ...]
+    defined: Array
 
 
 def predictive_draws(
@@ -85,14 +95,43 @@ def predict(calibration: Calibration, table: Table) -> Prediction:
     """
     model = calibration.problem.bound.model
     conditions = model.select(table.columns)
+    problem = calibration.problem
+    natural = problem.theta(calibration.subset(N_DRAWS))
+    # The same noise draws for every row: its bands do not depend on the other rows.
     rng = generator(calibration.seed, calibration.label, "predict")
-    mean, measured = predictive_draws(calibration, conditions, rng)
+    noises = [natural[:, -1:] * z for z in _stratified_normals(rng, natural.shape[0])]
+    parts = []
+    for start in range(0, len(table), _ROWS_AT_ONCE):
+        rows = {name: v[start : start + _ROWS_AT_ONCE] for name, v in conditions.items()}
+        location = problem.bound.location(natural[:, :-1], rows)
+        share = np.isfinite(location).mean(axis=0)
+        # Where many plausible parameters give the equation no value (a quadratic in pressure
+        # extrapolated below zero), the rest are no sample of anything: no value is better.
+        location = np.where(share >= MIN_DEFINED, location, np.nan)
+        back = problem.bound.from_response
+        measured = np.concatenate([back(location + noise) for noise in noises])
+        parts.append((bands(back(location)), bands(measured), share))
     return Prediction(
         model.output,
         conditions,
-        bands(mean),
-        bands(measured),
-        _outside(calibration.problem.conditions, conditions),
+        _join([p[0] for p in parts]),
+        _join([p[1] for p in parts]),
+        _outside(problem.conditions, conditions),
+        np.concatenate([p[2] for p in parts]),
+    )
+
+
+def _stratified_normals(rng: np.random.Generator, size: int) -> Iterator[Array]:
+    """Standard normals, evenly spread over their quantiles, in random order, (size, 1) each."""
+    for _ in range(_NOISE_REPEATS):
+        yield ndtri((rng.permutation(size) + rng.uniform(size=size)) / size)[:, None]
+
+
+def _join(parts: Sequence[Bands]) -> Bands:
+    return Bands(
+        np.concatenate([b.median for b in parts]),
+        {level: np.concatenate([b.lower[level] for b in parts]) for level in LEVELS},
+        {level: np.concatenate([b.upper[level] for b in parts]) for level in LEVELS},
     )
 
 
@@ -126,8 +165,7 @@ def prediction_columns(prediction: Prediction, table: Table) -> dict[str, Array 
         The conditions.
     """
     output = prediction.output
-    columns: dict[str, Array | list[str]] = dict(table.columns)
-    columns.pop(output, None)
+    columns: dict[str, Array | list[str]] = echoed(table, output)
     columns[f"{output}_median"] = prediction.predictive.median
     for kind, banded in (
         ("parameter", prediction.parameter),
@@ -136,8 +174,31 @@ def prediction_columns(prediction: Prediction, table: Table) -> dict[str, Array 
         for level in LEVELS:
             columns[f"{output}_{kind}_{100 * level:g}_lower"] = banded.lower[level]
             columns[f"{output}_{kind}_{100 * level:g}_upper"] = banded.upper[level]
-    columns["outside_calibrated_range"] = ["+".join(flags) for flags in prediction.outside]
+    columns["outside_calibrated_range"] = [
+        "+".join(flags)
+        + ("" if defined >= MIN_DEFINED else f" (no value: defined for {defined:.0%})")
+        for flags, defined in zip(prediction.outside, prediction.defined, strict=True)
+    ]
     return columns
+
+
+def echoed(table: Table, output: str) -> dict[str, Array | list[str]]:
+    """Return the columns of a table as they were given, but for a measured output.
+
+    Long tables, whose text is not kept, come back in canonical columns.
+    """
+    if table.text:
+        given = {h: [row[j] for row in table.text] for j, h in enumerate(table.header)}
+        return {h: v for h, v in given.items() if not _names(h, output)}
+    return {name: v for name, v in table.columns.items() if name != output}
+
+
+def _names(header: str, output: str) -> bool:
+    try:
+        column = parse_header(header)
+    except CalibError:
+        return False
+    return column is not None and column.quantity.canonical == output
 
 
 def _outside(

@@ -23,7 +23,14 @@ from scipy.special import log_ndtr, ndtr, ndtri
 from calib.errors import CalibError
 from calib.models.base import Array
 
-__all__ = ["Prior", "Priors", "default_prior_path", "parse_priors", "read_priors"]
+__all__ = [
+    "Prior",
+    "Priors",
+    "default_prior_path",
+    "parse_priors",
+    "prior_file_model",
+    "read_priors",
+]
 
 
 class _Entry(BaseModel):
@@ -257,6 +264,30 @@ def default_prior_path(model_name: str) -> Path:
     return folder / f"{model_name}.toml"
 
 
+def prior_file_model(path: Path) -> str:
+    """Return the model that a prior file says it is for.
+
+    Raises
+    ------
+    CalibError
+        If the file cannot be read or names none.
+    """
+    try:
+        model = tomllib.loads(Path(path).read_text(encoding="utf-8")).get("model")
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise CalibError(
+            f"the prior file cannot be read ({error})", where=str(path), mend="correct it"
+        ) from None
+    if not isinstance(model, str):
+        raise CalibError(
+            "the prior file does not say which model it is for",
+            where=str(path),
+            allowed='model = "NAME"',
+            mend="add this line at its top",
+        )
+    return model
+
+
 def read_priors(
     path: Path, model_name: str, parameters: Sequence[str], references: Mapping[str, float]
 ) -> Priors:
@@ -309,6 +340,7 @@ def parse_priors(
         file = _FILE.validate_python(content)
     except ValidationError as error:
         raise _explain(error, source) from None
+    _check_units(file, source, model_name)
     entries = tuple(_prior(name, file.parameters[name], source, references) for name in parameters)
     return Priors(entries, text, source)
 
@@ -339,6 +371,25 @@ def _check_names(
             allowed=", ".join(parameters),
             mend="give exactly these parameters; copy the shipped file and edit it",
         )
+
+
+def _check_units(file: _File, source: str, model_name: str) -> None:
+    """A prior in another unit would silently be taken for one in the model's."""
+    shipped = default_prior_path(model_name)
+    if not shipped.is_file():
+        return
+    units = {
+        name: entry.get("unit")
+        for name, entry in tomllib.loads(shipped.read_text(encoding="utf-8"))["parameters"].items()
+    }
+    for name, entry in file.parameters.items():
+        if name in units and entry.unit != units[name]:
+            raise CalibError(
+                f"the unit is {entry.unit!r}",
+                where=f"{source}, parameters.{name}",
+                allowed=f"unit = {units[name]!r}",
+                mend="convert the numbers to this unit",
+            )
 
 
 def _explain(error: ValidationError, source: str) -> CalibError:

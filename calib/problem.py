@@ -42,11 +42,14 @@ class Problem:
         The calibration data.
     priors : Priors
         Of the model's parameters and the noise scale ``sigma``, in this order.
+    notes : tuple of str
+        What a reader must know about how the problem was set up.
     """
 
     bound: BoundModel
     table: Table
     priors: Priors
+    notes: tuple[str, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -124,7 +127,7 @@ class Problem:
 
     def with_table(self, table: Table) -> Problem:
         """Return the same problem, reference conditions included, with other rows."""
-        return Problem(self.bound, table, self.priors)
+        return Problem(self.bound, table, self.priors, self.notes)
 
     def with_fixed(self, values: Mapping[str, float]) -> Problem:
         """Return the problem with some natural parameters held fixed."""
@@ -187,5 +190,11 @@ def build_problem(
             allowed=error.allowed,
             mend=error.mend,
         ) from None
-    problem = Problem(bound, table, priors)
+    notes: tuple[str, ...] = ()
+    if not loads and 'relative_to = "normal_load_kn"' in priors.text:
+        notes = (
+            "the data have no normal_load column, so the priors of forces assume 5 kN; give the "
+            "load of your wheel if it differs",
+        )
+    problem = Problem(bound, table, priors, notes)
     return problem.with_fixed(fixed) if fixed else problem

@@ -6,6 +6,7 @@ A run folder holds everything that is needed to predict from it and to compute i
 
 from __future__ import annotations
 
+import hashlib
 import json
 import warnings
 from collections.abc import Iterator
@@ -31,7 +32,9 @@ from calib.streams import generator
 __all__ = ["load_calibration", "save_calibration", "to_datatree", "write_netcdf"]
 
 SCHEMA = "calib/run/1"
+_HASHED = ("posterior.nc", "priors.toml", "data.csv")
 N_PRIOR = 2000
+MAX_CELLS = 8_000_000
 
 
 def to_datatree(calibration: Calibration) -> xr.DataTree:
@@ -46,15 +49,27 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     problem = calibration.problem
     draws = calibration.draws
     chains, steps = calibration.natural.shape[:2]
-    shape = (chains, steps, problem.response.size)
     output = problem.bound.model.output
-    natural = calibration.natural.reshape(-1, calibration.natural.shape[-1])
+    # Of long data the groups that hold a number for every draw and row hold fewer draws, or none.
+    kept = min(steps, MAX_CELLS // (chains * problem.response.size))
+    picked = np.linspace(0, steps - 1, kept).round().astype(int)
+    shape = (chains, kept, problem.response.size)
+    natural = calibration.natural[:, picked].reshape(-1, calibration.natural.shape[-1])
+    internal = draws.t.reshape(chains, steps, -1)[:, picked].reshape(-1, draws.t.shape[-1])
     location = problem.bound.location(natural[:, :-1], problem.conditions)
     rng = generator(calibration.seed, calibration.label, "posterior_predictive")
     noisy = location + natural[:, -1:] * rng.standard_normal(location.shape)
     prior = problem.theta(
         problem.priors.sample(generator(calibration.seed, calibration.label, "prior"), N_PRIOR)
     )
+    by_row = {
+        "posterior_predictive": {
+            output: problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
+        },
+        "log_likelihood": {output: problem.log_likelihood_rows(internal).reshape(shape)},
+    }
+    if kept == 0:
+        by_row = {}
     ensembles = np.repeat(np.arange(draws.t.shape[0]), draws.t.shape[1])
     with warnings.catch_warnings():
         # Walkers are chains, of which there are more than draws in a short run.
@@ -63,10 +78,7 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
             {
                 "posterior": dict(calibration.parameters),
                 "prior": _prior_group(calibration, prior),
-                "posterior_predictive": {
-                    output: problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
-                },
-                "log_likelihood": {output: problem.log_likelihood_rows(draws.flat).reshape(shape)},
+                **by_row,
                 "sample_stats": {
                     "lp": draws.log_prob.reshape(chains, steps),
                     "ensemble": np.repeat(ensembles[:, None], steps, axis=1),
@@ -144,9 +156,30 @@ def save_calibration(calibration: Calibration, folder: Path) -> None:
     """Write a run folder into an existing, empty folder."""
     problem = calibration.problem
     write_netcdf(to_datatree(calibration), folder / "posterior.nc")
-    (folder / "run.json").write_text(json.dumps(_describe(calibration), indent=1) + "\n")
     (folder / "priors.toml").write_text(problem.priors.text, encoding="utf-8")
     write_table(folder / "data.csv", problem.table.columns)
+    hashes = {name: _sha256(folder / name) for name in _HASHED}
+    described = _describe(calibration) | {"sha256": hashes}
+    (folder / "run.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _check_hashes(meta: dict[str, Any], folder: Path) -> None:
+    """A run is predicted from only as it was written."""
+    for name, expected in meta.get("sha256", {}).items():
+        with _damage(folder / name):
+            found = _sha256(folder / name)
+        if found != expected:
+            raise CalibError(
+                "the file has changed since the run was written",
+                where=str(folder / name),
+                allowed=f"SHA-256 {expected[:16]}..., found {found[:16]}...",
+                mend="restore it, or run `calib fit` again",
+            )
 
 
 def load_calibration(folder: Path) -> Calibration:
@@ -159,6 +192,7 @@ def load_calibration(folder: Path) -> Calibration:
     """
     folder = Path(folder)
     meta = _read_meta(folder)
+    _check_hashes(meta, folder)
     with _damage(folder / "run.json"):
         problem = _problem(meta, folder / "data.csv")
         shape = tuple(meta["shape"])

@@ -19,9 +19,11 @@ from calib.data import Table, hold_out
 from calib.errors import CalibError
 from calib.estimators import PointEstimate, estimate, methods_for
 from calib.headers import parse_header
+from calib.models import get_model
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.prediction import predictive_draws
+from calib.priors import prior_file_model
 from calib.problem import Problem, build_problem
 from calib.sampling.sampler import SamplerSettings
 from calib.streams import generator
@@ -33,6 +35,8 @@ __all__ = [
 ]  # fmt: skip
 
 N_PRIOR_PREDICTIVE = 1000
+# Figures and leave-one-out hold a number for every draw and row.
+MAX_ROWS = 5000
 
 type Progress = Callable[[str, int, int], None]
 
@@ -148,18 +152,48 @@ def choose_model(output: str, table: Table) -> str:
 
 
 def plan_tasks(
-    tables: Sequence[Table], held_out: HoldOut | None = None, prior_path: Path | None = None
+    tables: Sequence[Table],
+    held_out: HoldOut | None = None,
+    *,
+    models: Sequence[str] = (),
+    prior_paths: Sequence[Path] = (),
+    only: Sequence[str] = (),
 ) -> tuple[Task, ...]:
     """Find the outputs in some tables and choose a model for each.
+
+    Parameters
+    ----------
+    tables : sequence of Table
+    held_out : HoldOut, optional
+    models : sequence of str
+        Models to use for their outputs, in the place of the ones the columns suggest.
+    prior_paths : sequence of Path
+        Prior files; each names the model it is for.
+    only : sequence of str
+        Outputs to work out (keys of `OUTPUTS`); all by default.
 
     Raises
     ------
     CalibError
-        If no table has an output, two have the same, or none has the rows to hold out.
+        If no table has an output, two have the same, none has the rows to hold out, a table is
+        too long for a report, or a name is unknown.
     """
+    wanted = {get_model(name).output: name for name in models}
+    priors = {prior_file_model(path): path for path in prior_paths}
+    for name in only:
+        if name not in OUTPUTS:
+            raise CalibError(f"there is no output {name!r}", allowed=", ".join(OUTPUTS))
     tasks: dict[str, Task] = {}
     for table in tables:
+        if len(table) > MAX_ROWS:
+            raise CalibError(
+                f"{len(table)} rows are too many for a report",
+                where=table.source,
+                allowed=f"up to {MAX_ROWS} rows",
+                mend="use `calib fit` and `calib predict`, or thin the rows",
+            )
         found = [key for key, column in OUTPUTS.items() if column in table]
+        found = [key for key in found if not only or key in only]
         if not found:
             raise CalibError(
                 "there is no output to calibrate",
@@ -176,7 +210,8 @@ def plan_tasks(
                 )
             rows = table.take(np.isfinite(table[OUTPUTS[key]]))
             usable = held_out if held_out is not None and held_out.applies_to(rows) else None
-            tasks[key] = Task(key, choose_model(key, rows), rows, usable, prior_path)
+            model = wanted.get(OUTPUTS[key]) or choose_model(key, rows)
+            tasks[key] = Task(key, model, rows, usable, priors.get(model))
     planned = tuple(tasks[key] for key in OUTPUTS if key in tasks)
     if held_out is not None:
         _check_held_out(planned, held_out)

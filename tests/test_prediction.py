@@ -134,3 +134,25 @@ def test_a_prediction_as_columns(pull_calibration: Calibration) -> None:
         columns["drawbar_pull_kn_parameter_50_lower"], found.parameter.lower[0.5]
     )
     assert columns["outside_calibrated_range"] == ["", "slip_ratio"]
+
+
+def test_bands_of_a_row_do_not_depend_on_the_other_rows(pull_calibration: Calibration) -> None:
+    many = predict(pull_calibration, conditions(np.array([0.05, 0.2, 0.5])))
+    one = predict(pull_calibration, conditions(np.array([0.2])))
+    assert one.predictive.lower[0.9][0] == many.predictive.lower[0.9][1]
+    assert one.predictive.upper[0.95][0] == many.predictive.upper[0.95][1]
+
+
+def test_no_band_where_the_model_has_no_value_for_much_of_the_posterior(
+    pull_calibration: Calibration,
+) -> None:
+    far = table_from_arrays(
+        {"slip_ratio": np.array([0.2, 0.2]), "inflation_pressure_psi": np.array([30.0, 120.0])}
+    )
+    found = predict(pull_calibration, far)
+    assert found.defined[0] == 1.0
+    assert np.isfinite(found.predictive.median[0])
+    assert found.defined[1] < 0.95
+    assert np.isnan(found.predictive.median[1])
+    assert np.isnan(found.parameter.upper[0.9][1])
+    assert "no value" in prediction_columns(found, far)["outside_calibrated_range"][1]

@@ -12,10 +12,13 @@ import pytest
 
 import calib.study as study_module
 from calib.data import Table, read_table, table_from_arrays
+from calib.datasets import he2019
+from calib.datasets.he2019 import load_he2019
 from calib.datasets.published import PUBLISHED
 from calib.errors import CalibError
 from calib.manifest import build_manifest, file_hashes, sha256, versions
 from calib.outputs import OUTPUTS
+from calib.priors import default_prior_path
 from calib.sampling.sampler import SamplerSettings
 from calib.study import (
     Failure,
@@ -322,3 +325,45 @@ def test_read_files_are_planned_as_arrays_are(tmp_path: Path) -> None:
     read = read_table(path, allow_missing=tuple(OUTPUTS.values()))
     tasks = plan_tasks([read])
     assert [(t.output, len(t.table)) for t in tasks] == [("drawbar_pull", 2), ("rut_depth", 0)]
+
+
+def test_a_model_can_be_chosen_for_its_output() -> None:
+    table = load_he2019("rut_depth")
+    assert plan_tasks([table])[0].model == "modified_bekker"
+    assert plan_tasks([table], models=["bekker"])[0].model == "bekker"
+
+
+def test_a_prior_file_goes_to_the_model_it_names(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(default_prior_path("bekker").read_text())
+    table = load_he2019("rut_depth")
+    assert plan_tasks([table], models=["bekker"], prior_paths=[path])[0].prior_path == path
+    assert plan_tasks([table], prior_paths=[path])[0].prior_path is None
+    path.write_text("x = 1\n")
+    with pytest.raises(CalibError, match="which model"):
+        plan_tasks([table], prior_paths=[path])
+
+
+def test_outputs_can_be_left_out() -> None:
+    tables = [load_he2019("rut_depth"), load_he2019("drawbar_pull")]
+    assert [t.output for t in plan_tasks(tables)] == ["drawbar_pull", "rut_depth"]
+    with pytest.raises(CalibError, match="no output 'ruts'"):
+        plan_tasks(tables, only=["ruts"])
+    assert [t.output for t in plan_tasks(tables[:1], only=["rut_depth"])] == ["rut_depth"]
+
+
+def test_a_report_has_a_longest_table() -> None:
+    n = 5001
+    table = table_from_arrays(
+        {"average_ground_pressure_kpa": np.linspace(100, 200, n),
+         "slip_ratio": np.linspace(0, 0.2, n), "rut_depth_mm": np.linspace(20, 30, n)}
+    )  # fmt: skip
+    with pytest.raises(CalibError, match="too many for a report"):
+        plan_tasks([table])
+
+
+def test_the_embedded_data_are_recognised_in_a_file(tmp_path: Path) -> None:
+    for path in he2019.write(tmp_path):
+        assert he2019.labelled(read_table(path)).label == "reconstructed"
+        path.write_text(path.read_text().replace("0.0", "0.1", 1))
+        assert he2019.labelled(read_table(path)).label == ""

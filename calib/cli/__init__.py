@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 
 import typer
@@ -30,6 +31,10 @@ def main() -> None:
 
     # A figure is never shown on a screen: no display, no toolkit.
     os.environ.setdefault("MPLBACKEND", "Agg")
+    # The matrices are small: threads of the linear algebra would only wait for each other.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # A polite kill cleans up as an interrupt does.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         app(prog_name="calib")
     except CalibError as error:

@@ -37,12 +37,22 @@ def report(
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-report"),
     seed: _Seed = 2019,
     hold_out: _HoldOut = None,
+    model: Annotated[
+        list[str] | None, typer.Option(help="Model for its output, not the suggested; repeatable.")
+    ] = None,
+    priors: Annotated[
+        list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")
+    ] = None,
+    only: Annotated[
+        list[str] | None, typer.Option(help="Output to report, e.g. drawbar_pull; repeatable.")
+    ] = None,
     overwrite: _Overwrite = False,
     max_steps: _MaxSteps = 25_600,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from calib.cli.display import progress_bars
     from calib.data import read_table
+    from calib.datasets.he2019 import labelled
     from calib.folders import check_folder
     from calib.outputs import OUTPUTS
     from calib.report import write_report
@@ -52,8 +62,11 @@ def report(
     check_folder(out, overwrite=overwrite)
     if files:
         tasks = plan_tasks(
-            [read_table(f, allow_missing=tuple(OUTPUTS.values())) for f in files],
+            [labelled(read_table(f, allow_missing=tuple(OUTPUTS.values()))) for f in files],
             _parse_hold_out(hold_out),
+            models=model or (),
+            prior_paths=priors or (),
+            only=only or (),
         )
         title = "Calibration report"
     else:
@@ -75,6 +88,8 @@ def report(
     print(page)
     if study.failures:
         raise typer.Exit(1)
+    if not all(r.calibration.converged for r in study.successes.values()):
+        raise typer.Exit(3)
 
 
 def fit(
@@ -117,6 +132,8 @@ def fit(
         save_calibration(calibration, folder)
     posterior_table(calibration)
     print(verdict_line(calibration))
+    for note in problem.notes:
+        print(f"note: {note}", file=sys.stderr)
     if held is not None:
         scores = validate_held_out(calibration, held).scores
         ninety = scores.coverage[0.9]

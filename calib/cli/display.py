@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from calib.calibration import Calibration
-from calib.page.numbers import format_value
+from calib.page.tables import mean_or_median
 
 __all__ = ["posterior_table", "progress_bars", "verdict_line"]
 
@@ -47,13 +47,21 @@ def posterior_table(calibration: Calibration) -> None:
 
     model = calibration.problem.bound.model
     table = RichTable(title=f"{model.name}: posterior of {len(calibration.problem.table)} rows")
-    for heading in ("parameter", "unit", "mean ± sd", "95 % HDI", "ESS bulk/tail", "R-hat", ""):
+    for heading in (
+        "parameter",
+        "unit",
+        "mean ± sd or median",
+        "95 % HDI",
+        "ESS bulk/tail",
+        "R-hat",
+        "remark",
+    ):
         table.add_column(
-            heading, justify="left" if heading in ("parameter", "unit", "") else "right"
+            heading, justify="left" if heading in ("parameter", "unit", "remark") else "right"
         )
     for s in calibration.summary.values():
         table.add_row(
-            s.name, s.unit, format_value(s.mean, s.sd),
+            s.name, s.unit, mean_or_median(s),
             f"{s.hdi_lower:.4g} to {s.hdi_upper:.4g}", f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}",
             f"{s.rhat:.3f}", "set by the prior" if s.sd_ratio > 0.9 else "",
         )  # fmt: skip

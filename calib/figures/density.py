@@ -65,8 +65,10 @@ def _against_cone_index(ax: Axes, fig: Figure, result: OutputResult) -> dict[str
         (line,) = ax.plot(x, mean.median, ls=dashes, lw=1.4, color=colour)
         handles[f"median, water {short(scaled)} {axis_of(water).unit}"] = line
         if quantile == 0.5:
-            handles["90 % predictive there"] = ax.fill_between(
-                x, measured.lower[0.9], measured.upper[0.9], color="#e4e4e4", lw=0.0, zorder=0
+            handles[f"90 % predictive, water {short(scaled)} {axis_of(water).unit}"] = (
+                ax.fill_between(
+                    x, measured.lower[0.9], measured.upper[0.9], color="#e4e4e4", lw=0.0, zorder=0
+                )
             )
     ax.set_xlabel(axis_of("cone_index_kpa").label)
     ax.set_ylabel(axis_of(problem.bound.model.output).label)

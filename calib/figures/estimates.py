@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from calib.chains import hdi
 from calib.datasets.published import PUBLISHED
 from calib.estimators import PointEstimate
 from calib.figures.labels import NO_UNIT, joined, parameter_label, plain, short, symbol
@@ -31,6 +32,8 @@ _LOOKS = {name: (MARKERS[i], CYCLE[i]) for i, name in enumerate(METHOD_NAMES)}
 # Estimates farther off than this many posterior sds are drawn at the edge.
 _EDGE = 5.0
 _WIDE = 4.0
+# Calibrated pressures that a legend lists one by one, at most.
+_LISTED = 5
 
 
 def distances(draws: Array, values: Array) -> tuple[Array, Array, bool]:
@@ -47,17 +50,17 @@ def distances(draws: Array, values: Array) -> tuple[Array, Array, bool]:
     distance : ndarray, shape (k,)
         NaN where a logarithm does not exist.
     interval : ndarray, shape (2,)
-        The central 95 % of the posterior, in the same unit.
+        The 95 % HDI of the posterior, in the same unit.
     log : bool
         Whether logarithms were taken, as they are of positive parameters that span decades.
     """
-    low, high = np.quantile(draws, [0.025, 0.975])
+    low, high = hdi(np.asarray(draws), 0.95)
     log = bool(low > 0.0 and high > _WIDE * low)
     with np.errstate(invalid="ignore", divide="ignore"):
         to = np.log if log else np.asarray
         t, x = to(draws[draws > 0.0] if log else draws), to(np.asarray(values, dtype=float))
     mean, sd = t.mean(), t.std()
-    return (x - mean) / sd, (np.quantile(t, [0.025, 0.975]) - mean) / sd, log
+    return (x - mean) / sd, (to(np.array([low, high])) - mean) / sd, log
 
 
 def estimates_plate(result: OutputResult, *, published: bool) -> Plate:
@@ -84,7 +87,7 @@ def estimates_plate(result: OutputResult, *, published: bool) -> Plate:
         values.append(printed[name].value if name in printed else np.nan)
         distance, interval, log = distances(draws.ravel(), np.array(values))
         reach = max(reach, *np.abs(interval), np.nanmax(np.abs(distance), initial=0.0))
-        (handles["posterior, 95 %"],) = ax.plot(
+        (handles["posterior, 95 % HDI"],) = ax.plot(
             interval, [i, i], color="#c4c4c4", lw=4.0, solid_capstyle="butt"
         )
         (handles["posterior mean"],) = ax.plot(0.0, i, "|", color=BLACK, ms=9.0, mew=1.3, zorder=3)
@@ -150,21 +153,21 @@ def _caption(result: OutputResult, reported: Mapping[str, Array], published: boo
     printed = published_parameters(result.calibration.problem.bound.model.name)
     if published and printed:
         outside = [
-            plain(n) for n in names if n in printed and _outside(reported[n], printed[n].value)
+            plain(n) for n in names if n in printed and _outside(result, n, printed[n].value)
         ]
         source = published_source(result.calibration.problem.bound.model.name)
         text += (
             f" Of the published figures ({source}), {joined(outside)} "
-            f"{'lies' if len(outside) == 1 else 'lie'} outside the posterior's 95 %."
+            f"{'lies' if len(outside) == 1 else 'lie'} outside the posterior's 95 % HDI."
             if outside
-            else f" All published figures ({source}) lie inside the posterior's 95 %."
+            else f" All published figures ({source}) lie inside the posterior's 95 % HDI."
         )
     return text
 
 
-def _outside(draws: Array, value: float) -> bool:
-    low, high = np.quantile(draws, [0.025, 0.975])
-    return not low <= value <= high
+def _outside(result: OutputResult, name: str, value: float) -> bool:
+    s = result.calibration.summary[name]
+    return not s.hdi_lower <= value <= s.hdi_upper
 
 
 def by_pressure_plate(result: OutputResult, *, published: bool) -> Plate | None:
@@ -205,8 +208,14 @@ def _coefficient(
 ) -> dict[str, Any]:
     handles: dict[str, Any] = {}
     low, middle, high = np.nanquantile(joint, [0.05, 0.5, 0.95], axis=0)
+    fitted = np.unique(result.calibration.problem.table["inflation_pressure_psi"])
+    jointly = f"{joined([f'{p:g}' for p in fitted])} psi"
+    if set(result.by_pressure) <= set(fitted.tolist()):
+        jointly = "all pressures"
+    elif fitted.size > _LISTED:
+        jointly = f"{fitted.size} pressures"
     for i, (psi, estimates) in enumerate(result.by_pressure.items()):
-        handles["all pressures jointly, 90 %"] = ax.errorbar(
+        handles[f"{jointly} calibrated jointly, 90 %"] = ax.errorbar(
             i - 0.33, middle[i], yerr=[[middle[i] - low[i]], [high[i] - middle[i]]], fmt="_",
             color=BLACK, ms=6.0, elinewidth=1.0,
         )  # fmt: skip

@@ -51,7 +51,7 @@ def where_plate(found: Diagnosis) -> Plate:
     )  # fmt: skip
     x, x_axis = _abscissa(found)
     for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
-        top = _limit(own)
+        limits = _limits(own)
         for j, (ax, (title, mask)) in enumerate(
             zip(row, panel_groups(found, own.rows), strict=True)
         ):
@@ -61,8 +61,8 @@ def where_plate(found: Diagnosis) -> Plate:
                     _span(ax, region, x_axis, found.data.view.conditions["slip_ratio"])
                     break
             _points(ax, x[own.rows][mask], own, mask)
-            ax.set_ylim(-top, top)
-            if top > 0.01:
+            ax.set_ylim(*limits)
+            if limits[1] > 0.01:
                 ax.ticklabel_format(axis="y", style="plain")
             if i == 0:
                 ax.set_title(title, loc="left", fontweight="bold")
@@ -92,16 +92,15 @@ def conditions_plate(found: Diagnosis) -> Plate | None:
         gap_x=3.0, gap_y=5.0, sharex="col", sharey="row",
     )  # fmt: skip
     for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
-        top = 1.12 * max(2.5, float(np.max((np.abs(own.gap) + 1.64 * own.sd) / own.noise)))
+        scaled = _in_noise(own)
         for ax, name in zip(row, names, strict=True):
             axis = axis_name(name)
             ax.axhspan(-1.0, 1.0, color=_BAND, lw=0.0, zorder=0)
             for region in found.regions:
                 if region.output == own.name and name in region.conditions:
                     _span(ax, region, axis, conditions[name])
-            scaled = _in_noise(own)
             _points(ax, axis.scale(conditions[name][own.rows]), scaled, np.ones(own.rows.size, "?"))
-            ax.set_ylim(-top, top)
+            ax.set_ylim(*_limits(scaled))
             if i == len(outputs) - 1:
                 ax.set_xlabel(f"{axis.name}\n({axis.unit})")
                 ax.xaxis.set_major_locator(MaxNLocator(3))
@@ -125,9 +124,12 @@ def _in_noise(own: OutputRows) -> OutputRows:
     )  # fmt: skip
 
 
-def _limit(own: OutputRows) -> float:
-    reach = np.abs(own.gap) + 1.64 * own.sd
-    return 1.1 * max(float(reach.max()), 2.0 * float(own.noise.mean()))
+def _limits(own: OutputRows) -> tuple[float, float]:
+    """Room for all bars, and for two noise sds to either side."""
+    least = 2.0 * float(own.noise.mean())
+    low = min(float((own.gap - 1.64 * own.sd).min()), -least)
+    high = max(float((own.gap + 1.64 * own.sd).max()), least)
+    return low - 0.06 * (high - low), high + 0.08 * (high - low)
 
 
 def _noise_band(ax: Axes, x: Array, noise: Array) -> None:

@@ -20,6 +20,8 @@ __all__ = [
 NO_UNIT = "\N{EN DASH}"
 MINUS = "\N{MINUS SIGN}"
 
+_SUPERSCRIPTS = str.maketrans("-0123456789", "\N{SUPERSCRIPT MINUS}⁰¹²³⁴⁵⁶⁷⁸⁹")
+
 _GREEK = {"sigma": r"\sigma", "gamma": r"\gamma", "theta": r"\theta"}
 
 
@@ -146,8 +148,13 @@ def short(value: float, digits: int = 2) -> str:
         text = f"{value:.{max(0, digits - 1 - size)}f}"
     else:
         mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
-        text = f"{mantissa}e{int(power)}"
+        text = f"{mantissa}\N{MULTIPLICATION SIGN}10{power_text(int(power))}"
     return text.replace("-", MINUS)
+
+
+def power_text(power: int) -> str:
+    """Write an exponent raised."""
+    return str(power).translate(_SUPERSCRIPTS)
 
 
 def percent(fraction: float) -> str:

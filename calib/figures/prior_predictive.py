@@ -14,7 +14,7 @@ from calib.figures.rows import Group, data_word, grid, groups, smooth_bands, x_c
 from calib.figures.style import GREY, legend_below, panels
 from calib.study import OutputResult
 
-__all__ = ["prior_predictive_plate"]
+__all__ = ["prior_hits", "prior_predictive_plate"]
 
 # A heavy prior tail would flatten the data: the axis ends at this multiple of their range.
 _ZOOM = 4.0
@@ -74,11 +74,18 @@ def _panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]:
     return handles
 
 
+def prior_hits(result: OutputResult) -> int:
+    """Count the calibrated points inside the priors' 95 % predictive band."""
+    observed = result.calibration.problem.observed
+    low, high = np.nanquantile(result.prior_predictive, [0.025, 0.975], axis=0)
+    return int(((observed >= low) & (observed <= high)).sum())
+
+
 def _caption(result: OutputResult) -> str:
     observed = result.calibration.problem.observed
     low, high = np.nanquantile(result.prior_predictive, [0.025, 0.975], axis=0)
     after = np.nanquantile(result.posterior_predictive, [0.025, 0.975], axis=0)
-    inside = int(((observed >= low) & (observed <= high)).sum())
+    inside = prior_hits(result)
     ratio = float(np.median(high - low) / np.median(after[1] - after[0]))
     return (
         f"Before any datum, the priors' 95 % band holds {inside} of {observed.size} calibration "

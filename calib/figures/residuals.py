@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from scipy.stats import beta, norm, shapiro
+from scipy.stats import beta, levene, norm, shapiro
 
-from calib.figures.labels import NO_UNIT, axis_of, plain, short, unit_plain
+from calib.figures.labels import NO_UNIT, axis_of, joined, plain, short, unit_plain
 from calib.figures.plate import Plate
-from calib.figures.rows import Group, data_word, groups, held_table, x_column
+from calib.figures.rows import Group, data_word, group_column, groups, held_table, x_column
 from calib.figures.style import BLACK, BLUE, CYCLE, DASHES, GREY, MARKERS, legend_below, panels
 from calib.models.base import Array
 from calib.problem import Problem
@@ -20,6 +20,9 @@ from calib.study import OutputResult
 __all__ = ["Standardised", "residuals_plate", "sign_changes", "standardise"]
 
 _N_DRAWS = 1000
+# Rows of a group whose spread is compared, at least.
+_FEWEST = 5
+_SIGNIFICANT = 0.05
 
 
 @dataclass(frozen=True)
@@ -172,11 +175,36 @@ def _caption(result: OutputResult, fitted: Standardised, held: Standardised | No
         unit = "" if sigma.unit == "1" else f" {unit_plain(sigma.unit)}"
         scale = " of ln output" if result.calibration.problem.bound.model.response == "log" else ""
         text += f" One noise sd {plain('sigma')} is {short(sigma.mean)}{unit}{scale}."
+    text += _spread_words(result, fitted)
     if held is not None:
         mean = float(held.residual.mean())
         side = "above" if mean > 0.0 else "below"
         text += f" Held-out rows (open) lie {short(abs(mean))} noise sds {side} their prediction."
     return text
+
+
+def _spread_words(result: OutputResult, fitted: Standardised) -> str:
+    """Say whether the noise differs between pressures; empty where too few rows would tell."""
+    if group_column(result) != "inflation_pressure_psi":
+        return ""
+    problem = result.calibration.problem
+    log = problem.bound.model.response == "log"
+    raw = problem.response - problem.bound.to_response(fitted.predicted)
+    found = [(g.title, raw[g.fitted]) for g in groups(result, most=False)]
+    found = [(title, r) for title, r in found if r.size >= _FEWEST]
+    if len(found) < 2:
+        return ""
+    p = float(levene(*(r for _, r in found)).pvalue)
+    if not p < _SIGNIFICANT:
+        return f" Their spread does not tell the pressures apart (Levene p = {short(p)})."
+    unit = "of ln output" if log else axis_of(problem.bound.model.output).unit
+    sds = sorted(((float(r.std(ddof=1)), title) for title, r in found), reverse=True)
+    listed = joined([f"{short(sd)} {unit} at {title}" for sd, title in sds])
+    return (
+        f" Their sd differs between pressures: {listed} (Levene p = {short(p)}); one "
+        f"{plain('sigma')} for all makes the bands too narrow at {sds[0][1]} and too wide at "
+        f"{sds[-1][1]}."
+    )
 
 
 def sign_changes(result: OutputResult, residual: Array) -> tuple[int, int]:

@@ -21,6 +21,10 @@ from calib.store import load_calibration
 
 __all__ = ["Campaigns", "Case", "OutputData", "campaigns", "case_from_run", "read_case"]
 
+# Fewer field rows cannot tell a gap from noise; a larger ratio is a wrong unit.
+MIN_FIELD_ROWS = 5
+MAX_RATIO = 100.0
+
 
 @dataclass(frozen=True)
 class Case:
@@ -91,8 +95,17 @@ class Campaigns:
         return self.at_conditions(table.columns)
 
     def at_conditions(self, conditions: Mapping[str, Array]) -> View:
-        """Return the view of conditions given as canonical columns."""
-        return replace(self.view, conditions=dict(conditions))
+        """Return the view of conditions given as canonical columns.
+
+        A covariate they lack is taken as it was in the calibration, or typically was in the
+        field.
+        """
+        n = next(iter(conditions.values())).size
+        filled = dict(conditions)
+        for name, values in self.view.conditions.items():
+            if name not in filled and name not in OUTPUTS.values():
+                filled[name] = np.full(n, self.view.lab.get(name, float(np.nanmedian(values))))
+        return replace(self.view, conditions=filled)
 
 
 def read_case(folder: Path) -> Case:
@@ -228,9 +241,29 @@ def _output(case: Case, name: str, model: str) -> OutputData:
     problem = build_problem(model, lab)
     problem.bound.model.select(case.field.columns)
     rows = np.flatnonzero(np.isfinite(case.field[column]))
+    _check_field(case, name, column, rows)
     response = problem.bound.to_response(case.field[column][rows])
     # The noise scale is not a parameter of the simulator: it is inferred beside it.
     return OutputData(name, problem, Priors(problem.priors.entries[:-1]), rows, response)
+
+
+def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) -> None:
+    """Refuse a field campaign that cannot be told from a mistake."""
+    if rows.size < MIN_FIELD_ROWS:
+        raise CalibError(
+            f"{rows.size} field rows with {column} cannot show a gap",
+            where=case.field.source,
+            allowed=f"at least {MIN_FIELD_ROWS}",
+            mend=f"measure more, or take {name} out of the case",
+        )
+    lab, field = (float(np.nanmedian(np.abs(t[column]))) for t in (case.lab, case.field))
+    if not 1.0 / MAX_RATIO < field / max(lab, 1e-300) < MAX_RATIO:
+        raise CalibError(
+            f"{column} is typically {field:.3g} in the field and {lab:.3g} in the calibration",
+            where=case.field.source,
+            allowed=f"campaigns whose outputs differ by less than a factor of {MAX_RATIO:g}",
+            mend="check the units in the column names",
+        )
 
 
 def _ground_exponent(lab: Table, field: Table) -> float:

@@ -149,5 +149,5 @@ def verdict(probability: Mapping[str, float]) -> str:
     """Name the outcome: a hypothesis at least `NAMED` probable, or `ambiguous`."""
     best = max(probability, key=lambda name: probability[name])
     if probability[best] < NAMED:
-        return "none" if best == "none" else "ambiguous"
+        return "ambiguous"
     return best if best in ("none", "unknown") else "effect"

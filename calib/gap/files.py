@@ -85,7 +85,10 @@ def _parameters(fit: Fit) -> dict[str, dict[str, float]]:
         effects, fit.forward.hypothesis.effect_priors, fit.forward.phi_slices, strict=True
     ):
         natural = priors.to_natural(fit.psi[None, part])[0]
-        for prior, value, s in zip(priors.entries, natural, sd[part], strict=True):
+        spread = dict(zip(priors.names, sd[part], strict=True))
+        for prior, value in zip(priors.entries, natural, strict=True):
+            # A parameter that the prior file holds fixed has no spread.
+            s = spread.get(prior.name, 0.0)
             name = prior.name if len(effects) == 1 else f"{effect.name}.{prior.name}"
             # A log-normal parameter's sd is that of its logarithm times its value.
             found[name] = {"mean": float(value), "sd": float(s * value if prior.log else s)}

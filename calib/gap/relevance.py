@@ -66,6 +66,11 @@ def sizes(fit: Fit, psi: Array) -> Array:
     forward = fit.forward
     hypothesis = forward.hypothesis
     data = forward.data
+    if len(hypothesis.effects) > 1:
+        # The form errors belong to the pair; each effect's own size is that of its formula.
+        psi = psi.copy()
+        for s in forward.form_slices.values():
+            psi[:, s] = 0.0
     with np.errstate(all="ignore"):
         full = forward.field(psi, data.view)
         if len(hypothesis.effects) <= 1:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import PurePath
 from typing import Any
@@ -13,7 +14,7 @@ from calib.figures.labels import axis_of, percent, short
 from calib.figures.rows import held_table
 from calib.models import get_model
 from calib.page.equations import equation, likelihood, parametrisation, prose
-from calib.page.facts import sampling_facts, validation_facts, worst_row
+from calib.page.facts import repeats_words, sampling_facts, validation_facts, worst_row
 from calib.page.numbers import format_number
 from calib.page.tables import (
     estimates_grid,
@@ -34,6 +35,9 @@ MARKS: Mapping[str, str] = {
     Level.FAILED: "\N{HEAVY BALLOT X}",
 }
 
+# Which exception carried a message is the programmer's business.
+_CLASS_NAME = re.compile(r"^(?:[A-Za-z_][\w.]*(?:Error|Exception): )+")
+
 _NAMES = {
     "bulk_density": "Bulk density",
     "drawbar_pull": "Drawbar pull",
@@ -53,7 +57,7 @@ def failed_section(key: str, failure: Failure) -> dict[str, Any]:
         "name": output_name(key),
         "model": get_model(failure.task.model).title,
         "failed": True,
-        "error": failure.error.removeprefix("CalibError: "),
+        "error": _CLASS_NAME.sub("", failure.error),
         "level": str(Level.FAILED.value),
         "mark": MARKS[Level.FAILED],
         "headline": "Failed",
@@ -99,6 +103,7 @@ def section(
         "likelihood": prose(likelihood(bound, axis_of(bound.model.output).name.lower()), names),
         "parametrisation": prose(parametrisation(bound), names),
         "data": _data_facts(result),
+        "assumed": [prose(note, names) for note in evidence.notes],
         "priors": prior_rows(result),
         "prior_source": PurePath(problem.priors.source).name,
         "estimates": estimates_grid(result, published=published),
@@ -133,6 +138,7 @@ def _card_facts(result: OutputResult, evidence: Evidence) -> list[list[str]]:
     if math.isfinite(evidence.max_relative_error):
         error += f", {percent(evidence.max_relative_error)} at most"
         error += f" (at {worst_row(result, along=True)})"
+    repeats = repeats_words(result)
     # An interval for independent rows would claim too much for rows that share a curve.
     worth = (
         f"as much evidence as {short(evidence.effective)} independent "
@@ -147,7 +153,8 @@ def _card_facts(result: OutputResult, evidence: Evidence) -> list[list[str]]:
             f"90 % band on {s.n} {'held-out' if held else 'left-out'} rows",
             f"covered {c.hits} of {c.n} ({worth})",
         ],
-        ["Error of the median there", error],
+        ["Error of the median on those rows", error],
+        *([["Repeats", repeats]] if repeats else []),
     ]
 
 

@@ -7,11 +7,11 @@ from collections.abc import Mapping
 import numpy as np
 
 from calib.figures.labels import axis_of, percent
-from calib.figures.rows import x_column
+from calib.figures.rows import held_table, x_column
 from calib.page.numbers import TIMES, format_number, format_value
 from calib.study import OutputResult
 
-__all__ = ["sampling_facts", "validation_facts", "worst_row"]
+__all__ = ["repeats_words", "sampling_facts", "validation_facts", "worst_row"]
 
 
 def validation_facts(result: OutputResult, effective: float, low_p: float) -> list[list[str]]:
@@ -22,6 +22,9 @@ def validation_facts(result: OutputResult, effective: float, low_p: float) -> li
         ["Root mean square error of the median", f"{format_number(s.rmse, 3)} {unit}"],
         ["Mean CRPS", f"{format_number(s.crps, 3)} {unit}"],
     ]
+    repeats = repeats_words(result)
+    if repeats:
+        facts.insert(0, ["Repeats", repeats])
     judged = np.abs(s.relative_error[np.isfinite(s.relative_error)])
     if judged.size:
         at_row = percent(float(judged.max())) + f", at {worst_row(result)}"
@@ -50,6 +53,18 @@ def validation_facts(result: OutputResult, effective: float, low_p: float) -> li
             ["Rows refitted (k above 0.7)", f"{len(v.refitted)} of {s.n}"],
         ]
     return facts
+
+
+def repeats_words(result: OutputResult) -> str:
+    """Say that a row's repeats stay when it is left out; empty where there are none."""
+    if held_table(result) is not None:
+        return ""
+    conditions = np.column_stack(list(result.calibration.problem.conditions.values()))
+    rows, distinct = conditions.shape[0], np.unique(conditions, axis=0).shape[0]
+    if distinct == rows:
+        return ""
+    where = "condition" if distinct == 1 else "conditions"
+    return f"{rows} rows at {distinct} distinct {where}; leaving one row out leaves its repeats in"
 
 
 def worst_row(result: OutputResult, *, along: bool = False) -> str:

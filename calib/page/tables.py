@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from calib.calibration import ParameterSummary
 from calib.datasets.published import PUBLISHED, FittedTable
 from calib.estimators import PointEstimate
 from calib.figures.estimates import METHOD_NAMES
@@ -25,9 +26,11 @@ from calib.page.numbers import (
 from calib.study import OutputResult
 
 __all__ = [
-    "Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows",
+    "Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows", "skewed",
 ]  # fmt: skip
 
+# An HDI that spans more than this factor has neither a telling mean nor a telling sd.
+_DECADES = 30.0
 _TICK = "\N{CHECK MARK}"
 
 
@@ -72,8 +75,7 @@ def posterior_rows(result: OutputResult) -> list[dict[str, Any]]:
         {
             "symbol": symbol_html(s.name),
             "unit": unit_html(s.unit),
-            "value": format_value(s.mean, s.sd),
-            "median": format_number(s.median, 3),
+            "value": mean_or_median(s),
             "hdi": _interval(s.hdi_lower, s.hdi_upper, s.sd),
             "ess": f"{s.ess_bulk:.0f} / {s.ess_tail:.0f}",
             "rhat": f"{s.rhat:.3f}",
@@ -83,6 +85,17 @@ def posterior_rows(result: OutputResult) -> list[dict[str, Any]]:
         }
         for s in calibration.summary.values()
     ]
+
+
+def skewed(s: ParameterSummary) -> bool:
+    """Whether a mean and sd would mislead: larger sd than mean, or an HDI over decades."""
+    low, high = sorted((abs(s.hdi_lower), abs(s.hdi_upper)))
+    one_sign = s.hdi_lower * s.hdi_upper > 0.0
+    return s.sd > abs(s.mean) or (one_sign and high > _DECADES * low)
+
+
+def mean_or_median(s: ParameterSummary) -> str:
+    return f"median {format_number(s.median, 3)}" if skewed(s) else format_value(s.mean, s.sd)
 
 
 def _interval(lower: float, upper: float, sd: float) -> str:
@@ -101,7 +114,7 @@ def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
     head: list[Any] = ["Parameter", "Unit"]
     head += [table.source] if table else []
     head += [METHOD_NAMES.get(e.method, e.method) for e in result.estimates]
-    head += ["Posterior mean ± sd"]
+    head += ["Posterior mean ± sd, or median and 95 % HDI"]
     varying = [name for name, v in result.calibration.reported.items() if np.ptp(v) > 0.0]
     rows = [_estimate_row(result, name, unit, table) for name, unit in model.reported.items()
             if name in varying]  # fmt: skip
@@ -109,16 +122,17 @@ def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
         f"{METHOD_NAMES.get(e.method, e.method)}: {e.note}" for e in result.estimates if e.note
     ]
     fitted, shown = len(result.calibration.problem.table), len(result.task.table)
+    caption = ""
     if fitted < shown and model.name.startswith("magic_formula"):
-        notes.insert(
-            0,
-            f"The estimates are of all {shown} rows, as in the source; the posterior is of the "
-            f"{fitted} that were not held out.",
+        caption = (
+            f"Not the same rows: the estimates are of all {shown} rows"
+            f"{', as in the source' if table else ''}; the posterior is of the {fitted} that were "
+            "not held out."
         )
     if table:
         notes.insert(0, f"{_TICK}: equal to {table.source} in every printed digit.")
         notes += [f"{table.source}: {table.note}"] if table.note else []
-    return Grid("", head, rows, _quality_rows(result.estimates, table), notes)
+    return Grid(caption, head, rows, _quality_rows(result.estimates, table), notes)
 
 
 def _estimate_row(
@@ -135,7 +149,11 @@ def _estimate_row(
         else:
             row.append(_ticked(_as_printed(value, printed.text), printed.agrees(value)))
     s = result.calibration.summary[name]
-    row.append(format_value(s.mean, s.sd))
+    if skewed(s):
+        interval = _interval(s.hdi_lower, s.hdi_upper, s.sd)
+        row.append(Markup("{}<br>HDI {}").format(mean_or_median(s), interval))
+    else:
+        row.append(format_value(s.mean, s.sd))
     return row
 
 
@@ -159,7 +177,7 @@ def _quality_rows(
         printed = [quality[key].text if key in quality else NOTHING] if table else []
         return [label, unit, *printed, *values, NOTHING]
 
-    unit = unit_html(estimates[0].cost_unit.replace("(", "").replace(")", ""))
+    unit = unit_html(estimates[0].cost_unit)
     return [
         row("Cost (sum of squares)", unit, "cost", [format_number(e.cost, 4) for e in estimates]),
         row("RMSE", NOTHING, "rmse", [format_number(e.rmse, 3) for e in estimates]),

@@ -6,9 +6,10 @@ The first rule that applies decides:
 2. not scored: the validation has no finite error;
 3. miscovered: unseen rows fell outside the 90 % band more often than chance allows;
 4. misfit: residuals keep their sign along the curve for longer than chance allows;
-5. extrapolated: the prior, not the data, sets what the prediction of unseen rows hangs on;
-6. weak: the median is hardly better than the mean of the calibrated rows;
-7. fine.
+5. unexpected: fewer than half of the calibrated points lie inside what the priors expect;
+6. extrapolated: the prior, not the data, sets what the prediction of unseen rows hangs on;
+7. weak: the median is hardly better than the mean of the calibrated rows;
+8. fine.
 """
 
 from __future__ import annotations
@@ -23,15 +24,26 @@ from scipy.stats import binomtest
 
 from calib.figures.joint import coverage_probability, effective_rows
 from calib.figures.labels import axis_of, joined, percent, plain, short
+from calib.figures.prior_predictive import prior_hits
 from calib.figures.residuals import sign_changes, standardise
 from calib.figures.roles import MOVED, PRIOR, role
 from calib.figures.rows import held_table, x_column
 from calib.study import OutputResult
 
-__all__ = ["Evidence", "Level", "Verdict", "gather", "judge_evidence"]
+__all__ = ["Evidence", "Level", "Verdict", "Where", "gather", "judge_evidence"]
 
 _SIGNIFICANT = 0.05
 _WEAK_SKILL = 0.5
+_EXPECTED = 0.5
+_PRESSURE = "inflation_pressure_psi"
+
+
+class Where(StrEnum):
+    """Where the rows that were not fitted lie, of those with a model in pressure."""
+
+    AT = "at calibrated pressures"
+    BETWEEN = "between them"
+    BEYOND = "beyond them"
 
 
 class Level(StrEnum):
@@ -79,6 +91,16 @@ class Evidence:
         The calibrated range in words.
     label : str
         Of the data.
+    unseen_at : Where
+        Where in pressure the unseen rows lie.
+    at_pressures : str
+        The two calibrated pressures and the range of the curves there.
+    prior_hits, prior_n : int
+        Calibrated points inside the priors' 95 % predictive band, and all.
+    suspects : str
+        What to check where the priors did not expect the data.
+    notes : sequence of str
+        What was assumed where the data do not say.
     """
 
     converged: bool
@@ -99,6 +121,12 @@ class Evidence:
     along: str
     inside: str
     label: str = ""
+    unseen_at: Where = Where.AT
+    at_pressures: str = "the two calibrated pressures"
+    prior_hits: int = 0
+    prior_n: int = 0
+    suspects: str = "the units"
+    notes: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -159,14 +187,16 @@ def judge_evidence(e: Evidence) -> Verdict:
             f"{e.along}, where about {e.neighbours / 2:.0f} changes would be chance",
         )  # fmt: skip
     names = joined([plain(name) for name in e.prior_set]) if e.prior_set else ""
-    if e.two_pressures and e.prior_set:
+    if e.prior_hits < _EXPECTED * e.prior_n:
         return Verdict(
-            Level.CARE, "extrapolated", "Curvature from the prior",
-            f"the curves at the two calibrated pressures, and the width of the band between them, "
-            f"for {e.inside}",
-            f"the median between the two pressures, off by {error}: two pressures do not "
-            f"determine a quadratic, so {names} come from the prior",
+            Level.CARE, "unexpected", "Data and priors disagree",
+            f"the shape of the curves for {e.inside}, to {error}, once the cause is known",
+            f"anything the prior has a say in: the priors did not expect these data ("
+            f"{e.prior_hits} of {e.prior_n} points lie inside their 95 % band); check {e.suspects}"
+            + "".join(f"; {note}" for note in e.notes),
         )  # fmt: skip
+    if e.two_pressures and e.prior_set:
+        return _between_two(e, names, error)
     if e.skill < _WEAK_SKILL:
         return Verdict(
             Level.CARE, "weak", "Explains little", f"the bands for {e.inside}",
@@ -180,6 +210,27 @@ def judge_evidence(e: Evidence) -> Verdict:
     return Verdict(Level.FINE, "fine", "Holds on unseen rows", trust, doubt)
 
 
+def _between_two(e: Evidence, names: str, error: str) -> Verdict:
+    """Say what two pressures leave open, with an error only where it was measured."""
+    verb = "comes" if len(e.prior_set) == 1 else "come"
+    why = f"two pressures do not determine a quadratic, so {names} {verb} from the prior"
+    trust = f"the curves at {e.at_pressures}"
+    if e.unseen_at is Where.BETWEEN:
+        rows = f"{short(e.effective)} independent {'row' if e.effective < 1.05 else 'rows'}"
+        worth = f", {e.n} rows worth {rows}," if math.isfinite(e.effective) else ""
+        doubt = (
+            f"the median between the two pressures, off by {error}: {why}. The width of the band "
+            f"there is the prior's too, and one held-out curve{worth} cannot confirm it"
+        )
+    else:
+        doubt = f"anything between the two pressures: nothing was measured between them, and {why}"
+        if e.unseen_at is Where.BEYOND:
+            doubt += f". Beyond them the median is off by {error}"
+        else:
+            trust += f", to {error}"
+    return Verdict(Level.CARE, "extrapolated", "Curvature from the prior", trust, doubt)
+
+
 def gather(result: OutputResult) -> Evidence:
     """Collect the evidence of a result."""
     calibration, v = result.calibration, result.validation
@@ -187,7 +238,6 @@ def gather(result: OutputResult) -> Evidence:
     covered = v.scores.coverage[0.9]
     held = held_table(result) is not None
     complete = bool(np.isfinite(v.draws).all(axis=1).any())
-    pressure = "inflation_pressure_psi"
     quadratic = problem.bound.model.name == "magic_formula_pressure"
     changes, neighbours = sign_changes(result, standardise(result, problem).residual)
     scatter = float(np.mean(np.square(v.observed - problem.observed.mean())))
@@ -208,14 +258,39 @@ def gather(result: OutputResult) -> Evidence:
         unit=axis_of(problem.bound.model.output).unit,
         max_relative_error=_largest(v.scores.relative_error),
         prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
-        two_pressures=quadratic and np.unique(problem.table[pressure]).size == 2,
+        two_pressures=quadratic and np.unique(problem.table[_PRESSURE]).size == 2,
         skill=1.0 - v.scores.rmse**2 / scatter if scatter > 0.0 else float("nan"),
         sign_changes=changes,
         neighbours=neighbours,
         along=axis_of(x_column(result)).name.lower(),
         inside=_range_words(result),
         label=problem.table.label,
+        unseen_at=_unseen_at(result) if quadratic and held else Where.AT,
+        at_pressures=_at_pressures(result) if quadratic else "",
+        prior_hits=prior_hits(result),
+        prior_n=problem.observed.size,
+        suspects=(
+            "the units and the normal load"
+            if problem.bound.model.output == "drawbar_pull_kn"
+            else "the units"
+        ),
+        notes=tuple(getattr(problem, "notes", ())),
     )
+
+
+def _unseen_at(result: OutputResult) -> Where:
+    fitted = result.calibration.problem.table[_PRESSURE]
+    unseen = result.validation.table[_PRESSURE]
+    if bool(((unseen < fitted.min()) | (unseen > fitted.max())).any()):
+        return Where.BEYOND
+    return Where.AT if bool(np.isin(unseen, fitted).any()) else Where.BETWEEN
+
+
+def _at_pressures(result: OutputResult) -> str:
+    problem = result.calibration.problem
+    psi, slip = axis_of(_PRESSURE), axis_of("slip_ratio")
+    words = joined([psi.value_text(float(p)) for p in np.unique(problem.table[_PRESSURE])])
+    return f"{words} {psi.unit} for slip {slip.range_text(problem.table['slip_ratio'])}"
 
 
 def _largest(relative: np.ndarray) -> float:

@@ -148,13 +148,28 @@ def test_a_run_that_does_not_converge_says_so_and_ends_with_3(calib: Calib, tmp_
 
 def test_an_earlier_run_is_replaced_on_request_only(calib: Calib) -> None:
     assert fit_rut(calib, RUT.encode()).code == 0
-    Path("run/old").write_text("x")
     refused = fit_rut(calib, RUT.encode())
     assert refused.code == 2
     assert "pass --overwrite" in refused.err
-    again = calib("fit", "my.csv", "--model", "modified_bekker", "--out", "run", "--overwrite")
-    assert again.code == 0
-    assert "run/old" not in contents(Path())
+    command = ("fit", "my.csv", "--model", "modified_bekker", "--out", "run", "--overwrite")
+    Path("run/notes.txt").write_text("mine")
+    kept = calib(*command)
+    assert kept.code == 2
+    assert "notes.txt" in kept.err
+    assert Path("run/notes.txt").read_text() == "mine"
+    Path("run/notes.txt").unlink()
+    Path("run/index.html").write_text("of an earlier run")
+    assert calib(*command).code == 0
+    assert "run/index.html" not in contents(Path())
+
+
+def test_a_changed_run_is_not_predicted_from(calib: Calib) -> None:
+    assert fit_rut(calib, RUT.encode()).code == 0
+    Path("run/data.csv").write_text(Path("run/data.csv").read_text().replace("0.1", "0.2"))
+    refused = calib("predict", "run", "--at", "my.csv")
+    assert refused.code == 2
+    assert "data.csv" in refused.err
+    assert "changed since the run was written" in refused.err
 
 
 def test_own_priors_are_used(calib: Calib) -> None:
@@ -241,7 +256,7 @@ def edited(text: str, line: int, old: str, new: str) -> str:
 
 
 def at_one_pressure() -> str:
-    return PRESSURES.replace(",42,", ",18,")
+    return PRESSURES.replace(",42,", ",18,").replace(",30,", ",18,")
 
 
 def constant(text: str) -> str:

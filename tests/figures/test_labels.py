@@ -16,12 +16,14 @@ from calib.figures.labels import (
 from calib.figures.learned import _log_ticks
 
 MINUS = "\N{MINUS SIGN}"
+TIMES = "\N{MULTIPLICATION SIGN}"
 
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.0, "0"), (0.0996, "0.10"), (1234.0, "1234"), (-0.5, f"{MINUS}0.50"), (4.3e8, "4.3e8"),
-     (1.9e-6, f"1.9e{MINUS}6"), (float("nan"), "\N{EN DASH}"), (99.6, "100")],
+    [(0.0, "0"), (0.0996, "0.10"), (1234.0, "1234"), (-0.5, f"{MINUS}0.50"),
+     (4.3e8, f"4.3{TIMES}10⁸"), (1.9e-6, f"1.9{TIMES}10⁻⁶"),
+     (float("nan"), "\N{EN DASH}"), (99.6, "100")],
 )  # fmt: skip
 def test_short(value, text):
     assert short(value) == text

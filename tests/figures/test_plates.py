@@ -212,9 +212,9 @@ def test_estimates_caption_names_the_published_figures_outside(rut):
     outside = [
         name
         for name, figure in (("n0", 1.996), ("n1", 1.266), ("k", 3.306e5))
-        if not np.quantile(rut.calibration.reported[name], 0.025)
+        if not rut.calibration.summary[name].hdi_lower
         <= figure
-        <= np.quantile(rut.calibration.reported[name], 0.975)
+        <= rut.calibration.summary[name].hdi_upper
     ]
     assert ("All published" in caption) == (not outside)
     for name in outside:
@@ -250,6 +250,43 @@ def test_residuals_are_in_noise_sds(rut):
     assert pairs == 18 - 2
     assert 0 <= changes <= pairs
     assert sign_changes(rut, np.ones(18)) == (0, 16)
+
+
+def with_residuals(drawbar, high, low):
+    """Give the two calibrated pressures residuals of a known spread."""
+    problem = drawbar.calibration.problem
+    table = problem.table
+    rng = np.random.default_rng(5)
+    noise = np.where(table["inflation_pressure_psi"] < 30.0, high, low)
+    predicted = standardise(drawbar, problem).predicted
+    columns = dict(table.columns) | {
+        "drawbar_pull_kn": predicted + noise * rng.standard_normal(len(table))
+    }
+    told = problem.with_table(replace(table, columns=columns))
+    return replace(drawbar, calibration=replace(drawbar.calibration, problem=told))
+
+
+def test_residuals_say_where_one_sigma_does_not_fit(drawbar):
+    caption = residuals_plate(with_residuals(drawbar, 0.2, 0.02)).caption
+    sds = re.search(r"([\d.]+) kN at 18 psi and ([\d.]+) kN at 42 psi", caption).groups()
+    assert float(sds[0]) == pytest.approx(0.2, rel=0.5)
+    assert float(sds[1]) == pytest.approx(0.02, rel=0.5)
+    assert "too narrow at 18 psi and too wide at 42 psi" in caption
+    same = residuals_plate(with_residuals(drawbar, 0.05, 0.05)).caption
+    assert "does not tell the pressures apart" in same
+    assert "too narrow" not in same
+
+
+def test_spread_is_compared_between_pressures_only(plate, density):
+    for result in (plate, density):
+        assert "Levene" not in residuals_plate(result).caption
+
+
+def test_by_pressure_says_which_pressures_were_calibrated(drawn):
+    figure = next(p for p in drawn["drawbar"] if p.name == "by_pressure").figure
+    labels = [t.get_text() for t in figure.legends[0].get_texts()]
+    assert "18 and 42 psi calibrated jointly, 90 %" in labels
+    assert not any("all pressures" in label for label in labels)
 
 
 def test_residuals_show_every_row(drawbar):

@@ -272,6 +272,31 @@ def test_warnings_and_names_of_the_case_are_shown_and_escaped(found):
     assert "<b>" not in html
 
 
+@pytest.mark.parametrize(
+    ("verdict", "best", "words"),
+    [
+        ("ambiguous", "lug_thrust", "the data cannot tell"),
+        ("unknown", "unknown", "no effect on the list explains it"),
+        ("effect", "parameter_shift", "the same model with other parameter values"),
+        ("effect", "force_offset+lug_thrust", "wo effects at once"),
+    ],
+)
+def test_every_verdict_has_its_page(found, verdict, best, words):
+    p = dict.fromkeys(found.ranking.probability, 0.0) | {"rate_effect": 0.3}
+    p |= {best: 0.6} if verdict != "ambiguous" else {best: 0.35}
+    ranking = replace(found.ranking, probability=p)
+    if best not in ranking.fits:  # this pair was not promising enough to be fitted
+        fits = dict(ranking.fits) | {best: ranking.fits["force_offset+sensor_drift"]}
+        evidence_of = dict(ranking.log_evidence) | {best: 0.0}
+        ranking = replace(ranking, fits=fits, log_evidence=evidence_of)
+    other = replace(found, verdict=verdict, ranking=ranking)
+    reader = Reader()
+    reader.feed(render_diagnosis(other, [], {}, manifest={}))
+    opening = reader.text[: reader.text.index("Before the outcomes")]
+    assert words in opening
+    assert reader.open == []
+
+
 def test_evidence_is_gathered_from_the_records(found):
     e = gap_evidence(found)
     assert e.verdict == found.verdict

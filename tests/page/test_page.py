@@ -6,17 +6,19 @@ import re
 from dataclasses import replace
 from html.parser import HTMLParser
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from calib.calibration import ParameterSummary
 from calib.figures import Plate
 from calib.models import MODELS
 from calib.models.base import BoundModel
 from calib.page import render_page
-from calib.page.content import png_size
+from calib.page.content import failed_section, png_size
 from calib.page.equations import equation, parametrisation, prose, symbol_html, unit_html
-from calib.page.facts import validation_facts
-from calib.page.tables import estimates_grid, posterior_rows, pressure_grids
+from calib.page.facts import repeats_words, validation_facts
+from calib.page.tables import estimates_grid, posterior_rows, pressure_grids, skewed
 from calib.study import Failure, Study
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\x00\x02\x00\x00\x00\x03\x08\x06\x00\x00\x00rest"
@@ -138,7 +140,37 @@ def test_a_failed_output_is_shown_and_the_rest_still_comes(rut):
     assert "This output failed: no <column>" in reader.text
     assert "What to do" in reader.text
     assert "no &lt;column&gt;" in html
+    assert "CalibError" not in html
     assert 'id="rut_depth-posterior"' in html
+
+
+@pytest.mark.parametrize("name", ["CalibError", "numpy.linalg.LinAlgError", "DataError"])
+def test_a_failure_does_not_show_the_name_of_a_class(rut, name):
+    failure = Failure(rut.task, f"{name}: row 3: no slip (Error: none)")
+    assert failed_section("rut_depth", failure)["error"] == "row 3: no slip (Error: none)"
+
+
+def test_notes_of_a_problem_are_shown(rut):
+    note = "no load <column>: 5 kN is assumed"
+    problem = replace(rut.calibration.problem, notes=(note,))
+    told = replace(rut, calibration=replace(rut.calibration, problem=problem))
+    assert note in page({"rut_depth": told})[1].text.replace("\N{NO-BREAK SPACE}", " ")
+    assert "Assumed" not in page({"rut_depth": rut})[1].text
+
+
+def test_repeats_that_stay_in_are_named(plate):
+    assert repeats_words(plate) == ""
+    table = plate.calibration.problem.table
+    columns = dict(table.columns) | {"average_ground_pressure_kpa": np.repeat([50.0, 90.0], 7)}
+    problem = plate.calibration.problem.with_table(replace(table, columns=columns))
+    repeated = replace(plate, calibration=replace(plate.calibration, problem=problem))
+    words = "14 rows at 2 distinct conditions; leaving one row out leaves its repeats in"
+    assert repeats_words(repeated) == words
+    assert words in page({"rut_depth": repeated})[1].text.replace("\N{NO-BREAK SPACE}", " ")
+
+
+def test_repeats_do_not_matter_for_held_out_rows(rut):
+    assert repeats_words(rut) == ""
 
 
 def test_a_missing_figure_says_why(whole):
@@ -187,6 +219,47 @@ def test_estimates_of_a_users_data_have_no_published_column(plate):
     assert all(len(row) == len(grid.head) for row in (*grid.rows, *grid.foot))
 
 
+def summary(mean, sd, low, high, median=2.0) -> ParameterSummary:
+    return ParameterSummary(
+        "C1", "kPa", mean, sd, median, low, high, 900.0, 900.0, 1.0, 0.1, float("nan")
+    )
+
+
+@pytest.mark.parametrize(
+    ("s", "expected"),
+    [
+        (summary(1.0, 1.1, 0.5, 3.0), True),
+        (summary(-1.0, 1.1, -3.0, -0.5), True),
+        (summary(5.0, 4.0, 0.1, 3.1), True),
+        (summary(-5.0, 4.0, -3.1, -0.1), True),
+        (summary(5.0, 4.0, 0.2, 3.1), False),
+        (summary(5.0, 1.0, -0.01, 7.0), False),
+    ],
+)
+def test_where_a_mean_would_mislead(s, expected):
+    assert skewed(s) is expected
+
+
+def test_a_skewed_parameter_has_a_median_and_no_sd(rut):
+    s = rut.calibration.summary
+    wide = replace(s["k"], mean=10.0, sd=40.0, median=2.0, hdi_lower=0.01, hdi_upper=90.0)
+    calibration = replace(rut.calibration)
+    object.__setattr__(calibration, "summary", {**s, "k": wide})
+    told = replace(rut, calibration=calibration)
+    row = next(r for r in posterior_rows(told) if str(r["symbol"]) == "<i>k</i>")
+    assert row["value"] == "median 2.00"
+    cells = [r for r in estimates_grid(told, published=True).rows if str(r[0]) == "<i>k</i>"]
+    assert str(cells[0][-1]) == "median 2.00<br>HDI 0.010 to 90"
+
+
+def test_the_table_says_that_its_estimates_are_of_more_rows(drawbar, rut):
+    caption = estimates_grid(drawbar, published=True).caption
+    assert "all 42 rows" in caption
+    assert "the 28 that were not held out" in caption
+    assert caption in page({"drawbar_pull": drawbar})[1].text
+    assert estimates_grid(rut, published=True).caption == ""
+
+
 def test_each_pressure_stands_beside_tables_3_and_4(drawbar):
     grids = pressure_grids(drawbar, published=True)
     assert [g.caption for g in grids] == ["18 psi alone", "30 psi alone", "42 psi alone"]
@@ -210,6 +283,7 @@ def test_every_model_has_an_equation_and_a_parametrisation(name):
     assert "<i>" in equation(bound)
     text = parametrisation(bound)
     assert "{" not in text
+    assert ("must stay positive" in text) == (name == "magic_formula_pressure")
     reader = Reader()
     reader.feed(str(equation(bound)))
     assert reader.open == []
@@ -230,6 +304,12 @@ def test_symbols_and_units_are_escaped():
     assert str(symbol_html("<b>")) == "<i>&lt;b&gt;</i>"
     assert str(unit_html("kPa (g/cm^3)^-C4")) == "kPa (g/cm<sup>3</sup>)<sup>&minus;C4</sup>"
     assert str(unit_html("1")) == "&ndash;"
+    assert str(unit_html("(g/cm^3)^2")) == "(g/cm<sup>3</sup>)<sup>2</sup>"
+
+
+def test_the_cost_has_its_unit(density):
+    cost = estimates_grid(density, published=True).foot[0]
+    assert str(cost[1]) == "(g/cm<sup>3</sup>)<sup>2</sup>"
 
 
 def test_png_size():

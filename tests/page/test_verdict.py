@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.page.verdict import Evidence, Level, binomial_p, gather, judge_evidence
+from calib.page.verdict import Evidence, Level, Where, binomial_p, gather, judge_evidence
 
 FINE = Evidence(
     converged=True,
@@ -37,6 +37,7 @@ RULES = {
     "not scored": {"rmse": float("nan")},
     "miscovered": {"hits": 6, "low_coverage_p": 0.001},
     "misfit": {"sign_changes": 4},
+    "unexpected": {"prior_hits": 2, "prior_n": 20},
     "extrapolated": {"two_pressures": True, "prior_set": ("K_bend", "D_bend")},
     "weak": {"skill": 0.1},
 }
@@ -77,6 +78,56 @@ def test_two_pressures_name_what_the_prior_sets():
     assert "K_bend and D_bend" in doubt
 
 
+def test_no_error_is_claimed_between_two_pressures_where_nothing_was_measured():
+    verdict = judge_evidence(replace(FINE, **RULES["extrapolated"], held_out=False))
+    assert "nothing was measured between them" in verdict.doubt
+    assert "0.040" not in verdict.doubt
+    assert "to 0.040 kN rms" in verdict.trust
+    assert "width" not in verdict.trust
+
+
+def test_an_error_beyond_two_pressures_is_said_to_be_there():
+    verdict = judge_evidence(replace(FINE, **RULES["extrapolated"], unseen_at=Where.BEYOND))
+    assert "nothing was measured between them" in verdict.doubt
+    assert "Beyond them the median is off by 0.040 kN rms" in verdict.doubt
+    assert "0.040" not in verdict.trust
+
+
+def test_one_held_out_curve_does_not_confirm_the_width():
+    verdict = judge_evidence(
+        replace(FINE, **RULES["extrapolated"], unseen_at=Where.BETWEEN, effective=1.8)
+    )
+    assert "off by 0.040 kN rms" in verdict.doubt
+    assert "14 rows worth 1.8 independent rows, cannot confirm it" in verdict.doubt
+    assert "width" not in verdict.trust
+
+
+@pytest.mark.parametrize(("hits", "rule"), [(9, "unexpected"), (10, "fine"), (20, "fine")])
+def test_priors_expect_at_least_half_of_the_points(hits, rule):
+    assert judge_evidence(replace(FINE, prior_hits=hits, prior_n=20)).rule == rule
+
+
+def test_data_that_the_priors_did_not_expect():
+    doubt = judge_evidence(
+        replace(FINE, **RULES["unexpected"], suspects="the load", notes=("5 kN is assumed",))
+    ).doubt
+    assert "did not expect these data (2 of 20 points" in doubt
+    assert "check the load; 5 kN is assumed" in doubt
+
+
+def test_units_off_by_a_thousand_conflict_with_the_priors(drawbar):
+    problem = replace(drawbar.calibration.problem, notes=("5 kN is assumed",))
+    calibration = replace(drawbar.calibration, problem=problem)
+    evidence = gather(
+        replace(
+            drawbar, calibration=calibration, prior_predictive=1000.0 + drawbar.prior_predictive
+        )
+    )
+    assert (evidence.prior_hits, evidence.prior_n) == (0, 28)
+    assert evidence.notes == ("5 kN is assumed",)
+    assert "normal load" in judge_evidence(evidence).doubt
+
+
 def test_parameters_set_by_the_prior_are_named_even_where_all_is_fine():
     assert "C2" in judge_evidence(replace(FINE, prior_set=("C2",))).doubt
 
@@ -100,7 +151,27 @@ def test_evidence_of_the_held_out_pressure(drawbar):
     assert evidence.effective < 7
     assert evidence.neighbours == 26
     assert evidence.inside == "slip 2 to 72 % and inflation pressure 18 to 42 psi"
-    assert judge_evidence(evidence).rule == "extrapolated"
+    assert evidence.unseen_at is Where.BETWEEN
+    assert evidence.prior_hits >= 14
+    verdict = judge_evidence(evidence)
+    assert verdict.rule == "extrapolated"
+    assert verdict.trust == "the curves at 18 and 42 psi for slip 2 to 72 %"
+
+
+@pytest.mark.parametrize(
+    ("psi", "where"), [(30.0, Where.BETWEEN), (18.0, Where.AT), (50.0, Where.BEYOND)]
+)
+def test_where_the_held_out_rows_lie(drawbar, psi, where):
+    table = drawbar.validation.table
+    columns = dict(table.columns) | {"inflation_pressure_psi": np.full(len(table), psi)}
+    held = replace(drawbar.validation, table=replace(table, columns=columns))
+    assert gather(replace(drawbar, validation=held)).unseen_at is where
+
+
+def test_leaving_rows_out_measures_nothing_between_two_pressures(drawbar):
+    left_out = replace(drawbar.validation, method="leave_one_out")
+    evidence = gather(replace(drawbar, validation=left_out))
+    assert evidence.unseen_at is Where.AT
 
 
 def test_evidence_of_leave_one_out(density):

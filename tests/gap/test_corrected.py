@@ -1,0 +1,52 @@
+"""The corrected model, saved and loaded, predicts what the diagnosis predicted."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.data import table_from_arrays
+from calib.errors import CalibError
+from calib.gap.corrected import load_corrected, predict_columns, save_corrected
+from calib.gap.diagnose import diagnose
+from calib.gap.effects import EFFECTS
+from tests.gap.cases import make_case
+
+FEW = {name: EFFECTS[name] for name in ("force_offset", "rate_effect")}
+
+
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("diagnosis")
+    case = make_case("force_offset")
+    found = diagnose(replace(case, fresh=case.field), 1, effects=FEW)
+    save_corrected(found.corrected, folder)
+    return found, folder
+
+
+def test_it_predicts_as_the_diagnosis_did(saved):
+    found, folder = saved
+    columns = predict_columns(load_corrected(folder), found.data.case.field)
+    for name, prediction in found.fresh.items():
+        column = {"drawbar_pull": "drawbar_pull_kn", "rut_depth": "rut_depth_mm"}[name]
+        np.testing.assert_allclose(columns[f"{column}_before"], prediction.before, rtol=1e-9)
+        np.testing.assert_allclose(columns[f"{column}_after"], prediction.after, rtol=1e-9)
+        np.testing.assert_allclose(columns[f"{column}_after_lower"], prediction.lower, rtol=1e-9)
+
+
+def test_a_damaged_one_is_refused(saved, tmp_path):
+    _, folder = saved
+    content = json.loads((folder / "corrected.json").read_text())
+    content["fits"][0]["psi"] = content["fits"][0]["psi"][:-1]
+    (tmp_path / "corrected.json").write_text(json.dumps(content))
+    (tmp_path / "case").symlink_to(folder / "case")
+    with pytest.raises(CalibError, match="no readable corrected model"):
+        load_corrected(tmp_path)
+
+
+def test_missing_covariates_are_named(saved):
+    _, folder = saved
+    few = table_from_arrays({"slip_ratio": np.array([0.1])})
+    with pytest.raises(CalibError, match="the corrected model needs"):
+        predict_columns(load_corrected(folder), few)
