@@ -39,7 +39,7 @@ $(READY): pyproject.toml constraints.txt
 	  $$p -c 'import sys; raise SystemExit(sys.version_info < (3, 12))' >/dev/null 2>&1 \
 	    && echo $$p && break; done); \
 	if [ -z "$$python" ]; then \
-	  echo "calib needs Python 3.12 or newer; found $$(python3 --version 2>&1 || echo none). Install a newer Python and run make again." >&2; \
+	  echo "calib needs Python 3.12 or newer; found $$({ command -v python3 >/dev/null && python3 --version; } 2>&1 || echo none). Install a newer Python and run make again." >&2; \
 	  exit 1; \
 	fi; \
 	set -e; \
