@@ -21,7 +21,8 @@ import numpy as np
 from calib.data import Table, check_enough, check_varies
 from calib.errors import CalibError
 from calib.models import Array, BoundModel, get_model
-from calib.priors import Priors, default_prior_path, read_priors
+from calib.prior_files import default_prior_path, read_priors
+from calib.priors import Priors
 
 __all__ = ["Problem", "build_problem"]
 

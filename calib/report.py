@@ -13,7 +13,7 @@ from calib.figures import Plate, plates
 from calib.folders import fresh_folder
 from calib.manifest import build_manifest, file_hashes, sha256
 from calib.page import render_page
-from calib.priors import default_prior_path
+from calib.prior_files import default_prior_path
 from calib.sampling.sampler import SamplerSettings
 from calib.store import to_datatree, write_netcdf
 from calib.study import Study

@@ -23,7 +23,8 @@ from calib.data import Table, read_for_model, write_table
 from calib.errors import CalibError
 from calib.models import BoundModel, get_model
 from calib.models.base import Array
-from calib.priors import Priors, parse_priors
+from calib.prior_files import parse_priors
+from calib.priors import Priors
 from calib.problem import Problem
 from calib.sampling.gate import GateReport
 from calib.sampling.sampler import Draws

@@ -23,7 +23,7 @@ from calib.models import get_model
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.prediction import predictive_draws
-from calib.priors import prior_file_model
+from calib.prior_files import prior_file_model
 from calib.problem import Problem, build_problem
 from calib.sampling.sampler import SamplerSettings
 from calib.streams import generator

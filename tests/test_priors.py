@@ -12,7 +12,8 @@ from scipy.integrate import quad
 
 from calib.errors import CalibError
 from calib.models import MODELS
-from calib.priors import Prior, Priors, default_prior_path, parse_priors, read_priors
+from calib.prior_files import default_prior_path, parse_priors, read_priors
+from calib.priors import Prior, Priors
 
 ENTRY = '[parameters.{name}]\nunit = "1"\nreason = "a test"\nsource = "nobody"\n'
 PRIOR_FILES = sorted(Path(__file__).resolve().parents[1].joinpath("priors").rglob("*.toml"))

@@ -18,7 +18,7 @@ from calib.datasets.published import PUBLISHED
 from calib.errors import CalibError
 from calib.manifest import build_manifest, file_hashes, sha256, versions
 from calib.outputs import OUTPUTS
-from calib.priors import default_prior_path
+from calib.prior_files import default_prior_path
 from calib.sampling.sampler import SamplerSettings
 from calib.study import (
     Failure,

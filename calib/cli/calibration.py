@@ -242,7 +242,7 @@ def priors(
 ) -> None:
     """Write the shipped priors of a model, to copy and edit."""
     from calib.models import get_model
-    from calib.priors import default_prior_path
+    from calib.prior_files import default_prior_path
 
     _emit(default_prior_path(get_model(model).name).read_text(encoding="utf-8"), out)
 

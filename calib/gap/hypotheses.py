@@ -10,7 +10,8 @@ import numpy as np
 from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Hypothesis
-from calib.priors import Priors, default_prior_path, read_priors
+from calib.prior_files import default_prior_path, read_priors
+from calib.priors import Priors
 
 __all__ = [
     "LN_PAIR_TO_SINGLE",

@@ -16,7 +16,7 @@ import pytest
 from calib.cli import main
 from calib.manifest import file_hashes
 from calib.models import MODELS
-from calib.priors import default_prior_path
+from calib.prior_files import default_prior_path
 from calib.templates import template_csv
 
 RUT = template_csv("modified_bekker")

@@ -15,7 +15,7 @@ from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.which import Ranking, rank
 from calib.outputs import OUTPUTS
-from calib.priors import default_prior_path, read_priors
+from calib.prior_files import default_prior_path, read_priors
 from calib.problem import build_problem
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "cases"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.gap.effects import EFFECTS, View
-from calib.priors import default_prior_path, read_priors
+from calib.prior_files import default_prior_path, read_priors
 from gap.cases import make_case, parameters, simulate
 
 OUTPUTS = ("drawbar_pull", "rut_depth", "bulk_density")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import calib
 import calib.gap
-from calib.priors import default_prior_path
+from calib.prior_files import default_prior_path
 from gap.cases import PULL_ONLY, make_case, write_case
 
 GAP = Path(calib.gap.__file__).parent
