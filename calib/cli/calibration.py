@@ -150,8 +150,15 @@ def predict(
     run: Annotated[Path, typer.Argument(help="Folder of `calib fit` or `calib diagnose`.")],
     at: Annotated[Path, typer.Option(help="CSV with the conditions.")],
     out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
+    overwrite: _Overwrite = False,
 ) -> None:
     """Predict with 50, 90 and 95 % bands at new conditions."""
+    if out is not None and out.exists() and not overwrite:
+        raise CalibError(
+            "the file exists already",
+            where=str(out),
+            mend="choose another --out, or pass --overwrite",
+        )
     from calib.data import read_for_model, write_table
     from calib.prediction import predict as predict_at
     from calib.prediction import prediction_columns

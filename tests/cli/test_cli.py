@@ -497,3 +497,15 @@ def test_the_command_is_installed() -> None:
     )  # fmt: skip
     assert done.returncode == 0
     assert "modified_bekker" in done.stdout
+
+
+def test_a_prediction_replaces_a_file_on_request_only(calib: Calib) -> None:
+    assert fit_rut(calib, RUT.encode()).code == 0
+    Path("p.csv").write_text("mine")
+    command = ("predict", "run", "--at", "my.csv", "--out", "p.csv")
+    refused = calib(*command)
+    assert refused.code == 2
+    assert "p.csv" in refused.err
+    assert Path("p.csv").read_text() == "mine"
+    assert calib(*command, "--overwrite").code == 0
+    assert "rut_depth_mm_median" in Path("p.csv").read_text()
