@@ -96,14 +96,20 @@ def axis_of(column: str) -> Axis:
     return Axis(quantity.stem.replace("_", " ").capitalize(), unit)
 
 
-def symbol(name: str) -> str:
-    """Return a parameter's symbol in mathtext: ``K_lo`` as K with a subscript."""
+def stem_and_subscript(name: str) -> tuple[str, str]:
+    """Split a parameter's name: ``K_lo`` into K and lo, ``C3`` into C and 3."""
     stem, _, below = name.partition("_")
     digits = re.fullmatch(r"([A-Za-z]+)(\d+)", stem)
     if digits and not below:
         stem, below = digits.groups()
     if not below and len(stem) == 2 and stem[0].isupper() and stem[1].islower():
         stem, below = stem[0], stem[1]
+    return stem, below
+
+
+def symbol(name: str) -> str:
+    """Return a parameter's symbol in mathtext: ``K_lo`` as K with a subscript."""
+    stem, below = stem_and_subscript(name)
     stem = _GREEK.get(stem, stem)
     return f"${stem}_\\mathrm{{{below}}}$" if below else f"${stem}$"
 

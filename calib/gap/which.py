@@ -65,9 +65,7 @@ class Ranking:
         return sorted(self.probability, key=lambda name: -self.probability[name])
 
 
-def rank(
-    data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS, temperature: float = 1.0
-) -> Ranking:
+def rank(data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS) -> Ranking:
     """Fit every hypothesis and rank them."""
     able, unable = split_testable(data, effects)
     lab_mode, noise = _calibrate_lab(data, seed)
@@ -89,13 +87,11 @@ def rank(
         )
         for name, group in fits.items()
     }
-    probability = probabilities(log_evidence, len(single), temperature)
+    probability = probabilities(log_evidence, len(single))
     return Ranking(fits, log_evidence, probability, unable, lab_mode, design)
 
 
-def probabilities(
-    log_evidence: Mapping[str, float], n_single: int, temperature: float
-) -> dict[str, float]:
+def probabilities(log_evidence: Mapping[str, float], n_single: int) -> dict[str, float]:
     """Posterior probabilities of hypotheses from their evidence."""
     score = {}
     for name, value in log_evidence.items():
@@ -105,7 +101,7 @@ def probabilities(
             prior = LN_PRIOR["single"] - np.log(max(n_single, 1)) + LN_PAIR_TO_SINGLE
         else:
             prior = LN_PRIOR["single"] - np.log(max(n_single, 1))
-        score[name] = value / temperature + prior
+        score[name] = value + prior
     total = logsumexp(list(score.values()))
     return {name: float(np.exp(value - total)) for name, value in score.items()}
 

@@ -8,7 +8,7 @@ from string import ascii_letters
 
 from markupsafe import Markup, escape
 
-from calib.figures.labels import MINUS, plain
+from calib.figures.labels import MINUS, plain, stem_and_subscript
 from calib.models import BoundModel
 
 __all__ = [
@@ -20,12 +20,7 @@ _GREEK = {"sigma": Markup("&sigma;"), "gamma": Markup("&gamma;"), "theta": Marku
 
 def symbol_html(name: str) -> Markup:
     """Return a parameter's symbol: ``K_lo`` as K with a subscript."""
-    stem, _, below = name.partition("_")
-    digits = re.fullmatch(r"([A-Za-z]+)(\d+)", stem)
-    if digits and not below:
-        stem, below = digits.groups()
-    if not below and len(stem) == 2 and stem[0].isupper() and stem[1].islower():
-        stem, below = stem[0], stem[1]
+    stem, below = stem_and_subscript(name)
     inside = Markup("<i>{}</i>").format(_GREEK.get(stem, stem))
     return inside + Markup("<sub>{}</sub>").format(below) if below else inside
 
