@@ -13,6 +13,9 @@ from calib.figures import Plate, plates
 from calib.folders import fresh_folder
 from calib.manifest import build_manifest, file_hashes, sha256
 from calib.page import render_page
+from calib.page.paper_gaps import write_gaps
+from calib.paper_gaps.find import FoundGap
+from calib.paper_gaps.summary import summarise_gaps
 from calib.prior_files import default_prior_path
 from calib.sampling.sampler import SamplerSettings
 from calib.store import to_datatree, write_netcdf
@@ -31,6 +34,7 @@ def write_report(
     settings: SamplerSettings,
     command: Sequence[str],
     title: str,
+    gaps: Sequence[FoundGap] = (),
     overwrite: bool = False,
     progress: Progress | None = None,
 ) -> Path:
@@ -46,6 +50,8 @@ def write_report(
     command : sequence of str
         The command line, for the manifest.
     title : str
+    gaps : sequence of FoundGap
+        Of the source's own models, diagnosed: a section of their own.
     overwrite : bool
         Replace an earlier report.
     progress : callable, optional
@@ -63,7 +69,10 @@ def write_report(
     tell = progress or (lambda what, done, planned: None)
     with fresh_folder(out, overwrite=overwrite) as folder:
         inputs = _copy_inputs(study, folder)
-        (folder / "summary.json").write_text(json.dumps(summarise(study), indent=1) + "\n")
+        summary = summarise(study)
+        if gaps:
+            summary["paper_gaps"] = summarise_gaps(gaps)
+        (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
         drawn: dict[str, list[Plate]] = {}
         images: dict[str, bytes] = {}
         (folder / "figures").mkdir()
@@ -79,12 +88,17 @@ def write_report(
                     (folder / "figures" / name).write_bytes(images[name])
         tell("drawing figures", len(successes), len(successes))
         manifest = build_manifest(study, settings, command, inputs)
+        gaps_html = None
+        if gaps:
+            manifest["paper_gaps"] = {r.gap.name: {"seed": r.found.seed} for r in gaps}
+            gaps_html = write_gaps(gaps, folder, _png, manifest=manifest, progress=tell)
         page = render_page(
             study,
             drawn,
             images,
             manifest=manifest,
             title=title,
+            gaps_html=gaps_html,
             reconstructed=any(r.task.table.label for r in study.results.values()),
         )
         (folder / "index.html").write_text(page, encoding="utf-8")
