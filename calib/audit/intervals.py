@@ -54,13 +54,17 @@ class Interval:
         return Interval(-self.upper, -self.lower)
 
     def __mul__(self, other: Interval) -> Interval:
-        corners = [a * b for a in (self.lower, self.upper) for b in (other.lower, other.upper)]
-        return _outward(np.minimum.reduce(corners), np.maximum.reduce(corners))
+        with np.errstate(over="ignore", invalid="ignore"):
+            corners = [a * b for a in (self.lower, self.upper) for b in (other.lower, other.upper)]
+        # Infinity stands for an end beyond the largest number: times zero it is zero.
+        finite = [np.where(np.isnan(corner), 0.0, corner) for corner in corners]
+        return _outward(np.minimum.reduce(finite), np.maximum.reduce(finite))
 
     def __truediv__(self, other: Interval) -> Interval:
         if np.any((other.lower <= 0.0) & (other.upper >= 0.0)):
             raise ValueError("an interval that holds zero cannot divide")
-        return self * _outward(1.0 / other.upper, 1.0 / other.lower)
+        with np.errstate(over="ignore"):
+            return self * _outward(1.0 / other.upper, 1.0 / other.lower)
 
     @property
     def middle(self) -> Array:
@@ -79,8 +83,14 @@ class Interval:
 
 
 def _outward(lower: ArrayLike, upper: ArrayLike) -> Interval:
-    low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
-    return Interval(low - _ULPS * np.spacing(np.abs(low)), high + _ULPS * np.spacing(np.abs(high)))
+    return Interval(_step(lower, -np.inf), _step(upper, np.inf))
+
+
+def _step(end: ArrayLike, towards: float) -> Array:
+    x = np.asarray(end, dtype=np.float64)
+    finite = np.isfinite(x)
+    steps = np.copysign(_ULPS, towards) * np.spacing(np.where(finite, np.abs(x), 0.0))
+    return np.asarray(np.where(finite, x + steps, np.nextafter(x, towards)))
 
 
 def exact(value: ArrayLike) -> Interval:
