@@ -47,9 +47,9 @@ _ARRIVED = 0.01
 class Seeds:
     """How many seeds each search is repeated with."""
 
-    by_pressure: int = 30
-    joint: int = 12
-    printed_coordinates: int = 12
+    by_pressure: int = 20
+    joint: int = 10
+    printed_coordinates: int = 10
 
 
 @dataclass(frozen=True, eq=False)

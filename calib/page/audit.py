@@ -20,7 +20,7 @@ from calib.datasets.published import DOI
 from calib.figures.audit import audit_plates
 from calib.figures.plate import Plate, png
 from calib.page.content import png_size
-from calib.page.equations import unit_html
+from calib.page.equations import unbroken, unit_html
 from calib.page.numbers import NOTHING, format_number
 
 __all__ = ["AUDIT_MARKS", "audit_section", "write_audit", "write_audit_page"]
@@ -137,7 +137,7 @@ def audit_section(audit: Audit, plates: Sequence[Plate], images: Mapping[str, by
 def _text(text: str) -> str:
     """Write minus signs and powers as a reader expects them."""
     signed = re.sub(r"(?<![\w.])-(?=[\d.,)])", _MINUS, text)
-    return (
+    return unbroken(
         signed.replace("kN^2", "kN²")
         .replace("psi^2", "psi²")
         .replace("R^2", "R²")
