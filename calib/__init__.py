@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from calib.audit import Audit, run_audit
     from calib.calibration import Calibration, calibrate
     from calib.data import Table, hold_out, read_table, table_from_arrays
     from calib.datasets.he2019 import load_he2019
@@ -25,6 +26,8 @@ if TYPE_CHECKING:
     from calib.validate import Validation, leave_one_out, validate_held_out
 
 _HOME = {
+    "Audit": "calib.audit",
+    "run_audit": "calib.audit",
     "Calibration": "calib.calibration",
     "calibrate": "calib.calibration",
     "Table": "calib.data",
@@ -55,6 +58,7 @@ _HOME = {
 
 __all__ = [
     "MODELS",
+    "Audit",
     "CalibError",
     "Calibration",
     "Case",
@@ -76,6 +80,7 @@ __all__ = [
     "predict",
     "read_case",
     "read_table",
+    "run_audit",
     "save_calibration",
     "table_from_arrays",
     "to_datatree",

@@ -14,10 +14,10 @@ from calib.errors import CalibError
 __all__ = ["check_folder", "fresh_folder"]
 
 # Files by which a folder is known to be one of ours, and may be replaced.
-_OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt")
+_OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json")
 _WRITTEN = (
     *_OURS, "index.html", "summary.json", "figures", "data", "priors", "gaps", "case",
-    "corrected.json", "fresh_prediction.csv", "priors.toml", "data.csv",
+    "corrected.json", "fresh_prediction.csv", "priors.toml", "data.csv", "audit.csv",
 )  # fmt: skip
 
 

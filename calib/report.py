@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from calib.audit import Audit
 from calib.data import write_table
 from calib.figures import Plate, plates
+from calib.figures.plate import png
 from calib.folders import fresh_folder
 from calib.manifest import build_manifest, file_hashes, sha256
 from calib.page import render_page
+from calib.page.audit import write_audit
 from calib.page.paper_gaps import write_gaps
 from calib.paper_gaps.find import FoundGap
 from calib.paper_gaps.summary import summarise_gaps
@@ -36,6 +38,7 @@ def write_report(
     title: str,
     gaps: Sequence[FoundGap] = (),
     overwrite: bool = False,
+    audit: Audit | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write a report folder.
@@ -54,6 +57,8 @@ def write_report(
         Of the source's own models, diagnosed: a section of their own.
     overwrite : bool
         Replace an earlier report.
+    audit : Audit, optional
+        Of the published tables, shown before the appendix.
     progress : callable, optional
 
     Returns
@@ -84,7 +89,7 @@ def write_report(
             for plate in drawn[key]:
                 if plate.figure is not None:
                     name = f"{key}_{plate.name}.png"
-                    images[name] = _png(plate)
+                    images[name] = png(plate)
                     (folder / "figures" / name).write_bytes(images[name])
         tell("drawing figures", len(successes), len(successes))
         manifest = build_manifest(study, settings, command, inputs)
@@ -100,6 +105,7 @@ def write_report(
             title=title,
             gaps_html=gaps_html,
             reconstructed=any(r.task.table.label for r in study.results.values()),
+            audit_html=write_audit(audit, folder) if audit is not None else None,
         )
         (folder / "index.html").write_text(page, encoding="utf-8")
         manifest["files"] = file_hashes(folder)
@@ -137,17 +143,3 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
             },
         }
     return inputs
-
-
-def _png(plate: Plate) -> bytes:
-    """Render a figure, with a palette of 256 colours: a third of the size, no visible loss."""
-    from PIL import Image
-
-    if plate.figure is None:
-        return b""
-    full, small = io.BytesIO(), io.BytesIO()
-    plate.figure.savefig(full, format="png", dpi=150)
-    full.seek(0)
-    with Image.open(full) as image:
-        image.convert("RGB").quantize(256).save(small, format="png")
-    return small.getvalue()

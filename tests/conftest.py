@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.audit import Audit, Seeds, run_audit
 from calib.calibration import Calibration, calibrate
 from calib.data import Table, hold_out, table_from_arrays
 from calib.datasets import he2019
@@ -56,3 +57,9 @@ def density_calibration() -> Calibration:
 def found_gaps() -> dict[str, FoundGap]:
     """The source's own gaps, diagnosed."""
     return {result.gap.name: result for result in find_gaps(SEED)}
+
+
+@pytest.fixture(scope="session")
+def audit(rut_calibration: Calibration) -> Audit:
+    """The audit of the published tables, the genetic algorithm over few seeds."""
+    return run_audit(SEED, seeds=Seeds(3, 2, 4), rut_calibration=rut_calibration)

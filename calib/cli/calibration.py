@@ -50,6 +50,7 @@ def report(
     max_steps: _MaxSteps = 25_600,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
+    from calib.audit import run_audit
     from calib.cli.display import progress_bars
     from calib.data import read_table
     from calib.datasets.he2019 import labelled
@@ -77,9 +78,15 @@ def report(
     with progress_bars() as tell:
         study = run_study(tasks, seed, settings=settings, progress=tell)
         gaps = () if files else find_gaps(seed, progress=tell)
+        # The audit is of the source's tables: beside the user's own data it has no place.
+        rut = study.successes.get("rut_depth")
+        rut_calibration = rut.calibration if rut is not None else None
+        audit = None
+        if not files:
+            audit = run_audit(seed, rut_calibration=rut_calibration, progress=tell)
         page = write_report(
             study, out, settings=settings, command=_command(), title=title, gaps=gaps,
-            overwrite=overwrite, progress=tell,
+            overwrite=overwrite, audit=audit, progress=tell,
         )  # fmt: skip
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]
