@@ -96,7 +96,7 @@ def write_report(
         gaps_html = None
         if gaps:
             manifest["paper_gaps"] = {r.gap.name: {"seed": r.found.seed} for r in gaps}
-            gaps_html = write_gaps(gaps, folder, _png, manifest=manifest, progress=tell)
+            gaps_html = write_gaps(gaps, folder, png, manifest=manifest, progress=tell)
         page = render_page(
             study,
             drawn,

@@ -184,7 +184,7 @@ def _table_4_costs() -> dict[str, float]:
     This needs no reconstructed number: residual variances of three fits by the same method, F
     distributed if the noise were normal and the same at all pressures, and the formula right.
     """
-    tables, n = PUBLISHED.genetic, PUBLISHED.setup.slip_levels
+    tables, n = PUBLISHED.genetic, int(PUBLISHED.setup.slip_levels.value)
     free = {psi: n - len(t.estimates) for psi, t in tables.items()}
     others = [psi for psi in tables if psi != 18]
     own = tables[18].quality["cost"].value / free[18]
