@@ -109,7 +109,7 @@ def test_30_psi_is_held_out_whole():
     case = GAPS["held_out_pull"].case
     assert set(case.lab["inflation_pressure_psi"]) == {18.0, 42.0}
     assert set(case.field["inflation_pressure_psi"]) == {30.0}
-    assert len(case.field) == PUBLISHED.setup.slip_levels
+    assert len(case.field) == PUBLISHED.setup.slip_levels.value
 
 
 @pytest.mark.parametrize(
@@ -124,7 +124,7 @@ def test_the_field_past_the_peak_is_18_psi_beyond_the_largest_pull(name, later):
     assert case.field["slip_ratio"].min() > rising.max()
     assert case.field["drawbar_pull_kn"].max() < pull.max()
     assert pull.size - 1 - int(np.argmax(pull)) == later
-    assert (~at_18).sum() == 2 * PUBLISHED.setup.slip_levels
+    assert (~at_18).sum() == 2 * PUBLISHED.setup.slip_levels.value
 
 
 def test_without_slip_in_the_ruts_slip_sinkage_is_not_found():
