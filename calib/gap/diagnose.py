@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from calib.gap.case import Campaigns, Case, campaigns
+from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns
 from calib.gap.corrected import Corrected
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.mixture import Truth, mixture
@@ -15,7 +16,9 @@ from calib.gap.next_measurement import NextMeasurement, next_measurements
 from calib.gap.shrink import FreshPrediction, Shrink, predict_fresh, shrink
 from calib.gap.where import Region, RowGap, regions, row_gaps
 from calib.gap.which import Ranking, rank
+from calib.models.base import Array
 from calib.outputs import OUTPUTS
+from calib.streams import generator
 
 __all__ = ["Diagnosis", "diagnose", "verdict"]
 
@@ -24,6 +27,8 @@ NAMED = 0.5
 # Standardised residual beyond which a row is set aside, and how often that is repeated.
 OUTLIER = 5.0
 _MOST_ROUNDS = 3
+# Parts the field rows are left out in, where there are no other conditions to judge by.
+_FOLDS = 5
 
 
 @dataclass(frozen=True)
@@ -91,6 +96,9 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
     at_target = truth if case.fresh is None else mixed.at(target)
     corrected = Corrected(mixed, ranking.lab_mode)
     before = corrected.calibrated(target.conditions)
+    far = shrink(data, at_target, before, at_target.means)
+    if far and case.fresh is None:
+        far = shrink(data, truth, before, _left_out(data, truth, seed, effects))
     return Diagnosis(
         data,
         ranking,
@@ -98,12 +106,34 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
         truth,
         gaps,
         regions(data, truth, gaps),
-        shrink(data, at_target, before),
+        far,
         {} if case.fresh is None else predict_fresh(at_target, before),
         next_measurements(data, ranking, seed),
         corrected,
         seed,
     )
+
+
+def _left_out(
+    data: Campaigns, truth: Truth, seed: int, effects: Mapping[str, Effect]
+) -> dict[str, Array]:
+    """Predict each field row by a diagnosis that has not seen it, hypotheses chosen anew.
+
+    Without other conditions to predict, this is how far the correction carries beyond the rows it
+    was found on. With too few rows to leave some out, the rows' own predictions stand.
+    """
+    n = len(data.case.field)
+    order = generator(seed, "gap", "folds").permutation(n)
+    predicted = truth.means
+    for fold in range(_FOLDS):
+        rows = order[fold::_FOLDS]
+        if min(np.setdiff1d(o.rows, rows).size for o in data.outputs) < MIN_FIELD_ROWS:
+            return truth.means
+        part = campaigns(_with_gaps(data.case, {o.name: rows for o in data.outputs}))
+        found = mixture(part, rank(part, seed, effects=effects), seed).at(data.view)
+        for name, values in found.means.items():
+            predicted[name][rows] = values[rows]
+    return predicted
 
 
 def _rank_without_outliers(
@@ -134,15 +164,21 @@ def _outliers(data: Campaigns, ranking: Ranking) -> dict[str, list[int]]:
 
 
 def _without(case: Case, far: Mapping[str, list[int]]) -> Case:
-    columns = {name: np.array(values) for name, values in case.field.columns.items()}
     said = list(case.warnings)
     for output, rows in far.items():
-        columns[OUTPUTS[output]][rows] = np.nan
         said.append(
             f"field row {', '.join(map(str, rows))}: {output} lies more than {OUTLIER:g} noise sds "
             "off whatever the hypothesis; it was left out as an outlier"
         )
-    return replace(case, field=replace(case.field, columns=columns), warnings=tuple(said))
+    return replace(_with_gaps(case, far), warnings=tuple(said))
+
+
+def _with_gaps(case: Case, rows: Mapping[str, Sequence[int] | NDArray[np.int64]]) -> Case:
+    """Take outputs of field rows out of a case, their conditions left in."""
+    columns = {name: np.array(values) for name, values in case.field.columns.items()}
+    for output, which in rows.items():
+        columns[OUTPUTS[output]][which] = np.nan
+    return replace(case, field=replace(case.field, columns=columns))
 
 
 def verdict(probability: Mapping[str, float]) -> str:

@@ -56,6 +56,11 @@ class Truth:
         index = np.argmax(cumulative >= q - 1e-12, axis=0)
         return np.asarray(ordered[index, np.arange(values.shape[1])])
 
+    @property
+    def means(self) -> dict[str, Array]:
+        """Mean of the truth of every output, shapes (n,)."""
+        return {name: self.mean(values) for name, values in self.truth.items()}
+
     def mean(self, values: Array) -> Array:
         """Weighted mean over the draws, shape (n,)."""
         return np.asarray(self.weight @ values)

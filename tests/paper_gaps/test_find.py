@@ -44,7 +44,7 @@ def test_a_withheld_effect_is_the_most_probable_and_shrinks_the_error_of_rows_no
 ):
     result = found_gaps[name]
     assert result.found.ranking.order[0] == result.gap.withheld
-    # Named: more probable than all others together. Fourteen rows leave room for something unlisted.
+    # Named: more probable than all others together. Fourteen rows leave room for the unlisted.
     assert probability_of(result.found, result.gap.withheld) > 0.5
     errors = unfitted_errors(result.found, result.gap)
     assert errors.n == 7
