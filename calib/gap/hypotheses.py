@@ -9,7 +9,7 @@ import numpy as np
 
 from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.base import RUT
+from calib.gap.effects.base import DRAWBAR, RUT
 from calib.gap.forward import Hypothesis, SmoothOver
 from calib.prior_files import default_prior_path, read_priors
 from calib.priors import Priors
@@ -39,6 +39,13 @@ VERY_SMOOTH = (3.0, 1.0)
 ONSET = 4.0
 # Part of `unknown` that comes on top of a listed effect instead of alone.
 REMAINDER = 0.2
+
+
+# One output that changes beyond some slip or run is what listed effects are: post-peak softening,
+# slip sinkage, rebound and drift may set in anywhere. Nobody could tell the unlisted from them.
+_LISTED_ONSETS: tuple[tuple[SmoothOver, tuple[str, ...]], ...] = (
+    ("slip", (DRAWBAR,)), ("slip", (RUT,)), ("order", (DRAWBAR,)),
+)  # fmt: skip
 
 
 def split_testable(
@@ -89,6 +96,7 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
     sudden = [
         Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over=over)
         for over, t in choices
+        if (over, t) not in _LISTED_ONSETS
     ]
     share = (1.0 - REMAINDER) / 2.0
     return [replace(h, share=share / len(group)) for group in (smooth, sudden) for h in group]

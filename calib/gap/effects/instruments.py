@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import DENSITY, DRAWBAR, RUT, Effect, View
+from calib.gap.effects.base import DENSITY, DRAWBAR, RUT, Effect, View, saturating
 from calib.models.base import Array
 
 __all__ = [
@@ -49,11 +49,11 @@ class ForceOffset(Effect):
 
 
 class SensorDrift(Effect):
-    """A drift of the drawbar reading with run order, of any curvature, from any zero."""
+    """A drift with run order: steady, settling, or from some run on; zeroed at any part of it."""
 
     name = "sensor_drift"
     title = "the drawbar reading drifts with run order"
-    parameters = ("drift", "curvature", "zero_at")
+    parameters = ("drift", "curvature", "half_way", "zero_at")
     form = ("shape",)
     outputs = (DRAWBAR,)
     covariates = ("run_order",)
@@ -67,9 +67,9 @@ class SensorDrift(Effect):
         """Add the drift (kN from the first run to the last)."""
         if output != DRAWBAR:
             return location
-        drift, curvature, zero_at = phi[:, :1], phi[:, 1:2], phi[:, 2:3]
+        drift, curvature, half_way, zero_at = (phi[:, i : i + 1] for i in range(4))
         u = np.maximum(self._progress(view), 1e-3)
-        return np.asarray(location + drift * (u**curvature - zero_at))
+        return np.asarray(location + drift * (saturating(u, curvature, half_way) - zero_at))
 
     def shape(self, view: View) -> Array | None:
         """Run order."""
