@@ -110,6 +110,7 @@ def fit(
     from calib.estimators import estimate
     from calib.folders import check_folder, fresh_folder
     from calib.models import get_model
+    from calib.numbers import format_number
     from calib.problem import build_problem
     from calib.sampling.sampler import SamplerSettings
     from calib.store import save_calibration
@@ -139,7 +140,7 @@ def fit(
         ninety = scores.coverage[0.9]
         print(
             f"held out ({kept}): 90 % band covers {ninety.hits} of {ninety.n}, "
-            f"RMSE {scores.rmse:.3g}, CRPS {scores.crps:.3g}"
+            f"RMSE {format_number(scores.rmse)}, CRPS {format_number(scores.crps)}"
         )
     print(f"run folder: {out}")
     if not calibration.converged:

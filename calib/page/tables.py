@@ -8,29 +8,18 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from calib.calibration import ParameterSummary
 from calib.datasets.published import PUBLISHED, FittedTable
 from calib.estimators import PointEstimate
 from calib.figures.estimates import METHOD_NAMES
 from calib.figures.reference import published_table
 from calib.figures.roles import role
+from calib.numbers import NOTHING, TIMES, format_like, format_number
 from calib.page.equations import symbol_html, unit_html
-from calib.page.numbers import (
-    NOTHING,
-    TIMES,
-    format_interval,
-    format_like,
-    format_number,
-    format_value,
-)
+from calib.posterior_text import centre_text, interval_text, skewed
 from calib.study import OutputResult
 
-__all__ = [
-    "Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows", "skewed",
-]  # fmt: skip
+__all__ = ["Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows"]
 
-# An HDI that spans more than this factor has neither a telling mean nor a telling sd.
-_DECADES = 30.0
 _TICK = "\N{CHECK MARK}"
 
 
@@ -75,8 +64,8 @@ def posterior_rows(result: OutputResult) -> list[dict[str, Any]]:
         {
             "symbol": symbol_html(s.name),
             "unit": unit_html(s.unit),
-            "value": mean_or_median(s),
-            "hdi": _interval(s.hdi_lower, s.hdi_upper, s.sd),
+            "value": centre_text(s),
+            "hdi": interval_text(s),
             "ess": f"{s.ess_bulk:.0f} / {s.ess_tail:.0f}",
             "rhat": f"{s.rhat:.3f}",
             "ratio": format_number(s.sd_ratio, 2),
@@ -85,24 +74,6 @@ def posterior_rows(result: OutputResult) -> list[dict[str, Any]]:
         }
         for s in calibration.summary.values()
     ]
-
-
-def skewed(s: ParameterSummary) -> bool:
-    """Whether a mean and sd would mislead: larger sd than mean, or an HDI over decades."""
-    low, high = sorted((abs(s.hdi_lower), abs(s.hdi_upper)))
-    one_sign = s.hdi_lower * s.hdi_upper > 0.0
-    return s.sd > abs(s.mean) or (one_sign and high > _DECADES * low)
-
-
-def mean_or_median(s: ParameterSummary) -> str:
-    return f"median {format_number(s.median, 3)}" if skewed(s) else format_value(s.mean, s.sd)
-
-
-def _interval(lower: float, upper: float, sd: float) -> str:
-    # Where the sd is inflated by a long tail, its digits would round a bound away.
-    if min(abs(lower), abs(upper)) < 0.05 * sd:
-        return f"{format_number(lower, 2)} to {format_number(upper, 2)}"
-    return format_interval(lower, upper, sd)
 
 
 def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
@@ -150,10 +121,9 @@ def _estimate_row(
             row.append(_ticked(_as_printed(value, printed.text), printed.agrees(value)))
     s = result.calibration.summary[name]
     if skewed(s):
-        interval = _interval(s.hdi_lower, s.hdi_upper, s.sd)
-        row.append(Markup("{}<br>HDI {}").format(mean_or_median(s), interval))
+        row.append(Markup("{}<br>HDI {}").format(centre_text(s), interval_text(s)))
     else:
-        row.append(format_value(s.mean, s.sd))
+        row.append(centre_text(s))
     return row
 
 
