@@ -16,14 +16,17 @@ import math
 from decimal import Decimal
 
 __all__ = [
-    "NOTHING", "TIMES", "ascii_number", "format_at", "format_interval", "format_like",
-    "format_number", "format_value", "interval_places", "last_place", "place_of",
+    "NOTHING", "TIMES", "ascii_number", "ascii_text", "format_as_printed", "format_at",
+    "format_interval", "format_like", "format_number", "format_value", "interval_places",
+    "last_place", "place_of",
 ]  # fmt: skip
 
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"
 TIMES = "\N{MULTIPLICATION SIGN}"
-_SUPERSCRIPTS = str.maketrans("-0123456789", "\N{SUPERSCRIPT MINUS}⁰¹²³⁴⁵⁶⁷⁸⁹")
+_RAISED = "\N{SUPERSCRIPT MINUS}⁰¹²³⁴⁵⁶⁷⁸⁹"
+_SUPERSCRIPTS = str.maketrans("-0123456789", _RAISED)
+_FROM_SUPERSCRIPTS = str.maketrans(_RAISED, "-0123456789")
 # Powers of ten outside this range are written as such.
 _PLAIN = range(-3, 5)
 
@@ -133,15 +136,30 @@ def format_like(value: float, printed: str) -> str:
     return f"{text}{_times(power)}" if exponent else text
 
 
-def ascii_number(value: float, last: int) -> str:
-    """Write a number rounded at the digit of 10^last, for machines; nothing where not finite."""
-    if not math.isfinite(value):
+def format_as_printed(value: float, printed: str) -> str:
+    """Write a number with the decimals of a printed one, or the digits of one with an exponent.
+
+    To three digits where the decimals would leave none of a number that is far smaller.
+    """
+    mantissa, _, exponent = printed.lower().partition("e")
+    if exponent:
+        return format_number(value, len(Decimal(mantissa).as_tuple().digits))
+    text = format_like(value, printed)
+    return text if any(c in "123456789" for c in text) else format_number(value, 3)
+
+
+def ascii_text(text: str) -> str:
+    """Return a number that was written for people as programs read it; nothing for a dash."""
+    if text == NOTHING:
         return ""
-    if not _shows(value, last):
-        return "0"
-    power = _power((value,), last)
-    text = _rounded(value, last, power).replace(_MINUS, "-")
-    return text if power == 0 else f"{text}e{power:+03d}"
+    digits, _, power = text.partition(f"{TIMES}10")
+    exponent = f"e{int(power.translate(_FROM_SUPERSCRIPTS)):+03d}" if power else ""
+    return digits.replace(_MINUS, "-") + exponent
+
+
+def ascii_number(value: float, last: int) -> str:
+    """Write a number rounded at the digit of 10^last for programs; nothing where not finite."""
+    return ascii_text(format_at(value, last))
 
 
 def format_at(value: float, last: int) -> str:

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 from calib.calibration import ParameterSummary
-from calib.numbers import format_at, format_interval, format_value, last_place
+from calib.numbers import format_at, format_interval, format_value, interval_places, last_place
 
-__all__ = ["centre_place", "centre_text", "end_scales", "interval_text", "skewed"]
+__all__ = [
+    "centre_place", "centre_text", "end_places", "end_scales", "interval_text", "skewed",
+]  # fmt: skip
 
-# An HDI that spans more than this factor has neither a telling mean nor a telling sd.
+# An interval that is this much longer on one side, or spans this factor, has no telling mean.
+_LOPSIDED = 2.0
 _DECADES = 30.0
 
 
 def skewed(s: ParameterSummary) -> bool:
-    """Whether a mean and sd would mislead: larger sd than mean, or an HDI over decades."""
+    """Whether mean and sd would mislead.
+
+    They do where the HDI reaches more than twice as far on one side of the median as on the
+    other, or spans more than a factor of 30.
+    """
+    near, far = sorted((s.median - s.hdi_lower, s.hdi_upper - s.median))
     low, high = sorted((abs(s.hdi_lower), abs(s.hdi_upper)))
     one_sign = s.hdi_lower * s.hdi_upper > 0.0
-    return s.sd > abs(s.mean) or (one_sign and high > _DECADES * low)
+    return far > _LOPSIDED * near or (one_sign and high > _DECADES * low)
 
 
 def end_scales(s: ParameterSummary) -> tuple[float, float]:
@@ -40,6 +48,11 @@ def centre_text(s: ParameterSummary) -> str:
     if not skewed(s):
         return format_value(s.mean, s.sd, s.mcse_mean)
     return f"median {format_at(s.median, centre_place(s))}"
+
+
+def end_places(s: ParameterSummary) -> tuple[int, int]:
+    """Return the powers of ten of the last digits of the HDI's ends."""
+    return interval_places(end_scales(s), (s.mcse_hdi_lower, s.mcse_hdi_upper))
 
 
 def interval_text(s: ParameterSummary) -> str:

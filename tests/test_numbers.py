@@ -14,6 +14,7 @@ from calib.numbers import (
     NOTHING,
     TIMES,
     ascii_number,
+    format_as_printed,
     format_interval,
     format_like,
     format_number,
@@ -170,6 +171,13 @@ def test_format_like_prints_what_the_source_would():
     assert format_like(5.934e-10, "5.934e-10") == f"5.934{TIMES}10\N{SUPERSCRIPT MINUS}¹⁰"
     assert format_like(-0.00001, "0.01") == "0.00"
     assert format_like(float("nan"), "1.0") == NOTHING
+
+
+def test_an_estimate_is_written_like_the_published_figure_beside_it():
+    assert format_as_printed(1.99612, "1.996") == "1.996"
+    assert format_as_printed(45_649_312.0, "3.306e5") == f"4.565{TIMES}10⁷"
+    assert format_as_printed(0.000213, "0.05") == f"2.13{TIMES}10⁻⁴"
+    assert format_as_printed(float("nan"), "0.05") == NOTHING
 
 
 def test_numbers_for_machines():

@@ -21,12 +21,15 @@ def summary(mean, sd, low, high, median=2.0) -> ParameterSummary:
 @pytest.mark.parametrize(
     ("s", "expected"),
     [
-        (summary(1.0, 1.1, 0.5, 3.0), True),
-        (summary(-1.0, 1.1, -3.0, -0.5), True),
-        (summary(5.0, 4.0, 0.1, 3.1), True),
-        (summary(-5.0, 4.0, -3.1, -0.1), True),
-        (summary(5.0, 4.0, 0.2, 3.1), False),
-        (summary(5.0, 1.0, -0.01, 7.0), False),
+        (summary(2.1, 0.5, 1.2, 3.1), False),
+        (summary(2.4, 0.9, 1.2, 3.7), True),
+        (summary(-2.4, 0.9, -3.7, -1.2, -2.0), True),
+        (summary(1.6, 0.9, 0.3, 2.8), True),
+        (summary(0.05, 0.29, -0.5, 0.6, 0.05), False),
+        (summary(2.0, 1.0, 0.1, 3.5), True),
+        (summary(-2.0, 1.0, -3.5, -0.1, -2.0), True),
+        (summary(2.0, 1.0, 0.13, 3.5), False),
+        (summary(2.0, 1.0, -0.01, 3.5), False),
     ],
 )
 def test_where_a_mean_would_mislead(s, expected):

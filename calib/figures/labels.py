@@ -15,7 +15,7 @@ from calib.numbers import NOTHING, format_number
 
 __all__ = [
     "MINUS", "NO_UNIT", "Axis", "axis_of", "joined", "parameter_label", "percent", "plain",
-    "short", "symbol", "unit_plain", "unit_text",
+    "short", "symbol", "unbroken", "unit_plain", "unit_text",
 ]  # fmt: skip
 
 NO_UNIT = NOTHING
@@ -155,3 +155,8 @@ def percent(fraction: float) -> str:
 def joined(words: list[str]) -> str:
     """Join words as a sentence does."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def unbroken(text: str) -> str:
+    """Keep numbers and their units on one line."""
+    return re.sub(r"(\d) (%|kN|mm|psi|kPa|g/cm³|rows?\b)", "\\1\N{NO-BREAK SPACE}\\2", text)

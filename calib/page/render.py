@@ -11,8 +11,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from calib.figures import Plate
+from calib.figures.labels import unbroken
 from calib.page.content import failed_section, section
-from calib.page.equations import unbroken
 from calib.study import OutputResult, Study
 
 __all__ = ["render_page"]

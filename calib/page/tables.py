@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from calib.datasets.published import PUBLISHED, FittedTable
+from calib.datasets.published import PUBLISHED, Figure, FittedTable
 from calib.estimators import PointEstimate
 from calib.figures.estimates import METHOD_NAMES
-from calib.figures.reference import published_table
+from calib.figures.reference import published_quality, published_table
 from calib.figures.roles import role
-from calib.numbers import NOTHING, TIMES, format_like, format_number
+from calib.numbers import NOTHING, format_as_printed, format_like, format_number
 from calib.page.equations import symbol_html, unit_html
 from calib.posterior_text import centre_text, interval_text, skewed
 from calib.study import OutputResult
@@ -82,6 +83,7 @@ def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
         return None
     model = result.calibration.problem.bound.model
     table = published_table(model.name) if published else None
+    quality = published_quality(model.name) if table else None
     head: list[Any] = ["Parameter", "Unit"]
     head += [table.source] if table else []
     head += [METHOD_NAMES.get(e.method, e.method) for e in result.estimates]
@@ -103,7 +105,7 @@ def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
     if table:
         notes.insert(0, f"{_TICK}: equal to {table.source} in every printed digit.")
         notes += [f"{table.source}: {table.note}"] if table.note else []
-    return Grid(caption, head, rows, _quality_rows(result.estimates, table), notes)
+    return Grid(caption, head, rows, _quality_rows(result.estimates, quality), notes)
 
 
 def _estimate_row(
@@ -118,7 +120,7 @@ def _estimate_row(
         if printed is None:
             row.append(format_number(value, 4))
         else:
-            row.append(_ticked(_as_printed(value, printed.text), printed.agrees(value)))
+            row.append(_ticked(format_as_printed(value, printed.text), printed.agrees(value)))
     s = result.calibration.summary[name]
     if skewed(s):
         row.append(Markup("{}<br>HDI {}").format(centre_text(s), interval_text(s)))
@@ -132,25 +134,21 @@ def _ticked(text: str, agrees: bool) -> Markup:
     return Markup('{}<span class="tick">{}</span>').format(text, _TICK if agrees else "")
 
 
-def _as_printed(value: float, printed: str) -> str:
-    """As printed, unless that would leave no digit of an estimate that is far smaller."""
-    text = format_like(value, printed)
-    return text if any(c in "123456789" for c in text.split(TIMES)[0]) else format_number(value, 3)
-
-
 def _quality_rows(
-    estimates: tuple[PointEstimate, ...], table: FittedTable | None
+    estimates: tuple[PointEstimate, ...], quality: Mapping[str, Figure] | None
 ) -> list[list[Any]]:
-    quality = table.quality if table else {}
+    """Rows on the fit; with a column of published figures, unless there is no table of them."""
 
     def row(label: str, unit: Any, key: str, values: list[str]) -> list[Any]:
-        printed = [quality[key].text if key in quality else NOTHING] if table else []
+        printed = []
+        if quality is not None:
+            printed = [quality[key].text if key in quality else NOTHING]
         return [label, unit, *printed, *values, NOTHING]
 
-    unit = unit_html(estimates[0].cost_unit)
+    unit, rmse_unit = (unit_html(u) for u in (estimates[0].cost_unit, estimates[0].rmse_unit))
     return [
         row("Cost (sum of squares)", unit, "cost", [format_number(e.cost, 4) for e in estimates]),
-        row("RMSE", NOTHING, "rmse", [format_number(e.rmse, 3) for e in estimates]),
+        row("RMSE", rmse_unit, "rmse", [format_number(e.rmse, 3) for e in estimates]),
         row("R²", NOTHING, "r_squared", [format_number(e.r_squared, 3) for e in estimates]),
         row("Evaluations", NOTHING, "", [f"{e.n_evaluations:,}" for e in estimates]),
         row("Time", "s", "", [f"{e.seconds:.2f}" for e in estimates]),
