@@ -10,16 +10,20 @@ from typing import Any
 
 from calib.data import write_table
 from calib.figures import Plate, plates
+from calib.figures.export import pdf_bytes
 from calib.folders import fresh_folder
 from calib.manifest import build_manifest, file_hashes, sha256
 from calib.page import render_page
 from calib.prior_files import default_prior_path
+from calib.publish import publication
 from calib.sampling.sampler import SamplerSettings
 from calib.store import to_datatree, write_netcdf
 from calib.study import Study
 from calib.summary import summarise
 
 __all__ = ["write_report"]
+
+_DPI = 150
 
 type Progress = Callable[[str, int, int], None]
 
@@ -32,6 +36,7 @@ def write_report(
     command: Sequence[str],
     title: str,
     overwrite: bool = False,
+    pdf: bool = False,
     progress: Progress | None = None,
 ) -> Path:
     """Write a report folder.
@@ -48,6 +53,8 @@ def write_report(
     title : str
     overwrite : bool
         Replace an earlier report.
+    pdf : bool
+        Whether every figure also comes as PDF, for print.
     progress : callable, optional
 
     Returns
@@ -63,7 +70,8 @@ def write_report(
     tell = progress or (lambda what, done, planned: None)
     with fresh_folder(out, overwrite=overwrite) as folder:
         inputs = _copy_inputs(study, folder)
-        (folder / "summary.json").write_text(json.dumps(summarise(study), indent=1) + "\n")
+        summary = summarise(study)
+        (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
         drawn: dict[str, list[Plate]] = {}
         images: dict[str, bytes] = {}
         (folder / "figures").mkdir()
@@ -77,8 +85,16 @@ def write_report(
                     name = f"{key}_{plate.name}.png"
                     images[name] = _png(plate)
                     (folder / "figures" / name).write_bytes(images[name])
+                    if pdf:
+                        file = folder / "figures" / f"{key}_{plate.name}.pdf"
+                        file.write_bytes(pdf_bytes(plate.figure))
         tell("drawing figures", len(successes), len(successes))
         manifest = build_manifest(study, settings, command, inputs)
+        manifest["pdf"] = pdf
+        paper = publication(manifest, summary)
+        for path, text in paper.files.items():
+            (folder / path).parent.mkdir(exist_ok=True)
+            (folder / path).write_text(text, encoding="utf-8")
         page = render_page(
             study,
             drawn,
@@ -86,6 +102,7 @@ def write_report(
             manifest=manifest,
             title=title,
             reconstructed=any(r.task.table.label for r in study.results.values()),
+            paper=paper,
         )
         (folder / "index.html").write_text(page, encoding="utf-8")
         manifest["files"] = file_hashes(folder)
@@ -132,8 +149,9 @@ def _png(plate: Plate) -> bytes:
     if plate.figure is None:
         return b""
     full, small = io.BytesIO(), io.BytesIO()
-    plate.figure.savefig(full, format="png", dpi=150)
+    plate.figure.savefig(full, format="png", dpi=_DPI)
     full.seek(0)
     with Image.open(full) as image:
-        image.convert("RGB").quantize(256).save(small, format="png")
+        # With its resolution, by which a text processor takes it over at its size in print.
+        image.convert("RGB").quantize(256).save(small, format="png", dpi=(_DPI, _DPI))
     return small.getvalue()

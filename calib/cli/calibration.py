@@ -47,6 +47,7 @@ def report(
         list[str] | None, typer.Option(help="Output to report, e.g. drawbar_pull; repeatable.")
     ] = None,
     overwrite: _Overwrite = False,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
     max_steps: _MaxSteps = 25_600,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
@@ -77,7 +78,7 @@ def report(
         study = run_study(tasks, seed, settings=settings, progress=tell)
         page = write_report(
             study, out, settings=settings, command=_command(), title=title, overwrite=overwrite,
-            progress=tell,
+            pdf=pdf, progress=tell,
         )  # fmt: skip
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from functools import cache
+from pathlib import PurePosixPath
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
@@ -13,6 +14,7 @@ from markupsafe import Markup
 from calib.figures import Plate
 from calib.figures.labels import unbroken
 from calib.page.content import failed_section, section
+from calib.publish import Publication
 from calib.study import OutputResult, Study
 
 __all__ = ["render_page"]
@@ -28,6 +30,7 @@ def _template() -> Template:
         lstrip_blocks=True,
     )
     environment.filters["unbroken"] = unbroken
+    environment.filters["basename"] = lambda path: PurePosixPath(path).name
     return environment.get_template("report.html.j2")
 
 
@@ -40,6 +43,7 @@ def render_page(
     title: str,
     reconstructed: bool,
     audit_html: str | None = None,
+    paper: Publication | None = None,
 ) -> str:
     """Render the report.
 
@@ -57,6 +61,8 @@ def render_page(
         Whether any data were reconstructed from published results.
     audit_html : str, optional
         A section to be placed before the appendix, as trusted HTML.
+    paper : Publication, optional
+        Tables and methods beside the page.
 
     Returns
     -------
@@ -74,6 +80,7 @@ def render_page(
         sections=sections,
         reconstructed=reconstructed,
         audit=Markup(audit_html) if audit_html else None,
+        paper=paper if paper is not None and paper.files else None,
         seed=study.seed,
         seconds=study.seconds,
         command=shlex.join(str(part) for part in manifest.get("command", ())),
