@@ -16,7 +16,7 @@ report: $(READY)
 reference: report
 	rm -rf reports/he2019
 	mkdir -p reports/he2019
-	cp -r $(OUT)/index.html $(OUT)/summary.json $(OUT)/manifest.json $(OUT)/figures $(OUT)/data $(OUT)/priors reports/he2019/
+	cp -r $(OUT)/index.html $(OUT)/summary.json $(OUT)/manifest.json $(OUT)/figures $(OUT)/data $(OUT)/priors $(OUT)/gaps reports/he2019/
 
 test: $(READY)
 	$(BIN)/python -m pytest

@@ -16,9 +16,9 @@ __all__ = ["check_folder", "fresh_folder"]
 # Files by which a folder is known to be one of ours, and may be replaced.
 _OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt")
 _WRITTEN = (
-    *_OURS, "index.html", "summary.json", "figures", "data", "priors", "case", "corrected.json",
-    "fresh_prediction.csv", "priors.toml", "data.csv", "tables", "methods.txt", "methods.tex",
-    "references.bib",
+    *_OURS, "index.html", "summary.json", "figures", "data", "priors", "gaps", "case",
+    "corrected.json", "fresh_prediction.csv", "priors.toml", "data.csv", "tables", "methods.txt",
+    "methods.tex", "references.bib",
 )  # fmt: skip
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -10,10 +9,13 @@ from typing import Any
 
 from calib.data import write_table
 from calib.figures import Plate, plates
-from calib.figures.export import pdf_bytes
+from calib.figures.export import pdf_bytes, png_bytes
 from calib.folders import fresh_folder
 from calib.manifest import build_manifest, file_hashes, sha256
 from calib.page import render_page
+from calib.page.paper_gaps import write_gaps
+from calib.paper_gaps.find import FoundGap
+from calib.paper_gaps.summary import summarise_gaps
 from calib.prior_files import default_prior_path
 from calib.publish import publication
 from calib.sampling.sampler import SamplerSettings
@@ -22,8 +24,6 @@ from calib.study import Study
 from calib.summary import summarise
 
 __all__ = ["write_report"]
-
-_DPI = 150
 
 type Progress = Callable[[str, int, int], None]
 
@@ -35,6 +35,7 @@ def write_report(
     settings: SamplerSettings,
     command: Sequence[str],
     title: str,
+    gaps: Sequence[FoundGap] = (),
     overwrite: bool = False,
     pdf: bool = False,
     progress: Progress | None = None,
@@ -51,6 +52,8 @@ def write_report(
     command : sequence of str
         The command line, for the manifest.
     title : str
+    gaps : sequence of FoundGap
+        Of the source's own models, diagnosed: a section of their own.
     overwrite : bool
         Replace an earlier report.
     pdf : bool
@@ -71,6 +74,8 @@ def write_report(
     with fresh_folder(out, overwrite=overwrite) as folder:
         inputs = _copy_inputs(study, folder)
         summary = summarise(study)
+        if gaps:
+            summary["paper_gaps"] = summarise_gaps(gaps)
         (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
         drawn: dict[str, list[Plate]] = {}
         images: dict[str, bytes] = {}
@@ -95,12 +100,17 @@ def write_report(
         for path, text in paper.files.items():
             (folder / path).parent.mkdir(exist_ok=True)
             (folder / path).write_text(text, encoding="utf-8")
+        gaps_html = None
+        if gaps:
+            manifest["paper_gaps"] = {r.gap.name: {"seed": r.found.seed} for r in gaps}
+            gaps_html = write_gaps(gaps, folder, _png, manifest=manifest, pdf=pdf, progress=tell)
         page = render_page(
             study,
             drawn,
             images,
             manifest=manifest,
             title=title,
+            gaps_html=gaps_html,
             reconstructed=any(r.task.table.label for r in study.results.values()),
             paper=paper,
         )
@@ -143,15 +153,4 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def _png(plate: Plate) -> bytes:
-    """Render a figure, with a palette of 256 colours: a third of the size, no visible loss."""
-    from PIL import Image
-
-    if plate.figure is None:
-        return b""
-    full, small = io.BytesIO(), io.BytesIO()
-    plate.figure.savefig(full, format="png", dpi=_DPI)
-    full.seek(0)
-    with Image.open(full) as image:
-        # With its resolution, by which a text processor takes it over at its size in print.
-        image.convert("RGB").quantize(256).save(small, format="png", dpi=(_DPI, _DPI))
-    return small.getvalue()
+    return png_bytes(plate.figure) if plate.figure is not None else b""

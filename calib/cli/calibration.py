@@ -56,6 +56,7 @@ def report(
     from calib.datasets.he2019 import labelled
     from calib.folders import check_folder
     from calib.outputs import OUTPUTS
+    from calib.paper_gaps.find import find_gaps
     from calib.report import write_report
     from calib.sampling.sampler import SamplerSettings
     from calib.study import he2019_tasks, plan_tasks, run_study
@@ -76,9 +77,10 @@ def report(
     settings = SamplerSettings(max_steps=max_steps)
     with progress_bars() as tell:
         study = run_study(tasks, seed, settings=settings, progress=tell)
+        gaps = () if files else find_gaps(seed, progress=tell)
         page = write_report(
-            study, out, settings=settings, command=_command(), title=title, overwrite=overwrite,
-            pdf=pdf, progress=tell,
+            study, out, settings=settings, command=_command(), title=title, gaps=gaps,
+            overwrite=overwrite, pdf=pdf, progress=tell,
         )  # fmt: skip
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]
@@ -206,32 +208,45 @@ def _predict_corrected(run: Path, at: Path, out: Path | None) -> None:
 
 
 def data(
-    name: Annotated[str, typer.Argument(help="he2019")],
-    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("he2019"),
+    name: Annotated[str, typer.Argument(help="he2019 or he2019-gaps")],
+    out: Annotated[Path | None, typer.Option(help="Folder to write; its name if none.")] = None,
     overwrite: _Overwrite = False,
 ) -> None:
-    """Write the embedded, reconstructed data as CSV files."""
-    from calib.datasets import he2019
-
-    if name != "he2019":
+    """Write the embedded, reconstructed data as CSV files, or as cases for `calib diagnose`."""
+    writers = {"he2019": _write_he2019, "he2019-gaps": _write_he2019_gaps}
+    if name not in writers:
         raise CalibError(
-            f"there is no data set {name!r}", allowed="he2019", mend="use this name"
+            f"there is no data set {name!r}", allowed=", ".join(writers), mend="use one of these"
         )  # fmt: skip
+    folder = Path(name) if out is None else out
     try:
-        existing = [f"{key}.csv" for key in he2019.tables() if (out / f"{key}.csv").exists()]
-        if existing and not overwrite:
-            raise CalibError(
-                f"{', '.join(existing)} exist there already", where=str(out),
-                mend="choose another --out, or pass --overwrite",
-            )  # fmt: skip
-        written = he2019.write(out)
+        written = writers[name](folder, overwrite)
     except OSError as error:
         raise CalibError(
-            f"the folder cannot be written ({error.strerror})", where=str(out),
+            f"the folder cannot be written ({error.strerror})", where=str(folder),
             mend="choose another --out",
         ) from None  # fmt: skip
     for path in written:
         print(f"{path} (reconstructed from published results, not measured)")
+
+
+def _write_he2019(out: Path, overwrite: bool) -> list[Path]:
+    from calib.datasets import he2019
+
+    existing = [f"{key}.csv" for key in he2019.tables() if (out / f"{key}.csv").exists()]
+    if existing and not overwrite:
+        raise CalibError(
+            f"{', '.join(existing)} exist there already", where=str(out),
+            mend="choose another --out, or pass --overwrite",
+        )  # fmt: skip
+    return he2019.write(out)
+
+
+def _write_he2019_gaps(out: Path, overwrite: bool) -> list[Path]:
+    from calib.paper_gaps.cases import paper_gaps
+    from calib.paper_gaps.folders import write_cases
+
+    return write_cases(paper_gaps(), out, overwrite=overwrite)
 
 
 def template(

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 from scipy.stats import gaussian_kde
 
 from calib.calibration import Calibration
@@ -89,6 +89,8 @@ def _prior_posterior(ax: Axes, prior: Prior, t: Array, mark: float | None) -> di
         ticks = _log_ticks(drawn[0], drawn[-1])
         ax.set_xticks(ticks, [short(v, 1).removeprefix(f"1{TIMES}") for v in ticks])
         ax.xaxis.set_minor_locator(NullLocator())
+    else:
+        ax.xaxis.set_major_locator(MaxNLocator(4))
     ax.set_xlim(drawn[0], drawn[-1])
     ax.set_ylim(0.0, 1.08)
     ax.yaxis.set_major_locator(NullLocator())

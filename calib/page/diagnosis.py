@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import shlex
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -12,6 +11,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
+from calib.figures.export import png_bytes
 from calib.figures.gap import gap_plates
 from calib.figures.gap_rows import (
     best_fit,
@@ -258,7 +258,4 @@ def _figure(plate: Plate, images: Mapping[str, bytes]) -> dict[str, Any]:
 
 
 def _png(plate: Plate) -> bytes:
-    buffer = io.BytesIO()
-    if plate.figure is not None:
-        plate.figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
-    return buffer.getvalue()
+    return png_bytes(plate.figure) if plate.figure is not None else b""

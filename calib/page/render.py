@@ -42,6 +42,7 @@ def render_page(
     manifest: Mapping[str, Any],
     title: str,
     reconstructed: bool,
+    gaps_html: str | None = None,
     audit_html: str | None = None,
     paper: Publication | None = None,
 ) -> str:
@@ -59,6 +60,8 @@ def render_page(
     title : str
     reconstructed : bool
         Whether any data were reconstructed from published results.
+    gaps_html : str, optional
+        A section on the source's own gaps, from `calib.page.paper_gaps.write_gaps`.
     audit_html : str, optional
         A section to be placed before the appendix, as trusted HTML.
     paper : Publication, optional
@@ -79,6 +82,7 @@ def render_page(
         title=title,
         sections=sections,
         reconstructed=reconstructed,
+        gaps=Markup(gaps_html) if gaps_html else None,
         audit=Markup(audit_html) if audit_html else None,
         paper=paper if paper is not None and paper.files else None,
         seed=study.seed,

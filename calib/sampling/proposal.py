@@ -16,7 +16,7 @@ from scipy.special import gammaln, logsumexp
 
 from calib.models.base import Array
 
-__all__ = ["Mixture", "StudentT", "adapt", "hessian_scale"]
+__all__ = ["Mixture", "StudentT", "adapt", "hessian_scale", "tempered_moments"]
 
 type LogProb = Callable[[Array], Array]
 
@@ -249,6 +249,25 @@ def _moments(draws: Array, weight: Array) -> tuple[Array, Array] | None:
         return mean, scale[:, None] * np.linalg.cholesky(correlation)
     except np.linalg.LinAlgError:
         return None
+
+
+def tempered_moments(draws: Array, log_weight: Array) -> tuple[Array, Array] | None:
+    """Mean and Cholesky factor of weighted draws, weights flattened where few draws carry them.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (k, d)
+    log_weight : ndarray, shape (k,)
+
+    Returns
+    -------
+    tuple of ndarray, shapes (d,) and (d, d), or None
+        None where the draws are degenerate.
+    """
+    total = logsumexp(log_weight)
+    if not np.isfinite(total):
+        return None
+    return _moments(draws, _tempered(np.exp(log_weight - total)))
 
 
 def _refit_single(proposal: Mixture, draws: Array, weight: Array) -> Mixture:

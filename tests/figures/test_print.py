@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 from colorspacious import cspace_convert
@@ -16,7 +17,7 @@ from matplotlib.text import Text
 
 from calib.figures import Plate, plates
 from calib.figures.bands import FILLS
-from calib.figures.export import pdf_bytes
+from calib.figures.export import pdf_bytes, png_bytes
 from calib.figures.style import (
     BLACK,
     CYCLE,
@@ -39,9 +40,10 @@ def drawn(drawbar, density, rut, plate) -> dict[str, Plate]:
     found = {}
     for key, result in {"drawbar": drawbar, "density": density, "rut": rut, "plate": plate}.items():
         found |= {f"{key} {p.name}": p for p in plates(result, published=key != "plate")}
-    for p in found.values():
-        assert p.figure is not None, p.caption
-        p.figure.draw_without_rendering()
+    with style():
+        for p in found.values():
+            assert p.figure is not None, p.caption
+            p.figure.draw_without_rendering()
     return found
 
 
@@ -200,11 +202,12 @@ def test_a_pdf_does_not_depend_on_the_process():
     assert len(runs) == 1
 
 
-def test_the_users_settings_do_not_reach_a_pdf(drawn):
-    import matplotlib as mpl
-
-    plain = pdf_bytes(drawn["rut estimates"].figure)
-    with mpl.rc_context({"savefig.bbox": "tight", "pdf.fonttype": 3, "savefig.dpi": 30}):
-        assert pdf_bytes(drawn["rut estimates"].figure) == plain
+@pytest.mark.parametrize("to_bytes", [pdf_bytes, png_bytes])
+def test_the_users_settings_do_not_reach_a_file(drawn, to_bytes):
+    figure = drawn["drawbar bands"].figure
+    plain = to_bytes(figure)
+    theirs = {"savefig.bbox": "tight", "pdf.fonttype": 3, "ytick.labelsize": 20.0}
+    with mpl.rc_context(theirs):
+        assert to_bytes(figure) == plain
     with style():
         assert mpl.rcParams["pdf.fonttype"] == 42

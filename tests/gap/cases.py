@@ -33,6 +33,7 @@ TRUTH: Mapping[str, Mapping[str, float]] = {
     },
     "magic_formula": {"K": 0.12, "C": 1.5, "D": 1.4, "G": 3.0, "Sh": 0.0, "Sv": 0.0},
     "modified_bekker": {"z_ref": 25.0, "n0": 1.0, "n1": 0.6},
+    "bekker": {"z_ref": 25.0, "n": 1.0},
 }  # fmt: skip
 # Sizes that are large beside the noise.
 LARGE: Mapping[str, Mapping[str, float]] = {

@@ -96,6 +96,13 @@ def test_a_tie_names_its_members_and_not_the_rest():
     assert "none" not in found.headline
 
 
+def test_a_tie_with_no_gap_at_all_does_not_claim_one():
+    tied = judge_gap(evidence("ambiguous", unknown=0.35, none=0.3, drift=0.2))
+    assert tied.headline.startswith("There may be a gap, but")
+    sure = judge_gap(evidence("ambiguous", unknown=0.45, drift=0.4, none=0.02))
+    assert sure.headline.startswith("There is a gap, but")
+
+
 def test_two_effects_are_said_to_be_two():
     assert "two effects at once" in judge_gap(evidence("effect", **{"a+b": 0.95})).headline.lower()
 

@@ -17,6 +17,7 @@ class SlipZeroShift(Effect):
     """A rolling radius wrong by a factor: 1 - s_true = (1 - s_recorded)(1 - error)."""
 
     name = "slip_zero_shift"
+    form = ("pressure",)  # a tyre rolls on a smaller radius at less inflation
     title = "the rolling radius behind the recorded slip is wrong"
     parameters = ("radius_error",)
     outputs = (DRAWBAR, RUT)
@@ -79,6 +80,7 @@ class PressureGaugeBias(Effect):
     """True inflation pressure differs from the gauge's by a gain and an offset."""
 
     name = "pressure_gauge_bias"
+    form = ("pressure",)  # the simulator is extrapolated to pressures it was not fitted at
     title = "true inflation pressure differs from the recorded one"
     parameters = ("gain", "offset", "ground_response")
     outputs = (DRAWBAR, RUT)
