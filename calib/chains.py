@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.models.base import Array
 
-__all__ = ["ess", "hdi", "psis", "rhat"]
+__all__ = ["ess", "hdi", "hdi_error", "median_error", "psis", "rhat"]
 
 
 def _stats() -> Any:
@@ -42,6 +42,30 @@ def hdi(draws: Array, prob: float) -> tuple[float, float]:
     """Highest-density interval of draws of shape (n,)."""
     low, high = _stats().hdi(draws, prob)
     return float(low), float(high)
+
+
+def hdi_error(batches: Array, prob: float) -> Array:
+    """Monte Carlo standard errors of the ends of a highest-density interval, shape (2,).
+
+    Parameters
+    ----------
+    batches : ndarray, shape (g, m)
+        The draws in g nearly independent parts.
+    prob : float
+
+    Notes
+    -----
+    The ends of a shortest interval converge with the cube root of the number of draws (Kim &
+    Pollard 1990, doi:10.1214/aos/1176347498), slower than the quantiles at which they lie: so do
+    the ends of the parts, whose scatter is scaled by that root.
+    """
+    ends = np.asarray(_stats().hdi(batches, prob, axis=-1))
+    return np.asarray(ends.std(axis=0, ddof=1) / np.cbrt(batches.shape[0]))
+
+
+def median_error(batches: Array) -> float:
+    """Monte Carlo standard error of the median of draws in nearly independent parts, (g, m)."""
+    return float(np.median(batches, axis=-1).std(ddof=1) / np.sqrt(batches.shape[0]))
 
 
 def psis(log_ratio: Array) -> tuple[Array, Array]:

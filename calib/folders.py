@@ -17,7 +17,8 @@ __all__ = ["check_folder", "fresh_folder"]
 _OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json")
 _WRITTEN = (
     *_OURS, "index.html", "summary.json", "figures", "data", "priors", "gaps", "case",
-    "corrected.json", "fresh_prediction.csv", "priors.toml", "data.csv", "audit.csv",
+    "corrected.json", "fresh_prediction.csv", "priors.toml", "data.csv", "tables", "methods.txt",
+    "methods.tex", "references.bib", "audit.csv",
 )  # fmt: skip
 
 

@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from calib.estimators import GeneticSettings
 from calib.sampling.sampler import SamplerSettings
 from calib.study import Study, Task
 
@@ -63,6 +64,7 @@ def build_manifest(
         "seed": study.seed,
         "versions": versions(),
         "settings": json.loads(json.dumps(asdict(settings))),
+        "genetic_algorithm": asdict(GeneticSettings()),
         "tasks": {k: _task(r.task, inputs[k]) for k, r in study.results.items()},
     }
 

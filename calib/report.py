@@ -10,7 +10,7 @@ from typing import Any
 from calib.audit import Audit
 from calib.data import write_table
 from calib.figures import Plate, plates
-from calib.figures.plate import png
+from calib.figures.export import pdf_bytes, png
 from calib.folders import fresh_folder
 from calib.manifest import build_manifest, file_hashes, sha256
 from calib.page import render_page
@@ -19,6 +19,7 @@ from calib.page.paper_gaps import write_gaps
 from calib.paper_gaps.find import FoundGap
 from calib.paper_gaps.summary import summarise_gaps
 from calib.prior_files import default_prior_path
+from calib.publish import publication
 from calib.sampling.sampler import SamplerSettings
 from calib.store import to_datatree, write_netcdf
 from calib.study import Study
@@ -39,6 +40,7 @@ def write_report(
     gaps: Sequence[FoundGap] = (),
     overwrite: bool = False,
     audit: Audit | None = None,
+    pdf: bool = False,
     progress: Progress | None = None,
 ) -> Path:
     """Write a report folder.
@@ -59,6 +61,8 @@ def write_report(
         Replace an earlier report.
     audit : Audit, optional
         Of the published tables, shown before the appendix.
+    pdf : bool
+        Whether every figure also comes as PDF, for print.
     progress : callable, optional
 
     Returns
@@ -91,12 +95,20 @@ def write_report(
                     name = f"{key}_{plate.name}.png"
                     images[name] = png(plate)
                     (folder / "figures" / name).write_bytes(images[name])
+                    if pdf:
+                        file = folder / "figures" / f"{key}_{plate.name}.pdf"
+                        file.write_bytes(pdf_bytes(plate.figure))
         tell("drawing figures", len(successes), len(successes))
         manifest = build_manifest(study, settings, command, inputs)
+        manifest["pdf"] = pdf
+        paper = publication(manifest, summary)
+        for path, text in paper.files.items():
+            (folder / path).parent.mkdir(exist_ok=True)
+            (folder / path).write_text(text, encoding="utf-8")
         gaps_html = None
         if gaps:
             manifest["paper_gaps"] = {r.gap.name: {"seed": r.found.seed} for r in gaps}
-            gaps_html = write_gaps(gaps, folder, png, manifest=manifest, progress=tell)
+            gaps_html = write_gaps(gaps, folder, png, manifest=manifest, pdf=pdf, progress=tell)
         page = render_page(
             study,
             drawn,
@@ -106,6 +118,7 @@ def write_report(
             gaps_html=gaps_html,
             reconstructed=any(r.task.table.label for r in study.results.values()),
             audit_html=write_audit(audit, folder) if audit is not None else None,
+            paper=paper,
         )
         (folder / "index.html").write_text(page, encoding="utf-8")
         manifest["files"] = file_hashes(folder)

@@ -5,8 +5,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from calib.calibration import Calibration
 from calib.estimators import PointEstimate
+from calib.models.base import Array
 from calib.scores import Scores
 from calib.study import OutputResult, Study
 
@@ -42,6 +45,11 @@ def _output(result: OutputResult) -> dict[str, Any]:
             "source": problem.table.source,
             "label": problem.table.label,
             "n": len(problem.table),
+            "n_all": len(result.task.table),
+            "ranges": {
+                name: _range(problem.table[name])
+                for name in (*problem.bound.model.conditions, problem.bound.model.output)
+            },
             "held_out": None if result.task.held_out is None else str(result.task.held_out),
         },
         "references": dict(problem.bound.references),
@@ -51,16 +59,35 @@ def _output(result: OutputResult) -> dict[str, Any]:
             f"{psi:g} psi": {e.method: {**e.reported, "cost": e.cost} for e in estimates}
             for psi, estimates in result.by_pressure.items()
         },
+        "priors": {
+            p.name: {
+                "unit": p.unit,
+                "distribution": p.text,
+                "reason": p.reason,
+                "source": p.source,
+            }
+            for p in problem.priors.entries
+        },
         "posterior": _posterior(result.calibration),
         "validation": _validation(result),
         "sampling": _sampling(result.calibration),
     }
 
 
+def _range(values: Array) -> dict[str, float]:
+    return {
+        "lower": float(values.min()),
+        "upper": float(values.max()),
+        "distinct": int(np.unique(values).size),
+    }
+
+
 def _fit(e: PointEstimate) -> dict[str, Any]:
     return {
         "cost": e.cost,
+        "cost_unit": e.cost_unit,
         "rmse": e.rmse,
+        "rmse_unit": e.rmse_unit,
         "r_squared": e.r_squared,
         "evaluations": e.n_evaluations,
         "converged": e.converged,
@@ -81,6 +108,9 @@ def _posterior(calibration: Calibration) -> dict[str, Any]:
             "ess_tail": s.ess_tail,
             "rhat": s.rhat,
             "mcse_mean": s.mcse_mean,
+            "mcse_median": s.mcse_median,
+            "mcse_hdi_lower": s.mcse_hdi_lower,
+            "mcse_hdi_upper": s.mcse_hdi_upper,
             "posterior_to_prior_sd": s.sd_ratio,
         }
         for name, s in calibration.summary.items()
@@ -93,6 +123,7 @@ def _validation(result: OutputResult) -> dict[str, Any]:
         {
             "elpd": v.elpd,
             "elpd_se": v.elpd_se,
+            "largest_pareto_k": None if v.pareto_k is None else float(v.pareto_k.max()),
             "refitted": list(v.refitted),
             "refits_not_converged": list(v.unconverged),
         }
@@ -118,13 +149,20 @@ def _scores(s: Scores) -> dict[str, Any]:
 
 def _sampling(calibration: Calibration) -> dict[str, Any]:
     d = calibration.draws
+    r = d.report
     return {
-        "converged": d.report.passed,
-        "reasons": list(d.report.reasons),
+        "converged": r.passed,
+        "reasons": list(r.reasons),
+        "gate": {
+            "largest_rhat": float(r.rhat.max()),
+            "smallest_ess_bulk": float(r.ess_bulk.min()),
+            "smallest_ess_tail": float(r.ess_tail.min()),
+            "smallest_steps_over_tau": float((r.steps / r.tau).min()),
+        },
         "ensembles": d.t.shape[0],
         "walkers": d.t.shape[1],
-        "steps": d.report.steps,
-        "tau": float(max(d.report.tau)),
+        "steps": r.steps,
+        "tau": float(max(r.tau)),
         "acceptance": d.acceptance,
         "evaluations": d.evaluations,
         "log_evidence": d.log_evidence,

@@ -47,6 +47,7 @@ def report(
         list[str] | None, typer.Option(help="Output to report, e.g. drawbar_pull; repeatable.")
     ] = None,
     overwrite: _Overwrite = False,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
     max_steps: _MaxSteps = 25_600,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
@@ -86,7 +87,7 @@ def report(
             audit = run_audit(seed, rut_calibration=rut_calibration, progress=tell)
         page = write_report(
             study, out, settings=settings, command=_command(), title=title, gaps=gaps,
-            overwrite=overwrite, audit=audit, progress=tell,
+            overwrite=overwrite, audit=audit, pdf=pdf, progress=tell,
         )  # fmt: skip
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]
@@ -119,6 +120,7 @@ def fit(
     from calib.estimators import estimate
     from calib.folders import check_folder, fresh_folder
     from calib.models import get_model
+    from calib.numbers import format_number
     from calib.problem import build_problem
     from calib.sampling.sampler import SamplerSettings
     from calib.store import save_calibration
@@ -148,7 +150,7 @@ def fit(
         ninety = scores.coverage[0.9]
         print(
             f"held out ({kept}): 90 % band covers {ninety.hits} of {ninety.n}, "
-            f"RMSE {scores.rmse:.3g}, CRPS {scores.crps:.3g}"
+            f"RMSE {format_number(scores.rmse)}, CRPS {format_number(scores.crps)}"
         )
     print(f"run folder: {out}")
     if not calibration.converged:

@@ -42,6 +42,7 @@ def diagnose(
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.load import load_effects
     from calib.gap.files import write_diagnosis
+    from calib.numbers import format_number
     from calib.page.diagnosis import write_page
 
     check_folder(out, overwrite=overwrite)
@@ -69,9 +70,9 @@ def diagnose(
     for output, s in found.shrink.items():
         low, high = s.interval
         print(
-            f"{output}: error {s.rmse_before:.3g} -> {s.rmse_after:.3g}, shrink "
-            f"{100 * s.fraction:.0f} % ({100 * low:.0f} to {100 * high:.0f}), "
-            f"noise {s.noise_floor:.3g}"
+            f"{output}: error {format_number(s.rmse_before)} -> {format_number(s.rmse_after)}, "
+            f"shrink {100 * s.fraction:.0f} % ({100 * low:.0f} to {100 * high:.0f}), "
+            f"noise {format_number(s.noise_floor)}"
         )
     print(out / "index.html")
 

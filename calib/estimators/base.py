@@ -61,6 +61,11 @@ class PointEstimate:
     converged: bool
     note: str = ""
 
+    @property
+    def rmse_unit(self) -> str:
+        """Unit of the RMSE."""
+        return self.cost_unit.removesuffix("^2").strip("()")
+
 
 def residuals(problem: Problem, natural: Array) -> Array:
     """Observed minus predicted on the scale of the response, in chunks.

@@ -20,6 +20,7 @@ from calib.figures.style import (
     GREY,
     MARKERS,
     SKY,
+    SMALLEST_PT,
     legend_below,
     panels,
     style,
@@ -52,7 +53,7 @@ def _plate(result: FoundGap) -> Plate:
     rows = 2 if result.gap.unfitted is not None else 1
     fig, axes = panels(1, 3, height=46.0, top=6.0, bottom=12.0 + 4.0 * rows)
     # The names of the hypotheses need the room beside the last panel.
-    for ax, left, width in zip(axes[0], (15.0, 70.0, 145.0), (52.0, 47.0, 22.0), strict=True):
+    for ax, left, width in zip(axes[0], (15.0, 70.0, 145.0), (52.0, 47.0, 32.0), strict=True):
         box = ax.get_position()
         ax.set_position((left / DOUBLE_MM, box.y0, width / DOUBLE_MM, box.height))
     before, after, which = axes[0]
@@ -142,9 +143,9 @@ def _which(ax: Axes, result: FoundGap) -> None:
     y = np.arange(len(names))[::-1]
     for i, (yi, name) in enumerate(zip(y, names, strict=True)):
         ax.barh(yi, p[name], color=BLUE if i == 0 else SKY, height=0.62)
-        ax.text(p[name] + 0.03, yi, probability_text(p[name]), va="center", fontsize=6.5)
+        ax.text(p[name] + 0.03, yi, probability_text(p[name]), va="center", fontsize=SMALLEST_PT)
     ax.set_yticks(y, [short_name(name).replace(" + ", "\n+ ") for name in names])
-    ax.tick_params(axis="y", length=0.0, labelsize=6.5)
+    ax.tick_params(axis="y", length=0.0, labelsize=SMALLEST_PT)
     ax.set_ylim(-0.6, len(names) - 0.4)
     ax.set_xlim(0.0, 1.0)
     ax.set_xticks([0.0, 0.5, 1.0], ["0", "0.5", "1"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -10,7 +9,7 @@ from matplotlib.figure import Figure
 
 from calib.figures.style import style
 
-__all__ = ["Plate", "draw_all", "png"]
+__all__ = ["Plate", "draw_all"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,17 +48,3 @@ def _attempt(name: str, draw: Callable[[], Plate | None]) -> Plate | None:
         # Any failure: a page without one figure is worth more than no page.
         why = f"{type(error).__name__}: {error}"
         return Plate(None, name, f"This figure could not be drawn ({why}).")
-
-
-def png(plate: Plate) -> bytes:
-    """Render a figure, with a palette of 256 colours: a third of the size, no visible loss."""
-    from PIL import Image
-
-    if plate.figure is None:
-        return b""
-    full, small = io.BytesIO(), io.BytesIO()
-    plate.figure.savefig(full, format="png", dpi=150)
-    full.seek(0)
-    with Image.open(full) as image:
-        image.convert("RGB").quantize(256).save(small, format="png")
-    return small.getvalue()

@@ -13,9 +13,9 @@ from calib.figures import Plate
 from calib.figures.labels import axis_of, percent, short
 from calib.figures.rows import held_table
 from calib.models import get_model
+from calib.numbers import format_number
 from calib.page.equations import equation, likelihood, parametrisation, prose
 from calib.page.facts import repeats_words, sampling_facts, validation_facts, worst_row
-from calib.page.numbers import format_number
 from calib.page.tables import (
     estimates_grid,
     posterior_rows,

@@ -19,7 +19,7 @@ from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit
 from calib.models.base import Array
-from calib.page.numbers import format_value
+from calib.numbers import format_value
 from calib.streams import generator
 
 __all__ = ["size_sentences"]

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping
 
 from calib.figures.gap_rows import short_name
 from calib.figures.labels import percent, short
+from calib.numbers import format_value
 from calib.page.gap_verdict import odds_text
-from calib.page.numbers import format_value
 from calib.paper_gaps.checks import Check
 
 __all__ = ["check_text"]

@@ -10,6 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
+from calib.figures.export import pdf_bytes
 from calib.figures.gap import gap_plates
 from calib.figures.gap_rows import short_name
 from calib.figures.labels import short
@@ -54,6 +55,7 @@ def write_gaps(
     to_png: ToPng,
     *,
     manifest: Mapping[str, Any],
+    pdf: bool = False,
     progress: Progress | None = None,
 ) -> str:
     """Write figures and pages of the gaps into a report folder, and return the section.
@@ -68,6 +70,8 @@ def write_gaps(
         Renders a figure.
     manifest : mapping
         Of the report, for the pages' versions.
+    pdf : bool
+        Whether each gap's figure also comes as PDF.
     progress : callable, optional
 
     Returns
@@ -82,6 +86,9 @@ def write_gaps(
         plate = gap_plate(result)
         image = to_png(plate)
         (folder / "figures" / f"gap_{plate.name}.png").write_bytes(image)
+        if pdf and plate.figure is not None:
+            file = folder / "figures" / f"gap_{plate.name}.pdf"
+            file.write_bytes(pdf_bytes(plate.figure))
         _write_diagnosis_page(result, folder / "gaps" / result.gap.name, to_png, manifest)
         blocks.append(_block(result, plate, image))
     tell("the paper's own gaps: drawing", len(results), len(results))
