@@ -199,6 +199,12 @@ class Forward:
 
     def onset(self, view: View, output: str, threshold: Array) -> tuple[Array, Array]:
         """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n)."""
+        u = self.onset_covariate(view, output)
+        beyond = (u - threshold[:, None]) / _ONSET_WIDTH
+        return expit(beyond), _ONSET_WIDTH * np.logaddexp(0.0, beyond)
+
+    def onset_covariate(self, view: View, output: str) -> Array:
+        """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
         over = self.hypothesis.onset_over
         if over in ("level", "sinkage"):
             u = self._level(view, output if over == "level" else RUT)
@@ -206,8 +212,7 @@ class Forward:
             u = self._scaled(view, "slip_ratio" if over == "slip" else "run_order")
         if u is None:
             raise ValueError(f"nothing to set in over: {over}")
-        beyond = (u - threshold[:, None]) / _ONSET_WIDTH
-        return expit(beyond), _ONSET_WIDTH * np.logaddexp(0.0, beyond)
+        return u
 
     def _smooth(self, view: View, output: str) -> Array:
         same = view.conditions is self.data.view.conditions

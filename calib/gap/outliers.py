@@ -78,7 +78,7 @@ def _noted(case: Case, far: Mapping[str, list[int]], campaign: str, bar: float) 
 
 
 def _field_outliers(data: Campaigns, ranking: Ranking) -> dict[str, list[int]]:
-    best = max(ranking.fits[ranking.order[0]], key=lambda f: f.log_evidence)
+    best = ranking.best(ranking.order[0])
     far = {}
     for o in data.outputs:
         found = np.abs(best.field_residuals[o.name]) > OUTLIER

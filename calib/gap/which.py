@@ -79,6 +79,10 @@ class Ranking:
         """Names, most probable first."""
         return sorted(self.probability, key=lambda name: -self.probability[name])
 
+    def best(self, name: str) -> Fit:
+        """The most probable fit of a hypothesis."""
+        return self.fits[name][int(np.argmax(self.scores[name]))]
+
 
 def rank(data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS) -> Ranking:
     """Fit every hypothesis and rank them."""

@@ -322,3 +322,27 @@ def test_conditions_that_do_not_vary_are_not_asked_for(found):
          "average_ground_pressure_kpa": 178.0, "speed_m_s": 2.0, "run_order": 26.0},
     )  # fmt: skip
     assert text == "slip 65 %, inflation pressure 42 psi, speed 2 m/s"
+
+
+def test_what_is_unknown_is_described_by_what_it_goes_along_with():
+    from dataclasses import replace
+
+    import numpy as np
+
+    from calib.data import table_from_arrays
+    from calib.gap.diagnose import diagnose
+    from calib.gap.effects import EFFECTS
+    from calib.page.gap_sizes import size_sentences
+    from gap.cases import PULL_ONLY, make_case
+
+    # An amplifier that saturates: no reading above 0.9 kN.
+    case = make_case(None, models=PULL_ONLY, n_field=36)
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    columns["drawbar_pull_kn"] = np.minimum(columns["drawbar_pull_kn"], 0.9)
+    case = replace(case, field=table_from_arrays(columns))
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")}
+    found = diagnose(case, 1, effects=few)
+    assert found.verdict == "unknown"
+    lead = size_sentences(found, "unknown")[0]
+    assert lead.startswith("what is missing sets in beyond a predicted drawbar pull of")
+    assert 0.8 < float(lead.split(" of ")[1].split()[0]) < 1.0
