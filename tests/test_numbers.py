@@ -75,7 +75,6 @@ def test_no_more_is_lost_than_the_sd_allows(mean, sd):
     slack = 1.0 + 1e-6
     assert abs(shown_mean - mean) <= 0.5 * unit * slack + 1e-12 * abs(mean)
     assert abs(shown_sd - sd) <= 0.5 * unit * slack
-    assert float(f"{sd:.1e}") == pytest.approx(shown_sd, rel=0.06)
 
 
 @given(finite, spread)

@@ -104,8 +104,8 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
 
 
 def _short(draws: Array) -> list[list[float]]:
-    """Six digits of each number: a band needs no more, and the file stays small."""
-    return [[float(f"{value:.6g}") for value in row] for row in draws]
+    """Twelve digits of each number, so that the file stays small."""
+    return [[float(f"{value:.12g}") for value in row] for row in draws]
 
 
 def load_corrected(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> Corrected:

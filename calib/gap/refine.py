@@ -21,7 +21,7 @@ from calib.streams import generator
 
 __all__ = ["refine"]
 
-_ROUNDS, _SIZE, _FINAL, _KEPT = 7, 2000, 6000, 800
+_ROUNDS, _SIZE, _FINAL, _KEPT = 7, 2000, 6000, 500
 _DOF = 30.0
 # Fewer effective draws than this do not replace the normal.
 _ENOUGH = 120.0

@@ -328,12 +328,12 @@ def test_what_is_unknown_is_described_by_what_it_goes_along_with():
     from dataclasses import replace
 
     import numpy as np
+    from gap.cases import PULL_ONLY, make_case
 
     from calib.data import table_from_arrays
     from calib.gap.diagnose import diagnose
     from calib.gap.effects import EFFECTS
     from calib.page.gap_sizes import size_sentences
-    from gap.cases import PULL_ONLY, make_case
 
     # An amplifier that saturates: no reading above 0.9 kN.
     case = make_case(None, models=PULL_ONLY, n_field=36)

@@ -49,7 +49,8 @@ def test_a_withheld_effect_is_the_most_probable_and_shrinks_the_error_of_rows_no
     errors = unfitted_errors(result.found, result.gap)
     assert errors.n == 7
     assert errors.rmse_after < 0.5 * errors.rmse_before
-    assert errors.covered >= 6
+    # Of seven, fewer than five are within a true 90 % band in 2.6 % of campaigns.
+    assert errors.covered >= 5
 
 
 def test_the_deepening_agrees_with_table_6(found_gaps):
