@@ -179,7 +179,7 @@ def test_a_scheduler_that_is_not_there_is_refused(tmp_path, monkeypatch):
 
 def test_workers_of_other_versions_are_refused(tmp_path, scheduler, monkeypatch):
     monkeypatch.setattr(cluster, "_SAME", ("numpy", "pytest"))
-    with pytest.raises(CalibError, match="would not give the same numbers.*pytest"):
+    with pytest.raises(CalibError, match=r"would not give the same numbers.*pytest"):
         run_tasks(work.draw, {"a": 1}, tmp_path, scheduler=scheduler)
 
 
