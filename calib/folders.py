@@ -11,7 +11,7 @@ from pathlib import Path
 
 from calib.errors import CalibError
 
-__all__ = ["check_folder", "fresh_folder", "unwritable"]
+__all__ = ["check_folder", "fresh_folder", "read_folder", "unwritable"]
 
 # Files by which a folder is known to be one of ours, and may be replaced.
 _OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt")
@@ -59,6 +59,15 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
             scratch.replace(out)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+def read_folder(folder: Path) -> dict[str, bytes]:
+    """Return the content of every file below a folder, by its relative name."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
 
 
 def unwritable(out: Path, why: str) -> CalibError:

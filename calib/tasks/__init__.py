@@ -5,7 +5,8 @@ missing when they are called again; `completed` hands results over as they come 
 """
 
 from calib.tasks.attempt import Finished
+from calib.tasks.items import LateItems
 from calib.tasks.run import Outcome, run_folder_tasks, run_tasks
 from calib.tasks.stream import completed
 
-__all__ = ["Finished", "Outcome", "completed", "run_folder_tasks", "run_tasks"]
+__all__ = ["Finished", "LateItems", "Outcome", "completed", "run_folder_tasks", "run_tasks"]

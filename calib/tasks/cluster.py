@@ -17,6 +17,7 @@ from typing import Any
 import dask
 from distributed import Client, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
+from distributed.utils import silence_logging_cmgr
 
 from calib.errors import CalibError
 from calib.tasks.attempt import Finished, attempt, describe
@@ -43,7 +44,8 @@ def on_cluster[I, R](
     """Yield tasks as they come to their end (see `calib.tasks.stream.completed`)."""
     # A cluster of our own need not be larger than the work.
     connected = _local(min(workers, len(names))) if scheduler is None else _existing(scheduler)
-    with connected as client:
+    # What goes wrong is told once, as the error of a task or as ours.
+    with silence_logging_cmgr(logging.CRITICAL), connected as client:
         announce(_describe(client, local=scheduler is None))
         killed: list[str] = []
         yield from _gather(client, function, items, names, WINDOW, killed)
@@ -74,7 +76,9 @@ def _gather[I, R](
     while True:
         # The items are sealed, so that Dask does not search them for tasks of its own.
         sealed: dict[str, bytes] = {}
-        while len(out) + len(sealed) < window and (name := next(waiting, None)) is not None:
+        # Many at a time, which costs the scheduler little more than one.
+        room = window - len(out) if len(out) <= window // 2 else 0
+        while len(sealed) < room and (name := next(waiting, None)) is not None:
             item = attempt(_seal, name, lambda name=name: items[name])  # type: ignore[misc]
             if item.result is None:
                 yield Finished(name, None, item.error, item.seconds)
@@ -128,7 +132,6 @@ def _local(workers: int) -> Iterator[Client]:
         LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, memory_limit=1.0 / workers,
             dashboard_address="127.0.0.1:0",  # any free port: the usual one may be taken
-            # What dies is told as the error of its task.
             silence_logs=logging.CRITICAL,
         ) as cluster,
         Client(cluster, set_as_default=False) as client,

@@ -157,6 +157,11 @@ def _run[I, R, C](
                 else:
                     failed[task.name] = task.error
                 tell(len(found) + len(failed), len(items))
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                f"interrupted; {len(found)} of {len(items)} results are kept in {landing.folder}, "
+                "and the same command does the others"
+            ) from None
         finally:
             _list(failed, landing.folder / FAILED)
     seconds = read_seconds(landing.folder)
