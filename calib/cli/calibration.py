@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calib.cli.parallel import Workers
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
@@ -48,6 +49,7 @@ def report(
     ] = None,
     overwrite: _Overwrite = False,
     max_steps: _MaxSteps = 25_600,
+    workers: Workers = 1,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from calib.cli.display import progress_bars
@@ -74,7 +76,7 @@ def report(
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
     with progress_bars() as tell:
-        study = run_study(tasks, seed, settings=settings, progress=tell)
+        study = run_study(tasks, seed, settings=settings, progress=tell, workers=workers)
         page = write_report(
             study, out, settings=settings, command=_command(), title=title, overwrite=overwrite,
             progress=tell,
@@ -282,19 +284,7 @@ def _emit(text: str, out: Path | None) -> None:
 def _parse_hold_out(text: str | None) -> HoldOut | None:
     from calib.study import HoldOut
 
-    if text is None:
-        return None
-    column, equals, value = text.partition("=")
-    try:
-        if not equals:
-            raise ValueError
-        return HoldOut(column.strip(), float(value))
-    except ValueError:
-        raise CalibError(
-            f"cannot read --hold-out {text!r}",
-            allowed="COLUMN=VALUE, for instance inflation_pressure_psi=30",
-            mend="name a column with its unit, an equals sign and one number",
-        ) from None
+    return None if text is None else HoldOut.parse(text)
 
 
 def _command() -> list[str]:

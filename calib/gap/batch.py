@@ -14,9 +14,11 @@ from tempfile import TemporaryDirectory
 from calib.errors import CalibError
 from calib.folders import read_folder
 from calib.gap.case import Case, read_case
+from calib.gap.diagnose import Diagnosis, diagnose
+from calib.gap.files import write_diagnosis
 from calib.tasks import LateItems, run_folder_tasks
 
-__all__ = ["case_folders", "diagnose_cases", "diagnosis_files"]
+__all__ = ["case_folders", "diagnose_cases", "written"]
 
 
 def case_folders(folder: Path) -> list[Path]:
@@ -63,25 +65,19 @@ def diagnose_cases(
         Cases that failed, with their error.
     """
     outcome = run_folder_tasks(
-        partial(diagnosis_files, seed=seed),
+        partial(_diagnose, seed=seed),
         LateItems({case.name: case for case in cases}, read_case),
         out, workers=workers, scheduler=scheduler, progress=progress, announce=announce,
     )  # fmt: skip
     return dict(outcome.failed)
 
 
-def diagnosis_files(case: Case, seed: int) -> dict[str, bytes]:
-    """Diagnose a case and return the files of the diagnosis by name.
+def _diagnose(case: Case, seed: int) -> dict[str, bytes]:
+    return written(diagnose(case, seed))
 
-    Raises
-    ------
-    CalibError
-        If it cannot be diagnosed.
-    """
-    from calib.gap.diagnose import diagnose
-    from calib.gap.files import write_diagnosis
 
-    found = diagnose(case, seed)
+def written(found: Diagnosis) -> dict[str, bytes]:
+    """Return the files of a diagnosis, by name, to be written elsewhere."""
     with TemporaryDirectory() as scratch:
         write_diagnosis(found, Path(scratch))
         return read_folder(Path(scratch))

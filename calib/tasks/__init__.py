@@ -6,7 +6,11 @@ missing when they are called again; `completed` hands results over as they come 
 
 from calib.tasks.attempt import Finished
 from calib.tasks.items import LateItems
+from calib.tasks.landing import check_names, failed_tasks
 from calib.tasks.run import Outcome, run_folder_tasks, run_tasks
 from calib.tasks.stream import completed
 
-__all__ = ["Finished", "LateItems", "Outcome", "completed", "run_folder_tasks", "run_tasks"]
+__all__ = [
+    "Finished", "LateItems", "Outcome", "check_names", "completed", "failed_tasks",
+    "run_folder_tasks", "run_tasks",
+]  # fmt: skip

@@ -6,7 +6,7 @@ import json
 import re
 import shutil
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any, Protocol, cast
@@ -15,8 +15,10 @@ from calib.errors import CalibError
 from calib.folders import unwritable
 from calib.tasks.attempt import Finished
 
-__all__ = ["FAILED", "Folders", "JsonFiles", "Landing", "check_names", "landing_ground",
-           "read_seconds"]  # fmt: skip
+__all__ = [
+    "FAILED", "Folders", "JsonFiles", "Landing", "check_names", "failed_tasks", "landing_ground",
+    "read_seconds",
+]  # fmt: skip
 
 FAILED = "failed.json"
 SECONDS = "seconds.csv"
@@ -92,7 +94,7 @@ class Folders:
             path.write_bytes(data)
 
 
-def check_names(names: Mapping[str, object]) -> None:
+def check_names(names: Iterable[str]) -> None:
     """Check that every task can have a file of its name.
 
     Raises
@@ -147,6 +149,13 @@ def landing_ground[C](landing: Landing[Any, C]) -> Iterator[Callable[[Finished[C
         finally:
             clock.close()
             shutil.rmtree(scratch, ignore_errors=True)
+
+
+def failed_tasks(folder: Path) -> dict[str, str]:
+    """Return the errors of the tasks that failed when they were last tried."""
+    path = folder / FAILED
+    found: dict[str, str] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return found
 
 
 def read_seconds(folder: Path) -> dict[str, float]:
