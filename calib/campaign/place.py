@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import glob
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -76,6 +77,17 @@ class Place:
                 allowed=f"a file, relative to {self.folder}", mend="correct the name",
             )  # fmt: skip
         return path
+
+    @contextmanager
+    def telling(self, key: str) -> Iterator[None]:
+        """Say of what goes wrong inside at which key of the plan it was."""
+        try:
+            yield
+        except CalibError as error:
+            where = ", ".join(filter(None, (f"{self.where}, {key}", error.where)))
+            raise CalibError(
+                error.message, where=where, allowed=error.allowed, mend=error.mend
+            ) from None
 
     def name(self, path: Path) -> str:
         """Return a path as the plan would name it."""

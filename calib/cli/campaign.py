@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import Scheduler, Workers, announce
+from calib.cli.parallel import Scheduler, Workers, announce, resumable
 
 __all__ = ["register"]
 
@@ -40,7 +40,7 @@ def campaign(
     if only_list:
         print("\n".join(planned.tasks))
         return
-    with progress_bars() as tell:
+    with resumable(), progress_bars() as tell:
         summary = run_campaign(
             planned, out, workers=workers, scheduler=scheduler, overwrite=overwrite,
             progress=lambda done, n: tell("tasks", done, n), announce=announce,

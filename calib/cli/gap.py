@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from calib.cli.parallel import Scheduler, Workers, announce
+from calib.cli.parallel import Scheduler, Workers, announce, resumable
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -111,7 +111,7 @@ def run(
     from calib.gap.batch import case_folders, diagnose_cases
 
     cases = case_folders(folder)
-    with progress_bars() as tell:
+    with resumable(), progress_bars() as tell:
         failed = diagnose_cases(
             cases, out, seed, workers=workers, scheduler=scheduler, announce=announce,
             progress=lambda done, n: tell("diagnosing", done, n),

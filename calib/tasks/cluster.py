@@ -132,7 +132,7 @@ def _local(workers: int) -> Iterator[Client]:
         LocalCluster(
             n_workers=workers, threads_per_worker=1, processes=True, memory_limit=1.0 / workers,
             dashboard_address="127.0.0.1:0",  # any free port: the usual one may be taken
-            silence_logs=logging.CRITICAL,
+            silence_logs=logging.CRITICAL, preload=["calib.tasks.worker"],
         ) as cluster,
         Client(cluster, set_as_default=False) as client,
     ):  # fmt: skip

@@ -82,9 +82,11 @@ class Fit(Kind[FitSection, FitItem]):
     def plan(self, section: FitSection, place: Place) -> Iterator[Planned]:
         """Yield a task for each file, model, prior file and hold-out."""
         priors = _priors(section, place)
-        held = [_held(text, place) for text in section.hold_out]
+        with place.telling("hold_out"):
+            for text in section.hold_out:
+                _held(text)
         for path, model in product(place.find("data", section.data), section.models):
-            for (prior, prior_path), out in product(priors[model], held):
+            for (prior, prior_path), out in product(priors[model], section.hold_out):
                 yield Planned(
                     f"{place.word(path)}.{model}.{word(prior)}.{word(out)}",
                     {
@@ -99,8 +101,7 @@ class Fit(Kind[FitSection, FitItem]):
         """Read the file and bind the model to it."""
         model = get_model(task.settings["model"])
         table = read_for_model(task.inputs["data"], (*model.conditions, model.output))
-        out = task.settings["hold_out"]
-        kept = None if out == NOTHING else HoldOut.parse(out)
+        kept = _held(task.settings["hold_out"])
         fitted, held = hold_out(table, kept.column, kept.value) if kept else (table, None)
         problem = build_problem(model.name, fitted, task.inputs["priors"])
         settings = SamplerSettings(max_steps=task.settings["max_steps"])
@@ -123,7 +124,8 @@ class Fit(Kind[FitSection, FitItem]):
 
 def _priors(section: FitSection, place: Place) -> dict[str, list[tuple[str, Path]]]:
     """Return names and paths of the prior files of each model."""
-    found: dict[str, list[tuple[str, Path]]] = {get_model(m).name: [] for m in section.models}
+    with place.telling("models"):
+        found: dict[str, list[tuple[str, Path]]] = {get_model(m).name: [] for m in section.models}
     for name in section.priors:
         if name == SHIPPED:
             for model, files in found.items():
@@ -147,16 +149,8 @@ def _priors(section: FitSection, place: Place) -> dict[str, list[tuple[str, Path
     return found
 
 
-def _held(text: str, place: Place) -> str:
-    if text != NOTHING:
-        try:
-            HoldOut.parse(text)
-        except CalibError as error:
-            raise CalibError(
-                error.message, where=f"{place.where}, hold_out", mend=error.mend,
-                allowed=f"{error.allowed}; or {NOTHING}",
-            ) from None  # fmt: skip
-    return text
+def _held(text: str) -> HoldOut | None:
+    return None if text == NOTHING else HoldOut.parse(text)
 
 
 def _numbers(calibration: Calibration) -> dict[str, Any]:
