@@ -126,24 +126,38 @@ def _local(workers: int) -> Iterator[Client]:
     Dask gives them one thread of the linear algebra each. They end with this process, however it
     ends.
     """
-    settings = {"distributed.scheduler.allowed-failures": ALLOWED_FAILURES}
-    with (
-        dask.config.set(settings),
-        LocalCluster(
-            n_workers=workers, threads_per_worker=1, processes=True, memory_limit=1.0 / workers,
-            dashboard_address="127.0.0.1:0",  # any free port: the usual one may be taken
-            silence_logs=logging.CRITICAL, preload=["calib.tasks.worker"],
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):  # fmt: skip
-        yield client
+    with dask.config.set({"distributed.scheduler.allowed-failures": ALLOWED_FAILURES}):
+        try:
+            cluster = LocalCluster(
+                n_workers=workers, threads_per_worker=1, processes=True, memory_limit=1.0 / workers,
+                dashboard_address="127.0.0.1:0",  # any free port: the usual one may be taken
+                silence_logs=logging.CRITICAL, preload=["calib.tasks.worker"],
+            )  # fmt: skip
+        except RuntimeError as error:
+            raise CalibError(
+                f"the worker processes do not start ({error})",
+                mend='in a script of yours, put the call below `if __name__ == "__main__":`',
+            ) from error
+        with cluster, Client(cluster, set_as_default=False) as client:
+            yield client
+
+
+class _Client(Client):
+    """A client that is closed if it cannot connect, not at some later time by its finaliser."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        try:
+            super().__init__(*args, **kwargs)  # type: ignore[no-untyped-call]
+        except BaseException:
+            self.close()  # type: ignore[no-untyped-call]
+            raise
 
 
 @contextmanager
 def _existing(address: str) -> Iterator[Client]:
     """Connect to a scheduler, and check that its workers would give the same numbers."""
     try:
-        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        client = _Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError) as error:
         raise CalibError(
             f"there is no Dask scheduler at this address ({type(error).__name__}: {error})",

@@ -163,13 +163,11 @@ def _run[I, R, C](
                 "and the same command does the others"
             ) from None
         finally:
+            failed = {name: failed[name] for name in items if name in failed}
             _list(failed, landing.folder / FAILED)
     seconds = read_seconds(landing.folder)
     done = tuple(name for name in items if name in found)
-    return Outcome(
-        done, resumed, {name: failed[name] for name in items if name in failed},
-        {name: seconds[name] for name in done if name in seconds},
-    )  # fmt: skip
+    return Outcome(done, resumed, failed, {n: seconds[n] for n in done if n in seconds})
 
 
 def _encoded[I, R, C](function: Callable[[I], R], encode: Callable[[R], C], item: I) -> C:

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -30,8 +31,13 @@ def content(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture(scope="module")
 def scheduler(tmp_path_factory) -> Iterator[str]:
-    """Address of a scheduler with one worker, started as a user would start them."""
-    folder = tmp_path_factory.mktemp("cluster")
+    with scheduler_and_worker(tmp_path_factory.mktemp("cluster")) as (address, _):
+        yield address
+
+
+@contextmanager
+def scheduler_and_worker(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
+    """Yield the address of a scheduler with one worker, started as a user would, and both."""
     environment = os.environ | {"PYTHONPATH": str(TESTS), "PYTHONWARNINGS": "ignore"}
     file = folder / "scheduler.json"
 
@@ -51,7 +57,7 @@ def scheduler(tmp_path_factory) -> Iterator[str]:
         while not file.exists() or not file.read_text():
             assert processes[0].poll() is None
             time.sleep(0.05)
-        yield json.loads(file.read_text())["address"]
+        yield json.loads(file.read_text())["address"], processes
     finally:
         for process in reversed(processes):
             process.terminate()
@@ -168,6 +174,33 @@ def _of_group(group: int) -> list[int]:
         except (ProcessLookupError, psutil.NoSuchProcess):
             pass
     return found
+
+
+def test_a_script_without_a_guard_is_told_so(tmp_path):
+    script = _CLIENT.replace('if __name__ == "__main__":', "if True:")
+    (tmp_path / "client.py").write_text(script)
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "client.py"), str(tmp_path / "out")],
+        env=os.environ | {"PYTHONPATH": str(TESTS)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert 'put the call below `if __name__ == "__main__":`' in done.stderr
+    assert list((tmp_path / "out").glob("*.json")) == []
+
+
+def test_a_scheduler_that_is_lost_is_told(tmp_path):
+    with scheduler_and_worker(tmp_path) as (address, processes):
+
+        def lose(done: int, planned: int) -> None:
+            if done == 2:
+                processes[0].kill()
+
+        items = {f"t{i}": (i, 0.2) for i in range(10)}
+        with pytest.raises(CalibError, match="connection to the Dask scheduler was lost"):
+            run_tasks(work.slow, items, tmp_path / "out", scheduler=address, progress=lose)
+    outcome = run_tasks(work.slow, items, tmp_path / "out")
+    assert len(outcome.resumed) >= 2
+    assert outcome.done == tuple(items)
 
 
 def test_a_scheduler_that_is_not_there_is_refused(tmp_path, monkeypatch):
