@@ -51,6 +51,27 @@ class HoldOut:
     def __str__(self) -> str:
         return f"{self.column} = {self.value:g}"
 
+    @classmethod
+    def parse(cls, text: str) -> HoldOut:
+        """Read ``COLUMN=VALUE``.
+
+        Raises
+        ------
+        CalibError
+            If it is not of this form.
+        """
+        column, equals, value = text.partition("=")
+        try:
+            if not equals:
+                raise ValueError
+            return cls(column.strip(), float(value))
+        except ValueError:
+            raise CalibError(
+                f"cannot read --hold-out {text!r}",
+                allowed="COLUMN=VALUE, for instance inflation_pressure_psi=30",
+                mend="name a column with its unit, an equals sign and one number",
+            ) from None
+
     def applies_to(self, table: Table) -> bool:
         """Whether a table has the column at all."""
         column = parse_header(self.column)
@@ -252,6 +273,7 @@ def run_study(
     *,
     settings: SamplerSettings | None = None,
     progress: Progress | None = None,
+    workers: int = 1,
 ) -> Study:
     """Work every task out.
 
@@ -262,12 +284,14 @@ def run_study(
     settings : SamplerSettings, optional
     progress : callable, optional
         Called with what is being done, steps done and steps planned.
+    workers : int
+        Processes for leaving rows out; the numbers do not depend on it.
     """
     began = time.perf_counter()
     results: dict[str, OutputResult | Failure] = {}
     for task in tasks:
         try:
-            results[task.output] = _work_out(task, seed, settings, progress or _silent)
+            results[task.output] = _work_out(task, seed, settings, progress or _silent, workers)
         except Exception as error:  # whatever fails, the other outputs still come
             results[task.output] = Failure(task, f"{type(error).__name__}: {error}")
     return Study(results, seed, time.perf_counter() - began)
@@ -278,7 +302,7 @@ def _silent(what: str, done: int, planned: int) -> None:
 
 
 def _work_out(
-    task: Task, seed: int, settings: SamplerSettings | None, progress: Progress
+    task: Task, seed: int, settings: SamplerSettings | None, progress: Progress, workers: int
 ) -> OutputResult:
     seconds: dict[str, float] = {}
     fitted, held = (
@@ -310,6 +334,7 @@ def _work_out(
             calibration,
             settings=settings,
             progress=lambda done, n: progress(f"{task.output}: leaving rows out", done, n),
+            workers=workers,
         )
     seconds["validate"] = time.perf_counter() - clock
     _, replicated = predictive_draws(

@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from calib.cli import audit, calibration, gap
+from calib.cli import audit, calibration, campaign, gap
 
 __all__ = ["app", "main"]
 
@@ -24,6 +24,7 @@ app = typer.Typer(
 calibration.register(app)
 gap.register(app)
 audit.register(app)
+campaign.register(app)
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calib.cli.parallel import Workers
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def report(
     overwrite: _Overwrite = False,
     pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
     max_steps: _MaxSteps = 25_600,
+    workers: Workers = 1,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from calib.audit import run_audit
@@ -77,7 +79,7 @@ def report(
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
     with progress_bars() as tell:
-        study = run_study(tasks, seed, settings=settings, progress=tell)
+        study = run_study(tasks, seed, settings=settings, progress=tell, workers=workers)
         gaps = () if files else find_gaps(seed, progress=tell)
         # The audit is of the source's tables: beside the user's own data it has no place.
         rut = study.successes.get("rut_depth")
@@ -306,19 +308,7 @@ def _emit(text: str, out: Path | None) -> None:
 def _parse_hold_out(text: str | None) -> HoldOut | None:
     from calib.study import HoldOut
 
-    if text is None:
-        return None
-    column, equals, value = text.partition("=")
-    try:
-        if not equals:
-            raise ValueError
-        return HoldOut(column.strip(), float(value))
-    except ValueError:
-        raise CalibError(
-            f"cannot read --hold-out {text!r}",
-            allowed="COLUMN=VALUE, for instance inflation_pressure_psi=30",
-            mend="name a column with its unit, an equals sign and one number",
-        ) from None
+    return None if text is None else HoldOut.parse(text)
 
 
 def _command() -> list[str]:
