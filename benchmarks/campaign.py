@@ -71,8 +71,7 @@ def overhead(tasks: int, repeats: int) -> dict[str, object]:
         for name, runs in found.items()
     }
     beyond = [
-        (a[0] - b[0], a[1] - b[1])
-        for a, b in zip(per_task["calib"], per_task["dask"], strict=True)
+        (a[0] - b[0], a[1] - b[1]) for a, b in zip(per_task["calib"], per_task["dask"], strict=True)
     ]
     return {
         "tasks": tasks,
