@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from calib.audit import Audit, run_audit
     from calib.calibration import Calibration, calibrate
+    from calib.campaign import read_plan, run_campaign
     from calib.data import Table, hold_out, read_table, table_from_arrays
     from calib.datasets.he2019 import load_he2019
     from calib.errors import CalibError
@@ -30,6 +31,8 @@ _HOME = {
     "run_audit": "calib.audit",
     "Calibration": "calib.calibration",
     "calibrate": "calib.calibration",
+    "read_plan": "calib.campaign",
+    "run_campaign": "calib.campaign",
     "Table": "calib.data",
     "hold_out": "calib.data",
     "read_table": "calib.data",
@@ -79,8 +82,10 @@ __all__ = [
     "load_he2019",
     "predict",
     "read_case",
+    "read_plan",
     "read_table",
     "run_audit",
+    "run_campaign",
     "save_calibration",
     "table_from_arrays",
     "to_datatree",

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import dask
-from distributed import Client, LocalCluster, as_completed
+from distributed import Client, Future, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
 from distributed.utils import silence_logging_cmgr
 
@@ -24,8 +24,11 @@ from calib.tasks.attempt import Finished, attempt, describe
 
 __all__ = ["on_cluster"]
 
-# Tasks at the scheduler at a time: enough for any cluster, few enough for any memory.
-WINDOW = 5000
+# Tasks at the scheduler at a time, and bytes of their items: enough for a large cluster, few enough
+# for a small memory. They are sent in batches, so that the first are at work while others are read.
+WINDOW, BYTES, BATCH = 5000, 400_000_000, 200
+# Items are sent with their tasks, on purpose: the workers have no other way to them.
+_NO_WARNING = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
 # When the worker of a task dies, the task is tried so many times more among the others.
 ALLOWED_FAILURES = 1
 CONNECT_SECONDS = 10
@@ -69,36 +72,13 @@ def _gather[I, R](
     killed: list[str],
 ) -> Iterator[Finished[R]]:
     """Yield tasks as they come, no more than a window of them sent; note those that were killed."""
+    sent = _Sent(client, partial(_call, function), window)
     waiting = iter(names)
-    run, sent = uuid.uuid4().hex, 0
-    out: dict[str, str] = {}
-    coming = as_completed(loop=client.loop, with_results=True, raise_errors=False)
     while True:
-        # The items are sealed, so that Dask does not search them for tasks of its own.
-        sealed: dict[str, bytes] = {}
-        # Many at a time, which costs the scheduler little more than one.
-        room = window - len(out) if len(out) <= window // 2 else 0
-        while len(sealed) < room and (name := next(waiting, None)) is not None:
-            item = attempt(_seal, name, lambda name=name: items[name])  # type: ignore[misc]
-            if item.result is None:
-                yield Finished(name, None, item.error, item.seconds)
-            else:
-                sealed[name] = item.result
-        if sealed:
-            # One prefix for all: the scheduler keeps a queue of them, and workers get few at once.
-            keys = [f"calib-{run}-{sent + i}" for i in range(len(sealed))]
-            call = partial(_call, function)
-            with _connection():
-                futures = client.map(
-                    call, list(sealed), list(sealed.values()), key=keys, pure=False
-                )
-            coming.update(futures)
-            out |= dict(zip(keys, sealed, strict=True))
-            sent += len(sealed)
-        if not out:
+        yield from sent.fill(items, waiting)
+        if not len(sent):
             return
-        for future, result in coming.next_batch():
-            name = out.pop(future.key)
+        for name, future, result in sent.come():
             if future.status == "finished":
                 yield result
             elif future.status != "error":
@@ -109,7 +89,77 @@ def _gather[I, R](
                 yield Finished(name, None, describe(result[1]), 0.0)
 
 
+class _Sent:
+    """The tasks that the scheduler has.
+
+    Parameters
+    ----------
+    client : Client
+    call : callable
+        Called with a name and a sealed item.
+    window : int
+        How many it may have.
+    """
+
+    def __init__(
+        self, client: Client, call: Callable[[str, bytes], Finished[Any]], window: int
+    ) -> None:
+        self._client, self._call, self._window = client, call, window
+        self._coming = as_completed(loop=client.loop, with_results=True, raise_errors=False)
+        # One prefix for all: the scheduler keeps a queue of them, and workers get few at once.
+        self._prefix = f"calib-{uuid.uuid4().hex}"
+        self._number = 0
+        self._out: dict[str, tuple[str, int]] = {}
+        self._bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._out)
+
+    def fill[I](self, items: Mapping[str, I], waiting: Iterator[str]) -> Iterator[Finished[Any]]:
+        """Send tasks off until there is no room for more; yield those whose item cannot be had."""
+        # Not one by one: many cost the scheduler little more than one.
+        if len(self) > self._window // 2 or self._bytes > BYTES // 2:
+            return
+        sealed: dict[str, bytes] = {}
+        size = 0
+        for name in waiting:
+            item = attempt(_seal, name, lambda name=name: items[name])  # type: ignore[misc]
+            if item.result is None:
+                yield Finished(name, None, item.error, item.seconds)
+                continue
+            sealed[name] = item.result
+            size += len(item.result)
+            full = len(self) + len(sealed) >= self._window or self._bytes + size >= BYTES
+            if full or len(sealed) >= BATCH:
+                self._send(sealed)
+                sealed, size = {}, 0
+            if full:
+                return
+        if sealed:
+            self._send(sealed)
+
+    def _send(self, sealed: Mapping[str, bytes]) -> None:
+        keys = [f"{self._prefix}-{self._number + i}" for i in range(len(sealed))]
+        with _connection(), dask.config.set(_NO_WARNING):
+            futures = self._client.map(
+                self._call, list(sealed), list(sealed.values()), key=keys, pure=False
+            )
+        self._coming.update(futures)
+        self._number += len(keys)
+        for key, (name, item) in zip(keys, sealed.items(), strict=True):
+            self._out[key] = name, len(item)
+            self._bytes += len(item)
+
+    def come(self) -> Iterator[tuple[str, Future[Any], Any]]:
+        """Wait for tasks to come to their end; yield name, future and result of each."""
+        for future, result in self._coming.next_batch():
+            name, size = self._out.pop(future.key)
+            self._bytes -= size
+            yield name, future, result
+
+
 def _seal(item: object) -> bytes:
+    """Pickle an item, so that Dask does not search it for tasks of its own."""
     return pickle.dumps(item)
 
 

@@ -133,7 +133,10 @@ def landing_ground[C](landing: Landing[Any, C]) -> Iterator[Callable[[Finished[C
         with _io(folder):
             shutil.rmtree(scratch, ignore_errors=True)
             scratch.mkdir()
-            clock = (folder / SECONDS).open("a", encoding="utf-8")
+            clock = (folder / SECONDS).open("a+", encoding="utf-8")
+            clock.seek(0)
+            if (times := clock.read()) and not times.endswith("\n"):
+                clock.write("\n")  # after a line that a kill has cut short
 
         def land(task: Finished[C]) -> None:
             part = scratch / task.name

@@ -101,9 +101,26 @@ def test_items_that_cannot_be_sent_fail_alone(tmp_path):
 
 
 def test_more_tasks_than_the_scheduler_is_given_at_once(tmp_path, monkeypatch):
-    monkeypatch.setattr(cluster, "WINDOW", 7)
+    most: list[int] = []
+    real = cluster._Sent.come
+
+    def come(sent):
+        most.append(len(sent))
+        return real(sent)
+
+    monkeypatch.setattr(cluster._Sent, "come", come)
     items = {f"t{i}": i for i in range(40)}
-    assert run_tasks(work.draw, items, tmp_path, workers=2).done == tuple(items)
+    for name, value, expected in (("WINDOW", 7, 7), ("BATCH", 3, 7), ("BYTES", 20, 4)):
+        monkeypatch.setattr(cluster, name, value)
+        outcome = run_tasks(work.draw, items, tmp_path / name, workers=2)
+        assert outcome.done == tuple(items)
+        assert max(most) == expected
+        most.clear()
+
+
+def test_many_items_are_sent_without_a_warning(tmp_path):
+    items = {f"t{i}": (bytes(6_000_000), i) for i in range(4)}
+    assert len(run_tasks(work.second, items, tmp_path, workers=2).done) == 4
 
 
 def test_a_worker_that_dies_loses_nothing(tmp_path):

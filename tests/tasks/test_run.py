@@ -163,6 +163,7 @@ def test_leftovers_of_a_kill_do_no_harm(tmp_path):
     outcome = run_tasks(work.draw, ITEMS, tmp_path)
     assert outcome.resumed == ("task-0",)
     assert outcome.seconds["task-0"] == 0.5
+    assert set(outcome.seconds) == set(ITEMS)
     assert names(tmp_path) == ["seconds.csv", *(f"task-{i}.json" for i in range(4))]
 
 

@@ -68,6 +68,10 @@ def slow(item: tuple[int, float]) -> dict[str, int]:
     return {"value": value}
 
 
+def second(item: tuple[bytes, int]) -> dict[str, int]:
+    return {"value": item[1]}
+
+
 def where(item: int) -> dict[str, object]:
     time.sleep(0.05)
     return {"pid": os.getpid(), "threads": os.environ.get("OPENBLAS_NUM_THREADS")}
