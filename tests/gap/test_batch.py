@@ -88,13 +88,13 @@ def test_a_case_that_fails_is_reported_and_leaves_nothing(cases, tmp_path):
 
 
 def test_an_interruption_leaves_no_half_written_folder(cases, tmp_path, monkeypatch):
-    from calib.gap import files
+    from calib.gap import batch
 
     def stop(found, folder):
         (folder / "diagnosis.json").write_text("{")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(files, "write_diagnosis", stop)
+    monkeypatch.setattr(batch, "write_diagnosis", stop)
     with pytest.raises(KeyboardInterrupt):
         diagnose_cases(cases[:1], tmp_path / "out", 1)
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["seconds.csv"]
