@@ -161,7 +161,7 @@ class Mixture:
 
 def adapt(
     log_prob: LogProb,
-    start: StudentT,
+    start: StudentT | Mixture,
     rng: np.random.Generator,
     *,
     size: int = 1500,
@@ -170,18 +170,20 @@ def adapt(
     """Fit a mixture of Student-t to a density by adaptive importance sampling.
 
     Rounds with one component find its location and scale; if that resembles the density, it is
-    kept, otherwise components are split off to follow its bends and tails.
+    kept, otherwise components are split off to follow its bends and tails. Of several modes, each
+    starts as a component and is split at once.
 
     Parameters
     ----------
     log_prob : callable
         ``(k, d) -> (k,)``, unnormalised.
-    start : StudentT
+    start : StudentT or Mixture
+        One component for each known mode.
     rng : Generator
     size : int
         Draws in each round.
     components : int
-        Most components.
+        Components split off at most.
 
     Returns
     -------
@@ -192,9 +194,12 @@ def adapt(
     float
         Effective sample fraction of the last round, in (0, 1].
     """
-    proposal = Mixture(np.ones(1), (start,))
+    proposal = start if isinstance(start, Mixture) else Mixture(np.ones(1), (start,))
     log_evidence, efficiency = -np.inf, 0.0
-    for stage in range(_SINGLE_ROUNDS + _MIXTURE_ROUNDS):
+    split_off = False
+    # Several modes are a mixture from the beginning.
+    first = 0 if len(proposal.components) == 1 else _SINGLE_ROUNDS
+    for stage in range(first, _SINGLE_ROUNDS + _MIXTURE_ROUNDS):
         draws = proposal.sample(rng, size)
         log_weight = log_prob(draws) - proposal.log_prob(draws)
         if not np.isfinite(log_weight).any():
@@ -209,10 +214,10 @@ def adapt(
         last_single = _SINGLE_ROUNDS - 1
         if stage < last_single or (stage == last_single and efficiency > _GOOD):
             proposal = _refit_single(proposal, draws, weight)
-        elif len(proposal.components) == 1:
-            single = _refit_single(proposal, draws, weight)
-            proposal = _split(single.components[0], draws, weight, rng, components)
+        elif not split_off:
+            proposal = _split(proposal, draws, weight, rng, components)
             proposal = _expectation_maximisation(proposal, draws, weight)
+            split_off = True
             size = 2 * size
         else:
             proposal = _expectation_maximisation(proposal, draws, weight)
@@ -252,6 +257,7 @@ def _moments(draws: Array, weight: Array) -> tuple[Array, Array] | None:
 
 
 def _refit_single(proposal: Mixture, draws: Array, weight: Array) -> Mixture:
+    """One component of the weighted draws' mean and covariance."""
     # The scale matrix of a Student-t of this covariance would be (dof - 2)/dof of it; keeping the
     # covariance itself covers the tails at little cost.
     found = _moments(draws, weight)
@@ -261,12 +267,21 @@ def _refit_single(proposal: Mixture, draws: Array, weight: Array) -> Mixture:
 
 
 def _split(
-    single: StudentT, draws: Array, weight: Array, rng: np.random.Generator, most: int
+    proposal: Mixture, draws: Array, weight: Array, rng: np.random.Generator, most: int
 ) -> Mixture:
-    """Spread components over the weighted draws, the broad one kept among them for safety."""
-    centres = draws[rng.choice(weight.size, size=most, p=weight)]
-    parts = tuple(StudentT(c, 0.7 * single.cholesky, single.dof) for c in centres)
-    weights = np.append(np.full(most, (1.0 - _DEFENSIVE) / most), _DEFENSIVE)
+    """Spread components over the weighted draws, a broad one kept among them for safety."""
+    single = _refit_single(proposal, draws, weight).components[0]
+    modes = (single,) if len(proposal.components) == 1 else proposal.components
+    picked = rng.choice(weight.size, size=most, p=weight)
+    # Each is as narrow as the mode to which its centre belongs.
+    near = Mixture(np.ones(len(modes)), modes).log_parts(draws[picked]).argmax(axis=0)
+    parts = [
+        StudentT(draws[i], 0.7 * modes[j].cholesky, single.dof)
+        for i, j in zip(picked, near, strict=True)
+    ]
+    # A mode that no centre was drawn in keeps its own.
+    parts += [m for j, m in enumerate(modes) if j not in near]
+    weights = np.append(np.full(len(parts), (1.0 - _DEFENSIVE) / len(parts)), _DEFENSIVE)
     broad = StudentT(single.mean, 1.3 * single.cholesky, single.dof)
     return Mixture(weights, (*parts, broad))
 

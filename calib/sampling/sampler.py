@@ -14,9 +14,9 @@ from calib.errors import CalibError
 from calib.models.base import Array
 from calib.problem import Problem
 from calib.sampling.gate import Gate, GateReport, judge
-from calib.sampling.mode import find_mode, prior_widths
+from calib.sampling.mode import find_modes
 from calib.sampling.moves import IndependenceMove
-from calib.sampling.proposal import Mixture, StudentT, adapt, hessian_scale
+from calib.sampling.proposal import Mixture, StudentT, adapt
 
 __all__ = ["Draws", "SamplerSettings", "sample_density", "sample_posterior"]
 
@@ -130,15 +130,18 @@ def sample_posterior(
     rng = np.random.default_rng(seeds[0])
     began = time.perf_counter()
     count = _Counter(problem.log_prob)
-    mode = find_mode(count, problem.priors, rng, starts=starts)
-    if not np.isfinite(count(mode[None])[0]):
+    modes = find_modes(count, problem.priors, rng, starts=starts)
+    if not np.isfinite(modes[0].height):
         raise CalibError(
             "no parameter values of positive probability were found",
             where=problem.table.source,
             mend="check that the data's units and the priors' scales fit each other",
         )
-    scale = hessian_scale(count, mode, prior_widths(problem.priors))
-    first = StudentT(mode, np.linalg.cholesky(scale), chosen.dof)
+    parts = [StudentT(m.at, np.linalg.cholesky(m.covariance), chosen.dof) for m in modes]
+    # Laplace's evidence of each mode; none so small that its draws could not correct it.
+    mass = np.array([m.height + 0.5 * np.linalg.slogdet(m.covariance)[1] for m in modes])
+    share = np.maximum(np.exp(mass - mass.max()), 0.05)
+    first = Mixture(share / share.sum(), tuple(parts))
     return sample_density(
         count, first, seeds, problem.names, chosen, rng=rng, progress=progress, began=began
     )
@@ -158,7 +161,7 @@ class _Counter:
 
 def sample_density(
     log_prob: Callable[[Array], Array],
-    first: StudentT,
+    first: StudentT | Mixture,
     seeds: list[np.random.SeedSequence],
     names: tuple[str, ...],
     settings: SamplerSettings,
@@ -173,8 +176,8 @@ def sample_density(
     ----------
     log_prob : callable
         ``(k, d) -> (k,)``, unnormalised.
-    first : StudentT
-        The first guess, for instance from the curvature at the mode.
+    first : StudentT or Mixture
+        The first guess, for instance from the curvature at each mode, the highest first.
     seeds : list of SeedSequence
         One for the adaptation (already used by `rng`) and one for each ensemble.
     names : tuple of str
@@ -208,7 +211,7 @@ def sample_density(
         t=t[:, :, picked],
         log_prob=log_probs[:, :, picked],
         report=report,
-        mode=first.mean,
+        mode=(first.components[0] if isinstance(first, Mixture) else first).mean,
         log_evidence=log_evidence,
         efficiency=efficiency,
         acceptance=float(np.mean([s.acceptance for s in samplers])),

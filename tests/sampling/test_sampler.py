@@ -8,15 +8,17 @@ from __future__ import annotations
 import emcee
 import numpy as np
 import pytest
+from custom_problems import fixed, normal, problem_of
 from scipy import stats
 
+from calib.chains import ess
 from calib.data import Table
 from calib.errors import CalibError
 from calib.problem import build_problem
 from calib.sampling import sampler as sampler_module
 from calib.sampling.sampler import Draws, SamplerSettings, sample_posterior
 
-from .closed_form import assert_distributed, evidence_error, linear, run
+from .closed_form import SIGMAS, assert_distributed, evidence_error, linear, run
 
 QUICK = SamplerSettings(steps=100, max_steps=100, keep=50)
 
@@ -89,6 +91,26 @@ def test_modes_that_are_never_left_are_refused() -> None:
     draws = run(two_modes(8.0), np.array([-8.0, 0.0]), np.eye(2), settings=short)
     assert not draws.report.passed
     assert any("R-hat of x0" in reason for reason in draws.report.reasons)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_distant_modes_come_out_in_their_proportions(seed: int) -> None:
+    """A square tells no sign: modes 80 sd apart, which no local move ever crosses."""
+    slip = np.linspace(0.0, 0.2, 12)
+    pull = 4.0 + 0.05 * np.random.default_rng(3).standard_normal(12)
+    priors = (normal("a", 0.4, 2.0), fixed("sigma", 0.05))
+    problem = problem_of(lambda a, x: a * a + 0.0 * x, priors, slip, pull)
+    draws = sample_posterior(problem, seed)
+    assert draws.report.passed
+    grid = np.concatenate([np.linspace(-2.1, -1.9, 4001), np.linspace(1.9, 2.1, 4001)])[:, None]
+    density = np.exp(problem.log_prob(grid) - problem.log_prob(grid).max())
+    exact = density[4001:].sum() / density.sum()
+    right = (draws.flat[:, 0] > 0.0).astype(float)
+    ensembles, walkers, steps, _ = draws.t.shape
+    size = float(ess(right.reshape(ensembles * walkers, steps, 1), "mean")[0])
+    assert abs(right.mean() - exact) < SIGMAS * np.sqrt(exact * (1.0 - exact) / size)
+    ln_evidence = np.log(density.sum() * 5e-5) + problem.log_prob(grid).max()
+    assert abs(draws.log_evidence - ln_evidence) < SIGMAS * evidence_error(draws)
 
 
 def test_the_numbers_follow_from_the_seed(rut_tables: tuple[Table, Table]) -> None:
