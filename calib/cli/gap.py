@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from calib.cli.parallel import Scheduler, Workers, announce
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -82,7 +83,8 @@ def make(
     seed: _Seed,
     cases: Annotated[int, typer.Option(help="How many.", min=1)] = 300,
     tier: Annotated[Literal["both", "easy", "hard"], typer.Option(help="Difficulty.")] = "both",
-    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 2,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
 ) -> None:
     """Write cases of known cause, and their answers into a sealed key."""
     from calib.challenge.make import make as make_cases
@@ -90,7 +92,7 @@ def make(
 
     with progress_bars() as tell:
         digest = make_cases(
-            out, key, seed=seed, n_cases=cases, workers=workers,
+            out, key, seed=seed, n_cases=cases, workers=workers, scheduler=scheduler,
             tiers=("easy", "hard") if tier == "both" else (tier,),
             progress=lambda done, n: tell("making cases", done, n),
         )  # fmt: skip
@@ -101,7 +103,8 @@ def run(
     folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
     out: Annotated[Path, typer.Option(help="Folder for the diagnoses; resumed if it is there.")],
     seed: _Seed = 1,
-    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 2,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
 ) -> None:
     """Diagnose every case of a folder; run again to resume."""
     from calib.cli.display import progress_bars
@@ -110,7 +113,7 @@ def run(
     cases = case_folders(folder)
     with progress_bars() as tell:
         failed = diagnose_cases(
-            cases, out, seed, workers=workers,
+            cases, out, seed, workers=workers, scheduler=scheduler, announce=announce,
             progress=lambda done, n: tell("diagnosing", done, n),
         )  # fmt: skip
     for name, error in failed.items():
