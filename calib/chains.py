@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.models.base import Array
 
-__all__ = ["ess", "hdi", "psis", "rhat"]
+__all__ = ["ess", "hdi", "power_scaled_weights", "power_sensitivity", "psis", "rhat"]
 
 
 def _stats() -> Any:
@@ -54,3 +54,47 @@ def psis(log_ratio: Array) -> tuple[Array, Array]:
     # ArviZ takes log likelihoods, of which it forms the ratios of leave-one-out itself.
     log_weight, k = _stats().psislw(-log_ratio)
     return np.asarray(log_weight), np.asarray(k)
+
+
+def power_scaled_weights(log_density: Array, alpha: float) -> Array:
+    """Smoothed weights that raise a part of the density to a power.
+
+    Parameters
+    ----------
+    log_density : ndarray, shape (chains, draws)
+        Of the prior, or of the likelihood, at each draw.
+    alpha : float
+        The power.
+
+    Returns
+    -------
+    ndarray, shape (chains, draws)
+        Of sum one.
+
+    References
+    ----------
+    Kallioinen et al. (2024), doi:10.1007/s11222-023-10366-5.
+    """
+    log_weight = np.asarray(_stats().power_scale_lw(log_density, alpha=alpha, axis=(0, 1)))
+    weight = np.exp(log_weight - log_weight.max())
+    return np.asarray(weight / weight.sum())
+
+
+def power_sensitivity(
+    draws: Array, weights: tuple[Array, Array], alphas: tuple[float, float]
+) -> float:
+    """Distance that a marginal moves per doubling of the power.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (chains, draws)
+    weights : tuple of ndarray
+        For the lower and for the upper power.
+    alphas : tuple of float
+        The two powers.
+    """
+    lower, upper = weights
+    value = _stats().power_scale_sense(
+        draws, lower, upper, lower_alpha=alphas[0], upper_alpha=alphas[1]
+    )
+    return float(value)

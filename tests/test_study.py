@@ -252,6 +252,11 @@ def test_the_summary_carries_what_was_promised(study: Study) -> None:
             found = entry["posterior"][parameter]
             for name in ("mean", "sd", "hdi_lower", "hdi_upper", "ess_bulk", "ess_tail", "rhat"):
                 assert found[name] == getattr(s, name)
+        sensitivity = entry["prior_sensitivity"]["parameters"]
+        assert set(sensitivity) == set(entry["posterior"])
+        for parameter, reaction in result.sensitivity.items():
+            assert sensitivity[parameter]["prior"] == reaction.prior
+            assert sensitivity[parameter]["identified"] is reaction.identified
         assert set(entry["validation"]["coverage"]) == {"50", "90", "95"}
         scores = result.validation.scores
         for name in ("n", "rmse", "crps", "max_relative_error"):
