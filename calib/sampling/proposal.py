@@ -166,7 +166,7 @@ class Proposal:
         """Log density, shape (k, d) to (k,)."""
         v, log_jacobian = self.straightener.straighten(t)
         straight = self.mixture.log_prob(v) + log_jacobian + np.log1p(-self.share)
-        return np.logaddexp(straight, self.broad.log_prob(t) + np.log(self.share))
+        return np.asarray(np.logaddexp(straight, self.broad.log_prob(t) + np.log(self.share)))
 
 
 type AnyProposal = Mixture | Proposal
@@ -407,11 +407,8 @@ def _fit_mixture(
     m = int(np.clip(effective / (_DRAWS_PER_COMPONENT * d), 1, _MOST_COMPONENTS))
     # In coordinates where the draws have no correlation and unit variance.
     x = np.linalg.solve(cholesky, (v - mean).T).T
-    if m == 1:
-        parts = (StudentT(np.zeros(d), np.eye(d), _DOFS[2]),)
-    else:
-        centres = x[rng.choice(weight.size, size=m, p=weight)]
-        parts = tuple(StudentT(c, 0.7 * np.eye(d), _DOFS[2]) for c in centres)
+    centres = x[rng.choice(weight.size, size=m, p=weight)] if m > 1 else np.zeros((1, d))
+    parts = tuple(StudentT(c, (0.7 if m > 1 else 1.0) * np.eye(d), _DOFS[2]) for c in centres)
     fitted = Mixture(np.full(m, 1.0 / m), parts)
     for step in range(_EM_STEPS):
         choose_dof = step in (_EM_STEPS // 2 - 1, _EM_STEPS - 1)
