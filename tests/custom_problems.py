@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from calib.data import table_from_arrays
-from calib.models.base import Model, columns
+from calib.models.base import Model
 from calib.priors import Prior, Priors
 from calib.problem import Problem
 
@@ -25,15 +25,14 @@ def fixed(name: str, value: float) -> Prior:
 def problem_of(
     function: Callable[..., Array], priors: Sequence[Prior], slip: Array, pull: Array
 ) -> Problem:
-    """A problem of pull against slip; `function` takes the parameters (k, 1) each, then slip.
+    """A problem of pull against slip; `function` takes each parameter, then slip, broadcast.
 
     The last prior is that of sigma.
     """
 
-    def location(theta, conditions, references):
-        parts = theta if isinstance(theta, tuple) else columns(theta)
-        value = function(*parts, conditions["slip_ratio"])
-        return np.broadcast_to(value, np.broadcast_shapes(value.shape, parts[0].shape))
+    def location(columns, rows, references, work=None):
+        # A new array, which the sum of squares is worked out in.
+        return np.array(function(*columns, rows["slip_ratio"]))
 
     names = tuple(p.name for p in priors)[:-1]
     model = Model(

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.models.base import Array, Conditions, Model, References, columns
+from calib.models.base import Array, Columns, Conditions, Model, References, Rows
 
 __all__ = ["AYERS_PERUMPRAL", "AYERS_PERUMPRAL_VOLUMETRIC", "bulk_density"]
 
@@ -47,12 +47,31 @@ def _ln_water_term(water: Array | float, C2: Array, C3: Array) -> Array:
     return np.asarray(np.log(C2 + (water - C3) ** 2))
 
 
-def _location(theta: Array, conditions: Conditions, references: References) -> Array:
-    gamma_ref, C2, C3, C4 = columns(theta)
-    ln_index = np.log(conditions["cone_index_kpa"] / references["ci_ref_kpa"])
-    water = conditions["gravimetric_water_content"]
-    drier = _ln_water_term(water, C2, C3) - _ln_water_term(references["water_ref"], C2, C3)
-    return np.asarray(gamma_ref * np.exp((ln_index + drier) / C4))
+def _ln_index(conditions: Conditions, references: References) -> Array:
+    return np.asarray(np.log(conditions["cone_index_kpa"] / references["ci_ref_kpa"]))
+
+
+def _prepare(conditions: Conditions, references: References) -> Rows:
+    return {
+        "ln_index": _ln_index(conditions, references),
+        "water": conditions["gravimetric_water_content"],
+    }
+
+
+def _location(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+    gamma_ref, C2, C3, C4 = columns
+    # gamma_ref exp{(ln_index + ln(C2 + (water - C3)^2) - the same at water_ref)/C4}, in place.
+    x: Array = work[0]
+    np.subtract(rows["water"], C3, out=x)
+    x *= x
+    x += C2
+    np.log(x, out=x)
+    x += rows["ln_index"]
+    x -= _ln_water_term(references["water_ref"], C2, C3)
+    x *= 1.0 / C4
+    np.exp(x, out=x)
+    x *= gamma_ref
+    return x
 
 
 def _report(theta: Array, references: References) -> dict[str, Array]:
@@ -87,13 +106,20 @@ def _references_volumetric(conditions: Conditions) -> dict[str, float]:
     }
 
 
-def _location_volumetric(theta: Array, conditions: Conditions, references: References) -> Array:
-    gamma_ref, A2, A3, A4 = columns(theta)
-    ln_index = np.log(conditions["cone_index_kpa"] / references["ci_ref_kpa"])
-    water = conditions["volumetric_water_content"]
+def _prepare_volumetric(conditions: Conditions, references: References) -> Rows:
+    return {
+        "ln_index": _ln_index(conditions, references),
+        "water": conditions["volumetric_water_content"],
+    }
+
+
+def _location_volumetric(
+    columns: Columns, rows: Rows, references: References, work: Array
+) -> Array:
+    gamma_ref, A2, A3, A4 = columns
     ln_ref = np.log(gamma_ref)
-    target = A2 * ln_ref + ln_index - _ln_water_term(references["water_ref"] / gamma_ref, A3, A4)
-    return np.exp(_solve_ln_density(target, water, A2, A3, A4))
+    target = A2 * ln_ref - _ln_water_term(references["water_ref"] / gamma_ref, A3, A4)
+    return np.exp(_solve_ln_density(rows["ln_index"] + target, rows["water"], A2, A3, A4))
 
 
 def _solve_ln_density(target: Array, water: Array, A2: Array, A3: Array, A4: Array) -> Array:
@@ -102,38 +128,28 @@ def _solve_ln_density(target: Array, water: Array, A2: Array, A3: Array, A4: Arr
     Newton's method kept inside a shrinking bracket, all roots at once; NaN where the bracket
     of 0.1 to 5 g/cm^3 holds no sign change.
     """
-    shape = np.broadcast_shapes(target.shape, water.shape)
-    given = [np.broadcast_to(a, shape).ravel() for a in (target, water, A2, A3, A4)]
-    root = np.full(given[0].size, np.nan)
-    low, high = (np.full(root.size, end) for end in _LN_DENSITY_BRACKET)
-    solvable = (_excess(low, *given)[0] < 0.0) & (_excess(high, *given)[0] > 0.0)
-    # Only what has not converged is worked on; most roots need six steps, a few need forty.
-    left = np.flatnonzero(solvable)
-    low, high, *given = (a[left] for a in (low, high, *given))
-    x = np.zeros(left.size)
+    low = np.full(np.broadcast_shapes(target.shape, water.shape), _LN_DENSITY_BRACKET[0])
+    high = np.full_like(low, _LN_DENSITY_BRACKET[1])
+
+    def excess(x: Array) -> tuple[Array, Array]:
+        w = water * np.exp(-x)
+        offset = w - A4
+        denominator = A3 + offset**2
+        return A2 * x - np.log(denominator) - target, A2 + 2.0 * offset * w / denominator
+
+    solvable = (excess(low)[0] < 0.0) & (excess(high)[0] > 0.0)
+    x = np.zeros_like(low)
     for _ in range(_MAX_ITERATIONS):
-        value, slope = _excess(x, *given)
+        value, slope = excess(x)
         low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
         step = x - value / slope
+        # Converged, the step ends on the bracket's edge, where x is.
         new = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
-        going = np.abs(new - x) > 1e-13
-        root[left] = x = new
-        if not going.any():
+        moved = np.abs(new - x)
+        x = new
+        if not np.any(moved[solvable] > 1e-13):
             break
-        if np.count_nonzero(going) < 0.7 * going.size:
-            left = left[going]
-            x, low, high, *given = (a[going] for a in (x, low, high, *given))
-    return root.reshape(shape)
-
-
-def _excess(
-    x: Array, target: Array, water: Array, A2: Array, A3: Array, A4: Array
-) -> tuple[Array, Array]:
-    """Left side of the equation less its right side, and its slope in x."""
-    w = water * np.exp(-x)
-    offset = w - A4
-    denominator = A3 + offset**2
-    return A2 * x - np.log(denominator) - target, A2 + 2.0 * offset * w / denominator
+    return np.where(solvable, x, np.nan)
 
 
 def _report_volumetric(theta: Array, references: References) -> dict[str, Array]:
@@ -166,6 +182,7 @@ AYERS_PERUMPRAL = Model(
     report_theta=_report,
     theta_from_reported=_from_reported,
     bind_references=_references,
+    prepare=_prepare,
 )
 
 AYERS_PERUMPRAL_VOLUMETRIC = Model(
@@ -181,4 +198,5 @@ AYERS_PERUMPRAL_VOLUMETRIC = Model(
     report_theta=_report_volumetric,
     theta_from_reported=_from_reported_volumetric,
     bind_references=_references_volumetric,
+    prepare=_prepare_volumetric,
 )

@@ -1,4 +1,4 @@
-"""Find the posterior's modes from point estimates and prior draws."""
+"""Find the modes of a posterior from point estimates and prior draws."""
 
 from __future__ import annotations
 
@@ -11,34 +11,15 @@ from scipy.optimize import minimize
 from calib.models.base import Array
 from calib.priors import Priors
 from calib.sampling.climb import climb
-from calib.sampling.proposal import hessian_scale
+from calib.sampling.curvature import hessian_scale
 
-__all__ = ["DEPTH", "Mode", "find_mode", "find_modes", "prior_widths"]
+__all__ = ["Mode", "find_mode", "find_modes", "prior_widths"]
 
-# Modes lower than the highest by this in log density are left out: a hundred times as wide, they
-# would still hold less than a thousandth of the posterior.
-DEPTH = 12.0
-# Points within this many standard deviations, per square root of the dimension, share a mode.
-_NEAR = 1.5
 _WORST = 1e12
-
-
-@dataclass(frozen=True)
-class Mode:
-    """A local maximum of a log density.
-
-    Parameters
-    ----------
-    at : ndarray, shape (d,)
-    height : float
-        Log density there.
-    covariance : ndarray, shape (d, d)
-        Of the normal approximation there.
-    """
-
-    at: Array
-    height: float
-    covariance: Array
+_MOST_POLISHED = 6
+# Modes so many nats below the highest hold no mass worth finding; squared standard distances up to
+# this are no distance.
+_NEGLIGIBLE, _NEAR = 15.0, 25.0
 
 
 def prior_widths(priors: Priors) -> Array:
@@ -54,13 +35,44 @@ def find_mode(
     rng: np.random.Generator,
     *,
     starts: Array | None = None,
-    n_polish: int = 4,
+    n_screen: int = 400,
+    n_climb: int = 16,
 ) -> Array:
     """Return the highest mode of a posterior in internal coordinates, shape (d,).
 
-    Parameters are those of `find_modes`.
+    Parameters
+    ----------
+    log_prob, priors, rng, starts, n_screen, n_climb
+        As for `find_modes`.
     """
-    return find_modes(log_prob, priors, rng, starts=starts, n_polish=n_polish)[0].at
+    modes = find_modes(log_prob, priors, rng, starts=starts, n_screen=n_screen, n_climb=n_climb)
+    return modes[0].t
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A mode of a posterior.
+
+    Parameters
+    ----------
+    t : ndarray, shape (d,)
+    log_prob : float
+    covariance : ndarray, shape (d, d)
+        Of the normal with the curvature there.
+    """
+
+    t: Array
+    log_prob: float
+    covariance: Array
+
+    def explains(self, t: Array, log_prob: float) -> bool:
+        """Whether a point may well belong here: no farther off than its density lets expect.
+
+        For a normal density the squared distance would be twice what the log density lacks.
+        """
+        apart = t - self.t
+        squared = float(apart @ np.linalg.solve(self.covariance, apart))
+        return squared < 4.0 * max(self.log_prob - log_prob, 0.0) + _NEAR
 
 
 def find_modes(
@@ -71,13 +83,13 @@ def find_modes(
     starts: Array | None = None,
     n_screen: int = 400,
     n_climb: int = 16,
-    n_polish: int = 4,
 ) -> list[Mode]:
-    """Return the modes of a posterior that matter, the highest first.
+    """Return the modes of a posterior that were found, the highest first.
 
     The given starts and the best of each group of prior draws climb together, a batch of
-    quasi-Newton ascents in one call per step; where they end apart, each end is polished by
-    L-BFGS-B. A sampler that knows one mode only may miss another whatever its own diagnostics say.
+    quasi-Newton ascents. The highest is polished by L-BFGS-B, with gradients by central
+    differences; so is each of the others that neither lies in its neighbourhood nor far below it.
+    A sampler that knows one mode only may miss another whatever its own diagnostics say.
 
     Parameters
     ----------
@@ -87,54 +99,61 @@ def find_modes(
     rng : Generator
     starts : ndarray, shape (m, d), optional
         Point estimates, in internal coordinates.
-    n_screen, n_climb, n_polish : int
-        Prior draws screened, how many of them climb, and how many ends are polished at most.
-
-    Returns
-    -------
-    list of Mode
-        Those within `DEPTH` of the highest in log density; where no allowed point was found, one
-        of height ``-inf``.
+    n_screen, n_climb : int
+        Prior draws screened, and how many of them climb.
     """
     width = prior_widths(priors)
-    lower = np.array([p.lower for p in priors.free])
-    upper = np.array([p.upper for p in priors.free])
+    ends, values = climb(
+        log_prob, _starts(log_prob, priors, rng, starts, n_screen, n_climb), width, *_bounds(priors)
+    )
+    modes: list[Mode] = []
+    polished = 0
+    for i in np.argsort(-values):
+        t, value = ends[i], float(values[i])
+        if polished == _MOST_POLISHED or (
+            modes
+            and (
+                modes[0].log_prob - value > _NEGLIGIBLE or any(m.explains(t, value) for m in modes)
+            )
+        ):
+            continue
+        top, end = _polish(log_prob, t, priors)
+        polished += 1
+        if top <= -_WORST:
+            # Nowhere is the density positive: the caller will see.
+            modes.append(Mode(end, -np.inf, np.diag(width**2)))
+        elif not any(m.explains(end, top) for m in modes):
+            modes.append(Mode(end, top, hessian_scale(log_prob, end, width)))
+    return sorted(modes, key=lambda mode: -mode.log_prob)
+
+
+def _starts(
+    log_prob: Callable[[Array], Array],
+    priors: Priors,
+    rng: np.random.Generator,
+    starts: Array | None,
+    n_screen: int,
+    n_climb: int,
+) -> Array:
     pool = priors.sample(rng, n_screen)
     value = log_prob(pool)
     # The best of each group rather than the best of all, which may share one basin.
     groups = np.array_split(np.arange(n_screen), n_climb)
     picked = pool[[group[value[group].argmax()] for group in groups]]
-    candidates = picked if starts is None else np.concatenate([np.atleast_2d(starts), picked])
-    ends, heights = climb(log_prob, candidates, width, lower, upper)
-    modes: list[Mode] = []
-    for i in np.argsort(-heights)[: 4 * n_polish]:
-        deep = modes and heights[i] < max(m.height for m in modes) - DEPTH
-        if len(modes) == n_polish or deep or heights[i] <= -_WORST:
-            break
-        if any(_near(ends[i], mode) for mode in modes):
-            continue
-        height, at = _polish(log_prob, ends[i], width, lower, upper)
-        if not any(_near(at, mode) for mode in modes):
-            modes.append(Mode(at, height, hessian_scale(log_prob, at, width)))
-    if not modes:
-        return [Mode(ends[0], -np.inf, np.diag(width**2))]
-    modes.sort(key=lambda mode: -mode.height)
-    return [mode for mode in modes if mode.height > modes[0].height - DEPTH]
+    return picked if starts is None else np.concatenate([np.atleast_2d(starts), picked])
 
 
-def _near(x: Array, mode: Mode) -> bool:
-    """Whether a point lies in the bulk that a mode's curvature describes."""
-    away = x - mode.at
-    return float(away @ np.linalg.solve(mode.covariance, away)) < _NEAR**2 * away.size
+def _bounds(priors: Priors) -> tuple[Array, Array]:
+    return np.array([p.lower for p in priors.free]), np.array([p.upper for p in priors.free])
 
 
 def _polish(
-    log_prob: Callable[[Array], Array], start: Array, width: Array, lower: Array, upper: Array
+    log_prob: Callable[[Array], Array], start: Array, priors: Priors
 ) -> tuple[float, Array]:
-    d = start.size
+    d, width = start.size, prior_widths(priors)
     step = 1e-5
     directions = np.concatenate([np.zeros((1, d)), step * np.eye(d), -step * np.eye(d)])
-    low, high = (lower - start) / width, (upper - start) / width
+    low, high = ((bound - start) / width for bound in _bounds(priors))
 
     def negative(z: Array) -> tuple[float, Array]:
         # One-sided at a bound: the outer point is pulled back onto it.

@@ -9,7 +9,7 @@ from scipy import stats
 from calib.data import Table
 from calib.priors import Prior, Priors
 from calib.problem import build_problem
-from calib.sampling.mode import DEPTH, find_mode, find_modes, prior_widths
+from calib.sampling.mode import find_mode, find_modes, prior_widths
 
 
 def box(*bounds: tuple[float, float]) -> Priors:
@@ -98,14 +98,14 @@ def test_both_of_two_modes_are_found(seed: int) -> None:
     log_prob = inside(priors, two_modes(5.0))
     found = find_modes(log_prob, priors, np.random.default_rng(seed))
     assert len(found) == 2
-    np.testing.assert_allclose([m.at for m in found], [[-3.0] * 4, [3.0] * 4], atol=1e-2)
-    np.testing.assert_allclose([m.height for m in found], [0.0, -5.0], atol=1e-3)
+    np.testing.assert_allclose([m.t for m in found], [[-3.0] * 4, [3.0] * 4], atol=1e-2)
+    np.testing.assert_allclose([m.log_prob for m in found], [0.0, -5.0], atol=1e-3)
     np.testing.assert_allclose(found[1].covariance, 0.0225 * np.eye(4), atol=1e-4)
 
 
 def test_a_mode_too_low_to_matter_is_left_out() -> None:
     priors = box(*[(-10.0, 10.0)] * 4)
-    log_prob = inside(priors, two_modes(DEPTH + 1.0))
+    log_prob = inside(priors, two_modes(20.0))
     assert len(find_modes(log_prob, priors, np.random.default_rng(1))) == 1
 
 
