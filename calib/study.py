@@ -26,6 +26,7 @@ from calib.prediction import predictive_draws
 from calib.prior_files import prior_file_model
 from calib.problem import Problem, build_problem
 from calib.sampling.sampler import SamplerSettings
+from calib.sensitivity import Sensitivity, prior_sensitivity
 from calib.streams import generator
 from calib.validate import Validation, leave_one_out, validate_held_out
 
@@ -120,6 +121,8 @@ class OutputResult:
     posterior_predictive : ndarray, shape (draws, n)
     seconds : mapping of str to float
         Of each stage.
+    sensitivity : mapping of str to Sensitivity
+        Of each parameter to prior and data.
     """
 
     task: Task
@@ -130,6 +133,7 @@ class OutputResult:
     prior_predictive: Array
     posterior_predictive: Array
     seconds: Mapping[str, float] = field(default_factory=dict)
+    sensitivity: Mapping[str, Sensitivity] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -349,6 +353,7 @@ def _work_out(
         _prior_predictive(problem, generator(seed, task.output, "prior")),
         replicated,
         seconds,
+        prior_sensitivity(calibration),
     )
 
 

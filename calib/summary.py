@@ -11,6 +11,7 @@ from calib.calibration import Calibration
 from calib.estimators import PointEstimate
 from calib.models.base import Array
 from calib.scores import Scores
+from calib.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 from calib.study import OutputResult, Study
 
 __all__ = ["SCHEMA", "summarise"]
@@ -22,7 +23,8 @@ def summarise(study: Study) -> dict[str, Any]:
     """Return a study's numbers as plain dictionaries.
 
     Keys under ``models.<output>``: ``estimates.<method>.<parameter>``, ``fit.<method>``,
-    ``posterior.<parameter>``, ``validation``, ``sampling``; a failed output has ``error`` alone.
+    ``posterior.<parameter>``, ``prior_sensitivity``, ``validation``, ``sampling``; a failed output
+    has ``error`` alone.
     """
     models: dict[str, Any] = {k: _output(r) for k, r in study.successes.items()}
     models |= {k: {"model": f.task.model, "error": f.error} for k, f in study.failures.items()}
@@ -69,6 +71,7 @@ def _output(result: OutputResult) -> dict[str, Any]:
             for p in problem.priors.entries
         },
         "posterior": _posterior(result.calibration),
+        "prior_sensitivity": _sensitivity(result),
         "validation": _validation(result),
         "sampling": _sampling(result.calibration),
     }
@@ -114,6 +117,25 @@ def _posterior(calibration: Calibration) -> dict[str, Any]:
             "posterior_to_prior_sd": s.sd_ratio,
         }
         for name, s in calibration.summary.items()
+    }
+
+
+def _sensitivity(result: OutputResult) -> dict[str, Any]:
+    return {
+        "criteria": {
+            "contraction_at_least": CONTRACTION_MIN,
+            "power_scaling_threshold": SENSITIVITY_MIN,
+        },
+        "parameters": {
+            name: {
+                "contraction": s.contraction,
+                "prior": s.prior,
+                "likelihood": s.likelihood,
+                "identified": s.identified,
+                "reading": s.reading,
+            }
+            for name, s in result.sensitivity.items()
+        },
     }
 
 

@@ -265,6 +265,11 @@ def test_the_summary_carries_what_was_promised(study: Study) -> None:
             values = result.calibration.problem.table[name]
             assert (found["lower"], found["upper"]) == (values.min(), values.max())
             assert found["distinct"] == len(set(values.tolist()))
+        sensitivity = entry["prior_sensitivity"]["parameters"]
+        assert set(sensitivity) == set(entry["posterior"])
+        for parameter, reaction in result.sensitivity.items():
+            assert sensitivity[parameter]["prior"] == reaction.prior
+            assert sensitivity[parameter]["identified"] is reaction.identified
         assert set(entry["validation"]["coverage"]) == {"50", "90", "95"}
         scores = result.validation.scores
         for name in ("n", "rmse", "crps", "max_relative_error"):

@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from calib.cli import audit, calibration, campaign, gap
+from calib.cli import audit, calibration, campaign, gap, sbc
 
 __all__ = ["app", "main"]
 
@@ -25,6 +25,7 @@ calibration.register(app)
 gap.register(app)
 audit.register(app)
 campaign.register(app)
+sbc.register(app)
 
 
 def main() -> None:

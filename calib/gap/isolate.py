@@ -19,8 +19,8 @@ from calib.gap.fit import Noise
 from calib.gap.forward import Forward, Hypothesis
 from calib.gap.hypotheses import LN_PRIOR
 from calib.models.base import Array
+from calib.sampling.curvature import hessian_scale
 from calib.sampling.mode import prior_widths
-from calib.sampling.proposal import hessian_scale
 from calib.streams import generator
 
 __all__ = ["Isolability", "isolability"]

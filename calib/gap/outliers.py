@@ -112,7 +112,7 @@ def _lab_residuals(data: Campaigns, output: str, seed: int) -> Array:
     """Residuals of the laboratory fit in robust sds, shape (n,)."""
     problem = next(o for o in data.outputs if o.name == output).problem
     mode = find_mode(
-        problem.log_prob, problem.priors, generator(seed, "gap", "outliers", output), n_polish=1
+        problem.log_prob, problem.priors, generator(seed, "gap", "outliers", output), n_climb=8
     )
     location = problem.bound.location(problem.theta(mode[None])[:, :-1], problem.conditions)[0]
     residual = problem.response - location

@@ -162,7 +162,7 @@ def _calibrate_lab(data: Campaigns, seed: int) -> tuple[dict[str, Array], dict[s
     modes, noise = {}, {}
     for o in data.outputs:
         rng = generator(seed, "gap", "lab", o.name)
-        mode = find_mode(o.problem.log_prob, o.problem.priors, rng, n_polish=3)
+        mode = find_mode(o.problem.log_prob, o.problem.priors, rng, n_climb=8)
         modes[o.name] = mode[:-1]
         sigma = float(o.problem.theta(mode[None])[0, -1])
         noise[o.name] = Noise(sigma, 0.0)

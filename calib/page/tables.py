@@ -17,11 +17,15 @@ from calib.figures.roles import role
 from calib.numbers import NOTHING, format_as_printed, format_like, format_number
 from calib.page.equations import symbol_html, unit_html
 from calib.posterior_text import centre_text, interval_text, skewed
+from calib.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 from calib.study import OutputResult
 
-__all__ = ["Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows"]
+__all__ = [
+    "Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows", "sensitivity_grid",
+]  # fmt: skip
 
 _TICK = "\N{CHECK MARK}"
+_MINUS = "\N{MINUS SIGN}"
 
 
 @dataclass(frozen=True)
@@ -75,6 +79,35 @@ def posterior_rows(result: OutputResult) -> list[dict[str, Any]]:
         }
         for s in calibration.summary.values()
     ]
+
+
+def sensitivity_grid(result: OutputResult) -> Grid:
+    """What each parameter owes to the prior, what to the data, and which are not identified."""
+    found = result.sensitivity
+    unknown = [symbol_html(name) for name, s in found.items() if not s.identified]
+    said = (
+        Markup("Not identified by these data: {}.").format(Markup(", ").join(unknown))
+        if unknown
+        else "Every parameter is identified by these data."
+    )
+    rows = [
+        [
+            symbol_html(name), format_number(s.contraction, 2), format_number(s.prior, 2),
+            format_number(s.likelihood, 2),
+            s.reading if s.identified else Markup("<strong>{}</strong>").format(s.reading),
+        ]
+        for name, s in found.items()
+    ]  # fmt: skip
+    head = ["Parameter", "Contraction", "Reacts to prior", "Reacts to data", "Identified by"]
+    notes = [
+        f"A parameter is not identified if its contraction, 1 {_MINUS} (posterior variance)/(prior "
+        f"variance), is below {CONTRACTION_MIN:g}, or if it reacts to the prior (at least "
+        f"{SENSITIVITY_MIN:g}) and not to the data (less).",
+        "Reacts to: how far its posterior moves per doubling of the power of the prior, or of the "
+        "likelihood (cumulative Jensen-Shannon distance; Kallioinen et al. 2024, "
+        "doi:10.1007/s11222-023-10366-5).",
+    ]
+    return Grid(said, head, rows, [], notes)
 
 
 def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:

@@ -12,8 +12,8 @@ from calib.gap.diagnose import Diagnosis, diagnose
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.paper_gaps.cases import PaperGap, paper_gaps
-from calib.sampling.mode import find_mode, prior_widths
-from calib.sampling.proposal import StudentT, adapt, hessian_scale
+from calib.sampling.mode import find_modes
+from calib.sampling.proposal import Guess, adapt
 from calib.streams import generator
 
 __all__ = ["FoundGap", "Unfitted", "find_gaps", "simulator_sd", "unfitted_errors"]
@@ -21,7 +21,6 @@ __all__ = ["FoundGap", "Unfitted", "find_gaps", "simulator_sd", "unfitted_errors
 _N_DRAWS = 20_000
 # Fewer effective draws do not give an sd to 5 %.
 _LEAST_ESS = 400.0
-_DOF = 5.0
 
 type Progress = Callable[[str, int, int], None]
 
@@ -131,9 +130,9 @@ def simulator_sd(found: Diagnosis) -> Array:
     o = found.data.outputs[0]
     rng = generator(found.seed, "paper gaps", "simulator", o.name)
     log_prob, priors = o.problem.log_prob, o.problem.priors
-    mode = find_mode(log_prob, priors, rng, n_polish=3)
-    scale = np.linalg.cholesky(hessian_scale(log_prob, mode, prior_widths(priors)))
-    proposal, _, _ = adapt(log_prob, StudentT(mode, scale, _DOF), rng)
+    modes = find_modes(log_prob, priors, rng)
+    guesses = [Guess(m.t, np.linalg.cholesky(m.covariance)) for m in modes]
+    proposal, _ = adapt(log_prob, guesses, rng)
     drawn = proposal.sample(rng, _N_DRAWS)
     log_weight = log_prob(drawn) - proposal.log_prob(drawn)
     weight = np.exp(log_weight - logsumexp(log_weight))

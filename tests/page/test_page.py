@@ -17,7 +17,7 @@ from calib.page import render_page
 from calib.page.content import failed_section, png_size
 from calib.page.equations import equation, parametrisation, prose, symbol_html, unit_html
 from calib.page.facts import repeats_words, validation_facts
-from calib.page.tables import estimates_grid, posterior_rows, pressure_grids
+from calib.page.tables import estimates_grid, posterior_rows, pressure_grids, sensitivity_grid
 from calib.study import Failure, Study
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\x00\x02\x00\x00\x00\x03\x08\x06\x00\x00\x00rest"
@@ -131,6 +131,19 @@ def test_measured_data_are_not_called_reconstructed(plate):
     html, reader = page({"rut_depth": plate}, reconstructed=False)
     assert "econstructed" not in html
     assert "Table 6" not in reader.text
+
+
+def test_parameters_that_are_not_identified_are_named(whole, drawbar, rut):
+    html, reader = whole
+    assert html.count("<h4>What the prior decides</h4>") == 3
+    start = reader.text.index("Not identified by these data: c1, c2,")
+    named = reader.text[start : reader.text.index(".", start)]
+    assert "bend" in named
+    assert "sigma" not in named
+    rows = {str(row[0]): row for row in sensitivity_grid(drawbar).rows}
+    assert "not identified" in rows[str(symbol_html("K_bend"))][-1]
+    assert rows[str(symbol_html("D_lo"))][-1] == "data"
+    assert sensitivity_grid(rut).caption == "Every parameter is identified by these data."
 
 
 def test_a_failed_output_is_shown_and_the_rest_still_comes(rut):
