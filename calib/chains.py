@@ -121,6 +121,8 @@ def autocorrelation_time(chain: Array, c: float = 5.0) -> Array:
         x = chain[..., j] - chain[..., j].mean(axis=1, keepdims=True)
         spectrum = rfft(x, n=size, axis=1)
         covariance = irfft(spectrum.real**2 + spectrum.imag**2, n=size, axis=1)[:, :steps]
+        # Of a walker that never moved, what the mean leaves is rounding.
+        covariance[np.ptp(chain[..., j], axis=1) == 0.0] = 0.0
         with np.errstate(invalid="ignore"):
             taus = 2.0 * np.cumsum((covariance / covariance[:, :1]).mean(axis=0)) - 1.0
         inside = np.arange(steps) < c * taus

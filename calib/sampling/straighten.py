@@ -63,8 +63,8 @@ class Straightener:
         d = t.shape[1]
         mean = weight @ t
         sd = np.sqrt(weight @ np.square(t - mean))
-        if not (np.isfinite(sd).all() and (sd > 0.0).all()):
-            raise np.linalg.LinAlgError
+        if not (np.isfinite(sd).all() and (sd > 1e-12 * (1.0 + abs(mean))).all()):
+            raise np.linalg.LinAlgError("the draws have no spread")
         z = ((t - mean) / sd)[:, ::-1]
         features = _features(z)
         effective = 1.0 / np.square(weight).sum()

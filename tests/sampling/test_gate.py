@@ -105,9 +105,9 @@ def test_the_limits_are_those_of_the_gate() -> None:
 def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.MonkeyPatch) -> None:
     from calib.sampling import sampler as module
 
-    chain = module._Ensemble.chain
+    chain = module.Ensemble.chain
     made: list[object] = []
-    init = module._Ensemble.__init__
+    init = module.Ensemble.__init__
 
     def remember(self, *args, **kwargs):
         init(self, *args, **kwargs)
@@ -117,8 +117,8 @@ def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.Monkey
         kept = chain(self, target)
         return np.repeat(kept[:, :1], target, axis=1) if self is made[1] else kept
 
-    monkeypatch.setattr(module._Ensemble, "__init__", remember)
-    monkeypatch.setattr(module._Ensemble, "chain", stuck)
+    monkeypatch.setattr(module.Ensemble, "__init__", remember)
+    monkeypatch.setattr(module.Ensemble, "chain", stuck)
     settings = SamplerSettings(max_steps=200)
     draws = run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=settings)
     assert len(made) == 4
