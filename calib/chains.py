@@ -17,7 +17,7 @@ from scipy.special import ndtri
 
 from calib.models.base import Array
 
-__all__ = ["Convergence", "autocorrelation_time", "convergence", "ess", "hdi", "psis", "rhat"]
+__all__ = ["Convergence", "autocorrelation_time", "convergence", "ess", "hdi", "psis"]
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}
 
@@ -46,7 +46,7 @@ def convergence(draws: Array) -> Convergence:
     Returns
     -------
     Convergence
-        NaN where draws are not finite.
+        NaN where draws are not finite or fewer than four steps.
 
     Notes
     -----
@@ -64,7 +64,7 @@ def convergence(draws: Array) -> Convergence:
     found = np.full((3, d), np.nan)
     for j in range(d):
         x = by_half[..., j]
-        if np.isfinite(x).all():
+        if half > 1 and np.isfinite(x).all():
             found[:, j] = _convergence_of(np.ascontiguousarray(x))
     return Convergence(*found)
 
@@ -128,17 +128,6 @@ def autocorrelation_time(chain: Array, c: float = 5.0) -> Array:
         inside = np.arange(steps) < c * taus
         tau[j] = taus[inside.argmin() if inside.any() else -1]
     return tau
-
-
-def rhat(chains: Array) -> Array:
-    """Rank-normalised split R-hat of each parameter, shape (chains, draws, d) to (d,).
-
-    References
-    ----------
-    Vehtari et al. (2021), doi:10.1214/20-BA1221.
-    """
-    with np.errstate(all="ignore"):
-        return np.asarray(_stats().rhat(chains, method="rank", **_AXES))
 
 
 def ess(chains: Array, method: Literal["bulk", "tail", "mean"]) -> Array:

@@ -38,7 +38,8 @@ class SamplerSettings:
     max_steps : int
         Where doubling stops.
     keep : int
-        Draws of each ensemble that are stored, thinned evenly from the kept steps.
+        Draws of each ensemble that are stored, thinned evenly from the kept steps; at least
+        four steps.
     ahead : int
         Steps whose independent proposals are evaluated in one batch.
     gate : Gate
@@ -220,7 +221,7 @@ def sample_density(
             break
         target *= 2
         proposal, found = refit(count, proposal, *_pooled(t, report), rng)
-    kept = min(target, max(1, settings.keep // t.shape[1]))
+    kept = min(target, max(4, settings.keep // t.shape[1]))
     picked = np.linspace(0, target - 1, kept).round().astype(int)
     return Draws(
         t=t[:, :, picked],

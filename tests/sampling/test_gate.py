@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.chains import ess, hdi, psis, rhat
+from calib.chains import convergence, ess, hdi, psis
 from calib.sampling.gate import Gate, GateReport, judge
 from calib.sampling.sampler import SamplerSettings
 
@@ -162,12 +162,12 @@ def test_effective_sizes_of_an_autoregressive_chain() -> None:
 
 
 def test_r_hat_of_shifted_chains() -> None:
-    x = np.random.default_rng(6).standard_normal((4, 4000, 1))
-    assert rhat(x)[0] == pytest.approx(1.0, abs=2e-3)
+    x = np.random.default_rng(6).standard_normal((4, 1, 4000, 1))
+    assert convergence(x).rhat[0] == pytest.approx(1.0, abs=2e-3)
     x[0] += 2.0
     # The means spread by sd 1 about their mean (0, 0, 0, 2): R-hat near sqrt(1 + 1) = 1.41, less
     # what ranking takes off.
-    assert 1.2 < rhat(x)[0] < 1.5
+    assert 1.2 < convergence(x).rhat[0] < 1.5
 
 
 def test_the_highest_density_interval_of_a_skewed_distribution() -> None:
