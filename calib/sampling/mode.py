@@ -99,7 +99,8 @@ def find_modes(
     starts : ndarray, shape (m, d), optional
         Point estimates, in internal coordinates.
     n_screen, n_polish : int
-        Prior draws screened, and how many of the best climb.
+        Prior draws screened (none, if starts are given and it is zero), and how many of the best
+        climb.
     """
     width = prior_widths(priors)
     climbed = sorted(
@@ -130,7 +131,7 @@ def _climb(
 ) -> list[tuple[float, Array]]:
     pool = priors.sample(rng, n_screen)
     given = np.empty((0, pool.shape[1])) if starts is None else np.atleast_2d(starts)
-    screened = pool[np.argsort(-log_prob(pool))[:n_polish]]
+    screened = pool[np.argsort(-log_prob(pool))[:n_polish]] if n_screen else pool
     return [_polish(log_prob, x, priors, _A_FEW_STEPS) for x in np.concatenate([given, screened])]
 
 

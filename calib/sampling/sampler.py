@@ -9,12 +9,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from calib.errors import CalibError
+from calib.estimators.identified import representative_rows
 from calib.models.base import Array
 from calib.problem import Problem
 from calib.sampling.adapt import Guess, adapt, refit
 from calib.sampling.ensemble import POOR, Ensemble
 from calib.sampling.gate import Gate, GateReport, judge
-from calib.sampling.mode import find_modes
+from calib.sampling.mode import Mode, find_modes
 from calib.sampling.proposal import AnyProposal
 
 __all__ = ["Draws", "SamplerSettings", "sample_density", "sample_posterior"]
@@ -130,7 +131,7 @@ def sample_posterior(
     rng = np.random.default_rng(seeds[0])
     began = time.perf_counter()
     count = _Counter(problem.log_prob)
-    modes = find_modes(count, problem.priors, rng, starts=starts)
+    modes = _modes(count, problem, rng, starts)
     if not np.isfinite(count(modes[0].t[None])[0]):
         raise CalibError(
             "no parameter values of positive probability were found",
@@ -143,12 +144,26 @@ def sample_posterior(
     )
 
 
+def _modes(
+    count: _Counter, problem: Problem, rng: np.random.Generator, starts: Array | None
+) -> list[Mode]:
+    rough = representative_rows(problem)
+    if rough is problem:
+        return find_modes(count, problem.priors, rng, starts=starts)
+    # Of long data a part shows where the modes are; from there it is not far.
+    count_rough = _Counter(rough.log_prob)
+    near = [m.t for m in find_modes(count_rough, problem.priors, rng, starts=starts)]
+    count.evaluations += count_rough.evaluations
+    given = near if starts is None else [*np.atleast_2d(starts), *near]
+    return find_modes(count, problem.priors, rng, starts=np.array(given), n_screen=0)
+
+
 def _fitting(settings: SamplerSettings, problem: Problem) -> SamplerSettings:
     """Of long data fewer draws are taken: each is dear, and the posterior all but normal."""
     if settings.walkers is not None or problem.squares.n_distinct <= _LONG:
         return settings
     walkers = max(20, 2 * (problem.n_dim + 1))
-    return replace(settings, walkers=walkers, steps=min(settings.steps, 100), ahead=1)
+    return replace(settings, walkers=walkers, steps=min(settings.steps, 128), ahead=1)
 
 
 _LONG = 5000
