@@ -12,8 +12,8 @@ from calib.gap.diagnose import Diagnosis, diagnose
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.paper_gaps.cases import PaperGap, paper_gaps
+from calib.sampling.adapt import Guess, adapt
 from calib.sampling.mode import find_modes
-from calib.sampling.proposal import Guess, adapt
 from calib.streams import generator
 
 __all__ = ["FoundGap", "Unfitted", "find_gaps", "simulator_sd", "unfitted_errors"]

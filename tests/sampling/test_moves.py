@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 from calib.chains import ess
+from calib.sampling.mixture import Mixture, StudentT
 from calib.sampling.moves import IndependenceMove
-from calib.sampling.proposal import Mixture, StudentT
 
 
 def proposal(mean: float = 0.8, scale: float = 1.7) -> Mixture:

@@ -15,10 +15,12 @@ from calib.chains import ess
 from calib.data import Table
 from calib.errors import CalibError
 from calib.problem import build_problem
+from calib.sampling import ensemble as ensemble_module
 from calib.sampling import sampler as sampler_module
+from calib.sampling.adapt import Guess
 from calib.sampling.gate import Gate, judge
+from calib.sampling.mixture import Mixture, StudentT
 from calib.sampling.mode import find_modes
-from calib.sampling.proposal import Guess, Mixture, StudentT
 from calib.sampling.sampler import Draws, SamplerSettings, sample_density, sample_posterior
 
 from .closed_form import SIGMAS, assert_distributed, evidence_error, linear, run
@@ -259,7 +261,7 @@ def test_emcee_takes_the_random_state(monkeypatch: pytest.MonkeyPatch) -> None:
         def random_state(self, state):
             pass
 
-    monkeypatch.setattr(sampler_module.emcee, "EnsembleSampler", Deaf)
+    monkeypatch.setattr(ensemble_module.emcee, "EnsembleSampler", Deaf)
     with pytest.raises(RuntimeError, match="did not take the random state"):
         run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=QUICK)
 
