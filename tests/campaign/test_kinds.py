@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.calibration import calibrate
+from calib.calibration import Calibration, calibrate
 from calib.campaign import read_plan, run_campaign
 from calib.challenge.make import make
 from calib.data import hold_out, read_table
@@ -105,9 +105,10 @@ def test_rows_held_out_are_scored_and_posteriors_can_be_left_out(folder):
     assert found["held_out"]["rows"] == len(held)
 
 
-def test_a_posterior_that_did_not_converge_is_named(folder):
+def test_a_posterior_that_did_not_converge_is_named(folder, monkeypatch):
+    monkeypatch.setattr(Calibration, "converged", property(lambda self: False))
     (folder / "plan.toml").write_text(
-        '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\nmax_steps = 100\n'
+        '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\n'
     )
     summary = run_campaign(read_plan(folder / "plan.toml"), folder / "out")
     assert summary.unconverged == ("a.rut.bekker.shipped.nothing",)

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from campaign.sites import results
 
+from calib.calibration import Calibration
 from calib.cli import main
 from calib.templates import template_csv
 
@@ -67,8 +68,9 @@ def test_failed_tasks_end_with_one(calib):
     assert state["a.bad.bekker.shipped.nothing"]["state"] == "failed"
 
 
-def test_posteriors_that_did_not_converge_end_with_three(calib):
-    code, out, _ = calib(FIT + "max_steps = 100\n")
+def test_posteriors_that_did_not_converge_end_with_three(calib, monkeypatch):
+    monkeypatch.setattr(Calibration, "converged", property(lambda self: False))
+    code, out, _ = calib(FIT)
     assert code == 3
     assert "NOT CONVERGED, not to be used: a.rut.bekker.shipped.nothing" in out
 
