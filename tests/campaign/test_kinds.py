@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calib.calibration import Calibration, calibrate
+from calib.calibration import calibrate
 from calib.campaign import read_plan, run_campaign
 from calib.challenge.make import make
 from calib.data import hold_out, read_table
@@ -19,7 +19,7 @@ from calib.store import load_calibration
 from calib.streams import generator
 from calib.templates import template_csv
 from calib.validate import validate_held_out
-from campaign.sites import EFFECT, NAMES, WIND, content
+from campaign.sites import EFFECT, NAMES, WIND, content, refuse_all
 
 
 def test_a_diagnosis_is_that_of_the_verb(site, serial, tmp_path):
@@ -106,9 +106,9 @@ def test_rows_held_out_are_scored_and_posteriors_can_be_left_out(folder):
 
 
 def test_a_posterior_that_did_not_converge_is_named(folder, monkeypatch):
-    monkeypatch.setattr(Calibration, "converged", property(lambda self: False))
+    refuse_all(monkeypatch)
     (folder / "plan.toml").write_text(
-        '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\n'
+        '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\nmax_steps = 100\n'
     )
     summary = run_campaign(read_plan(folder / "plan.toml"), folder / "out")
     assert summary.unconverged == ("a.rut.bekker.shipped.nothing",)

@@ -11,9 +11,8 @@ import time
 from pathlib import Path
 
 import pytest
-from campaign.sites import results
+from campaign.sites import refuse_all, results
 
-from calib.calibration import Calibration
 from calib.cli import main
 from calib.templates import template_csv
 
@@ -69,8 +68,8 @@ def test_failed_tasks_end_with_one(calib):
 
 
 def test_posteriors_that_did_not_converge_end_with_three(calib, monkeypatch):
-    monkeypatch.setattr(Calibration, "converged", property(lambda self: False))
-    code, out, _ = calib(FIT)
+    refuse_all(monkeypatch)
+    code, out, _ = calib(FIT + "max_steps = 100\n")
     assert code == 3
     assert "NOT CONVERGED, not to be used: a.rut.bekker.shipped.nothing" in out
 
