@@ -70,7 +70,7 @@ def _everything(manifest: Mapping[str, Any], outputs: Sequence[Output]) -> list[
         *sentences,
         f"Posteriors were sampled with emcee {v['emcee']} [@ForemanMackey_2013] by "
         f"{s['ensembles']} independently seeded ensembles, in which an independence move beside "
-        "differential-evolution [@terBraak_2006] and snooker [@terBraak_2008] moves proposes from "
+        "differential-evolution moves [@terBraak_2006] proposes from "
         "a mixture of Student-t distributions in straightened coordinates, fitted to the "
         "posterior by adaptive importance sampling [@Cappe_2008] from every mode that was found; "
         f"proposals of {s['ahead']} steps at a time were evaluated in one batch.",
