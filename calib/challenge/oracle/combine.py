@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calib.challenge.design import Tier
-from calib.challenge.effects import NONE
 from calib.challenge.oracle.designs import named, plan_shares
 from calib.challenge.oracle.finding import NEVER
 
 type Array = NDArray[np.float64]
 
 _ROUNDS, _SETTLED = 500, 1e-9
+_NOTHING = 1e-12
 
 
 def probabilities(
@@ -36,14 +36,16 @@ def probabilities(
     which : str
         ``log_evidence``, or ``known_soil``.
     """
+    rows = zip(cases, _shares(cases, tier, which), strict=True)
+    return {case: _by_hypothesis(list(plan_shares(tier)), row) for case, row in rows}
+
+
+def _shares(cases: Mapping[str, Mapping[str, Any]], tier: Tier, which: str) -> Array:
+    """Return the posterior probability of every state in every case, ``(N, S)``."""
     states = list(plan_shares(tier))
-    log_plan = np.log(list(plan_shares(tier).values()))
-    told = _table(cases, states, "log_design")
-    weights = log_plan + told - log_kept(cases, tier) + _table(cases, states, which)
-    weights -= logsumexp(weights, axis=1, keepdims=True)
-    return {
-        case: _by_hypothesis(states, np.exp(row)) for case, row in zip(cases, weights, strict=True)
-    }
+    weights = np.log(list(plan_shares(tier).values())) - log_kept(cases, tier)
+    weights = weights + _table(cases, states, "log_design") + _table(cases, states, which)
+    return np.exp(weights - logsumexp(weights, axis=1, keepdims=True))
 
 
 def errors(cases: Mapping[str, Mapping[str, Any]], tier: Tier) -> dict[str, float]:
@@ -51,10 +53,7 @@ def errors(cases: Mapping[str, Mapping[str, Any]], tier: Tier) -> dict[str, floa
     found = {}
     states = list(plan_shares(tier))
     relative = _table(cases, states, "error", missing=0.0)
-    log_plan = np.log(list(plan_shares(tier).values()))
-    weights = log_plan + _table(cases, states, "log_design") - log_kept(cases, tier)
-    weights += _table(cases, states, "log_evidence")
-    shares = np.exp(weights - logsumexp(weights, axis=1, keepdims=True))
+    shares = _shares(cases, tier, "log_evidence")
     for case, share, error in zip(cases, shares, relative, strict=True):
         true = np.array([named(state) == cases[case]["truth"] for state in states])
         slope = share * (true - float(share[true].sum()))
@@ -65,9 +64,9 @@ def errors(cases: Mapping[str, Mapping[str, Any]], tier: Tier) -> dict[str, floa
 def log_kept(cases: Mapping[str, Mapping[str, Any]], tier: Tier) -> Array:
     """Return the logarithm of the share of draws that the generator keeps, of each state.
 
-    The stages of the cases are a sample of those on which the generator kept a draw of one state
-    or another, so each state's share over all stages follows from its shares on these, weighted
-    as in multistate reweighting [1]_; of no gap it is one.
+    The stages of the cases are those on which the generator kept a draw of one state or another.
+    Weighted back, as in multistate reweighting [1]_, they are a sample of the stages that are
+    drawn for each state, and the share it keeps is its mean over them.
 
     Parameters
     ----------
@@ -77,26 +76,29 @@ def log_kept(cases: Mapping[str, Mapping[str, Any]], tier: Tier) -> Array:
     Returns
     -------
     array
-        In the order of `plan_shares`; zero for a state that acts on none of the stages.
+        In the order of `plan_shares`, at most zero; zero for no gap.
 
     References
     ----------
     .. [1] M. R. Shirts, J. D. Chodera, J. Chem. Phys. 129 (2008) 124105, doi 10.1063/1.2978177.
     """
     states = list(plan_shares(tier))
-    log_plan = np.log(list(plan_shares(tier).values()))
-    kept = np.maximum(_table(cases, states, "kept", missing=0.0), np.exp(NEVER / 1e4))
-    weight = _table(cases, states, "log_design") + np.log(kept)
-    able = np.any(weight > NEVER / 2.0, axis=0)
-    found = np.zeros(len(states))
+    plan = np.array(list(plan_shares(tier).values()))
+    # Only ratios between states matter, so a stage's own scale is taken out.
+    told = _table(cases, states, "log_design")
+    drawn = np.exp(told - told.max(axis=1, keepdims=True))
+    kept = np.clip(_table(cases, states, "kept", missing=0.0), 0.0, 1.0)
+    found = np.ones(len(states))
     for _ in range(_ROUNDS):
-        mixture = logsumexp((log_plan + weight - found)[:, able], axis=1)
-        new = np.where(able, logsumexp(weight - mixture[:, None], axis=0), 0.0)
-        new = np.where(able, new - new[states.index(NONE)], 0.0)
-        moved, found = float(np.max(np.abs(new - found))), new
+        mixture = (drawn * kept) @ (plan / found)
+        weight = drawn / mixture[:, None]
+        total = np.maximum(weight.sum(axis=0), _NOTHING)
+        new = np.maximum((weight * kept).sum(axis=0) / total, _NOTHING)
+        moved, found = float(np.max(np.abs(np.log(new / found)))), new
         if moved < _SETTLED:
             break
-    return found
+    # A state that acts nowhere here, or is never kept, has no share that could matter.
+    return np.where(found > _NOTHING, np.log(found), 0.0)
 
 
 def _table(
