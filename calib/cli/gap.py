@@ -23,6 +23,7 @@ def register(app: typer.Typer) -> None:
     challenge = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.")
     challenge.command("make")(make)
     challenge.command("run")(run)
+    challenge.command("limit")(limit)
     challenge.command("score")(score)
     app.add_typer(challenge, name="challenge")
 
@@ -124,15 +125,38 @@ def run(
         raise typer.Exit(1)
 
 
+def limit(
+    folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
+    key: Annotated[Path, typer.Option(help="The sealed answers.")],
+    out: Annotated[Path, typer.Option(help="Folder for limit.json; resumed if it is there.")],
+    seed: _Seed = 1,
+    effort: Annotated[int, typer.Option(help="Multiplies the places looked at.", min=1)] = 1,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+) -> None:
+    """Find the best any method could do on these cases, by one who knows how they were made."""
+    from calib.challenge.limit import find_limit
+    from calib.cli.display import progress_bars
+
+    with progress_bars() as tell:
+        path = find_limit(
+            folder, key, out, seed=seed, effort=effort, workers=workers, scheduler=scheduler,
+            progress=lambda done, n: tell("asking the oracle", done, n), announce=announce,
+        )  # fmt: skip
+    print(path)
+
+
 def score(
     folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
     results: Annotated[Path, typer.Option(help="Folder with the diagnoses.")],
     key: Annotated[Path, typer.Option(help="The sealed answers.")],
+    limit: Annotated[Path | None, typer.Option(help="limit.json of these cases.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
     overwrite: _Overwrite = False,
 ) -> None:
     """Compare diagnoses with the sealed answers."""
     from calib.challenge.figures import confusion_figure, levels_figure, reliability_figure
+    from calib.challenge.limit import read_limit
     from calib.challenge.score import score as score_all
     from calib.challenge.table import text_table
     from calib.folders import check_folder, fresh_folder
@@ -140,13 +164,15 @@ def score(
     if out is not None:
         check_folder(out, overwrite=overwrite)
     found = score_all(folder, results, key)
-    table = text_table(found)
+    known = None if limit is None else read_limit(limit, folder)
+    table = text_table(found, known)
     print(table)
     if out is None:
         return
     with fresh_folder(out, overwrite=overwrite) as scratch:
         (scratch / "score.txt").write_text(table + "\n", encoding="utf-8")
-        levels_figure(list(found.tiers.values())).savefig(scratch / "levels.png", dpi=150)
+        levels = levels_figure(list(found.tiers.values()), known)
+        levels.savefig(scratch / "levels.png", dpi=150)
         for tier, confusion in found.confusion.items():
             figure = confusion_figure(confusion, f"{tier} cases")
             figure.savefig(scratch / f"confusion_{tier}.png", dpi=150)

@@ -159,7 +159,9 @@ class BoundModel:
 
     def report(self, theta: Array) -> dict[str, Array]:
         """Return the published parameters of each vector, each of shape (k,)."""
-        return self.model.report_theta(np.atleast_2d(theta), self.references)
+        # A published coefficient may be beyond all numbers where the sampled ones are not.
+        with np.errstate(all="ignore"):
+            return self.model.report_theta(np.atleast_2d(theta), self.references)
 
     def theta(self, reported: Mapping[str, float]) -> Array:
         """Return the sampled parameters of published ones, shape (d,)."""

@@ -70,9 +70,10 @@ def _everything(manifest: Mapping[str, Any], outputs: Sequence[Output]) -> list[
         *sentences,
         f"Posteriors were sampled with emcee {v['emcee']} [@ForemanMackey_2013] by "
         f"{s['ensembles']} independently seeded ensembles, in which an independence move beside "
-        "differential-evolution [@terBraak_2006] and snooker [@terBraak_2008] moves proposes from "
-        "a mixture of Student-t distributions, fitted to the posterior by adaptive importance "
-        f"sampling [@Cappe_2008] from a first one with {s['dof']:g} degrees of freedom.",
+        "differential-evolution moves [@terBraak_2006] proposes from "
+        "a mixture of Student-t distributions in straightened coordinates, fitted to the "
+        "posterior by adaptive importance sampling [@Cappe_2008] from every mode that was found; "
+        f"proposals of {s['ahead']} steps at a time were evaluated in one batch.",
         f"Each ensemble ran for {s['steps']} steps, doubled up to at most {s['max_steps']} until "
         "every sampled parameter passed a gate: rank-normalised split R-hat [@Vehtari_2021] of "
         f"at most {gate['rhat_max']:g}, bulk and tail effective sample sizes (ESS) of at least "

@@ -6,7 +6,7 @@ import logging
 import pickle
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from hashlib import sha256
 from importlib.metadata import version
@@ -32,6 +32,7 @@ _NO_WARNING = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
 # When the worker of a task dies, the task is tried so many times more among the others.
 ALLOWED_FAILURES = 1
 CONNECT_SECONDS = 10
+SETTLE_SECONDS = 20
 _SAME = ("numpy", "scipy", "emcee")
 
 
@@ -188,8 +189,16 @@ def _local(workers: int) -> Iterator[Client]:
                 f"the worker processes do not start ({error})",
                 mend='in a script of yours, put the call below `if __name__ == "__main__":`',
             ) from error
-        with cluster, Client(cluster, set_as_default=False) as client:
-            yield client
+        try:
+            with Client(cluster, set_as_default=False) as client:
+                yield client
+                # A worker that died is being replaced: Dask cannot close a nanny amid that.
+                with suppress(TimeoutError):
+                    client.wait_for_workers(workers, timeout=SETTLE_SECONDS)
+        finally:
+            # Results are here by now; a process that Dask still fails to end ends with this one.
+            with suppress(AssertionError):
+                cluster.close()
 
 
 class _Client(Client):

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
 import numpy as np
 from gap.cases import PULL_ONLY, make_case, write_case
 
+from calib.sampling import sampler
+from calib.sampling.gate import judge
 from calib.templates import template_csv
 
 N_CASES = 4
@@ -112,3 +115,12 @@ def _numbers(path: Path) -> bytes:
 def results(out: Path) -> list[str]:
     """Return the names of the tasks that have a result."""
     return sorted(p.parent.name for p in (out / "results").glob("*/task.json"))
+
+
+def refuse_all(monkeypatch) -> None:
+    """Let the gate refuse every posterior."""
+
+    def refuse(*args, **kwargs):
+        return replace(judge(*args, **kwargs), passed=False, reasons=("refused",))
+
+    monkeypatch.setattr(sampler, "judge", refuse)

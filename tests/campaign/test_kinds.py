@@ -19,7 +19,7 @@ from calib.store import load_calibration
 from calib.streams import generator
 from calib.templates import template_csv
 from calib.validate import validate_held_out
-from campaign.sites import EFFECT, NAMES, WIND, content
+from campaign.sites import EFFECT, NAMES, WIND, content, refuse_all
 
 
 def test_a_diagnosis_is_that_of_the_verb(site, serial, tmp_path):
@@ -105,7 +105,8 @@ def test_rows_held_out_are_scored_and_posteriors_can_be_left_out(folder):
     assert found["held_out"]["rows"] == len(held)
 
 
-def test_a_posterior_that_did_not_converge_is_named(folder):
+def test_a_posterior_that_did_not_converge_is_named(folder, monkeypatch):
+    refuse_all(monkeypatch)
     (folder / "plan.toml").write_text(
         '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\nmax_steps = 100\n'
     )

@@ -11,7 +11,7 @@ import time
 from pathlib import Path
 
 import pytest
-from campaign.sites import results
+from campaign.sites import refuse_all, results
 
 from calib.cli import main
 from calib.templates import template_csv
@@ -67,7 +67,8 @@ def test_failed_tasks_end_with_one(calib):
     assert state["a.bad.bekker.shipped.nothing"]["state"] == "failed"
 
 
-def test_posteriors_that_did_not_converge_end_with_three(calib):
+def test_posteriors_that_did_not_converge_end_with_three(calib, monkeypatch):
+    refuse_all(monkeypatch)
     code, out, _ = calib(FIT + "max_steps = 100\n")
     assert code == 3
     assert "NOT CONVERGED, not to be used: a.rut.bekker.shipped.nothing" in out

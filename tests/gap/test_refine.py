@@ -35,7 +35,7 @@ def long_chain(found, seed: int) -> np.ndarray:
     start = found.psi + 0.2 * scale * rng.standard_normal((8 * d, d))
     *_, lower, upper, _ = found.forward.priors._arrays
     start = np.clip(start, lower + 1e-6, upper - 1e-6)
-    moves = [(emcee.moves.DEMove(), 0.8), (emcee.moves.DESnookerMove(), 0.2)]
+    moves = emcee.moves.DEMove()
     sampler = emcee.EnsembleSampler(
         8 * d, d, lambda psi: log_joint(found, psi), vectorize=True, moves=moves
     )
