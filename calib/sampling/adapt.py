@@ -87,9 +87,9 @@ def adapt(
     d = proposal.n_dim
     memory = _Memory()
     for size in _ROUNDS:
-        draws = proposal.sample(rng, size * (d + 5))
+        draws, log_q = proposal.draw(rng, size * (d + 5))
         value = log_prob(draws)
-        found = _assess(value - proposal.log_prob(draws))
+        found = _assess(value - log_q)
         if found.efficiency > _GOOD or found.efficiency == 0.0:
             break
         memory.add(proposal, draws, value)
@@ -119,8 +119,8 @@ def refit(
     """
     weight = np.full(draws.shape[0], 1.0 / draws.shape[0])
     proposal = fit_proposal(old, draws, weight, effective, 1.0, rng)
-    fresh = proposal.sample(rng, _ROUNDS[-2] * (draws.shape[1] + 5))
-    return proposal, _assess(log_prob(fresh) - proposal.log_prob(fresh))
+    fresh, log_q = proposal.draw(rng, _ROUNDS[-2] * (draws.shape[1] + 5))
+    return proposal, _assess(log_prob(fresh) - log_q)
 
 
 def tempered_moments(draws: Array, log_weight: Array) -> tuple[Array, Array] | None:

@@ -7,17 +7,18 @@ from collections.abc import Callable
 
 import emcee
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.chains import autocorrelation_time
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.sampling.moves import IndependenceMove
-from calib.sampling.proposal import AnyProposal
+from calib.sampling.moves import IndependenceMove, WalkMove
+from calib.sampling.proposal import AnyProposal, Proposal
 
 __all__ = ["POOR", "Ensemble"]
 
-# Efficiency below which the local moves do most of the work, and the share of a good proposal.
-POOR, _INDEPENDENT = 0.1, 0.9
+# Efficiency below which the local moves do most of the work.
+POOR = 0.1
 
 
 class Ensemble:
@@ -41,19 +42,18 @@ class Ensemble:
     def run(self, proposal: AnyProposal, efficiency: float, steps: int) -> None:
         """Run on with a proposal, forgetting the steps before."""
         # A good proposal does most of the work; a poor one leaves it to the local moves.
-        independent = _INDEPENDENT if efficiency > POOR else 0.3
-        local = 1.0 - independent
+        if efficiency > POOR and isinstance(proposal, Proposal):
+            local = [(WalkMove(proposal, self.rng), 0.1)]
+        else:
+            # Not emcee's snooker move: with half the exponent of ter Braak & Vrugt (2008) in its
+            # acceptance it does not keep a normal. Whole differences jump between modes.
+            local = [(emcee.moves.DEMove(), 0.5), (emcee.moves.DEMove(gamma0=1.0), 0.2)]
+        independent = 1.0 - sum(share for _, share in local)
         self.sampler = emcee.EnsembleSampler(
             *self.state.coords.shape,
             self.log_prob_fn,
             vectorize=True,
-            moves=[
-                (IndependenceMove(proposal, self.rng, self.ahead), independent),
-                # Not emcee's snooker move: with half the exponent of ter Braak & Vrugt (2008) in
-                # its acceptance it does not keep a normal. Whole differences jump between modes.
-                (emcee.moves.DEMove(), 0.7 * local),
-                (emcee.moves.DEMove(gamma0=1.0), 0.3 * local),
-            ],
+            moves=[(IndependenceMove(proposal, self.rng, self.ahead), independent), *local],
         )
         self.sampler.random_state = self.random_state
         if not np.array_equal(self.sampler.random_state[1], self.random_state[1]):
@@ -67,20 +67,20 @@ class Ensemble:
         self.state = emcee.State(end.coords, log_prob=end.log_prob, copy=True)
         self.random_state = self.sampler.random_state
 
-    def chain(self, target: int) -> Array:
-        """The last `target` steps, shape (walkers, target, d)."""
-        kept: Array = self.sampler.get_chain()[-target:]
-        return kept.transpose(1, 0, 2)
+    @property
+    def walkers(self) -> int:
+        """Number of walkers."""
+        return int(self.state.coords.shape[0])
 
-    def log_prob(self, target: int) -> Array:
-        """Log densities of the last `target` steps, shape (walkers, target)."""
-        kept: Array = self.sampler.get_log_prob()[-target:]
-        return kept.T
+    def drawn(self, steps: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Draws of some steps of the stretch, (walkers, n, d), and log densities (walkers, n)."""
+        t, log_prob = self.sampler.get_chain()[steps], self.sampler.get_log_prob()[steps]
+        return t.transpose(1, 0, 2), log_prob.T
 
     def tau(self, target: int) -> Array:
         """Autocorrelation times over the last `target` steps, shape (d,)."""
         # A constant chain has no autocorrelation time; it must fail the gate.
-        tau = autocorrelation_time(self.chain(target))
+        tau = autocorrelation_time(self.sampler.get_chain()[-target:].transpose(1, 0, 2))
         return np.where(np.isfinite(tau), np.maximum(tau, 1.0), np.inf)
 
     @property
@@ -101,7 +101,7 @@ def _start(
     """
     coords, values = np.empty((0, proposal.n_dim)), np.empty(0)
     for _ in range(500):
-        drawn = proposal.sample(rng, walkers)
+        drawn, _ = proposal.draw(rng, walkers)
         value = log_prob(drawn)
         good = np.isfinite(value)
         coords, values = np.concatenate([coords, drawn[good]]), np.append(values, value[good])

@@ -30,7 +30,7 @@ class StudentT:
     cholesky: Array
     dof: float
 
-    def sample(self, rng: np.random.Generator | np.random.RandomState, size: int) -> Array:
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
         """Draw, shape (size, d)."""
         normal = rng.standard_normal((size, self.mean.size))
         chi2 = rng.chisquare(self.dof, size) / self.dof
@@ -85,7 +85,12 @@ class Mixture:
         whitened = inverses @ means[:, :, None]
         return inverses.reshape(m * d, d), whitened, constant, dof
 
-    def sample(self, rng: np.random.Generator | np.random.RandomState, size: int) -> Array:
+    def draw(self, rng: np.random.Generator, size: int) -> tuple[Array, Array]:
+        """Draw, and return the log density there, shapes (size, d) and (size,)."""
+        t = self.sample(rng, size)
+        return t, self.log_prob(t)
+
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
         """Draw, shape (size, d)."""
         which = rng.choice(self.weights.size, size=size, p=self.weights)
         drawn = np.empty((size, self.n_dim))
@@ -93,6 +98,15 @@ class Mixture:
             mine = np.flatnonzero(which == j)
             drawn[mine] = component.sample(rng, mine.size)
         return drawn
+
+    def covariance_cholesky(self) -> Array:
+        """Lower factor of the whole mixture's scale: components' scales and between their means."""
+        mean = self.weights @ np.stack([c.mean for c in self.components])
+        covariance = sum(
+            w * (c.cholesky @ c.cholesky.T + np.outer(c.mean - mean, c.mean - mean))
+            for w, c in zip(self.weights, self.components, strict=True)
+        )
+        return np.linalg.cholesky(covariance)
 
     def squared_distances(self, t: Array) -> Array:
         """Squared Mahalanobis distances from each component, shape (k, d) to (m, k)."""

@@ -8,14 +8,14 @@ import numpy as np
 
 from calib.models.base import Array
 from calib.sampling.expectation import fit_mixture, moments
-from calib.sampling.mixture import Mixture, StudentT
+from calib.sampling.mixture import Mixture, StudentT, log_sum
 from calib.sampling.straighten import Straightener
 
 __all__ = ["AnyProposal", "Proposal", "fit_proposal"]
 
 _FITTED_DRAWS = 6000
-_BROAD_SCALE, _BROAD_DOF = 1.5, 4.0
-_LEAST_BROAD, _MOST_BROAD = 0.05, 0.4
+_BROAD_SCALE, _BROAD_DOF = 1.3, 4.0
+_LEAST_BROAD, _MOST_BROAD = 0.08, 0.4
 
 
 @dataclass(frozen=True)
@@ -43,18 +43,23 @@ class Proposal:
         """Dimension."""
         return self.mixture.n_dim
 
-    def sample(self, rng: np.random.Generator | np.random.RandomState, size: int) -> Array:
-        """Draw, shape (size, d)."""
-        drawn = self.straightener.bend(self.mixture.sample(rng, size))
+    def draw(self, rng: np.random.Generator, size: int) -> tuple[Array, Array]:
+        """Draw, and return the log density there, shapes (size, d) and (size,)."""
+        v = self.mixture.sample(rng, size)
+        t, log_jacobian = self.straightener.bend(v)
         broad = np.flatnonzero(rng.random(size) < self.share)
-        drawn[broad] = self.broad.sample(rng, broad.size)
-        return drawn
+        t[broad] = self.broad.sample(rng, broad.size)
+        v[broad], log_jacobian[broad] = self.straightener.straighten(t[broad])
+        return t, self._log_prob(t, v, log_jacobian)
 
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
-        v, log_jacobian = self.straightener.straighten(t)
+        return self._log_prob(t, *self.straightener.straighten(t))
+
+    def _log_prob(self, t: Array, v: Array, log_jacobian: Array) -> Array:
         straight = self.mixture.log_prob(v) + log_jacobian + np.log1p(-self.share)
-        return np.asarray(np.logaddexp(straight, self.broad.log_prob(t) + np.log(self.share)))
+        broad = self.broad.log_prob(t) + np.log(self.share)
+        return log_sum(np.stack([straight, broad]))
 
 
 type AnyProposal = Mixture | Proposal

@@ -32,7 +32,7 @@ class SamplerSettings:
     ensembles : int
         Independently seeded ensembles.
     walkers : int, optional
-        In each ensemble; by default 64, of long data 20, but at least twice the dimension plus
+        In each ensemble; by default 128, of long data 20, but at least twice the dimension plus
         two.
     steps : int
         Kept steps of the first attempt; doubled until the gate passes.
@@ -48,7 +48,7 @@ class SamplerSettings:
 
     ensembles: int = 4
     walkers: int | None = None
-    steps: int = 200
+    steps: int = 160
     max_steps: int = 25_600
     keep: int = 4096
     ahead: int = 16
@@ -56,7 +56,7 @@ class SamplerSettings:
 
     def n_walkers(self, n_dim: int) -> int:
         """Number of walkers for a dimension."""
-        return self.walkers or max(64, 2 * (n_dim + 1))
+        return self.walkers or max(128, 2 * (n_dim + 1))
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Draws:
     t : ndarray, shape (ensembles, walkers, draws, d)
     log_prob : ndarray, shape (ensembles, walkers, draws)
     report : GateReport
-        On the whole chain, before thinning.
+        On as many draws as are stored by default, autocorrelation times on all.
     mode : ndarray, shape (d,)
     log_evidence, efficiency : float
         By importance sampling from the proposal, and its effective fraction.
@@ -226,21 +226,21 @@ def sample_density(
             if progress is not None:
                 progress(done + (i + 1) * length, done + len(ensembles) * length)
         done += len(ensembles) * length
-        t = np.stack([e.chain(target) for e in ensembles])
         tau = np.stack([e.tau(target) for e in ensembles]).max(axis=0)
-        report = judge(t, names, settings.gate, tau=tau)
-        log_probs = np.stack([e.log_prob(target) for e in ensembles])
+        # Fewer draws, evenly thinned, are worth less: what passes is not in doubt.
+        t, log_probs = _drawn(ensembles, target, _JUDGED)
+        report = judge(t, names, settings.gate, tau=tau, steps=target)
         if report.passed and found.efficiency > POOR:
-            report = _refuse_neglect(report, proposal, t, log_probs)
+            report = _refuse_neglect(report, proposal, t, log_probs, steps=target)
         if report.passed or target * 2 > settings.max_steps:
             break
         target *= 2
         proposal, found = refit(count, proposal, *_pooled(t, report), rng)
-    kept = min(target, max(4, settings.keep // t.shape[1]))
-    picked = np.linspace(0, target - 1, kept).round().astype(int)
+    if settings.keep != _JUDGED:
+        t, log_probs = _drawn(ensembles, target, settings.keep)
     return Draws(
-        t=t[:, :, picked],
-        log_prob=log_probs[:, :, picked],
+        t=t,
+        log_prob=log_probs,
         report=report,
         mode=first[0].mean,
         log_evidence=found.log_evidence,
@@ -251,28 +251,44 @@ def sample_density(
     )
 
 
+def _drawn(ensembles: list[Ensemble], steps: int, draws: int) -> tuple[Array, Array]:
+    """About so many draws of each ensemble, at least four steps, evenly from its last ones.
+
+    Returns
+    -------
+    ndarray, shape (ensembles, walkers, kept, d)
+    ndarray, shape (ensembles, walkers, kept)
+        Log densities.
+    """
+    kept = min(steps, max(4, draws // ensembles[0].walkers))
+    picked = np.linspace(-steps, -1, kept).round().astype(np.intp)
+    chains, log_probs = zip(*(e.drawn(picked) for e in ensembles), strict=True)
+    return np.stack(chains), np.stack(log_probs)
+
+
+# Draws of each ensemble that the gate looks at.
+_JUDGED = 4096
 # One step in so many is run before those that are kept.
-_DISCARDED = 6
-_POOLED = 20_000
+_DISCARDED = 12
 # A region of at least this part of the draws must have been proposed at least so often.
 _LEAST_REGION, _LEAST_PROPOSED = 0.003, 5.0
 
 
 def _refuse_neglect(
-    report: GateReport, proposal: AnyProposal, t: Array, log_prob: Array
+    report: GateReport, proposal: AnyProposal, t: Array, log_prob: Array, *, steps: int
 ) -> GateReport:
     """Refuse draws some of which lie where the proposal would not have gone.
 
     A walker that a local move, or luck, has carried to a tail or a mode of which the proposal
     knows nothing stays there, and the others never follow: R-hat sees little of it, and what the
     walkers say of the region is luck. Of draws from pi, those in a region stand for a part of the
-    proposal q that is proportional to the mean of q/pi over them.
+    proposal q that is proportional to the mean of q/pi over them. `steps` is the length of the
+    chain that the draws were taken from.
     """
-    every = max(1, log_prob.size // _POOLED)
-    flat, value = t.reshape(-1, t.shape[-1])[::every], log_prob.ravel()[::every]
-    log_ratio = proposal.log_prob(flat) - value
+    log_ratio = proposal.log_prob(t.reshape(-1, t.shape[-1])) - log_prob.ravel()
     ratio = np.sort(np.exp(log_ratio - log_ratio.max()))
-    proposed = log_prob.size * np.cumsum(ratio) / ratio.sum()
+    n_proposed = log_prob.shape[0] * log_prob.shape[1] * steps
+    proposed = n_proposed * np.cumsum(ratio) / ratio.sum()
     region = np.arange(1, ratio.size + 1) / ratio.size
     neglected = region[(region >= _LEAST_REGION) & (proposed < _LEAST_PROPOSED)]
     if not neglected.size:
@@ -282,7 +298,7 @@ def _refuse_neglect(
 
 
 def _pooled(t: Array, report: GateReport) -> tuple[Array, float]:
-    """Draws of all ensembles, thinned, and what they are worth."""
+    """Draws of all ensembles, and what they are worth."""
     flat = t.reshape(-1, t.shape[-1])
     worth = report.ess_bulk[np.isfinite(report.ess_bulk)].min(initial=np.inf)
-    return flat[:: max(1, flat.shape[0] // _POOLED)], float(min(worth, flat.shape[0]))
+    return flat, float(min(worth, flat.shape[0]))

@@ -89,13 +89,13 @@ class Straightener:
         v[:, 1:] *= np.exp(-log_scale)[:, None]
         return v, -(t.shape[1] - 1) * log_scale - np.log(self.sd).sum()
 
-    def bend(self, v: Array) -> Array:
-        """Return t of straightened coordinates, shape (k, d)."""
+    def bend(self, v: Array) -> tuple[Array, Array]:
+        """Return t, shape (k, d), and the log of |dv/dt| there, as `straighten` of it would."""
         k, d = v.shape
         z, bounded = np.empty((d, k)), np.empty((d, k))
         features = np.empty((self.coefficients.shape[0], k))
         features[0] = 1.0
-        scale = np.ones(k)
+        scale, log_scale = np.ones(k), np.zeros(k)
         n = 1
         for i in range(d):
             z[i] = self.coefficients[:n, i] @ features[:n] + v[:, i] * scale
@@ -104,8 +104,9 @@ class Straightener:
             np.multiply(bounded[i], bounded[: i + 1], out=features[n + 1 : n + i + 2])
             n += i + 2
             if i == 0:
-                scale = np.exp(self.rho * bounded[0])
-        return np.asarray(z[::-1].T * self.sd + self.mean)
+                log_scale = self.rho * bounded[0]
+                scale = np.exp(log_scale)
+        return z[::-1].T * self.sd + self.mean, -(d - 1) * log_scale - np.log(self.sd).sum()
 
 
 def _bounded(z: Array) -> Array:

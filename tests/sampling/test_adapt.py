@@ -38,7 +38,7 @@ def test_the_evidence_of_a_gaussian_found_from_a_poor_guess() -> None:
     mixed, log_evidence, efficiency = adapted(lambda t: target.logpdf(t) - 7.5, poor)
     assert efficiency > 0.7
     assert abs(log_evidence + 7.5) < error_of(efficiency)
-    drawn = mixed.sample(np.random.default_rng(1), 20_000)
+    drawn, _ = mixed.draw(np.random.default_rng(1), 20_000)
     # A loose check that it lies on the target: a tenth of the sds, and a half of the spread
     # (the proposal is wider by design).
     assert np.all(np.abs(drawn.mean(axis=0) - MEAN) < 0.1 * np.sqrt(np.diag(SCALE)))

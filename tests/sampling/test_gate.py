@@ -105,7 +105,7 @@ def test_the_limits_are_those_of_the_gate() -> None:
 def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.MonkeyPatch) -> None:
     from calib.sampling import sampler as module
 
-    chain = module.Ensemble.chain
+    drawn = module.Ensemble.drawn
     made: list[object] = []
     init = module.Ensemble.__init__
 
@@ -113,12 +113,12 @@ def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.Monkey
         init(self, *args, **kwargs)
         made.append(self)
 
-    def stuck(self, target):
-        kept = chain(self, target)
-        return np.repeat(kept[:, :1], target, axis=1) if self is made[1] else kept
+    def stuck(self, steps):
+        t, log_prob = drawn(self, steps)
+        return (np.repeat(t[:, :1], steps.size, axis=1) if self is made[1] else t), log_prob
 
     monkeypatch.setattr(module.Ensemble, "__init__", remember)
-    monkeypatch.setattr(module.Ensemble, "chain", stuck)
+    monkeypatch.setattr(module.Ensemble, "drawn", stuck)
     settings = SamplerSettings(max_steps=200)
     draws = run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=settings)
     assert len(made) == 4

@@ -27,8 +27,10 @@ def test_there_and_back(d: int) -> None:
     straightener = fitted(t)
     # Also far outside what it was fitted to.
     for scale in (1.0, 30.0):
-        there, _ = straightener.straighten(scale * t)
-        np.testing.assert_allclose(straightener.bend(there), scale * t, rtol=1e-7, atol=1e-7)
+        there, log_jacobian = straightener.straighten(scale * t)
+        back, the_same = straightener.bend(there)
+        np.testing.assert_allclose(back, scale * t, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(the_same, log_jacobian, atol=1e-9)
 
 
 def test_the_jacobian_is_that_of_the_map() -> None:
