@@ -42,18 +42,21 @@ class Ensemble:
     def run(self, proposal: AnyProposal, efficiency: float, steps: int) -> None:
         """Run on with a proposal, forgetting the steps before."""
         # A good proposal does most of the work; a poor one leaves it to the local moves.
+        independent = 0.9 if efficiency > POOR else 0.3
         if efficiency > POOR and isinstance(proposal, Proposal):
-            local = [(WalkMove(proposal, self.rng), 0.1)]
+            local = [(WalkMove(proposal, self.rng), 1.0)]
         else:
             # Not emcee's snooker move: with half the exponent of ter Braak & Vrugt (2008) in its
             # acceptance it does not keep a normal. Whole differences jump between modes.
-            local = [(emcee.moves.DEMove(), 0.5), (emcee.moves.DEMove(gamma0=1.0), 0.2)]
-        independent = 1.0 - sum(share for _, share in local)
+            local = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.3)]
         self.sampler = emcee.EnsembleSampler(
             *self.state.coords.shape,
             self.log_prob_fn,
             vectorize=True,
-            moves=[(IndependenceMove(proposal, self.rng, self.ahead), independent), *local],
+            moves=[
+                (IndependenceMove(proposal, self.rng, self.ahead), independent),
+                *((move, (1.0 - independent) * share) for move, share in local),
+            ],
         )
         self.sampler.random_state = self.random_state
         if not np.array_equal(self.sampler.random_state[1], self.random_state[1]):
