@@ -19,6 +19,8 @@ __all__ = ["POOR", "Ensemble"]
 
 # Efficiency below which the local moves do most of the work.
 POOR = 0.1
+# Walkers whose autocorrelations are averaged, evenly picked.
+_WALKERS_OF_TAU = 64
 
 
 class Ensemble:
@@ -83,7 +85,8 @@ class Ensemble:
     def tau(self, target: int) -> Array:
         """Autocorrelation times over the last `target` steps, shape (d,)."""
         # A constant chain has no autocorrelation time; it must fail the gate.
-        tau = autocorrelation_time(self.sampler.get_chain()[-target:].transpose(1, 0, 2))
+        chain = self.sampler.get_chain()[-target:, :: max(1, self.walkers // _WALKERS_OF_TAU)]
+        tau = autocorrelation_time(chain.transpose(1, 0, 2))
         return np.where(np.isfinite(tau), np.maximum(tau, 1.0), np.inf)
 
     @property

@@ -38,16 +38,23 @@ class StudentT:
 
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
+        whiten, constant = self._prepared
+        z = whiten @ (t - self.mean).T
+        squared = np.einsum("dk,dk->k", z, z)
+        power = 0.5 * (self.dof + self.mean.size)
+        return np.asarray(constant - power * np.log1p(squared / self.dof))
+
+    @cached_property
+    def _prepared(self) -> tuple[Array, float]:
+        """Whitening matrix (d, d), and the log density at the mean."""
         d = self.mean.size
-        z = np.linalg.solve(self.cholesky, (t - self.mean).T)
         constant = (
             gammaln(0.5 * (self.dof + d))
             - gammaln(0.5 * self.dof)
             - 0.5 * d * np.log(self.dof * np.pi)
             - np.log(np.diag(self.cholesky)).sum()
         )
-        squared = np.einsum("dk,dk->k", z, z)
-        return np.asarray(constant - 0.5 * (self.dof + d) * np.log1p(squared / self.dof))
+        return np.linalg.inv(self.cholesky), float(constant)
 
 
 @dataclass(frozen=True)
