@@ -32,8 +32,10 @@ MOST_VECTORS = 16_384
 PEER_ROWS = (42, 4_200, 1_000_000)
 PRESSURES_PSI = np.array([18.0, 30.0, 42.0])
 _BLOCK = 65_536
-_TRUTH = dict(K_lo=0.2, K_hi=0.12, K_bend=0.05, D_lo=1.8, D_hi=1.2, D_bend=0.02, G_lo=3.0,
-              G_hi=2.0, G_bend=0.1, C=1.4)  # fmt: skip
+_TRUTH = {
+    "K_lo": 0.2, "K_hi": 0.12, "K_bend": 0.05, "D_lo": 1.8, "D_hi": 1.2, "D_bend": 0.02,
+    "G_lo": 3.0, "G_hi": 2.0, "G_bend": 0.1, "C": 1.4,
+}  # fmt: skip
 
 
 def problem_of(rows: int, *, distinct: int | None = None, seed: int = 1) -> Problem:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+
 from calib.problem import Problem
 
 __all__ = ["pymc_model"]
@@ -80,7 +81,9 @@ def _modified_bekker(v: dict[str, Any], problem: Problem, pm: Any, pt: Any) -> A
     exponent = v["n0"] + v["n1"] * conditions["slip_ratio"]
     pm.Potential("exponent_positive", pt.switch(pt.all(exponent > 0.0), 0.0, -np.inf))
     ln_mm_per_m = np.log(1000.0)
-    return (np.log(pressure) + v["n0"] * (pt.log(v["z_ref"]) - ln_mm_per_m)) / exponent + ln_mm_per_m
+    return (
+        np.log(pressure) + v["n0"] * (pt.log(v["z_ref"]) - ln_mm_per_m)
+    ) / exponent + ln_mm_per_m
 
 
 def _ayers_perumpral(v: dict[str, Any], problem: Problem, pm: Any, pt: Any) -> Any:

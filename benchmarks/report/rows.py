@@ -1,0 +1,234 @@
+"""Measurements as rows of one table: what, how much, how far it spread, what was asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+__all__ = ["NAMES", "Row", "largest_z", "rows_of"]
+
+NAMES = {
+    "drawbar_pull": "joint drawbar pull",
+    "rut_depth": "rut depth",
+    "bulk_density": "bulk density",
+}
+SAMPLERS = {
+    "calib default": "calib, default settings",
+    "calib long": "calib, 512 walkers",
+    "nutpie default": "PyMC + nutpie, 4,000 draws",
+    "nutpie long": "PyMC + nutpie, 40,000 draws",
+    "stretch": "emcee's stretch move",
+}
+
+type Measured = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of the table; `low` and `high` are the least and the most of the repeats."""
+
+    part: str
+    subject: str
+    quantity: str
+    value: float
+    low: float | None = None
+    high: float | None = None
+    asked: str = ""
+    met: bool | None = None
+
+    @property
+    def line(self) -> str:
+        """Return it as a line of a Markdown table."""
+        span = "" if self.low is None else f"{_short(self.low)} to {_short(self.high)}"
+        met = {None: "", True: "met", False: "**missed**"}[self.met]
+        cells = (self.subject, self.quantity, _short(self.value), span, self.asked, met)
+        return f"| {' | '.join(cells)} |"
+
+
+def _short(value: float | None) -> str:
+    if value is None:
+        return ""
+    if value != 0.0 and abs(value) >= 1000.0:
+        return f"{float(f'{value:.3g}'):,.0f}"
+    return f"{value:.3g}"
+
+
+def rows_of(measured: Mapping[str, Measured]) -> list[Row]:
+    """Return the rows of all parts that were measured."""
+    makers = {
+        "posterior": _posterior, "likelihood": _likelihood, "genetic": _genetic,
+        "million": _million, "campaign": _campaign, "survival": _survival,
+    }  # fmt: skip
+    return [
+        row for part, make in makers.items() if part in measured for row in make(measured[part])
+    ]
+
+
+def largest_z(scores: Mapping[str, list[float]]) -> tuple[float, int, float]:
+    """Largest of the z-scores, their number, and what only one set in a hundred exceeds."""
+    z = np.abs(np.concatenate([np.asarray(v) for v in scores.values()]))
+    limit = float(stats.norm.ppf(0.5 + 0.5 * 0.99 ** (1.0 / z.size)))
+    return float(z.max()), z.size, limit
+
+
+def _asked(
+    part: str, subject: str, quantity: str, s: Mapping[str, float], most: float | None = None,
+    least: float | None = None,
+) -> Row:  # fmt: skip
+    value = s["median"]
+    if most is not None:
+        asked, met = f"≤ {most:g}", value <= most
+    elif least is not None:
+        asked, met = f"≥ {least:g}", value >= least
+    else:
+        asked, met = "", None
+    return Row(part, subject, quantity, value, s.get("low"), s.get("high"), asked, met)
+
+
+def _posterior(m: Measured) -> Iterator[Row]:
+    part = "posterior"
+    for key in NAMES:
+        p = m["problems"][key]
+        subject, spread = NAMES[key], p["spread"]
+        for length in ("default", "long"):
+            ours, theirs = p["runs"][f"calib {length}"], p["runs"][f"nutpie {length}"]
+            what = {"default": "both at default settings", "long": "both long"}[length]
+            for kind in ("bulk", "tail"):
+                name = f"{kind}_per_second"
+                ratio = (
+                    spread[f"calib {length}"][name]["median"]
+                    / (spread[f"nutpie {length}"][name]["median"])
+                )
+                pairs = [a[name] / b[name] for a, b in zip(ours, theirs, strict=True)]
+                s = {"median": ratio, "low": min(pairs), "high": max(pairs)}
+                least = 50.0 if kind == "bulk" else None
+                yield _asked(part, subject, f"{kind} ESS/s over nutpie's, {what}", s, least=least)
+        for length in ("default", "long"):
+            ratios = [
+                a["bulk_per_second"] / spread["stretch"]["bulk_per_second"]["median"]
+                for a in p["runs"][f"calib {length}"]
+            ]
+            s = {"median": float(np.median(ratios)), "low": min(ratios), "high": max(ratios)}
+            what = SAMPLERS[f"calib {length}"].removeprefix("calib, ")
+            yield _asked(
+                part, subject, f"bulk ESS/s over the stretch move's, {what}", s, least=80.0
+            )
+        yield _asked(
+            part, subject, "likelihood evaluations per bulk ESS, default settings",
+            spread["calib default"]["evaluations_per_bulk"], most=6.0,
+        )  # fmt: skip
+        for peer, title in (("nutpie", "PyMC + nutpie"), ("stretch", "the stretch move")):
+            if not p["z_scores"][peer]:
+                continue
+            z, n, limit = largest_z(p["z_scores"][peer])
+            yield Row(
+                part, subject, f"largest of {n} z-scores against {title}", z,
+                asked=f"≤ {limit:.2f}", met=z <= limit,
+            )  # fmt: skip
+        r = p["replicates"]
+        each = r["variance_over_claimed"]
+        yield Row(
+            part, subject, f"variance of means of {r['runs']} runs over what their ESS claim",
+            r["mean"], min(each), max(each),
+        )  # fmt: skip
+        for name, title in SAMPLERS.items():
+            for quantity, label in (
+                ("bulk_per_second", "bulk ESS/s"), ("tail_per_second", "tail ESS/s"),
+                ("ess_bulk", "bulk ESS"), ("seconds", "seconds"),
+                ("evaluations_per_bulk", "evaluations per bulk ESS"),
+            ):  # fmt: skip
+                yield _asked(part, subject, f"{title}: {label}", spread[name][quantity])
+        for length, count in p["nutpie_runs_with_bad_rhat"].items():
+            n = len(p["runs"][f"nutpie {length}"])
+            yield Row(
+                part, subject, f"{SAMPLERS[f'nutpie {length}']}: runs of {n} with R-hat > 1.01",
+                float(count),
+            )  # fmt: skip
+
+
+def _likelihood(m: Measured) -> Iterator[Row]:
+    part = "likelihood"
+    for r in [*m["rows"], m["repeated_conditions"]]:
+        subject = f"{r['rows']:,} rows"
+        if r["distinct"] != r["rows"]:
+            subject += f" at {r['distinct']} conditions"
+        yield _asked(part, subject, "time over the floor's", r["time_over_floor"], most=1.5)
+        yield _asked(part, subject, "vectors times rows per second", r["cells_per_second"])
+        yield Row(
+            part, subject, f"memory of a call, MiB (all at once: {r['mib_if_all_at_once']:.0f})",
+            r["peak_mib_of_a_call"],
+        )  # fmt: skip
+    for r in m["peers"]:
+        for name, s in r["speed_over_calib"].items():
+            if name != "calib":
+                yield _asked(part, f"{r['rows']:,} rows", f"{name}: speed over calib's", s)
+
+
+def _genetic(m: Measured) -> Iterator[Row]:
+    part = "genetic"
+    for key, p in m["problems"].items():
+        subject = NAMES.get(key, key.replace("drawbar_pull", "drawbar pull"))
+        ga, *others = p["methods"].items()
+        for name, found in others:
+            equal = found["at_the_optimum"] == found["seeds"]
+            ratio = found["seconds"]["median"] / ga[1]["seconds"]["median"]
+            yield Row(
+                part, subject, f"{name}: time over the genetic algorithm's", ratio,
+                asked="> 1" if equal else "", met=ratio > 1.0 if equal else None,
+            )  # fmt: skip
+        for name, found in (ga, *others):
+            yield Row(
+                part, subject, f"{name}: seeds of {found['seeds']} at the optimum",
+                float(found["at_the_optimum"]),
+            )  # fmt: skip
+            yield _asked(part, subject, f"{name}: seconds", found["seconds"])
+
+
+def _million(m: Measured) -> Iterator[Row]:
+    part, subject = "million", f"{m['rows']:,} rows, {m['threads']} cores"
+    s = m["seconds"]
+    yield Row(part, subject, "seconds of a calibration", float(np.median(s)), min(s), max(s))
+    yield Row(part, subject, "bulk ESS of the stored draws", m["ess_bulk"])
+    yield Row(part, subject, "likelihood evaluations", float(m["evaluations"]))
+    yield Row(part, subject, "peak memory, MiB", m["peak_mib"])
+    z, n, limit = largest_z(m["check"]["z_scores"])
+    yield Row(
+        part, subject, f"largest of {n} z-scores against every row, written out", z,
+        asked=f"≤ {limit:.2f}", met=z <= limit,
+    )  # fmt: skip
+    ratios = m["check"]["sd_ratio"]
+    yield Row(
+        part, subject, "posterior sd over that of every row, written out",
+        float(np.median(ratios)), min(ratios), max(ratios),
+    )  # fmt: skip
+
+
+def _campaign(m: Measured) -> Iterator[Row]:
+    part, o = "campaign", m["overhead"]
+    pairs = zip(*(o["ms_per_task_wall_and_cpu"][n] for n in ("calib", "dask")), strict=True)
+    beyond = [a[0] - b[0] for a, b in pairs]
+    s = {
+        "median": o["beyond_dask_ms_median_wall"],
+        "low": min(beyond),
+        "high": max(beyond),
+    }
+    yield _asked(part, f"{o['tasks']:,} tiny tasks", "ms per task beyond Dask's own", s, most=2.0)
+    if "gain" in m:
+        g = m["gain"]
+        s = {"median": g["ratio_median"], "low": min(g["ratios"]), "high": max(g["ratios"])}
+        yield _asked(part, f"{g['diagnoses']} diagnoses", "two workers over one", s, least=1.8)
+
+
+def _survival(m: Measured) -> Iterator[Row]:
+    part, subject = "survival", f"{m['cases']} diagnoses, two workers and the client killed"
+    yield Row(part, subject, "results", float(m["results"]), asked=f"= {m['cases']}",
+              met=m["results"] == m["cases"])  # fmt: skip
+    yield Row(part, subject, "results done again after the client was killed",
+              float(m["done_again"]), asked="= 0", met=m["done_again"] == 0)  # fmt: skip
+    yield Row(part, subject, f"files of {m['files_compared']} that differ from an undisturbed run",
+              float(m["files_that_differ"]), asked="= 0",
+              met=m["files_that_differ"] == 0)  # fmt: skip

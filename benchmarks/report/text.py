@@ -1,0 +1,122 @@
+"""What the benchmarks' README says: what was asked and reached, on what, how, what was tried."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from report.rows import Row
+
+__all__ = ["readme"]
+
+_HEAD = """# Benchmarks
+
+Made by `make bench`; `make bench PART="posterior likelihood"` renews a part. Medians over repeats
+that take turns with the peers', with the least and the most of them. Every line is in
+[results.md](results.md) and `results.csv`, every measurement in `measured/`.
+
+![What a posterior costs, and the likelihood against its floor](benchmarks.png)
+"""
+
+_HOW = """## How it was measured
+
+- **Posterior.** One core. The three problems of the report, with all their rows: same data, priors,
+  truncations, likelihood and coordinates for every sampler (`benchmarks/shared/peers.py` writes
+  them in PyMC). Time is everything but PyMC's compilation: our search for modes, adaptation and
+  gate, nutpie's tuning, the stretch move's burn-in (a tenth of it). The stretch move starts from
+  draws of our posterior and searches for nothing. Effective sample sizes are ArviZ's, smallest over
+  the parameters, of all draws that were kept, with walkers as chains. calib stores 16,384 draws of
+  a posterior unless `SamplerSettings.keep` says more, and they are worth no more than that; here
+  it keeps all. "Default" is 4 ensembles of 128 walkers and 160 steps, and nutpie's 4 chains of
+  1,000 draws after its tuning; "long" is 512 walkers, and 4 chains of 10,000 draws: what a sampler
+  does once what comes first is of little account.
+- **Are those sizes honest?** The means of 40 runs of other seeds must scatter by what the sizes
+  claim: the ratio of variances is in results.md (one if they are right).
+- **One posterior?** z-scores of the means and of the shares below the pooled 5, 50 and 95 %
+  quantiles of every parameter (`equality.csv`), with the error of that very quantity. The limit is
+  what the largest of so many exceeds once in a hundred times. nutpie's runs with an R-hat above
+  1.01 (a chain that stays where the drawbar's density is cut off) are counted, and left out here.
+- **Evaluations** of nutpie are of the density with its gradient, each worth several of ours.
+- **Likelihood.** One core, all conditions distinct. The floor is one sine and two arctangents for
+  each row and vector, which is what Eqs 12-15 take, by NumPy in place on blocks in the cache.
+- **A million rows.** All cores. The check evaluates the equation as printed at every row in plain
+  NumPy, at draws of a Student-t that are weighted by it.
+- **Genetic algorithm.** One core, same likelihood and box, a population in each call for both. A
+  seed is at the optimum if its cost is within 1e-6 of the lowest that any run reached.
+- **Campaign.** Two worker processes. `benchmarks/campaign.py` and `campaign_survival.py`.
+"""
+
+_TRIED = """## What was tried
+
+Sampler, by bulk ESS per second of the joint drawbar pull on one core:
+
+- Kept: proposals' densities worked out with the draws; expectation maximisation in two matrix
+  products; a random walk in straightened coordinates in the place of differential evolution; the
+  gate on the draws that are stored; log densities taken past emcee's loop over scalars; components
+  of the mixture limited by the entries of their covariances; a twelfth of the steps before those
+  that are kept; 128 walkers. Together 57,000 to 120,000 per second and 4.9 to 3.8 evaluations per
+  ESS with default settings (six seeds each, in one sitting).
+- Dropped, without gain beyond their cost: Newton's method in the search for modes (quasi-Newton
+  ascents in a batch were there), 12,000 draws in the place of 6,000 in each fit, a fifth round of
+  adaptation (efficiency 0.72 to 0.79, but as much time), one component only, fewer rounds
+  (efficiency 0.65), wider or narrower components, six steps of expectation maximisation (half the
+  tail ESS of density). A proposal fitted to 50,000 posterior draws reaches an efficiency of 0.84:
+  that is the limit of a quadratic map and a mixture, and would give a quarter more.
+- Where the time of a default run goes (285 ms): 140 to the steps, of which 75 to drawing proposals
+  and their densities, 67 to adaptation, 30 to the search for modes, 26 to the gate, 9 to
+  autocorrelation times. The likelihood is 0.3 us of the 0.9 us that a proposal costs. nutpie's
+  compiled density and gradient take 3 us together, 55 to 80 of them per ESS.
+- emcee's snooker move is not used: half the exponent of ter Braak & Vrugt (2008) in its acceptance.
+
+Likelihood: {libraries}
+A sine is worked out as a tangent of the half argument, for which NumPy has vector instructions:
+that is why the whole density can be below the floor. No compiler is a dependency.
+"""
+
+
+def readme(measured: Mapping[str, Mapping[str, Any]], rows: list[Row]) -> str:
+    """Write the README from the measurements."""
+    asked = [r for r in rows if r.asked]
+    missed = [r for r in asked if r.met is False]
+    lines = [_HEAD, "## What was asked, and what was reached", ""]
+    lines += ["| | | median | range | asked | |", "|---|---|---:|---:|---|---|"]
+    lines += [r.line for r in asked]
+    lines += ["", f"{len(asked) - len(missed)} of {len(asked)} are met.", ""]
+    lines += ["## On what", "", *_machines(measured), ""]
+    return "\n".join(lines) + "\n" + _HOW + "\n" + _TRIED.format(libraries=_libraries(measured))
+
+
+def _machines(measured: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """One line for each machine that parts were measured on, and the load they met."""
+    parts: dict[str, list[str]] = {}
+    for part, m in measured.items():
+        machine = m.get("machine")
+        if not isinstance(machine, dict):
+            continue
+        versions = ", ".join(f"{n} {v}" for n, v in machine["versions"].items())
+        text = (
+            f"{machine['processor']}, {machine['cores']} cores, {machine['memory_gib']} GiB, "
+            f"{machine['system']}; {versions}."
+        )
+        load = machine["load_average_1_min"]
+        parts.setdefault(text, []).append(f"{part} {load:g}")
+    return [
+        f"- {text} Load average as each part began: {', '.join(p)}." for text, p in parts.items()
+    ]
+
+
+def _libraries(measured: Mapping[str, Mapping[str, Any]]) -> str:
+    if "likelihood" not in measured:
+        return "not measured here."
+    found = []
+    for r in measured["likelihood"]["peers"]:
+        speeds = ", ".join(
+            f"{n} {s['median']:.2g}" for n, s in r["speed_over_calib"].items() if n != "calib"
+        )
+        found.append(f"{speeds} at {r['rows']:,} rows")
+    return (
+        "speed of the sums of squares over ours, on one core in double precision, coefficients of "
+        f"each pressure handed over ready: {'; '.join(found)}. "
+        "(Numba has no vectorised arctangent without Intel's library; JAX costs 600 MB and seconds "
+        "of compilation for each shape.)"
+    )
