@@ -14,12 +14,13 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+from shared.machine import describe
 
 # The matrices are small: threads of the linear algebra would only wait for each other.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -113,8 +114,7 @@ def main() -> None:
     from calib.challenge.make import make
 
     result: dict[str, object] = {
-        "machine": f"{os.cpu_count()} cores, {platform.machine()}, Python "
-        f"{platform.python_version()}",
+        "machine": describe(),
         "load_before": os.getloadavg(),
         "overhead": overhead(options.tasks, options.repeats),
     }

@@ -21,6 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import psutil
+from shared.machine import describe
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
@@ -101,7 +102,7 @@ def main() -> None:
         if calib(folder, *make, "--cases", str(options.cases)).wait():
             raise SystemExit("the cases could not be made")
         (folder / "plan.toml").write_text(PLAN)
-        result = {"cases": options.cases, **survive(folder, options.cases)}
+        result = {"machine": describe(), "cases": options.cases, **survive(folder, options.cases)}
         began = time.perf_counter()
         code = calib(folder, "campaign", "plan.toml", "--out", "whole", "--workers", "1").wait()
         result["undisturbed_serial_exit_code"] = code

@@ -38,8 +38,8 @@ def draw(measured: Mapping[str, Mapping[str, Any]], path: Path) -> None:
     """Draw what was measured of the posterior and the likelihood parts."""
     with style():
         figure, axes = panels(
-            2, 3, height=50.0, width=180.0, left=14.0, right=4.0, top=7.0, bottom=22.0,
-            gap_x=15.0, gap_y=17.0,
+            2, 3, height=50.0, width=180.0, left=14.0, right=4.0, top=7.0, bottom=27.0,
+            gap_x=17.0, gap_y=17.0,
         )  # fmt: skip
         handles: dict[str, Any] = {}
         for ax, key in zip(axes[0], NAMES, strict=True):
@@ -51,7 +51,7 @@ def draw(measured: Mapping[str, Mapping[str, Any]], path: Path) -> None:
         if "likelihood" in measured:
             handles |= _likelihood(axes[1, 1], measured["likelihood"])
         if "genetic" in measured:
-            _genetic(axes[1, 2], measured["genetic"]["problems"])
+            handles |= _genetic(axes[1, 2], measured["genetic"]["problems"])
         legend_below(figure, list(handles.values()), list(handles), ncols=4)
         figure.savefig(path, dpi=200)
 
@@ -65,6 +65,13 @@ def _time(ax: Axes, problem: Mapping[str, Any]) -> dict[str, Any]:
             x, y, marker, color=colour, mfc="none" if marker == "s" else colour, ms=4.0, alpha=0.8,
         )  # fmt: skip
     ax.set(xscale="log", yscale="log", xlabel="seconds", ylabel="smallest bulk ESS")
+    ax.margins(0.12)
+    stuck = sum(problem["nutpie_runs_with_bad_rhat"].values())
+    if stuck:
+        ax.annotate(
+            f"{stuck} runs of nutpie with R-hat > 1.01", (0.97, 0.03), fontsize=6,
+            xycoords="axes fraction", ha="right", color=VERMILION,
+        )  # fmt: skip
     _rates(ax)
     return handles
 
@@ -77,10 +84,11 @@ def _rates(ax: Axes) -> None:
         if rate * x1 > y0 and rate * x0 < y1:
             ax.plot(x, rate * x, ":", color=GREY, lw=0.6, zorder=0)
             at = min(x1, y1 / rate)
-            ax.annotate(
-                f"$10^{int(np.log10(rate))}$/s", (at, rate * at), fontsize=6, color=GREY,
-                ha="right", va="top",
-            )  # fmt: skip
+            if rate * at > y0 * (y1 / y0) ** 0.1:
+                ax.annotate(
+                    f"$10^{int(np.log10(rate))}$/s", (at, rate * at), fontsize=6, color=GREY,
+                    ha="right", va="top",
+                )  # fmt: skip
     ax.set(xlim=(x0, x1), ylim=(y0, y1))
 
 
@@ -96,7 +104,7 @@ def _evaluations(ax: Axes, problems: Mapping[str, Any]) -> None:
     ax.axhline(1.0, color=GREY, lw=0.8, ls=":")
     ax.annotate("independent draws: 1", (2.45, 1.05), fontsize=7, ha="right", color=GREY)
     ax.set_xticks(range(len(NAMES)), [n.replace(" ", "\n", 1) for n in NAMES.values()])
-    ax.set(yscale="log", ylim=(0.8, 300.0), xlim=(-0.5, 2.5), ylabel="evaluations per bulk ESS")
+    ax.set(yscale="log", ylim=(0.8, 400.0), xlim=(-0.5, 2.5), ylabel="evaluations per bulk ESS")
     ax.set_title("likelihoods (nutpie: and gradients)")
 
 
@@ -122,25 +130,34 @@ def _likelihood(ax: Axes, measured: Mapping[str, Any]) -> dict[str, Any]:
             y = [1e-6 * r["cells_per_second"][name]["median"] for r in found]
             (handles[name],) = ax.plot([r["rows"] for r in found], y, ":", marker=marker,
                                        color=colour)  # fmt: skip
-    ax.set(xscale="log", yscale="log", xlabel="rows", ylabel="million vectors times rows per s")
+    ax.set(
+        xscale="log",
+        yscale="log",
+        xlabel="rows (cell: row times vector)",
+        ylabel="million cells per second",
+        ylim=(8.0, 400.0),
+    )
     ax.set_title("likelihood of drawbar pull: one core")
     return handles
 
 
-def _genetic(ax: Axes, problems: Mapping[str, Any]) -> None:
+def _genetic(ax: Axes, problems: Mapping[str, Any]) -> dict[str, Any]:
+    handles = {}
     for i, p in enumerate(problems.values()):
-        for shift, (m, colour) in enumerate(
-            zip(p["methods"].values(), (BLUE, ORANGE, VERMILION), strict=True)
+        for shift, ((name, m), colour) in enumerate(
+            zip(p["methods"].items(), (BLUE, ORANGE, VERMILION), strict=True)
         ):
             y = i + 0.25 * (shift - 1)
             s = {k: 1e3 * v for k, v in m["seconds"].items()}
-            ax.barh(y, s["median"], 0.23, color=colour)
+            handles[name] = ax.barh(y, s["median"], 0.23, color=colour)
             ax.plot([s["low"], s["high"]], [y, y], color=BLACK, lw=0.6)
             ax.annotate(f" {m['at_the_optimum']}/{m['seeds']}", (s["high"], y), fontsize=5.5,
                         va="center")  # fmt: skip
-    labels = [NAMES.get(k, k.replace("drawbar_pull at ", "")) for k in problems]
-    ax.set_yticks(range(len(labels)), [n.replace(" ", "\n", 1) for n in labels])
+    labels = [NAMES.get(k, k.replace("drawbar_pull at ", "")).replace(" ", "\n") for k in problems]
+    ax.set_yticks(range(len(labels)), labels, fontsize=6)
     ax.invert_yaxis()
     high = max(m["seconds"]["high"] for p in problems.values() for m in p["methods"].values())
-    ax.set(xscale="log", xlabel="milliseconds; seeds at the optimum", xlim=(2.0, 4e3 * high))
-    ax.set_title("genetic algorithm, SciPy DE, DE to 1e-8")
+    ax.set(xscale="log", xlabel="milliseconds; seeds of 20",
+           xlim=(2.0, 4e3 * high))  # fmt: skip
+    ax.set_title("to the lowest cost: one core")
+    return handles
