@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.models.base import Array
 
-__all__ = ["ess", "hdi", "psis", "rhat"]
+__all__ = ["ess", "hdi", "mcse", "psis", "rhat", "tail_shape"]
 
 
 def _stats() -> Any:
@@ -36,6 +36,26 @@ def ess(chains: Array, method: Literal["bulk", "tail", "mean"]) -> Array:
     with np.errstate(all="ignore"):
         value = _stats().ess(chains, chain_axis=0, draw_axis=1, method=method, **extra)
     return np.asarray(value)
+
+
+def mcse(chains: Array, method: Literal["mean", "sd", "median"]) -> Array:
+    """Monte Carlo standard error of a summary of each parameter, (chains, draws, d) to (d,)."""
+    with np.errstate(all="ignore"):
+        value = _stats().mcse(chains, chain_axis=0, draw_axis=1, method=method)
+    return np.asarray(value)
+
+
+def tail_shape(chains: Array) -> Array:
+    """Pareto shape k of the heavier tail of each parameter, (chains, draws, d) to (d,).
+
+    Moments up to 1/k exist: with k above 1/2 no variance, so no Monte Carlo error of a mean.
+
+    References
+    ----------
+    Vehtari et al. (2024), Pareto smoothed importance sampling, JMLR 25(72).
+    """
+    with np.errstate(all="ignore"):
+        return np.asarray(_stats().pareto_khat(chains, chain_axis=0, draw_axis=1))
 
 
 def hdi(draws: Array, prob: float) -> tuple[float, float]:

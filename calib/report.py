@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.data import write_table
+from calib.environment import Environment
 from calib.figures import Plate, plates
 from calib.folders import fresh_folder
 from calib.manifest import build_manifest, file_hashes, sha256
@@ -32,6 +33,8 @@ def write_report(
     command: Sequence[str],
     title: str,
     overwrite: bool = False,
+    posteriors: bool = True,
+    environment: Environment | None = None,
     progress: Progress | None = None,
 ) -> Path:
     """Write a report folder.
@@ -48,6 +51,11 @@ def write_report(
     title : str
     overwrite : bool
         Replace an earlier report.
+    posteriors : bool
+        Whether to keep the netCDF files, which are megabytes. Where they are left out, the
+        manifest says so and has their hashes.
+    environment : Environment, optional
+        Where the manifest says the report was made: that of this process by default.
     progress : callable, optional
 
     Returns
@@ -78,7 +86,9 @@ def write_report(
                     images[name] = _png(plate)
                     (folder / "figures" / name).write_bytes(images[name])
         tell("drawing figures", len(successes), len(successes))
-        manifest = build_manifest(study, settings, command, inputs)
+        manifest = build_manifest(
+            study, settings, command, inputs, title=title, environment=environment
+        )
         page = render_page(
             study,
             drawn,
@@ -88,7 +98,12 @@ def write_report(
             reconstructed=any(r.task.table.label for r in study.results.values()),
         )
         (folder / "index.html").write_text(page, encoding="utf-8")
-        manifest["files"] = file_hashes(folder)
+        files = file_hashes(folder)
+        left_out = [] if posteriors else [f"{key}.nc" for key in successes]
+        manifest["left_out"] = {name: files.pop(name) for name in left_out}
+        for name in left_out:
+            (folder / name).unlink()
+        manifest["files"] = files
         (folder / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
     return Path(out) / "index.html"
 
@@ -113,13 +128,15 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
             "data": {
                 "file": f"data/{key}.csv",
                 "sha256": sha256(data),
-                "source": Path(task.table.source).name,
+                "source": task.table.source,
                 "source_sha256": task.table.sha256,
+                "ignored": list(task.table.ignored),
             },
             "priors": {
                 "file": f"priors/{key}.toml",
                 "sha256": sha256(priors),
                 "source": prior_path.name,
+                "shipped": task.prior_path is None,
             },
         }
     return inputs

@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from calib.cli import calibration, gap
+from calib.cli import calibration, check, gap
 
 __all__ = ["app", "main"]
 
@@ -23,6 +23,7 @@ app = typer.Typer(
 )
 calibration.register(app)
 gap.register(app)
+check.register(app)
 
 
 def main() -> None:

@@ -48,6 +48,9 @@ def report(
     ] = None,
     overwrite: _Overwrite = False,
     max_steps: _MaxSteps = 25_600,
+    posteriors: Annotated[
+        bool, typer.Option(help="Keep the posteriors, megabytes of netCDF, in the folder.")
+    ] = True,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from calib.cli.display import progress_bars
@@ -77,7 +80,7 @@ def report(
         study = run_study(tasks, seed, settings=settings, progress=tell)
         page = write_report(
             study, out, settings=settings, command=_command(), title=title, overwrite=overwrite,
-            progress=tell,
+            posteriors=posteriors, progress=tell,
         )  # fmt: skip
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]
@@ -107,6 +110,7 @@ def fit(
     from calib.cli.display import posterior_table, progress_bars, verdict_line
     from calib.data import hold_out as split
     from calib.data import read_for_model
+    from calib.datasets.he2019 import labelled
     from calib.estimators import estimate
     from calib.folders import check_folder, fresh_folder
     from calib.models import get_model
@@ -118,7 +122,7 @@ def fit(
 
     chosen = get_model(model)
     check_folder(out, overwrite=overwrite)
-    table = read_for_model(file, (*chosen.conditions, chosen.output))
+    table = labelled(read_for_model(file, (*chosen.conditions, chosen.output)))
     kept = _parse_hold_out(hold_out)
     fitted, held = split(table, kept.column, kept.value) if kept else (table, None)
     problem = build_problem(model, fitted, priors)

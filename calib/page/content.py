@@ -15,7 +15,6 @@ from calib.figures.rows import held_table
 from calib.models import get_model
 from calib.page.equations import equation, likelihood, parametrisation, prose
 from calib.page.facts import repeats_words, sampling_facts, validation_facts, worst_row
-from calib.page.numbers import format_number
 from calib.page.tables import (
     estimates_grid,
     posterior_rows,
@@ -114,7 +113,6 @@ def section(
         "validation_title": _validation_title(result),
         "figures": {p.name: _figure(key, p, images, names) for p in plates},
         "converged": calibration.converged,
-        "seconds": {k: format_number(v, 2) for k, v in result.seconds.items()},
     }
 
 

@@ -75,7 +75,6 @@ def render_page(
         reconstructed=reconstructed,
         audit=Markup(audit_html) if audit_html else None,
         seed=study.seed,
-        seconds=study.seconds,
         command=shlex.join(str(part) for part in manifest.get("command", ())),
         versions=manifest.get("versions", {}),
         settings=manifest.get("settings", {}),

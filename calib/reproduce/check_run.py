@@ -1,0 +1,142 @@
+"""Check a run folder: its hashes, its inputs, and its posterior sampled again from them."""
+
+from __future__ import annotations
+
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from calib.environment import Environment
+from calib.errors import CalibError
+from calib.problem import Problem
+from calib.reproduce.allowances import describe, run_allowances, run_estimate_allowances
+from calib.reproduce.files import verify_files
+from calib.reproduce.inputs import GROUP as INPUTS
+from calib.reproduce.inputs import verify_label
+from calib.reproduce.items import Item, Status
+from calib.reproduce.montecarlo import Path as Place
+from calib.reproduce.montecarlo import posterior_errors
+from calib.reproduce.numbers import Section, compare_section, flatten
+from calib.reproduce.posteriors import compare_posterior, read_draws, summary_of, verify_density
+from calib.reproduce.recompute import estimate_again, recompute_run
+from calib.reproduce.schema import RunRecord
+from calib.store import describe_estimates, run_problem
+from calib.study import Progress
+
+__all__ = ["check_run"]
+
+_RECORD, _POSTERIOR, _PRIORS, _DATA = "run.json", "posterior.nc", "priors.toml", "data.csv"
+_FILES = (_POSTERIOR, _PRIORS, _DATA)
+# Durations, and hashes that are verified as such.
+_NOT_COMPARED = ("seconds", "sha256")
+
+
+def check_run(
+    record: RunRecord,
+    folder: Path,
+    scratch: Path,
+    here: Environment,
+    progress: Progress,
+    *,
+    quick: bool,
+) -> tuple[list[Item], str]:
+    """Return what was found, and what Monte Carlo error was allowed, in words.
+
+    Parameters
+    ----------
+    record : RunRecord
+    folder, scratch : Path
+        The run, and an empty folder.
+    here : Environment
+    progress : callable
+    quick : bool
+        Skip the sampling.
+    """
+    items = verify_files(folder, record.sha256, _RECORD, {})
+    items += [
+        Item(INPUTS, name, Status.DIFFERENT, note="run.json has no hash of it")
+        for name in _FILES
+        if name not in record.sha256
+    ]
+    try:
+        problem = run_problem(record.document, folder / _DATA)
+    except CalibError as error:
+        note = f"not computed again: {error.message}"
+        return [*items, Item(INPUTS, _DATA, Status.DIFFERENT, note=note)], ""
+    items += _consistent(record, folder, problem)
+    if quick:
+        return items + _estimates_alone(record, problem), ""
+    try:
+        calibration = recompute_run(record, problem, scratch / "again", progress)
+    except CalibError as error:
+        note = f"not computed again: {error.message}"
+        return [*items, Item(INPUTS, _RECORD, Status.DIFFERENT, note=note)], ""
+    made = scratch / "again"
+    recorded, found = _document(record.document, folder), _document(_read(made), made)
+    if "posterior" not in recorded:  # it cannot be read, which has been said
+        del found["posterior"]
+    section = Section(_RECORD, (), dict(flatten(recorded)), dict(flatten(found)))
+    paths = {**section.recorded, **section.found}
+    allowances = run_allowances(calibration, section.recorded, paths)
+    items += compare_section(section, allowances, group_of=_group)
+    if "posterior" in recorded:
+        items.append(
+            compare_posterior(
+                _POSTERIOR, folder / _POSTERIOR, made / _POSTERIOR,
+                exact=section.exact and record.environment.same_program(here),
+            )
+        )  # fmt: skip
+    return items + _blame(items), describe(len(posterior_errors(calibration)))
+
+
+def _consistent(record: RunRecord, folder: Path, problem: Problem) -> list[Item]:
+    """Hold the parts of the folder against each other, without computing anything again."""
+    items = [verify_label(_DATA, problem.table, record.data_label)]
+    priors = folder / _PRIORS
+    if priors.is_file() and priors.read_text("utf-8", "replace") != record.prior_text:
+        note = "not the priors that run.json repeats"
+        items.append(Item(INPUTS, _PRIORS, Status.DIFFERENT, note=note))
+    file = folder / _POSTERIOR
+    if file.is_file():
+        items.append(verify_density(_POSTERIOR, file, problem))
+    return items
+
+
+def _document(record: dict[str, Any], folder: Path) -> dict[str, Any]:
+    """Return what is compared of a run: its record, and the summary of its draws."""
+    document = {key: value for key, value in record.items() if key not in _NOT_COMPARED}
+    with suppress(CalibError):
+        document["posterior"] = summary_of(read_draws(folder / _POSTERIOR))
+    return document
+
+
+def _read(folder: Path) -> dict[str, Any]:
+    content: dict[str, Any] = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
+    return content
+
+
+def _group(path: Place) -> str:
+    if path[0] in ("posterior", "gate", "mode", "log_evidence", "efficiency", "acceptance",
+                   "evaluations"):  # fmt: skip
+        return "posterior"
+    return "estimates" if path[0] == "estimates" else "what was computed"
+
+
+def _estimates_alone(record: RunRecord, problem: Problem) -> list[Item]:
+    again = describe_estimates(estimate_again(record, problem))
+    recorded = {"estimates": record.document["estimates"]}
+    found = {"estimates": json.loads(json.dumps(again))}
+    section = Section(_RECORD, (), dict(flatten(recorded)), dict(flatten(found)))
+    allowances = run_estimate_allowances(section.recorded)
+    return compare_section(section, allowances, group_of=_group)
+
+
+def _blame(items: list[Item]) -> list[Item]:
+    """Name the input that the recorded numbers cannot have been computed from."""
+    mode = [item for item in items if item.name.startswith(f"{_RECORD}: mode.")]
+    different = sum(item.status is Status.DIFFERENT for item in mode)
+    if different <= 0.5 * len(mode):
+        return []
+    note = "the posterior mode in run.json does not follow from the data and priors here"
+    return [Item(INPUTS, f"{_DATA} or {_PRIORS}", Status.DIFFERENT, note=note)]

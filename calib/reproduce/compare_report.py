@@ -1,0 +1,289 @@
+"""Compare a report folder with the one that was made again from it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from calib.environment import Environment
+from calib.manifest import sha256
+from calib.models.base import Array
+from calib.reproduce.allowances import (
+    Allowance,
+    count_errors,
+    estimate_allowances,
+    output_allowances,
+)
+from calib.reproduce.figures import compare_figure, thumbnails
+from calib.reproduce.inputs import GROUP as INPUTS
+from calib.reproduce.items import Item, Status
+from calib.reproduce.montecarlo import Path as Place
+from calib.reproduce.numbers import Section, compare_section, flatten
+from calib.reproduce.posteriors import GROUP as POSTERIORS
+from calib.reproduce.posteriors import compare_posterior
+from calib.reproduce.schema import Manifest
+from calib.reproduce.text import GROUP as TEXT
+from calib.reproduce.text import compare_text
+from calib.study import OutputResult, Progress, Study, Task, estimate_task
+from calib.summary import summarise_estimates
+
+__all__ = [
+    "PAGE", "RECORD", "SUMMARY", "Again", "compare_estimates", "compare_report", "count_numbers",
+    "read_json",
+]  # fmt: skip
+
+RECORD, SUMMARY, PAGE = "manifest.json", "summary.json", "index.html"
+# What a manifest has about itself: durations, and hashes that are verified as such.
+_NOT_COMPARED = ("seconds", "files", "left_out")
+_VERIFIED = ("sha256", "shipped")
+_POINTS = ("estimates", "fit", "by_pressure")
+_CHAIN = ("posterior", "validation", "sampling")
+_HEAD = ("schema", "seed")
+_SET_UP = ("model", "output", "data", "references", "error")
+_KNOWN = (*_POINTS, *_CHAIN, *_SET_UP)
+_NO_RULE = Allowance(why="no allowance is stated for it")
+_SEARCHES = ("genetic", "differential_evolution")
+
+
+@dataclass(frozen=True)
+class Again:
+    """A report folder and the same made again.
+
+    Parameters
+    ----------
+    manifest : Manifest
+    folder, made : Path
+        The report, and the one made again.
+    study : Study
+        What the second shows.
+    here : Environment
+    """
+
+    manifest: Manifest
+    folder: Path
+    made: Path
+    study: Study
+    here: Environment
+
+    @cached_property
+    def same_program(self) -> bool:
+        """Whether equal numbers must give equal files."""
+        return self.manifest.environment.same_program(self.here)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return a JSON object; empty where the file is missing or damaged."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def count_numbers(study: Study) -> int:
+    """Return how many numbers of a study follow from posterior draws."""
+    return sum(count_errors(result) for result in study.successes.values())
+
+
+def compare_report(again: Again, summary: Mapping[str, Any]) -> list[Item]:
+    """Return an item for each number and file that could be compared.
+
+    Parameters
+    ----------
+    again : Again
+    summary : mapping
+        The recorded `summary.json`.
+    """
+    made = read_json(again.made / SUMMARY)
+    exact: dict[str, bool] = {}
+    items = []
+    for key, part in _outputs(made).items():
+        section = _section(("models", key), _outputs(summary).get(key), part)
+        exact[key] = section.exact
+        numbers = compare_section(
+            section, _allowances(again.study, key, section), group_of=_grouped(key)
+        )
+        items += numbers + _blame(again.manifest, key, numbers)
+    for key in dict.fromkeys([*summary, *made]):
+        if key != "models":
+            section = _section((key,), summary.get(key), made.get(key))
+            exact[key] = section.exact
+            group = SUMMARY if key in _HEAD else key
+            items += compare_section(section, _no_rules(section, _HEAD), group_of=_always(group))
+    if summary and set(_outputs(summary)) != set(_outputs(made)):
+        items.append(Item(SUMMARY, SUMMARY, Status.DIFFERENT, note="it has other outputs"))
+    items += _record(again)
+    alone = all(item.status is Status.IDENTICAL for item in items)
+    if alone and _bytes(again.folder / SUMMARY) != _bytes(again.made / SUMMARY):
+        note = "the same numbers in another form than it is written in"
+        items.append(Item(SUMMARY, SUMMARY, Status.DIFFERENT, note=note))
+    return items + _files(again, exact)
+
+
+def compare_estimates(
+    tasks: Iterable[Task], seed: int, summary: Mapping[str, Any], progress: Progress
+) -> list[Item]:
+    """Compare the point estimates alone, computed again without sampling."""
+    items = []
+    for task in tasks:
+        key = task.output
+        recorded = _outputs(summary).get(key, {})
+        recorded = recorded if isinstance(recorded, Mapping) else {}
+        if "error" in recorded:
+            note = "it failed; to see whether it does again, check without --quick"
+            items.append(Item(f"{key}: error", f"{SUMMARY}: models.{key}", Status.UNJUDGED,
+                              note=note))  # fmt: skip
+            continue
+        estimates, by_pressure = estimate_task(task, seed, progress=progress)
+        found = json.loads(json.dumps(summarise_estimates(estimates, by_pressure)))
+        section = _section(
+            ("models", key), {name: recorded.get(name, {}) for name in _POINTS}, found
+        )
+        allowances = estimate_allowances(estimates, by_pressure, None)
+        items += compare_section(section, allowances, group_of=_grouped(key))
+    return items
+
+
+def _outputs(summary: Mapping[str, Any]) -> Mapping[str, Any]:
+    models = summary.get("models")
+    return models if isinstance(models, Mapping) else {}
+
+
+def _section(place: Place, recorded: Any, found: Any) -> Section:
+    return Section(SUMMARY, place, dict(flatten(recorded)), dict(flatten(found)))
+
+
+def _allowances(study: Study, key: str, section: Section) -> dict[Place, Allowance]:
+    result = study.results[key]
+    rules = _no_rules(section, _KNOWN)
+    if isinstance(result, OutputResult):
+        paths = {**section.recorded, **section.found}
+        rules |= output_allowances(result, count_numbers(study), section.recorded, paths)
+    return rules
+
+
+def _no_rules(section: Section, known: tuple[str, ...]) -> dict[Place, Allowance]:
+    """Text of sections that other parts of the package add may depend on draws."""
+    every = {**section.recorded, **section.found}
+    return {
+        path: _NO_RULE
+        for path, value in every.items()
+        if path and path[0] not in known and not isinstance(value, int | float)
+    }
+
+
+def _always(group: str) -> Callable[[Place], str]:
+    return lambda _: group
+
+
+def _grouped(key: str) -> Callable[[Place], str]:
+    def group(path: Place) -> str:
+        if not path or path[0] in _SET_UP:
+            return f"{key}: what was computed"
+        if path[0] not in (*_POINTS, *_CHAIN):
+            return f"{key}: {path[0]}"
+        if path[0] == "by_pressure":
+            return f"{key}: estimates ({' '.join(path[1:3])})"
+        # Posterior, scores and sampling figures come of the same draws.
+        return f"{key}: estimates ({path[1]})" if path[0] in _POINTS else f"{key}: posterior"
+
+    return group
+
+
+def _blame(manifest: Manifest, key: str, items: list[Item]) -> list[Item]:
+    """Name the input that the recorded numbers cannot have been computed from."""
+    entry = manifest.tasks[key]
+    points = [
+        item for item in items
+        if item.group.startswith(f"{key}: estimates") and item.share is not None
+        and not any(search in item.group for search in _SEARCHES)
+    ]  # fmt: skip
+    mode = [i for i in items if ".sampling.mode." in i.name and i.share is not None]
+    if _mostly_different(points):
+        note = "most estimates in summary.json do not follow from these rows"
+        return [Item(INPUTS, entry.data.file, Status.DIFFERENT, note=note)]
+    if _mostly_different(mode):
+        note = "the posterior mode in summary.json does not follow from these priors and the data"
+        return [Item(INPUTS, entry.priors.file, Status.DIFFERENT, note=note)]
+    return []
+
+
+def _mostly_different(items: list[Item]) -> bool:
+    different = sum(item.status is Status.DIFFERENT for item in items)
+    return bool(items) and different > 0.5 * len(items)
+
+
+def _record(again: Again) -> list[Item]:
+    """Compare what the manifests say, beyond what was taken over from the first."""
+    recorded, made = (_comparable(read_json(f / RECORD)) for f in (again.folder, again.made))
+    section = Section(RECORD, (), dict(flatten(recorded)), dict(flatten(made)))
+    return compare_section(section, {}, exact=again.same_program, group_of=_always(RECORD))
+
+
+def _comparable(manifest: dict[str, Any]) -> dict[str, Any]:
+    kept = {key: value for key, value in manifest.items() if key not in _NOT_COMPARED}
+    for entry in kept.get("tasks", {}).values():
+        for file in ("data", "priors"):
+            entry[file] = {k: v for k, v in entry[file].items() if k not in _VERIFIED}
+    return kept
+
+
+def _files(again: Again, exact: Mapping[str, bool]) -> list[Item]:
+    made = {p.relative_to(again.made).as_posix() for p in again.made.rglob("*") if p.is_file()}
+    made -= {RECORD, SUMMARY}
+    pictures = thumbnails(again.made)
+    items = [_file(again, name, exact, pictures) for name in sorted(made)]
+    status = Status.DIFFERENT if again.same_program else Status.UNJUDGED
+    listed = set(again.manifest.files) - {SUMMARY}
+    return items + [
+        Item(TEXT, name, status, note="this version makes no such file")
+        for name in sorted(listed - made)
+    ]
+
+
+def _file(
+    again: Again, name: str, exact: Mapping[str, bool], pictures: Mapping[str, Array]
+) -> Item:
+    recorded, made = again.folder / name, again.made / name
+    output = next((key for key in again.study.results if _belongs(name, key)), None)
+    same_numbers = all(exact.values()) if output is None else exact[output]
+    strict = same_numbers and again.same_program
+    if name in again.manifest.left_out:
+        return _left_out(again.manifest.left_out[name], made, name, strict=strict)
+    if not recorded.is_file():
+        status = Status.DIFFERENT if again.same_program else Status.UNJUDGED
+        return Item(TEXT, name, status, note="missing")
+    if name.endswith(".nc"):
+        return compare_posterior(name, recorded, made, exact=strict)
+    if name.endswith(".png"):
+        return compare_figure(
+            name, recorded.read_bytes(), made.read_bytes(), pictures, exact=strict
+        )
+    if name.startswith(("data/", "priors/")):
+        strict = True
+    why = "other draws" if not same_numbers else "another version wrote it"
+    return compare_text(name, recorded.read_bytes(), made.read_bytes(), exact=strict, why_not=why)
+
+
+def _belongs(name: str, key: str) -> bool:
+    stem = name.rpartition("/")[2]
+    return stem.startswith((f"{key}.", f"{key}_"))
+
+
+def _left_out(recorded: str, made: Path, name: str, *, strict: bool) -> Item:
+    found = sha256(made.read_bytes())
+    if found == recorded:
+        note = "left out on purpose; made again, it has the recorded hash"
+        return Item(POSTERIORS, name, Status.IDENTICAL, note=note)
+    if strict:
+        note = "left out; made again, it has another hash"
+        return Item(POSTERIORS, name, Status.DIFFERENT, recorded, found, note=note)
+    return Item(POSTERIORS, name, Status.UNJUDGED, note="left out on purpose; other draws")
+
+
+def _bytes(path: Path) -> bytes:
+    return path.read_bytes() if path.is_file() else b""
