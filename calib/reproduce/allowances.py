@@ -19,7 +19,7 @@ from calib.reproduce.montecarlo import Path, posterior_errors, validation_errors
 from calib.study import OutputResult
 
 __all__ = [
-    "MONTE_CARLO", "Allowance", "count_errors", "describe", "estimate_allowances",
+    "MONTE_CARLO", "Allowance", "count_drawn", "describe", "estimate_allowances",
     "output_allowances", "run_allowances", "run_estimate_allowances",
 ]  # fmt: skip
 
@@ -94,10 +94,12 @@ def _multiple(n: int) -> float:
     return float(_SAFETY * norm.isf(_FAMILY / (2 * max(n, 1))))
 
 
-def count_errors(result: OutputResult) -> int:
-    """Return how many numbers of an output follow from posterior draws."""
-    posterior = posterior_errors(result.calibration)
-    return len(posterior) + len(validation_errors(result.calibration, result.validation, 1.0))
+def count_drawn(calibration: Calibration, n_validated: int = 0) -> int:
+    """Return how many numbers of an output follow from posterior draws, at most.
+
+    Six of each parameter, the evidence; of a validation one for each row, and fourteen scores.
+    """
+    return 6 * len(calibration.parameters) + 1 + (n_validated + 14 if n_validated else 0)
 
 
 def output_allowances(
@@ -147,7 +149,8 @@ def run_allowances(
     """
     errors = posterior_errors(calibration)
     errors["log_evidence",] = errors.pop(("sampling", "log_evidence"))
-    times = _multiple(len(errors)) * _of_difference(calibration, recorded.get(("gate", "steps")))
+    times = _multiple(count_drawn(calibration))
+    times *= _of_difference(calibration, recorded.get(("gate", "steps")))
     found = _rough(paths) | _monte_carlo(errors, times)
     for j, sd in enumerate(calibration.draws.flat.std(axis=0)):
         found["mode", str(j)] = Allowance(_MODE_SD * sd, why=f"{_MODE_SD:g} posterior sd")

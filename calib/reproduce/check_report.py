@@ -18,13 +18,14 @@ from calib.reproduce.compare_report import (
     compare_estimates,
     compare_report,
     count_numbers,
+    entry,
     read_json,
 )
 from calib.reproduce.files import verify_files
 from calib.reproduce.inputs import GROUP, verify_hashes, verify_label, verify_priors
 from calib.reproduce.items import Item, Status
 from calib.reproduce.posteriors import GROUP as POSTERIORS
-from calib.reproduce.posteriors import verify_density, verify_summary
+from calib.reproduce.posteriors import DrawsFile, read_draws, verify_density, verify_summary
 from calib.reproduce.recompute import recompute_report, report_tasks
 from calib.reproduce.schema import Manifest
 from calib.reproduce.text import verify_images
@@ -55,10 +56,11 @@ def check_report(
         Skip the sampling.
     """
     items = verify_files(folder, manifest.files, RECORD, manifest.left_out)
-    for key, entry in manifest.tasks.items():
-        items += verify_hashes(key, entry, folder)
+    for key, said in manifest.tasks.items():
+        items += verify_hashes(key, said, folder)
     summary = read_json(folder / SUMMARY)
-    items += _consistent(folder, manifest, summary)
+    posteriors, unreadable = _posteriors(folder, manifest)
+    items += unreadable + _consistent(folder, summary, posteriors)
     try:
         tasks = report_tasks(manifest, folder, scratch / "inputs")
     except CalibError as error:
@@ -66,6 +68,9 @@ def check_report(
         return [*items, Item(GROUP, error.where or RECORD, Status.DIFFERENT, note=note)], ""
     same_code = manifest.code == here.code
     items += _named_rightly(manifest, folder, tasks, same_code=same_code)
+    items += [
+        _density(task, posteriors[task.output]) for task in tasks if task.output in posteriors
+    ]
     if quick:
         items += [
             Item(POSTERIORS, name, Status.UNJUDGED, note="left out on purpose, and not made again")
@@ -77,20 +82,33 @@ def check_report(
     return items + compare_report(again, summary), describe(count_numbers(study))
 
 
-def _consistent(folder: Path, manifest: Manifest, summary: Mapping[str, Any]) -> list[Item]:
+def _posteriors(folder: Path, manifest: Manifest) -> tuple[dict[str, DrawsFile], list[Item]]:
+    """Read the netCDF files that are there, by output; and what cannot be read."""
+    found, unreadable = {}, []
+    for key in manifest.tasks:
+        path = folder / f"{key}.nc"
+        if path.is_file():
+            try:
+                found[key] = read_draws(path)
+            except CalibError as error:
+                item = Item(POSTERIORS, path.name, Status.DIFFERENT, note=error.message)
+                unreadable.append(item)
+    return found, unreadable
+
+
+def _consistent(
+    folder: Path, summary: Mapping[str, Any], posteriors: Mapping[str, DrawsFile]
+) -> list[Item]:
     """Hold the parts of the folder against each other, without computing anything again."""
     items = []
     page = folder / PAGE
     if page.is_file():
         items += verify_images(page.read_text(encoding="utf-8", errors="replace"), folder)
-    models = summary.get("models")
-    for key in manifest.tasks:
-        file = folder / f"{key}.nc"
-        if file.is_file():
-            entry = models.get(key) if isinstance(models, Mapping) else None
-            stated = entry.get("posterior") if isinstance(entry, Mapping) else None
-            stated = stated if isinstance(stated, Mapping) else {}
-            items.append(verify_summary(file.name, file, stated))
+    for key, file in posteriors.items():
+        stated = entry(summary, key).get("posterior")
+        items.append(
+            verify_summary(f"{key}.nc", file, stated if isinstance(stated, Mapping) else {})
+        )
     return items
 
 
@@ -99,19 +117,16 @@ def _named_rightly(
 ) -> list[Item]:
     items = []
     for task in tasks:
-        entry = manifest.tasks[task.output]
-        items.append(verify_label(entry.data.file, task.table, entry.label))
-        items.append(verify_priors(task.output, entry, folder, same_code=same_code))
-        file = folder / f"{task.output}.nc"
-        if file.is_file():
-            items.append(_density(task, file))
+        said = manifest.tasks[task.output]
+        items.append(verify_label(said.data.file, task.table, said.label))
+        items.append(verify_priors(task.output, said, folder, same_code=same_code))
     return items
 
 
-def _density(task: Task, file: Path) -> Item:
+def _density(task: Task, file: DrawsFile) -> Item:
+    name = f"{task.output}.nc"
     try:
-        rows = fitted_rows(task)[0]
-        problem = build_problem(task.model, rows, task.prior_path)
+        problem = build_problem(task.model, fitted_rows(task)[0], task.prior_path)
     except CalibError as error:
-        return Item(POSTERIORS, file.name, Status.DIFFERENT, note=error.message)
-    return verify_density(file.name, file, problem)
+        return Item(POSTERIORS, name, Status.DIFFERENT, note=error.message)
+    return verify_density(name, file, problem)

@@ -10,14 +10,19 @@ from typing import Any
 from calib.environment import Environment
 from calib.errors import CalibError
 from calib.problem import Problem
-from calib.reproduce.allowances import describe, run_allowances, run_estimate_allowances
+from calib.reproduce.allowances import (
+    count_drawn,
+    describe,
+    run_allowances,
+    run_estimate_allowances,
+)
 from calib.reproduce.files import verify_files
 from calib.reproduce.inputs import GROUP as INPUTS
 from calib.reproduce.inputs import verify_label
 from calib.reproduce.items import Item, Status
 from calib.reproduce.montecarlo import Path as Place
-from calib.reproduce.montecarlo import posterior_errors
 from calib.reproduce.numbers import Section, compare_section, flatten
+from calib.reproduce.posteriors import GROUP as POSTERIORS
 from calib.reproduce.posteriors import compare_posterior, read_draws, summary_of, verify_density
 from calib.reproduce.recompute import estimate_again, recompute_run
 from calib.reproduce.schema import RunRecord
@@ -87,7 +92,7 @@ def check_run(
                 exact=section.exact and record.environment.same_program(here),
             )
         )  # fmt: skip
-    return items + _blame(items), describe(len(posterior_errors(calibration)))
+    return items + _blame(items), describe(count_drawn(calibration))
 
 
 def _consistent(record: RunRecord, folder: Path, problem: Problem) -> list[Item]:
@@ -97,8 +102,11 @@ def _consistent(record: RunRecord, folder: Path, problem: Problem) -> list[Item]
     if priors.is_file() and priors.read_text("utf-8", "replace") != record.prior_text:
         note = "not the priors that run.json repeats"
         items.append(Item(INPUTS, _PRIORS, Status.DIFFERENT, note=note))
-    file = folder / _POSTERIOR
-    if file.is_file():
+    if (folder / _POSTERIOR).is_file():
+        try:
+            file = read_draws(folder / _POSTERIOR)
+        except CalibError as error:
+            return [*items, Item(POSTERIORS, _POSTERIOR, Status.DIFFERENT, note=error.message)]
         items.append(verify_density(_POSTERIOR, file, problem))
     return items
 
@@ -107,7 +115,7 @@ def _document(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     """Return what is compared of a run: its record, and the summary of its draws."""
     document = {key: value for key, value in record.items() if key not in _NOT_COMPARED}
     with suppress(CalibError):
-        document["posterior"] = summary_of(read_draws(folder / _POSTERIOR))
+        document["posterior"] = summary_of(read_draws(folder / _POSTERIOR).draws)
     return document
 
 

@@ -14,7 +14,7 @@ from calib.manifest import sha256
 from calib.models.base import Array
 from calib.reproduce.allowances import (
     Allowance,
-    count_errors,
+    count_drawn,
     estimate_allowances,
     output_allowances,
 )
@@ -33,7 +33,7 @@ from calib.summary import summarise_estimates
 
 __all__ = [
     "PAGE", "RECORD", "SUMMARY", "Again", "compare_estimates", "compare_report", "count_numbers",
-    "read_json",
+    "entry", "read_json",
 ]  # fmt: skip
 
 RECORD, SUMMARY, PAGE = "manifest.json", "summary.json", "index.html"
@@ -86,7 +86,8 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def count_numbers(study: Study) -> int:
     """Return how many numbers of a study follow from posterior draws."""
-    return sum(count_errors(result) for result in study.successes.values())
+    results = study.successes.values()
+    return sum(count_drawn(r.calibration, r.validation.scores.n) for r in results)
 
 
 def compare_report(again: Again, summary: Mapping[str, Any]) -> list[Item]:
@@ -102,7 +103,7 @@ def compare_report(again: Again, summary: Mapping[str, Any]) -> list[Item]:
     exact: dict[str, bool] = {}
     items = []
     for key, part in _outputs(made).items():
-        section = _section(("models", key), _outputs(summary).get(key), part)
+        section = _section(("models", key), entry(summary, key), part)
         exact[key] = section.exact
         numbers = compare_section(
             section, _allowances(again.study, key, section), group_of=_grouped(key)
@@ -112,8 +113,11 @@ def compare_report(again: Again, summary: Mapping[str, Any]) -> list[Item]:
         if key != "models":
             section = _section((key,), summary.get(key), made.get(key))
             exact[key] = section.exact
-            group = SUMMARY if key in _HEAD else key
-            items += compare_section(section, _no_rules(section, _HEAD), group_of=_always(group))
+            head = key in _HEAD
+            items += compare_section(
+                section, _no_rules(section, ()), group_of=_always(SUMMARY if head else key),
+                exact=head or None,
+            )  # fmt: skip
     if summary and set(_outputs(summary)) != set(_outputs(made)):
         items.append(Item(SUMMARY, SUMMARY, Status.DIFFERENT, note="it has other outputs"))
     items += _record(again)
@@ -131,8 +135,7 @@ def compare_estimates(
     items = []
     for task in tasks:
         key = task.output
-        recorded = _outputs(summary).get(key, {})
-        recorded = recorded if isinstance(recorded, Mapping) else {}
+        recorded = entry(summary, key)
         if "error" in recorded:
             note = "it failed; to see whether it does again, check without --quick"
             items.append(Item(f"{key}: error", f"{SUMMARY}: models.{key}", Status.UNJUDGED,
@@ -153,8 +156,15 @@ def _outputs(summary: Mapping[str, Any]) -> Mapping[str, Any]:
     return models if isinstance(models, Mapping) else {}
 
 
+def entry(summary: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """Return what a summary says of an output; empty where it says nothing."""
+    found = _outputs(summary).get(key)
+    return found if isinstance(found, Mapping) else {}
+
+
 def _section(place: Place, recorded: Any, found: Any) -> Section:
-    return Section(SUMMARY, place, dict(flatten(recorded)), dict(flatten(found)))
+    old, new = ({} if part is None else dict(flatten(part)) for part in (recorded, found))
+    return Section(SUMMARY, place, old, new)
 
 
 def _allowances(study: Study, key: str, section: Section) -> dict[Place, Allowance]:
@@ -172,7 +182,7 @@ def _no_rules(section: Section, known: tuple[str, ...]) -> dict[Place, Allowance
     return {
         path: _NO_RULE
         for path, value in every.items()
-        if path and path[0] not in known and not isinstance(value, int | float)
+        if path[:1] not in {(name,) for name in known} and not isinstance(value, int | float)
     }
 
 
@@ -196,7 +206,7 @@ def _grouped(key: str) -> Callable[[Place], str]:
 
 def _blame(manifest: Manifest, key: str, items: list[Item]) -> list[Item]:
     """Name the input that the recorded numbers cannot have been computed from."""
-    entry = manifest.tasks[key]
+    task = manifest.tasks[key]
     points = [
         item for item in items
         if item.group.startswith(f"{key}: estimates") and item.share is not None
@@ -205,10 +215,10 @@ def _blame(manifest: Manifest, key: str, items: list[Item]) -> list[Item]:
     mode = [i for i in items if ".sampling.mode." in i.name and i.share is not None]
     if _mostly_different(points):
         note = "most estimates in summary.json do not follow from these rows"
-        return [Item(INPUTS, entry.data.file, Status.DIFFERENT, note=note)]
+        return [Item(INPUTS, task.data.file, Status.DIFFERENT, note=note)]
     if _mostly_different(mode):
         note = "the posterior mode in summary.json does not follow from these priors and the data"
-        return [Item(INPUTS, entry.priors.file, Status.DIFFERENT, note=note)]
+        return [Item(INPUTS, task.priors.file, Status.DIFFERENT, note=note)]
     return []
 
 
@@ -226,9 +236,9 @@ def _record(again: Again) -> list[Item]:
 
 def _comparable(manifest: dict[str, Any]) -> dict[str, Any]:
     kept = {key: value for key, value in manifest.items() if key not in _NOT_COMPARED}
-    for entry in kept.get("tasks", {}).values():
+    for task in kept.get("tasks", {}).values():
         for file in ("data", "priors"):
-            entry[file] = {k: v for k, v in entry[file].items() if k not in _VERIFIED}
+            task[file] = {k: v for k, v in task[file].items() if k not in _VERIFIED}
     return kept
 
 

@@ -90,8 +90,8 @@ def validation_errors(
     Notes
     -----
     A part p of the predictive draws has the error sqrt(p (1 - p) (1/N + 1/ESS)): N draws of the
-    noise on top of ESS effective draws of the parameters. Errors of rows are taken for fully
-    dependent where they are summed, which is the cautious side.
+    noise on top of ESS effective draws of the parameters. What is a mean over rows has the error
+    of the mean influence of a draw on them.
     """
     draws, observed, scores = validation.draws, validation.observed, validation.scores
     n_draws, n = draws.shape
@@ -102,8 +102,8 @@ def validation_errors(
     slope = (np.quantile(draws, 0.55, axis=0) - np.quantile(draws, 0.45, axis=0)) / 0.1
     median = 0.5 * part * slope
     errors: dict[Path, float | None] = {
-        ("validation", "rmse"): float(np.sqrt(np.mean(median**2))),
-        ("validation", "crps"): float(_crps_influence(draws, observed).mean()) * part,
+        ("validation", "rmse"): part * _rmse_influence(draws, observed, slope, scores.rmse),
+        ("validation", "crps"): part * _crps_influence(draws, observed),
     }
     errors |= {("validation", "pit", str(i)): float(pit[i]) for i in range(n)}
     large = np.abs(observed) > RELATIVE_ERROR_FLOOR * np.abs(observed).max()
@@ -125,15 +125,27 @@ def validation_errors(
     return errors
 
 
-def _crps_influence(draws: Array, observed: Array) -> Array:
-    """Standard deviation of one draw's contribution to the CRPS of each row, shape (n,)."""
-    ordered = np.sort(draws, axis=0)
+def _rmse_influence(draws: Array, observed: Array, slope: Array, rmse: float) -> float:
+    """Standard deviation of one draw's influence on the RMSE of the medians."""
+    if rmse == 0.0:
+        return 0.0
+    medians = np.median(draws, axis=0)
+    influence = slope * (0.5 - (draws < medians))
+    return float(((medians - observed) * influence).mean(axis=1).std() / rmse)
+
+
+def _crps_influence(draws: Array, observed: Array) -> float:
+    """Standard deviation of one draw's influence on the mean CRPS."""
     m = draws.shape[0]
-    rank = np.arange(1, m + 1)[:, None]
+    order = np.argsort(draws, axis=0)
+    ordered = np.take_along_axis(draws, order, axis=0)
     total = np.cumsum(ordered, axis=0)
-    # Mean absolute difference of each draw to all others, from the sorted draws' sums.
-    to_others = (ordered * (2 * rank - m) + total[-1] - 2.0 * total) / m
-    return np.asarray((np.abs(ordered - observed) - to_others).std(axis=0))
+    rank = np.arange(1, m + 1)[:, None]
+    # Mean absolute difference of each draw to all others, from the sums of the sorted draws.
+    sorted_apart = (ordered * (2 * rank - m) + total[-1] - 2.0 * total) / m
+    apart = np.empty_like(draws)
+    np.put_along_axis(apart, order, sorted_apart, axis=0)
+    return float((np.abs(draws - observed) - apart).mean(axis=1).std())
 
 
 def _elpd_errors(calibration: Calibration, ess: float) -> dict[Path, float | None]:

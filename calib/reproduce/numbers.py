@@ -94,8 +94,9 @@ def compare_section(
     paths = [*section.recorded, *(p for p in section.found if p not in section.recorded)]
     items = {p: _compare(section, p, allowances.get(p), strict, group_of(p)) for p in paths}
     if not strict:
-        for group in {item.group for item in items.values()}:
-            items |= _outliers({p: item for p, item in items.items() if item.group == group})
+        sharp = {p: item for p, item in items.items() if _is_sharp(allowances.get(p))}
+        for group in {item.group for item in sharp.values()}:
+            items |= _outliers({p: item for p, item in sharp.items() if item.group == group})
     return list(items.values())
 
 
@@ -109,6 +110,11 @@ def _outliers(items: Mapping[Path, Item]) -> dict[Path, Item]:
         for path, share in shares.items()
         if share > _STANDS_OUT and items[path].status is Status.WITHIN
     }
+
+
+def _is_sharp(allowance: Allowance | None) -> bool:
+    """Whether a difference is measured, rather than the order of magnitude looked at."""
+    return allowance is not None and allowance.size is not None
 
 
 def _restated(item: Item, note: str) -> Item:

@@ -1,0 +1,144 @@
+"""A small report and a run, made once, and copies of them to tamper with."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import calib.reproduce.check_report as check_report_module
+from calib.calibration import Calibration
+from calib.figures import Plate
+from calib.figures.bands import bands_plate
+from calib.figures.learned import learned_plate
+from calib.figures.style import style
+from calib.manifest import file_hashes, sha256
+from calib.report import write_report
+from calib.reproduce.check import check
+from calib.reproduce.items import Status
+from calib.reproduce.outcome import Outcome
+from calib.reproduce.recompute import recompute_report
+from calib.sampling.gate import Gate
+from calib.sampling.sampler import SamplerSettings
+from calib.store import save_calibration
+from calib.study import OutputResult, Study, he2019_tasks, run_study
+
+# Short chains, and a gate that lets them pass.
+SETTINGS = SamplerSettings(steps=100, keep=100, gate=Gate(taus_min=20.0))
+
+
+def two_plates(result: OutputResult, published: bool = False) -> list[Plate]:
+    with style():
+        return [
+            bands_plate(result, published=published),
+            learned_plate(result, published=published),
+        ]
+
+
+@pytest.fixture(scope="package", autouse=True)
+def _few_figures() -> Iterator[None]:
+    """Drawing takes most of the time of a report: two figures do for these tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("calib.report.plates", two_plates)
+        yield
+
+
+def rut_study(seed: int = 2019) -> Study:
+    tasks = [task for task in he2019_tasks() if task.output == "rut_depth"]
+    return run_study(tasks, seed, settings=SETTINGS)
+
+
+def write(study: Study, out: Path, **kwargs: Any) -> Path:
+    write_report(
+        study, out, settings=SETTINGS, command=["calib", "report"], title="A report", **kwargs
+    )
+    return out
+
+
+@pytest.fixture(scope="package")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of rut depth, posterior included."""
+    return write(rut_study(), tmp_path_factory.mktemp("original") / "report")
+
+
+@pytest.fixture(scope="package")
+def original_run(rut_calibration: Calibration, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("original") / "run"
+    folder.mkdir()
+    save_calibration(rut_calibration, folder)
+    return folder
+
+
+@pytest.fixture
+def report(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "report"))
+
+
+@pytest.fixture
+def run(original_run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original_run, tmp_path / "run"))
+
+
+@pytest.fixture(scope="package")
+def _made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[Any, tuple[Study, Path]], Path]:
+    return {}, tmp_path_factory.mktemp("made")
+
+
+@pytest.fixture
+def computed_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do the work of equal inputs once: most tampering leaves them as they are."""
+    cache, folder = _made
+
+    def again(manifest, tasks, out, progress):
+        key = (
+            manifest.model_dump_json(exclude={"files", "left_out"}),
+            *(t.table[c].tobytes() for t in tasks for c in t.table),
+            *(t.prior_path.read_bytes() for t in tasks),
+        )
+        if key not in cache:
+            kept = folder / str(len(cache))
+            cache[key] = recompute_report(manifest, tasks, kept, progress), kept
+        study, kept = cache[key]
+        shutil.copytree(kept, out)
+        return study
+
+    monkeypatch.setattr(check_report_module, "recompute_report", again)
+
+
+def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def seal(folder: Path) -> None:
+    """Make every hash in a manifest agree with the files as they are now."""
+
+    def change(manifest: dict[str, Any]) -> None:
+        manifest["files"] = file_hashes(folder)
+        for entry in manifest["tasks"].values():
+            for kind in ("data", "priors"):
+                path = folder / entry[kind]["file"]
+                entry[kind]["sha256"] = sha256(path.read_bytes())
+
+    edit_json(folder / "manifest.json", change)
+
+
+def seal_run(folder: Path) -> None:
+    def change(record: dict[str, Any]) -> None:
+        record["sha256"] = {n: sha256((folder / n).read_bytes()) for n in record["sha256"]}
+
+    edit_json(folder / "run.json", change)
+
+
+def different(outcome: Outcome) -> dict[str, str]:
+    """What a check calls different, and why."""
+    return {item.name: item.note for item in outcome.of(Status.DIFFERENT)}
+
+
+def findings(folder: Path, *, quick: bool = False) -> dict[str, str]:
+    return different(check(folder, quick=quick))
