@@ -154,7 +154,7 @@ def run_allowances(
     found = _rough(paths) | _monte_carlo(errors, times)
     for j, sd in enumerate(calibration.draws.flat.std(axis=0)):
         found["mode", str(j)] = Allowance(_MODE_SD * sd, why=f"{_MODE_SD:g} posterior sd")
-    return found | run_estimate_allowances(recorded)
+    return found
 
 
 def run_estimate_allowances(recorded: Mapping[Path, object]) -> dict[Path, Allowance]:
@@ -162,7 +162,7 @@ def run_estimate_allowances(recorded: Mapping[Path, object]) -> dict[Path, Allow
     return {
         path: _relative(value, _STRICT_COST if path[-1] in ("cost", "rmse") else _ALONE)
         for path, value in recorded.items()
-        if path[0] == "estimates" and isinstance(value, float)
+        if isinstance(value, float)
     }
 
 

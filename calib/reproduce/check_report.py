@@ -22,11 +22,11 @@ from calib.reproduce.compare_report import (
     read_json,
 )
 from calib.reproduce.files import verify_files
-from calib.reproduce.inputs import GROUP, verify_hashes, verify_label, verify_priors
+from calib.reproduce.inputs import verify_hashes, verify_label, verify_priors
 from calib.reproduce.items import Item, Status
 from calib.reproduce.posteriors import GROUP as POSTERIORS
 from calib.reproduce.posteriors import DrawsFile, read_draws, verify_density, verify_summary
-from calib.reproduce.recompute import recompute_report, report_tasks
+from calib.reproduce.recompute import not_computed, recompute_report, report_tasks
 from calib.reproduce.schema import Manifest
 from calib.reproduce.text import verify_images
 from calib.study import Progress, Task, fitted_rows
@@ -61,25 +61,27 @@ def check_report(
     summary = read_json(folder / SUMMARY)
     posteriors, unreadable = _posteriors(folder, manifest)
     items += unreadable + _consistent(folder, summary, posteriors)
-    try:
+    allowed = ""
+    with not_computed(items, RECORD):
         tasks = report_tasks(manifest, folder, scratch / "inputs")
-    except CalibError as error:
-        note = f"not computed again: {error.message}"
-        return [*items, Item(GROUP, error.where or RECORD, Status.DIFFERENT, note=note)], ""
-    same_code = manifest.code == here.code
-    items += _named_rightly(manifest, folder, tasks, same_code=same_code)
-    items += [
-        _density(task, posteriors[task.output]) for task in tasks if task.output in posteriors
-    ]
-    if quick:
-        items += [
-            Item(POSTERIORS, name, Status.UNJUDGED, note="left out on purpose, and not made again")
-            for name in manifest.left_out
-        ]
-        return items + compare_estimates(tasks, manifest.seed, summary, progress), ""
-    study = recompute_report(manifest, tasks, scratch / "again", progress)
-    again = Again(manifest, folder, scratch / "again", study, here)
-    return items + compare_report(again, summary), describe(count_numbers(study))
+        items += _named_rightly(manifest, folder, tasks, same_code=manifest.code == here.code)
+        there = [task for task in tasks if task.output in posteriors]
+        items += [_density(task, posteriors[task.output]) for task in there]
+        if quick:
+            items += _left_out(manifest)
+            items += compare_estimates(tasks, manifest.seed, summary, progress)
+        else:
+            study = recompute_report(manifest, tasks, scratch / "again", progress)
+            allowed = describe(count_numbers(study))
+            items += compare_report(
+                Again(manifest, folder, scratch / "again", study, here), summary
+            )
+    return items, allowed
+
+
+def _left_out(manifest: Manifest) -> list[Item]:
+    note = "left out on purpose, and not made again"
+    return [Item(POSTERIORS, name, Status.UNJUDGED, note=note) for name in manifest.left_out]
 
 
 def _posteriors(folder: Path, manifest: Manifest) -> tuple[dict[str, DrawsFile], list[Item]]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from calib.calibration import Calibration
 from calib.environment import Environment
 from calib.errors import CalibError
 from calib.problem import Problem
@@ -24,7 +26,7 @@ from calib.reproduce.montecarlo import Path as Place
 from calib.reproduce.numbers import Section, compare_section, flatten
 from calib.reproduce.posteriors import GROUP as POSTERIORS
 from calib.reproduce.posteriors import compare_posterior, read_draws, summary_of, verify_density
-from calib.reproduce.recompute import estimate_again, recompute_run
+from calib.reproduce.recompute import estimate_again, not_computed, recompute_run
 from calib.reproduce.schema import RunRecord
 from calib.store import describe_estimates, run_problem
 from calib.study import Progress
@@ -33,8 +35,8 @@ __all__ = ["check_run"]
 
 _RECORD, _POSTERIOR, _PRIORS, _DATA = "run.json", "posterior.nc", "priors.toml", "data.csv"
 _FILES = (_POSTERIOR, _PRIORS, _DATA)
-# Durations, and hashes that are verified as such.
-_NOT_COMPARED = ("seconds", "sha256")
+# Durations, hashes that are verified as such, and estimates, which are compared by themselves.
+_NOT_COMPARED = ("seconds", "sha256", "estimates")
 
 
 def check_run(
@@ -64,21 +66,28 @@ def check_run(
         for name in _FILES
         if name not in record.sha256
     ]
-    try:
+    allowed = ""
+    with not_computed(items, _RECORD):
         problem = run_problem(record.document, folder / _DATA)
-    except CalibError as error:
-        note = f"not computed again: {error.message}"
-        return [*items, Item(INPUTS, _DATA, Status.DIFFERENT, note=note)], ""
-    items += _consistent(record, folder, problem)
-    if quick:
-        return items + _estimates_alone(record, problem), ""
-    try:
-        calibration = recompute_run(record, problem, scratch / "again", progress)
-    except CalibError as error:
-        note = f"not computed again: {error.message}"
-        return [*items, Item(INPUTS, _RECORD, Status.DIFFERENT, note=note)], ""
-    made = scratch / "again"
-    recorded, found = _document(record.document, folder), _document(_read(made), made)
+        items += _consistent(record, folder, problem)
+        if quick:
+            items += _estimates(
+                record.document, describe_estimates(estimate_again(record, problem))
+            )
+        else:
+            calibration = recompute_run(record, problem, scratch / "again", progress)
+            allowed = describe(count_drawn(calibration))
+            same = record.environment.same_program(here)
+            items += _compare(record, calibration, folder, scratch / "again", same_program=same)
+    return items, allowed
+
+
+def _compare(
+    record: RunRecord, calibration: Calibration, folder: Path, made: Path, *, same_program: bool
+) -> list[Item]:
+    again = json.loads((made / _RECORD).read_text(encoding="utf-8"))
+    items = _estimates(record.document, again["estimates"])
+    recorded, found = _document(record.document, folder), _document(again, made)
     if "posterior" not in recorded:  # it cannot be read, which has been said
         del found["posterior"]
     section = Section(_RECORD, (), dict(flatten(recorded)), dict(flatten(found)))
@@ -86,13 +95,10 @@ def check_run(
     allowances = run_allowances(calibration, section.recorded, paths)
     items += compare_section(section, allowances, group_of=_group)
     if "posterior" in recorded:
-        items.append(
-            compare_posterior(
-                _POSTERIOR, folder / _POSTERIOR, made / _POSTERIOR,
-                exact=section.exact and record.environment.same_program(here),
-            )
-        )  # fmt: skip
-    return items + _blame(items), describe(count_drawn(calibration))
+        exact = section.exact and same_program
+        files = (folder / _POSTERIOR, made / _POSTERIOR)
+        items.append(compare_posterior(_POSTERIOR, *files, exact=exact))
+    return items + _blame(items)
 
 
 def _consistent(record: RunRecord, folder: Path, problem: Problem) -> list[Item]:
@@ -111,7 +117,7 @@ def _consistent(record: RunRecord, folder: Path, problem: Problem) -> list[Item]
     return items
 
 
-def _document(record: dict[str, Any], folder: Path) -> dict[str, Any]:
+def _document(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """Return what is compared of a run: its record, and the summary of its draws."""
     document = {key: value for key, value in record.items() if key not in _NOT_COMPARED}
     with suppress(CalibError):
@@ -119,25 +125,20 @@ def _document(record: dict[str, Any], folder: Path) -> dict[str, Any]:
     return document
 
 
-def _read(folder: Path) -> dict[str, Any]:
-    content: dict[str, Any] = json.loads((folder / _RECORD).read_text(encoding="utf-8"))
-    return content
-
-
 def _group(path: Place) -> str:
     if path[0] in ("posterior", "gate", "mode", "log_evidence", "efficiency", "acceptance",
                    "evaluations"):  # fmt: skip
         return "posterior"
-    return "estimates" if path[0] == "estimates" else "what was computed"
+    return "what was computed"
 
 
-def _estimates_alone(record: RunRecord, problem: Problem) -> list[Item]:
-    again = describe_estimates(estimate_again(record, problem))
-    recorded = {"estimates": record.document["estimates"]}
-    found = {"estimates": json.loads(json.dumps(again))}
-    section = Section(_RECORD, (), dict(flatten(recorded)), dict(flatten(found)))
+def _estimates(record: Mapping[str, Any], again: Sequence[Mapping[str, Any]]) -> list[Item]:
+    found = json.loads(json.dumps(again))
+    place = ("estimates",)
+    old, new = dict(flatten(record["estimates"])), dict(flatten(found))
+    section = Section(_RECORD, place, old, new)
     allowances = run_estimate_allowances(section.recorded)
-    return compare_section(section, allowances, group_of=_group)
+    return compare_section(section, allowances, group_of=lambda _: "estimates")
 
 
 def _blame(items: list[Item]) -> list[Item]:

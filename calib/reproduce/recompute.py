@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,16 +12,37 @@ import numpy as np
 
 from calib.calibration import Calibration, calibrate
 from calib.data import read_table
+from calib.errors import CalibError
 from calib.estimators import PointEstimate, estimate
 from calib.outputs import OUTPUTS
 from calib.problem import Problem
 from calib.report import write_report
+from calib.reproduce.inputs import GROUP as INPUTS
+from calib.reproduce.items import Item, Status
 from calib.reproduce.schema import Manifest, RunRecord, TaskRecord
 from calib.store import save_calibration
 from calib.streams import generator
 from calib.study import HoldOut, Progress, Study, Task, run_study
 
-__all__ = ["estimate_again", "recompute_report", "recompute_run", "report_tasks"]
+__all__ = ["estimate_again", "not_computed", "recompute_report", "recompute_run", "report_tasks"]
+
+
+@contextmanager
+def not_computed(items: list[Item], folder: Path, record: str) -> Iterator[None]:
+    """Turn whatever stops the work into one more item.
+
+    The record is somebody else's: what it makes fail is a finding, with what was found before.
+    """
+    try:
+        yield
+    except CalibError as error:
+        path = Path((error.where or "").partition(",")[0])
+        where = path.relative_to(folder).as_posix() if path.is_relative_to(folder) else record
+        note = f"not computed again: {error.message}"
+        items.append(Item(INPUTS, where, Status.DIFFERENT, note=note))
+    except Exception as error:
+        note = f"not computed again: {type(error).__name__}: {error}"
+        items.append(Item(INPUTS, record, Status.DIFFERENT, note=note))
 
 
 def report_tasks(manifest: Manifest, folder: Path, scratch: Path) -> tuple[Task, ...]:

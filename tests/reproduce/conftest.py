@@ -11,12 +11,15 @@ from typing import Any
 import pytest
 
 import calib.reproduce.check_report as check_report_module
-from calib.calibration import Calibration
+from calib.calibration import Calibration, calibrate
+from calib.data import Table
+from calib.estimators import estimate
 from calib.figures import Plate
 from calib.figures.bands import bands_plate
 from calib.figures.learned import learned_plate
 from calib.figures.style import style
 from calib.manifest import file_hashes, sha256
+from calib.problem import Problem, build_problem
 from calib.report import write_report
 from calib.reproduce.check import check
 from calib.reproduce.items import Status
@@ -25,6 +28,7 @@ from calib.reproduce.recompute import recompute_report
 from calib.sampling.gate import Gate
 from calib.sampling.sampler import SamplerSettings
 from calib.store import save_calibration
+from calib.streams import generator
 from calib.study import OutputResult, Study, he2019_tasks, run_study
 
 # Short chains, and a gate that lets them pass.
@@ -66,11 +70,18 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="package")
-def original_run(rut_calibration: Calibration, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def original_run(rut_tables: tuple[Table, Table], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run as `calib fit` makes it."""
     folder = tmp_path_factory.mktemp("original") / "run"
     folder.mkdir()
-    save_calibration(rut_calibration, folder)
+    save_calibration(fitted_run(build_problem("modified_bekker", rut_tables[0]), 2019), folder)
     return folder
+
+
+def fitted_run(problem: Problem, seed: int) -> Calibration:
+    rng = generator(seed, problem.bound.model.name, "least_squares")
+    point = estimate(problem, "least_squares", rng)
+    return calibrate(problem, seed, estimates=(point,), settings=SETTINGS)
 
 
 @pytest.fixture
