@@ -62,7 +62,7 @@ def check_report(
     posteriors, unreadable = _posteriors(folder, manifest)
     items += unreadable + _consistent(folder, summary, posteriors)
     allowed = ""
-    with not_computed(items, RECORD):
+    with not_computed(items, folder, RECORD):
         tasks = report_tasks(manifest, folder, scratch / "inputs")
         items += _named_rightly(manifest, folder, tasks, same_code=manifest.code == here.code)
         there = [task for task in tasks if task.output in posteriors]

@@ -67,7 +67,7 @@ def check_run(
         if name not in record.sha256
     ]
     allowed = ""
-    with not_computed(items, _RECORD):
+    with not_computed(items, folder, _RECORD):
         problem = run_problem(record.document, folder / _DATA)
         items += _consistent(record, folder, problem)
         if quick:

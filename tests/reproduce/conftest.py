@@ -148,7 +148,8 @@ def seal_run(folder: Path) -> None:
 
 def different(outcome: Outcome) -> dict[str, str]:
     """What a check calls different, and why."""
-    return {item.name: item.note for item in outcome.of(Status.DIFFERENT)}
+    # The first remark of several on the same thing.
+    return {item.name: item.note for item in reversed(outcome.of(Status.DIFFERENT))}
 
 
 def findings(folder: Path, *, quick: bool = False) -> dict[str, str]:
