@@ -15,7 +15,7 @@ from scipy.stats import norm
 
 from calib.calibration import Calibration
 from calib.estimators import PointEstimate
-from calib.reproduce.montecarlo import Path, posterior_errors, validation_errors
+from calib.reproduce.montecarlo import Place, posterior_errors, validation_errors
 from calib.study import OutputResult
 
 __all__ = [
@@ -38,7 +38,8 @@ _STRICT, _SEARCH, _ALONE = 1e-4, 0.05, 0.01
 _STRICT_COST, _SEARCH_COST = 1e-6, 1e-3
 _FLOOR = 1e-9
 _MODE_SD, _LOG_POSTERIOR = 0.01, 1e-5
-_ACCEPTANCE, _RHAT, _FACTOR = 0.1, 0.01, 3.0
+# Effective sample sizes of tails differ by up to a factor of four between seeds.
+_ACCEPTANCE, _RHAT, _FACTOR, _MCSE_FACTOR = 0.1, 0.01, 10.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,7 @@ class Allowance:
 
 
 _HEAVY = Allowance(why="tail too heavy for a Monte Carlo error")
+_MCSE = Allowance(factor=_MCSE_FACTOR, why=f"a factor of {_MCSE_FACTOR:g}")
 _ROWS = Allowance(why="which rows are refitted is decided by their draws")
 # Figures about the sampling, by the name of the entry: what matters of them is their size.
 _ROUGH: Mapping[str, Allowance] = {
@@ -103,8 +105,8 @@ def count_drawn(calibration: Calibration, n_validated: int = 0) -> int:
 
 
 def output_allowances(
-    result: OutputResult, n: int, recorded: Mapping[Path, object], paths: Iterable[Path]
-) -> dict[Path, Allowance]:
+    result: OutputResult, n: int, recorded: Mapping[Place, object], paths: Iterable[Place]
+) -> dict[Place, Allowance]:
     """Return the allowances of one output's part of `summary.json`.
 
     Parameters
@@ -128,7 +130,7 @@ def output_allowances(
             found[path] = _of_scale(calibration, path[-1], _MODE_SD)
         elif path[-1] == "mcse_mean":
             heavy = errors.get(("posterior", path[1], "sd")) is None
-            found[path] = _HEAVY if heavy else _ROUGH["ess_bulk"]
+            found[path] = _HEAVY if heavy else _MCSE
     return {
         **found,
         **estimate_allowances(result.estimates, result.by_pressure, calibration),
@@ -136,8 +138,8 @@ def output_allowances(
 
 
 def run_allowances(
-    calibration: Calibration, recorded: Mapping[Path, object], paths: Iterable[Path]
-) -> dict[Path, Allowance]:
+    calibration: Calibration, recorded: Mapping[Place, object], paths: Iterable[Place]
+) -> dict[Place, Allowance]:
     """Return the allowances of `run.json` and of the summary of its posterior.
 
     Parameters
@@ -157,7 +159,7 @@ def run_allowances(
     return found
 
 
-def run_estimate_allowances(recorded: Mapping[Path, object]) -> dict[Path, Allowance]:
+def run_estimate_allowances(recorded: Mapping[Place, object]) -> dict[Place, Allowance]:
     """Return the allowances of the point estimates in `run.json`."""
     return {
         path: _relative(value, _STRICT_COST if path[-1] in ("cost", "rmse") else _ALONE)
@@ -170,9 +172,9 @@ def estimate_allowances(
     estimates: Iterable[PointEstimate],
     by_pressure: Mapping[float, Iterable[PointEstimate]],
     calibration: Calibration | None,
-) -> dict[Path, Allowance]:
+) -> dict[Place, Allowance]:
     """Return the allowances of point estimates, in terms of the posterior where there is one."""
-    found: dict[Path, Allowance] = {}
+    found: dict[Place, Allowance] = {}
     for e in estimates:
         search = e.method in _SEARCHES
         sds, cost = (_SEARCH_SD, _SEARCH_COST) if search else (_STRICT_SD, _STRICT_COST)
@@ -200,7 +202,7 @@ def estimate_allowances(
     return found
 
 
-def _rough(paths: Iterable[Path]) -> dict[Path, Allowance]:
+def _rough(paths: Iterable[Place]) -> dict[Place, Allowance]:
     names = {path: next((key for key in reversed(path) if key in _ROUGH), "") for path in paths}
     return {path: _ROUGH[name] for path, name in names.items() if name}
 
@@ -213,7 +215,7 @@ def _of_difference(calibration: Calibration, steps: object) -> float:
     return float(np.sqrt(1.0 + np.clip(ratio, 1.0, 4.0)))
 
 
-def _monte_carlo(errors: Mapping[Path, float | None], times: float) -> dict[Path, Allowance]:
+def _monte_carlo(errors: Mapping[Place, float | None], times: float) -> dict[Place, Allowance]:
     return {
         path: _HEAVY if error is None else Allowance(times * error, why=MONTE_CARLO)
         for path, error in errors.items()

@@ -10,11 +10,8 @@ from calib.environment import Environment
 from calib.errors import CalibError
 from calib.problem import build_problem
 from calib.reproduce.allowances import describe
+from calib.reproduce.compare_files import PAGE, RECORD, SUMMARY, Again
 from calib.reproduce.compare_report import (
-    PAGE,
-    RECORD,
-    SUMMARY,
-    Again,
     compare_estimates,
     compare_report,
     count_numbers,

@@ -22,7 +22,7 @@ from calib.reproduce.files import verify_files
 from calib.reproduce.inputs import GROUP as INPUTS
 from calib.reproduce.inputs import verify_label
 from calib.reproduce.items import Item, Status
-from calib.reproduce.montecarlo import Path as Place
+from calib.reproduce.montecarlo import Place
 from calib.reproduce.numbers import Section, compare_section, flatten
 from calib.reproduce.posteriors import GROUP as POSTERIORS
 from calib.reproduce.posteriors import compare_posterior, read_draws, summary_of, verify_density

@@ -4,39 +4,28 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from calib.environment import Environment
-from calib.manifest import sha256
-from calib.models.base import Array
 from calib.reproduce.allowances import (
     Allowance,
     count_drawn,
     estimate_allowances,
     output_allowances,
 )
-from calib.reproduce.figures import compare_figure, thumbnails
+from calib.reproduce.compare_files import RECORD, SUMMARY, Again, compare_files
 from calib.reproduce.inputs import GROUP as INPUTS
 from calib.reproduce.items import Item, Status
-from calib.reproduce.montecarlo import Path as Place
+from calib.reproduce.montecarlo import Place
 from calib.reproduce.numbers import Section, compare_section, flatten
-from calib.reproduce.posteriors import GROUP as POSTERIORS
-from calib.reproduce.posteriors import compare_posterior
 from calib.reproduce.schema import Manifest
-from calib.reproduce.text import GROUP as TEXT
-from calib.reproduce.text import compare_text
 from calib.study import OutputResult, Progress, Study, Task, estimate_task
 from calib.summary import summarise_estimates
 
 __all__ = [
-    "PAGE", "RECORD", "SUMMARY", "Again", "compare_estimates", "compare_report", "count_numbers",
-    "entry", "read_json",
+    "compare_estimates", "compare_report", "count_numbers", "entry", "read_json",
 ]  # fmt: skip
 
-RECORD, SUMMARY, PAGE = "manifest.json", "summary.json", "index.html"
 # What a manifest has about itself: durations, and hashes that are verified as such.
 _NOT_COMPARED = ("seconds", "files", "left_out")
 _VERIFIED = ("sha256", "shipped")
@@ -47,32 +36,6 @@ _SET_UP = ("model", "output", "data", "references", "error")
 _KNOWN = (*_POINTS, *_CHAIN, *_SET_UP)
 _NO_RULE = Allowance(why="no allowance is stated for it")
 _SEARCHES = ("genetic", "differential_evolution")
-
-
-@dataclass(frozen=True)
-class Again:
-    """A report folder and the same made again.
-
-    Parameters
-    ----------
-    manifest : Manifest
-    folder, made : Path
-        The report, and the one made again.
-    study : Study
-        What the second shows.
-    here : Environment
-    """
-
-    manifest: Manifest
-    folder: Path
-    made: Path
-    study: Study
-    here: Environment
-
-    @cached_property
-    def same_program(self) -> bool:
-        """Whether equal numbers must give equal files."""
-        return self.manifest.environment.same_program(self.here)
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -125,7 +88,7 @@ def compare_report(again: Again, summary: Mapping[str, Any]) -> list[Item]:
     if alone and _bytes(again.folder / SUMMARY) != _bytes(again.made / SUMMARY):
         note = "the same numbers in another form than it is written in"
         items.append(Item(SUMMARY, SUMMARY, Status.DIFFERENT, note=note))
-    return items + _files(again, exact)
+    return items + compare_files(again, exact)
 
 
 def compare_estimates(
@@ -207,24 +170,25 @@ def _grouped(key: str) -> Callable[[Place], str]:
 def _blame(manifest: Manifest, key: str, items: list[Item]) -> list[Item]:
     """Name the input that the recorded numbers cannot have been computed from."""
     task = manifest.tasks[key]
-    points = [
-        item for item in items
-        if item.group.startswith(f"{key}: estimates") and item.share is not None
+    strict = [
+        item
+        for item in items
+        if item.group.startswith(f"{key}: estimates")
         and not any(search in item.group for search in _SEARCHES)
-    ]  # fmt: skip
-    mode = [i for i in items if ".sampling.mode." in i.name and i.share is not None]
-    if _mostly_different(points):
+    ]
+    if _mostly_different(strict):
         note = "most estimates in summary.json do not follow from these rows"
         return [Item(INPUTS, task.data.file, Status.DIFFERENT, note=note)]
-    if _mostly_different(mode):
+    if _mostly_different([item for item in items if ".sampling.mode." in item.name]):
         note = "the posterior mode in summary.json does not follow from these priors and the data"
         return [Item(INPUTS, task.priors.file, Status.DIFFERENT, note=note)]
     return []
 
 
 def _mostly_different(items: list[Item]) -> bool:
-    different = sum(item.status is Status.DIFFERENT for item in items)
-    return bool(items) and different > 0.5 * len(items)
+    numbers = [item for item in items if isinstance(item.recorded, float)]
+    different = sum(item.status is Status.DIFFERENT for item in numbers)
+    return different > 0.5 * len(numbers)
 
 
 def _record(again: Again) -> list[Item]:
@@ -240,59 +204,6 @@ def _comparable(manifest: dict[str, Any]) -> dict[str, Any]:
         for file in ("data", "priors"):
             task[file] = {k: v for k, v in task[file].items() if k not in _VERIFIED}
     return kept
-
-
-def _files(again: Again, exact: Mapping[str, bool]) -> list[Item]:
-    made = {p.relative_to(again.made).as_posix() for p in again.made.rglob("*") if p.is_file()}
-    made -= {RECORD, SUMMARY}
-    pictures = thumbnails(again.made)
-    items = [_file(again, name, exact, pictures) for name in sorted(made)]
-    status = Status.DIFFERENT if again.same_program else Status.UNJUDGED
-    listed = set(again.manifest.files) - {SUMMARY}
-    return items + [
-        Item(TEXT, name, status, note="this version makes no such file")
-        for name in sorted(listed - made)
-    ]
-
-
-def _file(
-    again: Again, name: str, exact: Mapping[str, bool], pictures: Mapping[str, Array]
-) -> Item:
-    recorded, made = again.folder / name, again.made / name
-    output = next((key for key in again.study.results if _belongs(name, key)), None)
-    same_numbers = all(exact.values()) if output is None else exact[output]
-    strict = same_numbers and again.same_program
-    if name in again.manifest.left_out:
-        return _left_out(again.manifest.left_out[name], made, name, strict=strict)
-    if not recorded.is_file():
-        status = Status.DIFFERENT if again.same_program else Status.UNJUDGED
-        return Item(TEXT, name, status, note="missing")
-    if name.endswith(".nc"):
-        return compare_posterior(name, recorded, made, exact=strict)
-    if name.endswith(".png"):
-        return compare_figure(
-            name, recorded.read_bytes(), made.read_bytes(), pictures, exact=strict
-        )
-    if name.startswith(("data/", "priors/")):
-        strict = True
-    why = "other draws" if not same_numbers else "another version wrote it"
-    return compare_text(name, recorded.read_bytes(), made.read_bytes(), exact=strict, why_not=why)
-
-
-def _belongs(name: str, key: str) -> bool:
-    stem = name.rpartition("/")[2]
-    return stem.startswith((f"{key}.", f"{key}_"))
-
-
-def _left_out(recorded: str, made: Path, name: str, *, strict: bool) -> Item:
-    found = sha256(made.read_bytes())
-    if found == recorded:
-        note = "left out on purpose; made again, it has the recorded hash"
-        return Item(POSTERIORS, name, Status.IDENTICAL, note=note)
-    if strict:
-        note = "left out; made again, it has another hash"
-        return Item(POSTERIORS, name, Status.DIFFERENT, recorded, found, note=note)
-    return Item(POSTERIORS, name, Status.UNJUDGED, note="left out on purpose; other draws")
 
 
 def _bytes(path: Path) -> bytes:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from calib.models.base import Array
 from calib.reproduce.items import Item, Status
@@ -48,6 +49,8 @@ def compare_figure(
     """
     if recorded == drawn:
         return Item(GROUP, name, Status.IDENTICAL)
+    if _pixels(recorded) == _pixels(drawn):
+        return Item(GROUP, name, Status.WITHIN, note="the same picture, stored otherwise")
     image = _thumbnail(recorded)
     if image is None:
         return Item(GROUP, name, Status.DIFFERENT, note="it is no readable image")
@@ -70,12 +73,22 @@ def _distance(one: Array, other: Array) -> float:
     return float(np.sqrt(np.mean(np.square(one - other))))
 
 
-def _thumbnail(content: bytes) -> Array | None:
-    from PIL import Image
+def _pixels(content: bytes) -> tuple[tuple[int, int], bytes] | None:
+    image = _opened(content)
+    return None if image is None else (image.size, image.tobytes())
 
+
+def _thumbnail(content: bytes) -> Array | None:
+    image = _opened(content)
+    if image is None:
+        return None
+    grey = image.convert("L").resize((_SIDE, _SIDE), Image.Resampling.BOX)
+    return np.asarray(grey, dtype=np.float64) / 255.0
+
+
+def _opened(content: bytes) -> Image.Image | None:
     try:
         with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
-            grey = image.convert("L").resize((_SIDE, _SIDE), Image.Resampling.BOX)
-            return np.asarray(grey, dtype=np.float64) / 255.0
+            return image.convert("RGB")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None

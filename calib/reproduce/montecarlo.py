@@ -15,9 +15,9 @@ from calib.models.base import Array
 from calib.scores import LEVELS, RELATIVE_ERROR_FLOOR
 from calib.validate import Validation
 
-__all__ = ["Path", "posterior_errors", "validation_errors"]
+__all__ = ["Place", "posterior_errors", "validation_errors"]
 
-type Path = tuple[str, ...]
+type Place = tuple[str, ...]
 """Keys from the top of a document to one of its numbers; positions in a list count from "0"."""
 
 _PARTS = 16
@@ -29,7 +29,7 @@ _K_MEAN, _K_SD = 0.5, 0.2
 _EVIDENCE_DRAWS = 1500
 
 
-def posterior_errors(calibration: Calibration) -> dict[Path, float | None]:
+def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:
     """Return the Monte Carlo standard errors of a posterior summary.
 
     Parameters
@@ -46,7 +46,7 @@ def posterior_errors(calibration: Calibration) -> dict[Path, float | None]:
     stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
     mean, sd, median = mcse(stacked, "mean"), mcse(stacked, "sd"), mcse(stacked, "median")
     shape = tail_shape(stacked)
-    errors: dict[Path, float | None] = {}
+    errors: dict[Place, float | None] = {}
     for j, name in enumerate(names):
         low, high = _hdi_errors(stacked[..., j])
         errors |= {
@@ -77,7 +77,7 @@ def _hdi_errors(chains: Array) -> tuple[float, float]:
 
 def validation_errors(
     calibration: Calibration, validation: Validation, multiple: float
-) -> dict[Path, float | None]:
+) -> dict[Place, float | None]:
     """Return the Monte Carlo standard errors of a validation's scores.
 
     Parameters
@@ -101,7 +101,7 @@ def validation_errors(
     pit = np.sqrt(p * (1.0 - p)) * part
     slope = (np.quantile(draws, 0.55, axis=0) - np.quantile(draws, 0.45, axis=0)) / 0.1
     median = 0.5 * part * slope
-    errors: dict[Path, float | None] = {
+    errors: dict[Place, float | None] = {
         ("validation", "rmse"): part * _rmse_influence(draws, observed, slope, scores.rmse),
         ("validation", "crps"): part * _crps_influence(draws, observed),
     }
@@ -148,7 +148,7 @@ def _crps_influence(draws: Array, observed: Array) -> float:
     return float((np.abs(draws - observed) - apart).mean(axis=1).std())
 
 
-def _elpd_errors(calibration: Calibration, ess: float) -> dict[Path, float | None]:
+def _elpd_errors(calibration: Calibration, ess: float) -> dict[Place, float | None]:
     """Of the sum over rows of -ln E[1/p(y_i | theta)] and of its spread, by their influence."""
     rows = calibration.problem.log_likelihood_rows(calibration.draws.flat)
     inverse = np.exp(rows.min(axis=0) - rows)

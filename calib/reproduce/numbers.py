@@ -16,16 +16,16 @@ from dataclasses import dataclass
 from statistics import median
 from typing import Any
 
-from calib.reproduce.allowances import Allowance
+from calib.reproduce.allowances import MONTE_CARLO, Allowance
 from calib.reproduce.items import Item, Status
-from calib.reproduce.montecarlo import Path
+from calib.reproduce.montecarlo import Place
 
 __all__ = ["Section", "compare_section", "flatten", "same_words", "without_numbers"]
 
 _MOSTLY = 0.9
 _ROUNDED, _STANDS_OUT = 1e-3, 0.05
-# Of what follows from no stated rule.
-_DETERMINISTIC = 1e-6
+# The last bits of a sum, which libraries round as they like; and of what has no stated rule.
+_LAST_BITS, _DETERMINISTIC = 1e-9, 1e-6
 _NUMBER = re.compile(
     r"[-+\u2212]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+|\u00d710[\u2070-\u2079\u00b2\u00b3\u00b9\u207b]+)?"
 )
@@ -46,9 +46,9 @@ class Section:
     """
 
     file: str
-    place: Path
-    recorded: Mapping[Path, Any]
-    found: Mapping[Path, Any]
+    place: Place
+    recorded: Mapping[Place, Any]
+    found: Mapping[Place, Any]
 
     @property
     def exact(self) -> bool:
@@ -59,7 +59,7 @@ class Section:
         return same >= _MOSTLY * len(floats)
 
 
-def flatten(document: Any, place: Path = ()) -> Iterator[tuple[Path, Any]]:
+def flatten(document: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
     """Yield the path and the value of every entry of a JSON document."""
     if isinstance(document, Mapping):
         for key, value in document.items():
@@ -73,9 +73,9 @@ def flatten(document: Any, place: Path = ()) -> Iterator[tuple[Path, Any]]:
 
 def compare_section(
     section: Section,
-    allowances: Mapping[Path, Allowance],
+    allowances: Mapping[Place, Allowance],
     *,
-    group_of: Callable[[Path], str],
+    group_of: Callable[[Place], str],
     exact: bool | None = None,
 ) -> list[Item]:
     """Return one item for each entry of a section.
@@ -94,13 +94,13 @@ def compare_section(
     paths = [*section.recorded, *(p for p in section.found if p not in section.recorded)]
     items = {p: _compare(section, p, allowances.get(p), strict, group_of(p)) for p in paths}
     if not strict:
-        sharp = {p: item for p, item in items.items() if _is_sharp(allowances.get(p))}
-        for group in {item.group for item in sharp.values()}:
-            items |= _outliers({p: item for p, item in sharp.items() if item.group == group})
+        drawn = {p: item for p, item in items.items() if _is_drawn(allowances.get(p))}
+        for group in {item.group for item in drawn.values()}:
+            items |= _outliers({p: item for p, item in drawn.items() if item.group == group})
     return list(items.values())
 
 
-def _outliers(items: Mapping[Path, Item]) -> dict[Path, Item]:
+def _outliers(items: Mapping[Place, Item]) -> dict[Place, Item]:
     """Numbers that stand out where the others agree far better than they need to."""
     shares = {path: item.share for path, item in items.items() if item.share is not None}
     if not shares or median(shares.values()) > _ROUNDED:
@@ -112,9 +112,9 @@ def _outliers(items: Mapping[Path, Item]) -> dict[Path, Item]:
     }
 
 
-def _is_sharp(allowance: Allowance | None) -> bool:
-    """Whether a difference is measured, rather than the order of magnitude looked at."""
-    return allowance is not None and allowance.size is not None
+def _is_drawn(allowance: Allowance | None) -> bool:
+    """Whether a number is drawn: estimates amplify rounding each in its own way."""
+    return allowance is not None and allowance.why == MONTE_CARLO
 
 
 def _restated(item: Item, note: str) -> Item:
@@ -124,7 +124,7 @@ def _restated(item: Item, note: str) -> Item:
 
 
 def _compare(
-    section: Section, path: Path, allowance: Allowance | None, strict: bool, group: str
+    section: Section, path: Place, allowance: Allowance | None, strict: bool, group: str
 ) -> Item:
     name = f"{section.file}: {'.'.join((*section.place, *path))}"
     absent = object()
@@ -164,6 +164,8 @@ def _judge(old: Any, new: Any, allowance: Allowance | None) -> tuple[Status, flo
     if allowance.factor is not None:
         size = (allowance.factor - 1.0) * min(abs(old), abs(new))
     within = size is not None and abs(old - new) <= size
+    if not within and abs(old - new) <= _LAST_BITS * max(abs(old), abs(new)):
+        return Status.WITHIN, None, "the last bits"
     return (Status.WITHIN if within else Status.DIFFERENT), size, allowance.why
 
 

@@ -179,6 +179,6 @@ def test_a_run_is_allowed_what_a_report_is(rut_calibration) -> None:
     rules = run_allowances(rut_calibration, {}, paths)
     assert rules["log_evidence",].why == "Monte Carlo error"
     assert rules["gate", "rhat", "0"].size == 0.01
-    assert rules["evaluations",].factor == 3.0
+    assert rules["evaluations",].factor == 10.0
     sd = rut_calibration.draws.flat.std(axis=0)
     assert rules["mode", "1"].size == pytest.approx(0.01 * sd[1])
