@@ -5,15 +5,12 @@ Two runs give the same bits where these agree; where they do not, only where cha
 
 from __future__ import annotations
 
-import hashlib
 import os
-import platform
 import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -74,10 +71,14 @@ class Environment:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that numbers depend on."""
+    from importlib.metadata import version
+
     return {"python": sys.version.split()[0], **{name: version(name) for name in _PACKAGES}}
 
 
 def _machine() -> dict[str, str]:
+    import platform
+
     import numpy as np
 
     config: Any = np.show_config(mode="dicts")
@@ -94,6 +95,8 @@ def _machine() -> dict[str, str]:
 
 @cache
 def _code_sha256() -> str:
+    import hashlib
+
     package = Path(__file__).resolve().parent
     digest = hashlib.sha256()
     for path in sorted(package.rglob("*")):
