@@ -10,7 +10,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from calib.audit import Audit, run_audit
     from calib.calibration import Calibration, calibrate
+    from calib.campaign import read_plan, run_campaign
     from calib.data import Table, hold_out, read_table, table_from_arrays
     from calib.datasets.he2019 import load_he2019
     from calib.errors import CalibError
@@ -26,8 +28,12 @@ if TYPE_CHECKING:
     from calib.validate import Validation, leave_one_out, validate_held_out
 
 _HOME = {
+    "Audit": "calib.audit",
+    "run_audit": "calib.audit",
     "Calibration": "calib.calibration",
     "calibrate": "calib.calibration",
+    "read_plan": "calib.campaign",
+    "run_campaign": "calib.campaign",
     "Table": "calib.data",
     "hold_out": "calib.data",
     "read_table": "calib.data",
@@ -57,6 +63,7 @@ _HOME = {
 
 __all__ = [
     "MODELS",
+    "Audit",
     "CalibError",
     "Calibration",
     "Case",
@@ -78,7 +85,10 @@ __all__ = [
     "load_he2019",
     "predict",
     "read_case",
+    "read_plan",
     "read_table",
+    "run_audit",
+    "run_campaign",
     "save_calibration",
     "table_from_arrays",
     "to_datatree",

@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from calib.chains import ess, hdi, rhat
+from calib.chains import ess, hdi, hdi_error, median_error, rhat
 from calib.estimators import PointEstimate
 from calib.models.base import Array
 from calib.problem import Problem
@@ -19,6 +19,8 @@ from calib.streams import stream
 __all__ = ["Calibration", "ParameterSummary", "calibrate"]
 
 _HDI = 0.95
+# Parts of each ensemble's steps whose scatter gives Monte Carlo errors.
+_PARTS = 4
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,9 @@ class ParameterSummary:
     mcse_mean: float
     sd_ratio: float
     """Posterior over prior standard deviation; near 1 the data say nothing. NaN if derived."""
+    mcse_median: float = float("nan")
+    mcse_hdi_lower: float = float("nan")
+    mcse_hdi_upper: float = float("nan")
 
 
 @dataclass(frozen=True, repr=False)
@@ -131,6 +136,8 @@ def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
     )  # fmt: skip
     flat = stacked.reshape(-1, len(names))
     interval = [hdi(flat[:, j], _HDI) for j in range(len(names))]
+    batches = _batches(stacked.reshape(ensembles, walkers, steps, -1))
+    interval_error = [hdi_error(batches[j], _HDI) for j in range(len(names))]
     prior_sd = _prior_sds(calibration)
     return {
         name: ParameterSummary(
@@ -146,9 +153,20 @@ def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
             rhat=float(r[j]),
             mcse_mean=float(flat[:, j].std(ddof=1) / np.sqrt(mean_ess[j])),
             sd_ratio=_internal_sd(calibration, name) / prior_sd.get(name, np.nan),
+            mcse_median=median_error(batches[j]),
+            mcse_hdi_lower=float(interval_error[j][0]),
+            mcse_hdi_upper=float(interval_error[j][1]),
         )
         for j, name in enumerate(names)
     }
+
+
+def _batches(draws: Array) -> Array:
+    """Draws (ensembles, walkers, steps, d) in consecutive parts of every ensemble, (d, g, m)."""
+    ensembles, walkers, steps, d = draws.shape
+    parts = max(1, min(_PARTS, steps // 2))
+    kept = draws[:, :, : parts * (steps // parts)].reshape(ensembles, walkers, parts, -1, d)
+    return np.asarray(kept.transpose(4, 0, 2, 1, 3).reshape(d, ensembles * parts, -1))
 
 
 def _prior_sds(calibration: Calibration) -> dict[str, float]:

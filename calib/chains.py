@@ -1,22 +1,134 @@
-"""Statistics of chains, by ArviZ: R-hat, effective sample sizes, intervals, smoothed weights.
+"""Statistics of chains: R-hat, effective sample sizes, autocorrelation times, intervals, weights.
 
-The only place that calls ArviZ's array functions; imported late because it takes half a second.
+ArviZ works them out; this is the only place that calls its array functions, imported late because
+that takes half a second. The ranks, most of the work, are found here, once for R-hat and bulk ESS
+alike; emcee's autocorrelation time is worked out for all walkers at once.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Literal
 
 import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.special import ndtri
 
 from calib.models.base import Array
 
-__all__ = ["ess", "hdi", "mcse", "psis", "rhat", "tail_shape"]
+__all__ = [
+    "Convergence", "autocorrelation_time", "convergence", "ess", "hdi", "hdi_error", "mcse",
+    "median_error", "power_scaled_weights", "power_sensitivity", "psis", "rhat", "tail_shape",
+]  # fmt: skip
+
+_AXES = {"chain_axis": 0, "draw_axis": 1}
 
 
 def _stats() -> Any:
     return import_module("arviz_stats.base").array_stats
+
+
+@dataclass(frozen=True)
+class Convergence:
+    """Rank-normalised split R-hat, bulk and tail ESS of each parameter, shape (d,) each."""
+
+    rhat: Array
+    ess_bulk: Array
+    ess_tail: Array
+
+
+def convergence(draws: Array) -> Convergence:
+    """Judge ensembles of walkers.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (ensembles, walkers, steps, d)
+        Of an odd number of steps the first is left out.
+
+    Returns
+    -------
+    Convergence
+        NaN where draws are not finite.
+
+    Notes
+    -----
+    Walkers of one ensemble are not independent chains, so R-hat compares whole ensembles: each is
+    one chain, its halves the earlier and the later steps. Effective sample sizes take each walker
+    as a chain, for autocorrelation runs along its steps.
+
+    References
+    ----------
+    Vehtari et al. (2021), doi:10.1214/20-BA1221.
+    """
+    ensembles, walkers, steps, d = draws.shape
+    half = steps // 2
+    by_half = draws[:, :, steps - 2 * half :].reshape(ensembles, walkers, 2, half, d)
+    found = np.full((3, d), np.nan)
+    for j in range(d):
+        x = by_half[..., j]
+        if np.isfinite(x).all():
+            found[:, j] = _convergence_of(np.ascontiguousarray(x))
+    return Convergence(*found)
+
+
+def _convergence_of(x: Array) -> tuple[float, float, float]:
+    """R-hat, bulk and tail ESS of one parameter, shape (ensembles, walkers, 2, half)."""
+    ensembles, walkers, _, half = x.shape
+    scores = _normal_scores(x)
+    folded = _normal_scores(abs(x - np.median(x)))
+    stats = _stats()
+    with np.errstate(all="ignore"):
+        rhats = [
+            stats.rhat(
+                v.swapaxes(1, 2).reshape(2 * ensembles, walkers * half), method="identity", **_AXES
+            )
+            for v in (scores, folded)
+        ]
+        bulk = stats.ess(scores.reshape(-1, half), method="identity", **_AXES)
+    tail = ess(x.reshape(ensembles * walkers, 2 * half, 1), "tail")[0]
+    return float(np.maximum(*rhats)), float(bulk), float(tail)
+
+
+def _normal_scores(x: Array) -> Array:
+    """Normal quantiles of the pooled ranks, ties averaged, of any shape (Blom 1958)."""
+    flat = x.ravel()
+    order = flat.argsort()
+    ordered = flat[order]
+    first = np.flatnonzero(np.concatenate([[True], ordered[1:] != ordered[:-1]]))
+    behind = np.append(first[1:], flat.size)
+    rank = 0.5 * (first + 1 + behind)
+    scores = np.empty(flat.size)
+    scores[order] = np.repeat(ndtri((rank - 0.375) / (flat.size + 0.25)), behind - first)
+    return scores.reshape(x.shape)
+
+
+def autocorrelation_time(chain: Array, c: float = 5.0) -> Array:
+    """Integrated autocorrelation time in steps, as `emcee.autocorr.integrated_time`.
+
+    Parameters
+    ----------
+    chain : ndarray, shape (walkers, steps, d)
+    c : float
+        The window is the first that spans as many autocorrelation times (Sokal).
+
+    Returns
+    -------
+    ndarray, shape (d,)
+        NaN if a walker never moved.
+    """
+    _, steps, d = chain.shape
+    size = next_fast_len(2 * steps, real=True)
+    tau = np.empty(d)
+    for j in range(d):
+        x = chain[..., j] - chain[..., j].mean(axis=1, keepdims=True)
+        spectrum = rfft(x, n=size, axis=1)
+        covariance = irfft(spectrum.real**2 + spectrum.imag**2, n=size, axis=1)[:, :steps]
+        with np.errstate(invalid="ignore"):
+            taus = 2.0 * np.cumsum((covariance / covariance[:, :1]).mean(axis=0)) - 1.0
+        inside = np.arange(steps) < c * taus
+        tau[j] = taus[inside.argmin() if inside.any() else -1]
+    return tau
 
 
 def rhat(chains: Array) -> Array:
@@ -27,14 +139,14 @@ def rhat(chains: Array) -> Array:
     Vehtari et al. (2021), doi:10.1214/20-BA1221.
     """
     with np.errstate(all="ignore"):
-        return np.asarray(_stats().rhat(chains, chain_axis=0, draw_axis=1, method="rank"))
+        return np.asarray(_stats().rhat(chains, method="rank", **_AXES))
 
 
 def ess(chains: Array, method: Literal["bulk", "tail", "mean"]) -> Array:
     """Effective sample size of each parameter, shape (chains, draws, d) to (d,)."""
     extra = {"prob": (0.05, 0.95)} if method == "tail" else {}
     with np.errstate(all="ignore"):
-        value = _stats().ess(chains, chain_axis=0, draw_axis=1, method=method, **extra)
+        value = _stats().ess(chains, method=method, **_AXES, **extra)
     return np.asarray(value)
 
 
@@ -64,6 +176,30 @@ def hdi(draws: Array, prob: float) -> tuple[float, float]:
     return float(low), float(high)
 
 
+def hdi_error(batches: Array, prob: float) -> Array:
+    """Monte Carlo standard errors of the ends of a highest-density interval, shape (2,).
+
+    Parameters
+    ----------
+    batches : ndarray, shape (g, m)
+        The draws in g nearly independent parts.
+    prob : float
+
+    Notes
+    -----
+    The ends of a shortest interval converge with the cube root of the number of draws (Kim &
+    Pollard 1990, doi:10.1214/aos/1176347498), slower than the quantiles at which they lie: so do
+    the ends of the parts, whose scatter is scaled by that root.
+    """
+    ends = np.asarray(_stats().hdi(batches, prob, axis=-1))
+    return np.asarray(ends.std(axis=0, ddof=1) / np.cbrt(batches.shape[0]))
+
+
+def median_error(batches: Array) -> float:
+    """Monte Carlo standard error of the median of draws in nearly independent parts, (g, m)."""
+    return float(np.median(batches, axis=-1).std(ddof=1) / np.sqrt(batches.shape[0]))
+
+
 def psis(log_ratio: Array) -> tuple[Array, Array]:
     """Pareto-smoothed log weights (n, draws) of log ratios (n, draws), and the shapes k, (n,).
 
@@ -74,3 +210,47 @@ def psis(log_ratio: Array) -> tuple[Array, Array]:
     # ArviZ takes log likelihoods, of which it forms the ratios of leave-one-out itself.
     log_weight, k = _stats().psislw(-log_ratio)
     return np.asarray(log_weight), np.asarray(k)
+
+
+def power_scaled_weights(log_density: Array, alpha: float) -> Array:
+    """Smoothed weights that raise a part of the density to a power.
+
+    Parameters
+    ----------
+    log_density : ndarray, shape (chains, draws)
+        Of the prior, or of the likelihood, at each draw.
+    alpha : float
+        The power.
+
+    Returns
+    -------
+    ndarray, shape (chains, draws)
+        Of sum one.
+
+    References
+    ----------
+    Kallioinen et al. (2024), doi:10.1007/s11222-023-10366-5.
+    """
+    log_weight = np.asarray(_stats().power_scale_lw(log_density, alpha=alpha, axis=(0, 1)))
+    weight = np.exp(log_weight - log_weight.max())
+    return np.asarray(weight / weight.sum())
+
+
+def power_sensitivity(
+    draws: Array, weights: tuple[Array, Array], alphas: tuple[float, float]
+) -> float:
+    """Distance that a marginal moves per doubling of the power.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (chains, draws)
+    weights : tuple of ndarray
+        For the lower and for the upper power.
+    alphas : tuple of float
+        The two powers.
+    """
+    lower, upper = weights
+    value = _stats().power_scale_sense(
+        draws, lower, upper, lower_alpha=alphas[0], upper_alpha=alphas[1]
+    )
+    return float(value)

@@ -14,13 +14,14 @@ from pathlib import Path
 
 from calib.errors import CalibError
 
-__all__ = ["check_folder", "fresh_folder"]
+__all__ = ["check_folder", "fresh_folder", "read_folder", "unwritable"]
 
 # Files by which a folder is known to be one of ours, and may be replaced.
-_OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt")
+_OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json")
 _WRITTEN = (
-    *_OURS, "index.html", "summary.json", "figures", "data", "priors", "case", "corrected.json",
-    "fresh_prediction.csv", "priors.toml", "data.csv",
+    *_OURS, "index.html", "summary.json", "figures", "data", "priors", "gaps", "case",
+    "corrected.json", "fresh_prediction.csv", "priors.toml", "data.csv", "tables", "methods.txt",
+    "methods.tex", "references.bib", "audit.csv",
 )  # fmt: skip
 
 _YOUNG_SECONDS = 60.0
@@ -53,7 +54,7 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
         lock = _lock(scratch)
     except OSError as error:
-        raise _unwritable(out, str(error.strerror)) from None
+        raise unwritable(out, str(error.strerror)) from None
     try:
         yield scratch
         scratch.chmod(0o777 & ~_umask())
@@ -106,7 +107,17 @@ def _remove_abandoned(out: Path) -> None:
                 os.close(lock)
 
 
-def _unwritable(out: Path, why: str) -> CalibError:
+def read_folder(folder: Path) -> dict[str, bytes]:
+    """Return the content of every file below a folder, by its relative name."""
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def unwritable(out: Path, why: str) -> CalibError:
+    """Return the error for a folder that cannot be written, and why."""
     return CalibError(
         f"the output folder cannot be written ({why})",
         where=str(out),
@@ -117,9 +128,9 @@ def _unwritable(out: Path, why: str) -> CalibError:
 def _check_parent(out: Path) -> None:
     parent = next(p for p in out.absolute().parents if p.exists())
     if not parent.is_dir():
-        raise _unwritable(out, f"{parent} is a file")
+        raise unwritable(out, f"{parent} is a file")
     if not os.access(parent, os.W_OK | os.X_OK):
-        raise _unwritable(out, f"no permission to write in {parent}")
+        raise unwritable(out, f"no permission to write in {parent}")
 
 
 def _umask() -> int:
@@ -139,7 +150,7 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
     try:
         exists = out.exists()
     except OSError as error:  # a name that is too long, a folder that may not be searched
-        raise _unwritable(out, str(error.strerror)) from None
+        raise unwritable(out, str(error.strerror)) from None
     if not exists:
         _check_parent(out)
         return

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.environment import Environment
+from calib.estimators import GeneticSettings
 from calib.sampling.sampler import SamplerSettings
 from calib.study import OutputResult, Study, Task
 
@@ -67,6 +68,7 @@ def build_manifest(
         "seed": study.seed,
         **(environment or Environment.here()).document(),
         "settings": json.loads(json.dumps(asdict(settings))),
+        "genetic_algorithm": asdict(GeneticSettings()),
         "tasks": {k: _task(r.task, inputs[k]) for k, r in study.results.items()},
         "seconds": {
             "study": study.seconds,

@@ -23,12 +23,11 @@ from calib.errors import CalibError
 from calib.models import Array, BoundModel, get_model
 from calib.prior_files import default_prior_path, read_priors
 from calib.priors import Priors
+from calib.squares import Squares
 
 __all__ = ["Problem", "build_problem"]
 
 _HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))
-# Rows times vectors evaluated at once: bounds the memory, keeps temporaries in cache.
-_CHUNK_CELLS = 200_000
 
 
 @dataclass(frozen=True)
@@ -82,6 +81,15 @@ class Problem:
         log = self.bound.model.response == "log"
         return -self.response if log else np.zeros_like(self.response)
 
+    @cached_property
+    def _sum_ln_jacobian(self) -> float:
+        return float(self._ln_jacobian.sum())
+
+    @cached_property
+    def squares(self) -> Squares:
+        """Sums of squared residuals, on the scale of the response, of natural parameters."""
+        return Squares.of(self.bound, self.conditions, self.response)
+
     def theta(self, t: Array) -> Array:
         """Natural parameters, sigma last, of internal ones: (k, n_dim) to (k, d_all)."""
         return self.priors.to_natural(t)
@@ -93,19 +101,12 @@ class Problem:
     def log_likelihood(self, t: Array) -> Array:
         """Log likelihood of internal coordinates, shape (k,); ``-inf`` where undefined."""
         natural = self.theta(t)
-        n = self.response.size
-        rows_at_once = max(1, _CHUNK_CELLS // n)
-        sigma = natural[:, -1]
+        n, sigma = self.response.size, natural[:, -1]
         # A prior may admit sigma <= 0 or predictions beyond all bounds: they become -inf below.
         with np.errstate(all="ignore"):
-            sse = np.concatenate(
-                [
-                    np.square(self.residuals(natural[i : i + rows_at_once])).sum(axis=1)
-                    for i in range(0, natural.shape[0], rows_at_once)
-                ]
-            )
+            sse = self.squares(natural[:, :-1])
             value = -n * (np.log(sigma) + _HALF_LN_2PI) - 0.5 * sse / sigma**2
-        value += self._ln_jacobian.sum()
+        value += self._sum_ln_jacobian
         return np.where(np.isfinite(value), value, -np.inf)
 
     def log_likelihood_rows(self, t: Array) -> Array:

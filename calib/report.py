@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-import io
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from calib.audit import Audit
 from calib.data import write_table
 from calib.environment import Environment
 from calib.figures import Plate, plates
+from calib.figures.export import pdf_bytes, png
 from calib.folders import fresh_folder
 from calib.manifest import build_manifest, file_hashes, sha256
 from calib.page import render_page
+from calib.page.audit import write_audit
+from calib.page.paper_gaps import write_gaps
+from calib.paper_gaps.find import FoundGap
+from calib.paper_gaps.summary import summarise_gaps
 from calib.prior_files import default_prior_path
+from calib.publish import publication
 from calib.sampling.sampler import SamplerSettings
 from calib.store import to_datatree, write_netcdf
 from calib.study import Study
@@ -32,9 +38,12 @@ def write_report(
     settings: SamplerSettings,
     command: Sequence[str],
     title: str,
+    gaps: Sequence[FoundGap] = (),
     overwrite: bool = False,
     posteriors: bool = True,
     environment: Environment | None = None,
+    audit: Audit | None = None,
+    pdf: bool = False,
     progress: Progress | None = None,
 ) -> Path:
     """Write a report folder.
@@ -49,6 +58,8 @@ def write_report(
     command : sequence of str
         The command line, for the manifest.
     title : str
+    gaps : sequence of FoundGap
+        Of the source's own models, diagnosed: a section of their own.
     overwrite : bool
         Replace an earlier report.
     posteriors : bool
@@ -56,6 +67,10 @@ def write_report(
         manifest says so and has their hashes.
     environment : Environment, optional
         Where the manifest says the report was made: that of this process by default.
+    audit : Audit, optional
+        Of the published tables, shown before the appendix.
+    pdf : bool
+        Whether every figure also comes as PDF, for print.
     progress : callable, optional
 
     Returns
@@ -71,7 +86,10 @@ def write_report(
     tell = progress or (lambda what, done, planned: None)
     with fresh_folder(out, overwrite=overwrite) as folder:
         inputs = _copy_inputs(study, folder)
-        (folder / "summary.json").write_text(json.dumps(summarise(study), indent=1) + "\n")
+        summary = summarise(study)
+        if gaps:
+            summary["paper_gaps"] = summarise_gaps(gaps)
+        (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
         drawn: dict[str, list[Plate]] = {}
         images: dict[str, bytes] = {}
         (folder / "figures").mkdir()
@@ -83,19 +101,34 @@ def write_report(
             for plate in drawn[key]:
                 if plate.figure is not None:
                     name = f"{key}_{plate.name}.png"
-                    images[name] = _png(plate)
+                    images[name] = png(plate)
                     (folder / "figures" / name).write_bytes(images[name])
+                    if pdf:
+                        file = folder / "figures" / f"{key}_{plate.name}.pdf"
+                        file.write_bytes(pdf_bytes(plate.figure))
         tell("drawing figures", len(successes), len(successes))
         manifest = build_manifest(
             study, settings, command, inputs, title=title, environment=environment
         )
+        manifest["pdf"] = pdf
+        paper = publication(manifest, summary)
+        for path, text in paper.files.items():
+            (folder / path).parent.mkdir(exist_ok=True)
+            (folder / path).write_text(text, encoding="utf-8")
+        gaps_html = None
+        if gaps:
+            manifest["paper_gaps"] = {r.gap.name: {"seed": r.found.seed} for r in gaps}
+            gaps_html = write_gaps(gaps, folder, png, manifest=manifest, pdf=pdf, progress=tell)
         page = render_page(
             study,
             drawn,
             images,
             manifest=manifest,
             title=title,
+            gaps_html=gaps_html,
             reconstructed=any(r.task.table.label for r in study.results.values()),
+            audit_html=write_audit(audit, folder) if audit is not None else None,
+            paper=paper,
         )
         (folder / "index.html").write_text(page, encoding="utf-8")
         files = file_hashes(folder)
@@ -140,17 +173,3 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
             },
         }
     return inputs
-
-
-def _png(plate: Plate) -> bytes:
-    """Render a figure, with a palette of 256 colours: a third of the size, no visible loss."""
-    from PIL import Image
-
-    if plate.figure is None:
-        return b""
-    full, small = io.BytesIO(), io.BytesIO()
-    plate.figure.savefig(full, format="png", dpi=150)
-    full.seek(0)
-    with Image.open(full) as image:
-        image.convert("RGB").quantize(256).save(small, format="png")
-    return small.getvalue()

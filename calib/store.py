@@ -47,7 +47,7 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     """Return a calibration as an ArviZ DataTree.
 
     Chains are walkers (`sample_stats.ensemble` says of which ensemble), so that effective sample
-    sizes computed from the file are those of the gate. Groups: posterior, prior,
+    sizes computed from the file are those of the gate. Groups: posterior, prior, log_prior,
     posterior_predictive, log_likelihood, sample_stats, observed_data, constant_data.
     """
     import arviz as az
@@ -85,6 +85,7 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
                 "posterior": dict(calibration.parameters),
                 "prior": _prior_group(calibration, prior),
                 **by_row,
+                "log_prior": {"joint": problem.priors.log_prob(draws.flat).reshape(chains, steps)},
                 "sample_stats": {
                     "lp": draws.log_prob.reshape(chains, steps),
                     "ensemble": np.repeat(ensembles[:, None], steps, axis=1),

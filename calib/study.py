@@ -26,6 +26,7 @@ from calib.prediction import predictive_draws
 from calib.prior_files import default_prior_path, prior_file_model
 from calib.problem import Problem, build_problem
 from calib.sampling.sampler import SamplerSettings
+from calib.sensitivity import Sensitivity, prior_sensitivity
 from calib.streams import generator
 from calib.validate import Validation, leave_one_out, validate_held_out
 
@@ -50,6 +51,27 @@ class HoldOut:
 
     def __str__(self) -> str:
         return f"{self.column} = {self.value:g}"
+
+    @classmethod
+    def parse(cls, text: str) -> HoldOut:
+        """Read ``COLUMN=VALUE``.
+
+        Raises
+        ------
+        CalibError
+            If it is not of this form.
+        """
+        column, equals, value = text.partition("=")
+        try:
+            if not equals:
+                raise ValueError
+            return cls(column.strip(), float(value))
+        except ValueError:
+            raise CalibError(
+                f"cannot read --hold-out {text!r}",
+                allowed="COLUMN=VALUE, for instance inflation_pressure_psi=30",
+                mend="name a column with its unit, an equals sign and one number",
+            ) from None
 
     def applies_to(self, table: Table) -> bool:
         """Whether a table has the column at all."""
@@ -99,6 +121,8 @@ class OutputResult:
     posterior_predictive : ndarray, shape (draws, n)
     seconds : mapping of str to float
         Of each stage.
+    sensitivity : mapping of str to Sensitivity
+        Of each parameter to prior and data.
     """
 
     task: Task
@@ -109,6 +133,7 @@ class OutputResult:
     prior_predictive: Array
     posterior_predictive: Array
     seconds: Mapping[str, float] = field(default_factory=dict)
+    sensitivity: Mapping[str, Sensitivity] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -252,6 +277,7 @@ def run_study(
     *,
     settings: SamplerSettings | None = None,
     progress: Progress | None = None,
+    workers: int = 1,
 ) -> Study:
     """Work every task out.
 
@@ -262,12 +288,14 @@ def run_study(
     settings : SamplerSettings, optional
     progress : callable, optional
         Called with what is being done, steps done and steps planned.
+    workers : int
+        Processes for leaving rows out; the numbers do not depend on it.
     """
     began = time.perf_counter()
     results: dict[str, OutputResult | Failure] = {}
     for task in tasks:
         try:
-            results[task.output] = _work_out(task, seed, settings, progress or _silent)
+            results[task.output] = _work_out(task, seed, settings, progress or _silent, workers)
         except Exception as error:  # whatever fails, the other outputs still come
             results[task.output] = Failure(task, _without_folder(task, error))
     return Study(results, seed, time.perf_counter() - began)
@@ -292,7 +320,7 @@ def fitted_rows(task: Task) -> tuple[Table, Table | None]:
 
 
 def _work_out(
-    task: Task, seed: int, settings: SamplerSettings | None, progress: Progress
+    task: Task, seed: int, settings: SamplerSettings | None, progress: Progress, workers: int
 ) -> OutputResult:
     seconds: dict[str, float] = {}
     fitted, held = fitted_rows(task)
@@ -319,6 +347,7 @@ def _work_out(
             calibration,
             settings=settings,
             progress=lambda done, n: progress(f"{task.output}: leaving rows out", done, n),
+            workers=workers,
         )
     seconds["validate"] = time.perf_counter() - clock
     _, replicated = predictive_draws(
@@ -333,6 +362,7 @@ def _work_out(
         _prior_predictive(problem, generator(seed, task.output, "prior")),
         replicated,
         seconds,
+        prior_sensitivity(calibration),
     )
 
 

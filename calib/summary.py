@@ -6,9 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from calib.calibration import Calibration
 from calib.estimators import PointEstimate
+from calib.models.base import Array
 from calib.scores import Scores
+from calib.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 from calib.study import OutputResult, Study
 
 __all__ = ["SCHEMA", "summarise", "summarise_estimates"]
@@ -20,7 +24,8 @@ def summarise(study: Study) -> dict[str, Any]:
     """Return a study's numbers as plain dictionaries.
 
     Keys under ``models.<output>``: ``estimates.<method>.<parameter>``, ``fit.<method>``,
-    ``posterior.<parameter>``, ``validation``, ``sampling``; a failed output has ``error`` alone.
+    ``posterior.<parameter>``, ``prior_sensitivity``, ``validation``, ``sampling``; a failed output
+    has ``error`` alone.
     """
     models: dict[str, Any] = {k: _output(r) for k, r in study.successes.items()}
     models |= {k: {"model": f.task.model, "error": f.error} for k, f in study.failures.items()}
@@ -42,11 +47,26 @@ def _output(result: OutputResult) -> dict[str, Any]:
             "source": problem.table.source,
             "label": problem.table.label,
             "n": len(problem.table),
+            "n_all": len(result.task.table),
+            "ranges": {
+                name: _range(problem.table[name])
+                for name in (*problem.bound.model.conditions, problem.bound.model.output)
+            },
             "held_out": None if result.task.held_out is None else str(result.task.held_out),
         },
         "references": dict(problem.bound.references),
         **summarise_estimates(result.estimates, result.by_pressure),
+        "priors": {
+            p.name: {
+                "unit": p.unit,
+                "distribution": p.text,
+                "reason": p.reason,
+                "source": p.source,
+            }
+            for p in problem.priors.entries
+        },
         "posterior": _posterior(result.calibration),
+        "prior_sensitivity": _sensitivity(result),
         "validation": _validation(result),
         "sampling": _sampling(result.calibration),
     }
@@ -69,10 +89,20 @@ def summarise_estimates(
     return plain
 
 
+def _range(values: Array) -> dict[str, float]:
+    return {
+        "lower": float(values.min()),
+        "upper": float(values.max()),
+        "distinct": int(np.unique(values).size),
+    }
+
+
 def _fit(e: PointEstimate) -> dict[str, Any]:
     return {
         "cost": e.cost,
+        "cost_unit": e.cost_unit,
         "rmse": e.rmse,
+        "rmse_unit": e.rmse_unit,
         "r_squared": e.r_squared,
         "evaluations": e.n_evaluations,
         "converged": e.converged,
@@ -93,9 +123,31 @@ def _posterior(calibration: Calibration) -> dict[str, Any]:
             "ess_tail": s.ess_tail,
             "rhat": s.rhat,
             "mcse_mean": s.mcse_mean,
+            "mcse_median": s.mcse_median,
+            "mcse_hdi_lower": s.mcse_hdi_lower,
+            "mcse_hdi_upper": s.mcse_hdi_upper,
             "posterior_to_prior_sd": s.sd_ratio,
         }
         for name, s in calibration.summary.items()
+    }
+
+
+def _sensitivity(result: OutputResult) -> dict[str, Any]:
+    return {
+        "criteria": {
+            "contraction_at_least": CONTRACTION_MIN,
+            "power_scaling_threshold": SENSITIVITY_MIN,
+        },
+        "parameters": {
+            name: {
+                "contraction": s.contraction,
+                "prior": s.prior,
+                "likelihood": s.likelihood,
+                "identified": s.identified,
+                "reading": s.reading,
+            }
+            for name, s in result.sensitivity.items()
+        },
     }
 
 
@@ -105,6 +157,7 @@ def _validation(result: OutputResult) -> dict[str, Any]:
         {
             "elpd": v.elpd,
             "elpd_se": v.elpd_se,
+            "largest_pareto_k": None if v.pareto_k is None else float(v.pareto_k.max()),
             "refitted": list(v.refitted),
             "refits_not_converged": list(v.unconverged),
         }
@@ -130,14 +183,21 @@ def _scores(s: Scores) -> dict[str, Any]:
 
 def _sampling(calibration: Calibration) -> dict[str, Any]:
     d, problem = calibration.draws, calibration.problem
+    r = d.report
     mode = problem.theta(d.mode[None])[0].tolist()
     return {
-        "converged": d.report.passed,
-        "reasons": list(d.report.reasons),
+        "converged": r.passed,
+        "reasons": list(r.reasons),
+        "gate": {
+            "largest_rhat": float(r.rhat.max()),
+            "smallest_ess_bulk": float(r.ess_bulk.min()),
+            "smallest_ess_tail": float(r.ess_tail.min()),
+            "smallest_steps_over_tau": float((r.steps / r.tau).min()),
+        },
         "ensembles": d.t.shape[0],
         "walkers": d.t.shape[1],
-        "steps": d.report.steps,
-        "tau": float(max(d.report.tau)),
+        "steps": r.steps,
+        "tau": float(max(r.tau)),
         "acceptance": d.acceptance,
         "evaluations": d.evaluations,
         "log_evidence": d.log_evidence,

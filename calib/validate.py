@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,9 +14,11 @@ from calib.data import Table
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.prediction import N_DRAWS, predictive_draws
+from calib.problem import Problem
 from calib.sampling.sampler import Progress, SamplerSettings, sample_posterior
 from calib.scores import Scores, score
 from calib.streams import generator, stream
+from calib.tasks import completed
 
 __all__ = ["Validation", "leave_one_out", "validate_held_out"]
 
@@ -96,6 +100,7 @@ def leave_one_out(
     *,
     settings: SamplerSettings | None = None,
     progress: Progress | None = None,
+    workers: int = 1,
 ) -> Validation:
     """Leave every row out in turn: by smoothed importance sampling, or by fitting again.
 
@@ -106,6 +111,8 @@ def leave_one_out(
         For the refits.
     progress : callable, optional
         Called with rows done and rows in all.
+    workers : int
+        Processes for the refits, as for `calib.tasks.completed`; the numbers do not depend on it.
 
     References
     ----------
@@ -119,24 +126,17 @@ def leave_one_out(
     n = problem.response.size
     drawn = np.empty((N_DRAWS, n))
     elpd = np.empty(n)
-    refitted, unconverged = [], []
+    too_large = [int(i) for i in np.flatnonzero(~(k <= PARETO_K_MAX))]
+    refits = _refits(calibration, too_large, settings, progress, workers)
     for i in range(n):
         row = problem.table.take(np.arange(n) == i)
-        if k[i] <= PARETO_K_MAX:
+        if i not in refits:
             weight = np.exp(log_weight[i] - log_weight[i].max())
             picked = rng.choice(t.shape[0], size=N_DRAWS, p=weight / weight.sum())
             sample = t[picked]
             elpd[i] = _log_mean(log_weight[i] + log_likelihood[:, i], log_weight[i])
         else:
-            refitted.append(i)
-            rest = problem.with_table(problem.table.take(np.arange(n) != i))
-            seed = stream(calibration.seed, calibration.label, "refit", i)
-            again = sample_posterior(
-                rest, seed, starts=calibration.draws.mode[None], settings=settings
-            )
-            if not again.report.passed:
-                unconverged.append(i)
-            sample = again.flat[np.linspace(0, again.flat.shape[0] - 1, N_DRAWS).astype(int)]
+            sample = refits[i].sample
             held = problem.with_table(row).log_likelihood_rows(sample)[:, 0]
             # Without this row, the equation may have no value at it: density zero there.
             defined = np.isfinite(held)
@@ -146,13 +146,66 @@ def leave_one_out(
         location = problem.bound.location(natural[:, :-1], problem.bound.model.select(row.columns))
         noisy = location[:, 0] + natural[:, -1] * rng.standard_normal(N_DRAWS)
         drawn[:, i] = problem.bound.from_response(noisy)
-        if progress is not None:
-            progress(i + 1, n)
+    if progress is not None and not refits:
+        progress(n, n)
     return Validation(
         "leave_one_out", problem.table, problem.observed, drawn, score(drawn, problem.observed),
-        k, tuple(refitted), float(elpd.sum()), float(np.sqrt(n * elpd.var(ddof=1))),
-        tuple(unconverged),
+        k, tuple(refits), float(elpd.sum()), float(np.sqrt(n * elpd.var(ddof=1))),
+        tuple(i for i, refit in refits.items() if not refit.passed),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Left:
+    """A problem without one of its rows, and how to sample it."""
+
+    problem: Problem
+    seed: np.random.SeedSequence
+    mode: Array
+    settings: SamplerSettings | None
+
+
+@dataclass(frozen=True)
+class _Refit:
+    """Draws without one row, shape (N_DRAWS, d), and whether they passed the gate."""
+
+    sample: Array
+    passed: bool
+
+
+def _refits(
+    calibration: Calibration, rows: Sequence[int], settings: SamplerSettings | None,
+    progress: Progress | None, workers: int,
+) -> dict[int, _Refit]:  # fmt: skip
+    """Fit again without each of some rows."""
+    problem, n = calibration.problem, calibration.problem.response.size
+    left = {
+        str(i): _Left(
+            problem.with_table(problem.table.take(np.arange(n) != i)),
+            stream(calibration.seed, calibration.label, "refit", i),
+            calibration.draws.mode,
+            settings,
+        )
+        for i in rows
+    }
+    found = {}
+    with closing(completed(_refit, left, workers=workers)) as coming:
+        for task in coming:
+            if task.result is None:
+                raise CalibError(f"the fit without row {task.name} failed: {task.error}")
+            found[int(task.name)] = task.result
+            if progress is not None:
+                # The other rows take no time.
+                progress(n - len(rows) + len(found), n)
+    return {i: found[i] for i in rows}
+
+
+def _refit(left: _Left) -> _Refit:
+    again = sample_posterior(
+        left.problem, left.seed, starts=left.mode[None], settings=left.settings
+    )
+    picked = np.linspace(0, again.flat.shape[0] - 1, N_DRAWS).astype(int)
+    return _Refit(again.flat[picked], again.report.passed)
 
 
 def _log_mean(log_value: Array, log_weight: Array) -> float:

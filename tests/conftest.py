@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.audit import Audit, Seeds, run_audit
 from calib.calibration import Calibration, calibrate
 from calib.data import Table, hold_out, table_from_arrays
 from calib.datasets import he2019
 from calib.estimators import estimate
+from calib.paper_gaps.find import FoundGap, find_gaps
 from calib.problem import build_problem
 
 SEED = 2019
@@ -49,3 +51,15 @@ def pull_calibration(pull_tables: tuple[Table, Table]) -> Calibration:
 @pytest.fixture(scope="session")
 def density_calibration() -> Calibration:
     return _calibrated("ayers_perumpral", he2019_table("bulk_density"))
+
+
+@pytest.fixture(scope="session")
+def found_gaps() -> dict[str, FoundGap]:
+    """The source's own gaps, diagnosed."""
+    return {result.gap.name: result for result in find_gaps(SEED)}
+
+
+@pytest.fixture(scope="session")
+def audit(rut_calibration: Calibration) -> Audit:
+    """The audit of the published tables, the genetic algorithm over few seeds."""
+    return run_audit(SEED, seeds=Seeds(3, 2, 4), rut_calibration=rut_calibration)

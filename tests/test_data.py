@@ -19,8 +19,8 @@ from calib.data import (
 )
 from calib.errors import CalibError
 
-DATA = Path("/work/shared/data")
-CASES = Path("/work/shared/cases")
+DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+CASES = Path(__file__).resolve().parents[2] / "shared" / "cases"
 GOOD = (
     "slip_percent,inflation_pressure_kpa,drawbar_pull_n,operator\n10,124.1,900,A\n20,206.8,950,B\n"
 )

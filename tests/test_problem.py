@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-import calib.problem as problem_module
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
 from calib.problem import Problem, build_problem
@@ -52,15 +51,6 @@ def test_the_posterior_is_prior_times_likelihood(rut_problem: Problem) -> None:
     expected = rut_problem.priors.log_prob(t) + rut_problem.log_likelihood(t)
     np.testing.assert_allclose(rut_problem.log_prob(t), expected, rtol=1e-12)
     assert rut_problem.log_prob(t[0]).shape == (1,)
-
-
-def test_chunks_make_no_difference(pull_problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
-    t = near(pull_problem)
-    whole = pull_problem.log_likelihood(t)
-    for cells in (1, 3 * len(pull_problem.table)):  # one vector, and three, at a time
-        monkeypatch.setattr(problem_module, "_CHUNK_CELLS", cells)
-        # Only the order of vectorised sums may differ, in the last bit.
-        np.testing.assert_allclose(pull_problem.log_likelihood(t), whole, rtol=1e-14)
 
 
 def test_outside_the_bounds_the_density_is_zero(pull_problem: Problem) -> None:

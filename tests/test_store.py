@@ -21,7 +21,7 @@ from calib.store import load_calibration, save_calibration, to_datatree
 from calib.validate import leave_one_out
 
 GROUPS = {
-    "posterior", "prior", "posterior_predictive", "log_likelihood", "sample_stats",
+    "posterior", "prior", "log_prior", "posterior_predictive", "log_likelihood", "sample_stats",
     "observed_data", "constant_data",
 }  # fmt: skip
 

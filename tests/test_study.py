@@ -252,6 +252,24 @@ def test_the_summary_carries_what_was_promised(study: Study) -> None:
             found = entry["posterior"][parameter]
             for name in ("mean", "sd", "hdi_lower", "hdi_upper", "ess_bulk", "ess_tail", "rhat"):
                 assert found[name] == getattr(s, name)
+            for name in ("mcse_mean", "mcse_median", "mcse_hdi_lower", "mcse_hdi_upper"):
+                assert found[name] == getattr(s, name)
+        report = result.calibration.draws.report
+        gate = entry["sampling"]["gate"]
+        assert gate["largest_rhat"] == max(report.rhat)
+        assert gate["smallest_ess_bulk"] == min(report.ess_bulk)
+        assert gate["smallest_ess_tail"] == min(report.ess_tail)
+        assert gate["smallest_steps_over_tau"] == min(report.steps / report.tau)
+        assert set(entry["priors"]) == {p.name for p in result.calibration.problem.priors.entries}
+        for name, found in entry["data"]["ranges"].items():
+            values = result.calibration.problem.table[name]
+            assert (found["lower"], found["upper"]) == (values.min(), values.max())
+            assert found["distinct"] == len(set(values.tolist()))
+        sensitivity = entry["prior_sensitivity"]["parameters"]
+        assert set(sensitivity) == set(entry["posterior"])
+        for parameter, reaction in result.sensitivity.items():
+            assert sensitivity[parameter]["prior"] == reaction.prior
+            assert sensitivity[parameter]["identified"] is reaction.identified
         assert set(entry["validation"]["coverage"]) == {"50", "90", "95"}
         scores = result.validation.scores
         for name in ("n", "rmse", "crps", "max_relative_error"):
@@ -296,6 +314,8 @@ def test_the_manifest_says_what_a_result_was_made_from(study: Study, tmp_path: P
     assert found["settings"]["max_steps"] == 1000
     assert found["settings"]["gate"]["rhat_max"] == 1.01
     assert set(found["versions"]) >= {"python", "numpy", "emcee", "arviz"}
+    # Table 2 of the source.
+    assert [found["genetic_algorithm"][k] for k in ("F", "CP", "MP", "NP")] == [0.4, 0.6, 0.1, 50]
     task = found["tasks"]["rut_depth"]
     assert task["held_out"] == {"column": "inflation_pressure_psi", "value": 30.0}
     assert task["label"] == "reconstructed"

@@ -16,6 +16,7 @@ from calib.sampling.sampler import SamplerSettings
 from calib.validate import Validation, leave_one_out, validate_held_out
 
 N = 9
+FEW = SamplerSettings(steps=20, max_steps=20)
 
 
 @pytest.fixture(scope="module")
@@ -85,6 +86,15 @@ def test_rows_that_cannot_be_smoothed_are_refitted(
     assert found.elpd == pytest.approx(elpd.sum(), abs=bound)
 
 
+def test_two_workers_refit_to_the_same_numbers(small, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(validate_module, "PARETO_K_MAX", -np.inf)
+    one, two = (leave_one_out(small, settings=FEW, workers=workers) for workers in (1, 2))
+    assert two.refitted == one.refitted == tuple(range(N))
+    assert two.unconverged == one.unconverged
+    np.testing.assert_array_equal(two.draws, one.draws)
+    assert (two.elpd, two.elpd_se) == (one.elpd, one.elpd_se)
+
+
 def test_rows_are_refitted_where_the_shape_is_too_large(smoothed) -> None:
     assert smoothed.pareto_k.shape == (N,)
     assert set(smoothed.refitted) == set(np.flatnonzero(smoothed.pareto_k > 0.7))
@@ -102,7 +112,7 @@ def test_a_row_left_out_is_predicted_worse_than_fitted(small, smoothed) -> None:
 
 def test_refits_that_do_not_converge_are_named(small, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(validate_module, "PARETO_K_MAX", -np.inf)
-    found = leave_one_out(small, settings=SamplerSettings(steps=20, max_steps=20))
+    found = leave_one_out(small, settings=FEW)
     assert found.unconverged == found.refitted == tuple(range(N))
 
 

@@ -21,7 +21,7 @@ from calib.challenge.effects import (
 from calib.challenge.identify import Identifiability, identify, isolable_nats
 from calib.challenge.mechanics import Reality
 from calib.challenge.mechanism import DENSITY, EffectKind, Readings
-from calib.challenge.shift import draw_shift, shifted
+from calib.challenge.shift import LARGEST_AMOUNT, SMALLEST_AMOUNT, draw_shift, shifted
 from calib.challenge.stage import LACK_OF_FIT, Stage, draw_stage, rms
 from calib.challenge.surrogate import misfit, recalibrate
 
@@ -31,9 +31,14 @@ type Kinds = tuple[EffectKind, ...]
 
 SMALLEST_GAP, LARGEST_GAP = 2.0, 6.0
 OWN_GAP = 1.0
+# One effect alone is drawn with a little more than the smallest gap, each of two with less and
+# over a part of the range, the second's place in it near the first's.
+SINGLE_FLOOR, PAIR_FLOOR = 1.06 * SMALLEST_GAP, 1.3 * OWN_GAP
+PAIR_SPAN, PAIR_SPREAD = 0.85, 0.3
 ISOLABLE_NATS, ABSORBABLE_NATS, RIVAL_NATS = 6.0, 2.0, 2.0
-_UNLISTED_NATS = {"easy": 12.0, "hard": 8.0}
-_CLOSE = 0.04
+UNLISTED_NATS = {"easy": 12.0, "hard": 8.0}
+DENSITY_ODDITY = 0.4
+CLOSE = 0.04
 
 
 @dataclass(frozen=True)
@@ -93,7 +98,7 @@ def scale_to(
 
     x0, x1 = float(np.log(bounds[0])), float(np.log(bounds[1]))
     y0, y1 = log_gap(x0), log_gap(x1)
-    floor, ceiling = float(np.log(low)), min(float(np.log(high)), y1 - _CLOSE)
+    floor, ceiling = float(np.log(low)), min(float(np.log(high)), y1 - CLOSE)
     goal = floor + place * (ceiling - floor)
     if ceiling < floor or y0 > goal:
         return None
@@ -101,7 +106,7 @@ def scale_to(
         share = 0.5 if step % 3 == 2 else float(np.clip((goal - y0) / (y1 - y0), 0.05, 0.95))
         x = x0 + share * (x1 - x0)
         y = log_gap(x)
-        if abs(y - goal) < _CLOSE:
+        if abs(y - goal) < CLOSE:
             return at(float(np.exp(x)))
         x0, y0, x1, y1 = (x, y, x1, y1) if y < goal else (x0, y0, x, y)
     return None
@@ -126,7 +131,8 @@ def _shift(rng: np.random.Generator, stage: Stage, place: float) -> tuple[Realit
     def at(amount: float) -> Reality:
         return shifted(stage.reality, change, amount)
 
-    reality = scale_to(stage, at, (0.03, 1.5), 1.06 * SMALLEST_GAP, LARGEST_GAP, place)
+    amounts = SMALLEST_AMOUNT, LARGEST_AMOUNT
+    reality = scale_to(stage, at, amounts, SINGLE_FLOOR, LARGEST_GAP, place)
     return None if reality is None else (reality, sentence)
 
 
@@ -134,10 +140,11 @@ def _pair(
     rng: np.random.Generator, stage: Stage, kinds: Kinds, place: float
 ) -> tuple[Reality, str] | None:
     """Draw two effects that both matter: neither vanishes on its own nor beside the other."""
-    places = (place, float(np.clip(place + rng.uniform(-0.3, 0.3), 0.0, 1.0)))
+    other = place + rng.uniform(-PAIR_SPREAD, PAIR_SPREAD)
+    places = (place, float(np.clip(other, 0.0, 1.0)))
     singles = []
     for kind, each in zip(kinds, places, strict=True):
-        single = _effect(rng, stage, kind, 1.3 * OWN_GAP, 0.85 * each)
+        single = _effect(rng, stage, kind, PAIR_FLOOR, PAIR_SPAN * each)
         if single is None:
             return None
         singles.append(single)
@@ -161,11 +168,11 @@ def _reality(
         return _shift(rng, stage, place)
     if len(kinds) > 1:
         return _pair(rng, stage, kinds, place)
-    reality = _effect(rng, stage, kinds[0], 1.06 * SMALLEST_GAP, place)
+    reality = _effect(rng, stage, kinds[0], SINGLE_FLOOR, place)
     return None if reality is None else (reality, reality.mechanisms[0].sentence)
 
 
-def _recalibration_closes(stage: Stage, field: Readings, fresh: Readings) -> bool:
+def recalibration_closes(stage: Stage, field: Readings, fresh: Readings) -> bool:
     """Whether the same models with other parameters describe field and fresh."""
     noise = stage.design.noise
     fresh_sd = {name: noise.sd(name, value, stage.fresh.slip) for name, value in fresh.items()}
@@ -195,7 +202,12 @@ def _telling(
     told = identify(rng, stage, gap, truth)
     if tier == "easy" and named and told.rival_nats < RIVAL_NATS:
         return None
-    return None if truth == UNKNOWN and told.rival_nats < _UNLISTED_NATS[tier] else told
+    return None if truth == UNKNOWN and told.rival_nats < UNLISTED_NATS[tier] else told
+
+
+def unlisted_weight(kind: EffectKind) -> float:
+    """Return how often an unlisted mechanism is drawn, relative to those of a wheel."""
+    return DENSITY_ODDITY if kind.outputs == (DENSITY,) else 1.0
 
 
 def unlisted_order(rng: np.random.Generator) -> list[EffectKind]:
@@ -203,7 +215,7 @@ def unlisted_order(rng: np.random.Generator) -> list[EffectKind]:
 
     A density gauge is one instrument among many: its oddities are the rarer ones.
     """
-    weights = np.array([0.4 if kind.outputs == (DENSITY,) else 1.0 for kind in UNLISTED])
+    weights = np.array([unlisted_weight(kind) for kind in UNLISTED])
     order = rng.choice(len(UNLISTED), len(UNLISTED), replace=False, p=weights / weights.sum())
     return [UNLISTED[int(i)] for i in order]
 
@@ -250,7 +262,7 @@ def try_case(
     gap = stage.gap(field)
     if not all(np.isfinite(part).all() for part in (*field.values(), *fresh.values())):
         return None
-    if truth == SHIFT and not _recalibration_closes(stage, field, fresh):
+    if truth == SHIFT and not recalibration_closes(stage, field, fresh):
         return None
     told = _telling(rng, stage, gap, truth, kinds)
     if told is None:

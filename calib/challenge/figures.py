@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from calib.challenge.levels import LEVELS
+from calib.challenge.limit import Limit
 from calib.challenge.score import Confusion, ReliabilityBin, TierScore
 
 # Okabe and Ito's colours, told apart with every common colour vision.
 _BLUE, _ORANGE, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
+_PURPLE = "#CC79A7"
 
 
 def confusion_figure(confusion: Confusion, title: str = "") -> Figure:
@@ -90,13 +93,15 @@ def reliability_figure(bins: Sequence[ReliabilityBin], title: str = "") -> Figur
     return figure
 
 
-def levels_figure(tiers: Sequence[TierScore]) -> Figure:
+def levels_figure(tiers: Sequence[TierScore], limit: Limit | None = None) -> Figure:
     """Draw every figure of merit with its interval beside the level asked for.
 
     Parameters
     ----------
     tiers : sequence of TierScore
         One panel each.
+    limit : Limit, optional
+        Of the same cases: a mark above each figure it limits.
     """
     figure = Figure(figsize=(5.6 * max(len(tiers), 1) + 1.6, 5.0), layout="constrained")
     panels = figure.subplots(1, max(len(tiers), 1), squeeze=False, sharey=True)[0]
@@ -125,6 +130,8 @@ def levels_figure(tiers: Sequence[TierScore]) -> Figure:
                 capsize=3,
                 color=_BLUE if met else _ORANGE,
             )
+        if limit is not None:
+            _mark_limit(axes, limit.tier(tier.tier))
         axes.set_yticks(range(len(LEVELS)), [level.label for level in LEVELS])
         axes.set(
             xlim=(-0.02, 1.02),
@@ -134,3 +141,16 @@ def levels_figure(tiers: Sequence[TierScore]) -> Figure:
         axes.invert_yaxis() if axes is panels[0] else None
         axes.legend(loc="lower left", fontsize=8)
     return figure
+
+
+def _mark_limit(axes: Axes, limit: TierScore) -> None:
+    """Mark what the oracle reaches a little above each figure that it has."""
+    label: str | None = "limit: the best any method could do, 95 % interval"
+    for i, level in enumerate(LEVELS):
+        figure = getattr(limit, level.name)
+        if figure.n:
+            arms = np.abs(np.array(figure.interval) - figure.value)[:, None]
+            axes.errorbar(
+                figure.value, i - 0.25, xerr=arms, fmt="D", ms=4, lw=1, color=_PURPLE, label=label
+            )
+            label = None

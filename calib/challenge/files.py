@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calib.challenge.build import DrawnCase
 from calib.challenge.design import Design
 from calib.challenge.mechanism import DENSITY, DRAWBAR, RUT, Conditions, Readings
+from calib.challenge.record import stage_record
 from calib.challenge.tyre import PSI_KPA, average_ground_pressure
 
 type Array = NDArray[np.float64]
@@ -131,6 +132,7 @@ def case_files(rng: np.random.Generator, case: DrawnCase) -> CaseFiles:
         "field_without": _plain(stage.field_without),
         "fresh_truth": _plain(case.fresh_truth),
         "fresh_without": _plain(stage.fresh_without),
+        "stage": stage_record(stage),
     }
     files = {
         "case.toml": _case_toml(design),

@@ -54,12 +54,12 @@ def remaining(gap: Array, span: Array) -> float:
     return rms(gap - coefficients @ span)
 
 
-def _whitener(span: Array) -> Array:
+def whitener(span: Array) -> Array:
     """Return the inverse covariance of unit noise plus unit-normal amounts of `span`, (M, M)."""
     return np.asarray(np.linalg.inv(np.eye(span.shape[1]) + span.T @ span), dtype=np.float64)
 
 
-def _lab_uncertainty(stage: Stage) -> Array:
+def lab_uncertainty(stage: Stage) -> Array:
     """Return what one sd of the lab's posterior does to the field, shape ``(K, M)``."""
     lab = full_jacobian(stage.simulator, stage.lab, stage.lab_sd)
     field = full_jacobian(stage.simulator, stage.field, stage.field_sd)
@@ -80,7 +80,8 @@ def _signature(rng: np.random.Generator, stage: Stage, kind: EffectKind, size: f
     return signature
 
 
-def _can_rival(stage: Stage, kind: EffectKind, truth: str) -> bool:
+def can_rival(stage: Stage, kind: EffectKind, truth: str) -> bool:
+    """Whether a listed effect could be taken for the truth on this stage."""
     has_already = kind.name == "slip_sinkage" and stage.design.models.get(RUT) != "bekker"
     able = acts_on(kind, stage.design.outputs, stage.design.varying)
     return able and not has_already and kind.name not in truth.split("+")
@@ -104,12 +105,12 @@ def identify(rng: np.random.Generator, stage: Stage, gap: Array, truth: str) -> 
         The true hypothesis, which is no rival of itself.
     """
     span = recalibration_span(stage.simulator, stage.field, stage.field_sd)
-    isolable_nats = float(0.5 * gap @ _whitener(span) @ gap)
-    white = _whitener(_lab_uncertainty(stage))
+    isolable_nats = float(0.5 * gap @ whitener(span) @ gap)
+    white = whitener(lab_uncertainty(stage))
     rival, nats = SHIFT, isolable_nats
     rival_gap = remaining(gap, span)
     for name, kind in LISTED.items():
-        if not _can_rival(stage, kind, truth):
+        if not can_rival(stage, kind, truth):
             continue
         signature = _signature(rng, stage, kind, rms(gap))
         along, own = float(gap @ white @ signature), float(signature @ white @ signature)
@@ -122,4 +123,4 @@ def identify(rng: np.random.Generator, stage: Stage, gap: Array, truth: str) -> 
 def isolable_nats(stage: Stage, gap: Array) -> float:
     """Return the cost of explaining a gap by a recalibration of plausible size, in nats."""
     span = recalibration_span(stage.simulator, stage.field, stage.field_sd)
-    return float(0.5 * gap @ _whitener(span) @ gap)
+    return float(0.5 * gap @ whitener(span) @ gap)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,10 @@ from calib.challenge.effects import LISTED, NONE, SHIFT, UNKNOWN, wheel_effects
 from calib.challenge.files import CaseFiles, case_files
 from calib.challenge.seal import KEY_SCHEMA, check_outside, publish, seal
 from calib.errors import CalibError
+from calib.tasks import completed
 
 type Progress = Callable[[int, int], None]
+type Job = tuple[np.random.SeedSequence, Tier, str]
 
 NULL_FRACTION, UNKNOWN_FRACTION, SHIFT_FRACTION = 1.0 / 3.0, 1.0 / 8.0, 1.0 / 10.0
 PAIR_FRACTION = 0.5  # of the hard tier's listed effects
@@ -106,16 +108,40 @@ def make_case(seed: np.random.SeedSequence, tier: Tier, truth: str) -> CaseFiles
     )
 
 
-def _make_one(job: tuple[np.random.SeedSequence, Tier, str]) -> CaseFiles:
-    return make_case(*job)
+def case_jobs(
+    seed: int, n_cases: int, tiers: tuple[Tier, ...], null_fraction: float = NULL_FRACTION
+) -> tuple[dict[str, Job], np.random.SeedSequence]:
+    """Return what each case of a blind test is made from, by name, and the seed of the plan.
 
+    Parameters
+    ----------
+    seed, n_cases, tiers, null_fraction
+        As for `make`.
 
-def _check(out_dir: Path, key_path: Path, n_cases: int, tiers: tuple[Tier, ...]) -> None:
-    check_outside(out_dir, key_path)
+    Raises
+    ------
+    CalibError
+        If a number will not do.
+    """
     if n_cases < 1:
         raise CalibError(f"{n_cases} cases were asked for", allowed="1 or more")
     if not tiers or not set(tiers) <= set(_TIERS):
         raise CalibError(f"unknown tiers {tiers}", allowed=", ".join(_TIERS))
+    if not 0.0 <= null_fraction <= 0.7:
+        raise CalibError(f"null_fraction is {null_fraction}", allowed="0 to 0.7")
+    planning, *own = np.random.SeedSequence(seed).spawn(n_cases + 1)
+    planned = plan(np.random.default_rng(planning), n_cases, tiers, null_fraction)
+    jobs = zip(own, planned, strict=True)
+    return {f"case-{i:03d}": (s, *job) for i, (s, job) in enumerate(jobs)}, planning
+
+
+def make_job(job: Job) -> CaseFiles:
+    """Return the case of a job."""
+    return make_case(*job)
+
+
+def _check(out_dir: Path, key_path: Path) -> None:
+    check_outside(out_dir, key_path)
     if out_dir.exists() and any(out_dir.iterdir()):
         raise CalibError(
             "the folder is not empty",
@@ -139,6 +165,7 @@ def make(
     tiers: tuple[Tier, ...] = _TIERS,
     null_fraction: float = NULL_FRACTION,
     workers: int = 1,
+    scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> str:
     """Write a blind test and return the hash of its key.
@@ -157,8 +184,8 @@ def make(
         ``easy``, ``hard`` or both.
     null_fraction : float
         Share of cases without any effect.
-    workers : int
-        Processes; the result does not depend on it.
+    workers, scheduler
+        As for `calib.tasks.completed`; the result does not depend on them.
     progress : callable, optional
         Called with the number of cases done and their total.
 
@@ -172,32 +199,21 @@ def make(
     CalibError
         If a path or a number will not do.
     """
-    _check(out_dir, key_path, n_cases, tiers)
-    if not 0.0 <= null_fraction <= 0.7:
-        raise CalibError(f"null_fraction is {null_fraction}", allowed="0 to 0.7")
-    planning, *case_seeds = np.random.SeedSequence(seed).spawn(n_cases + 1)
-    planned = plan(np.random.default_rng(planning), n_cases, tiers, null_fraction)
-    jobs = [(own, *each) for own, each in zip(case_seeds, planned, strict=True)]
-    keys: dict[str, Any] = {}
+    _check(out_dir, key_path)
+    jobs, planning = case_jobs(seed, n_cases, tiers, null_fraction)
+    entries: dict[str, Any] = {}
     out_dir.mkdir(parents=True, exist_ok=True)
-    for i, case in enumerate(_made(jobs, workers)):
-        name = f"case-{i:03d}"
-        case.write(out_dir / name)
-        keys[name] = case.key
-        if progress is not None:
-            progress(i + 1, n_cases)
+    with closing(completed(make_job, jobs, workers=workers, scheduler=scheduler)) as coming:
+        for task in coming:
+            if task.result is None:
+                raise CalibError(f"{task.name} could not be made: {task.error}")
+            task.result.write(out_dir / task.name)
+            entries[task.name] = task.result.key
+            if progress is not None:
+                progress(len(entries), n_cases)
+    keys = {name: entries[name] for name in jobs}
     salt = "".join(f"{word:08x}" for word in planning.generate_state(8)[4:])
     key = {"schema": KEY_SCHEMA, "seed": seed, "salt": salt, "cases": keys}
     digest = seal(key, key_path)
     publish(out_dir, key, digest, tiers)
     return digest
-
-
-def _made(
-    jobs: Iterable[tuple[np.random.SeedSequence, Tier, str]], workers: int
-) -> Iterator[CaseFiles]:
-    if workers <= 1:
-        yield from map(_make_one, jobs)
-        return
-    with ProcessPoolExecutor(max_workers=workers) as pool:
-        yield from pool.map(_make_one, jobs)

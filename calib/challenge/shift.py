@@ -10,6 +10,8 @@ from calib.challenge.density import ConeLaw
 from calib.challenge.mechanics import Reality
 from calib.challenge.soil import Soil
 
+SMALLEST_AMOUNT, LARGEST_AMOUNT = 0.03, 1.5
+
 
 def _other_soil(soil: Soil, change: dict[str, float], amount: float) -> Soil:
     support, cohesion = np.exp(amount * change["support"]), np.exp(amount * change["cohesion"])

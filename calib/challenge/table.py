@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
+from calib.challenge.answers import CaseAnswer
+from calib.challenge.effects import NONE, SHIFT, UNKNOWN
 from calib.challenge.levels import LEVELS, Level
+from calib.challenge.limit import Limit, rms_error
 from calib.challenge.score import Average, Proportion, Score, TierScore
 
 _EXTRA = (
@@ -26,36 +31,132 @@ def asked(level: Level, tier: str) -> str:
     return f">= {low:.2f}" if level.direction > 0 else f"<= {high:.2f}"
 
 
-def _line(label: str, figure: Proportion | Average, asked_for: str, mark: str) -> str:
+def _span(figure: Proportion | Average) -> str:
     low, high = figure.interval
+    return f"[{low:.2f}, {high:.2f}]"
+
+
+def _line(label: str, figure: Proportion | Average, asked_for: str, limit: str, mark: str) -> str:
     count = f"{figure.successes}/{figure.n}" if isinstance(figure, Proportion) else f"n={figure.n}"
-    if figure.n == 0:
-        return f"  {label:<47} {'-':>6} {'':>14} {count:>8}  {asked_for:>10}"
-    span = f"[{low:.2f}, {high:.2f}]"
-    return f"  {label:<47} {figure.value:6.3f} {span:>14} {count:>8}  {asked_for:>10} {mark}"
+    value, span = (f"{figure.value:6.3f}", _span(figure)) if figure.n else ("-", "")
+    mark = mark if figure.n else ""
+    return f"  {label:<47} {value:>6} {span:>14} {count:>8}  {asked_for:>10} {limit} {mark}"
 
 
-def tier_table(tier: TierScore) -> str:
-    """Return one tier's table."""
+def _of_limit(limit: TierScore | None, name: str) -> str:
+    """Return the oracle's figure; empty where it has none, or there is no oracle."""
+    if limit is None:
+        return ""
+    figure = _figure(limit, name)
+    return f"{figure.value:6.3f} {_span(figure):>14}" if figure.n else f"{'-':>6} {'':>14}"
+
+
+def tier_table(tier: TierScore, limit: TierScore | None = None) -> str:
+    """Return one tier's table.
+
+    Parameters
+    ----------
+    tier : TierScore
+        What was reached.
+    limit : TierScore, optional
+        What the oracle reached on the same cases.
+    """
     lines = [f"{tier.tier}: {tier.n_cases} cases, {tier.n_failed} failed"]
-    lines.append(f"  {'':<47} {'value':>6} {'95 % interval':>14} {'count':>8}  {'asked':>10}")
+    head = f"  {'':<47} {'value':>6} {'95 % interval':>14} {'count':>8}  {'asked':>10}"
+    lines.append(head + (f" {'limit':>6} {'95 % interval':>14}" if limit else ""))
     for level in LEVELS:
         figure = _figure(tier, level.name)
         mark = "met" if level.met(tier.tier, figure.value) else "MISSED"
-        lines.append(_line(level.label, figure, asked(level, tier.tier), mark))
-    lines += [_line(label, _figure(tier, name), "", "") for name, label in _EXTRA]
+        beside = _of_limit(limit, level.name)
+        lines.append(_line(level.label, figure, asked(level, tier.tier), beside, mark))
+    for name, label in _EXTRA:
+        lines.append(_line(label, _figure(tier, name), "", _of_limit(limit, name), ""))
     return "\n".join(line.rstrip() for line in lines)
 
 
-def text_table(score: Score) -> str:
+def _kind(answer: CaseAnswer) -> str:
+    if answer.truth in (NONE, SHIFT, UNKNOWN):
+        return {NONE: "no gap", SHIFT: "parameter shift", UNKNOWN: "unlisted"}[answer.truth]
+    return "two listed effects" if "+" in answer.truth else "one listed effect"
+
+
+_KINDS = ("no gap", "one listed effect", "parameter shift", "unlisted", "two listed effects")
+
+
+def _row(label: str, reached: list[CaseAnswer], limit: list[CaseAnswer]) -> str:
+    cells = []
+    for answers in (reached, limit):
+        first = sum(a.among_first(1) for a in answers)
+        mean = sum(a.truth_probability for a in answers) / len(answers)
+        cells.append(f"{first / len(answers):7.2f} {first:>4}/{len(answers):<4} {mean:6.2f}")
+    return f"  {label:<32} " + "   ".join(cells)
+
+
+def kinds_table(answers: Iterable[CaseAnswer], limit: Limit) -> str:
+    """Return, by what was true, how often it was named first, by the diagnosis and the oracle.
+
+    Parameters
+    ----------
+    answers : iterable of CaseAnswer
+        Of the diagnosis.
+    limit : Limit
+        Of the same cases.
+    """
+    every = list(answers)
+    lines = [
+        f"  {'':<32} {'reached':>7} {'':>9} {'mean p':>6}   {'limit':>7} {'':>9} {'mean p':>6}"
+    ]
+
+    def add(label: str, chosen: Callable[[CaseAnswer], bool]) -> None:
+        part = [a for a in every if chosen(a)]
+        if part:
+            lines.append(_row(label, part, [limit.answers[a.case] for a in part]))
+
+    for tier in sorted({a.tier for a in every}):
+        for kind in _KINDS:
+            for density in (False, True):
+                label = f"{tier}, {kind}" + (", density" if density else "")
+                add(
+                    label,
+                    lambda a, t=tier, k=kind, d=density: (  # type: ignore[misc]
+                        (a.tier, _kind(a), limit.density[a.case]) == (t, k, d)
+                    ),
+                )
+    return "\n".join(lines)
+
+
+def _limit_notes(limit: Limit, tiers: Iterable[str]) -> list[str]:
+    lines = [
+        "limit: the oracle, Bayes' theorem by one who knows how the cases were made, the soil's",
+        "numbers but by prior and lab. No method names the truth first more often in expectation.",
+        f"Monte Carlo error of the truth's probability, rms over cases: {rms_error(limit):.4f}.",
+    ]
+    for tier in tiers:
+        known = limit.tier_known_soil(tier)
+        lines.append(
+            f"{tier}: the oracle expects {limit.expected_first(tier):.3f} first by its own "
+            f"probabilities; knowing the soil itself it names {known.top_1.value:.3f} first, mean "
+            f"probability {known.truth_probability.value:.3f}."
+        )
+    return lines
+
+
+def text_table(score: Score, limit: Limit | None = None) -> str:
     """Return the table of all tiers, and the cases that failed.
 
     Parameters
     ----------
     score : Score
         From `calib.challenge.score.score`.
+    limit : Limit, optional
+        Shown beside every figure, and by what was true.
     """
-    parts = [tier_table(tier) for tier in score.tiers.values()]
+    parts = [
+        tier_table(tier, limit.tier(name) if limit else None) for name, tier in score.tiers.items()
+    ]
+    if limit is not None:
+        parts.append("\n".join(_limit_notes(limit, score.tiers)))
+        parts.append("truth named first, by what was true:\n" + kinds_table(score.answers, limit))
     failed = [f"  {a.case}: {a.problem}" for a in score.answers if a.problem]
     if failed:
         parts.append("\n".join(["without a readable diagnosis, counted as wrong:", *failed]))

@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from calib.cli import calibration, check, gap
+from calib.cli import audit, calibration, campaign, check, gap, sbc
 
 __all__ = ["app", "main"]
 
@@ -24,6 +24,9 @@ app = typer.Typer(
 calibration.register(app)
 gap.register(app)
 check.register(app)
+audit.register(app)
+campaign.register(app)
+sbc.register(app)
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calib.cli.parallel import Workers
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
@@ -47,17 +48,21 @@ def report(
         list[str] | None, typer.Option(help="Output to report, e.g. drawbar_pull; repeatable.")
     ] = None,
     overwrite: _Overwrite = False,
+    pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
     max_steps: _MaxSteps = 25_600,
     posteriors: Annotated[
         bool, typer.Option(help="Keep the posteriors, megabytes of netCDF, in the folder.")
     ] = True,
+    workers: Workers = 1,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
+    from calib.audit import run_audit
     from calib.cli.display import progress_bars
     from calib.data import read_table
     from calib.datasets.he2019 import labelled
     from calib.folders import check_folder
     from calib.outputs import OUTPUTS
+    from calib.paper_gaps.find import find_gaps
     from calib.report import write_report
     from calib.sampling.sampler import SamplerSettings
     from calib.study import he2019_tasks, plan_tasks, run_study
@@ -77,10 +82,17 @@ def report(
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
     with progress_bars() as tell:
-        study = run_study(tasks, seed, settings=settings, progress=tell)
+        study = run_study(tasks, seed, settings=settings, progress=tell, workers=workers)
+        gaps = () if files else find_gaps(seed, progress=tell)
+        # The audit is of the source's tables: beside the user's own data it has no place.
+        rut = study.successes.get("rut_depth")
+        rut_calibration = rut.calibration if rut is not None else None
+        audit = None
+        if not files:
+            audit = run_audit(seed, rut_calibration=rut_calibration, progress=tell)
         page = write_report(
-            study, out, settings=settings, command=_command(), title=title, overwrite=overwrite,
-            posteriors=posteriors, progress=tell,
+            study, out, settings=settings, command=_command(), title=title, gaps=gaps,
+            overwrite=overwrite, posteriors=posteriors, audit=audit, pdf=pdf, progress=tell,
         )  # fmt: skip
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]
@@ -114,6 +126,7 @@ def fit(
     from calib.estimators import estimate
     from calib.folders import check_folder, fresh_folder
     from calib.models import get_model
+    from calib.numbers import format_number
     from calib.problem import build_problem
     from calib.sampling.sampler import SamplerSettings
     from calib.store import save_calibration
@@ -143,7 +156,7 @@ def fit(
         ninety = scores.coverage[0.9]
         print(
             f"held out ({kept}): 90 % band covers {ninety.hits} of {ninety.n}, "
-            f"RMSE {scores.rmse:.3g}, CRPS {scores.crps:.3g}"
+            f"RMSE {format_number(scores.rmse)}, CRPS {format_number(scores.crps)}"
         )
     print(f"run folder: {out}")
     if not calibration.converged:
@@ -208,32 +221,45 @@ def _predict_corrected(run: Path, at: Path, out: Path | None) -> None:
 
 
 def data(
-    name: Annotated[str, typer.Argument(help="he2019")],
-    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("he2019"),
+    name: Annotated[str, typer.Argument(help="he2019 or he2019-gaps")],
+    out: Annotated[Path | None, typer.Option(help="Folder to write; its name if none.")] = None,
     overwrite: _Overwrite = False,
 ) -> None:
-    """Write the embedded, reconstructed data as CSV files."""
-    from calib.datasets import he2019
-
-    if name != "he2019":
+    """Write the embedded, reconstructed data as CSV files, or as cases for `calib diagnose`."""
+    writers = {"he2019": _write_he2019, "he2019-gaps": _write_he2019_gaps}
+    if name not in writers:
         raise CalibError(
-            f"there is no data set {name!r}", allowed="he2019", mend="use this name"
+            f"there is no data set {name!r}", allowed=", ".join(writers), mend="use one of these"
         )  # fmt: skip
+    folder = Path(name) if out is None else out
     try:
-        existing = [f"{key}.csv" for key in he2019.tables() if (out / f"{key}.csv").exists()]
-        if existing and not overwrite:
-            raise CalibError(
-                f"{', '.join(existing)} exist there already", where=str(out),
-                mend="choose another --out, or pass --overwrite",
-            )  # fmt: skip
-        written = he2019.write(out)
+        written = writers[name](folder, overwrite)
     except OSError as error:
         raise CalibError(
-            f"the folder cannot be written ({error.strerror})", where=str(out),
+            f"the folder cannot be written ({error.strerror})", where=str(folder),
             mend="choose another --out",
         ) from None  # fmt: skip
     for path in written:
         print(f"{path} (reconstructed from published results, not measured)")
+
+
+def _write_he2019(out: Path, overwrite: bool) -> list[Path]:
+    from calib.datasets import he2019
+
+    existing = [f"{key}.csv" for key in he2019.tables() if (out / f"{key}.csv").exists()]
+    if existing and not overwrite:
+        raise CalibError(
+            f"{', '.join(existing)} exist there already", where=str(out),
+            mend="choose another --out, or pass --overwrite",
+        )  # fmt: skip
+    return he2019.write(out)
+
+
+def _write_he2019_gaps(out: Path, overwrite: bool) -> list[Path]:
+    from calib.paper_gaps.cases import paper_gaps
+    from calib.paper_gaps.folders import write_cases
+
+    return write_cases(paper_gaps(), out, overwrite=overwrite)
 
 
 def template(
@@ -286,19 +312,7 @@ def _emit(text: str, out: Path | None) -> None:
 def _parse_hold_out(text: str | None) -> HoldOut | None:
     from calib.study import HoldOut
 
-    if text is None:
-        return None
-    column, equals, value = text.partition("=")
-    try:
-        if not equals:
-            raise ValueError
-        return HoldOut(column.strip(), float(value))
-    except ValueError:
-        raise CalibError(
-            f"cannot read --hold-out {text!r}",
-            allowed="COLUMN=VALUE, for instance inflation_pressure_psi=30",
-            mend="name a column with its unit, an equals sign and one number",
-        ) from None
+    return None if text is None else HoldOut.parse(text)
 
 
 def _command() -> list[str]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from calib.calibration import Calibration
-from calib.page.tables import mean_or_median
+from calib.posterior_text import centre_text, interval_text
 
 __all__ = ["posterior_table", "progress_bars", "verdict_line"]
 
@@ -61,8 +61,8 @@ def posterior_table(calibration: Calibration) -> None:
         )
     for s in calibration.summary.values():
         table.add_row(
-            s.name, s.unit, mean_or_median(s),
-            f"{s.hdi_lower:.4g} to {s.hdi_upper:.4g}", f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}",
+            s.name, s.unit, centre_text(s),
+            interval_text(s), f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}",
             f"{s.rhat:.3f}", "set by the prior" if s.sd_ratio > 0.9 else "",
         )  # fmt: skip
     # A pipe has no width of its own: wide enough for whole rows.

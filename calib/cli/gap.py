@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from calib.cli.parallel import Scheduler, Workers, announce, resumable
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -22,6 +23,7 @@ def register(app: typer.Typer) -> None:
     challenge = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.")
     challenge.command("make")(make)
     challenge.command("run")(run)
+    challenge.command("limit")(limit)
     challenge.command("score")(score)
     app.add_typer(challenge, name="challenge")
 
@@ -42,6 +44,7 @@ def diagnose(
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.load import load_effects
     from calib.gap.files import write_diagnosis
+    from calib.numbers import format_number
     from calib.page.diagnosis import write_page
 
     check_folder(out, overwrite=overwrite)
@@ -69,9 +72,9 @@ def diagnose(
     for output, s in found.shrink.items():
         low, high = s.interval
         print(
-            f"{output}: error {s.rmse_before:.3g} -> {s.rmse_after:.3g}, shrink "
-            f"{100 * s.fraction:.0f} % ({100 * low:.0f} to {100 * high:.0f}), "
-            f"noise {s.noise_floor:.3g}"
+            f"{output}: error {format_number(s.rmse_before)} -> {format_number(s.rmse_after)}, "
+            f"shrink {100 * s.fraction:.0f} % ({100 * low:.0f} to {100 * high:.0f}), "
+            f"noise {format_number(s.noise_floor)}"
         )
     print(out / "index.html")
 
@@ -82,7 +85,8 @@ def make(
     seed: _Seed,
     cases: Annotated[int, typer.Option(help="How many.", min=1)] = 300,
     tier: Annotated[Literal["both", "easy", "hard"], typer.Option(help="Difficulty.")] = "both",
-    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 2,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
 ) -> None:
     """Write cases of known cause, and their answers into a sealed key."""
     from calib.challenge.make import make as make_cases
@@ -90,7 +94,7 @@ def make(
 
     with progress_bars() as tell:
         digest = make_cases(
-            out, key, seed=seed, n_cases=cases, workers=workers,
+            out, key, seed=seed, n_cases=cases, workers=workers, scheduler=scheduler,
             tiers=("easy", "hard") if tier == "both" else (tier,),
             progress=lambda done, n: tell("making cases", done, n),
         )  # fmt: skip
@@ -101,16 +105,17 @@ def run(
     folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
     out: Annotated[Path, typer.Option(help="Folder for the diagnoses; resumed if it is there.")],
     seed: _Seed = 1,
-    workers: Annotated[int, typer.Option(help="Processes.", min=1)] = 2,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
 ) -> None:
     """Diagnose every case of a folder; run again to resume."""
     from calib.cli.display import progress_bars
     from calib.gap.batch import case_folders, diagnose_cases
 
     cases = case_folders(folder)
-    with progress_bars() as tell:
+    with resumable(), progress_bars() as tell:
         failed = diagnose_cases(
-            cases, out, seed, workers=workers,
+            cases, out, seed, workers=workers, scheduler=scheduler, announce=announce,
             progress=lambda done, n: tell("diagnosing", done, n),
         )  # fmt: skip
     for name, error in failed.items():
@@ -120,15 +125,38 @@ def run(
         raise typer.Exit(1)
 
 
+def limit(
+    folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
+    key: Annotated[Path, typer.Option(help="The sealed answers.")],
+    out: Annotated[Path, typer.Option(help="Folder for limit.json; resumed if it is there.")],
+    seed: _Seed = 1,
+    effort: Annotated[int, typer.Option(help="Multiplies the places looked at.", min=1)] = 1,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+) -> None:
+    """Find the best any method could do on these cases, by one who knows how they were made."""
+    from calib.challenge.limit import find_limit
+    from calib.cli.display import progress_bars
+
+    with progress_bars() as tell:
+        path = find_limit(
+            folder, key, out, seed=seed, effort=effort, workers=workers, scheduler=scheduler,
+            progress=lambda done, n: tell("asking the oracle", done, n), announce=announce,
+        )  # fmt: skip
+    print(path)
+
+
 def score(
     folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
     results: Annotated[Path, typer.Option(help="Folder with the diagnoses.")],
     key: Annotated[Path, typer.Option(help="The sealed answers.")],
+    limit: Annotated[Path | None, typer.Option(help="limit.json of these cases.")] = None,
     out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
     overwrite: _Overwrite = False,
 ) -> None:
     """Compare diagnoses with the sealed answers."""
     from calib.challenge.figures import confusion_figure, levels_figure, reliability_figure
+    from calib.challenge.limit import read_limit
     from calib.challenge.score import score as score_all
     from calib.challenge.table import text_table
     from calib.folders import check_folder, fresh_folder
@@ -136,13 +164,15 @@ def score(
     if out is not None:
         check_folder(out, overwrite=overwrite)
     found = score_all(folder, results, key)
-    table = text_table(found)
+    known = None if limit is None else read_limit(limit, folder)
+    table = text_table(found, known)
     print(table)
     if out is None:
         return
     with fresh_folder(out, overwrite=overwrite) as scratch:
         (scratch / "score.txt").write_text(table + "\n", encoding="utf-8")
-        levels_figure(list(found.tiers.values())).savefig(scratch / "levels.png", dpi=150)
+        levels = levels_figure(list(found.tiers.values()), known)
+        levels.savefig(scratch / "levels.png", dpi=150)
         for tier, confusion in found.confusion.items():
             figure = confusion_figure(confusion, f"{tier} cases")
             figure.savefig(scratch / f"confusion_{tier}.png", dpi=150)

@@ -25,7 +25,7 @@ from calib.datasets.published import PUBLISHED
 from calib.datasets.reconstruct import Array, nearest_errors, normalised_basis, read_only
 from calib.models.magic_formula import magic_formula
 
-__all__ = ["DECIMALS", "NOMINAL_SLIPS", "SLIP_SHIFT", "drawbar_pull"]
+__all__ = ["DECIMALS", "NOMINAL_SLIPS", "SLIP_SHIFT", "drawbar_pull", "magic_formula_jacobian"]
 
 NOMINAL_SLIPS = (
     0.0, 0.025, 0.05, 0.075, 0.10, 0.125, 0.15, 0.175, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70,
@@ -68,7 +68,8 @@ _SETTINGS = {
 }
 
 
-def _jacobian(slip_percent: Array, B: float, C: float, D: float, E: float) -> Array:
+def magic_formula_jacobian(slip_percent: Array, B: float, C: float, D: float, E: float) -> Array:
+    """Return the derivatives of the pull (kN) by B, C, D and E, shape (n, 4)."""
     bx = B * slip_percent
     bend = bx - np.arctan(bx)
     argument = bx - E * bend
@@ -88,7 +89,7 @@ def _errors(psi: int, slip_percent: Array, drawn: Array) -> Array:
     setting, table = _SETTINGS[psi], PUBLISHED.genetic[psi]
     cost = table.quality["cost"].value
     curve = magic_formula(slip_percent, **table.values)
-    tangent = normalised_basis(_jacobian(slip_percent, **table.values))
+    tangent = normalised_basis(magic_formula_jacobian(slip_percent, **table.values))
     apart = np.array([magic_formula(slip_percent, *rival) - curve for rival in setting.rivals])
     apart = apart.reshape(-1, slip_percent.size)
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass, field
 from decimal import Decimal
 from types import MappingProxyType
 
-__all__ = ["DOI", "PUBLISHED", "Figure", "FittedTable", "Published", "Setup"]
+__all__ = ["DOI", "PUBLISHED", "Figure", "FittedTable", "Published", "Setup", "printed_figures"]
 
 DOI = "10.1016/j.jterra.2019.07.003"
 
@@ -104,7 +104,10 @@ class Setup:
             {18: Figure("266.56", "mm"), 30: Figure("201.59", "mm"), 42: Figure("159.43", "mm")}
         )
     )
-    slip_levels: int = 14
+    slip_levels: Figure = Figure("14")
+    named_slips: tuple[Figure, ...] = (Figure("0"), Figure("0.025"))
+    largest_rut_slip: Figure = Figure("0.20")
+    rebound_slip: Figure = Figure("0.30")
     largest_water_content: Figure = Figure("0.088", "g/g")
     genetic_settings: Mapping[str, Figure] = field(
         default_factory=lambda: MappingProxyType(
@@ -139,6 +142,28 @@ class Published:
     pressure: FittedTable
     rut_depth: FittedTable
     setup: Setup
+
+
+def printed_figures(published: Published) -> dict[str, Figure]:
+    """Return every printed figure by where it stands, such as ``"Table 4, 18 psi: E"``."""
+    tables = (
+        published.bulk_density, *published.geometric.values(), *published.genetic.values(),
+        published.pressure, published.rut_depth,
+    )  # fmt: skip
+    found = {
+        f"{table.source}: {name}": figure
+        for table in tables
+        for name, figure in (*table.estimates.items(), *table.quality.items())
+    }
+    setup = published.setup
+    found |= {f"Table 2: {name}": figure for name, figure in setup.genetic_settings.items()}
+    found |= {f"Setup: contact length, {p} psi": f for p, f in setup.contact_length_mm.items()}
+    found |= {f"Setup: named slip {i}": f for i, f in enumerate(setup.named_slips, start=1)}
+    plain = (
+        "tyre_width_mm", "normal_load_kn", "speed_m_s", "contact_width_mm", "slip_levels",
+        "largest_rut_slip", "rebound_slip", "largest_water_content",
+    )  # fmt: skip
+    return found | {f"Setup: {name}": getattr(setup, name) for name in plain}
 
 
 _SIGN_OF_E = (
@@ -199,7 +224,11 @@ _PRESSURE = FittedTable(
         c6=Figure("0.0001", "kN/%/psi^2"),
         c7=Figure("0.963"),
         c8=Figure("-0.139", "1/psi", "negative inferred: E falls with pressure in Table 4"),
-        c9=Figure("-0.0025", "1/psi^2", "open; negative gives E nearer to Table 4"),
+        c9=Figure(
+            "-0.0025",
+            "1/psi^2",
+            "open; negative gives E nearer to Table 4, positive the pull (see `calib audit`)",
+        ),
         b0=Figure("1.554"),
     ),
     quality=_frozen(cost=Figure("0.1050", "kN^2")),

@@ -61,6 +61,11 @@ class PointEstimate:
     converged: bool
     note: str = ""
 
+    @property
+    def rmse_unit(self) -> str:
+        """Unit of the RMSE."""
+        return self.cost_unit.removesuffix("^2").strip("()")
+
 
 def residuals(problem: Problem, natural: Array) -> Array:
     """Observed minus predicted on the scale of the response, in chunks.
@@ -95,11 +100,7 @@ def sum_of_squares(problem: Problem, natural: Array) -> Array:
     natural : ndarray, shape (k, d_model + 1)
         Natural parameters, the noise scale last.
     """
-    k, at_once = natural.shape[0], max(1, _CHUNK_CELLS // problem.response.size)
-    cost = np.empty(k)
-    for i in range(0, k, at_once):
-        r = problem.residuals(natural[i : i + at_once])
-        cost[i : i + at_once] = np.einsum("kn,kn->k", r, r)
+    cost = problem.squares(natural[:, :-1])
     cost[np.isnan(cost)] = np.inf
     return cost
 

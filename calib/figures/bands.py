@@ -20,7 +20,18 @@ from calib.figures.rows import (
     smooth_bands,
     x_column,
 )
-from calib.figures.style import BLACK, BLUE, DASHES, ORANGE, VERMILION, legend_below, panels
+from calib.figures.style import (
+    BLACK,
+    BLUE,
+    DASHES,
+    DOUBLE_MM,
+    EMBER,
+    MIDDLE_MM,
+    ORANGE,
+    VERMILION,
+    legend_below,
+    panels,
+)
 from calib.models.base import Array
 from calib.prediction import Bands
 from calib.study import OutputResult
@@ -67,7 +78,7 @@ def bands_plate(result: OutputResult, *, published: bool) -> Plate:
     shown = groups(result)
     cols = min(3, len(shown))
     rows = -(-len(shown) // cols)
-    width = 180.0 if cols > 1 else 120.0
+    width = DOUBLE_MM if cols > 1 else MIDDLE_MM
     fig, axes = panels(
         rows, cols, height=52.0 if cols > 1 else 60.0, width=width, bottom=20.0, top=7.0,
         gap_x=3.0, gap_y=8.0, sharex=True, sharey=True,
@@ -75,7 +86,7 @@ def bands_plate(result: OutputResult, *, published: bool) -> Plate:
     handles: dict[str, Any] = {}
     for ax, group in zip(axes.flat, shown, strict=False):
         handles |= _panel(ax, result, group, published)
-        ax.set_title(group.title, color=VERMILION if group.held else BLACK,
+        ax.set_title(group.title, color=EMBER if group.held else BLACK,
                      weight="bold" if group.held else "normal")  # fmt: skip
         ax.set_xlabel(x_axis.label)
         ax.margins(x=0.02)

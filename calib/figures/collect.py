@@ -10,10 +10,9 @@ from calib.figures.density import density_plate
 from calib.figures.ensembles import ensembles_plate
 from calib.figures.estimates import by_pressure_plate, estimates_plate
 from calib.figures.learned import learned_plate
-from calib.figures.plate import Plate
+from calib.figures.plate import Plate, draw_all
 from calib.figures.prior_predictive import prior_predictive_plate
 from calib.figures.residuals import residuals_plate
-from calib.figures.style import style
 from calib.figures.validation import validation_plate
 from calib.study import OutputResult
 
@@ -53,15 +52,4 @@ def plates(result: OutputResult, published: bool = False) -> list[Plate]:
         "estimates": lambda: estimates_plate(result, published=published),
         "by_pressure": lambda: by_pressure_plate(result, published=published),
     }
-    with style():
-        drawn = [_attempt(name, draw) for name, draw in drawings.items()]
-    return [plate for plate in drawn if plate is not None]
-
-
-def _attempt(name: str, draw: _Draw) -> Plate | None:
-    try:
-        return draw()
-    except Exception as error:
-        # Any failure: a report without one figure is worth more than no report.
-        why = f"{type(error).__name__}: {error}"
-        return Plate(None, name, f"This figure could not be drawn ({why}).")
+    return draw_all(drawings)

@@ -12,10 +12,21 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from calib.calibration import Calibration
-from calib.figures.labels import parameter_label, plain, short
+from calib.figures.labels import MINUS, parameter_label, plain, short
 from calib.figures.plate import Plate
 from calib.figures.reference import published_sampled
-from calib.figures.style import BLACK, BLUE, DASHES, ORANGE
+from calib.figures.style import (
+    BLACK,
+    BLUE,
+    DASHES,
+    DOUBLE_MM,
+    MIDDLE_MM,
+    ORANGE,
+    SINGLE_MM,
+    SMALLEST_PT,
+    SYMBOL_PT,
+    WIDE,
+)
 from calib.models.base import Array
 from calib.priors import Prior
 from calib.study import OutputResult
@@ -24,8 +35,10 @@ __all__ = ["corner_plate"]
 
 MAX_PARAMETERS = 11
 _N_DRAWS = 4000
-# A positive parameter this wide (98 % over 2 % point) is drawn by its logarithm.
-_WIDE = 2.5
+# Tick labels this near to an end of their panel, as a part of it, would meet the next panel's.
+_CLEAR = 0.1
+# For tick labels and labels to the left and below, and to the right and above.
+_MARGIN_MM, _REST_MM = 19.0, 2.0
 # Part of a cell that its panel takes.
 _FILL = 0.93
 
@@ -54,8 +67,14 @@ class _Cells:
 
     def ticks(self, j: int, most: int) -> Array:
         """A few round values inside the range."""
-        values = np.asarray(MaxNLocator(most).tick_values(self.low[j], self.high[j]))
-        return np.asarray(values[(values >= self.low[j]) & (values <= self.high[j])])
+        clear = _CLEAR * (self.high[j] - self.low[j])
+        low, high = self.low[j] + clear, self.high[j] - clear
+        for n in range(most, most + 3):
+            values = np.asarray(MaxNLocator(n).tick_values(low, high))
+            found = values[(values >= low) & (values <= high)]
+            if found.size >= 2:
+                break
+        return np.asarray(found[:: -(-found.size // most)])
 
 
 def corner_plate(result: OutputResult, *, published: bool) -> Plate:
@@ -73,7 +92,10 @@ def corner_plate(result: OutputResult, *, published: bool) -> Plate:
         np.log10(marks[p.name]) if w and p.name in marks else marks.get(p.name)
         for p, w in zip(priors, wide, strict=True)
     ]
-    labels = [parameter_label(p.name, p.unit, log=w) for p, w in zip(priors, wide, strict=True)]
+    labels = [
+        parameter_label(p.name, p.unit, log=w).replace(" (", "\n(", 1)
+        for p, w in zip(priors, wide, strict=True)
+    ]
     cells = _Cells(draws)
     fig, ax = _frame(cells)
     for i in range(cells.d):
@@ -83,7 +105,7 @@ def corner_plate(result: OutputResult, *, published: bool) -> Plate:
     _marks(ax, cells, at)
     _ticks(ax, cells, labels)
     note = "contours hold 50 % and 90 %" + ("\ndashed: published" if marks else "")
-    ax.text(1.1, cells.d - 0.1, note, va="top", fontsize=7.0)
+    ax.text(1.1, cells.d - 0.1, note, va="top", fontsize=SMALLEST_PT)
     ax.set_xlim(0.0, cells.d)
     ax.set_ylim(0.0, cells.d)
     caption = _caption(draws, [p.name for p in priors], bool(marks))
@@ -96,16 +118,20 @@ def _sampled(calibration: Calibration) -> tuple[Array, list[Prior], list[bool]]:
     free = [i for i, p in enumerate(entries) if not p.fixed][:MAX_PARAMETERS]
     natural = calibration.problem.theta(calibration.subset(_N_DRAWS))[:, free]
     low, high = np.quantile(natural, [0.02, 0.98], axis=0)
-    wide = [bool(entries[i].log and high[j] > _WIDE * low[j]) for j, i in enumerate(free)]
+    wide = [bool(entries[i].log and high[j] > WIDE * low[j]) for j, i in enumerate(free)]
     natural[:, wide] = np.log10(natural[:, wide])
     return natural, [entries[i] for i in free], wide
 
 
+def _width(d: int) -> float:
+    """Width in millimetres of a figure of so many parameters."""
+    return SINGLE_MM if d <= 2 else MIDDLE_MM if d <= 5 else DOUBLE_MM
+
+
 def _frame(cells: _Cells) -> tuple[Figure, Axes]:
     """One pair of axes without spines; every panel gets a left and a lower edge."""
-    edge = cells.d * (14.5 if cells.d > 7 else min(30.0, 125.0 / cells.d))
-    margin, rest = 17.0, 2.0
-    total = edge + margin + rest
+    total = _width(cells.d)
+    margin, edge = _MARGIN_MM, total - _MARGIN_MM - _REST_MM
     fig = Figure(figsize=(total / 25.4, total / 25.4))
     ax = fig.add_axes((margin / total, margin / total, edge / total, edge / total))
     ax.set_axis_off()
@@ -159,32 +185,37 @@ def _marks(ax: Axes, cells: _Cells, at: list[float | None]) -> None:
 
 def _ticks(ax: Axes, cells: _Cells, labels: list[str]) -> None:
     many = cells.d > 7
-    size, most, tick = (6.5, 2, 0.05) if many else (8.0, 3, 0.03)
-    style: dict[str, Any] = {"fontsize": size - 0.5, "clip_on": False}
+    most, tick = (2, 0.05) if many else (3, 0.03)
+    style: dict[str, Any] = {"fontsize": SMALLEST_PT, "clip_on": False}
     # Distances from the panels are in cells, so they grow with the number of panels.
-    away = (11.5 if many else 11.0) / (14.5 if many else min(30.0, 125.0 / cells.d))
+    away = 14.0 * cells.d / (_width(cells.d) - _MARGIN_MM - _REST_MM)
     lines = []
     for k, label in enumerate(labels):
         y = cells.bottom(k)
-        for value in cells.ticks(k, most):
+        ticks = cells.ticks(k, most)
+        for value, text in zip(ticks, _tick_texts(ticks), strict=True):
             part = float(cells.part(k, value))
-            text = _tick_text(float(value))
             lines.append([(k + part, 0.0), (k + part, -tick)])
             ax.text(k + part, -1.6 * tick, text, ha="center", va="top",
-                    rotation=90 if many else 45, **style)  # fmt: skip
+                    rotation=90, **style)  # fmt: skip
             if k > 0:
                 lines.append([(0.0, y + part), (-tick, y + part)])
                 ax.text(-1.6 * tick, y + part, text, ha="right", va="center", **style)
-        ax.text(k + 0.5 * _FILL, -away, label, ha="center", va="center", fontsize=size)
+        ax.text(k + 0.5 * _FILL, -away, label, ha="center", va="center", fontsize=SYMBOL_PT)
         if k > 0:
-            ax.text(-away, y + 0.5 * _FILL, label, rotation=90, ha="right", va="center",
-                    fontsize=size)  # fmt: skip
+            ax.text(-away, y + 0.5 * _FILL, label, rotation=90, ha="center", va="center",
+                    fontsize=SYMBOL_PT)  # fmt: skip
     ax.add_collection(LineCollection(lines, colors=BLACK, linewidths=0.6, clip_on=False))
 
 
-def _tick_text(value: float) -> str:
-    """Write a tick's value."""
-    return f"{value:.6g}".replace("-", "\N{MINUS SIGN}")
+def _tick_texts(values: Array) -> list[str]:
+    """Write the values of ticks, with the decimals that the finest of them needs."""
+    texts = [f"{value:.6g}" for value in values]
+    decimals = max((len(text.partition(".")[2]) for text in texts if "e" not in text), default=0)
+    return [
+        (text if "e" in text else f"{value:.{decimals}f}").replace("-", MINUS)
+        for text, value in zip(texts, values, strict=True)
+    ]
 
 
 def _caption(draws: Array, names: list[str], marked: bool) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from calib.figures.bands import observed_words
 from calib.figures.labels import axis_of, percent, short
@@ -101,6 +102,7 @@ def draw_predicted_observed(ax: Axes, result: OutputResult) -> dict[str, Any]:
             )  # fmt: skip
     ends = _ends(v.observed, median)
     (handles["observed = predicted"],) = ax.plot(ends, ends, color=GREY, lw=0.9, ls=DASHES[2])
+    ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.set_xlabel(f"Observed {axis.name.lower()} ({axis.unit})")
     ax.set_ylabel(f"Predicted {axis.name.lower()} ({axis.unit})")
     return handles

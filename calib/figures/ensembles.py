@@ -12,7 +12,7 @@ from scipy.stats import rankdata
 
 from calib.figures.labels import NO_UNIT, parameter_label, plain, short
 from calib.figures.plate import Plate
-from calib.figures.style import CYCLE, DASHES, legend_below
+from calib.figures.style import CYCLE, DASHES, DOUBLE_MM, SMALLEST_PT, SYMBOL_PT, WIDE, legend_below
 from calib.models.base import Array
 from calib.study import OutputResult
 
@@ -57,9 +57,12 @@ def ensembles_plate(result: OutputResult) -> Plate:
     for j, prior in enumerate(free):
         t = draws.t[..., j]
         natural = np.exp(t) if prior.log else t
+        low, high = np.quantile(natural, [0.02, 0.98])
+        # Of a parameter that spans decades, the mean would show its largest draws alone.
+        wide = bool(prior.log and high > WIDE * low)
         trace, ranks = pairs[j]
-        handles |= _trace(trace, natural)
-        trace.set_ylabel(parameter_label(prior.name, prior.unit))
+        handles |= _trace(trace, np.log10(natural) if wide else natural)
+        trace.set_ylabel(parameter_label(prior.name, prior.unit, log=wide))
         _ranks(ranks, natural.reshape(natural.shape[0], -1), ess[prior.name] / natural.shape[0])
         if j >= len(free) - per_row:
             trace.set_xlabel(f"Step ({NO_UNIT})")
@@ -75,9 +78,9 @@ def ensembles_plate(result: OutputResult) -> Plate:
 def _pairs(rows: int, per_row: int, n: int) -> tuple[Figure, list[tuple[Axes, Axes]]]:
     """Axes in pairs, trace wider than ranks, laid out in millimetres."""
     height, gap_y, top, bottom = (21.0 if per_row == 3 else 24.0), 5.5, 5.5, 17.0
-    cell = 180.0 / per_row
+    cell = DOUBLE_MM / per_row
     total = top + bottom + rows * height + (rows - 1) * gap_y
-    fig = Figure(figsize=(180.0 / 25.4, total / 25.4))
+    fig = Figure(figsize=(DOUBLE_MM / 25.4, total / 25.4))
     # Two in a row leave room for longer tick labels.
     left, between, right = (14.5, 10.0, 2.5) if per_row == 3 else (20.0, 11.0, 3.0)
     span = cell - left - between - right
@@ -86,9 +89,9 @@ def _pairs(rows: int, per_row: int, n: int) -> tuple[Figure, list[tuple[Axes, Ax
         row, col = divmod(k, per_row)
         y = (total - top - height - row * (height + gap_y)) / total
         x = col * cell + left
-        trace = fig.add_axes((x / 180.0, y, 0.6 * span / 180.0, height / total))
+        trace = fig.add_axes((x / DOUBLE_MM, y, 0.6 * span / DOUBLE_MM, height / total))
         ranks = fig.add_axes(
-            ((x + 0.6 * span + between) / 180.0, y, 0.4 * span / 180.0, height / total)
+            ((x + 0.6 * span + between) / DOUBLE_MM, y, 0.4 * span / DOUBLE_MM, height / total)
         )
         found.append((trace, ranks))
     return fig, found
@@ -106,6 +109,7 @@ def _trace(ax: Axes, natural: Array) -> dict[str, Any]:
     ax.set_xlim(0, max(1, steps[-1]))
     ax.xaxis.set_major_locator(MaxNLocator(2))
     ax.yaxis.set_major_locator(MaxNLocator(3))
+    ax.yaxis.get_offset_text().set_fontsize(SYMBOL_PT)
     return handles
 
 
@@ -122,7 +126,7 @@ def _ranks(ax: Axes, values: Array, effective: float) -> None:
     ax.set_xlim(0.0, 1.0)
     ax.set_xticks([0.0, 0.5, 1.0], ["0", "½", "1"])
     ax.set_yticks([0.0, 1.0, 2.0], ["0", "1", "2"])
-    ax.set_ylabel(f"Ratio ({NO_UNIT})", fontsize=7.0, labelpad=1.0)
+    ax.set_ylabel(f"Ratio ({NO_UNIT})", fontsize=SMALLEST_PT, labelpad=1.0)
 
 
 def _caption(result: OutputResult) -> str:

@@ -14,7 +14,18 @@ from calib.estimators import PointEstimate
 from calib.figures.labels import NO_UNIT, joined, parameter_label, plain, short, symbol
 from calib.figures.plate import Plate
 from calib.figures.reference import published_parameters, published_source
-from calib.figures.style import BLACK, CYCLE, GREY, MARKERS, ORANGE, legend_below, panels
+from calib.figures.style import (
+    BLACK,
+    CYCLE,
+    GREY,
+    MARKERS,
+    MIDDLE_MM,
+    ORANGE,
+    SMALLEST_PT,
+    SYMBOL_PT,
+    legend_below,
+    panels,
+)
 from calib.models.base import Array
 from calib.models.magic_formula_pressure import coefficients_at
 from calib.study import OutputResult
@@ -77,7 +88,13 @@ def estimates_plate(result: OutputResult, *, published: bool) -> Plate:
     model = calibration.problem.bound.model
     printed = published_parameters(model.name) if published else {}
     fig, axes = panels(
-        1, 1, height=max(34.0, 8.0 * len(reported)), width=150.0, left=18.0, bottom=22.0, top=3.0
+        1,
+        1,
+        height=max(34.0, 8.0 * len(reported)),
+        width=MIDDLE_MM,
+        left=18.0,
+        bottom=22.0,
+        top=3.0,
     )
     ax: Axes = axes[0, 0]
     handles: dict[str, Any] = {}
@@ -95,7 +112,7 @@ def estimates_plate(result: OutputResult, *, published: bool) -> Plate:
         names.append(f"ln {symbol(name)}" if log else symbol(name))
     reach = 1.08 * min(_EDGE, reach)
     ax.set_xlim(-reach, reach)
-    ax.set_yticks(range(len(names)), names)
+    ax.set_yticks(range(len(names)), names, fontsize=SYMBOL_PT)
     ax.set_ylim(len(names) - 0.4, -0.6)
     ax.axvline(0.0, color=GREY, lw=0.5, zorder=0)
     ax.set_xlabel("Distance from the posterior mean (posterior sds)")
@@ -108,7 +125,7 @@ def _row(
     ax: Axes, i: int, distance: Array, estimates: tuple[PointEstimate, ...], source: str
 ) -> dict[str, Any]:
     handles: dict[str, Any] = {}
-    spread = np.linspace(-0.22, 0.22, max(2, len(estimates)))
+    spread = np.linspace(-0.33, 0.33, max(2, len(estimates)))
     for k, (estimate, d) in enumerate(zip(estimates, distance[:-1], strict=True)):
         if np.isfinite(d):
             name = METHOD_NAMES.get(estimate.method, estimate.method)
@@ -128,8 +145,8 @@ def _dot(ax: Axes, d: float, y: float, marker: str, colour: str, *, ring: bool =
     if abs(d) > _EDGE:
         ax.annotate(
             f"{short(d)} ►" if d > 0 else f"◄ {short(d)}", (x, y),
-            (-6.0 if d > 0 else 6.0, 0.0), textcoords="offset points", fontsize=6.0,
-            va="center", ha="right" if d > 0 else "left", color=colour,
+            (-6.0 if d > 0 else 6.0, 0.0), textcoords="offset points", fontsize=SMALLEST_PT,
+            va="center", ha="right" if d > 0 else "left",
         )  # fmt: skip
     return dot
 
@@ -193,8 +210,8 @@ def by_pressure_plate(result: OutputResult, *, published: bool) -> Plate | None:
     for ax, name in zip(axes[0], "BCDE", strict=True):
         handles |= _coefficient(ax, result, name, joint[name], published)
         ax.set_xticks(range(len(pressures)), [f"{p:g}" for p in pressures])
-        ax.tick_params(axis="x", labelsize=7.0 if len(pressures) <= 5 else 5.5)
-        ax.set_xlim(-0.5, len(pressures) - 0.5)
+        ax.tick_params(axis="x", labelsize=SMALLEST_PT)
+        ax.set_xlim(-0.65, len(pressures) - 0.35)
         ax.set_xlabel("Pressure (psi)")
         ax.set_ylabel(parameter_label(name, units[name]))
     legend_below(fig, list(handles.values()), list(handles), 3)
@@ -216,16 +233,16 @@ def _coefficient(
         jointly = f"{fitted.size} pressures"
     for i, (psi, estimates) in enumerate(result.by_pressure.items()):
         handles[f"{jointly} calibrated jointly, 90 %"] = ax.errorbar(
-            i - 0.33, middle[i], yerr=[[middle[i] - low[i]], [high[i] - middle[i]]], fmt="_",
+            i - 0.4, middle[i], yerr=[[middle[i] - low[i]], [high[i] - middle[i]]], fmt="_",
             color=BLACK, ms=6.0, elinewidth=1.0,
         )  # fmt: skip
         for k, e in enumerate(estimates):
             marker, colour = _LOOKS.get(e.method, ("P", GREY))
             (handles[METHOD_NAMES.get(e.method, e.method)],) = ax.plot(
-                i - 0.16 + 0.16 * k, e.reported[name], marker, color=colour, ms=4.6,
+                i - 0.2 + 0.2 * k, e.reported[name], marker, color=colour, ms=4.6,
                 mec="white", mew=0.4,
             )  # fmt: skip
-        for table, at, shape in ((PUBLISHED.geometric, -0.16, "o"), (PUBLISHED.genetic, 0.0, "s")):
+        for table, at, shape in ((PUBLISHED.geometric, -0.2, "o"), (PUBLISHED.genetic, 0.0, "s")):
             if published and psi in table:
                 label = f"published ({table[round(psi)].source.partition(',')[0]})"
                 (handles[label],) = ax.plot(

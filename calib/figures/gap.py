@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 from calib.figures.gap_design import isolability_plate, left_over_plate
 from calib.figures.gap_shrink import how_far_plate
 from calib.figures.gap_where import conditions_plate, where_plate
 from calib.figures.gap_which import placebo_plate, which_plate
-from calib.figures.plate import Plate
-from calib.figures.style import style
+from calib.figures.plate import Plate, draw_all
 from calib.gap.diagnose import Diagnosis
 
 __all__ = ["gap_plates"]
@@ -39,15 +39,4 @@ def gap_plates(found: Diagnosis) -> list[Plate]:
     list of Plate
         In reading order. A figure that failed has ``figure=None`` and a caption saying why.
     """
-    with style():
-        drawn = [_attempt(name, draw, found) for name, draw in _DRAWINGS.items()]
-    return [plate for plate in drawn if plate is not None]
-
-
-def _attempt(name: str, draw: _Draw, found: Diagnosis) -> Plate | None:
-    try:
-        return draw(found)
-    except Exception as error:
-        # Any failure: a page without one figure is worth more than no page.
-        why = f"{type(error).__name__}: {error}"
-        return Plate(None, name, f"This figure could not be drawn ({why}).")
+    return draw_all({name: partial(draw, found) for name, draw in _DRAWINGS.items()})

@@ -17,6 +17,7 @@ from calib.figures.style import (
     GREY,
     MARKERS,
     ORANGE,
+    SMALLEST_PT,
     VERMILION,
     legend_below,
     panels,
@@ -60,7 +61,7 @@ def isolability_plate(found: Diagnosis) -> Plate | None:
     for yi, value in zip(y, size, strict=True):
         axes[0, 2].text(
             min(value, 4.0) + 0.12, yi, short(float(value)) if value < 100.0 else "> 100",
-            va="center", fontsize=6.5,
+            va="center", fontsize=SMALLEST_PT,
         )  # fmt: skip
     axes[0, 2].set_xlim(0.0, max(1.25 * float(shown.max()), 1.5))
     axes[0, 2].set_xlabel("Smallest nameable\nsize (noise sd)")
@@ -87,7 +88,7 @@ def _matrix(ax: Axes, design: Isolability, names: list[str]) -> None:
                 continue
             alike = value >= ALIKE
             ax.text(
-                j, i, f"{100.0 * value:.0f}", ha="center", va="center", fontsize=5.8,
+                j, i, f"{100.0 * value:.0f}", ha="center", va="center", fontsize=SMALLEST_PT,
                 color="white" if value > 0.6 else BLACK, fontweight="bold" if alike else "normal",
             )  # fmt: skip
             if alike:

@@ -93,7 +93,7 @@ def output_word(output: str) -> str:
 
 def best_fit(found: Diagnosis, name: str) -> Fit:
     """Return the most probable variant of a hypothesis."""
-    return max(found.ranking.fits[name], key=lambda f: f.log_evidence)
+    return found.ranking.best(name)
 
 
 def best_of(found: Diagnosis) -> str:

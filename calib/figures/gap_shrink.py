@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from calib.figures.gap_rows import OutputRows, axis_name, output_rows, output_word
 from calib.figures.labels import MINUS, percent, short
 from calib.figures.plate import Plate
-from calib.figures.style import BLACK, BLUE, GREY, VERMILION, legend_below, panels
+from calib.figures.style import BLACK, BLUE, GREY, SMALLEST_PT, VERMILION, legend_below, panels
 from calib.gap.diagnose import Diagnosis
 from calib.gap.shrink import Shrink
 from calib.models.base import Array
@@ -103,7 +103,9 @@ def _bars(ax: Axes, found: Diagnosis, own: OutputRows) -> None:
     ax.set_ylim(0.0, top)
     if top > 0.01:
         ax.ticklabel_format(axis="y", style="plain")
-    ax.text(1.47, s.noise_floor + 0.012 * top, "noise", ha="right", va="bottom", fontsize=6.5)
+    ax.text(
+        1.47, s.noise_floor + 0.012 * top, "noise", ha="right", va="bottom", fontsize=SMALLEST_PT
+    )
     text = f"shrinks by {100.0 * s.fraction:.0f} %\n({_interval(s.interval)})"
     ax.text(0.5, 0.985, text, ha="center", va="top", fontsize=7.0, transform=ax.transAxes)
     ax.set_xlim(-0.5, 1.5)

@@ -9,7 +9,7 @@ import numpy as np
 from calib.figures.gap_rows import best_fit, best_of, output_rows, short_name
 from calib.figures.labels import MINUS, NO_UNIT, joined, percent, short
 from calib.figures.plate import Plate
-from calib.figures.style import BLACK, BLUE, GREY, ORANGE, SKY, VERMILION, note, panels
+from calib.figures.style import BLACK, BLUE, EMBER, GREY, ORANGE, SKY, VERMILION, note, panels
 from calib.gap.diagnose import Diagnosis
 from calib.models.base import Array
 
@@ -169,7 +169,7 @@ def placebo_plate(found: Diagnosis) -> Plate:
     ax.text(1.0, top, "noise", ha="center", va="bottom", fontsize=7.0)
     if placebo.before - 1.0 > 0.12 * (high - low + 2.0 * pad):
         ax.text(placebo.before, top, "simulator", ha="center", va="bottom", fontsize=7.0,
-                color=VERMILION)  # fmt: skip
+                color=EMBER)  # fmt: skip
     ax.text(1.015, 1.0, "removed", transform=ax.transAxes, va="bottom", fontsize=7.0, color=GREY)
     ax.set_yticks(y, [short_name(n) for n in order])
     ax.set_ylim(-0.6, len(order) - 0.4)

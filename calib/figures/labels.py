@@ -11,16 +11,15 @@ import numpy as np
 
 from calib.columns import QUANTITIES
 from calib.models.base import Array
+from calib.numbers import NOTHING, format_number
 
 __all__ = [
     "MINUS", "NO_UNIT", "Axis", "axis_of", "joined", "parameter_label", "percent", "plain",
-    "short", "symbol", "unit_plain", "unit_text",
+    "short", "symbol", "unbroken", "unit_plain", "unit_text",
 ]  # fmt: skip
 
-NO_UNIT = "\N{EN DASH}"
+NO_UNIT = NOTHING
 MINUS = "\N{MINUS SIGN}"
-
-_SUPERSCRIPTS = str.maketrans("-0123456789", "\N{SUPERSCRIPT MINUS}⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 _GREEK = {"sigma": r"\sigma", "gamma": r"\gamma", "theta": r"\theta"}
 
@@ -144,23 +143,8 @@ def parameter_label(name: str, unit: str, *, log: bool = False) -> str:
 
 
 def short(value: float, digits: int = 2) -> str:
-    """Write a number with few significant digits and without exponent where that is readable."""
-    if not np.isfinite(value):
-        return NO_UNIT
-    if value == 0.0:
-        return "0"
-    size = int(np.floor(np.log10(abs(float(f"{value:.{digits - 1}e}")))))
-    if -4 <= size < 5:
-        text = f"{value:.{max(0, digits - 1 - size)}f}"
-    else:
-        mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
-        text = f"{mantissa}\N{MULTIPLICATION SIGN}10{power_text(int(power))}"
-    return text.replace("-", MINUS)
-
-
-def power_text(power: int) -> str:
-    """Write an exponent raised."""
-    return str(power).translate(_SUPERSCRIPTS)
+    """Write a number with few significant digits."""
+    return format_number(value, digits)
 
 
 def percent(fraction: float) -> str:
@@ -171,3 +155,8 @@ def percent(fraction: float) -> str:
 def joined(words: list[str]) -> str:
     """Join words as a sentence does."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def unbroken(text: str) -> str:
+    """Keep numbers and their units on one line."""
+    return re.sub(r"(\d) (%|kN|mm|psi|kPa|g/cm³|rows?\b)", "\\1\N{NO-BREAK SPACE}\\2", text)

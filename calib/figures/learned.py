@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 from scipy.stats import gaussian_kde
 
 from calib.calibration import Calibration
@@ -14,8 +14,18 @@ from calib.figures.labels import joined, parameter_label, plain, short
 from calib.figures.plate import Plate
 from calib.figures.reference import published_sampled
 from calib.figures.roles import MOVED, PRIOR, ROLES, role
-from calib.figures.style import BLACK, BLUE, DASHES, ORANGE, VERMILION, legend_below, panels
+from calib.figures.style import (
+    BLACK,
+    BLUE,
+    DASHES,
+    EMBER,
+    ORANGE,
+    SMALLEST_PT,
+    legend_below,
+    panels,
+)
 from calib.models.base import Array
+from calib.numbers import TIMES
 from calib.priors import Prior
 from calib.study import OutputResult
 
@@ -48,8 +58,8 @@ def learned_plate(result: OutputResult, *, published: bool) -> Plate:
         ratio, what = calibration.summary[prior.name].sd_ratio, role(calibration, prior.name)
         strong = what in (PRIOR, MOVED)
         ax.set_title(
-            f"{what}, sd ratio {short(ratio)}", fontsize=6.5, color=VERMILION if strong else BLACK,
-            weight="bold" if strong else "normal",
+            f"{what}, sd ratio {short(ratio)}", fontsize=SMALLEST_PT,
+            color=EMBER if strong else BLACK, weight="bold" if strong else "normal",
         )  # fmt: skip
     for ax in axes.flat[len(free) :]:
         ax.set_visible(False)
@@ -77,8 +87,10 @@ def _prior_posterior(ax: Axes, prior: Prior, t: Array, mark: float | None) -> di
     if prior.log:
         ax.set_xscale("log")
         ticks = _log_ticks(drawn[0], drawn[-1])
-        ax.set_xticks(ticks, [short(v, 1) for v in ticks])
+        ax.set_xticks(ticks, [short(v, 1).removeprefix(f"1{TIMES}") for v in ticks])
         ax.xaxis.set_minor_locator(NullLocator())
+    else:
+        ax.xaxis.set_major_locator(MaxNLocator(4))
     ax.set_xlim(drawn[0], drawn[-1])
     ax.set_ylim(0.0, 1.08)
     ax.yaxis.set_major_locator(NullLocator())

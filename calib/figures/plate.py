@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-__all__ = ["Plate"]
+from calib.figures.style import style
+
+__all__ = ["Plate", "draw_all"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,3 +32,19 @@ class Plate:
     name: str
     caption: str
     heading: str = ""
+
+
+def draw_all(drawings: Mapping[str, Callable[[], Plate | None]]) -> list[Plate]:
+    """Draw figures by name, in order; one that fails has no figure and a caption saying why."""
+    with style():
+        drawn = [_attempt(name, draw) for name, draw in drawings.items()]
+    return [plate for plate in drawn if plate is not None]
+
+
+def _attempt(name: str, draw: Callable[[], Plate | None]) -> Plate | None:
+    try:
+        return draw()
+    except Exception as error:
+        # Any failure: a page without one figure is worth more than no page.
+        why = f"{type(error).__name__}: {error}"
+        return Plate(None, name, f"This figure could not be drawn ({why}).")

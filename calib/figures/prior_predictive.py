@@ -11,7 +11,7 @@ from calib.figures.bands import FILLS, scatter_points
 from calib.figures.labels import axis_of, short
 from calib.figures.plate import Plate
 from calib.figures.rows import Group, data_word, grid, groups, smooth_bands, x_column
-from calib.figures.style import GREY, legend_below, panels
+from calib.figures.style import DOUBLE_MM, GREY, MIDDLE_MM, legend_below, panels
 from calib.study import OutputResult
 
 __all__ = ["prior_hits", "prior_predictive_plate"]
@@ -33,7 +33,7 @@ def prior_predictive_plate(result: OutputResult) -> Plate:
     cols = min(3, len(shown))
     rows = -(-len(shown) // cols)
     fig, axes = panels(
-        rows, cols, height=44.0, width=180.0 if cols > 1 else 120.0, bottom=16.0, top=6.0,
+        rows, cols, height=44.0, width=DOUBLE_MM if cols > 1 else MIDDLE_MM, bottom=16.0, top=6.0,
         gap_x=3.0, gap_y=8.0, sharex=True, sharey=True,
     )  # fmt: skip
     handles: dict[str, Any] = {}

@@ -12,8 +12,8 @@ from calib.models.base import Array, BoundModel
 from calib.models.bekker import rut_depth
 from calib.models.magic_formula import magic_formula
 
-__all__ = ["Limit", "limits", "published_curve", "published_parameters", "published_sampled",
-           "published_source", "published_table"]  # fmt: skip
+__all__ = ["Limit", "limits", "published_curve", "published_parameters", "published_quality",
+           "published_sampled", "published_source", "published_table"]  # fmt: skip
 
 type Limit = tuple[float, str]
 
@@ -32,6 +32,14 @@ def published_parameters(model: str) -> Mapping[str, Figure]:
 def published_table(model: str) -> FittedTable | None:
     """Return the published table of a model, if there is one."""
     return _TABLES.get(model)
+
+
+def published_quality(model: str) -> Mapping[str, Figure]:
+    """Return the published goodness of fit that can stand beside ours; empty where none can.
+
+    Table 6 gives that of ln pgr, the pressure regressed on the rut; ours is of ln z.
+    """
+    return {} if model not in _TABLES or model == "modified_bekker" else _TABLES[model].quality
 
 
 def published_source(model: str) -> str:

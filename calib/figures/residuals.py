@@ -14,6 +14,7 @@ from calib.figures.plate import Plate
 from calib.figures.rows import Group, data_word, group_column, groups, held_table, x_column
 from calib.figures.style import BLACK, BLUE, CYCLE, DASHES, GREY, MARKERS, legend_below, panels
 from calib.models.base import Array
+from calib.posterior_text import centre_text
 from calib.problem import Problem
 from calib.study import OutputResult
 
@@ -174,7 +175,7 @@ def _caption(result: OutputResult, fitted: Standardised, held: Standardised | No
     if sigma is not None:
         unit = "" if sigma.unit == "1" else f" {unit_plain(sigma.unit)}"
         scale = " of ln output" if result.calibration.problem.bound.model.response == "log" else ""
-        text += f" One noise sd {plain('sigma')} is {short(sigma.mean)}{unit}{scale}."
+        text += f" One noise sd {plain('sigma')} is {centre_text(sigma)}{unit}{scale}."
     text += _spread_words(result, fitted)
     if held is not None:
         mean = float(held.residual.mean())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.calibration import Calibration
+from calib.sensitivity import CONTRACTION_MIN
 
 __all__ = ["BOTH", "DATA", "MOVED", "PRIOR", "ROLES", "role", "role_of", "shift"]
 
@@ -12,7 +13,8 @@ DATA, BOTH = "set by the data", "partly by the prior"
 MOVED, PRIOR = "moved, not narrowed", "set by the prior"
 ROLES = (DATA, BOTH, MOVED, PRIOR)
 
-PRIOR_SET, PARTLY_SET = 0.9, 0.5
+# The same limit as that of an identified parameter: nine tenths of the prior's sd.
+PRIOR_SET, PARTLY_SET = (1.0 - CONTRACTION_MIN) ** 0.5, 0.5
 MOVED_SDS = 0.5
 
 

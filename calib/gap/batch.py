@@ -1,4 +1,4 @@
-"""Diagnose many cases on several processes; what is there already is not done again.
+"""Diagnose many cases, here or on a cluster; what is there already is not done again.
 
 It is given case folders and an output folder, and opens nothing else: a key of sealed answers is
 not among its inputs.
@@ -6,16 +6,19 @@ not among its inputs.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from multiprocessing import get_context
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from calib.errors import CalibError
-from calib.folders import fresh_folder
+from calib.folders import read_folder
+from calib.gap.case import Case, read_case
+from calib.gap.diagnose import Diagnosis, diagnose
+from calib.gap.files import write_diagnosis
+from calib.tasks import LateItems, run_folder_tasks
 
-__all__ = ["case_folders", "diagnose_cases"]
+__all__ = ["case_folders", "diagnose_cases", "written"]
 
 
 def case_folders(folder: Path) -> list[Path]:
@@ -41,7 +44,9 @@ def diagnose_cases(
     seed: int,
     *,
     workers: int = 1,
+    scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
+    announce: Callable[[str], None] | None = None,
 ) -> dict[str, str]:
     """Diagnose cases, each into a folder of its name that appears whole or not at all.
 
@@ -51,55 +56,28 @@ def diagnose_cases(
     out : Path
     seed : int
         Results do not depend on the number of workers.
-    workers : int
-    progress : callable, optional
-        Called with cases done and cases in all.
+    workers, scheduler, progress, announce
+        As for `calib.tasks.run_tasks`.
 
     Returns
     -------
     dict of str to str
         Cases that failed, with their error.
     """
-    missing = [c for c in cases if not (out / c.name / "diagnosis.json").exists()]
-    done, failed = len(cases) - len(missing), {}
-    if progress is not None:
-        progress(done, len(cases))
-    if workers == 1:
-        for case in missing:
-            error = _one(case, out / case.name, seed)
-            if error is not None:
-                failed[case.name] = error
-            done += 1
-            if progress is not None:
-                progress(done, len(cases))
-        return failed
-    # Spawned, not forked: numerical libraries keep threads that do not survive a fork.
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn"), initializer=_quiet) as pool:
-        futures = {pool.submit(_one, case, out / case.name, seed): case for case in missing}
-        for future in as_completed(futures):
-            error = future.result()
-            if error is not None:
-                failed[futures[future].name] = error
-            done += 1
-            if progress is not None:
-                progress(done, len(cases))
-    return failed
+    outcome = run_folder_tasks(
+        partial(_diagnose, seed=seed),
+        LateItems({case.name: case for case in cases}, read_case),
+        out, workers=workers, scheduler=scheduler, progress=progress, announce=announce,
+    )  # fmt: skip
+    return dict(outcome.failed)
 
 
-def _quiet() -> None:
-    # One process per core: threads of the linear algebra would only get in each other's way.
-    os.environ["OPENBLAS_NUM_THREADS"] = "1"
+def _diagnose(case: Case, seed: int) -> dict[str, bytes]:
+    return written(diagnose(case, seed))
 
 
-def _one(case: Path, out: Path, seed: int) -> str | None:
-    from calib.gap.case import read_case
-    from calib.gap.diagnose import diagnose
-    from calib.gap.files import write_diagnosis
-
-    try:
-        found = diagnose(read_case(case), seed)
-        with fresh_folder(out, overwrite=True) as folder:
-            write_diagnosis(found, folder)
-    except CalibError as error:
-        return str(error)
-    return None
+def written(found: Diagnosis) -> dict[str, bytes]:
+    """Return the files of a diagnosis, by name, to be written elsewhere."""
+    with TemporaryDirectory() as scratch:
+        write_diagnosis(found, Path(scratch))
+        return read_folder(Path(scratch))

@@ -93,11 +93,19 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
         "smooth": h.smooth,
         "smooth_outputs": list(h.smooth_outputs),
         "smooth_over": h.smooth_over,
+        "smooth_decay": h.smooth_decay,
+        "onset_over": h.onset_over,
         "probability": probability,
         "psi": fit.psi.tolist(),
         "covariance": fit.covariance.tolist(),
+        "sample": None if fit.sample is None else _short(fit.sample),
         "noise": {o: {"sigma": n.sigma, "rho": n.rho} for o, n in fit.noise.items()},
     }
+
+
+def _short(draws: Array) -> list[list[float]]:
+    """Twelve digits of each number, so that the file stays small."""
+    return [[float(f"{value:.12g}") for value in row] for row in draws]
 
 
 def load_corrected(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> Corrected:
@@ -149,14 +157,17 @@ def _load_fit(
     hypothesis = Hypothesis(
         document["name"], chosen, tuple(effect_priors(data, e) for e in chosen),
         document["shift"], document["smooth"], tuple(document["smooth_outputs"]),
-        document["smooth_over"],
+        document["smooth_over"], document["smooth_decay"], document["onset_over"],
     )  # fmt: skip
     noise = {o: Noise(n["sigma"], n["rho"]) for o, n in document["noise"].items()}
     forward = Forward(data, hypothesis, {o: n.sigma for o, n in noise.items()}, lab_mode)
     psi, covariance = np.array(document["psi"]), np.array(document["covariance"])
     if psi.shape != (forward.n_dim,) or covariance.shape != (forward.n_dim, forward.n_dim):
         raise ValueError("shape")
-    return Fit(forward, psi, covariance, noise, 0.0, 0.0, {})
+    sample = None if document["sample"] is None else np.array(document["sample"])
+    if sample is not None and sample.shape[1:] != psi.shape:
+        raise ValueError("shape")
+    return Fit(forward, psi, covariance, noise, 0.0, 0.0, {}, sample)
 
 
 def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array]:

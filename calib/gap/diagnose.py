@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from calib.gap.case import Campaigns, Case, campaigns
+from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns
 from calib.gap.corrected import Corrected
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.mixture import Truth, mixture
 from calib.gap.next_measurement import NextMeasurement, next_measurements
+from calib.gap.outliers import rank_without_outliers, without_outputs
 from calib.gap.shrink import FreshPrediction, Shrink, predict_fresh, shrink
 from calib.gap.where import Region, RowGap, regions, row_gaps
 from calib.gap.which import Ranking, rank
-from calib.outputs import OUTPUTS
+from calib.models.base import Array
+from calib.streams import generator
 
 __all__ = ["Diagnosis", "diagnose", "verdict"]
 
 # A single hypothesis is named when it is at least this probable.
 NAMED = 0.5
-# Standardised residual beyond which a row is set aside, and how often that is repeated.
-OUTLIER = 5.0
-_MOST_ROUNDS = 3
+# Parts the field rows are left out in, where there are no other conditions to judge by.
+_FOLDS = 5
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
     CalibError
         If the case cannot be diagnosed: an output or a condition is missing, too few rows.
     """
-    data, ranking = _rank_without_outliers(case, seed, effects)
+    data, ranking = rank_without_outliers(case, seed, effects)
     mixed = mixture(data, ranking, seed)
     truth = mixed.at(data.view)
     gaps = row_gaps(data, truth)
@@ -91,6 +92,9 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
     at_target = truth if case.fresh is None else mixed.at(target)
     corrected = Corrected(mixed, ranking.lab_mode)
     before = corrected.calibrated(target.conditions)
+    far = shrink(data, at_target, before, at_target.means)
+    if far and case.fresh is None:
+        far = shrink(data, truth, before, _left_out(data, truth, seed, effects))
     return Diagnosis(
         data,
         ranking,
@@ -98,7 +102,7 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
         truth,
         gaps,
         regions(data, truth, gaps),
-        shrink(data, at_target, before),
+        far,
         {} if case.fresh is None else predict_fresh(at_target, before),
         next_measurements(data, ranking, seed),
         corrected,
@@ -106,43 +110,26 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
     )
 
 
-def _rank_without_outliers(
-    case: Case, seed: int, effects: Mapping[str, Effect]
-) -> tuple[Campaigns, Ranking]:
-    """Rank; set rows aside that no hypothesis explains, however good it is for the others."""
-    data = campaigns(case)
-    ranking = rank(data, seed, effects=effects)
-    for _ in range(_MOST_ROUNDS):
-        far = _outliers(data, ranking)
-        if not far:
-            break
-        case = _without(case, far)
-        data = campaigns(case)
-        ranking = rank(data, seed, effects=effects)
-    return data, ranking
+def _left_out(
+    data: Campaigns, truth: Truth, seed: int, effects: Mapping[str, Effect]
+) -> dict[str, Array]:
+    """Predict each field row by a diagnosis that has not seen it, hypotheses chosen anew.
 
-
-def _outliers(data: Campaigns, ranking: Ranking) -> dict[str, list[int]]:
-    best = max(ranking.fits[ranking.order[0]], key=lambda f: f.log_evidence)
-    found = {}
-    for o in data.outputs:
-        far = np.abs(best.field_residuals[o.name]) > OUTLIER
-        # Many such rows are a gap that is not understood, not outliers.
-        if 0 < far.sum() <= max(1, o.rows.size // 10):
-            found[o.name] = [int(row) for row in o.rows[far]]
-    return found
-
-
-def _without(case: Case, far: Mapping[str, list[int]]) -> Case:
-    columns = {name: np.array(values) for name, values in case.field.columns.items()}
-    said = list(case.warnings)
-    for output, rows in far.items():
-        columns[OUTPUTS[output]][rows] = np.nan
-        said.append(
-            f"field row {', '.join(map(str, rows))}: {output} lies more than {OUTLIER:g} noise sds "
-            "off whatever the hypothesis; it was left out as an outlier"
-        )
-    return replace(case, field=replace(case.field, columns=columns), warnings=tuple(said))
+    Without other conditions to predict, this is how far the correction carries beyond the rows it
+    was found on. With too few rows to leave some out, the rows' own predictions stand.
+    """
+    n = len(data.case.field)
+    order = generator(seed, "gap", "folds").permutation(n)
+    predicted = truth.means
+    for fold in range(_FOLDS):
+        rows = order[fold::_FOLDS]
+        if min(np.setdiff1d(o.rows, rows).size for o in data.outputs) < MIN_FIELD_ROWS:
+            return truth.means
+        part = campaigns(without_outputs(data.case, {o.name: rows for o in data.outputs}))
+        found = mixture(part, rank(part, seed, effects=effects), seed).at(data.view)
+        for name, values in found.means.items():
+            predicted[name][rows] = values[rows]
+    return predicted
 
 
 def verdict(probability: Mapping[str, float]) -> str:

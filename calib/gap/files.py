@@ -30,7 +30,7 @@ def document(found: Diagnosis) -> dict[str, Any]:
             {
                 "name": name,
                 "probability": ranking.probability[name],
-                "parameters": _parameters(ranking.fits[name][0]),
+                "parameters": _parameters(ranking.best(name)),
             }
             for name in ranking.order
         ],

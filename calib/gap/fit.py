@@ -21,7 +21,7 @@ from calib.gap.forward import Forward
 from calib.models.base import Array
 from calib.sampling.mode import prior_widths
 
-__all__ = ["Fit", "Noise", "fit"]
+__all__ = ["Fit", "Noise", "fit", "log_joint"]
 
 # Growth of the noise with slip: sigma (1 + rho s), and the prior probability of each.
 RHO = np.array([0.0, 1.0, 2.5, 5.0])
@@ -29,6 +29,8 @@ LN_RHO_PRIOR = np.log(np.array([0.5, 0.2, 0.15, 0.15]))
 # The noise of an output is known beforehand to this factor (sd of its logarithm).
 SIGMA_SD_LOG = 1.0
 _MAX_STEPS = 40
+# Guesses closer than this (in prior sds) climb to the same mode.
+_APART = 0.7
 
 
 @dataclass(frozen=True)
@@ -57,6 +59,8 @@ class Fit:
     log_likelihood : float
     field_residuals : mapping of str to ndarray
         Standardised residuals of the field rows of each output.
+    sample : ndarray, shape (draws, d), optional
+        Draws of the posterior itself, where the normal was not good enough.
     """
 
     forward: Forward
@@ -66,9 +70,12 @@ class Fit:
     log_evidence: float
     log_likelihood: float
     field_residuals: Mapping[str, Array]
+    sample: Array | None = None
 
     def draws(self, rng: np.random.Generator, size: int) -> Array:
         """Draw psi within its bounds, shape (size, d)."""
+        if self.sample is not None:
+            return np.asarray(self.sample[rng.integers(self.sample.shape[0], size=size)])
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         drawn = self.psi + rng.standard_normal((size, self.psi.size)) @ root.T
@@ -83,6 +90,7 @@ def fit(
     noise: Mapping[str, Noise],
     *,
     starts: Array | None = None,
+    polish: int = 1,
 ) -> Fit:
     """Fit a hypothesis.
 
@@ -95,30 +103,39 @@ def fit(
     noise : mapping of str to Noise
         First guess.
     starts : ndarray, shape (k, d), optional
-        More guesses, screened in one call; the best is polished.
+        More guesses, screened in one call.
+    polish : int
+        How many of the best guesses, apart from each other, are polished; the most probable
+        mode is kept.
     """
     problem = _Residuals(data, forward)
-    psi = problem.clip(start)
+    candidates = problem.clip(start)[None]
     if starts is not None:
-        psi = problem.best(np.concatenate([psi[None], problem.clip(starts)]), noise)
+        candidates = np.concatenate([candidates, problem.clip(starts)])
+    fits = [_polish(problem, psi, noise) for psi in problem.best(candidates, noise, polish)]
+    return max(fits, key=lambda f: f.log_evidence)
+
+
+def _polish(problem: _Residuals, psi: Array, noise: Mapping[str, Noise]) -> Fit:
+    """Climb from a guess to the mode beside it."""
     noise = dict(noise)
     damping = 1e-3
-    cost = problem.cost(psi, noise)
+    raw = problem.raw(psi[None])
     quiet = 0
     for _ in range(_MAX_STEPS):
         jacobian, residual = problem.jacobian(psi, noise)
         gradient = jacobian.T @ residual
         hessian = jacobian.T @ jacobian
-        step, new_cost, damping = _step(problem, psi, noise, hessian, gradient, cost, damping)
-        gained = cost - new_cost
-        psi = problem.clip(psi + step)
-        new_noise = problem.update_noise(psi, jacobian, hessian)
+        cost = float(problem.costs(psi[None], raw, noise)[0])
+        step, gained, damping, moved = _step(problem, psi, noise, hessian, gradient, cost, damping)
+        if moved is not None:
+            psi, raw = problem.clip(psi + step), moved
+        new_noise = problem.update_noise(raw, jacobian, hessian)
         changed = max(
             abs(np.log(new_noise[o].sigma / noise[o].sigma)) + abs(new_noise[o].rho - noise[o].rho)
             for o in noise
         )
         noise = new_noise
-        cost = problem.cost(psi, noise)
         quiet = quiet + 1 if gained < 1e-3 and changed < 1e-2 else 0
         if quiet >= 2:
             break
@@ -128,23 +145,29 @@ def fit(
 def _step(
     problem: _Residuals, psi: Array, noise: Mapping[str, Noise], hessian: Array, gradient: Array,
     cost: float, damping: float,
-) -> tuple[Array, float, float]:  # fmt: skip
-    """One Levenberg-Marquardt step: several dampings tried in one batched call."""
+) -> tuple[Array, float, float, dict[str, Array] | None]:  # fmt: skip
+    """One Levenberg-Marquardt step: several dampings tried in one batched call.
+
+    Returns the step, what it gained, the next damping, and the residuals there (none without a
+    step).
+    """
     # A coordinate that nothing depends on at this point still needs a finite step.
     diagonal = np.diag(np.diag(hessian) + 1e-2 / problem.width**2)
     dampings = damping * 10.0 ** np.arange(-1.0, 5.0)
     # At a bound, a coordinate that would leave is held there.
     free = ~problem.blocked(psi, -gradient)
     steps = np.zeros((dampings.size, psi.size))
-    for i, value in enumerate(dampings):
-        h = (hessian + value * diagonal)[np.ix_(free, free)]
-        steps[i, free] = -np.linalg.solve(h, gradient[free])
+    inner = np.ix_(free, free)
+    stack = hessian[inner] + dampings[:, None, None] * diagonal[inner]
+    steps[:, free] = -np.linalg.solve(stack, gradient[free][None, :, None])[..., 0]
     steps = problem.clip(psi + steps) - psi
-    costs = problem.costs(psi + steps, noise)
+    raw = problem.raw(psi + steps)
+    costs = problem.costs(psi + steps, raw, noise)
     best = int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))
     if not costs[best] < cost:
-        return np.zeros_like(psi), cost, min(dampings[-1] * 10.0, 1e6)
-    return steps[best], float(costs[best]), max(dampings[best], 1e-9)
+        return np.zeros_like(psi), 0.0, min(dampings[-1] * 10.0, 1e6), None
+    at_best = {o: r[best : best + 1] for o, r in raw.items()}
+    return steps[best], cost - float(costs[best]), max(dampings[best], 1e-9), at_best
 
 
 class _Residuals:
@@ -187,25 +210,32 @@ class _Residuals:
             for o in self.data.outputs
         }
 
-    def standardised(self, psi: Array, noise: Mapping[str, Noise]) -> Array:
+    def standardised(
+        self, psi: Array, raw: Mapping[str, Array], noise: Mapping[str, Noise]
+    ) -> Array:
         """All residuals over their sds, the priors' included, shape (k, N)."""
-        parts = [r / noise[o].sd(self.slips[o]) for o, r in self.raw(psi).items()]
+        parts = [r / noise[o].sd(self.slips[o]) for o, r in raw.items()]
         parts.append((psi - self.loc) * self.precision)
         return np.concatenate(parts, axis=1)
 
-    def _ln_sds(self, noise: Mapping[str, Noise]) -> float:
+    def ln_sds(self, noise: Mapping[str, Noise]) -> float:
         return float(sum(np.log(noise[o].sd(s)).sum() for o, s in self.slips.items()))
 
-    def costs(self, psi: Array, noise: Mapping[str, Noise]) -> Array:
-        r = self.standardised(psi, noise)
-        return np.asarray(0.5 * np.square(r).sum(axis=1) + self._ln_sds(noise))
+    def costs(self, psi: Array, raw: Mapping[str, Array], noise: Mapping[str, Noise]) -> Array:
+        """Minus log posterior but for constants, shape (k,)."""
+        r = self.standardised(psi, raw, noise)
+        return np.asarray(0.5 * np.square(r).sum(axis=1) + self.ln_sds(noise))
 
-    def cost(self, psi: Array, noise: Mapping[str, Noise]) -> float:
-        return float(self.costs(psi[None], noise)[0])
-
-    def best(self, candidates: Array, noise: Mapping[str, Noise]) -> Array:
-        costs = self.costs(candidates, noise)
-        picked: Array = candidates[int(np.nanargmin(np.where(np.isfinite(costs), costs, np.inf)))]
+    def best(self, candidates: Array, noise: Mapping[str, Noise], count: int) -> list[Array]:
+        """Return the best candidates that lie apart from each other."""
+        costs = self.costs(candidates, self.raw(candidates), noise)
+        picked: list[Array] = []
+        for i in np.argsort(np.where(np.isfinite(costs), costs, np.inf), kind="stable"):
+            apart = [np.abs((candidates[i] - p) / self.width).max() > _APART for p in picked]
+            if all(apart):
+                picked.append(candidates[i])
+            if len(picked) == count:
+                break
         return picked
 
     def jacobian(self, psi: Array, noise: Mapping[str, Noise]) -> tuple[Array, Array]:
@@ -213,15 +243,16 @@ class _Residuals:
         h = 1e-4 * self.width
         sign = np.where(psi + h > self.upper, -1.0, 1.0)
         points = np.concatenate([psi[None], psi + np.diag(sign * h)])
-        r = self.standardised(points, noise)
+        r = self.standardised(points, self.raw(points), noise)
         r = np.where(np.isfinite(r), r, r[0])
         return ((r[1:] - r[0]) / (sign * h)[:, None]).T.reshape(-1, d), r[0]
 
-    def update_noise(self, psi: Array, jacobian: Array, hessian: Array) -> dict[str, Noise]:
+    def update_noise(
+        self, raw: Mapping[str, Array], jacobian: Array, hessian: Array
+    ) -> dict[str, Noise]:
         """Noise scales that maximise the marginal likelihood, parameters allowed for."""
         factor = np.linalg.solve(hessian + np.diag(1e-6 / self.width**2), jacobian.T)
         leverage = np.einsum("nd,dn->n", jacobian, factor)
-        raw = self.raw(psi[None])
         updated, start = {}, 0
         for o, r in raw.items():
             n = r.shape[1]
@@ -240,7 +271,7 @@ class _Residuals:
         n = sum(s.size for s in self.slips.values())
         data_part = residual[:n]
         log_likelihood = (
-            -0.5 * float(data_part @ data_part) - self._ln_sds(noise) - 0.5 * n * np.log(2 * np.pi)
+            -0.5 * float(data_part @ data_part) - self.ln_sds(noise) - 0.5 * n * np.log(2 * np.pi)
         )
         log_prior = float(self.forward.priors.log_prob(psi[None])[0])
         # A flat direction is as wide as its prior.
@@ -249,7 +280,9 @@ class _Residuals:
         covariance = np.linalg.inv(hessian)
         evidence = log_likelihood + log_prior + 0.5 * d * np.log(2 * np.pi) - 0.5 * log_det
         evidence += self._bounds_correction(psi, gradient, covariance)
-        evidence += float(sum(self._rho_prior(v) for v in noise.values()))
+        evidence += float(
+            sum(LN_RHO_PRIOR[int(np.argmin(np.abs(RHO - n.rho)))] for n in noise.values())
+        )
         residuals, start = {}, 0
         for o in self.data.outputs:
             n_lab, n_all = o.problem.response.size, self.slips[o.name].size
@@ -260,9 +293,6 @@ class _Residuals:
             float(evidence) if np.isfinite(evidence) and sign > 0 else -np.inf,
             log_likelihood, residuals,
         )  # fmt: skip
-
-    def _rho_prior(self, noise: Noise) -> float:
-        return float(LN_RHO_PRIOR[int(np.argmin(np.abs(RHO - noise.rho)))])
 
     def _bounds_correction(self, psi: Array, gradient: Array, covariance: Array) -> float:
         """Mass of the normal that lies inside the bounds, one coordinate at a time."""
@@ -281,6 +311,21 @@ class _Residuals:
                 inside = 1.0 - np.exp(log_ndtr(-to_low)) - np.exp(log_ndtr(-to_high))
                 total += float(np.log(max(inside, 1e-6)))
         return total
+
+
+def log_joint(fit: Fit, psi: Array) -> Array:
+    """Log likelihood plus log prior at a fit's noise, shape (k, d) to (k,)."""
+    problem = _Residuals(fit.forward.data, fit.forward)
+    with np.errstate(all="ignore"):
+        prior = fit.forward.priors.log_prob(psi)
+        inside = problem.clip(psi)
+        squares = [
+            np.square(r / fit.noise[o].sd(problem.slips[o])).sum(axis=1)
+            for o, r in problem.raw(inside).items()
+        ]
+    n = sum(s.size for s in problem.slips.values())
+    constant = problem.ln_sds(fit.noise) + 0.5 * n * np.log(2.0 * np.pi)
+    return np.asarray(prior - 0.5 * np.sum(squares, axis=0) - constant)
 
 
 def _best_noise(squared: Array, slip: Array) -> Noise:

@@ -3,6 +3,7 @@
 The vector psi of a hypothesis stacks, all with (truncated) normal or uniform priors:
 
     simulator parameters of each output (internal coordinates)
+    inadequacy of each simulator, in the lab and the field alike
     parameters of each effect
     form errors: the effect's size departs from its formula by 1 + sum_j c_j b_j(x)
     shifts of the simulator's parameters in the field (parameter_shift only)
@@ -17,17 +18,27 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy.special import expit
 
-from calib.gap.case import Campaigns
+from calib.gap.case import Campaigns, OutputData
 from calib.gap.effects import Effect, View
+from calib.gap.effects.base import RUT
 from calib.models.base import Array
 from calib.priors import Prior, Priors
 from calib.sampling.mode import prior_widths
 
-__all__ = ["FORM_ERROR", "Forward", "Hypothesis"]
+__all__ = ["FORM_ERROR", "Forward", "Hypothesis", "SmoothOver"]
+
+type SmoothOver = Literal["slip", "level", "sinkage", "order", "all"]
 
 # Relative size by which a formula may misrepresent its effect along one direction.
 FORM_ERROR = 0.3
+# Inadequacy of a simulator at the end of the lab's range of a condition, in noise sds.
+MISFIT = 1.0
+MISFIT_OUTPUTS = ("bulk_density",)
+# Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
+_THRESHOLDS = (-0.85, 0.9)
+_ONSET_WIDTH = 0.06
 # Shifts that differ between pressures, relative to those that are common to them.
 SHIFT_DIFFERENCE = 0.35
 
@@ -48,9 +59,17 @@ class Hypothesis:
         Prior sd of a free discrepancy, in units of the noise; 0 for none.
     smooth_outputs : tuple of str
         Outputs that have the free discrepancy.
-    smooth_over : {"slip", "level", "all"}
+    smooth_over : {"slip", "level", "sinkage", "order", "all"}
         What it may vary with: slip, the level of the predicted output (as a saturating
-        instrument would), or every condition.
+        instrument would), the predicted rut depth (as layered soil would), the order of the runs
+        (as weather or another stretch of ground would), or every condition.
+    smooth_decay : float
+        Number of half waves from which the discrepancy's coefficients fall off.
+    onset_over : {"slip", "level", "sinkage", "order"}, optional
+        Instead of smooth, the discrepancy may set in beyond a threshold of one of these: a step
+        and a change of slope there.
+    share : float
+        Part of the prior probability of its name.
     """
 
     name: str
@@ -59,7 +78,10 @@ class Hypothesis:
     shift: float = 0.0
     smooth: float = 0.0
     smooth_outputs: tuple[str, ...] = ()
-    smooth_over: Literal["slip", "level", "all"] = "all"
+    smooth_over: SmoothOver = "all"
+    smooth_decay: float = 4.0
+    onset_over: SmoothOver | None = None
+    share: float = 1.0
 
 
 class Forward:
@@ -92,13 +114,22 @@ class Forward:
         self.theta_slices: dict[str, slice] = {}
         for o in data.outputs:
             self.theta_slices[o.name] = _append(entries, o.priors.free, o.name)
+        self.misfit_slices: dict[str, slice] = {}
+        self._misfit_ranges: dict[str, tuple[tuple[str, float, float], ...]] = {}
+        for o in data.outputs:
+            self._misfit_ranges[o.name] = ranges = _misfit_ranges(o)
+            m = len(ranges) * (len(ranges) + 1) // 2
+            bends = [_normal("misfit", MISFIT * noise[o.name])] * m
+            self.misfit_slices[o.name] = _append(entries, bends, o.name)
         self.phi_slices = [
             _append(entries, p.free, e.name)
             for e, p in zip(hypothesis.effects, hypothesis.effect_priors, strict=True)
         ]
         # Worked out once for the field rows, which every step of a fit predicts.
         self._field_form = self._form_basis(data.view)
-        self._field_smooth = self._smooth_basis(data.view) if hypothesis.smooth_outputs else None
+        self._field_smooth = {
+            name: self._smooth_basis(data.view, name) for name in hypothesis.smooth_outputs
+        }
         self.form_slices: dict[str, slice] = {}
         for o in data.outputs:
             m = self._field_form.shape[1]
@@ -117,11 +148,14 @@ class Forward:
         self.smooth_slices: dict[str, slice] = {}
         for o in data.outputs:
             if o.name in hypothesis.smooth_outputs:
-                weights = self._smooth(data.view)[1]
+                weights = self._field_smooth[o.name][1]
                 sd = hypothesis.smooth * noise[o.name]
                 self.smooth_slices[o.name] = _append(
                     entries, [_normal("smooth", sd * w) for w in weights], o.name
                 )
+        self.threshold = len(entries)
+        if hypothesis.onset_over is not None:
+            entries.append(_uniform("threshold", *_THRESHOLDS))
         self.priors = Priors(tuple(entries))
 
     @property
@@ -155,11 +189,34 @@ class Forward:
         same = view.conditions is self.data.view.conditions
         return self._field_form if same else self._form_basis(view)
 
-    def _smooth(self, view: View) -> tuple[Array, Array]:
+    def _discrepancy(self, psi: Array, view: View, name: str) -> Array:
+        """Free discrepancy of an output, shape (k, n)."""
+        amplitudes = psi[:, self.smooth_slices[name]]
+        if self.hypothesis.onset_over is None:
+            return amplitudes @ self._smooth(view, name).T
+        step, bend = self.onset(view, name, psi[:, self.threshold])
+        return amplitudes[:, :1] * step + amplitudes[:, 1:2] * bend
+
+    def onset(self, view: View, output: str, threshold: Array) -> tuple[Array, Array]:
+        """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n)."""
+        u = self.onset_covariate(view, output)
+        beyond = (u - threshold[:, None]) / _ONSET_WIDTH
+        return expit(beyond), _ONSET_WIDTH * np.logaddexp(0.0, beyond)
+
+    def onset_covariate(self, view: View, output: str) -> Array:
+        """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
+        over = self.hypothesis.onset_over
+        if over in ("level", "sinkage"):
+            u = self._level(view, output if over == "level" else RUT)
+        else:
+            u = self._scaled(view, "slip_ratio" if over == "slip" else "run_order")
+        if u is None:
+            raise ValueError(f"nothing to set in over: {over}")
+        return u
+
+    def _smooth(self, view: View, output: str) -> Array:
         same = view.conditions is self.data.view.conditions
-        if same and self._field_smooth is not None:
-            return self._field_smooth
-        return self._smooth_basis(view)
+        return (self._field_smooth[output] if same else self._smooth_basis(view, output))[0]
 
     def _form_basis(self, view: View) -> Array:
         """Basis of the form error, shape (n, m)."""
@@ -193,35 +250,31 @@ class Forward:
                     basis.append(np.clip((values - mid) / (0.5 * np.ptp(reference)), -1.5, 1.5))
         return np.stack(basis, axis=1) if basis else np.empty((n, 0))
 
-    def _smooth_basis(self, view: View) -> tuple[Array, Array]:
-        """Basis of a free discrepancy, shape (n, m), and the sds of its coefficients."""
+    def _smooth_basis(self, view: View, output: str) -> tuple[Array, Array]:
+        """Basis of an output's free discrepancy, shape (n, m), and its coefficients' sds."""
+        over = self.hypothesis.smooth_over
+        if self.hypothesis.onset_over is not None:
+            # Its shape depends on the threshold; here are its two amplitudes.
+            return np.empty((0, 2)), np.array([1.0, 2.0])
+        if over in ("level", "sinkage"):
+            terms = self._cosines(self._level(view, output if over == "level" else RUT), 8, 0.8)
+        elif over == "order":
+            terms = self._cosines(self._scaled(view, "run_order"), 12, 0.7)
+        else:
+            terms = self._condition_terms(view, everything=over == "all")
+        n = next(iter(view.conditions.values())).size
+        basis = [np.ones(n)] + [b for b, _ in terms]
+        return np.stack(basis, axis=1), np.array([1.0] + [w for _, w in terms])
+
+    def _condition_terms(self, view: View, *, everything: bool) -> list[tuple[Array, float]]:
         slip = self._scaled(view, "slip_ratio")
         pressure = self._scaled(view, "inflation_pressure_psi")
         if pressure is None:
             pressure = self._scaled(view, "average_ground_pressure_kpa")
-        order = self._scaled(view, "run_order")
-        n = next(iter(view.conditions.values())).size
-        basis, weights = [np.ones(n)], [1.0]
-
-        def cosines(u: Array | None, most: int, scale: float) -> list[tuple[Array, float]]:
-            if u is None:
-                return []
-            angle = 0.5 * np.pi * (np.clip(u, -1.2, 1.2) + 1.0)
-            return [
-                (np.sqrt(2.0) * np.cos(j * angle), scale / (1.0 + (j / 4.0) ** 2))
-                for j in range(1, most + 1)
-            ]
-
-        if self.hypothesis.smooth_over == "level":
-            for b, w in cosines(self._level(view), 8, 0.8):
-                basis.append(b)
-                weights.append(w)
-            return np.stack(basis, axis=1), np.array(weights)
-        slips = cosines(slip, 10, 0.7)
+        slips = self._cosines(slip, 10, 0.7)
         terms = list(slips)
-        everything = self.hypothesis.smooth_over == "all"
         if everything:
-            terms += cosines(order, 6, 0.5)
+            terms += self._cosines(self._scaled(view, "run_order"), 6, 0.5)
         if pressure is not None:
             terms.append((pressure, 0.7))
             terms += [(pressure * b, 0.6 * w) for b, w in slips[:4]]
@@ -232,21 +285,30 @@ class Forward:
         ):  # fmt: skip
             u = self._scaled(view, name, transform)
             if u is not None and everything:
-                terms += cosines(u, 3, 0.4)
+                terms += self._cosines(u, 3, 0.4)
                 if slip is not None:
                     terms.append((u * slip, 0.4))
-        for b, w in terms:
-            basis.append(b)
-            weights.append(w)
-        return np.stack(basis, axis=1), np.array(weights)
+        return terms
 
-    def _level(self, view: View) -> Array | None:
-        """Predicted level of the (first) output with a discrepancy, scaled to the field's range."""
-        if not self.lab_mode:
+    def _cosines(self, u: Array | None, most: int, scale: float) -> list[tuple[Array, float]]:
+        """Cosines of a covariate scaled to -1..1, and the sds of their coefficients."""
+        if u is None:
+            return []
+        angle = 0.5 * np.pi * (np.clip(u, -1.2, 1.2) + 1.0)
+        return [
+            (
+                np.sqrt(2.0) * np.cos(j * angle),
+                scale / (1.0 + (j / self.hypothesis.smooth_decay) ** 2),
+            )
+            for j in range(1, most + 1)
+        ]
+
+    def _level(self, view: View, output: str) -> Array | None:
+        """Predicted level of an output, scaled to the field's range."""
+        if output not in self.lab_mode:
             return None
-        name = self.hypothesis.smooth_outputs[0]
-        o = next(o for o in self.data.outputs if o.name == name)
-        theta = o.priors.to_natural(self.lab_mode[name][None])
+        o = next(o for o in self.data.outputs if o.name == output)
+        theta = o.priors.to_natural(self.lab_mode[output][None])
 
         def predicted(conditions: Mapping[str, Array]) -> Array:
             selected = o.problem.bound.model.select(conditions)
@@ -266,11 +328,31 @@ class Forward:
             t = t + psi[:, self.shift_slices[output]] @ self._shift_maps[output].T
         return o.priors.to_natural(t)
 
+    def _predict(
+        self, o: OutputData, theta: Array, psi: Array, conditions: Mapping[str, Array]
+    ) -> Array:
+        """Simulator and its inadequacy at conditions, on the scale of the response."""
+        location = o.problem.bound.location(theta, conditions)
+        misfit = psi[:, self.misfit_slices[o.name]]
+        if not misfit.shape[1]:
+            return location
+        scaled = [
+            np.clip((_LOGS.get(name, _same)(conditions[name]) - mid) / half, -2.5, 2.5)
+            for name, mid, half in self._misfit_ranges[o.name]
+        ]
+        column = 0
+        for i, u in enumerate(scaled):
+            for j, v in enumerate(scaled[: i + 1]):
+                bend = u * v - (1.0 / 3.0 if i == j else 0.0)
+                location = location + misfit[:, column : column + 1] * bend
+                column += 1
+        return location
+
     def lab(self, psi: Array) -> dict[str, Array]:
         """Predict the lab rows on the scale of the response, shapes (k, n_lab)."""
         return {
-            o.name: o.problem.bound.location(
-                self.theta(psi, o.name, field=False), o.problem.conditions
+            o.name: self._predict(
+                o, self.theta(psi, o.name, field=False), psi, o.problem.conditions
             )
             for o in self.data.outputs
         }
@@ -278,11 +360,12 @@ class Forward:
     def simulator(self, psi: Array, view: View) -> dict[str, Array]:
         """Predict with the calibrated simulator alone, on the scale of the response."""
         return {
-            o.name: o.problem.bound.location(
-                self.theta(psi, o.name, field=False), o.problem.bound.model.select(view.conditions)
+            o.name: self._predict(
+                o, self.theta(psi, o.name, field=False), psi,
+                o.problem.bound.model.select(view.conditions),
             )
             for o in self.data.outputs
-        }
+        }  # fmt: skip
 
     def field(self, psi: Array, view: View) -> dict[str, Array]:
         """Predict field rows with the hypothesis in force, on the scale of the response."""
@@ -290,13 +373,12 @@ class Forward:
         for o in self.data.outputs:
             theta = self.theta(psi, o.name, field=True)
             conditions = o.problem.bound.model.select(view.conditions)
-            plain[o.name] = o.problem.bound.location(theta, conditions)
+            plain[o.name] = self._predict(o, theta, psi, conditions)
         if self.hypothesis.effects:
             plain = self._with_effects(psi, view, plain)
         if self.smooth_slices:
-            basis = self._smooth(view)[0]
             plain = {
-                name: location + psi[:, self.smooth_slices[name]] @ basis.T
+                name: location + self._discrepancy(psi, view, name)
                 if name in self.smooth_slices
                 else location
                 for name, location in plain.items()
@@ -320,7 +402,8 @@ class Forward:
                 conditions = effect.on_conditions(phi, name, conditions, view)
             location = plain[name]
             if conditions is not original:
-                location = o.problem.bound.location(self.theta(psi, name, field=True), conditions)
+                theta = self.theta(psi, name, field=True)
+                location = self._predict(o, theta, psi, conditions)
             for effect, phi in zip(self.hypothesis.effects, phis, strict=True):
                 location = effect.on_output(phi, name, location, view)
             if form.shape[1]:
@@ -328,6 +411,31 @@ class Forward:
                 location = plain[name] + (location - plain[name]) * factor
             changed[name] = location
         return changed
+
+
+def _same(values: Array) -> Array:
+    return values
+
+
+def _ln(values: Array) -> Array:
+    return np.asarray(np.log(np.maximum(values, 1e-6)))
+
+
+# Conditions whose effect is even on the logarithm.
+_LOGS = {"cone_index_kpa": _ln, "average_ground_pressure_kpa": _ln}
+
+
+def _misfit_ranges(o: OutputData) -> tuple[tuple[str, float, float], ...]:
+    """Conditions over which a simulator may be bent, with middle and half range in the lab."""
+    if o.name not in MISFIT_OUTPUTS:
+        return ()
+    found = []
+    for name, values in o.problem.conditions.items():
+        values = _LOGS.get(name, _same)(values)
+        half = 0.5 * float(np.ptp(values))
+        if half > 1e-9 * max(1.0, float(np.abs(values).max())):
+            found.append((name, 0.5 * float(values.max() + values.min()), half))
+    return tuple(found)
 
 
 def _shift_map(names: tuple[str, ...]) -> tuple[Array, list[float]]:
@@ -350,6 +458,13 @@ def _append(entries: list[Prior], new: list[Prior] | tuple[Prior, ...], prefix: 
     start = len(entries)
     entries += [replace(p, name=f"{prefix}.{p.name}") for p in new]
     return slice(start, len(entries))
+
+
+def _uniform(name: str, lower: float, upper: float) -> Prior:
+    return Prior(
+        name, "1", "", "", f"uniform({lower:g}, {upper:g})", False, 0.5 * (lower + upper), np.inf,
+        lower, upper,
+    )  # fmt: skip
 
 
 def _normal(name: str, sd: float) -> Prior:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 
 from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.forward import Hypothesis
+from calib.gap.effects.base import DRAWBAR, RUT
+from calib.gap.forward import Hypothesis, SmoothOver
 from calib.prior_files import default_prior_path, read_priors
 from calib.priors import Priors
 
@@ -18,6 +19,8 @@ __all__ = [
     "LN_PRIOR",
     "effect_priors",
     "pair",
+    "remainders",
+    "shifts",
     "singles",
     "split_testable",
     "unknowns",
@@ -29,7 +32,20 @@ PRIOR = {"none": 0.40, "unknown": 0.10, "parameter_shift": 0.10, "single": 0.40}
 LN_PAIR_TO_SINGLE = float(np.log(0.05))
 LN_PRIOR: Mapping[str, float] = {k: float(np.log(v)) for k, v in PRIOR.items()}
 SHIFTS = (0.1, 0.25, 0.6)
-SMOOTHS = (1.5, 5.0)
+# Size (noise sds) and number of half waves of a free discrepancy.
+SMOOTHS = ((1.5, 4.0), (5.0, 4.0))
+VERY_SMOOTH = (3.0, 1.0)
+# Size (noise sds) of a discrepancy that sets in beyond a threshold.
+ONSET = 4.0
+# Part of `unknown` that comes on top of a listed effect instead of alone.
+REMAINDER = 0.2
+
+
+# One output that changes beyond some slip or run is what listed effects are: post-peak softening,
+# slip sinkage, rebound and drift may set in anywhere. Nobody could tell the unlisted from them.
+_LISTED_ONSETS: tuple[tuple[SmoothOver, tuple[str, ...]], ...] = (
+    ("slip", (DRAWBAR,)), ("slip", (RUT,)), ("order", (DRAWBAR,)),
+)  # fmt: skip
 
 
 def split_testable(
@@ -59,20 +75,60 @@ def singles(data: Campaigns, effects: Mapping[str, Effect]) -> list[Hypothesis]:
 
 
 def unknowns(data: Campaigns) -> list[Hypothesis]:
-    """Free smooth discrepancies: of one output or all, over slip or everything, small or large."""
+    """Free smooth discrepancies: of one output or all, over slip, level, …, small or large."""
     names = data.names
-    touched = [(name,) for name in names] + ([names] if len(names) > 1 else [])
-    overs: tuple[Literal["slip", "level", "all"], ...] = ("slip", "level", "all")
-    if "slip_ratio" not in data.view.conditions:
-        overs = ("level", "all")
-    return [
-        Hypothesis("unknown", smooth=size, smooth_outputs=outputs, smooth_over=over)
-        for outputs in touched
-        for over in overs
-        for size in SMOOTHS
-        # The level is that of one output.
-        if over != "level" or len(outputs) == 1
+    each = [(name,) for name in names]
+    touched = each + ([names] if len(names) > 1 else [])
+    recorded = data.view.conditions
+    choices: list[tuple[SmoothOver, tuple[str, ...]]] = [("level", t) for t in each]
+    if "slip_ratio" in recorded:
+        choices += [("slip", t) for t in touched]
+    if RUT in names:
+        choices += [("sinkage", t) for t in touched if t != (RUT,)]
+    if "run_order" in recorded and np.ptp(recorded["run_order"]) > 0:
+        choices += [("order", t) for t in touched]
+    smooth = [
+        Hypothesis("unknown", smooth=size, smooth_outputs=t, smooth_over=over, smooth_decay=decay)
+        for over, t in [*choices, *(("all", t) for t in touched)]
+        # Over slip at every pressure, what is very smooth is a parameter shift.
+        for size, decay in (SMOOTHS if over in ("slip", "all") else (*SMOOTHS, VERY_SMOOTH))
     ]
+    sudden = [
+        Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over=over)
+        for over, t in choices
+        if (over, t) not in _LISTED_ONSETS
+    ]
+    share = (1.0 - REMAINDER) / 2.0
+    return [replace(h, share=share / len(group)) for group in (smooth, sudden) for h in group]
+
+
+def remainders(data: Campaigns, best: Sequence[Hypothesis], n_single: int) -> list[Hypothesis]:
+    """A listed effect, or a shift, and besides it something that is not listed.
+
+    The best of them stand for all: the others' evidence is negligible beside theirs.
+    """
+    overs: tuple[SmoothOver, ...] = ("all", "level")
+    if "slip_ratio" in data.view.conditions:
+        overs = ("all", "level", "slip")
+    share = REMAINDER / ((n_single + 1) * len(overs))
+    return [
+        replace(
+            h,
+            name="unknown",
+            smooth=SMOOTHS[0][0],
+            smooth_decay=SMOOTHS[0][1],
+            smooth_outputs=data.names,
+            smooth_over=over,
+            share=share,
+        )
+        for h in best
+        for over in overs
+    ]
+
+
+def shifts() -> list[Hypothesis]:
+    """Other parameter values in the field, by a little or a lot."""
+    return [Hypothesis("parameter_shift", shift=s, share=1.0 / len(SHIFTS)) for s in SHIFTS]
 
 
 def pair(a: Hypothesis, b: Hypothesis) -> Hypothesis:

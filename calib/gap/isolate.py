@@ -19,8 +19,8 @@ from calib.gap.fit import Noise
 from calib.gap.forward import Forward, Hypothesis
 from calib.gap.hypotheses import LN_PRIOR
 from calib.models.base import Array
+from calib.sampling.curvature import hessian_scale
 from calib.sampling.mode import prior_widths
-from calib.sampling.proposal import hessian_scale
 from calib.streams import generator
 
 __all__ = ["Isolability", "isolability"]
@@ -29,6 +29,7 @@ _N_DRAWS = 64
 _Z_POWER = 0.8416  # 80 % power
 _LN_ODDS = float(np.log(10.0))  # an effect is named when it is ten times as probable as none
 ALIKE = 0.95
+_NOTHING = 1e-6  # noise sds
 
 
 @dataclass(frozen=True)
@@ -43,11 +44,14 @@ class Isolability:
         Smallest size that is named with 80 % power, in noise sds rms over the field rows.
     likeness : mapping of (str, str) to float
         Cosine between what is left of two effects, best match over their priors.
+    idle : tuple of str
+        Effects that change nothing the models of this case predict.
     """
 
     absorbed: Mapping[str, float]
     detectable: Mapping[str, float]
     likeness: Mapping[tuple[str, str], float]
+    idle: tuple[str, ...] = ()
 
     @property
     def alike(self) -> list[tuple[str, str]]:
@@ -75,6 +79,8 @@ def isolability(
     """
     root = _metric_root(data, lab_mode, noise)
     raw = {h.name: _signatures(data, h, lab_mode, noise, seed) for h in single}
+    idle = tuple(name for name, g in raw.items() if not (np.abs(g) > _NOTHING).any())
+    raw = {name: g for name, g in raw.items() if name not in idle}
     left = {name: g @ root.T for name, g in raw.items()}
     absorbed, detectable = {}, {}
     ln_odds = _LN_ODDS + LN_PRIOR["none"] - LN_PRIOR["single"] + np.log(max(len(single), 1))
@@ -85,7 +91,7 @@ def isolability(
         share = float(np.median(kept[size > 1e-12])) if (size > 1e-12).any() else 0.0
         absorbed[name] = 1.0 - share
         detectable[name] = float(np.sqrt(needed / (g.shape[1] * max(share, 1e-6))))
-    return Isolability(absorbed, detectable, _likeness(left))
+    return Isolability(absorbed, detectable, _likeness(left), idle)
 
 
 def _likeness(left: Mapping[str, Array]) -> dict[tuple[str, str], float]:

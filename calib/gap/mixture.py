@@ -10,7 +10,7 @@ import numpy as np
 from calib.gap.case import Campaigns
 from calib.gap.effects import View
 from calib.gap.fit import Fit
-from calib.gap.relevance import relevance
+from calib.gap.refine import refine
 from calib.gap.which import Ranking
 from calib.models.base import Array
 from calib.streams import generator
@@ -20,6 +20,8 @@ __all__ = ["Mixture", "Truth", "mixture"]
 N_DRAWS = 1200
 # Hypotheses less probable than this are not drawn from.
 _NEGLIGIBLE = 2e-3
+# More probable than this, a hypothesis is worth draws of its own posterior.
+_WORTH_DRAWING = 0.05
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,11 @@ class Truth:
         cumulative = np.cumsum(self.weight[order], axis=0)
         index = np.argmax(cumulative >= q - 1e-12, axis=0)
         return np.asarray(ordered[index, np.arange(values.shape[1])])
+
+    @property
+    def means(self) -> dict[str, Array]:
+        """Mean of the truth of every output, shapes (n,)."""
+        return {name: self.mean(values) for name, values in self.truth.items()}
 
     def mean(self, values: Array) -> Array:
         """Weighted mean over the draws, shape (n,)."""
@@ -121,12 +128,13 @@ def mixture(data: Campaigns, ranking: Ranking, seed: int) -> Mixture:
         if ranking.probability[name] < _NEGLIGIBLE and fits:
             continue
         group = ranking.fits[name]
-        score = np.array([f.log_evidence + relevance(f, seed) for f in group])
+        score = np.array(ranking.scores[name])
         share = np.exp(score - score.max())
         share /= share.sum()
         for f, s in zip(group, share, strict=True):
             if s > 0.05:
-                fits.append(f)
+                matters = ranking.probability[name] * s > _WORTH_DRAWING
+                fits.append(refine(f, seed) if matters else f)
                 weights.append(ranking.probability[name] * float(s))
     total = sum(weights)
     return Mixture(data, tuple(fits), tuple(w / total for w in weights), seed)

@@ -68,7 +68,7 @@ def next_measurements(data: Campaigns, ranking: Ranking, seed: int) -> tuple[Nex
 
 
 def _best(ranking: Ranking, name: str) -> Fit:
-    return max(ranking.fits[name], key=lambda f: f.log_evidence)
+    return ranking.best(name)
 
 
 def _candidates(data: Campaigns, rng: np.random.Generator) -> dict[str, Array]:

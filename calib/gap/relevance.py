@@ -26,26 +26,27 @@ __all__ = ["RELEVANT", "relevance", "sizes"]
 
 RELEVANT = 1.25
 RELEVANT_IN_PAIR = 0.8
-_N_DRAWS = 160
 
 
-def relevance(fit: Fit, seed: int) -> float:
+def relevance(fit: Fit, seed: int, draws: int) -> float:
     """Log of the factor by which restricting a hypothesis to relevant sizes changes its evidence.
 
     Parameters
     ----------
     fit : Fit
     seed : int
+    draws : int
+        Of the prior and of the posterior.
     """
     hypothesis = fit.forward.hypothesis
     if hypothesis.name == "none":
         return 0.0
     rng = generator(seed, "gap", "relevance", hypothesis.name)
-    posterior = fit.draws(rng, _N_DRAWS)
+    posterior = fit.draws(rng, draws)
     # Prior draws of the effect about the simulator as it was fitted.
-    prior = np.repeat(fit.psi[None], _N_DRAWS, axis=0)
-    drawn = fit.forward.priors.sample(rng, _N_DRAWS)
-    first_effect = max(s.stop for s in fit.forward.theta_slices.values())
+    prior = np.repeat(fit.psi[None], draws, axis=0)
+    drawn = fit.forward.priors.sample(rng, draws)
+    first_effect = max(s.stop for s in fit.forward.misfit_slices.values())
     prior[:, first_effect:] = drawn[:, first_effect:]
     return _log_share(sizes(fit, posterior)) - _log_share(sizes(fit, prior))
 
@@ -61,11 +62,13 @@ def _log_share(size: Array) -> float:
 def sizes(fit: Fit, psi: Array) -> Array:
     """Size of each effect in noise sds, rms over field rows and outputs, shape (k, n_effects).
 
-    A parameter shift or a free discrepancy counts as one effect.
+    A parameter shift or a free discrepancy counts as one effect; of a discrepancy on top of an
+    effect the size is that of the discrepancy.
     """
     forward = fit.forward
     hypothesis = forward.hypothesis
     data = forward.data
+    named = bool(hypothesis.effects) or hypothesis.shift > 0.0
     if len(hypothesis.effects) > 1:
         # The form errors belong to the pair; each effect's own size is that of its formula.
         psi = psi.copy()
@@ -73,7 +76,12 @@ def sizes(fit: Fit, psi: Array) -> Array:
             psi[:, s] = 0.0
     with np.errstate(all="ignore"):
         full = forward.field(psi, data.view)
-        if len(hypothesis.effects) <= 1:
+        if hypothesis.smooth_outputs and named:
+            rest = psi.copy()
+            for s in forward.smooth_slices.values():
+                rest[:, s] = 0.0
+            without = [forward.field(rest, data.view)]
+        elif len(hypothesis.effects) <= 1:
             without = [forward.simulator(psi, data.view)]
         else:
             without = [_lone(forward, psi, i) for i in range(len(hypothesis.effects))]
@@ -104,5 +112,7 @@ def _lone(forward: Forward, psi: Array, idle: int) -> dict[str, Array]:
     short = np.zeros((psi.shape[0], reduced.n_dim))
     for name, s in reduced.theta_slices.items():
         short[:, s] = psi[:, forward.theta_slices[name]]
+    for name, s in reduced.misfit_slices.items():
+        short[:, s] = psi[:, forward.misfit_slices[name]]
     short[:, reduced.phi_slices[0]] = psi[:, forward.phi_slices[keep]]
     return reduced.field(short, forward.data.view)

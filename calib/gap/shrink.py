@@ -59,7 +59,9 @@ def predict_fresh(truth: Truth, before: Mapping[str, Array]) -> dict[str, FreshP
     }
 
 
-def shrink(data: Campaigns, truth: Truth, before: Mapping[str, Array]) -> dict[str, Shrink]:
+def shrink(
+    data: Campaigns, truth: Truth, before: Mapping[str, Array], after: Mapping[str, Array]
+) -> dict[str, Shrink]:
     """Posterior of the shrink of every output that probably has a gap.
 
     Parameters
@@ -67,20 +69,21 @@ def shrink(data: Campaigns, truth: Truth, before: Mapping[str, Array]) -> dict[s
     data : Campaigns
     truth : Truth
         At conditions that were not fitted.
-    before : mapping of str to ndarray, shape (n,)
+    before, after : mapping of str to ndarray, shape (n,)
+        Predictions by the simulator as it was calibrated, and with the correction.
     """
-    found = {o.name: _shrink_of(truth, before[o.name], o.name) for o in data.outputs}
+    found = {o.name: _shrink_of(truth, before[o.name], after[o.name], o.name) for o in data.outputs}
     return {name: value for name, value in found.items() if value is not None}
 
 
-def _shrink_of(truth: Truth, before: Array, name: str) -> Shrink | None:
+def _shrink_of(truth: Truth, before: Array, after: Array, name: str) -> Shrink | None:
     values = truth.truth[name]
     floor = np.sqrt(np.square(truth.noise[name]).mean(axis=1))
     gap = np.sqrt(np.square(values - truth.simulator[name]).mean(axis=1))
     if float(truth.weight @ (gap > _SMALLEST * floor)) < 0.5:
         return None
     before_error = np.sqrt(np.square(values - before).mean(axis=1))
-    after_error = np.sqrt(np.square(values - truth.mean(values)).mean(axis=1))
+    after_error = np.sqrt(np.square(values - after).mean(axis=1))
     fraction = 1.0 - after_error / np.maximum(before_error, 1e-12)
 
     def quantile(draws: Array, q: float) -> float:

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.models.base import Array, Conditions, Model, References, columns
+from calib.models.base import Array, Columns, Conditions, Model, References, Rows
 
 __all__ = ["AYERS_PERUMPRAL", "AYERS_PERUMPRAL_VOLUMETRIC", "bulk_density"]
 
@@ -47,12 +47,31 @@ def _ln_water_term(water: Array | float, C2: Array, C3: Array) -> Array:
     return np.asarray(np.log(C2 + (water - C3) ** 2))
 
 
-def _location(theta: Array, conditions: Conditions, references: References) -> Array:
-    gamma_ref, C2, C3, C4 = columns(theta)
-    ln_index = np.log(conditions["cone_index_kpa"] / references["ci_ref_kpa"])
-    water = conditions["gravimetric_water_content"]
-    drier = _ln_water_term(water, C2, C3) - _ln_water_term(references["water_ref"], C2, C3)
-    return np.asarray(gamma_ref * np.exp((ln_index + drier) / C4))
+def _ln_index(conditions: Conditions, references: References) -> Array:
+    return np.asarray(np.log(conditions["cone_index_kpa"] / references["ci_ref_kpa"]))
+
+
+def _prepare(conditions: Conditions, references: References) -> Rows:
+    return {
+        "ln_index": _ln_index(conditions, references),
+        "water": conditions["gravimetric_water_content"],
+    }
+
+
+def _location(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+    gamma_ref, C2, C3, C4 = columns
+    # gamma_ref exp{(ln_index + ln(C2 + (water - C3)^2) - the same at water_ref)/C4}, in place.
+    x: Array = work[0]
+    np.subtract(rows["water"], C3, out=x)
+    x *= x
+    x += C2
+    np.log(x, out=x)
+    x += rows["ln_index"]
+    x -= _ln_water_term(references["water_ref"], C2, C3)
+    x *= 1.0 / C4
+    np.exp(x, out=x)
+    x *= gamma_ref
+    return x
 
 
 def _report(theta: Array, references: References) -> dict[str, Array]:
@@ -87,13 +106,20 @@ def _references_volumetric(conditions: Conditions) -> dict[str, float]:
     }
 
 
-def _location_volumetric(theta: Array, conditions: Conditions, references: References) -> Array:
-    gamma_ref, A2, A3, A4 = columns(theta)
-    ln_index = np.log(conditions["cone_index_kpa"] / references["ci_ref_kpa"])
-    water = conditions["volumetric_water_content"]
+def _prepare_volumetric(conditions: Conditions, references: References) -> Rows:
+    return {
+        "ln_index": _ln_index(conditions, references),
+        "water": conditions["volumetric_water_content"],
+    }
+
+
+def _location_volumetric(
+    columns: Columns, rows: Rows, references: References, work: Array
+) -> Array:
+    gamma_ref, A2, A3, A4 = columns
     ln_ref = np.log(gamma_ref)
-    target = A2 * ln_ref + ln_index - _ln_water_term(references["water_ref"] / gamma_ref, A3, A4)
-    return np.exp(_solve_ln_density(target, water, A2, A3, A4))
+    target = A2 * ln_ref - _ln_water_term(references["water_ref"] / gamma_ref, A3, A4)
+    return np.exp(_solve_ln_density(rows["ln_index"] + target, rows["water"], A2, A3, A4))
 
 
 def _solve_ln_density(target: Array, water: Array, A2: Array, A3: Array, A4: Array) -> Array:
@@ -117,7 +143,8 @@ def _solve_ln_density(target: Array, water: Array, A2: Array, A3: Array, A4: Arr
         value, slope = excess(x)
         low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
         step = x - value / slope
-        new = np.where((step > low) & (step < high), step, 0.5 * (low + high))
+        # Converged, the step ends on the bracket's edge, where x is.
+        new = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
         moved = np.abs(new - x)
         x = new
         if not np.any(moved[solvable] > 1e-13):
@@ -155,6 +182,7 @@ AYERS_PERUMPRAL = Model(
     report_theta=_report,
     theta_from_reported=_from_reported,
     bind_references=_references,
+    prepare=_prepare,
 )
 
 AYERS_PERUMPRAL_VOLUMETRIC = Model(
@@ -170,4 +198,5 @@ AYERS_PERUMPRAL_VOLUMETRIC = Model(
     report_theta=_report_volumetric,
     theta_from_reported=_from_reported_volumetric,
     bind_references=_references_volumetric,
+    prepare=_prepare_volumetric,
 )

@@ -10,21 +10,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
 
-__all__ = ["Array", "BoundModel", "Conditions", "Model", "References", "columns"]
+__all__ = [
+    "N_WORK", "Array", "BoundModel", "Columns", "Conditions", "Model", "References", "Rows",
+    "columns",
+]  # fmt: skip
+
+N_WORK = 3
 
 type Array = NDArray[np.float64]
 type References = Mapping[str, float]
 type Conditions = Mapping[str, Array]
+type Columns = tuple[Array, ...]
+# What an equation needs of the conditions, whatever the parameters; see `Model.prepare`.
+type Rows = Mapping[str, NDArray[Any]]
 
 
-def columns(theta: Array) -> tuple[Array, ...]:
+def columns(theta: Array) -> Columns:
     """Split parameter vectors into columns that broadcast against conditions.
 
     Parameters
@@ -40,6 +48,10 @@ def columns(theta: Array) -> tuple[Array, ...]:
 
 def _no_references(conditions: Conditions) -> dict[str, float]:
     return {}
+
+
+def _as_they_are(conditions: Conditions, references: References) -> Rows:
+    return conditions
 
 
 @dataclass(frozen=True)
@@ -61,14 +73,20 @@ class Model:
     response : {"identity", "log"}
         Scale on which the noise is additive.
     location : callable
-        ``(theta (k, d), conditions (n,), references) -> (k, n)``: the prediction on the scale of
-        the response; NaN where the equation has no value.
+        ``(columns, rows, references, work) -> prediction`` on the scale of the response; NaN where
+        the equation has no value. Columns of shape (k, 1) with rows of shape (n,) give (k, n);
+        columns of shape (1, k) with rows of shape (n, 1) give (n, k), for short data much faster.
+        `work`, shape (`N_WORK`, k, n) or (`N_WORK`, n, k), is memory for temporaries and the
+        result: fresh memory would cost more than the arithmetic.
     report_theta : callable
         ``(theta, references) -> {name: (k,)}``: published parameters from sampled ones.
     theta_from_reported : callable
         The inverse for one vector.
     bind_references : callable
         ``conditions -> references``.
+    prepare : callable
+        ``(conditions, references) -> rows``: what `location` needs of the conditions, worked out
+        once for any number of parameter vectors.
     """
 
     name: str
@@ -79,10 +97,11 @@ class Model:
     parameters: tuple[str, ...]
     reported: Mapping[str, str]
     response: Literal["identity", "log"]
-    location: Callable[[Array, Conditions, References], Array]
+    location: Callable[[Columns, Rows, References, Array], Array]
     report_theta: Callable[[Array, References], dict[str, Array]]
     theta_from_reported: Callable[[Mapping[str, float], References], Array]
     bind_references: Callable[[Conditions], dict[str, float]] = _no_references
+    prepare: Callable[[Conditions, References], Rows] = _as_they_are
 
     def bind(self, conditions: Conditions) -> BoundModel:
         """Fix the reference conditions to those of calibration data."""
@@ -116,7 +135,15 @@ class BoundModel:
     def location(self, theta: Array, conditions: Conditions) -> Array:
         """Predict on the scale of the response, shape (k, n)."""
         with np.errstate(all="ignore"):
-            return self.model.location(np.atleast_2d(theta), conditions, self.references)
+            by_column = columns(np.atleast_2d(theta))
+            shape = np.broadcast_shapes(by_column[0].shape, *(v.shape for v in conditions.values()))
+            work = np.empty((N_WORK, *shape))
+            return self.model.location(by_column, self.prepare(conditions), self.references, work)
+
+    def prepare(self, conditions: Conditions) -> Rows:
+        """Work out what the equation needs of conditions."""
+        with np.errstate(all="ignore"):
+            return self.model.prepare(conditions, self.references)
 
     def predict(self, theta: Array, conditions: Conditions) -> Array:
         """Predict the output in its canonical unit, shape (k, n)."""
@@ -132,7 +159,9 @@ class BoundModel:
 
     def report(self, theta: Array) -> dict[str, Array]:
         """Return the published parameters of each vector, each of shape (k,)."""
-        return self.model.report_theta(np.atleast_2d(theta), self.references)
+        # A published coefficient may be beyond all numbers where the sampled ones are not.
+        with np.errstate(all="ignore"):
+            return self.model.report_theta(np.atleast_2d(theta), self.references)
 
     def theta(self, reported: Mapping[str, float]) -> Array:
         """Return the sampled parameters of published ones, shape (d,)."""

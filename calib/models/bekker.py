@@ -14,7 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.models.base import Array, Conditions, Model, References, columns
+from calib.models.base import Array, Columns, Conditions, Model, References, Rows
 
 __all__ = ["BEKKER", "MODIFIED_BEKKER", "rut_depth"]
 
@@ -43,32 +43,38 @@ def rut_depth(
     return np.asarray((pressure_kpa / k) ** (1.0 / (n0 + n1 * slip_ratio)))
 
 
+def _prepare(conditions: Conditions, references: References) -> Rows:
+    ln_pressure = np.log(conditions["average_ground_pressure_kpa"] / references["p_ref_kpa"])
+    rows = {"ln_pressure": ln_pressure}
+    return rows | ({"slip": conditions["slip_ratio"]} if "slip_ratio" in conditions else {})
+
+
 def _ln_rut_mm(
-    pressure: Array, slip: Array | float, z_ref_mm: Array, n0: Array, n1: Array | float,
-    references: References,
-) -> Array:  # fmt: skip
-    exponent = n0 + n1 * slip
-    ln_z_ref = np.log(z_ref_mm) - LN_MM_PER_M
-    ln_pressure = np.log(pressure / references["p_ref_kpa"])
-    ln_z = (ln_pressure + n0 * ln_z_ref) / exponent
-    return np.asarray(np.where(exponent > 0.0, ln_z + LN_MM_PER_M, np.nan))
+    ln_pressure: Array, exponent: Array, z_ref_mm: Array, n0: Array, work: Array
+) -> Array:
+    ln_z: Array = work[0]
+    np.add(ln_pressure, n0 * (np.log(z_ref_mm) - LN_MM_PER_M), out=ln_z)
+    ln_z /= exponent
+    ln_z += LN_MM_PER_M
+    if not exponent.min() > 0.0:
+        np.copyto(ln_z, np.nan, where=~(exponent > 0.0))
+    return ln_z
 
 
 def _references(conditions: Conditions) -> dict[str, float]:
     return {"p_ref_kpa": float(np.exp(np.log(conditions["average_ground_pressure_kpa"]).mean()))}
 
 
-def _location_bekker(theta: Array, conditions: Conditions, references: References) -> Array:
-    z_ref, n = columns(theta)
-    return _ln_rut_mm(conditions["average_ground_pressure_kpa"], 0.0, z_ref, n, 0.0, references)
+def _location_bekker(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+    z_ref, n = columns
+    return _ln_rut_mm(rows["ln_pressure"], n, z_ref, n, work)
 
 
-def _location_modified(theta: Array, conditions: Conditions, references: References) -> Array:
-    z_ref, n0, n1 = columns(theta)
-    return _ln_rut_mm(
-        conditions["average_ground_pressure_kpa"], conditions["slip_ratio"], z_ref, n0, n1,
-        references,
-    )  # fmt: skip
+def _location_modified(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+    z_ref, n0, n1 = columns
+    exponent = np.multiply(n1, rows["slip"], out=work[1])
+    exponent += n0
+    return _ln_rut_mm(rows["ln_pressure"], exponent, z_ref, n0, work)
 
 
 def _k(z_ref_mm: Array, n0: Array, references: References) -> Array:
@@ -111,6 +117,7 @@ BEKKER = Model(
     report_theta=_report_bekker,
     theta_from_reported=_theta_bekker,
     bind_references=_references,
+    prepare=_prepare,
 )
 
 MODIFIED_BEKKER = Model(
@@ -126,4 +133,5 @@ MODIFIED_BEKKER = Model(
     report_theta=_report_modified,
     theta_from_reported=_theta_modified,
     bind_references=_references,
+    prepare=_prepare,
 )

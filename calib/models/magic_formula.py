@@ -15,9 +15,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.models.base import Array, Conditions, Model, References, columns
+from calib.models.base import Array, Columns, Conditions, Model, References, Rows
 
-__all__ = ["MAGIC_FORMULA", "magic_formula"]
+__all__ = ["MAGIC_FORMULA", "half_sine_in_place", "magic_formula"]
 
 
 def magic_formula(
@@ -53,10 +53,48 @@ def magic_formula(
     return np.asarray(Sv + D * np.sin(C * np.arctan(bx - E * (bx - np.arctan(bx)))))
 
 
-def _location(theta: Array, conditions: Conditions, references: References) -> Array:
-    K, C, D, G, Sh, Sv = columns(theta)
-    slip_percent = 100.0 * conditions["slip_ratio"]
-    return magic_formula(slip_percent, K / (C * D), C, D, 1.0 - G, Sh, Sv)
+def half_sine_in_place(bx: Array, work: Array, C: Array, G: Array) -> None:
+    """Turn B X into sin(C arctan[B X - E (B X - arctan B X)])/2 where it stands.
+
+    Parameters
+    ----------
+    bx : ndarray
+        B X; overwritten.
+    work : ndarray
+        Of the same shape; overwritten.
+    C, G : ndarray
+        G = 1 - E; broadcast against `bx`.
+
+    Notes
+    -----
+    BX - E(BX - arctan BX) = arctan BX + G(BX - arctan BX), and with t = tan(v/2)
+    sin(v)/2 = t/(1 + t^2): NumPy has vector instructions for the tangent, not for the sine.
+    """
+    np.arctan(bx, out=work)
+    bx -= work
+    bx *= G
+    bx += work
+    np.arctan(bx, out=bx)
+    bx *= 0.5 * C
+    np.tan(bx, out=bx)
+    np.multiply(bx, bx, out=work)
+    work += 1.0
+    bx /= work
+
+
+def _prepare(conditions: Conditions, references: References) -> Rows:
+    return {"slip_percent": 100.0 * conditions["slip_ratio"]}
+
+
+def _location(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+    K, C, D, G, Sh, Sv = columns
+    bx: Array = work[0]
+    np.subtract(rows["slip_percent"], Sh, out=bx)
+    bx *= K / (C * D)
+    half_sine_in_place(bx, work[1], C, G)
+    bx *= 2.0 * D
+    bx += Sv
+    return bx
 
 
 def _report(theta: Array, references: References) -> dict[str, Array]:
@@ -81,4 +119,5 @@ MAGIC_FORMULA = Model(
     location=_location,
     report_theta=_report,
     theta_from_reported=_from_reported,
+    prepare=_prepare,
 )

@@ -16,13 +16,14 @@ keeps the curve single-peaked.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
-from calib.models.base import Array, Conditions, Model, References, columns
-from calib.models.magic_formula import magic_formula
+from calib.models.base import Array, Columns, Conditions, Model, References, Rows, columns
+from calib.models.magic_formula import half_sine_in_place
 
 __all__ = ["MAGIC_FORMULA_PRESSURE", "coefficients_at"]
 
@@ -43,12 +44,12 @@ def _positive(low: Array, high: Array, bend: Array) -> NDArray[np.bool_]:
     )
 
 
-def _at(theta: tuple[Array, ...], u: Array) -> tuple[Array, Array, Array, Array]:
+def _at(columns: Columns, u: Array) -> tuple[Array, Array, Array, Array]:
     # K, D and G at once: one small array operation in the place of three.
-    low, high, bend = (np.stack(theta[j:9:3]) for j in range(3))
+    low, high, bend = (np.stack(columns[j:9:3]) for j in range(3))
     allowed = _positive(low, high, bend).all(axis=0)
     K, D, G = _quadratic(u, low, high, bend)
-    return K, theta[9], np.where(allowed, D, np.nan), 1.0 - G
+    return K, columns[9], np.where(allowed, D, np.nan), G
 
 
 def coefficients_at(theta: Array, pressure_psi: Array, references: References) -> dict[str, Array]:
@@ -65,25 +66,42 @@ def coefficients_at(theta: Array, pressure_psi: Array, references: References) -
     dict of ndarray, shape (k, n)
     """
     u = (np.asarray(pressure_psi) - references["p_mid_psi"]) / references["p_half_psi"]
-    K, C, D, E = _at(columns(np.atleast_2d(theta)), u)
-    return {"B": K / (C * D), "C": np.broadcast_to(C, D.shape), "D": D, "E": E}
+    K, C, D, G = _at(columns(np.atleast_2d(theta)), u)
+    return {"B": K / (C * D), "C": np.broadcast_to(C, D.shape), "D": D, "E": 1.0 - G}
 
 
-def _location(theta: Array, conditions: Conditions, references: References) -> Array:
+def _prepare(conditions: Conditions, references: References) -> Rows:
     pressure = conditions["inflation_pressure_psi"]
+    rows: dict[str, NDArray[Any]] = {"slip_percent": 100.0 * conditions["slip_ratio"]}
     if pressure.ndim == 1:
         # Few pressures, many slips: the quadratics are worked out once per distinct pressure.
-        distinct, inverse = np.unique(pressure, return_inverse=True)
-    else:
-        # A pressure for every parameter vector and row, as an uncertain gauge gives.
-        distinct, inverse = pressure, np.arange(pressure.shape[1])
-    u = (distinct - references["p_mid_psi"]) / references["p_half_psi"]
-    K, C, D, E = _at(columns(theta), u)
+        pressure, level = np.unique(pressure, return_inverse=True)
+        if pressure.size > 1:
+            rows["level"] = level
+    # Otherwise a pressure for every parameter vector and row, as an uncertain gauge gives.
+    rows["u"] = (pressure - references["p_mid_psi"]) / references["p_half_psi"]
+    return rows
+
+
+def _location(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+    K, C, D, G = _at(columns, rows["u"])
     # Extrapolated to other pressures, the quadratics may still turn negative.
     D = np.where((D > 0.0) & (K > 0.0), D, np.nan)
     B = K / (C * D)
-    slip_percent = 100.0 * conditions["slip_ratio"]
-    return magic_formula(slip_percent, B[:, inverse], C, D[:, inverse], E[:, inverse])
+    bx: Array = work[0]
+    np.multiply(_by_row(B, rows, bx), rows["slip_percent"], out=bx)
+    half_sine_in_place(bx, work[1], C, _by_row(G, rows, work[2]))
+    bx *= _by_row(2.0 * D, rows, work[1])
+    return bx
+
+
+def _by_row(value: Array, rows: Rows, out: Array) -> Array:
+    """Repeat the value of each distinct pressure for the rows at that pressure."""
+    if "level" not in rows:
+        return value
+    level = rows["level"]
+    # Clipping, which cannot happen, lets NumPy write into `out` without a copy.
+    return np.take(value, level.ravel(), axis=2 - level.ndim, out=out, mode="clip")
 
 
 def _monomials(low: Array, high: Array, bend: Array, references: References) -> tuple[Array, ...]:
@@ -173,4 +191,5 @@ MAGIC_FORMULA_PRESSURE = Model(
     report_theta=_report,
     theta_from_reported=_from_reported,
     bind_references=_references,
+    prepare=_prepare,
 )

@@ -20,6 +20,7 @@ from calib.page.tables import (
     posterior_rows,
     pressure_grids,
     prior_rows,
+    sensitivity_grid,
 )
 from calib.page.verdict import Evidence, Level, gather, judge_evidence
 from calib.study import Failure, OutputResult
@@ -108,6 +109,7 @@ def section(
         "estimates": estimates_grid(result, published=published),
         "by_pressure": pressure_grids(result, published=published),
         "posterior": posterior_rows(result),
+        "sensitivity": sensitivity_grid(result) if result.sensitivity else None,
         "sampling": sampling_facts(result),
         "validation": validation_facts(result, evidence.effective, evidence.low_coverage_p),
         "validation_title": _validation_title(result),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import io
 import shlex
 from collections.abc import Mapping, Sequence
 from functools import cache
@@ -12,6 +11,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
+from calib.figures.export import png
 from calib.figures.gap import gap_plates
 from calib.figures.gap_rows import (
     best_fit,
@@ -74,7 +74,7 @@ def write_page(found: Diagnosis, folder: Path, manifest: Mapping[str, Any]) -> N
         ``command`` and ``versions``, as `calib.manifest.build_manifest` has them; both optional.
     """
     plates = gap_plates(found)
-    images = {f"{p.name}.png": _png(p) for p in plates if p.figure is not None}
+    images = {f"{p.name}.png": png(p) for p in plates if p.figure is not None}
     (folder / "figures").mkdir(exist_ok=True)
     for name, image in images.items():
         (folder / "figures" / name).write_bytes(image)
@@ -255,10 +255,3 @@ def _figure(plate: Plate, images: Mapping[str, bytes]) -> dict[str, Any]:
         "uri": f"data:image/png;base64,{base64.b64encode(image).decode()}" if image else "",
         "size": png_size(image) if image else (0, 0),
     }
-
-
-def _png(plate: Plate) -> bytes:
-    buffer = io.BytesIO()
-    if plate.figure is not None:
-        plate.figure.savefig(buffer, format="png", dpi=150, metadata={"Software": None})
-    return buffer.getvalue()

@@ -8,11 +8,11 @@ from string import ascii_letters
 
 from markupsafe import Markup, escape
 
-from calib.figures.labels import MINUS, plain, stem_and_subscript
+from calib.figures.labels import MINUS, plain, stem_and_subscript, unbroken
 from calib.models import BoundModel
 
 __all__ = [
-    "equation", "likelihood", "parametrisation", "prose", "symbol_html", "unbroken", "unit_html",
+    "equation", "likelihood", "parametrisation", "prose", "symbol_html", "unit_html",
 ]  # fmt: skip
 
 _GREEK = {"sigma": Markup("&sigma;"), "gamma": Markup("&gamma;"), "theta": Markup("&theta;")}
@@ -49,11 +49,6 @@ def prose(text: str, names: Iterable[str]) -> Markup:
             escaped,
         )
     return Markup(escaped)
-
-
-def unbroken(text: str) -> str:
-    """Keep numbers and their units on one line."""
-    return re.sub(r"(\d) (%|kN|mm|psi|kPa|g/cm³|rows?\b)", "\\1\N{NO-BREAK SPACE}\\2", text)
 
 
 _MAGIC = (

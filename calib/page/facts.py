@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.figures.labels import axis_of, percent
 from calib.figures.rows import held_table, x_column
-from calib.page.numbers import TIMES, format_number, format_value
+from calib.numbers import TIMES, format_number, format_value
 from calib.study import OutputResult
 
 __all__ = ["repeats_words", "sampling_facts", "validation_facts", "worst_row"]

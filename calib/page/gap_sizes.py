@@ -15,11 +15,12 @@ from calib.figures.gap_rows import (
     output_word,
     unit_after,
 )
+from calib.figures.labels import joined
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit
 from calib.models.base import Array
-from calib.page.numbers import format_value
+from calib.numbers import format_value
 from calib.streams import generator
 
 __all__ = ["size_sentences"]
@@ -55,6 +56,8 @@ def size_sentences(found: Diagnosis, name: str) -> list[str]:
     psi = fit.draws(generator(found.seed, "gap", "size", name), _N_DRAWS)
     changes = _changes(found, fit, psi)
     effects = fit.forward.hypothesis.effects
+    if name == "unknown":
+        return [_lead(found, fit), *_rms_sentences(found, changes, together=False)]
     if len(effects) != 1:
         return _rms_sentences(found, changes, together=len(effects) > 1)
     effect = effects[0]
@@ -64,6 +67,50 @@ def size_sentences(found: Diagnosis, name: str) -> list[str]:
         if sentences:
             return sentences
     return _end_sentences(found, effect, changes)
+
+
+def _lead(found: Diagnosis, fit: Fit) -> str:
+    """Say what an effect that is not listed goes along with: where to look for it."""
+    h = fit.forward.hypothesis
+    own = {output_word(name) for name in h.smooth_outputs}
+    level = f"predicted {joined(sorted(own)).lower()}"
+    along = {
+        "slip": "slip", "level": f"the {level}", "sinkage": "the predicted rut depth",
+        "order": "the order of the runs", "all": "several conditions",
+    }  # fmt: skip
+    if h.onset_over is not None:
+        return f"what is missing sets in beyond {_threshold(found, fit)}"
+    on_top = ""
+    if h.effects:
+        on_top = f", on top of {h.effects[0].name.replace('_', ' ')}"
+    elif h.shift > 0.0:
+        on_top = ", on top of other parameter values"
+    return f"what is missing goes along with {along[h.smooth_over]}{on_top}"
+
+
+def _threshold(found: Diagnosis, fit: Fit) -> str:
+    forward, view = fit.forward, found.data.view
+    h = forward.hypothesis
+    output = h.smooth_outputs[0] if h.onset_over == "level" else "rut_depth"
+    u = forward.onset_covariate(view, output)
+    if h.onset_over in ("level", "sinkage"):
+        o = next(o for o in found.data.outputs if o.name == output)
+        with np.errstate(all="ignore"):
+            location = forward.simulator(fit.psi[None], view)[output]
+        axis = output_axis(found, output)
+        values = axis.factor * o.problem.bound.from_response(location)[0]
+        name, unit = f"a predicted {output_word(output).lower()} of", f" {axis.unit}"
+    else:
+        column = "slip_ratio" if h.onset_over == "slip" else "run_order"
+        shown = axis_name(column)
+        values, unit = shown.scale(view.conditions[column]), unit_after(shown)
+        name = "a slip of" if column == "slip_ratio" else "run"
+    order = np.argsort(u)
+    good = order[np.isfinite(values[order])]
+    at = float(np.interp(fit.psi[forward.threshold], u[good], values[good]))
+    sd = float(np.sqrt(fit.covariance[forward.threshold, forward.threshold]))
+    spread = abs(float(np.interp(fit.psi[forward.threshold] + sd, u[good], values[good])) - at)
+    return f"{name} {format_value(at, max(spread, 1e-3 * abs(at) + 1e-9))}{unit}"
 
 
 def _changes(found: Diagnosis, fit: Fit, psi: Array) -> dict[str, _Change]:

@@ -19,8 +19,8 @@ from calib.figures.gap_which import placebos
 from calib.figures.labels import MINUS
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
+from calib.numbers import format_number, format_value
 from calib.page.gap_verdict import TIE, odds_text, repeats_needed
-from calib.page.numbers import format_number, format_value
 from calib.priors import Prior
 
 __all__ = ["conditions_text", "hypothesis_groups", "next_rows", "parameter_text"]

@@ -159,8 +159,10 @@ def _judge(e: GapEvidence) -> GapVerdict:
             "There is a real gap, and no effect on the list explains it", facts,
         )  # fmt: skip
     if e.verdict == "ambiguous":
-        words = [c.words for c in _tied(e)]
-        headline = f"There is a gap, but the data cannot tell {joined(words)} apart"
+        tied = _tied(e)
+        words = [c.words for c in tied]
+        there_is = "There may be" if any(c.name == "none" for c in tied) else "There is"
+        headline = f"{there_is} a gap, but the data cannot tell {joined(words)} apart"
         if len(words) == 1:
             headline = f"There may be a gap; {words[0]} is the likeliest of many explanations"
         return GapVerdict(Tone.CARE, "tie", "Not told apart", headline, facts)

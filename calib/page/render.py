@@ -5,14 +5,16 @@ from __future__ import annotations
 import shlex
 from collections.abc import Mapping, Sequence
 from functools import cache
+from pathlib import PurePosixPath
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from calib.figures import Plate
+from calib.figures.labels import unbroken
 from calib.page.content import failed_section, section
-from calib.page.equations import unbroken
+from calib.publish import Publication
 from calib.study import OutputResult, Study
 
 __all__ = ["render_page"]
@@ -28,6 +30,7 @@ def _template() -> Template:
         lstrip_blocks=True,
     )
     environment.filters["unbroken"] = unbroken
+    environment.filters["basename"] = lambda path: PurePosixPath(path).name
     return environment.get_template("report.html.j2")
 
 
@@ -39,7 +42,9 @@ def render_page(
     manifest: Mapping[str, Any],
     title: str,
     reconstructed: bool,
+    gaps_html: str | None = None,
     audit_html: str | None = None,
+    paper: Publication | None = None,
 ) -> str:
     """Render the report.
 
@@ -55,8 +60,12 @@ def render_page(
     title : str
     reconstructed : bool
         Whether any data were reconstructed from published results.
+    gaps_html : str, optional
+        A section on the source's own gaps, from `calib.page.paper_gaps.write_gaps`.
     audit_html : str, optional
         A section to be placed before the appendix, as trusted HTML.
+    paper : Publication, optional
+        Tables and methods beside the page.
 
     Returns
     -------
@@ -73,7 +82,9 @@ def render_page(
         title=title,
         sections=sections,
         reconstructed=reconstructed,
+        gaps=Markup(gaps_html) if gaps_html else None,
         audit=Markup(audit_html) if audit_html else None,
+        paper=paper if paper is not None and paper.files else None,
         seed=study.seed,
         command=shlex.join(str(part) for part in manifest.get("command", ())),
         versions=manifest.get("versions", {}),

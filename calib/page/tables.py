@@ -2,36 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from markupsafe import Markup
 
-from calib.calibration import ParameterSummary
-from calib.datasets.published import PUBLISHED, FittedTable
+from calib.datasets.published import PUBLISHED, Figure, FittedTable
 from calib.estimators import PointEstimate
 from calib.figures.estimates import METHOD_NAMES
-from calib.figures.reference import published_table
+from calib.figures.reference import published_quality, published_table
 from calib.figures.roles import role
+from calib.numbers import NOTHING, format_as_printed, format_like, format_number
 from calib.page.equations import symbol_html, unit_html
-from calib.page.numbers import (
-    NOTHING,
-    TIMES,
-    format_interval,
-    format_like,
-    format_number,
-    format_value,
-)
+from calib.posterior_text import centre_text, interval_text, skewed
+from calib.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 from calib.study import OutputResult
 
 __all__ = [
-    "Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows", "skewed",
+    "Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows", "sensitivity_grid",
 ]  # fmt: skip
 
-# An HDI that spans more than this factor has neither a telling mean nor a telling sd.
-_DECADES = 30.0
 _TICK = "\N{CHECK MARK}"
+_MINUS = "\N{MINUS SIGN}"
 
 
 @dataclass(frozen=True)
@@ -75,8 +69,8 @@ def posterior_rows(result: OutputResult) -> list[dict[str, Any]]:
         {
             "symbol": symbol_html(s.name),
             "unit": unit_html(s.unit),
-            "value": mean_or_median(s),
-            "hdi": _interval(s.hdi_lower, s.hdi_upper, s.sd),
+            "value": centre_text(s),
+            "hdi": interval_text(s),
             "ess": f"{s.ess_bulk:.0f} / {s.ess_tail:.0f}",
             "rhat": f"{s.rhat:.3f}",
             "ratio": format_number(s.sd_ratio, 2),
@@ -87,22 +81,33 @@ def posterior_rows(result: OutputResult) -> list[dict[str, Any]]:
     ]
 
 
-def skewed(s: ParameterSummary) -> bool:
-    """Whether a mean and sd would mislead: larger sd than mean, or an HDI over decades."""
-    low, high = sorted((abs(s.hdi_lower), abs(s.hdi_upper)))
-    one_sign = s.hdi_lower * s.hdi_upper > 0.0
-    return s.sd > abs(s.mean) or (one_sign and high > _DECADES * low)
-
-
-def mean_or_median(s: ParameterSummary) -> str:
-    return f"median {format_number(s.median, 3)}" if skewed(s) else format_value(s.mean, s.sd)
-
-
-def _interval(lower: float, upper: float, sd: float) -> str:
-    # Where the sd is inflated by a long tail, its digits would round a bound away.
-    if min(abs(lower), abs(upper)) < 0.05 * sd:
-        return f"{format_number(lower, 2)} to {format_number(upper, 2)}"
-    return format_interval(lower, upper, sd)
+def sensitivity_grid(result: OutputResult) -> Grid:
+    """What each parameter owes to the prior, what to the data, and which are not identified."""
+    found = result.sensitivity
+    unknown = [symbol_html(name) for name, s in found.items() if not s.identified]
+    said = (
+        Markup("Not identified by these data: {}.").format(Markup(", ").join(unknown))
+        if unknown
+        else "Every parameter is identified by these data."
+    )
+    rows = [
+        [
+            symbol_html(name), format_number(s.contraction, 2), format_number(s.prior, 2),
+            format_number(s.likelihood, 2),
+            s.reading if s.identified else Markup("<strong>{}</strong>").format(s.reading),
+        ]
+        for name, s in found.items()
+    ]  # fmt: skip
+    head = ["Parameter", "Contraction", "Reacts to prior", "Reacts to data", "Identified by"]
+    notes = [
+        f"A parameter is not identified if its contraction, 1 {_MINUS} (posterior variance)/(prior "
+        f"variance), is below {CONTRACTION_MIN:g}, or if it reacts to the prior (at least "
+        f"{SENSITIVITY_MIN:g}) and not to the data (less).",
+        "Reacts to: how far its posterior moves per doubling of the power of the prior, or of the "
+        "likelihood (cumulative Jensen-Shannon distance; Kallioinen et al. 2024, "
+        "doi:10.1007/s11222-023-10366-5).",
+    ]
+    return Grid(said, head, rows, [], notes)
 
 
 def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
@@ -111,6 +116,7 @@ def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
         return None
     model = result.calibration.problem.bound.model
     table = published_table(model.name) if published else None
+    quality = published_quality(model.name) if table else None
     head: list[Any] = ["Parameter", "Unit"]
     head += [table.source] if table else []
     head += [METHOD_NAMES.get(e.method, e.method) for e in result.estimates]
@@ -132,7 +138,7 @@ def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
     if table:
         notes.insert(0, f"{_TICK}: equal to {table.source} in every printed digit.")
         notes += [f"{table.source}: {table.note}"] if table.note else []
-    return Grid(caption, head, rows, _quality_rows(result.estimates, table), notes)
+    return Grid(caption, head, rows, _quality_rows(result.estimates, quality), notes)
 
 
 def _estimate_row(
@@ -147,13 +153,12 @@ def _estimate_row(
         if printed is None:
             row.append(format_number(value, 4))
         else:
-            row.append(_ticked(_as_printed(value, printed.text), printed.agrees(value)))
+            row.append(_ticked(format_as_printed(value, printed.text), printed.agrees(value)))
     s = result.calibration.summary[name]
     if skewed(s):
-        interval = _interval(s.hdi_lower, s.hdi_upper, s.sd)
-        row.append(Markup("{}<br>HDI {}").format(mean_or_median(s), interval))
+        row.append(Markup("{}<br>HDI {}").format(centre_text(s), interval_text(s)))
     else:
-        row.append(format_value(s.mean, s.sd))
+        row.append(centre_text(s))
     return row
 
 
@@ -162,25 +167,21 @@ def _ticked(text: str, agrees: bool) -> Markup:
     return Markup('{}<span class="tick">{}</span>').format(text, _TICK if agrees else "")
 
 
-def _as_printed(value: float, printed: str) -> str:
-    """As printed, unless that would leave no digit of an estimate that is far smaller."""
-    text = format_like(value, printed)
-    return text if any(c in "123456789" for c in text.split(TIMES)[0]) else format_number(value, 3)
-
-
 def _quality_rows(
-    estimates: tuple[PointEstimate, ...], table: FittedTable | None
+    estimates: tuple[PointEstimate, ...], quality: Mapping[str, Figure] | None
 ) -> list[list[Any]]:
-    quality = table.quality if table else {}
+    """Rows on the fit; with a column of published figures, unless there is no table of them."""
 
     def row(label: str, unit: Any, key: str, values: list[str]) -> list[Any]:
-        printed = [quality[key].text if key in quality else NOTHING] if table else []
+        printed = []
+        if quality is not None:
+            printed = [quality[key].text if key in quality else NOTHING]
         return [label, unit, *printed, *values, NOTHING]
 
-    unit = unit_html(estimates[0].cost_unit)
+    unit, rmse_unit = (unit_html(u) for u in (estimates[0].cost_unit, estimates[0].rmse_unit))
     return [
         row("Cost (sum of squares)", unit, "cost", [format_number(e.cost, 4) for e in estimates]),
-        row("RMSE", NOTHING, "rmse", [format_number(e.rmse, 3) for e in estimates]),
+        row("RMSE", rmse_unit, "rmse", [format_number(e.rmse, 3) for e in estimates]),
         row("R²", NOTHING, "r_squared", [format_number(e.r_squared, 3) for e in estimates]),
         row("Evaluations", NOTHING, "", [f"{e.n_evaluations:,}" for e in estimates]),
         row("Stopped by its own rule", NOTHING, "",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from calib.chains import ess, rhat
+from calib.chains import convergence
 from calib.models.base import Array
 
 __all__ = ["Gate", "GateReport", "judge"]
@@ -62,16 +62,13 @@ def judge(
     min_ensembles : int
         Fewer cannot be compared.
 
-    Notes
-    -----
-    Walkers of one ensemble are not independent chains, so R-hat compares whole ensembles: each is
-    one chain, its halves the earlier and the later steps. Effective sample sizes take each walker
-    as a chain, for autocorrelation runs along its steps.
+    See Also
+    --------
+    calib.chains.convergence : How R-hat and effective sample sizes are taken.
     """
-    ensembles, walkers, steps, d = draws.shape
-    by_ensemble = draws.transpose(0, 2, 1, 3).reshape(ensembles, steps * walkers, d)
-    by_walker = draws.reshape(ensembles * walkers, steps, d)
-    r, bulk, tail = rhat(by_ensemble), ess(by_walker, "bulk"), ess(by_walker, "tail")
+    ensembles, _, steps, _ = draws.shape
+    found = convergence(draws)
+    r, bulk, tail = found.rhat, found.ess_bulk, found.ess_tail
     reasons = []
     if ensembles < min_ensembles:
         reasons.append(f"{ensembles} ensembles, at least {min_ensembles} are needed")

@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 
 import emcee
 import numpy as np
 
+from calib.chains import autocorrelation_time
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.problem import Problem
 from calib.sampling.gate import Gate, GateReport, judge
-from calib.sampling.mode import find_mode, prior_widths
+from calib.sampling.mode import find_modes
 from calib.sampling.moves import IndependenceMove
-from calib.sampling.proposal import Mixture, StudentT, adapt, hessian_scale
+from calib.sampling.proposal import AnyProposal, Guess, adapt, refit
 
 __all__ = ["Draws", "SamplerSettings", "sample_density", "sample_posterior"]
 
@@ -32,16 +33,16 @@ class SamplerSettings:
     ensembles : int
         Independently seeded ensembles.
     walkers : int, optional
-        In each ensemble; by default the smallest even number of at least twice the dimension
-        plus two, and 20.
+        In each ensemble; by default 64, of long data 20, but at least twice the dimension plus
+        two.
     steps : int
         Kept steps of the first attempt; doubled until the gate passes.
     max_steps : int
         Where doubling stops.
     keep : int
-        Steps of each walker that are stored, thinned evenly from the kept ones.
-    dof : float
-        Degrees of freedom of the proposal.
+        Draws of each ensemble that are stored, thinned evenly from the kept steps.
+    ahead : int
+        Steps whose independent proposals are evaluated in one batch.
     gate : Gate
     """
 
@@ -49,13 +50,13 @@ class SamplerSettings:
     walkers: int | None = None
     steps: int = 200
     max_steps: int = 25_600
-    keep: int = 200
-    dof: float = 6.0
+    keep: int = 4096
+    ahead: int = 16
     gate: Gate = field(default_factory=Gate)
 
     def n_walkers(self, n_dim: int) -> int:
         """Number of walkers for a dimension."""
-        return self.walkers or max(20, 2 * (n_dim + 1))
+        return self.walkers or max(64, 2 * (n_dim + 1))
 
 
 @dataclass(frozen=True)
@@ -124,24 +125,34 @@ def sample_posterior(
     CalibError
         If no parameters of positive probability can be found.
     """
-    chosen = settings or SamplerSettings()
+    chosen = _fitting(settings or SamplerSettings(), problem)
     root = np.random.SeedSequence(seed) if isinstance(seed, int) else seed
     seeds = root.spawn(1 + chosen.ensembles)
     rng = np.random.default_rng(seeds[0])
     began = time.perf_counter()
     count = _Counter(problem.log_prob)
-    mode = find_mode(count, problem.priors, rng, starts=starts)
-    if not np.isfinite(count(mode[None])[0]):
+    modes = find_modes(count, problem.priors, rng, starts=starts)
+    if not np.isfinite(count(modes[0].t[None])[0]):
         raise CalibError(
             "no parameter values of positive probability were found",
             where=problem.table.source,
             mend="check that the data's units and the priors' scales fit each other",
         )
-    scale = hessian_scale(count, mode, prior_widths(problem.priors))
-    first = StudentT(mode, np.linalg.cholesky(scale), chosen.dof)
+    first = [Guess(m.t, np.linalg.cholesky(m.covariance)) for m in modes]
     return sample_density(
         count, first, seeds, problem.names, chosen, rng=rng, progress=progress, began=began
     )
+
+
+def _fitting(settings: SamplerSettings, problem: Problem) -> SamplerSettings:
+    """Of long data fewer draws are taken: each is dear, and the posterior all but normal."""
+    if settings.walkers is not None or problem.squares.n_distinct <= _LONG:
+        return settings
+    walkers = max(20, 2 * (problem.n_dim + 1))
+    return replace(settings, walkers=walkers, steps=min(settings.steps, 100), ahead=1)
+
+
+_LONG = 5000
 
 
 class _Counter:
@@ -158,7 +169,7 @@ class _Counter:
 
 def sample_density(
     log_prob: Callable[[Array], Array],
-    first: StudentT,
+    first: Sequence[Guess],
     seeds: list[np.random.SeedSequence],
     names: tuple[str, ...],
     settings: SamplerSettings,
@@ -173,8 +184,8 @@ def sample_density(
     ----------
     log_prob : callable
         ``(k, d) -> (k,)``, unnormalised.
-    first : StudentT
-        The first guess, for instance from the curvature at the mode.
+    first : sequence of Guess
+        First guesses, the best first, for instance from the curvature at each mode.
     seeds : list of SeedSequence
         One for the adaptation (already used by `rng`) and one for each ensemble.
     names : tuple of str
@@ -187,79 +198,127 @@ def sample_density(
     """
     began = time.perf_counter() if began is None else began
     count = log_prob if isinstance(log_prob, _Counter) else _Counter(log_prob)
-    proposal, log_evidence, efficiency = adapt(count, first, rng)
-    samplers = [_Ensemble(count, proposal, efficiency, seed, settings) for seed in seeds[1:]]
+    proposal, found = adapt(count, first, rng)
+    ensembles = [_Ensemble(count, proposal, seed, settings) for seed in seeds[1:]]
     target = min(settings.steps, settings.max_steps)
+    done = 0
     while True:
-        planned = target + target // 4
-        for i, sampler in enumerate(samplers):
-            sampler.run_to(planned)
+        length = target + target // _DISCARDED
+        for i, ensemble in enumerate(ensembles):
+            ensemble.run(proposal, found.efficiency, length)
             if progress is not None:
-                progress((i + 1) * planned, len(samplers) * planned)
-        t = np.stack([s.chain(target) for s in samplers])
-        tau = np.stack([s.tau(target) for s in samplers]).max(axis=0)
+                progress(done + (i + 1) * length, done + len(ensembles) * length)
+        done += len(ensembles) * length
+        t = np.stack([e.chain(target) for e in ensembles])
+        tau = np.stack([e.tau(target) for e in ensembles]).max(axis=0)
         report = judge(t, names, settings.gate, tau=tau)
+        log_probs = np.stack([e.log_prob(target) for e in ensembles])
+        if report.passed and found.efficiency > _POOR:
+            report = _refuse_neglect(report, proposal, t, log_probs)
         if report.passed or target * 2 > settings.max_steps:
             break
         target *= 2
-    picked = np.linspace(0, target - 1, min(settings.keep, target)).round().astype(int)
-    log_probs = np.stack([s.log_prob(target) for s in samplers])
+        proposal, found = refit(count, proposal, *_pooled(t, report), rng)
+    kept = min(target, max(1, settings.keep // t.shape[1]))
+    picked = np.linspace(0, target - 1, kept).round().astype(int)
     return Draws(
         t=t[:, :, picked],
         log_prob=log_probs[:, :, picked],
         report=report,
-        mode=first.mean,
-        log_evidence=log_evidence,
-        efficiency=efficiency,
-        acceptance=float(np.mean([s.acceptance for s in samplers])),
+        mode=first[0].mean,
+        log_evidence=found.log_evidence,
+        efficiency=found.efficiency,
+        acceptance=float(np.mean([e.acceptance for e in ensembles])),
         evaluations=count.evaluations,
         seconds=time.perf_counter() - began,
     )
 
 
+# One step in so many is run before those that are kept.
+_DISCARDED = 6
+# Efficiency below which the local moves do most of the work, and the share of a good proposal.
+_POOR, _INDEPENDENT = 0.1, 0.9
+_POOLED = 20_000
+# A region of at least this part of the draws must have been proposed at least so often.
+_LEAST_REGION, _LEAST_PROPOSED = 0.003, 5.0
+
+
+def _refuse_neglect(
+    report: GateReport, proposal: AnyProposal, t: Array, log_prob: Array
+) -> GateReport:
+    """Refuse draws some of which lie where the proposal would not have gone.
+
+    A walker that a local move, or luck, has carried to a tail or a mode of which the proposal
+    knows nothing stays there, and the others never follow: R-hat sees little of it, and what the
+    walkers say of the region is luck. Of draws from pi, those in a region stand for a part of the
+    proposal q that is proportional to the mean of q/pi over them.
+    """
+    every = max(1, log_prob.size // _POOLED)
+    flat, value = t.reshape(-1, t.shape[-1])[::every], log_prob.ravel()[::every]
+    log_ratio = proposal.log_prob(flat) - value
+    ratio = np.sort(np.exp(log_ratio - log_ratio.max()))
+    proposed = log_prob.size * np.cumsum(ratio) / ratio.sum()
+    region = np.arange(1, ratio.size + 1) / ratio.size
+    neglected = region[(region >= _LEAST_REGION) & (proposed < _LEAST_PROPOSED)]
+    if not neglected.size:
+        return report
+    reason = f"{neglected.max():.1%} of the draws lie where hardly any was proposed"
+    return replace(report, passed=False, reasons=(reason,))
+
+
+def _pooled(t: Array, report: GateReport) -> tuple[Array, float]:
+    """Draws of all ensembles, thinned, and what they are worth."""
+    flat = t.reshape(-1, t.shape[-1])
+    worth = report.ess_bulk[np.isfinite(report.ess_bulk)].min(initial=np.inf)
+    return flat[:: max(1, flat.shape[0] // _POOLED)], float(min(worth, flat.shape[0]))
+
+
 class _Ensemble:
-    """One independently seeded emcee ensemble that can be run further."""
+    """One independently seeded emcee ensemble that is run in stretches of a fixed kernel each."""
 
     def __init__(
         self,
         log_prob: Callable[[Array], Array],
-        proposal: Mixture,
-        efficiency: float,
+        proposal: AnyProposal,
         seed: np.random.SeedSequence,
         settings: SamplerSettings,
     ) -> None:
-        d = proposal.n_dim
-        walkers = settings.n_walkers(d)
+        self.log_prob_fn = log_prob
+        self.walkers = settings.n_walkers(proposal.n_dim)
+        self.ahead = settings.ahead
+        start, self.rng = (np.random.default_rng(child) for child in seed.spawn(2))
+        self.random_state = np.random.RandomState(np.random.MT19937(seed)).get_state()
+        self.state = _start(log_prob, proposal, self.walkers, start)
+
+    def run(self, proposal: AnyProposal, efficiency: float, steps: int) -> None:
+        """Run on with a proposal, forgetting the steps before."""
         # A good proposal does most of the work; a poor one leaves it to the local moves.
-        independent = 0.8 if efficiency > 0.1 else 0.3
+        independent = _INDEPENDENT if efficiency > _POOR else 0.3
         local = 1.0 - independent
         self.sampler = emcee.EnsembleSampler(
-            walkers,
-            d,
-            log_prob,
+            self.walkers,
+            proposal.n_dim,
+            self.log_prob_fn,
             vectorize=True,
             moves=[
-                (IndependenceMove(proposal), independent),
+                (IndependenceMove(proposal, self.rng, self.ahead), independent),
+                # Not emcee's snooker move: with half the exponent of ter Braak & Vrugt (2008) in
+                # its acceptance it does not keep a normal. Whole differences jump between modes.
                 (emcee.moves.DEMove(), 0.7 * local),
-                (emcee.moves.DESnookerMove(), 0.3 * local),
+                (emcee.moves.DEMove(gamma0=1.0), 0.3 * local),
             ],
         )
-        state = np.random.RandomState(np.random.MT19937(seed)).get_state()
-        self.sampler.random_state = state
-        if not np.array_equal(self.sampler.random_state[1], state[1]):
+        self.sampler.random_state = self.random_state
+        if not np.array_equal(self.sampler.random_state[1], self.random_state[1]):
             # emcee ignores a state it does not like; the run would not be reproducible.
             raise RuntimeError("emcee did not take the random state")
-        self.start = _start(log_prob, proposal, walkers, np.random.default_rng(seed.spawn(1)[0]))
-        self.steps = 0
-
-    def run_to(self, steps: int) -> None:
-        if steps > self.steps:
-            initial = self.start if self.steps == 0 else None
-            with warnings.catch_warnings():
-                # numpy 2 deprecates what emcee does inside its moves.
-                warnings.simplefilter("ignore", DeprecationWarning)
-                self.sampler.run_mcmc(initial, steps - self.steps, skip_initial_state_check=True)
-            self.steps = steps
+        with warnings.catch_warnings():
+            # numpy 2 deprecates what emcee does inside its moves.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            end = self.sampler.run_mcmc(self.state, steps, skip_initial_state_check=True)
+        # The random state travels apart, as a start may be without one.
+        self.state = emcee.State(end.coords, log_prob=end.log_prob, copy=True)
+        self.random_state = self.sampler.random_state
 
     def chain(self, target: int) -> Array:
         """The last `target` steps, shape (walkers, target, d)."""
@@ -267,40 +326,40 @@ class _Ensemble:
         return kept.transpose(1, 0, 2)
 
     def log_prob(self, target: int) -> Array:
+        """Log densities of the last `target` steps, shape (walkers, target)."""
         kept: Array = self.sampler.get_log_prob()[-target:]
         return kept.T
 
     def tau(self, target: int) -> Array:
-        chain = self.sampler.get_chain()[-target:]
+        """Autocorrelation times over the last `target` steps, shape (d,)."""
         # A constant chain has no autocorrelation time; it must fail the gate.
-        with np.errstate(invalid="ignore"):
-            tau = emcee.autocorr.integrated_time(chain, quiet=True, tol=0)
+        tau = autocorrelation_time(self.chain(target))
         return np.where(np.isfinite(tau), np.maximum(tau, 1.0), np.inf)
 
     @property
     def acceptance(self) -> float:
+        """Fraction of proposals accepted."""
         return float(np.mean(self.sampler.acceptance_fraction))
 
 
 def _start(
     log_prob: Callable[[Array], Array],
-    proposal: Mixture,
+    proposal: AnyProposal,
     walkers: int,
     rng: np.random.Generator,
-) -> Array:
+) -> emcee.State:
     """Overdispersed starting points, every one of positive probability.
 
     emcee accepts walkers that start where the density is zero without a word.
     """
-    found: list[Array] = []
-    n = 0
-    for _ in range(200):
-        drawn = proposal.sample(rng, 4 * walkers)
-        good = drawn[np.isfinite(log_prob(drawn))]
-        found.append(good)
-        n += good.shape[0]
-        if n >= walkers:
-            return np.concatenate(found)[:walkers]
+    coords, values = np.empty((0, proposal.n_dim)), np.empty(0)
+    for _ in range(500):
+        drawn = proposal.sample(rng, walkers)
+        value = log_prob(drawn)
+        good = np.isfinite(value)
+        coords, values = np.concatenate([coords, drawn[good]]), np.append(values, value[good])
+        if values.size >= walkers:
+            return emcee.State(coords[:walkers], log_prob=values[:walkers])
     raise CalibError(
         "the sampler could not be started: almost no parameters near the mode are allowed",
         mend="widen the priors' bounds, or check the data's units",

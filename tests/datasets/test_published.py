@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from calib.datasets.published import DOI, PUBLISHED, Figure
+from calib.datasets.published import DOI, PUBLISHED, Figure, printed_figures
 
 
 def test_a_figure_knows_its_printed_digits() -> None:
@@ -46,3 +46,14 @@ def test_every_negative_sign_says_what_it_was_inferred_from() -> None:
     for table in tables:
         for name, figure in table.estimates.items():
             assert figure.note or "-" not in figure.text, (table.source, name)
+
+
+def test_every_printed_figure_is_listed_once() -> None:
+    found = printed_figures(PUBLISHED)
+    # Tables 1 and 6: 4 + 3 and 3 + 7; Tables 3 and 4: 5 for each pressure; Table 5: 10 + 1.
+    tables = 7 + 10 + 2 * 3 * 5 + 11
+    setup = len(PUBLISHED.setup.genetic_settings) + 3 + 2 + 8
+    assert len(found) == tables + setup
+    assert found["Table 4, 18 psi: E"].text == "-0.1026"
+    assert found["Table 2: NP"].value == 50
+    assert found["Setup: contact length, 42 psi"].unit == "mm"

@@ -13,6 +13,7 @@ from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.prediction import predictive_draws
 from calib.problem import Problem, build_problem
+from calib.sensitivity import prior_sensitivity
 from calib.study import HoldOut, OutputResult, Task
 from calib.validate import leave_one_out, validate_held_out
 
@@ -60,4 +61,5 @@ def build(calibration: Calibration, held: Table | None = None) -> OutputResult:
         _prior_predictive(problem, rng),
         predictive_draws(calibration, problem.conditions, rng, 500)[1],
         {"sample": 1.0},
+        prior_sensitivity(calibration),
     )

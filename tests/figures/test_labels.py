@@ -21,7 +21,7 @@ TIMES = "\N{MULTIPLICATION SIGN}"
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.0, "0"), (0.0996, "0.10"), (1234.0, "1234"), (-0.5, f"{MINUS}0.50"),
+    [(0.0, "0"), (0.0996, "0.10"), (1234.0, "1200"), (-0.5, f"{MINUS}0.50"),
      (4.3e8, f"4.3{TIMES}10⁸"), (1.9e-6, f"1.9{TIMES}10⁻⁶"),
      (float("nan"), "\N{EN DASH}"), (99.6, "100")],
 )  # fmt: skip

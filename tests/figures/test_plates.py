@@ -70,7 +70,7 @@ def test_shared_axes_are_labelled_at_the_edge(drawn):
 
 def test_corner_labels_every_parameter_with_its_unit(drawbar):
     texts = [t.get_text() for t in corner_plate(drawbar, published=True).figure.axes[0].texts]
-    for symbol in (r"$K_\mathrm{lo}$ (kN/%)", r"$D_\mathrm{hi}$ (kN)", r"$\sigma$ (kN)"):
+    for symbol in ("$K_\\mathrm{lo}$\n(kN/%)", "$D_\\mathrm{hi}$\n(kN)", "$\\sigma$\n(kN)"):
         assert symbol in texts
     assert any("dashed: published" in t for t in texts)
 

@@ -33,11 +33,12 @@ TRUTH: Mapping[str, Mapping[str, float]] = {
     },
     "magic_formula": {"K": 0.12, "C": 1.5, "D": 1.4, "G": 3.0, "Sh": 0.0, "Sv": 0.0},
     "modified_bekker": {"z_ref": 25.0, "n0": 1.0, "n1": 0.6},
+    "bekker": {"z_ref": 25.0, "n": 1.0},
 }  # fmt: skip
 # Sizes that are large beside the noise.
 LARGE: Mapping[str, Mapping[str, float]] = {
     "force_offset": {"offset": 0.12},
-    "sensor_drift": {"drift": 0.25, "curvature": 1.0, "zero_at": 0.0},
+    "sensor_drift": {"drift": 0.25, "curvature": 1.0, "half_way": 10.0, "zero_at": 0.0},
     "slip_zero_shift": {"radius_error": 0.05},
     "rate_effect": {"pull": 0.08, "slope": 0.08, "rut": -0.08},
     "lug_thrust": {"thrust": 0.09, "slip_scale": 0.25, "digging": 0.15},

@@ -34,7 +34,7 @@ def content(out: Path) -> dict[str, bytes]:
     return {
         p.relative_to(out).as_posix(): p.read_bytes()
         for p in sorted(out.rglob("*"))
-        if p.is_file() and p.suffix in (".json", ".csv") and p.name != "manifest.json"
+        if p.is_file() and p.suffix in (".json", ".csv") and p.name != "seconds.csv"
     }
 
 
@@ -47,7 +47,7 @@ def test_folders_with_a_case_in_them_are_found(cases, tmp_path):
 def test_every_case_has_its_diagnosis(done):
     assert json.loads((done / "case-0" / "diagnosis.json").read_text())["verdict"] == "none"
     assert json.loads((done / "case-1" / "diagnosis.json").read_text())["verdict"] != "none"
-    assert sorted(p.name for p in done.iterdir()) == ["case-0", "case-1"]
+    assert sorted(p.name for p in done.iterdir()) == ["case-0", "case-1", "seconds.csv"]
 
 
 def test_two_workers_write_the_same_bytes(cases, done, tmp_path):
@@ -60,7 +60,7 @@ def test_what_is_there_is_not_done_again(cases, done, monkeypatch):
     def refuse(*args, **kwargs):
         raise AssertionError("done again")
 
-    monkeypatch.setattr(batch, "_one", refuse)
+    monkeypatch.setattr(batch, "read_case", refuse)
     seen = []
     assert diagnose_cases(cases, done, 1, progress=lambda *p: seen.append(p)) == {}
     assert seen == [(2, 2)]
@@ -83,17 +83,18 @@ def test_a_case_that_fails_is_reported_and_leaves_nothing(cases, tmp_path):
     failed = diagnose_cases([bad, cases[0]], tmp_path / "out", 1)
     assert list(failed) == ["bad"]
     assert "lab.csv" in failed["bad"]
-    assert [p.name for p in (tmp_path / "out").iterdir()] == ["case-0"]
+    assert {p.name for p in (tmp_path / "out").iterdir() if p.is_dir()} == {"case-0"}
+    assert json.loads((tmp_path / "out" / "failed.json").read_text()) == failed
 
 
 def test_an_interruption_leaves_no_half_written_folder(cases, tmp_path, monkeypatch):
-    from calib.gap import files
+    from calib.gap import batch
 
     def stop(found, folder):
         (folder / "diagnosis.json").write_text("{")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(files, "write_diagnosis", stop)
+    monkeypatch.setattr(batch, "write_diagnosis", stop)
     with pytest.raises(KeyboardInterrupt):
         diagnose_cases(cases[:1], tmp_path / "out", 1)
-    assert list((tmp_path / "out").iterdir()) == []
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["seconds.csv"]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from calib.gap.effects import EFFECTS, View
+from calib.gap.effects.base import saturating
 from calib.prior_files import default_prior_path, read_priors
 from gap.cases import make_case, parameters, simulate
 
@@ -35,7 +36,7 @@ SIZES = {
 SOME: Mapping[str, tuple[Mapping[str, float], int | None, int | None]] = {
     "slip_zero_shift": ({"radius_error": 0.05}, 1, 1),
     "force_offset": ({"offset": 0.2}, 1, None),
-    "sensor_drift": ({"drift": 0.2, "curvature": 1.0, "zero_at": 0.0}, 1, None),
+    "sensor_drift": ({"drift": 0.2, "curvature": 1.0, "half_way": 1e9, "zero_at": 0.0}, 1, None),
     "pressure_gauge_bias": ({"gain": 0.3}, -1, 1),
     "multipass_compaction": ({"pull": 0.1, "rut": -0.1}, 1, -1),
     "rate_effect": ({"pull": 0.1, "rut": -0.1}, 1, -1),
@@ -43,7 +44,11 @@ SOME: Mapping[str, tuple[Mapping[str, float], int | None, int | None]] = {
     "bulldozing_resistance": ({"resistance": 0.05}, -1, None),
     "lug_thrust": ({"thrust": 0.1, "digging": 0.3}, 1, 1),
     "slip_sinkage": ({"growth": 0.8, "pull_loss": 0.05}, -1, 1),
-    "rut_rebound": ({"towed": 0.05, "growth": 0.5, "slip_exponent": 1.0}, None, -1),
+    "rut_rebound": (
+        {"towed": 0.05, "growth": 0.5, "slip_exponent": 1.0, "half_way": 1e9},
+        None,
+        -1,
+    ),
     "post_peak_softening": ({"loss": 0.4, "peak_slip": 0.2, "slip_scale": 0.2}, -1, None),
     "load_transfer": ({"transfer": 0.4}, 1, 1),
 }
@@ -142,14 +147,20 @@ def test_outputs_that_it_changes_are_the_ones_it_states(name, view):
 def test_amounts(view):
     np.testing.assert_allclose(apply("force_offset", {"offset": 0.2}, "drawbar_pull", view), 0.2)
     drift = apply(
-        "sensor_drift", {"drift": 0.2, "curvature": 1.0, "zero_at": 0.25}, "drawbar_pull", view
+        "sensor_drift",
+        {"drift": 0.2, "curvature": 1.0, "half_way": 1e9, "zero_at": 0.25},
+        "drawbar_pull",
+        view,
     )[0]
     # Linear from the first run to the last, about its zero; the first run is taken at u = 0.001.
     np.testing.assert_allclose(drift, 0.2 * (np.arange(20) / 19.0 - 0.25), atol=3e-4)
     rate = apply("rate_effect", {"rut": 0.5}, "rut_depth", view)[0]
     np.testing.assert_allclose(rate, 0.5 * np.log(view.conditions["speed_m_s"] / 0.3))
     rut = apply(
-        "rut_rebound", {"towed": 0.1, "growth": 0.5, "slip_exponent": 1.0}, "rut_depth", view
+        "rut_rebound",
+        {"towed": 0.1, "growth": 0.5, "slip_exponent": 1.0, "half_way": 1e9},
+        "rut_depth",
+        view,
     )[0]
     np.testing.assert_allclose(rut, -0.1 - 0.5 * view.slip())
     lug = apply("lug_thrust", {"thrust": 0.1, "slip_scale": 0.2}, "drawbar_pull", view)[0]
@@ -263,3 +274,16 @@ def test_signs_hold_with_the_simulators_own_curves():
                 np.testing.assert_allclose(change, 0.0, atol=1e-12)
             else:
                 assert (sign * change > 0.0).all()
+
+
+def test_growth_that_levels_off():
+    u = np.linspace(0.01, 1.0, 50)
+    one = np.ones((1, 1))
+    # Far from half way it is the plain power, far beyond it a step; 0 at 0 and 1 at 1 always.
+    np.testing.assert_allclose(saturating(u, 1.7 * one, 1e4 * one)[0], u**1.7, rtol=1e-5)
+    steep = saturating(u, 60.0 * one, 0.5 * one)[0]
+    np.testing.assert_allclose(steep[u < 0.4], 0.0, atol=1e-5)
+    np.testing.assert_allclose(steep[u > 0.6], 1.0, atol=1e-4)
+    assert saturating(np.ones(1), 0.6 * one, 0.2 * one) == pytest.approx(1.0)
+    warm = saturating(u, one, 0.2 * one)[0]
+    np.testing.assert_allclose(warm, 1.2 * u / (u + 0.2))

@@ -81,7 +81,7 @@ def test_parameters_of_a_pair_carry_their_effects_name(written):
     pair = next(e for e in effects if e["name"] == "force_offset+sensor_drift")
     assert set(pair["parameters"]) == {
         "force_offset.offset", "sensor_drift.drift", "sensor_drift.curvature",
-        "sensor_drift.zero_at",
+        "sensor_drift.half_way", "sensor_drift.zero_at",
     }  # fmt: skip
     single = next(e for e in effects if e["name"] == "sensor_drift")
     assert single["parameters"]["drift"]["mean"] == pytest.approx(0.25, abs=0.1)

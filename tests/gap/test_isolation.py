@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -56,9 +57,12 @@ def test_only_the_case_and_the_priors_are_opened(tmp_path):
     key.write_text(json.dumps({"case-000": "force_offset"}))
     (case.parent / "case-000-key.json").write_text("{}")
     out = tmp_path / "out" / "case-000"
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
     ran = subprocess.run(
         [sys.executable, "-c", _WATCH, str(case), str(out.parent)],
         capture_output=True, text=True, check=True, timeout=120,
+        env={**os.environ, "TMPDIR": str(scratch)},
     )  # fmt: skip
     found = json.loads(ran.stdout.splitlines()[-1])
     assert found["failed"] == {}
@@ -70,7 +74,7 @@ def test_only_the_case_and_the_priors_are_opened(tmp_path):
     assert all(p.parent == case for p in inside)
     priors = default_prior_path("magic_formula").parent
     package = Path(calib.__file__).parent
-    allowed = (case, out.parent, priors, package, Path(sys.prefix), Path(sys.base_prefix))
+    allowed = (case, out.parent, scratch, priors, package, Path(sys.prefix), Path(sys.base_prefix))
     strange = [
         p for p in map(Path, found["opened"])
         if p.is_absolute() and not any(p.is_relative_to(a) for a in allowed)

@@ -14,7 +14,7 @@ def fit_of(case: str | None, name: str):
 
 
 def test_none_has_no_size_to_restrict():
-    assert relevance(fit_of(None, "none"), 1) == 0.0
+    assert relevance(fit_of(None, "none"), 1, 200) == 0.0
 
 
 def test_size_is_in_noise_sds_over_all_rows_and_outputs():
@@ -47,11 +47,11 @@ def test_each_of_a_pair_has_its_own_size():
 
 def test_a_large_effect_gains_and_an_invisible_one_loses():
     # A large one is relevant for certain, so that its evidence is divided by the prior share.
-    assert relevance(fit_of("lug_thrust", "lug_thrust"), 1) >= 0.0
+    assert relevance(fit_of("lug_thrust", "lug_thrust"), 1, 200) >= 0.0
     # On a null campaign, the posterior of an offset is far below one noise sd.
-    assert relevance(fit_of(None, "force_offset"), 1) < -1.0
+    assert relevance(fit_of(None, "force_offset"), 1, 200) < -1.0
 
 
 def test_it_is_the_same_for_the_same_seed():
     fit = fit_of(None, "rate_effect")
-    assert relevance(fit, 5) == relevance(fit, 5)
+    assert relevance(fit, 5, 200) == relevance(fit, 5, 200)

@@ -5,9 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.gap.mixture import Truth
+from calib.gap.case import campaigns
+from calib.gap.diagnose import diagnose
+from calib.gap.effects import EFFECTS
+from calib.gap.mixture import Truth, mixture
 from calib.gap.shrink import predict_fresh, shrink
-from gap.cases import campaigns_of, diagnosis_of, make_case
+from calib.gap.which import rank
+from gap.cases import PULL_ONLY, campaigns_of, diagnosis_of, make_case
 
 N = 27
 
@@ -30,7 +34,8 @@ def truth(gap: float, spread: float, noise: float = 0.05, draws: int = 2000) -> 
 
 
 def test_a_known_gap_shrinks_to_what_is_not_known_of_it(data):
-    found = shrink(data, truth(0.2, 0.01), {"drawbar_pull": np.ones(N)})["drawbar_pull"]
+    known = truth(0.2, 0.01)
+    found = shrink(data, known, {"drawbar_pull": np.ones(N)}, known.means)["drawbar_pull"]
     assert found.rmse_before == pytest.approx(0.2, abs=0.002)
     # The median of |normal| is 0.674 sd.
     assert found.rmse_after == pytest.approx(0.00674, rel=0.1)
@@ -44,12 +49,14 @@ def test_a_known_gap_shrinks_to_what_is_not_known_of_it(data):
 
 def test_before_is_the_simulator_as_it_was_calibrated(data):
     before = {"drawbar_pull": np.full(N, 0.9)}
-    found = shrink(data, truth(0.2, 0.01), before)["drawbar_pull"]
+    known = truth(0.2, 0.01)
+    found = shrink(data, known, before, known.means)["drawbar_pull"]
     assert found.rmse_before == pytest.approx(0.3, abs=0.002)
 
 
 def test_what_is_small_beside_the_noise_is_no_gap(data):
-    assert shrink(data, truth(0.01, 0.0), {"drawbar_pull": np.ones(N)}) == {}
+    small = truth(0.01, 0.0)
+    assert shrink(data, small, {"drawbar_pull": np.ones(N)}, small.means) == {}
 
 
 def test_fresh_predictions_have_the_noise_in_their_band(data):
@@ -95,3 +102,23 @@ def test_the_correction_of_a_large_drift_predicts_new_conditions():
     before = np.sqrt(np.mean(np.square(band.before - actual)))
     after = np.sqrt(np.mean(np.square(band.after - actual)))
     assert after < 0.6 * before
+
+
+def test_without_fresh_conditions_the_rows_are_predicted_by_diagnoses_that_left_them_out():
+    case = make_case("force_offset", models=PULL_ONLY, size={"offset": 0.12})
+    few = {n: EFFECTS[n] for n in ("force_offset", "lug_thrust")}
+    found = diagnose(case, 1, effects=few).shrink["drawbar_pull"]
+    mixed = mixture(campaigns(case), rank(campaigns(case), 1, effects=few), 1)
+    truth_there = mixed.at(campaigns(case).view)
+    before = {"drawbar_pull": truth_there.means["drawbar_pull"] - 0.12}
+    seen = shrink(campaigns(case), truth_there, before, truth_there.means)["drawbar_pull"]
+    # What is left is larger than on rows that were fitted, and still far below the gap.
+    assert found.rmse_after > seen.rmse_after
+    assert found.fraction > 0.5
+
+
+def test_too_few_rows_to_leave_out_are_judged_by_their_own_prediction():
+    case = make_case("force_offset", models=PULL_ONLY, size={"offset": 0.3}, n_field=6)
+    few = {"force_offset": EFFECTS["force_offset"]}
+    found = diagnose(case, 1, effects=few).shrink["drawbar_pull"]
+    assert found.fraction > 0.5

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from calib.gap.which import probabilities, rank
-from gap.cases import CHOICE, LARGE, campaigns_of, ranking_of
+from calib.data import table_from_arrays
+from calib.gap.case import campaigns
+from calib.gap.effects import EFFECTS
+from calib.gap.which import TEMPER, probabilities, rank
+from calib.outputs import OUTPUTS
+from gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
 
 @pytest.mark.parametrize("name", [None, *LARGE])
@@ -54,8 +60,6 @@ def test_the_same_seed_gives_the_same_numbers():
 
 
 def test_untestable_effects_are_listed_and_not_fitted():
-    from calib.gap.effects import EFFECTS
-
     data = campaigns_of("sensor_drift", "pull")
     few = {n: EFFECTS[n] for n in ("force_offset", "rut_rebound", "moisture_softening")}
     ranking = rank(data, 1, effects=few)
@@ -69,6 +73,54 @@ def test_probabilities_from_evidence():
     assert sum(p.values()) == pytest.approx(1.0)
     assert p["a"] == pytest.approx(p["b"])
     assert p["a+b"] < p["a"] < p["none"]
-    better = probabilities(even | {"a": np.log(10.0)}, 2)
-    # Ten times the evidence is ten times the odds.
+    better = probabilities(even | {"a": TEMPER * np.log(10.0)}, 2)
+    # Ten times the evidence, tempered, is ten times the odds.
     assert better["a"] / better["b"] == pytest.approx(10.0)
+
+
+def test_an_effect_that_changes_nothing_is_not_testable():
+    # Plain Bekker has no slip, so that a wrong rolling radius cannot show in the rut.
+    case = make_case(None, models={"rut_depth": "bekker"})
+    few = {n: EFFECTS[n] for n in ("slip_zero_shift", "rut_rebound")}
+    ranking = rank(campaigns(case), 1, effects=few)
+    assert "changes nothing" in ranking.not_testable["slip_zero_shift"]
+    assert "slip_zero_shift" not in ranking.probability
+
+
+def test_a_warming_gauge_is_found_from_several_guesses():
+    # From the middle of its prior the climb ends in another mode, a drift late in the campaign.
+    size = {"drift": -0.35, "curvature": 0.35, "zero_at": 0.0}
+    data = campaigns(make_case("sensor_drift", size=size, models=PULL_ONLY))
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")}
+    ranking = rank(data, 1, effects=few)
+    (found,) = ranking.fits["sensor_drift"]
+    phi = found.forward.hypothesis.effect_priors[0].to_natural(
+        found.psi[None, found.forward.phi_slices[0]]
+    )[0]
+    assert phi[0] < -0.2
+    assert phi[1] < 0.8
+    assert ranking.order[0] == "sensor_drift"
+
+
+def wave(data, output: str, size: float):
+    """Add three waves over the order of the runs to an output: nothing that is listed."""
+    columns = {name: np.array(v) for name, v in data.field.columns.items()}
+    u = columns["run_order"] / columns["run_order"].max()
+    columns[OUTPUTS[output]] = columns[OUTPUTS[output]] + size * np.sin(6.0 * np.pi * u)
+    return replace(data, field=table_from_arrays(columns))
+
+
+def test_waves_along_the_campaign_are_unknown():
+    case = wave(make_case(None, models=PULL_ONLY, n_field=36), "drawbar_pull", 0.15)
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}
+    ranking = rank(campaigns(case), 1, effects=few)
+    assert ranking.order[0] == "unknown"
+    best = int(np.argmax(ranking.scores["unknown"]))
+    assert ranking.fits["unknown"][best].forward.hypothesis.smooth_over == "order"
+
+
+def test_what_a_listed_effect_leaves_is_unknown():
+    case = wave(make_case("force_offset", models=PULL_ONLY, n_field=36), "drawbar_pull", 0.15)
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}
+    ranking = rank(campaigns(case), 1, effects=few)
+    assert ranking.order[0] == "unknown"

@@ -173,9 +173,11 @@ def test_the_two_density_relations_agree_at_their_common_water(seed: int) -> Non
     gravimetric = bound.predict(theta, conditions)
     reported = bound.report(theta)
     for i in range(theta.shape[0]):
-        A2, A3 = float(theta[i, 3]), float(theta[i, 1])
+        A2, A3, A4 = float(theta[i, 3]), float(theta[i, 1]), float(theta[i, 2])
         volume_water = conditions["gravimetric_water_content"] * gravimetric[i]
-        if volume_water.max() / np.sqrt(A3) > A2:
+        ln_density = np.linspace(np.log(0.1), np.log(5.0), 4000)[:, None]
+        offset = volume_water * np.exp(-ln_density) - A4
+        if np.any(np.diff(A2 * ln_density - np.log(A3 + offset**2), axis=0) <= 0.0):
             continue  # the implicit equation may then have several roots
         other = MODELS["ayers_perumpral_volumetric"].bind(
             {"cone_index_kpa": conditions["cone_index_kpa"],
@@ -189,6 +191,15 @@ def test_the_two_density_relations_agree_at_their_common_water(seed: int) -> Non
              "volumetric_water_content": volume_water},
         )[0]  # fmt: skip
         np.testing.assert_allclose(found, gravimetric[i], rtol=1e-9)
+
+
+def test_a_density_does_not_depend_on_the_vectors_beside_it() -> None:
+    """Not even where the equation has several roots, of which one is returned."""
+    bound, theta, conditions = draw(11, "ayers_perumpral_volumetric", k=2000, n=5)
+    theta[:, 1] = 3.0  # a small A2 gives several roots
+    together = bound.predict(theta, conditions)
+    alone = np.concatenate([bound.predict(row[None], conditions) for row in theta])
+    np.testing.assert_allclose(together, alone, rtol=1e-12)
 
 
 def test_a_density_outside_the_bracket_has_no_value() -> None:

@@ -96,6 +96,13 @@ def test_a_tie_names_its_members_and_not_the_rest():
     assert "none" not in found.headline
 
 
+def test_a_tie_with_no_gap_at_all_does_not_claim_one():
+    tied = judge_gap(evidence("ambiguous", unknown=0.35, none=0.3, drift=0.2))
+    assert tied.headline.startswith("There may be a gap, but")
+    sure = judge_gap(evidence("ambiguous", unknown=0.45, drift=0.4, none=0.02))
+    assert sure.headline.startswith("There is a gap, but")
+
+
 def test_two_effects_are_said_to_be_two():
     assert "two effects at once" in judge_gap(evidence("effect", **{"a+b": 0.95})).headline.lower()
 
@@ -315,3 +322,27 @@ def test_conditions_that_do_not_vary_are_not_asked_for(found):
          "average_ground_pressure_kpa": 178.0, "speed_m_s": 2.0, "run_order": 26.0},
     )  # fmt: skip
     assert text == "slip 65 %, inflation pressure 42 psi, speed 2 m/s"
+
+
+def test_what_is_unknown_is_described_by_what_it_goes_along_with():
+    from dataclasses import replace
+
+    import numpy as np
+    from gap.cases import PULL_ONLY, make_case
+
+    from calib.data import table_from_arrays
+    from calib.gap.diagnose import diagnose
+    from calib.gap.effects import EFFECTS
+    from calib.page.gap_sizes import size_sentences
+
+    # An amplifier that saturates: no reading above 0.9 kN.
+    case = make_case(None, models=PULL_ONLY, n_field=36)
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    columns["drawbar_pull_kn"] = np.minimum(columns["drawbar_pull_kn"], 0.9)
+    case = replace(case, field=table_from_arrays(columns))
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")}
+    found = diagnose(case, 1, effects=few)
+    assert found.verdict == "unknown"
+    lead = size_sentences(found, "unknown")[0]
+    assert lead.startswith("what is missing sets in beyond a predicted drawbar pull of")
+    assert 0.8 < float(lead.split(" of ")[1].split()[0]) < 1.0

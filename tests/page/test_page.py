@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from calib.calibration import ParameterSummary
 from calib.figures import Plate
 from calib.models import MODELS
 from calib.models.base import BoundModel
@@ -18,7 +17,7 @@ from calib.page import render_page
 from calib.page.content import failed_section, png_size
 from calib.page.equations import equation, parametrisation, prose, symbol_html, unit_html
 from calib.page.facts import repeats_words, validation_facts
-from calib.page.tables import estimates_grid, posterior_rows, pressure_grids, skewed
+from calib.page.tables import estimates_grid, posterior_rows, pressure_grids, sensitivity_grid
 from calib.study import Failure, Study
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\x00\x02\x00\x00\x00\x03\x08\x06\x00\x00\x00rest"
@@ -134,6 +133,19 @@ def test_measured_data_are_not_called_reconstructed(plate):
     assert "Table 6" not in reader.text
 
 
+def test_parameters_that_are_not_identified_are_named(whole, drawbar, rut):
+    html, reader = whole
+    assert html.count("<h4>What the prior decides</h4>") == 3
+    start = reader.text.index("Not identified by these data: c1, c2,")
+    named = reader.text[start : reader.text.index(".", start)]
+    assert "bend" in named
+    assert "sigma" not in named
+    rows = {str(row[0]): row for row in sensitivity_grid(drawbar).rows}
+    assert "not identified" in rows[str(symbol_html("K_bend"))][-1]
+    assert rows[str(symbol_html("D_lo"))][-1] == "data"
+    assert sensitivity_grid(rut).caption == "Every parameter is identified by these data."
+
+
 def test_a_failed_output_is_shown_and_the_rest_still_comes(rut):
     failure = Failure(replace(rut.task, output="drawbar_pull"), "CalibError: no <column>")
     html, reader = page({"drawbar_pull": failure, "rut_depth": rut})
@@ -219,37 +231,19 @@ def test_estimates_of_a_users_data_have_no_published_column(plate):
     assert all(len(row) == len(grid.head) for row in (*grid.rows, *grid.foot))
 
 
-def summary(mean, sd, low, high, median=2.0) -> ParameterSummary:
-    return ParameterSummary(
-        "C1", "kPa", mean, sd, median, low, high, 900.0, 900.0, 1.0, 0.1, float("nan")
-    )
-
-
-@pytest.mark.parametrize(
-    ("s", "expected"),
-    [
-        (summary(1.0, 1.1, 0.5, 3.0), True),
-        (summary(-1.0, 1.1, -3.0, -0.5), True),
-        (summary(5.0, 4.0, 0.1, 3.1), True),
-        (summary(-5.0, 4.0, -3.1, -0.1), True),
-        (summary(5.0, 4.0, 0.2, 3.1), False),
-        (summary(5.0, 1.0, -0.01, 7.0), False),
-    ],
-)
-def test_where_a_mean_would_mislead(s, expected):
-    assert skewed(s) is expected
-
-
 def test_a_skewed_parameter_has_a_median_and_no_sd(rut):
     s = rut.calibration.summary
-    wide = replace(s["k"], mean=10.0, sd=40.0, median=2.0, hdi_lower=0.01, hdi_upper=90.0)
+    wide = replace(
+        s["k"], mean=10.0, sd=40.0, median=2.0, hdi_lower=0.01, hdi_upper=90.0, mcse_median=0.03,
+        mcse_hdi_lower=0.02, mcse_hdi_upper=3.0,
+    )  # fmt: skip
     calibration = replace(rut.calibration)
     object.__setattr__(calibration, "summary", {**s, "k": wide})
     told = replace(rut, calibration=calibration)
     row = next(r for r in posterior_rows(told) if str(r["symbol"]) == "<i>k</i>")
-    assert row["value"] == "median 2.00"
+    assert row["value"] == "median 2.0"
     cells = [r for r in estimates_grid(told, published=True).rows if str(r[0]) == "<i>k</i>"]
-    assert str(cells[0][-1]) == "median 2.00<br>HDI 0.010 to 90"
+    assert str(cells[0][-1]) == "median 2.0<br>HDI 0 to 90"
 
 
 def test_the_table_says_that_its_estimates_are_of_more_rows(drawbar, rut):

@@ -11,7 +11,7 @@ from scipy.special import gammaln
 
 from calib.chains import ess
 from calib.models.base import Array
-from calib.sampling.proposal import StudentT
+from calib.sampling.proposal import Guess
 from calib.sampling.sampler import Draws, SamplerSettings, sample_density
 
 # Deviations are allowed five standard errors: by chance one in two million.
@@ -28,10 +28,10 @@ def run(
     """Sample a density from a first guess of its location and scale."""
     mean = np.asarray(mean, dtype=float)
     seeds = np.random.SeedSequence(seed).spawn(5)
-    first = StudentT(mean, np.linalg.cholesky(np.asarray(covariance, dtype=float)), 6.0)
+    first = Guess(mean, np.linalg.cholesky(np.asarray(covariance, dtype=float)))
     names = tuple(f"x{i}" for i in range(mean.size))
     return sample_density(
-        log_prob, first, seeds, names, settings or SamplerSettings(),
+        log_prob, [first], seeds, names, settings or SamplerSettings(),
         rng=np.random.default_rng(seeds[0]),
     )  # fmt: skip
 

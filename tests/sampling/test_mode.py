@@ -9,7 +9,7 @@ from scipy import stats
 from calib.data import Table
 from calib.priors import Prior, Priors
 from calib.problem import build_problem
-from calib.sampling.mode import find_mode, prior_widths
+from calib.sampling.mode import find_mode, find_modes, prior_widths
 
 
 def box(*bounds: tuple[float, float]) -> Priors:
@@ -77,6 +77,41 @@ def test_the_better_of_two_modes_is_taken() -> None:
     )
     found = find_mode(log_prob, priors, np.random.default_rng(1), starts=np.array([[-5.0]]))
     assert found[0] == pytest.approx(5.0, abs=1e-3)
+
+
+def two_modes(depth: float):
+    """Two normals in four dimensions, of one width, the second lower by `depth`."""
+    one, other = (np.full(4, x) for x in (-3.0, 3.0))
+
+    def log_density(t):
+        return np.logaddexp(
+            -0.5 * np.square((t - one) / 0.15).sum(axis=1),
+            -depth - 0.5 * np.square((t - other) / 0.15).sum(axis=1),
+        )
+
+    return log_density
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_both_of_two_modes_are_found(seed: int) -> None:
+    priors = box(*[(-10.0, 10.0)] * 4)
+    log_prob = inside(priors, two_modes(5.0))
+    found = find_modes(log_prob, priors, np.random.default_rng(seed))
+    assert len(found) == 2
+    np.testing.assert_allclose([m.t for m in found], [[-3.0] * 4, [3.0] * 4], atol=1e-2)
+    np.testing.assert_allclose([m.log_prob for m in found], [0.0, -5.0], atol=1e-3)
+    np.testing.assert_allclose(found[1].covariance, 0.0225 * np.eye(4), atol=1e-4)
+
+
+def test_a_mode_too_low_to_matter_is_left_out() -> None:
+    priors = box(*[(-10.0, 10.0)] * 4)
+    log_prob = inside(priors, two_modes(20.0))
+    assert len(find_modes(log_prob, priors, np.random.default_rng(1))) == 1
+
+
+def test_one_mode_is_found_once(rut_tables: tuple[Table, Table]) -> None:
+    problem = build_problem("modified_bekker", rut_tables[0])
+    assert len(find_modes(problem.log_prob, problem.priors, np.random.default_rng(1))) == 1
 
 
 def test_the_mode_of_a_real_problem_is_stationary(rut_tables: tuple[Table, Table]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.models.base import Array
 
-__all__ = ["Effect", "View"]
+__all__ = ["Effect", "View", "saturating"]
 
 DRAWBAR, RUT, DENSITY = "drawbar_pull", "rut_depth", "bulk_density"
 
@@ -57,6 +57,25 @@ class View:
         if RUT in self.base:
             return self.base[RUT] / 30.0
         return (1.0 + np.maximum(self.slip(), 0.0))[None, :]
+
+
+def saturating(u: Array, exponent: Array, half_way: Array) -> Array:
+    """Growth from 0 at 0 to 1 at 1: a power at first, levelling off beyond `half_way`.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n,)
+        Positive.
+    exponent, half_way : ndarray, shape (k, 1)
+        A large `half_way` leaves a plain power; a large exponent makes a step at it.
+
+    Returns
+    -------
+    ndarray, shape (k, n)
+    """
+    grown = u**exponent
+    half = half_way**exponent
+    return np.asarray((1.0 + half) * grown / (grown + half))
 
 
 class Effect:

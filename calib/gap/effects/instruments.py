@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import DENSITY, DRAWBAR, RUT, Effect, View
+from calib.gap.effects.base import DENSITY, DRAWBAR, RUT, Effect, View, saturating
 from calib.models.base import Array
 
 __all__ = [
@@ -17,6 +17,7 @@ class SlipZeroShift(Effect):
     """A rolling radius wrong by a factor: 1 - s_true = (1 - s_recorded)(1 - error)."""
 
     name = "slip_zero_shift"
+    form = ("pressure",)  # a tyre rolls on a smaller radius at less inflation
     title = "the rolling radius behind the recorded slip is wrong"
     parameters = ("radius_error",)
     outputs = (DRAWBAR, RUT)
@@ -48,11 +49,11 @@ class ForceOffset(Effect):
 
 
 class SensorDrift(Effect):
-    """A drift of the drawbar reading with run order, of any curvature, from any zero."""
+    """A drift with run order: steady, settling, or from some run on; zeroed at any part of it."""
 
     name = "sensor_drift"
     title = "the drawbar reading drifts with run order"
-    parameters = ("drift", "curvature", "zero_at")
+    parameters = ("drift", "curvature", "half_way", "zero_at")
     form = ("shape",)
     outputs = (DRAWBAR,)
     covariates = ("run_order",)
@@ -66,9 +67,9 @@ class SensorDrift(Effect):
         """Add the drift (kN from the first run to the last)."""
         if output != DRAWBAR:
             return location
-        drift, curvature, zero_at = phi[:, :1], phi[:, 1:2], phi[:, 2:3]
+        drift, curvature, half_way, zero_at = (phi[:, i : i + 1] for i in range(4))
         u = np.maximum(self._progress(view), 1e-3)
-        return np.asarray(location + drift * (u**curvature - zero_at))
+        return np.asarray(location + drift * (saturating(u, curvature, half_way) - zero_at))
 
     def shape(self, view: View) -> Array | None:
         """Run order."""
@@ -79,6 +80,7 @@ class PressureGaugeBias(Effect):
     """True inflation pressure differs from the gauge's by a gain and an offset."""
 
     name = "pressure_gauge_bias"
+    form = ("pressure",)  # the simulator is extrapolated to pressures it was not fitted at
     title = "true inflation pressure differs from the recorded one"
     parameters = ("gain", "offset", "ground_response")
     outputs = (DRAWBAR, RUT)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import DRAWBAR, RUT, Effect, View
+from calib.gap.effects.base import DRAWBAR, RUT, Effect, View, saturating
 from calib.models.base import Array
 
 __all__ = [
@@ -92,11 +92,11 @@ class SlipSinkage(Effect):
 
 
 class RutRebound(Effect):
-    """Part of the sinkage springs back: ln z - a0 - a s^c."""
+    """Part of the sinkage springs back: ln z - a0 - a g(s), g growing as s^c and levelling off."""
 
     name = "rut_rebound"
     title = "part of the sinkage springs back, more at high slip"
-    parameters = ("towed", "growth", "slip_exponent")
+    parameters = ("towed", "growth", "slip_exponent", "half_way")
     form = ("slip", "pressure")
     outputs = (RUT,)
     covariates = ("slip_ratio",)
@@ -106,7 +106,8 @@ class RutRebound(Effect):
         if output != RUT:
             return location
         slip = np.maximum(view.slip(), 1e-4)
-        return np.asarray(location - phi[:, :1] - phi[:, 1:2] * slip ** phi[:, 2:3])
+        grown = saturating(slip, phi[:, 2:3], phi[:, 3:4])
+        return np.asarray(location - phi[:, :1] - phi[:, 1:2] * grown)
 
     def shape(self, view: View) -> Array | None:
         """Slip."""

@@ -1,0 +1,135 @@
+"""What running tasks on Dask costs, and what a second worker gains.
+
+    python benchmarks/campaign.py --out campaign.json
+
+Overhead: tiny tasks through `calib.tasks.run_tasks`, which writes a file for each, and through
+Dask's own `Client.map` and `as_completed`, which writes none, on one cluster of two workers.
+Gain: diagnoses of challenge cases in this process and on two workers, start-up included.
+Each is repeated, the two sides of a comparison in turn, and medians are taken: other work on the
+machine disturbs both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+# The matrices are small: threads of the linear algebra would only wait for each other.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+SEED = 77
+
+
+def tiny(item: int) -> dict[str, int]:
+    """Do nothing."""
+    return {"item": item}
+
+
+def timed(call: Callable[[], object]) -> tuple[float, float]:
+    """Return seconds on the wall clock, and of this process's processors."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    call()
+    return time.perf_counter() - wall, time.process_time() - cpu
+
+
+def overhead(tasks: int, repeats: int) -> dict[str, object]:
+    """Milliseconds for each of many tiny tasks, ours and Dask's own."""
+    from distributed import Client, LocalCluster, as_completed
+
+    from calib.tasks import run_tasks
+
+    items = {f"task-{i}": i for i in range(tasks)}
+    found: dict[str, list[tuple[float, float]]] = {"dask": [], "calib": []}
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address="127.0.0.1:0") as cluster,
+        Client(cluster) as client,
+    ):
+
+        def dask_own() -> None:
+            futures = client.map(tiny, list(items.values()), pure=False)
+            for _ in as_completed(futures, with_results=True).batches():
+                pass
+
+        def ours() -> None:
+            with tempfile.TemporaryDirectory() as folder:
+                outcome = run_tasks(tiny, items, Path(folder), scheduler=cluster.scheduler_address)
+            assert len(outcome.done) == tasks
+
+        for _ in range(repeats + 1):
+            found["dask"].append(timed(dask_own))
+            found["calib"].append(timed(ours))
+    # The first round imports and connects.
+    per_task = {
+        name: [(1e3 * w / tasks, 1e3 * c / tasks) for w, c in runs[1:]]
+        for name, runs in found.items()
+    }
+    beyond = [
+        (a[0] - b[0], a[1] - b[1]) for a, b in zip(per_task["calib"], per_task["dask"], strict=True)
+    ]
+    return {
+        "tasks": tasks,
+        "ms_per_task_wall_and_cpu": per_task,
+        "beyond_dask_ms_median_wall": statistics.median(b[0] for b in beyond),
+        "beyond_dask_ms_median_cpu": statistics.median(b[1] for b in beyond),
+    }
+
+
+def gain(cases: Path, count: int, repeats: int) -> dict[str, object]:
+    """Seconds for some diagnoses with one worker and with two."""
+    from calib.gap.batch import case_folders, diagnose_cases
+
+    folders = case_folders(cases)[:count]
+    seconds: dict[int, list[float]] = {1: [], 2: []}
+    for _ in range(repeats):
+        for workers, runs in seconds.items():
+            with tempfile.TemporaryDirectory() as out:
+                began = time.perf_counter()
+                assert diagnose_cases(folders, Path(out), 1, workers=workers) == {}
+                runs.append(time.perf_counter() - began)
+    ratios = [one / two for one, two in zip(seconds[1], seconds[2], strict=True)]
+    return {
+        "diagnoses": len(folders),
+        "seconds": seconds,
+        "ratios": ratios,
+        "ratio_median": statistics.median(ratios),
+    }
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=Path, help="JSON file to write; printed if none")
+    parser.add_argument("--tasks", type=int, default=10_000, help="tiny tasks")
+    parser.add_argument("--cases", type=int, default=200, help="diagnoses")
+    parser.add_argument("--repeats", type=int, default=3)
+    options = parser.parse_args()
+    from calib.challenge.make import make
+
+    result: dict[str, object] = {
+        "machine": f"{os.cpu_count()} cores, {platform.machine()}, Python "
+        f"{platform.python_version()}",
+        "load_before": os.getloadavg(),
+        "overhead": overhead(options.tasks, options.repeats),
+    }
+    if options.cases:
+        with tempfile.TemporaryDirectory() as scratch:
+            cases = Path(scratch) / "cases"
+            make(cases, Path(scratch) / "key", seed=SEED, n_cases=options.cases, workers=2)
+            result["gain"] = gain(cases, options.cases, options.repeats)
+    result["load_after"] = os.getloadavg()
+    text = json.dumps(result, indent=1) + "\n"
+    if options.out is None:
+        print(text)
+    else:
+        options.out.write_text(text)
+
+
+if __name__ == "__main__":
+    main()

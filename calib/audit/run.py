@@ -1,0 +1,125 @@
+"""The whole audit: every family of findings in reading order, with what its figures need."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from calib.audit.convergence import (
+    GeneticStudy,
+    Seeds,
+    convergence_findings,
+    study_convergence,
+)
+from calib.audit.curvature_signs import CurvatureStudy, curvature_signs, study_curvature_signs
+from calib.audit.density import density_findings
+from calib.audit.finding import Finding, Verdict
+from calib.audit.geometric import geometric_findings
+from calib.audit.inverse_findings import inverse_findings
+from calib.audit.inverse_regression import InverseStudy, study_inverse
+from calib.audit.pressure_unit import pressure_unit
+from calib.audit.rounding import RoundingStudy, rounding_findings, study_rounding
+from calib.audit.rut_quality import QualityStudy, rut_quality_findings, study_quality
+from calib.audit.signs import signs
+from calib.audit.table5_cost import cost_findings
+from calib.audit.untested import untested
+from calib.calibration import Calibration
+from calib.datasets.published import PUBLISHED, Published
+
+__all__ = ["Audit", "run_audit"]
+
+type Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Audit:
+    """An audit of the published figures.
+
+    Parameters
+    ----------
+    findings : tuple of Finding
+        By verdict, the gravest first; within a verdict in the order of the source.
+    published : Published
+        What was audited.
+    seed : int
+    rounding : RoundingStudy
+    curvature : CurvatureStudy
+    quality : QualityStudy
+    inverse : InverseStudy
+    genetic : GeneticStudy
+    """
+
+    findings: tuple[Finding, ...]
+    published: Published
+    seed: int
+    rounding: RoundingStudy
+    curvature: CurvatureStudy
+    quality: QualityStudy
+    inverse: InverseStudy
+    genetic: GeneticStudy
+
+    @property
+    def counts(self) -> dict[Verdict, int]:
+        """How many findings have each verdict; verdicts in the order of `Verdict`."""
+        found = Counter(f.verdict for f in self.findings)
+        return {verdict: found[verdict] for verdict in Verdict if found[verdict]}
+
+    def __getitem__(self, key: str) -> Finding:
+        return next(f for f in self.findings if f.key == key)
+
+
+def run_audit(
+    seed: int = 2019,
+    *,
+    published: Published = PUBLISHED,
+    seeds: Seeds | None = None,
+    rut_calibration: Calibration | None = None,
+    progress: Progress | None = None,
+) -> Audit:
+    """Audit the published figures.
+
+    Parameters
+    ----------
+    seed : int
+        Same seed, same numbers.
+    published : Published
+        The figures to audit.
+    seeds : Seeds, optional
+        How often the genetic algorithm is repeated.
+    rut_calibration : Calibration, optional
+        Of modified_bekker on the reconstructed 18 and 42 psi rows; made here if it is not at hand.
+    progress : callable, optional
+        Called with what is being done, steps done and steps planned.
+
+    Returns
+    -------
+    Audit
+    """
+    tell = progress or (lambda what, done, planned: None)
+    genetic = study_convergence(published, seed, seeds, progress)
+    inverse = study_inverse(
+        published, seed, calibration=rut_calibration,
+        progress=lambda done, planned: tell("rut depth: sampling", done, planned),
+    )  # fmt: skip
+    tell("testing printed figures", 0, 2)
+    curvature = study_curvature_signs(published, seed)
+    tell("testing printed figures", 1, 2)
+    rounding, quality = study_rounding(published), study_quality(published)
+    findings = [
+        *density_findings(published),
+        *geometric_findings(published, genetic.read_off),
+        *signs(published),
+        *curvature_signs(published, curvature),
+        pressure_unit(published),
+        *cost_findings(published, genetic.joint.optimum),
+        *rounding_findings(published, rounding),
+        *convergence_findings(published, genetic),
+        *rut_quality_findings(published, quality),
+        *inverse_findings(published, inverse),
+        untested(published),
+    ]
+    tell("testing printed figures", 2, 2)
+    order = list(Verdict)
+    ranked = sorted(findings, key=lambda f: order.index(f.verdict))
+    return Audit(tuple(ranked), published, seed, rounding, curvature, quality, inverse, genetic)

@@ -1,0 +1,80 @@
+"""The verb of the audit: test what the source paper prints."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from calib.audit import Audit
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to an app."""
+    app.command()(audit)
+
+
+def audit(
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for audit.json, audit.csv, figures and a page.")
+    ] = None,
+    json: Annotated[
+        bool, typer.Option("--json", help="Print JSON in the place of a table.")
+    ] = False,
+    seed: Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)] = 2019,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier result.")
+    ] = False,
+) -> None:
+    """Audit the published tables of He, Sandu & Osorio (2019): every figure and its verdict."""
+    from calib.audit import audit_json, run_audit
+    from calib.cli.display import progress_bars
+    from calib.folders import check_folder, fresh_folder
+
+    if out is not None:
+        check_folder(out, overwrite=overwrite)
+    with progress_bars() as tell:
+        found = run_audit(seed, progress=tell)
+        if out is not None:
+            from calib.page.audit import write_audit_page
+
+            tell("drawing figures", 0, 1)
+            with fresh_folder(out, overwrite=overwrite) as folder:
+                write_audit_page(found, folder, ["calib", *sys.argv[1:]])
+            tell("drawing figures", 1, 1)
+    if json:
+        sys.stdout.write(audit_json(found))
+        return
+    _print(found)
+    if out is not None:
+        print(out / "index.html")
+
+
+def _print(found: Audit) -> None:
+    from rich.console import Console
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    from calib.page.audit import AUDIT_MARKS
+
+    table = RichTable(title="Audit of He, Sandu & Osorio (2019)", show_lines=True)
+    for heading in ("verdict", "where", "claim or reading", "evidence"):
+        table.add_column(heading)
+    for f in found.findings:
+        where = f"{f.where}\n[reconstructed data]" if f.reconstructed else f.where
+        cells = (f"{AUDIT_MARKS[f.verdict]} {f.verdict.value}", where, f.claim, f.evidence)
+        table.add_row(*map(Text, cells))
+    # A pipe has no width of its own: wide enough for whole rows.
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    console.print(table)
+    counts = ", ".join(f"{n} {verdict.value}" for verdict, n in found.counts.items())
+    print(f"{len(found.findings)} findings: {counts}")
+    print(
+        "Verdicts marked [reconstructed data] show what a method does with such data and prove "
+        "nothing about the measured ones."
+    )

@@ -1,0 +1,58 @@
+"""Verb of campaigns: many fits and diagnoses, here or on a Dask cluster."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.parallel import Scheduler, Workers, announce, resumable
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to an app."""
+    app.command()(campaign)
+
+
+def campaign(
+    plan: Annotated[Path, typer.Argument(help="TOML file with the tasks (see the README).")],
+    out: Annotated[Path, typer.Option(help="Folder of results; resumed if it is there.")] = Path(
+        "calib-campaign"
+    ),
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    only_list: Annotated[
+        bool, typer.Option("--list", help="Check the plan, list its tasks and stop.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Do again what was made from other inputs.")
+    ] = False,
+) -> None:
+    """Run many fits and diagnoses as independent tasks; run again to resume."""
+    from calib.campaign import read_plan, run_campaign
+    from calib.cli.display import progress_bars
+
+    planned = read_plan(plan)
+    if only_list:
+        print("\n".join(planned.tasks))
+        return
+    with resumable(), progress_bars() as tell:
+        summary = run_campaign(
+            planned, out, workers=workers, scheduler=scheduler, overwrite=overwrite,
+            progress=lambda done, n: tell("tasks", done, n), announce=announce,
+        )  # fmt: skip
+    for name, error in summary.failed.items():
+        print(f"calib: {name} failed: {error}", file=sys.stderr)
+    counts = summary.counts
+    print(f"{counts['done']} of {len(summary.kinds)} tasks done, {counts['failed']} failed")
+    if summary.unconverged:
+        print(f"NOT CONVERGED, not to be used: {', '.join(summary.unconverged)}")
+    print(out / "summary.json")
+    if summary.failed:
+        raise typer.Exit(1)
+    if summary.unconverged:
+        raise typer.Exit(3)

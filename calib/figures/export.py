@@ -1,0 +1,56 @@
+"""Figures as files: the same bytes every time, whatever the user's own settings are.
+
+Ticks are placed when a figure is drawn, so the style holds then as well.
+"""
+
+from __future__ import annotations
+
+import io
+
+from matplotlib.figure import Figure
+
+from calib.figures.plate import Plate
+from calib.figures.style import style
+
+__all__ = ["pdf_bytes", "png", "png_bytes"]
+
+_DPI = 150
+
+
+def png(plate: Plate) -> bytes:
+    """Render a plate's figure; nothing where it has none."""
+    return png_bytes(plate.figure) if plate.figure is not None else b""
+
+
+def png_bytes(figure: Figure) -> bytes:
+    """Render a figure, with a palette of 256 colours: a third of the size, no visible loss.
+
+    Parameters
+    ----------
+    figure : Figure
+        Drawn in the project's style.
+    """
+    from PIL import Image
+
+    full, small = io.BytesIO(), io.BytesIO()
+    with style():
+        figure.savefig(full, format="png", dpi=_DPI)
+    full.seek(0)
+    with Image.open(full) as image:
+        # With its resolution, by which a text processor takes it over at its size in print.
+        image.convert("RGB").quantize(256).save(small, format="png", dpi=(_DPI, _DPI))
+    return small.getvalue()
+
+
+def pdf_bytes(figure: Figure) -> bytes:
+    """Render a figure as PDF: fonts inside as TrueType, no date, so that its hash repeats.
+
+    Parameters
+    ----------
+    figure : Figure
+        Drawn in the project's style.
+    """
+    content = io.BytesIO()
+    with style():
+        figure.savefig(content, format="pdf", metadata={"CreationDate": None})
+    return content.getvalue()

@@ -1,0 +1,120 @@
+"""Rows that nothing explains: set aside before they can name a cause or hide one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.data import Table
+from calib.gap.case import Campaigns, Case, campaigns
+from calib.gap.effects import Effect
+from calib.gap.which import Ranking, rank
+from calib.models.base import Array
+from calib.outputs import OUTPUTS
+from calib.sampling.mode import find_mode
+from calib.streams import generator
+
+__all__ = ["LAB_OUTLIER", "OUTLIER", "rank_without_outliers", "without_outputs"]
+
+# Standardised residual beyond which a field row is set aside, and how often that is repeated.
+OUTLIER = 5.0
+# In the laboratory the row itself widens the noise, so the unit is a robust sd, and the bar higher.
+LAB_OUTLIER = 8.0
+_MOST_ROUNDS = 3
+
+
+def rank_without_outliers(
+    case: Case, seed: int, effects: Mapping[str, Effect]
+) -> tuple[Campaigns, Ranking]:
+    """Rank; set rows aside that no hypothesis explains, however good it is for the others.
+
+    Parameters
+    ----------
+    case : Case
+    seed : int
+    effects : mapping of str to Effect
+
+    Returns
+    -------
+    Campaigns
+        Of the rows that are left; its case says which were set aside.
+    Ranking
+    """
+    case = _without_lab_outliers(case, seed)
+    data = campaigns(case)
+    ranking = rank(data, seed, effects=effects)
+    for _ in range(_MOST_ROUNDS):
+        far = _field_outliers(data, ranking)
+        if not far:
+            break
+        case = _noted(without_outputs(case, far), far, "field", OUTLIER)
+        data = campaigns(case)
+        ranking = rank(data, seed, effects=effects)
+    return data, ranking
+
+
+def without_outputs(case: Case, rows: Mapping[str, Sequence[int] | NDArray[np.int64]]) -> Case:
+    """Take outputs of field rows out of a case, their conditions left in."""
+    return replace(case, field=_blanked(case.field, rows))
+
+
+def _blanked(table: Table, rows: Mapping[str, Sequence[int] | NDArray[np.int64]]) -> Table:
+    columns = {name: np.array(values) for name, values in table.columns.items()}
+    for output, which in rows.items():
+        columns[OUTPUTS[output]][which] = np.nan
+    return replace(table, columns=columns)
+
+
+def _noted(case: Case, far: Mapping[str, list[int]], campaign: str, bar: float) -> Case:
+    said = [
+        f"{campaign} row {', '.join(map(str, rows))}: {output} lies more than {bar:g} noise sds "
+        "off whatever the hypothesis; it was left out as an outlier"
+        for output, rows in far.items()
+    ]
+    return replace(case, warnings=(*case.warnings, *said))
+
+
+def _field_outliers(data: Campaigns, ranking: Ranking) -> dict[str, list[int]]:
+    best = ranking.best(ranking.order[0])
+    far = {}
+    for o in data.outputs:
+        found = np.abs(best.field_residuals[o.name]) > OUTLIER
+        if 0 < found.sum() <= _most(o.rows.size):
+            far[o.name] = [int(row) for row in o.rows[found]]
+    return far
+
+
+def _most(n: int) -> int:
+    """Many rows that lie off are a gap that is not understood, not outliers."""
+    return max(1, n // 10)
+
+
+def _without_lab_outliers(case: Case, seed: int) -> Case:
+    for _ in range(_MOST_ROUNDS):
+        data = campaigns(case)
+        far = {}
+        for o in data.outputs:
+            z = _lab_residuals(data, o.name, seed)
+            found = np.abs(z) > LAB_OUTLIER
+            if 0 < found.sum() <= _most(z.size):
+                measured = np.flatnonzero(np.isfinite(case.lab[OUTPUTS[o.name]]))
+                far[o.name] = [int(row) for row in measured[found]]
+        if not far:
+            return case
+        case = _noted(replace(case, lab=_blanked(case.lab, far)), far, "calibration", LAB_OUTLIER)
+    return case
+
+
+def _lab_residuals(data: Campaigns, output: str, seed: int) -> Array:
+    """Residuals of the laboratory fit in robust sds, shape (n,)."""
+    problem = next(o for o in data.outputs if o.name == output).problem
+    mode = find_mode(
+        problem.log_prob, problem.priors, generator(seed, "gap", "outliers", output), n_climb=8
+    )
+    location = problem.bound.location(problem.theta(mode[None])[:, :-1], problem.conditions)[0]
+    residual = problem.response - location
+    robust = 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
+    return np.asarray(residual / max(robust, 1e-12))

@@ -1,0 +1,156 @@
+"""Coordinates in which a posterior is nearer to a normal: a triangular quadratic map.
+
+Posteriors of nonlinear regressions bend, and widen with the noise scale. Each coordinate, from the
+last (the logarithm of the noise scale) to the first, is regressed on those before it, their
+squares and their products; what is left of it, divided by a scale that grows with the last
+coordinate, is its straightened value. It is the Knothe-Rosenblatt rearrangement to second order
+(Parno & Marzouk 2018, doi:10.1137/17M1134640). A mixture fitted there needs few components.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.models.base import Array
+
+__all__ = ["Straightener"]
+
+# Squares, products and the scale saturate this many standard deviations from the mean: they are
+# fitted to the bulk, and tails beyond it are bent no further.
+_SATURATION = 4.0
+# Draws' worth of evidence that there is no bend.
+_RIDGE = 3.0
+_NEWTON_STEPS = 8
+
+
+@dataclass(frozen=True)
+class Straightener:
+    """A map of coordinates t to straightened ones v, one to one.
+
+    Parameters
+    ----------
+    mean, sd : ndarray, shape (d,)
+        Of t.
+    coefficients : ndarray, shape (1 + d (d + 3)/2, d)
+        Of the regression of each standardised coordinate, in the order last to first, on the
+        features of those before it; zero from its own feature on.
+    rho : float
+        Growth of the logarithm of the scale with the last coordinate.
+    """
+
+    mean: Array
+    sd: Array
+    coefficients: Array
+    rho: float
+
+    @classmethod
+    def fit(cls, t: Array, weight: Array) -> Straightener:
+        """Fit to weighted draws.
+
+        Parameters
+        ----------
+        t : ndarray, shape (k, d)
+        weight : ndarray, shape (k,)
+            Of sum 1.
+
+        Raises
+        ------
+        numpy.linalg.LinAlgError
+            If the draws are degenerate.
+        """
+        d = t.shape[1]
+        mean = weight @ t
+        sd = np.sqrt(weight @ np.square(t - mean))
+        if not (np.isfinite(sd).all() and (sd > 0.0).all()):
+            raise np.linalg.LinAlgError
+        z = ((t - mean) / sd)[:, ::-1]
+        features = _features(z)
+        effective = 1.0 / np.square(weight).sum()
+        coefficients = _regress(features, z, weight, effective)
+        rho = 0.0
+        if d > 1:
+            left = np.square(z - features @ coefficients)[:, 1:]
+            relative = (left / np.maximum(weight @ left, 1e-300)).mean(axis=1)
+            bounded = _bounded(z[:, 0])
+            rho = _growth(relative, bounded, weight)
+            # Where the scale is small a draw says more about the bend.
+            precise = weight * np.exp(-2.0 * rho * bounded)
+            coefficients = _regress(features, z, precise / precise.sum(), effective)
+        return cls(mean, sd, coefficients, rho)
+
+    def straighten(self, t: Array) -> tuple[Array, Array]:
+        """Return v, shape (k, d), and the log of the Jacobian |dv/dt|, shape (k,)."""
+        z = ((t - self.mean) / self.sd)[:, ::-1]
+        v = z - _features(z) @ self.coefficients
+        log_scale = self.rho * _bounded(z[:, 0])
+        v[:, 1:] *= np.exp(-log_scale)[:, None]
+        return v, -(t.shape[1] - 1) * log_scale - np.log(self.sd).sum()
+
+    def bend(self, v: Array) -> Array:
+        """Return t of straightened coordinates, shape (k, d)."""
+        k, d = v.shape
+        z, bounded = np.empty((d, k)), np.empty((d, k))
+        features = np.empty((self.coefficients.shape[0], k))
+        features[0] = 1.0
+        scale = np.ones(k)
+        n = 1
+        for i in range(d):
+            z[i] = self.coefficients[:n, i] @ features[:n] + v[:, i] * scale
+            bounded[i] = _bounded(z[i])
+            features[n] = z[i]
+            np.multiply(bounded[i], bounded[: i + 1], out=features[n + 1 : n + i + 2])
+            n += i + 2
+            if i == 0:
+                scale = np.exp(self.rho * bounded[0])
+        return np.asarray(z[::-1].T * self.sd + self.mean)
+
+
+def _bounded(z: Array) -> Array:
+    return np.asarray(_SATURATION * np.tanh(z / _SATURATION))
+
+
+def _features(z: Array) -> Array:
+    """One, and for each coordinate itself and its products with those up to it, (k, 1 + ...).
+
+    The features of the first i coordinates come first.
+    """
+    k, d = z.shape
+    features = np.empty((1 + d * (d + 3) // 2, k))
+    features[0] = 1.0
+    bounded = np.ascontiguousarray(_bounded(z).T)
+    n = 1
+    for i in range(d):
+        features[n] = z[:, i]
+        np.multiply(bounded[i], bounded[: i + 1], out=features[n + 1 : n + i + 2])
+        n += i + 2
+    return features.T
+
+
+def _regress(features: Array, z: Array, weight: Array, effective: float) -> Array:
+    """Ridge regression of each coordinate on the features of those before it."""
+    weighted = features * weight[:, None]
+    gram, moment = weighted.T @ features, weighted.T @ z
+    penalty = np.full(features.shape[1], _RIDGE / effective)
+    penalty[0] = 0.0
+    coefficients = np.zeros((features.shape[1], z.shape[1]))
+    n = 1
+    for i in range(z.shape[1]):
+        left = gram[:n, :n] + np.diag(penalty[:n])
+        coefficients[:n, i] = np.linalg.solve(left, moment[:n, i])
+        n += i + 2
+    return coefficients
+
+
+def _growth(squared: Array, bounded: Array, weight: Array) -> float:
+    """Likeliest rho where squared residuals have a mean proportional to exp(2 rho bounded)."""
+    shape = bounded - weight @ bounded
+    rho = 0.0
+    for _ in range(_NEWTON_STEPS):
+        ratio = squared * np.exp(-2.0 * rho * shape)
+        ratio /= weight @ ratio
+        slope = (weight * shape) @ (ratio - 1.0)
+        curvature = 2.0 * (weight * shape * shape) @ np.maximum(ratio, 0.5)
+        rho = float(np.clip(rho + slope / curvature, -1.0, 1.0))
+    return rho

@@ -1,0 +1,223 @@
+"""Sums of squared residuals of many parameter vectors: the work of every likelihood.
+
+Rows taken at the same conditions share their prediction mu. Of m such rows with mean m_y,
+
+    sum (y - mu)^2 = sum (y - m_y)^2 + m (m_y - mu)^2,
+
+so the model is evaluated once per distinct condition, whatever the number of rows. What is left
+is worked through in tiles, some rows times some vectors, that stay in the processor's cache and
+bound the memory. Each tile's part is summed on its own, so the number of threads does not change
+a digit of the result.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.models.base import N_WORK, Array, BoundModel, Conditions, Rows
+
+__all__ = ["Squares"]
+
+# Cells (rows times vectors) of a tile: three arrays of doubles in a cache of a megabyte or two.
+# Measured from 8,192 to 131,072: smaller ones pay for NumPy's calls, larger ones for memory.
+_TILE_CELLS = 65_536
+# Up to this many rows vectors run along the contiguous axis, beyond it rows do.
+_SHORT = 256
+# Cells from which a second thread is worth starting.
+_PARALLEL_CELLS = 4_000_000
+
+
+@dataclass(frozen=True)
+class _Tile:
+    """Rows that are evaluated together."""
+
+    rows: Rows
+    response: Array
+    """Mean response at each distinct condition."""
+    repeats: Array | None
+    """How many rows share the condition; None where all are distinct."""
+
+
+@dataclass(frozen=True)
+class Squares:
+    """Sum of squared residuals of a bound model on fixed data.
+
+    Parameters
+    ----------
+    bound : BoundModel
+    tiles : tuple of _Tile
+    n_distinct : int
+        Distinct conditions.
+    within : float
+        Sum of squares of the repeats about their means.
+    threads : int
+        For large tasks; the result does not depend on it.
+    """
+
+    bound: BoundModel
+    tiles: tuple[_Tile, ...]
+    n_distinct: int
+    within: float
+    threads: int
+    _spare: list[Array] = field(default_factory=list, repr=False, compare=False)
+
+    @classmethod
+    def of(
+        cls,
+        bound: BoundModel,
+        conditions: Conditions,
+        response: Array,
+        *,
+        threads: int | None = None,
+    ) -> Squares:
+        """Arrange data for a bound model.
+
+        Parameters
+        ----------
+        bound : BoundModel
+        conditions : mapping of str to ndarray, shape (n,)
+        response : ndarray, shape (n,)
+        threads : int, optional
+            As many as processors by default.
+        """
+        distinct, mean, repeats, within = _distinct(conditions, response)
+        tiles = tuple(
+            _tile(bound, distinct, mean, repeats, rows) for rows in _blocks(distinct, mean.size)
+        )
+        return cls(bound, tiles, mean.size, within, threads or _processors())
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The workspace does not travel to other processes.
+        return {**self.__dict__, "_spare": []}
+
+    def __call__(self, theta: Array) -> Array:
+        """Evaluate.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (k, d)
+            Natural parameters of the model.
+
+        Returns
+        -------
+        ndarray, shape (k,)
+            NaN where the model has no value.
+        """
+        sums = np.empty((len(self.tiles), theta.shape[0]))
+
+        def work(i: int) -> None:
+            # One workspace for every thread that is at work, kept for the next call.
+            space = self._spare.pop() if self._spare else np.empty((N_WORK, _TILE_CELLS))
+            _evaluate(self.bound, self.tiles[i], theta, space, sums[i])
+            self._spare.append(space)
+
+        if self.threads > 1 and theta.shape[0] * self.n_distinct >= _PARALLEL_CELLS:
+            with ThreadPoolExecutor(self.threads) as pool:
+                list(pool.map(work, range(len(self.tiles))))
+        else:
+            for i in range(len(self.tiles)):
+                work(i)
+        return np.asarray(sums.sum(axis=0) + self.within)
+
+
+def _processors() -> int:
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _evaluate(bound: BoundModel, tile: _Tile, theta: Array, space: Array, out: Array) -> None:
+    """Write each vector's sum of squares over a tile's rows."""
+    n, short = tile.response.size, tile.response.ndim == 2
+    at_once = _TILE_CELLS // n
+    by_column = tuple(np.ascontiguousarray(c) for c in theta.T)
+    # Threads have their own error state. Bad vectors come out as NaN.
+    with np.errstate(all="ignore"):
+        for i in range(0, theta.shape[0], at_once):
+            some = tuple(c[i : i + at_once] for c in by_column)
+            k = some[0].size
+            shape = (n, k) if short else (k, n)
+            work = space[:, : n * k].reshape(N_WORK, *shape)
+            some = tuple(c[None] if short else c[:, None] for c in some)
+            r = bound.model.location(some, tile.rows, bound.references, work)
+            r -= tile.response
+            r *= r
+            if tile.repeats is not None:
+                r *= tile.repeats
+            r.sum(axis=0 if short else 1, out=out[i : i + at_once])
+
+
+def _tile(
+    bound: BoundModel, distinct: Conditions, mean: Array, repeats: Array | None, rows: slice
+) -> _Tile:
+    prepared = bound.prepare({name: v[rows] for name, v in distinct.items()})
+    response, weight = mean[rows], None if repeats is None else repeats[rows]
+    if mean.size <= _SHORT:
+        prepared = {name: v[:, None] for name, v in prepared.items()}
+        response, weight = response[:, None], None if weight is None else weight[:, None]
+    return _Tile(prepared, response, weight)
+
+
+def _distinct(
+    conditions: Conditions, response: Array
+) -> tuple[dict[str, Array], Array, Array | None, float]:
+    """Merge the repeats; long data come back sorted by the condition of fewest values.
+
+    Returns
+    -------
+    distinct : dict of ndarray, shape (m,)
+        Distinct conditions.
+    mean : ndarray, shape (m,)
+        Mean response at each.
+    repeats : ndarray, shape (m,), optional
+        Rows at each; None if no condition was repeated.
+    within : float
+        Sum of squares about the means.
+    """
+    n = response.size
+    levels = [np.unique(v, return_inverse=True) for v in conditions.values()]
+    levels.sort(key=lambda level: level[0].size)
+    code = np.zeros(n, dtype=np.intp)
+    for values, inverse in levels:
+        # Renumbered at every step, so that the codes cannot overflow.
+        code = _renumbered(code * values.size + inverse)
+    count = np.bincount(code)
+    if count.size == n:
+        order = np.argsort(code) if n > _SHORT else np.arange(n)
+        return {name: v[order] for name, v in conditions.items()}, response[order], None, 0.0
+    first = np.empty(count.size, dtype=np.intp)
+    first[code[::-1]] = np.arange(n)[::-1]
+    mean = np.bincount(code, response) / count
+    within = float(np.square(response - mean[code]).sum())
+    distinct = {name: v[first] for name, v in conditions.items()}
+    return distinct, mean, count.astype(np.float64), within
+
+
+def _renumbered(code: NDArray[np.intp]) -> NDArray[np.intp]:
+    return np.unique(code, return_inverse=True)[1]
+
+
+def _blocks(distinct: Conditions, n: int) -> list[slice]:
+    """Cut sorted rows into tiles, also where the condition of fewest values changes.
+
+    There the equation may work out per value what it would otherwise do per row.
+    """
+    if n <= _SHORT:
+        return [slice(0, n)]
+    few = min(distinct.values(), key=lambda v: np.unique(v).size)
+    edges = np.flatnonzero(np.diff(few)) + 1
+    if edges.size * _SHORT > n:
+        edges = edges[:0]
+    cuts = [0]
+    for edge in [*edges.tolist(), n]:
+        length = edge - cuts[-1]
+        parts = -(-length // _TILE_CELLS)
+        cuts += [cuts[-1] + length * (j + 1) // parts for j in range(parts)]
+    return [slice(a, b) for a, b in pairwise(cuts)]

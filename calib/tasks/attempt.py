@@ -1,0 +1,64 @@
+"""One task: its result or its error, and how long it took."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from calib.errors import CalibError
+
+__all__ = ["Finished", "attempt", "describe"]
+
+
+@dataclass(frozen=True)
+class Finished[R]:
+    """A task that came to its end.
+
+    Parameters
+    ----------
+    name : str
+    result : object
+        What the task returned; None where it failed.
+    error : str, optional
+        Why it failed; None where it did not.
+    seconds : float
+        Wall-clock time of the task itself.
+    """
+
+    name: str
+    result: R | None
+    error: str | None
+    seconds: float
+
+
+def attempt[I, R](function: Callable[[I], R], name: str, item: Callable[[], I]) -> Finished[R]:
+    """Run a task and keep whatever goes wrong with it.
+
+    Parameters
+    ----------
+    function : callable
+    name : str
+    item : callable
+        Returns what `function` is called with.
+    """
+    began = time.perf_counter()
+    try:
+        result = function(item())
+    # A library that calls sys.exit ends its own task only.
+    except (Exception, SystemExit) as error:
+        return Finished(name, None, describe(error), time.perf_counter() - began)
+    return Finished(name, result, None, time.perf_counter() - began)
+
+
+def describe(error: BaseException) -> str:
+    """Return an error as a reader needs it: what can be mended, or what broke and where."""
+    if isinstance(error, CalibError):
+        return str(error)
+    text = "".join(traceback.format_exception_only(error)).strip()
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames:
+        return text
+    return f"{text} ({Path(frames[-1].filename).name}, line {frames[-1].lineno})"

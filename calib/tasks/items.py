@@ -1,0 +1,35 @@
+"""Items that are read when their task is sent off, not all before the first."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+
+__all__ = ["LateItems"]
+
+
+class LateItems[S, I](Mapping[str, I]):
+    """A mapping whose values are read anew each time they are asked for.
+
+    Parameters
+    ----------
+    sources : mapping of str to object
+        Where each item is, such as a path.
+    read : callable
+        Returns the item of a source; what it raises is the error of that task alone.
+    """
+
+    def __init__(self, sources: Mapping[str, S], read: Callable[[S], I]) -> None:
+        self._sources = sources
+        self._read = read
+
+    def __getitem__(self, name: str) -> I:
+        return self._read(self._sources[name])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._sources)
+
+    def __len__(self) -> int:
+        return len(self._sources)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._sources

@@ -1,0 +1,10 @@
+"""What a worker process on this machine does first; Dask loads it there."""
+
+from __future__ import annotations
+
+import signal
+
+
+def dask_setup(worker: object) -> None:
+    """Leave Ctrl-C, which a terminal sends to all processes, to the one that owns the workers."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

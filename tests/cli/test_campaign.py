@@ -1,0 +1,107 @@
+"""The campaign verb: its exit codes and what it says."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from campaign.sites import refuse_all, results
+
+from calib.cli import main
+from calib.templates import template_csv
+
+CASES = '[[challenge]]\nname = "blind"\ncases = {}\ndraw_seed = 5\ntier = "easy"\n'
+FIT = '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\nposteriors = false\n'
+
+
+@pytest.fixture
+def calib(monkeypatch, capsys, tmp_path):
+    """Run the verb as the shell would, in a folder with a data file."""
+    monkeypatch.chdir(tmp_path)
+    Path("rut.csv").write_text(template_csv("bekker"))
+
+    def run(plan: str, *options: str) -> tuple[int, str, str]:
+        Path("plan.toml").write_text(plan)
+        words = ["calib", "campaign", "plan.toml", "--out", "out", "--workers", "1", *options]
+        monkeypatch.setattr(sys, "argv", words)
+        with pytest.raises(SystemExit) as ended:
+            main()
+        captured = capsys.readouterr()
+        return int(ended.value.code or 0), captured.out, captured.err
+
+    return run
+
+
+def test_it_works_and_goes_on_where_it_stopped(calib):
+    code, out, _ = calib(FIT)
+    assert code == 0
+    assert out == "1 of 1 tasks done, 0 failed\nout/summary.json\n"
+    first = Path("out/results/a.rut.bekker.shipped.nothing/numbers.json").stat().st_mtime_ns
+    code, out, _ = calib(FIT + CASES.format(1))
+    assert (code, out.splitlines()[0]) == (0, "2 of 2 tasks done, 0 failed")
+    again = Path("out/results/a.rut.bekker.shipped.nothing/numbers.json").stat().st_mtime_ns
+    assert again == first
+
+
+def test_a_list_of_tasks_does_nothing(calib):
+    code, out, _ = calib(FIT + CASES.format(2), "--list")
+    assert code == 0
+    assert out == "a.rut.bekker.shipped.nothing\nblind.case-000\nblind.case-001\n"
+    assert not Path("out").exists()
+
+
+def test_failed_tasks_end_with_one(calib):
+    Path("bad.csv").write_text("average_ground_pressure_kpa\n1\n")
+    code, out, err = calib(FIT)
+    assert code == 1
+    assert "1 of 2 tasks done, 1 failed" in out
+    assert "a.bad.bekker.shipped.nothing failed: bad.csv" in err
+    assert "rut_depth" in err
+    state = json.loads(Path("out/summary.json").read_text())["tasks"]
+    assert state["a.bad.bekker.shipped.nothing"]["state"] == "failed"
+
+
+def test_posteriors_that_did_not_converge_end_with_three(calib, monkeypatch):
+    refuse_all(monkeypatch)
+    code, out, _ = calib(FIT + "max_steps = 100\n")
+    assert code == 3
+    assert "NOT CONVERGED, not to be used: a.rut.bekker.shipped.nothing" in out
+
+
+def test_what_can_be_mended_ends_with_two(calib):
+    code, _, err = calib(FIT.replace("bekker", "becker"))
+    assert code == 2
+    assert "plan.toml, [[fit]], models: " in err
+    code, _, err = calib(FIT, "--scheduler", "nonsense")
+    assert code == 2
+    assert "no Dask scheduler" in err
+    calib(FIT)
+    code, _, err = calib("seed = 1\n" + FIT)
+    assert code == 2
+    assert "--overwrite" in err
+    assert calib("seed = 1\n" + FIT, "--overwrite")[0] == 0
+
+
+def test_control_c_says_what_is_kept_and_nothing_else(tmp_path):
+    (tmp_path / "plan.toml").write_text(CASES.format(40))
+    process = subprocess.Popen(
+        [sys.executable, "-c", "from calib.cli import main; main()", "campaign", "plan.toml",
+         "--out", "out"],
+        cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+    while not results(tmp_path / "out"):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.01)
+    # As a terminal does: to the workers as well.
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "of 40 results are kept in out/results" in err
+    assert "Traceback" not in err

@@ -1,0 +1,68 @@
+"""The source's own gaps at the command line: in the embedded report, not in that of own data."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from calib.templates import template_csv
+
+from .test_cli import Calib, assert_refused, calib, contents  # noqa: F401
+
+
+def test_the_four_cases_are_written_and_can_be_diagnosed(calib: Calib) -> None:  # noqa: F811
+    written = calib("data", "he2019-gaps", "--out", "gaps")
+    assert written.code == 0, written.err
+    assert written.out.count("reconstructed from published results, not measured") == 4
+    diagnosed = calib("diagnose", "gaps/plain_bekker", "--out", "found")
+    assert diagnosed.code == 0, diagnosed.err
+    assert "verdict: effect" in diagnosed.out
+    assert "slip_sinkage" in diagnosed.out
+    assert Path("found/fresh_prediction.csv").exists()
+    again = calib("data", "he2019-gaps", "--out", "gaps")
+    assert_refused(again, ["plain_bekker", "exist there already", "--overwrite"])
+    assert calib("data", "he2019-gaps", "--out", "gaps", "--overwrite").code == 0
+
+
+def test_the_folder_is_called_by_the_name_of_the_data(calib: Calib, tmp_path: Path) -> None:  # noqa: F811
+    assert calib("data", "he2019").code == 0
+    assert calib("data", "he2019-gaps").code == 0
+    assert {p for p in contents(tmp_path) if "/" not in p} == {"he2019", "he2019-gaps"}
+
+
+def test_a_folder_that_cannot_be_made_is_said_so(calib: Calib) -> None:  # noqa: F811
+    Path("file").write_text("")
+    refused = calib("data", "he2019-gaps", "--out", "file/gaps")
+    assert_refused(refused, ["file/gaps", "cannot be written"])
+
+
+def test_the_report_of_the_embedded_data_has_the_section(
+    calib: Calib,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+    found_gaps,
+) -> None:
+    """The command passes the gaps on; calibrations, tested elsewhere, are left out here."""
+    asked = []
+
+    def find(seed, **_):
+        asked.append(seed)
+        return (found_gaps["plain_bekker"],)
+
+    monkeypatch.setattr("calib.study.he2019_tasks", lambda: ())
+    monkeypatch.setattr("calib.paper_gaps.find.find_gaps", find)
+    ran = calib("report", "--out", "rep", "--seed", 5)
+    assert ran.code == 0, ran.err
+    assert asked == [5]
+    assert set(json.loads(Path("rep/summary.json").read_text())["paper_gaps"]) == {"plain_bekker"}
+    assert 'id="paper-gaps"' in Path("rep/index.html").read_text()
+
+
+def test_the_report_of_own_data_has_no_such_section(calib: Calib) -> None:  # noqa: F811
+    Path("my.csv").write_text(template_csv("modified_bekker"))
+    ran = calib("report", "my.csv", "--out", "rep")
+    assert ran.code == 0, ran.err
+    assert "paper_gaps" not in json.loads(Path("rep/summary.json").read_text())
+    assert "paper-gaps" not in Path("rep/index.html").read_text()
+    assert not Path("rep/gaps").exists()

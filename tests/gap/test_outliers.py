@@ -1,0 +1,49 @@
+"""Gigantic outliers: set aside with a warning, in either campaign; they name no cause."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.gap.case import campaigns
+from calib.gap.effects import EFFECTS
+from calib.gap.outliers import rank_without_outliers
+from gap.cases import PULL_ONLY, make_case
+
+FEW = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}
+
+
+def spoiled(case, campaign: str, row: int, factor: float):
+    table = getattr(case, campaign)
+    columns = {name: np.array(v) for name, v in table.columns.items()}
+    columns["drawbar_pull_kn"][row] *= factor
+    return replace(case, **{campaign: replace(table, columns=columns)})
+
+
+@pytest.mark.parametrize(
+    ("campaign", "said"), [("lab", "calibration row 4"), ("field", "field row 4")]
+)
+@pytest.mark.parametrize("effect", [None, "force_offset"])
+def test_a_gigantic_outlier_is_set_aside_and_changes_nothing_else(campaign, said, effect):
+    case = make_case(effect, models=PULL_ONLY)
+    data, ranking = rank_without_outliers(spoiled(case, campaign, 4, 20.0), 1, FEW)
+    assert any(said in warning for warning in data.case.warnings)
+    assert ranking.order[0] == (effect or "none")
+
+
+def test_a_clean_case_is_left_as_it_is():
+    case = make_case(None, models=PULL_ONLY)
+    data, _ = rank_without_outliers(case, 1, FEW)
+    assert data.case.warnings == case.warnings
+    assert len(data.outputs[0].rows) == len(campaigns(case).outputs[0].rows)
+
+
+def test_many_rows_that_lie_off_are_no_outliers():
+    case = make_case(None, models=PULL_ONLY)
+    for row in range(0, 27, 3):
+        case = spoiled(case, "field", row, 3.0)
+    data, ranking = rank_without_outliers(case, 1, FEW)
+    assert data.outputs[0].rows.size == 27
+    assert ranking.probability["none"] < 0.5
