@@ -153,8 +153,7 @@ def ess(chains: Array, method: Literal["bulk", "tail", "mean"]) -> Array:
 def mcse(chains: Array, method: Literal["mean", "sd", "median"]) -> Array:
     """Monte Carlo standard error of a summary of each parameter, (chains, draws, d) to (d,)."""
     with np.errstate(all="ignore"):
-        value = _stats().mcse(chains, chain_axis=0, draw_axis=1, method=method)
-    return np.asarray(value)
+        return np.asarray(_stats().mcse(chains, method=method, **_AXES))
 
 
 def tail_shape(chains: Array) -> Array:
@@ -167,7 +166,7 @@ def tail_shape(chains: Array) -> Array:
     Vehtari et al. (2024), Pareto smoothed importance sampling, JMLR 25(72).
     """
     with np.errstate(all="ignore"):
-        return np.asarray(_stats().pareto_khat(chains, chain_axis=0, draw_axis=1))
+        return np.asarray(_stats().pareto_khat(chains, **_AXES))
 
 
 def hdi(draws: Array, prob: float) -> tuple[float, float]:

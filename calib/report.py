@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -119,6 +120,8 @@ def write_report(
         if gaps:
             manifest["paper_gaps"] = {r.gap.name: {"seed": r.found.seed} for r in gaps}
             gaps_html = write_gaps(gaps, folder, png, manifest=manifest, pdf=pdf, progress=tell)
+        if audit is not None:
+            manifest["audit"] = {"seed": audit.seed, "seeds": asdict(audit.seeds)}
         page = render_page(
             study,
             drawn,

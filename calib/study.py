@@ -28,6 +28,7 @@ from calib.problem import Problem, build_problem
 from calib.sampling.sampler import SamplerSettings
 from calib.sensitivity import Sensitivity, prior_sensitivity
 from calib.streams import generator
+from calib.threads import one_thread
 from calib.validate import Validation, leave_one_out, validate_held_out
 
 __all__ = [
@@ -271,6 +272,7 @@ def he2019_tasks() -> tuple[Task, ...]:
     return tuple(Task(key, model, load_he2019(key), rows) for key, (model, rows) in models.items())
 
 
+@one_thread()
 def run_study(
     tasks: Sequence[Task],
     seed: int,

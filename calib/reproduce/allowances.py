@@ -39,7 +39,7 @@ _STRICT_COST, _SEARCH_COST = 1e-6, 1e-3
 _FLOOR = 1e-9
 _MODE_SD, _LOG_POSTERIOR = 0.01, 1e-5
 # Effective sample sizes of tails differ by up to a factor of four between seeds.
-_ACCEPTANCE, _RHAT, _FACTOR, _MCSE_FACTOR = 0.1, 0.01, 10.0, 3.0
+_ACCEPTANCE, _RHAT, _FACTOR, _MCSE_FACTOR = 0.1, 0.01, 10.0, 5.0
 
 
 @dataclass(frozen=True)
@@ -70,10 +70,20 @@ _ROWS = Allowance(why="which rows are refitted is decided by their draws")
 # Figures about the sampling, by the name of the entry: what matters of them is their size.
 _ROUGH: Mapping[str, Allowance] = {
     **dict.fromkeys(
-        ("ess_bulk", "ess_tail", "tau", "steps", "evaluations", "efficiency"),
+        (
+            "ess_bulk",
+            "ess_tail",
+            "tau",
+            "steps",
+            "evaluations",
+            "efficiency",
+            "smallest_ess_bulk",
+            "smallest_ess_tail",
+            "smallest_steps_over_tau",
+        ),
         Allowance(factor=_FACTOR, why=f"a factor of {_FACTOR:g}"),
     ),
-    "rhat": Allowance(_RHAT, why="stated"),
+    **dict.fromkeys(("rhat", "largest_rhat"), Allowance(_RHAT, why="stated")),
     "acceptance": Allowance(_ACCEPTANCE, why="stated"),
     "log_posterior_at_mode": Allowance(_LOG_POSTERIOR, why="stated"),
     "reasons": Allowance(words=True, why="words"),
@@ -128,7 +138,7 @@ def output_allowances(
     for path in paths:
         if path[:2] == ("sampling", "mode"):
             found[path] = _of_scale(calibration, path[-1], _MODE_SD)
-        elif path[-1] == "mcse_mean":
+        elif path[-1].startswith("mcse_"):
             heavy = errors.get(("posterior", path[1], "sd")) is None
             found[path] = _HEAVY if heavy else _MCSE
     return {

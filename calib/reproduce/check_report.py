@@ -16,11 +16,12 @@ from calib.reproduce.compare_report import (
     compare_report,
     count_numbers,
     entry,
-    read_json,
 )
+from calib.reproduce.derived import verify_derived, verify_gap_summaries
 from calib.reproduce.files import verify_files
 from calib.reproduce.inputs import verify_hashes, verify_label, verify_priors
 from calib.reproduce.items import Item, Status
+from calib.reproduce.numbers import read_json
 from calib.reproduce.posteriors import GROUP as POSTERIORS
 from calib.reproduce.posteriors import DrawsFile, read_draws, verify_density, verify_summary
 from calib.reproduce.recompute import not_computed, recompute_report, report_tasks
@@ -58,6 +59,10 @@ def check_report(
     summary = read_json(folder / SUMMARY)
     posteriors, unreadable = _posteriors(folder, manifest)
     items += unreadable + _consistent(folder, summary, posteriors)
+    items += verify_gap_summaries(folder, summary) + verify_derived(
+        folder, manifest.files, read_json(folder / RECORD), summary,
+        same_code=manifest.code == here.code,
+    )  # fmt: skip
     allowed = ""
     with not_computed(items, folder, RECORD):
         tasks = report_tasks(manifest, folder, scratch / "inputs")

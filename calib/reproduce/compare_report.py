@@ -13,38 +13,34 @@ from calib.reproduce.allowances import (
     estimate_allowances,
     output_allowances,
 )
+from calib.reproduce.compare_documents import gap_group
 from calib.reproduce.compare_files import RECORD, SUMMARY, Again, compare_files
 from calib.reproduce.inputs import GROUP as INPUTS
 from calib.reproduce.items import Item, Status
 from calib.reproduce.montecarlo import Place
-from calib.reproduce.numbers import Section, compare_section, flatten
+from calib.reproduce.numbers import Section, compare_section, flatten, read_json
 from calib.reproduce.schema import Manifest
+from calib.reproduce.stated import gap_allowances, sensitivity_allowances
 from calib.study import OutputResult, Progress, Study, Task, estimate_task
 from calib.summary import summarise_estimates
 
 __all__ = [
-    "compare_estimates", "compare_report", "count_numbers", "entry", "read_json",
+    "compare_estimates", "compare_report", "count_numbers", "entry",
 ]  # fmt: skip
 
 # What a manifest has about itself: durations, and hashes that are verified as such.
 _NOT_COMPARED = ("seconds", "files", "left_out")
 _VERIFIED = ("sha256", "shipped")
 _POINTS = ("estimates", "fit", "by_pressure")
-_CHAIN = ("posterior", "validation", "sampling")
+_CHAIN = ("posterior", "prior_sensitivity", "validation", "sampling")
 _HEAD = ("schema", "seed")
-_SET_UP = ("model", "output", "data", "references", "error")
+_SET_UP = ("model", "output", "data", "references", "priors", "error")
 _KNOWN = (*_POINTS, *_CHAIN, *_SET_UP)
+_GAPS = "paper_gaps"
+# Of what is set up, only the last bits may differ.
+_SET_UP_PART = 1e-9
 _NO_RULE = Allowance(why="no allowance is stated for it")
 _SEARCHES = ("genetic", "differential_evolution")
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Return a JSON object; empty where the file is missing or damaged."""
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
-        return {}
-    return content if isinstance(content, dict) else {}
 
 
 def count_numbers(study: Study) -> int:
@@ -72,8 +68,11 @@ def compare_report(again: Again, summary: Mapping[str, Any]) -> list[Item]:
             section, _allowances(again.study, key, section), group_of=_grouped(key)
         )
         items += numbers + _blame(again.manifest, key, numbers)
+    for name in _gaps(made):
+        numbers, exact[gap_group(name)] = _compare_gap(summary, made, name)
+        items += numbers
     for key in dict.fromkeys([*summary, *made]):
-        if key != "models":
+        if key not in ("models", _GAPS):
             section = _section((key,), summary.get(key), made.get(key))
             exact[key] = section.exact
             head = key in _HEAD
@@ -83,12 +82,15 @@ def compare_report(again: Again, summary: Mapping[str, Any]) -> list[Item]:
             )  # fmt: skip
     if summary and set(_outputs(summary)) != set(_outputs(made)):
         items.append(Item(SUMMARY, SUMMARY, Status.DIFFERENT, note="it has other outputs"))
+    if summary and set(_gaps(summary)) != set(_gaps(made)):
+        items.append(Item(SUMMARY, SUMMARY, Status.DIFFERENT, note="it has other gaps"))
     items += _record(again)
     alone = all(item.status is Status.IDENTICAL for item in items)
     if alone and _bytes(again.folder / SUMMARY) != _bytes(again.made / SUMMARY):
         note = "the same numbers in another form than it is written in"
         items.append(Item(SUMMARY, SUMMARY, Status.DIFFERENT, note=note))
-    return items + compare_files(again, exact)
+    best = {name: str(gap["best"]) for name, gap in _gaps(made).items()}
+    return items + compare_files(again, exact, best)
 
 
 def compare_estimates(
@@ -114,6 +116,21 @@ def compare_estimates(
     return items
 
 
+def _compare_gap(
+    summary: Mapping[str, Any], made: Mapping[str, Any], name: str
+) -> tuple[list[Item], bool]:
+    new = _gaps(made)[name]
+    section = _section((_GAPS, name), _gaps(summary).get(name), new)
+    allowances = gap_allowances({**section.recorded, **section.found}, str(new["best"]))
+    items = compare_section(section, allowances, group_of=_always(gap_group(name)))
+    return items, section.exact
+
+
+def _gaps(summary: Mapping[str, Any]) -> Mapping[str, Any]:
+    gaps = summary.get(_GAPS)
+    return gaps if isinstance(gaps, Mapping) else {}
+
+
 def _outputs(summary: Mapping[str, Any]) -> Mapping[str, Any]:
     models = summary.get("models")
     return models if isinstance(models, Mapping) else {}
@@ -133,9 +150,15 @@ def _section(place: Place, recorded: Any, found: Any) -> Section:
 def _allowances(study: Study, key: str, section: Section) -> dict[Place, Allowance]:
     result = study.results[key]
     rules = _no_rules(section, _KNOWN)
+    rules |= {
+        path: Allowance(_SET_UP_PART * abs(value), why="it follows from the data")
+        for path, value in section.found.items()
+        if path[:1] and path[0] in _SET_UP and isinstance(value, int | float)
+    }
     if isinstance(result, OutputResult):
         paths = {**section.recorded, **section.found}
         rules |= output_allowances(result, count_numbers(study), section.recorded, paths)
+        rules |= sensitivity_allowances(section.found)
     return rules
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ from PIL import Image
 from calib.models.base import Array
 from calib.reproduce.items import Item, Status
 
-__all__ = ["GROUP", "compare_figure", "thumbnails"]
+__all__ = ["GROUP", "compare_figure", "compare_pictures", "compare_print", "thumbnails"]
 
 GROUP = "figures"
 # Root mean square difference of grey levels from 0 to 1 of figures reduced to 64 x 64. Other draws
@@ -67,6 +67,42 @@ def compare_figure(
         note = "the numbers are the same to the last bit, the figure is not"
         return Item(GROUP, name, Status.DIFFERENT, note=note)
     return Item(GROUP, name, Status.WITHIN, note="it looks like the one drawn again", **facts)
+
+
+def compare_pictures(
+    page: str, recorded: Sequence[bytes], drawn: Sequence[bytes], *, exact: bool
+) -> list[Item]:
+    """Compare the pictures that a page alone has with those drawn again, in their order.
+
+    Parameters
+    ----------
+    page : str
+        Its path in the folder.
+    recorded, drawn : sequence of bytes
+        PNG files.
+    exact : bool
+        As for `compare_figure`.
+    """
+    if len(recorded) != len(drawn):
+        note = f"it has {len(recorded)} pictures of its own, not {len(drawn)}"
+        return [Item(GROUP, page, Status.DIFFERENT, note=note)]
+    names = [f"{page}: picture {i + 1}" for i in range(len(drawn))]
+    reduced = {name: _thumbnail(image) for name, image in zip(names, drawn, strict=True)}
+    others = {name: image for name, image in reduced.items() if image is not None}
+    return [
+        compare_figure(name, old, new, others, exact=exact)
+        for name, old, new in zip(names, recorded, drawn, strict=True)
+    ]
+
+
+def compare_print(name: str, recorded: bytes, drawn: bytes, *, exact: bool) -> Item:
+    """Compare a figure as PDF, of which only the bytes can be compared."""
+    if recorded == drawn:
+        return Item(GROUP, name, Status.IDENTICAL)
+    if exact:
+        note = "the numbers are the same to the last bit, the figure is not"
+        return Item(GROUP, name, Status.DIFFERENT, note=note)
+    return Item(GROUP, name, Status.UNJUDGED, note="for print; the PNG beside it is compared")
 
 
 def _distance(one: Array, other: Array) -> float:

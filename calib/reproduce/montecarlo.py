@@ -1,8 +1,7 @@
 """Monte Carlo standard errors of everything that is computed from posterior draws.
 
-Of a posterior's mean, sd and median they are ArviZ's. The ends of a highest-density interval
-converge as the cube root of the number of draws, so theirs come from parts of the draws by that
-rate. Scores follow from the errors of the predictive distributions they are scores of.
+Of a posterior's summary they are the stated ones, of its sd ArviZ's. Scores follow from the errors
+of the predictive distributions they are scores of.
 """
 
 from __future__ import annotations
@@ -10,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.calibration import Calibration
-from calib.chains import hdi, mcse, tail_shape
+from calib.chains import mcse, tail_shape
 from calib.models.base import Array
 from calib.scores import LEVELS, RELATIVE_ERROR_FLOOR
 from calib.validate import Validation
@@ -20,8 +19,6 @@ __all__ = ["Place", "posterior_errors", "validation_errors"]
 type Place = tuple[str, ...]
 """Keys from the top of a document to one of its numbers; positions in a list count from "0"."""
 
-_PARTS = 16
-_HDI = 0.95
 # Moments that exist: the variance of a mean, and of a variance. The shape is estimated, so a
 # little less is asked of the second.
 _K_MEAN, _K_SD = 0.5, 0.2
@@ -44,17 +41,16 @@ def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:
     """
     names = tuple(calibration.parameters)
     stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
-    mean, sd, median = mcse(stacked, "mean"), mcse(stacked, "sd"), mcse(stacked, "median")
-    shape = tail_shape(stacked)
+    sd, shape = mcse(stacked, "sd"), tail_shape(stacked)
     errors: dict[Place, float | None] = {}
     for j, name in enumerate(names):
-        low, high = _hdi_errors(stacked[..., j])
+        stated = calibration.summary[name]
         errors |= {
-            ("posterior", name, "mean"): float(mean[j]) if shape[j] < _K_MEAN else None,
+            ("posterior", name, "mean"): stated.mcse_mean if shape[j] < _K_MEAN else None,
             ("posterior", name, "sd"): float(sd[j]) if shape[j] < _K_SD else None,
-            ("posterior", name, "median"): float(median[j]),
-            ("posterior", name, "hdi_lower"): low,
-            ("posterior", name, "hdi_upper"): high,
+            ("posterior", name, "median"): stated.mcse_median,
+            ("posterior", name, "hdi_lower"): stated.mcse_hdi_lower,
+            ("posterior", name, "hdi_upper"): stated.mcse_hdi_upper,
         }
     draws = calibration.draws
     internal = draws.t.reshape(-1, *draws.t.shape[2:])
@@ -66,13 +62,6 @@ def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:
     efficiency = max(draws.efficiency, 1e-3)
     errors["sampling", "log_evidence"] = float(np.sqrt((1.0 / efficiency - 1.0) / _EVIDENCE_DRAWS))
     return errors
-
-
-def _hdi_errors(chains: Array) -> tuple[float, float]:
-    parts = np.array_split(chains.reshape(-1, chains.shape[-1]), min(_PARTS, chains.shape[0]))
-    ends = np.array([hdi(part.ravel(), _HDI) for part in parts])
-    low, high = ends.std(axis=0, ddof=1) * len(parts) ** (-1.0 / 3.0)
-    return float(low), float(high)
 
 
 def validation_errors(

@@ -9,10 +9,12 @@ out. Otherwise the draws are others, and each number has its allowance.
 
 from __future__ import annotations
 
+import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -20,7 +22,7 @@ from calib.reproduce.allowances import MONTE_CARLO, Allowance
 from calib.reproduce.items import Item, Status
 from calib.reproduce.montecarlo import Place
 
-__all__ = ["Section", "compare_section", "flatten", "same_words", "without_numbers"]
+__all__ = ["Section", "compare_section", "flatten", "read_json", "same_words", "without_numbers"]
 
 _MOSTLY = 0.9
 _ROUNDED, _STANDS_OUT = 1e-3, 0.05
@@ -59,16 +61,37 @@ class Section:
         return same >= _MOSTLY * len(floats)
 
 
+def read_json(path: Path) -> dict[str, Any]:
+    """Return a JSON object; empty where the file is missing or damaged."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
 def flatten(document: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
-    """Yield the path and the value of every entry of a JSON document."""
+    """Yield the path and the value of every entry of a JSON document.
+
+    Entries of a list are known by their ``name`` or ``key`` where each has its own, otherwise by
+    their position.
+    """
     if isinstance(document, Mapping):
         for key, value in document.items():
             yield from flatten(value, (*place, str(key)))
     elif isinstance(document, Sequence) and not isinstance(document, str):
-        for i, value in enumerate(document):
-            yield from flatten(value, (*place, str(i)))
+        for name, value in zip(_names(document), document, strict=True):
+            yield from flatten(value, (*place, name))
     else:
         yield place, document
+
+
+def _names(entries: Sequence[Any]) -> list[str]:
+    for key in ("name", "key"):
+        names = [entry.get(key) for entry in entries if isinstance(entry, Mapping)]
+        if len(names) == len(set(map(str, names))) == len(entries) and None not in names:
+            return [str(name) for name in names]
+    return [str(i) for i in range(len(entries))]
 
 
 def compare_section(

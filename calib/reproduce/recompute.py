@@ -10,11 +10,14 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.audit import Seeds
 from calib.calibration import Calibration, calibrate
+from calib.contents import work_out
 from calib.data import read_table
 from calib.errors import CalibError
 from calib.estimators import PointEstimate, estimate
 from calib.outputs import OUTPUTS
+from calib.paper_gaps.cases import paper_gaps
 from calib.problem import Problem
 from calib.report import write_report
 from calib.reproduce.inputs import GROUP as INPUTS
@@ -22,7 +25,7 @@ from calib.reproduce.items import Item, Status
 from calib.reproduce.schema import Manifest, RunRecord, TaskRecord
 from calib.store import save_calibration
 from calib.streams import generator
-from calib.study import HoldOut, Progress, Study, Task, run_study
+from calib.study import HoldOut, Progress, Study, Task
 
 __all__ = ["estimate_again", "not_computed", "recompute_report", "recompute_run", "report_tasks"]
 
@@ -86,17 +89,28 @@ def recompute_report(
     manifest: Manifest, tasks: tuple[Task, ...], out: Path, progress: Progress
 ) -> Study:
     """Work a report out again and write it into a new folder."""
-    study = run_study(tasks, manifest.seed, settings=manifest.settings, progress=progress)
+    repeats = manifest.audit and manifest.audit.seeds
+    contents = work_out(
+        tasks,
+        manifest.seed,
+        settings=manifest.settings,
+        gaps=[gap for gap in paper_gaps() if gap.name in manifest.paper_gaps],
+        audit=Seeds(**repeats.model_dump()) if repeats else None,
+        progress=progress,
+    )
     write_report(
-        study,
+        contents.study,
         out,
+        gaps=contents.gaps,
+        audit=contents.audit,
+        pdf=manifest.pdf,
         settings=manifest.settings,
         command=manifest.command,
         title=manifest.title,
         environment=manifest.environment,
         progress=progress,
     )
-    return study
+    return contents.study
 
 
 def estimate_again(record: RunRecord, problem: Problem) -> tuple[PointEstimate, ...]:

@@ -22,6 +22,7 @@ from calib.errors import CalibError
 from calib.manifest import SCHEMA as REPORT_SCHEMA
 from calib.models import MODELS
 from calib.outputs import OUTPUTS
+from calib.paper_gaps.cases import paper_gaps
 from calib.sampling.sampler import SamplerSettings
 from calib.store import SCHEMA as RUN_SCHEMA
 
@@ -48,11 +49,20 @@ def _known_model(name: str) -> str:
     return name
 
 
+def _known_gap(name: str) -> str:
+    known = [gap.name for gap in paper_gaps()]
+    if name not in known:
+        raise ValueError(f"not one of {', '.join(known)}")
+    return name
+
+
 type _Hash = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 type _File = Annotated[str, AfterValidator(_inside)]
 type _Name = Annotated[str, AfterValidator(_name)]
 type _Model = Annotated[str, AfterValidator(_known_model)]
 type _Seed = Annotated[int, Field(ge=0)]
+type _Repeat = Annotated[int, Field(ge=1, le=1000)]
+type _Gap = Annotated[str, AfterValidator(_known_gap)]
 
 
 class _Record(BaseModel):
@@ -101,6 +111,20 @@ class _Made(_Record):
         return Environment(self.versions, self.machine, self.code)
 
 
+class _Seeded(_Record):
+    seed: _Seed
+
+
+class _Repeats(_Record):
+    by_pressure: _Repeat
+    joint: _Repeat
+    printed_coordinates: _Repeat
+
+
+class _Audit(_Seeded):
+    seeds: _Repeats
+
+
 class Manifest(_Made):
     """`manifest.json` of a report folder."""
 
@@ -110,6 +134,9 @@ class Manifest(_Made):
     seed: _Seed
     settings: SamplerSettings
     tasks: dict[str, TaskRecord]
+    pdf: bool = False
+    paper_gaps: dict[_Gap, _Seeded] = {}
+    audit: _Audit | None = None
     files: dict[_File, _Hash]
     left_out: dict[_File, _Hash]
 

@@ -13,7 +13,9 @@ from calib.manifest import sha256
 from calib.reproduce.items import Item, Status
 from calib.reproduce.numbers import without_numbers
 
-__all__ = ["GROUP", "compare_text", "readable", "verify_images"]
+__all__ = [
+    "GROUP", "compare_text", "differing_lines", "own_pictures", "readable", "verify_images",
+]  # fmt: skip
 
 GROUP = "page and tables"
 _IMAGE = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]*)")
@@ -50,10 +52,14 @@ def _figures(folder: Path) -> dict[str, str]:
 
 
 def _hash(encoded: str) -> str:
+    return sha256(_decoded(encoded))
+
+
+def _decoded(encoded: str) -> bytes:
     try:
-        return sha256(base64.b64decode(encoded, validate=True))
+        return base64.b64decode(encoded, validate=True)
     except binascii.Error:
-        return ""
+        return b""
 
 
 def readable(content: bytes, folder: Path) -> list[str]:
@@ -63,6 +69,13 @@ def readable(content: bytes, folder: Path) -> list[str]:
     return _IMAGE.sub(
         lambda m: f"[picture {names.get(_hash(m[1]), 'of another file')}]", text
     ).splitlines()
+
+
+def own_pictures(content: bytes, folder: Path) -> list[bytes]:
+    """Return the pictures of a page that are none of the folder's figures, in their order."""
+    known = _figures(folder)
+    encoded = _IMAGE.findall(content.decode("utf-8", errors="replace"))
+    return [_decoded(text) for text in encoded if _hash(text) not in known]
 
 
 def compare_text(
@@ -94,7 +107,7 @@ def compare_text(
         note = "the same but for its pictures, which are compared as figures, or its line ends"
         return Item(GROUP, name, Status.WITHIN, note=note)
     if exact:
-        return Item(GROUP, name, Status.DIFFERENT, note=_differing(recorded, written))
+        return Item(GROUP, name, Status.DIFFERENT, note=differing_lines(recorded, written))
     old, new = ("\n".join(text) for text in (recorded, written))
     if _PICTURE.findall(old) != _PICTURE.findall(new):
         note = "it shows other pictures, or in another order"
@@ -107,11 +120,12 @@ def compare_text(
         lines = sum(a != b for a, b in zip(recorded, written, strict=True))
         note = f"{why_not}; the words are the same, {lines} lines differ in their numbers"
         return Item(GROUP, name, Status.UNJUDGED, note=note)
-    note = f"{why_not}; beside numbers, {_differing(old_words, new_words)}"
+    note = f"{why_not}; beside numbers, {differing_lines(old_words, new_words)}"
     return Item(GROUP, name, Status.UNJUDGED, note=note)
 
 
-def _differing(old: Sequence[str], new: Sequence[str]) -> str:
+def differing_lines(old: Sequence[str], new: Sequence[str]) -> str:
+    """Return how many lines two texts do not share, and the first of them."""
     changed = [
         line
         for line in difflib.unified_diff(old, new, "recorded", "written again", n=0, lineterm="")

@@ -32,7 +32,7 @@ from calib.streams import generator
 from calib.study import OutputResult, Study, he2019_tasks, run_study
 
 # Short chains, and a gate that lets them pass.
-SETTINGS = SamplerSettings(steps=100, keep=100, gate=Gate(taus_min=20.0))
+SETTINGS = SamplerSettings(steps=100, gate=Gate(taus_min=20.0))
 
 
 def two_plates(result: OutputResult, published: bool = False) -> list[Plate]:

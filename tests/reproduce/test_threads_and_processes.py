@@ -16,7 +16,7 @@ from calib.sampling.sampler import SamplerSettings
 from calib.study import he2019_tasks, run_study
 from calib.summary import summarise
 
-SHORT = SamplerSettings(steps=60, max_steps=60, keep=60)
+SHORT = SamplerSettings(steps=60, max_steps=60)
 OUTPUTS = ("rut_depth", "drawbar_pull")
 ROOT = Path(__file__).resolve().parents[2]
 
