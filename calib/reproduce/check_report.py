@@ -59,10 +59,6 @@ def check_report(
     summary = read_json(folder / SUMMARY)
     posteriors, unreadable = _posteriors(folder, manifest)
     items += unreadable + _consistent(folder, summary, posteriors)
-    items += verify_gap_summaries(folder, summary) + verify_derived(
-        folder, manifest.files, read_json(folder / RECORD), summary,
-        same_code=manifest.code == here.code,
-    )  # fmt: skip
     allowed = ""
     with not_computed(items, folder, RECORD):
         tasks = report_tasks(manifest, folder, scratch / "inputs")
@@ -78,6 +74,10 @@ def check_report(
             items += compare_report(
                 Again(manifest, folder, scratch / "again", study, here), summary
             )
+    items += verify_gap_summaries(folder, summary) + verify_derived(
+        folder, manifest.files, read_json(folder / RECORD), summary,
+        same_code=manifest.code == here.code,
+    )  # fmt: skip
     return items, allowed
 
 

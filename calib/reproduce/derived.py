@@ -52,7 +52,7 @@ def verify_derived(
         Whether this version wrote the report: another one may word it otherwise.
     """
     expected: dict[str, str] = {}
-    items = []
+    failed = []
     writers: dict[str, Callable[[], Mapping[str, str]]] = {
         _SOURCES: lambda: publication(manifest, summary).files,
         AUDIT_JSON: lambda: _audit_csv(folder, files),
@@ -63,15 +63,16 @@ def verify_derived(
         except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
             note = f"what follows from it cannot be written ({type(error).__name__}: {error})"
             status = Status.DIFFERENT if same_code else Status.UNJUDGED
-            items.append(Item(TEXT, source, status, note=note))
+            failed.append(Item(TEXT, source, status, note=note))
+    items = []
     listed = derived_files(files)
     for name in sorted(listed | set(expected)):
         if name in expected:
             items.append(_written(folder, name, expected[name], same_code=same_code))
-        elif not items:
+        elif not failed:
             note = "it follows from nothing here"
             items.append(_different(name, note, same_code=same_code))
-    return items
+    return failed + items
 
 
 def _audit_csv(folder: Path, files: Mapping[str, str]) -> dict[str, str]:

@@ -21,10 +21,12 @@ type Entries = Mapping[Place, Any]
 
 _WHY = "stated"
 _JUMPS = Allowance(why="a search among nearly equal modes may end elsewhere")
+_SAME = Allowance(0.0, why="nothing moves it")
 _WORDS = Allowance(words=True, why="words")
 
 # Prior sensitivity: a part of the sensitivity and something on top; a part of what is left of the
 # prior's variance.
+_PARAMETERS = ("prior_sensitivity", "parameters")
 _SENSITIVITY, _SENSITIVITY_FLOOR, _LEFT = 0.5, 0.02, 0.3
 
 # Gaps: probabilities, and those of a question asked otherwise; parameters of the best hypothesis.
@@ -43,14 +45,14 @@ def sensitivity_allowances(found: Entries) -> dict[Place, Allowance]:
     """Return the allowances of ``prior_sensitivity`` of an output, computed again as `found`."""
     rules: dict[Place, Allowance] = {}
     for path, value in found.items():
-        if path[:2] != ("prior_sensitivity", "parameters"):
+        if path[:2] != _PARAMETERS or not isinstance(value, float):
             continue
         if path[-1] in ("prior", "likelihood"):
             rules[path] = Allowance(_SENSITIVITY * value + _SENSITIVITY_FLOOR, why=_WHY)
         elif path[-1] == "contraction":
             rules[path] = Allowance(_LEFT * (1.0 - value), why=_WHY)
     for path in found:
-        if path[:2] == ("prior_sensitivity", "parameters") and path not in rules:
+        if path[:2] == _PARAMETERS and path not in rules:
             rules[path] = _of_thresholds(path[:-1], found, rules)
     return rules
 
@@ -62,8 +64,8 @@ def _of_thresholds(place: Place, found: Entries, rules: Mapping[Place, Allowance
         ("prior", SENSITIVITY_MIN),
         ("likelihood", SENSITIVITY_MIN),
     ):
-        size = rules[*place, name].size or 0.0
-        if abs(found[*place, name] - threshold) <= size:
+        rule = rules.get((*place, name))
+        if rule is None or abs(found[*place, name] - threshold) <= (rule.size or 0.0):
             return Allowance(why="a number that it is read off is near its threshold")
     return Allowance(0.0, why=_WHY)
 
@@ -92,7 +94,7 @@ def _gap_rule(path: Place, value: Any, best: str, entries: Entries) -> Allowance
         return Allowance(_PROBABILITY, why=_WHY)
     if top == "effects" and path[1] != best:
         return _JUMPS
-    if not isinstance(value, int | float) or top in ("rows", "withheld"):
+    if not isinstance(value, int | float):
         return None
     if top in ("parameters", "effects"):
         return Allowance(_PARAMETER * abs(value) + _PARAMETER_FLOOR, why=_WHY)
@@ -103,7 +105,7 @@ def _gap_rule(path: Place, value: Any, best: str, entries: Entries) -> Allowance
         return _check_rule(last, value)
     if top == "where":
         return _where_rule(path, entries)
-    return Allowance(_OPEN * abs(value), why=_WHY) if top == "open_sd_rms" else None
+    return Allowance(_OPEN * abs(value), why=_WHY) if top == "open_sd_rms" else _SAME
 
 
 def _check_rule(name: str, value: float) -> Allowance:
@@ -117,7 +119,7 @@ def _check_rule(name: str, value: float) -> Allowance:
 def _where_rule(path: Place, entries: Entries) -> Allowance | None:
     sd = entries.get((*path[:-1], "gap_sd"), 0.0)
     sizes = {"gap": sd, "gap_sd": _GAP_SD * sd, "probability": 2.0 * _PROBABILITY}
-    return Allowance(sizes[path[-1]], why=_WHY) if path[-1] in sizes else None
+    return Allowance(sizes[path[-1]], why=_WHY) if path[-1] in sizes else _SAME
 
 
 def corrected_allowances(paths: Iterable[Place]) -> dict[Place, Allowance]:
@@ -133,7 +135,7 @@ def audit_allowances(entries: Entries) -> dict[Place, Allowance]:
 
 def _audit_rule(path: Place, value: Any, entries: Entries) -> Allowance | None:
     if path[0] != "findings" or len(path) < 3:
-        return None
+        return None if isinstance(value, str) else _SAME
     key, part = path[1], path[2]
     if part == "evidence":
         return _WORDS

@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 import calib.reproduce.check_report as check_report_module
+from calib.audit import Seeds
 from calib.calibration import Calibration, calibrate
+from calib.contents import work_out
 from calib.data import Table
 from calib.estimators import estimate
 from calib.figures import Plate
@@ -19,7 +22,9 @@ from calib.figures.bands import bands_plate
 from calib.figures.learned import learned_plate
 from calib.figures.style import style
 from calib.manifest import file_hashes, sha256
+from calib.paper_gaps.cases import paper_gaps
 from calib.problem import Problem, build_problem
+from calib.publish import publication
 from calib.report import write_report
 from calib.reproduce.check import check
 from calib.reproduce.items import Status
@@ -70,6 +75,16 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="package")
+def original_whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report with one of the source's gaps, the audit and figures for print."""
+    tasks = [task for task in he2019_tasks() if task.output == "rut_depth"]
+    gaps = [gap for gap in paper_gaps() if gap.name == "plain_bekker"]
+    found = work_out(tasks, 2019, settings=SETTINGS, gaps=gaps, audit=Seeds(1, 1, 1))
+    out = tmp_path_factory.mktemp("original") / "whole"
+    return write(found.study, out, gaps=found.gaps, audit=found.audit, pdf=True)
+
+
+@pytest.fixture(scope="package")
 def original_run(rut_tables: tuple[Table, Table], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run as `calib fit` makes it."""
     folder = tmp_path_factory.mktemp("original") / "run"
@@ -87,6 +102,11 @@ def fitted_run(problem: Problem, seed: int) -> Calibration:
 @pytest.fixture
 def report(original: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(original, tmp_path / "report"))
+
+
+@pytest.fixture
+def whole(original_whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original_whole, tmp_path / "whole"))
 
 
 @pytest.fixture
@@ -126,8 +146,21 @@ def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
     path.write_text(json.dumps(content, indent=1) + "\n")
 
 
-def seal(folder: Path) -> None:
-    """Make every hash in a manifest agree with the files as they are now."""
+def seal(folder: Path, *, rewrite: bool = True) -> None:
+    """Make a manifest agree with the files as they are now, as a thorough forger would.
+
+    Tables and methods are written again from the numbers as they are now, unless told otherwise.
+    """
+    if rewrite:
+        with suppress(ValueError, KeyError, TypeError, AttributeError):
+            manifest = json.loads((folder / "manifest.json").read_text())
+            summary = json.loads((folder / "summary.json").read_text())
+            for name, entry in manifest["tasks"].items():
+                for kind in ("data", "priors"):
+                    path = folder / entry[kind]["file"]
+                    manifest["tasks"][name][kind]["sha256"] = sha256(path.read_bytes())
+            for name, text in publication(manifest, summary).files.items():
+                (folder / name).write_text(text, encoding="utf-8")
 
     def change(manifest: dict[str, Any]) -> None:
         manifest["files"] = file_hashes(folder)

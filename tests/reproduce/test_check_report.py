@@ -439,7 +439,7 @@ def test_rounding_is_no_difference(report: Path) -> None:
 def test_among_rounded_numbers_one_that_moved_is_found(report: Path) -> None:
     """By less than other draws might move it."""
     edit_json(report / "summary.json", round_otherwise)
-    edit_json(report / "summary.json", lambda s: scale(s, "posterior", "n1", "mean", by=1.02))
+    edit_json(report / "summary.json", lambda s: scale(s, "posterior", "n1", "mean", by=1.004))
     seal(report)
     found = findings(report)
     assert set(found) == {f"{SUMMARY}.posterior.n1.mean", CONTRADICTION}
