@@ -15,7 +15,6 @@ from calib.models.base import Array
 from calib.problem import Problem
 from calib.sampling.sampler import Draws, Progress, SamplerSettings, sample_posterior
 from calib.streams import stream
-from calib.threads import one_thread
 
 __all__ = ["Calibration", "ParameterSummary", "calibrate"]
 
@@ -184,7 +183,6 @@ def _internal_sd(calibration: Calibration, name: str) -> float:
     return float(calibration.draws.flat[:, names.index(name)].std())
 
 
-@one_thread()
 def calibrate(
     problem: Problem,
     seed: int,

@@ -13,13 +13,19 @@ from calib.reproduce.derived import AUDIT_JSON
 from calib.reproduce.items import Item, Status
 from calib.reproduce.montecarlo import Place
 from calib.reproduce.numbers import Section, compare_section, flatten
-from calib.reproduce.stated import audit_allowances, corrected_allowances, gap_allowances
+from calib.reproduce.stated import (
+    audit_allowances,
+    corrected_allowances,
+    gap_allowances,
+    prediction_allowances,
+)
 
 __all__ = ["AUDIT", "compare_document", "gap_group", "is_document"]
 
 AUDIT = "audit"
 _TABLE = 1e-9
-_JUMPS = Allowance(why="it follows from a diagnosis")
+# Entries of one status that are still listed one by one.
+_MANY = 50
 
 
 def gap_group(name: str) -> str:
@@ -65,7 +71,22 @@ def compare_document(
         status = Status.DIFFERENT if same_program else Status.UNJUDGED
         note = "the same numbers in another form than it is written in"
         found = [Item(group, name, status, note=note)]
-    return found, section.exact
+    return _folded(found), section.exact
+
+
+def _folded(items: list[Item]) -> list[Item]:
+    """Put what is alike and not different into one item where there is much of it."""
+    kept = [item for item in items if item.status is Status.DIFFERENT]
+    for status in (Status.WITHIN, Status.UNJUDGED):
+        alike = [item for item in items if item.status is status]
+        if len(alike) > _MANY:
+            first = alike[0]
+            name = first.name.partition(":")[0]
+            note = f"{len(alike)} of its entries, the first {first.name.partition(': ')[2]}"
+            why = f"; {first.note}" if first.note else ""
+            alike = [Item(first.group, name, status, note=note + why)]
+        kept += alike
+    return kept
 
 
 def _read(path: Path) -> dict[Place, Any]:
@@ -92,7 +113,7 @@ def _allowances(name: str, section: Section, best: str) -> Mapping[Place, Allowa
     if name.endswith("corrected.json"):
         return corrected_allowances(paths)
     if "/case/" not in name:
-        return dict.fromkeys(paths, _JUMPS)
+        return prediction_allowances(section.found)
     return {
         path: Allowance(_TABLE * abs(value), why="data")
         for path, value in section.found.items()

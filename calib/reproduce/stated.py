@@ -15,7 +15,10 @@ from calib.reproduce.allowances import Allowance
 from calib.reproduce.montecarlo import Place
 from calib.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 
-__all__ = ["audit_allowances", "corrected_allowances", "gap_allowances", "sensitivity_allowances"]
+__all__ = [
+    "audit_allowances", "corrected_allowances", "gap_allowances", "prediction_allowances",
+    "sensitivity_allowances",
+]  # fmt: skip
 
 type Entries = Mapping[Place, Any]
 
@@ -34,6 +37,7 @@ _PROBABILITY, _VARIANT = 0.05, 0.4
 _PARAMETER, _PARAMETER_FLOOR = 0.02, 1e-6
 _SHRINK, _ERROR, _CHECK, _OPEN = 0.25, 1.0, 0.6, 0.2
 _GAP_SD, _ROWS = 2.0, 2.0
+_BAND, _TABLE = 0.25, 1e-9
 
 # Audit: least costs of multi-start searches; posterior and simulated figures, as parts of their
 # intervals. Final costs of genetic searches in bad coordinates are anywhere.
@@ -125,6 +129,21 @@ def _where_rule(path: Place, entries: Entries) -> Allowance | None:
 def corrected_allowances(paths: Iterable[Place]) -> dict[Place, Allowance]:
     """Return the allowances of ``corrected.json``: its modes follow those of the diagnosis."""
     return {path: _JUMPS for path in paths if path[0] in ("fits", "lab_mode")}
+
+
+def prediction_allowances(entries: Entries) -> dict[Place, Allowance]:
+    """Return the allowances of ``fresh_prediction.csv``: a part of the width of each band."""
+    found: dict[Place, Allowance] = {}
+    for path, value in entries.items():
+        row, column = path
+        stem = column.partition("_before")[0].partition("_after")[0]
+        low, high = (entries.get((row, f"{stem}_after_{end}")) for end in ("lower", "upper"))
+        if stem == column or not isinstance(low, float) or not isinstance(high, float):
+            if isinstance(value, float):
+                found[path] = Allowance(_TABLE * abs(value), why="data")
+        else:
+            found[path] = Allowance(_BAND * (high - low), why=_WHY)
+    return found
 
 
 def audit_allowances(entries: Entries) -> dict[Place, Allowance]:

@@ -18,6 +18,7 @@ from calib.sampling.gate import Gate, GateReport, judge
 from calib.sampling.mode import find_modes
 from calib.sampling.moves import IndependenceMove
 from calib.sampling.proposal import AnyProposal, Guess, adapt, refit
+from calib.threads import one_thread
 
 __all__ = ["Draws", "SamplerSettings", "sample_density", "sample_posterior"]
 
@@ -94,6 +95,7 @@ class Draws:
         return self.t.reshape(-1, self.t.shape[-1])
 
 
+@one_thread()
 def sample_posterior(
     problem: Problem,
     seed: int | np.random.SeedSequence,
