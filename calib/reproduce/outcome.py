@@ -73,7 +73,7 @@ class Outcome:
         unjudged = len(self.of(Status.UNJUDGED))
         rest = f"; {unjudged} not judged" if unjudged else ""
         if self.quick:
-            return f"NOTHING DIFFERENT, BUT THE POSTERIOR WAS NOT COMPUTED AGAIN (--quick){rest}"
+            return f"NOTHING DIFFERENT, BUT ONLY ESTIMATES WERE COMPUTED AGAIN (--quick){rest}"
         identical = len(self.of(Status.IDENTICAL))
         if not self.of(Status.WITHIN):
             return f"SAME, bit for bit: {identical} numbers and files{rest}"

@@ -34,7 +34,7 @@ def test_the_first_line_is_the_verdict(calib: Calib, run: Path) -> None:  # noqa
 
     quick = calib("check", run, "--quick")
     assert quick.code == 0
-    assert "POSTERIOR WAS NOT COMPUTED AGAIN" in quick.out.splitlines()[0]
+    assert "ONLY ESTIMATES WERE COMPUTED AGAIN" in quick.out.splitlines()[0]
 
     every = calib("check", run, "--quick", "--all")
     assert "run.json: estimates.0.cost" in every.out
