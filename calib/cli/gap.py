@@ -24,6 +24,7 @@ def register(app: typer.Typer) -> None:
     challenge.command("make")(make)
     challenge.command("run")(run)
     challenge.command("limit")(limit)
+    challenge.command("twin")(twin)
     challenge.command("score")(score)
     app.add_typer(challenge, name="challenge")
 
@@ -144,6 +145,29 @@ def limit(
             progress=lambda done, n: tell("asking the oracle", done, n), announce=announce,
         )  # fmt: skip
     print(path)
+
+
+def twin(
+    folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
+    key: Annotated[Path, typer.Option(help="Their sealed answers.")],
+    out: Annotated[Path, typer.Option(help="Folder for the twins.")],
+    twin_key: Annotated[Path, typer.Option(help="File for the twins' answers, outside it.")],
+    seed: _Seed = 1,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+) -> None:
+    """Write twins of cases, in which effects act exactly as the diagnosis believes."""
+    from calib.cli.display import progress_bars
+    from calib.twins import make_twins
+
+    with progress_bars() as tell:
+        without = make_twins(
+            folder, key, out, twin_key, seed=seed, workers=workers, scheduler=scheduler,
+            progress=lambda done, n: tell("drawing twins", done, n), announce=announce,
+        )  # fmt: skip
+    for name, why in without.items():
+        print(f"calib: {name} has no twin: {why}", file=sys.stderr)
+    print(f"twins in {out}; diagnose and score them as any other cases")
 
 
 def score(

@@ -13,16 +13,18 @@ too small to see, and that of one effect among pairs whose other half is idle.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
-from calib.gap.fit import Fit
+from calib.gap.fit import Fit, Noise
 from calib.gap.forward import Forward
 from calib.models.base import Array
 from calib.streams import generator
 
-__all__ = ["RELEVANT", "relevance", "sizes"]
+__all__ = ["RELEVANT", "RELEVANT_IN_PAIR", "relevance", "sizes"]
 
 RELEVANT = 1.25
 RELEVANT_IN_PAIR = 0.8
@@ -48,7 +50,8 @@ def relevance(fit: Fit, seed: int, draws: int) -> float:
     drawn = fit.forward.priors.sample(rng, draws)
     first_effect = max(s.stop for s in fit.forward.misfit_slices.values())
     prior[:, first_effect:] = drawn[:, first_effect:]
-    return _log_share(sizes(fit, posterior)) - _log_share(sizes(fit, prior))
+    size = partial(sizes, fit.forward, fit.noise)
+    return _log_share(size(posterior)) - _log_share(size(prior))
 
 
 def _log_share(size: Array) -> float:
@@ -59,13 +62,12 @@ def _log_share(size: Array) -> float:
     return float(np.log((relevant.sum() + 0.2) / (size.shape[0] + 0.4)))
 
 
-def sizes(fit: Fit, psi: Array) -> Array:
+def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
     """Size of each effect in noise sds, rms over field rows and outputs, shape (k, n_effects).
 
     A parameter shift or a free discrepancy counts as one effect; of a discrepancy on top of an
     effect the size is that of the discrepancy.
     """
-    forward = fit.forward
     hypothesis = forward.hypothesis
     data = forward.data
     named = bool(hypothesis.effects) or hypothesis.shift > 0.0
@@ -89,9 +91,7 @@ def sizes(fit: Fit, psi: Array) -> Array:
     columns = []
     for other in without:
         squares = [
-            np.square(
-                (full[o.name] - other[o.name])[:, o.rows] / fit.noise[o.name].sd(slip[o.rows])
-            )
+            np.square((full[o.name] - other[o.name])[:, o.rows] / noise[o.name].sd(slip[o.rows]))
             for o in data.outputs
         ]
         columns.append(np.sqrt(np.concatenate(squares, axis=1).mean(axis=1)))

@@ -28,7 +28,7 @@ from calib.models.base import Array
 from calib.sampling.mode import find_mode
 from calib.streams import generator
 
-__all__ = ["Ranking", "rank"]
+__all__ = ["Ranking", "calibrate_lab", "rank"]
 
 # Evidence is overconfident where every formula is somewhat wrong. On 421 simulated cases (of seeds
 # 202, 303 and 20261121 of `calib challenge make`) the log score was best with exponents between
@@ -87,7 +87,7 @@ class Ranking:
 def rank(data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS) -> Ranking:
     """Fit every hypothesis and rank them."""
     able, unable = split_testable(data, effects)
-    lab_mode, noise = _calibrate_lab(data, seed)
+    lab_mode, noise = calibrate_lab(data, seed)
     single = singles(data, able)
     design = isolability(data, single, lab_mode, noise, seed)
     single = [h for h in single if h.name not in design.idle]
@@ -157,7 +157,7 @@ def _promising_pairs(
     return [h for h in pairs_of(single) if best & {e.name for e in h.effects}]
 
 
-def _calibrate_lab(data: Campaigns, seed: int) -> tuple[dict[str, Array], dict[str, Noise]]:
+def calibrate_lab(data: Campaigns, seed: int) -> tuple[dict[str, Array], dict[str, Noise]]:
     """Mode of each output's simulator on the lab, and its noise."""
     modes, noise = {}, {}
     for o in data.outputs:

@@ -192,7 +192,7 @@ def _local(workers: int) -> Iterator[Client]:
         try:
             with Client(cluster, set_as_default=False) as client:
                 yield client
-                # A worker that died is being replaced: Dask cannot close a nanny meanwhile.
+                # A worker that died is being replaced: Dask cannot close its nanny meanwhile.
                 with suppress(TimeoutError):
                     client.wait_for_workers(workers, timeout=SETTLE_SECONDS)
         finally:

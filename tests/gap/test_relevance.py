@@ -22,7 +22,7 @@ def test_size_is_in_noise_sds_over_all_rows_and_outputs():
     psi = np.tile(fit.psi, (2, 1))
     part = fit.forward.phi_slices[0]
     psi[0, part], psi[1, part] = 0.0, 0.1
-    size = sizes(fit, psi)
+    size = sizes(fit.forward, fit.noise, psi)
     assert size.shape == (2, 1)
     assert size[0, 0] == pytest.approx(0.0, abs=1e-12)
     # Half of the values are ruts, which an offset of the pull does not touch.
@@ -39,7 +39,7 @@ def test_each_of_a_pair_has_its_own_size():
     psi[:, offset] = 0.2
     for part in fit.forward.form_slices.values():
         psi[:, part] = 0.0
-    size = sizes(fit, psi)
+    size = sizes(fit.forward, fit.noise, psi)
     assert size.shape == (1, 2)
     # One column for each effect left out: without the drift nothing changes.
     assert sorted(size[0] > 1e-9) == [False, True]

@@ -159,6 +159,8 @@ def add_nodes(
     prior = log_prior(dials, bank.cause.normal)
     density = sum(n * np.exp(prior if p is None else p.log_density(dials)) for n, p in drawn)
     weight = np.exp(prior) / density
+    if not inside.any():
+        return replace(bank, weight=weight, drawn=drawn)
     traced = _trace(site, bank.cause, new[inside], smallest, bank.size.shape[1])
     size, strength, shape, bottom, top = traced
     return Bank(

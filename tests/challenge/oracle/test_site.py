@@ -96,6 +96,20 @@ def test_added_nodes_leave_the_prior_what_it_was() -> None:
     assert bank.weight @ bank.dials / bank.weight.sum() == pytest.approx(np.full(d, 0.5), abs=0.08)
 
 
+def test_draws_that_all_miss_the_dials_range_add_no_node() -> None:
+    """They count in the mixture, where they have next to no density, and change nothing else."""
+    stage, rng = stage_with(WHEEL), np.random.default_rng(2)
+    site = Site(stage)
+    cause = next(c for c in causes_of("rate_effect") if c.sign > 0.0)
+    bank = open_bank(site, cause, float(np.log(2.1)), rng)
+    d = bank.dials.shape[1]
+    nowhere = Proposal(np.ones(1), np.full((1, d), 1e6), 1e-3 * np.eye(d)[None])
+    after = add_nodes(site, bank, nowhere, 8, float(np.log(2.1)), rng)
+    assert np.array_equal(after.dials, bank.dials)
+    assert after.weight == pytest.approx(bank.weight)
+    assert after.drawn == (*bank.drawn, (8, nowhere))
+
+
 def test_after_the_lab_the_field_is_standard_normal() -> None:
     """Whitened residuals of undisturbed fields are normal: chi-squared, over many stages."""
     rng, shares = np.random.default_rng(4), []
