@@ -30,13 +30,13 @@ _WORDS = Allowance(words=True, why="words")
 # Prior sensitivity: a part of the sensitivity and something on top; a part of what is left of the
 # prior's variance.
 _PARAMETERS = ("prior_sensitivity", "parameters")
-_SENSITIVITY, _SENSITIVITY_FLOOR, _LEFT = 0.5, 0.02, 0.3
+_SENSITIVITY, _SENSITIVITY_FLOOR, _LEFT = 1.0, 0.04, 0.7
 
 # Gaps: probabilities, and those of a question asked otherwise; parameters of the best hypothesis.
 _PROBABILITY, _VARIANT = 0.05, 0.4
 _PARAMETER, _PARAMETER_FLOOR = 0.02, 1e-6
-_SHRINK, _ERROR, _CHECK, _OPEN = 0.25, 1.0, 0.6, 0.2
-_GAP_SD, _ROWS = 2.0, 2.0
+_SHRINK, _ERROR, _CHECK, _OPEN = 0.25, 2.0, 0.8, 0.2
+_GAP, _GAP_SD, _WHERE, _ROWS = 3.0, 2.0, 0.3, 3.0
 _BAND, _TABLE = 0.25, 1e-9
 
 # Audit: least costs of multi-start searches; posterior and simulated figures, as parts of their
@@ -68,8 +68,9 @@ def _of_thresholds(place: Place, found: Entries, rules: Mapping[Place, Allowance
         ("prior", SENSITIVITY_MIN),
         ("likelihood", SENSITIVITY_MIN),
     ):
-        rule = rules.get((*place, name))
-        if rule is None or abs(found[*place, name] - threshold) <= (rule.size or 0.0):
+        value = found.get((*place, name))
+        # Repeats moved it by no more than half of what is allowed.
+        if value is None or abs(value - threshold) <= 0.5 * (rules[*place, name].size or 0.0):
             return Allowance(why="a number that it is read off is near its threshold")
     return Allowance(0.0, why=_WHY)
 
@@ -106,7 +107,8 @@ def _gap_rule(path: Place, value: Any, best: str, entries: Entries) -> Allowance
         absolute = last == "fraction"
         return Allowance(_SHRINK if absolute else _ERROR * abs(value), why=_WHY)
     if top == "checks":
-        return _check_rule(last, value)
+        # These are of the question asked otherwise, and name what is found there.
+        return _JUMPS if path[1].startswith("field_begins") else _check_rule(last, value)
     if top == "where":
         return _where_rule(path, entries)
     return Allowance(_OPEN * abs(value), why=_WHY) if top == "open_sd_rms" else _SAME
@@ -122,7 +124,7 @@ def _check_rule(name: str, value: float) -> Allowance:
 
 def _where_rule(path: Place, entries: Entries) -> Allowance | None:
     sd = entries.get((*path[:-1], "gap_sd"), 0.0)
-    sizes = {"gap": sd, "gap_sd": _GAP_SD * sd, "probability": 2.0 * _PROBABILITY}
+    sizes = {"gap": _GAP * sd, "gap_sd": _GAP_SD * sd, "probability": _WHERE}
     return Allowance(sizes[path[-1]], why=_WHY) if path[-1] in sizes else _SAME
 
 
