@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from calib.models import MODELS
     from calib.prediction import Prediction, predict
     from calib.problem import Problem, build_problem
+    from calib.reproduce.check import check
     from calib.sampling.sampler import SamplerSettings
     from calib.store import load_calibration, save_calibration, to_datatree
     from calib.validate import Validation, leave_one_out, validate_held_out
@@ -50,6 +51,7 @@ _HOME = {
     "predict": "calib.prediction",
     "Problem": "calib.problem",
     "build_problem": "calib.problem",
+    "check": "calib.reproduce.check",
     "SamplerSettings": "calib.sampling.sampler",
     "load_calibration": "calib.store",
     "save_calibration": "calib.store",
@@ -74,6 +76,7 @@ __all__ = [
     "Validation",
     "build_problem",
     "calibrate",
+    "check",
     "diagnose",
     "estimate",
     "hold_out",

@@ -58,6 +58,8 @@ class Calibration:
         Names the random streams that belong to it.
     estimates : tuple of PointEstimate
         That seeded the sampler.
+    settings : SamplerSettings
+        How it was sampled.
     """
 
     problem: Problem
@@ -65,6 +67,7 @@ class Calibration:
     seed: int
     label: str
     estimates: tuple[PointEstimate, ...] = ()
+    settings: SamplerSettings = field(default_factory=SamplerSettings)
     summary: Mapping[str, ParameterSummary] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -205,10 +208,11 @@ def calibrate(
     """
     label = label or problem.bound.model.output
     starts = _starts(problem, estimates) if estimates else None
+    chosen = settings or SamplerSettings()
     draws = sample_posterior(
-        problem, stream(seed, label, "sample"), starts=starts, settings=settings, progress=progress
+        problem, stream(seed, label, "sample"), starts=starts, settings=chosen, progress=progress
     )
-    return Calibration(problem, draws, seed, label, estimates)
+    return Calibration(problem, draws, seed, label, estimates, chosen)
 
 
 def _starts(problem: Problem, estimates: tuple[PointEstimate, ...]) -> Array:

@@ -18,8 +18,8 @@ from scipy.special import ndtri
 from calib.models.base import Array
 
 __all__ = [
-    "Convergence", "autocorrelation_time", "convergence", "ess", "hdi", "hdi_error",
-    "median_error", "power_scaled_weights", "power_sensitivity", "psis",
+    "Convergence", "autocorrelation_time", "convergence", "ess", "hdi", "hdi_error", "mcse",
+    "median_error", "power_scaled_weights", "power_sensitivity", "psis", "tail_shape",
 ]  # fmt: skip
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}
@@ -139,6 +139,25 @@ def ess(chains: Array, method: Literal["bulk", "tail", "mean"]) -> Array:
     with np.errstate(all="ignore"):
         value = _stats().ess(chains, method=method, **_AXES, **extra)
     return np.asarray(value)
+
+
+def mcse(chains: Array, method: Literal["mean", "sd", "median"]) -> Array:
+    """Monte Carlo standard error of a summary of each parameter, (chains, draws, d) to (d,)."""
+    with np.errstate(all="ignore"):
+        return np.asarray(_stats().mcse(chains, method=method, **_AXES))
+
+
+def tail_shape(chains: Array) -> Array:
+    """Pareto shape k of the heavier tail of each parameter, (chains, draws, d) to (d,).
+
+    Moments up to 1/k exist: with k above 1/2 no variance, so no Monte Carlo error of a mean.
+
+    References
+    ----------
+    Vehtari et al. (2024), Pareto smoothed importance sampling, JMLR 25(72).
+    """
+    with np.errstate(all="ignore"):
+        return np.asarray(_stats().pareto_khat(chains, **_AXES))
 
 
 def hdi(draws: Array, prob: float) -> tuple[float, float]:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,6 +23,8 @@ _WRITTEN = (
     "corrected.json", "fresh_prediction.csv", "priors.toml", "data.csv", "tables", "methods.txt",
     "methods.tex", "references.bib", "audit.csv",
 )  # fmt: skip
+
+_YOUNG_SECONDS = 60.0
 
 
 def _is_ours(name: str) -> bool:
@@ -45,7 +50,9 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     check_folder(out, overwrite=overwrite)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
+        _remove_abandoned(out)
         scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+        lock = _lock(scratch)
     except OSError as error:
         raise unwritable(out, str(error.strerror)) from None
     try:
@@ -60,6 +67,44 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
             scratch.replace(out)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+        if lock is not None:
+            os.close(lock)
+
+
+def _lock(folder: Path) -> int | None:
+    """Lock a folder for as long as this process lives; None where another holds the lock."""
+    try:
+        import fcntl
+    except ImportError:  # not on this system: nothing is ever taken for abandoned there
+        return None
+    found = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(found, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        os.close(found)
+        return None
+    return found
+
+
+def _remove_abandoned(out: Path) -> None:
+    """Remove the scratch folders of runs into `out` that were killed.
+
+    The lock of a killed process is gone. Folders younger than a minute are left: their process
+    may be about to lock them. An earlier result that was being replaced stays if it is the only
+    one there is.
+    """
+    pattern = re.compile(rf"\.{re.escape(out.name)}-(?P<old>old-)?[a-z0-9_]{{8}}")
+    for path in out.parent.iterdir():
+        match = pattern.fullmatch(path.name)
+        if match is None or not path.is_dir() or (match["old"] and not out.exists()):
+            continue
+        with contextlib.suppress(OSError):
+            if time.time() - path.stat().st_mtime < _YOUNG_SECONDS:
+                continue
+            lock = _lock(path)
+            if lock is not None:
+                shutil.rmtree(path, ignore_errors=True)
+                os.close(lock)
 
 
 def read_folder(folder: Path) -> dict[str, bytes]:

@@ -4,22 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from calib.environment import Environment
 from calib.estimators import GeneticSettings
 from calib.sampling.sampler import SamplerSettings
-from calib.study import Study, Task
+from calib.study import OutputResult, Study, Task
 
-__all__ = ["SCHEMA", "build_manifest", "file_hashes", "sha256", "versions"]
+__all__ = ["SCHEMA", "build_manifest", "file_hashes", "sha256"]
 
-SCHEMA = "calib/manifest/1"
-_PACKAGES = ("terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-stats", "matplotlib",
-             "corner", "h5netcdf", "h5py")  # fmt: skip
+SCHEMA = "calib/manifest/2"
 
 
 def sha256(content: bytes) -> str:
@@ -27,17 +24,12 @@ def sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that numbers depend on."""
-    return {"python": sys.version.split()[0], **{name: version(name) for name in _PACKAGES}}
-
-
 def file_hashes(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of every file below a folder but the manifest, by relative path."""
     return {
         path.relative_to(folder).as_posix(): sha256(path.read_bytes())
         for path in sorted(folder.rglob("*"))
-        if path.is_file() and path.name != "manifest.json"
+        if path.is_file() and path.relative_to(folder).as_posix() != "manifest.json"
     }
 
 
@@ -46,6 +38,9 @@ def build_manifest(
     settings: SamplerSettings,
     command: Sequence[str],
     inputs: Mapping[str, Mapping[str, Any]],
+    *,
+    title: str = "",
+    environment: Environment | None = None,
 ) -> dict[str, Any]:
     """Return the manifest of a study, its file hashes still to be added.
 
@@ -57,15 +52,28 @@ def build_manifest(
         The command line, program first.
     inputs : mapping
         For every output: the files its data and priors were copied to, and their hashes.
+    title : str
+        Of the report.
+    environment : Environment, optional
+        That of this process by default.
+
+    Notes
+    -----
+    ``seconds`` is the one place of a report that holds durations, which no two runs share.
     """
     return {
         "schema": SCHEMA,
+        "title": title,
         "command": list(command),
         "seed": study.seed,
-        "versions": versions(),
+        **(environment or Environment.here()).document(),
         "settings": json.loads(json.dumps(asdict(settings))),
         "genetic_algorithm": asdict(GeneticSettings()),
         "tasks": {k: _task(r.task, inputs[k]) for k, r in study.results.items()},
+        "seconds": {
+            "study": study.seconds,
+            **{key: _seconds(result) for key, result in study.successes.items()},
+        },
     }
 
 
@@ -77,3 +85,7 @@ def _task(task: Task, inputs: Mapping[str, Any]) -> dict[str, Any]:
         "label": task.table.label,
         **inputs,
     }
+
+
+def _seconds(result: OutputResult) -> dict[str, Any]:
+    return {**result.seconds, "methods": {e.method: e.seconds for e in result.estimates}}

@@ -16,6 +16,7 @@ from calib.headers import parse_header
 from calib.models.base import Array
 from calib.scores import LEVELS
 from calib.streams import generator
+from calib.threads import one_thread
 
 __all__ = ["Bands", "Prediction", "bands", "predict", "prediction_columns", "predictive_draws"]
 
@@ -62,6 +63,7 @@ class Prediction:
     defined: Array
 
 
+@one_thread()
 def predictive_draws(
     calibration: Calibration, conditions: Mapping[str, Array], rng: np.random.Generator,
     size: int = N_DRAWS,

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from calib.audit import Audit
 from calib.data import write_table
+from calib.environment import Environment
 from calib.figures import Plate, plates
 from calib.figures.export import pdf_bytes, png
 from calib.folders import fresh_folder
@@ -39,6 +41,8 @@ def write_report(
     title: str,
     gaps: Sequence[FoundGap] = (),
     overwrite: bool = False,
+    posteriors: bool = True,
+    environment: Environment | None = None,
     audit: Audit | None = None,
     pdf: bool = False,
     progress: Progress | None = None,
@@ -59,6 +63,11 @@ def write_report(
         Of the source's own models, diagnosed: a section of their own.
     overwrite : bool
         Replace an earlier report.
+    posteriors : bool
+        Whether to keep the netCDF files, which are megabytes. Where they are left out, the
+        manifest says so and has their hashes.
+    environment : Environment, optional
+        Where the manifest says the report was made: that of this process by default.
     audit : Audit, optional
         Of the published tables, shown before the appendix.
     pdf : bool
@@ -99,7 +108,9 @@ def write_report(
                         file = folder / "figures" / f"{key}_{plate.name}.pdf"
                         file.write_bytes(pdf_bytes(plate.figure))
         tell("drawing figures", len(successes), len(successes))
-        manifest = build_manifest(study, settings, command, inputs)
+        manifest = build_manifest(
+            study, settings, command, inputs, title=title, environment=environment
+        )
         manifest["pdf"] = pdf
         paper = publication(manifest, summary)
         for path, text in paper.files.items():
@@ -109,6 +120,8 @@ def write_report(
         if gaps:
             manifest["paper_gaps"] = {r.gap.name: {"seed": r.found.seed} for r in gaps}
             gaps_html = write_gaps(gaps, folder, png, manifest=manifest, pdf=pdf, progress=tell)
+        if audit is not None:
+            manifest["audit"] = {"seed": audit.seed, "seeds": asdict(audit.seeds)}
         page = render_page(
             study,
             drawn,
@@ -121,7 +134,12 @@ def write_report(
             paper=paper,
         )
         (folder / "index.html").write_text(page, encoding="utf-8")
-        manifest["files"] = file_hashes(folder)
+        files = file_hashes(folder)
+        left_out = [] if posteriors else [f"{key}.nc" for key in successes]
+        manifest["left_out"] = {name: files.pop(name) for name in left_out}
+        for name in left_out:
+            (folder / name).unlink()
+        manifest["files"] = files
         (folder / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
     return Path(out) / "index.html"
 
@@ -146,13 +164,15 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
             "data": {
                 "file": f"data/{key}.csv",
                 "sha256": sha256(data),
-                "source": Path(task.table.source).name,
+                "source": task.table.source,
                 "source_sha256": task.table.sha256,
+                "ignored": list(task.table.ignored),
             },
             "priors": {
                 "file": f"priors/{key}.toml",
                 "sha256": sha256(priors),
                 "source": prior_path.name,
+                "shipped": task.prior_path is None,
             },
         }
     return inputs

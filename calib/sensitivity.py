@@ -22,6 +22,7 @@ from calib.calibration import Calibration
 from calib.chains import power_scaled_weights, power_sensitivity
 from calib.models.base import Array
 from calib.streams import generator
+from calib.threads import one_thread
 
 __all__ = [
     "CONTRACTION_MIN", "SENSITIVITY_MIN", "Sensitivity", "prior_sensitivity",
@@ -75,6 +76,7 @@ class Sensitivity:
         return "data and prior" if self.prior >= SENSITIVITY_MIN else "data"
 
 
+@one_thread()
 def prior_sensitivity(calibration: Calibration) -> dict[str, Sensitivity]:
     """Work out the sensitivity of every parameter that varies, sampled or published.
 

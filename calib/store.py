@@ -9,10 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
-from pathlib import Path
+from dataclasses import asdict, replace
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,9 @@ import xarray as xr
 
 from calib.calibration import Calibration
 from calib.data import Table, read_for_model, write_table
+from calib.environment import Environment
 from calib.errors import CalibError
+from calib.estimators import PointEstimate
 from calib.models import BoundModel, get_model
 from calib.models.base import Array
 from calib.prior_files import parse_priors
@@ -30,7 +32,10 @@ from calib.sampling.gate import GateReport
 from calib.sampling.sampler import Draws
 from calib.streams import generator
 
-__all__ = ["load_calibration", "save_calibration", "to_datatree", "write_netcdf"]
+__all__ = [
+    "SCHEMA", "describe_estimates", "load_calibration", "run_problem", "save_calibration",
+    "to_datatree", "write_netcdf",
+]  # fmt: skip
 
 SCHEMA = "calib/run/1"
 _HASHED = ("posterior.nc", "priors.toml", "data.csv")
@@ -92,6 +97,7 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
                 output: ["row"],
                 **{name: ["row"] for name in problem.conditions},
             },
+            # Without durations: equal results give equal files.
             attrs={"/": {"run": json.dumps(_describe(calibration))}},
         )
     return tree
@@ -114,7 +120,7 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         "output": problem.bound.model.output,
         "references": dict(problem.bound.references),
         "fixed": {p.name: p.loc for p in problem.priors.entries if p.fixed},
-        "prior_file": problem.priors.source,
+        "prior_file": PurePath(problem.priors.source).name,
         "prior_text": problem.priors.text,
         "prior_references": _loads(problem.table),
         "seed": calibration.seed,
@@ -125,7 +131,8 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         "efficiency": calibration.draws.efficiency,
         "acceptance": calibration.draws.acceptance,
         "evaluations": calibration.draws.evaluations,
-        "seconds": calibration.draws.seconds,
+        "settings": asdict(calibration.settings),
+        "estimates": describe_estimates(calibration.estimates),
         "data_source": problem.table.source,
         "data_label": problem.table.label,
         "gate": {
@@ -136,6 +143,20 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
             **{k: getattr(report, k).tolist() for k in ("rhat", "ess_bulk", "ess_tail", "tau")},
         },
     }
+
+
+def describe_estimates(estimates: Sequence[PointEstimate]) -> list[dict[str, Any]]:
+    """Return what a run folder keeps of the estimates that seeded the sampler."""
+    return [
+        {
+            "method": e.method,
+            "theta": e.theta.tolist(),
+            "reported": e.reported,
+            "cost": e.cost,
+            "rmse": e.rmse,
+        }
+        for e in estimates
+    ]
 
 
 def _loads(table: Table) -> dict[str, float]:
@@ -154,14 +175,29 @@ def write_netcdf(tree: xr.DataTree, path: Path) -> None:
     tree.to_netcdf(path, engine="h5netcdf", encoding=encoding)
 
 
-def save_calibration(calibration: Calibration, folder: Path) -> None:
-    """Write a run folder into an existing, empty folder."""
+def save_calibration(
+    calibration: Calibration, folder: Path, *, environment: Environment | None = None
+) -> None:
+    """Write a run folder into an existing, empty folder.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    folder : Path
+    environment : Environment, optional
+        Where it says that it was made: in that of this process by default.
+    """
     problem = calibration.problem
     write_netcdf(to_datatree(calibration), folder / "posterior.nc")
     (folder / "priors.toml").write_text(problem.priors.text, encoding="utf-8")
     write_table(folder / "data.csv", problem.table.columns)
     hashes = {name: _sha256(folder / name) for name in _HASHED}
-    described = _describe(calibration) | {"sha256": hashes}
+    described = {
+        **_describe(calibration),
+        "seconds": calibration.draws.seconds,
+        **(environment or Environment.here()).document(),
+        "sha256": hashes,
+    }
     (folder / "run.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
 
 
@@ -196,7 +232,7 @@ def load_calibration(folder: Path) -> Calibration:
     meta = _read_meta(folder)
     _check_hashes(meta, folder)
     with _damage(folder / "run.json"):
-        problem = _problem(meta, folder / "data.csv")
+        problem = run_problem(meta, folder / "data.csv")
         shape = tuple(meta["shape"])
         seed, label = meta["seed"], meta["label"]
     with _damage(folder / "posterior.nc"):
@@ -218,7 +254,16 @@ def _damage(path: Path) -> Iterator[None]:
         ) from None
 
 
-def _problem(meta: dict[str, Any], data: Path) -> Problem:
+def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
+    """Return the problem of a run folder.
+
+    Parameters
+    ----------
+    meta : mapping
+        The content of its ``run.json``.
+    data : Path
+        Its ``data.csv``.
+    """
     model = get_model(meta["model"])
     priors = parse_priors(
         meta["prior_text"], meta["prior_file"], model.name,
@@ -228,7 +273,7 @@ def _problem(meta: dict[str, Any], data: Path) -> Problem:
         priors = priors.fix(meta["fixed"])
     table = read_for_model(data, (*model.conditions, model.output))
     # What is reconstructed stays labelled so.
-    table = replace(table, label=meta["data_label"])
+    table = replace(table, source=meta["data_source"], label=meta["data_label"])
     return Problem(BoundModel(model, meta["references"]), table, priors)
 
 

@@ -23,16 +23,17 @@ from calib.models import get_model
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.prediction import predictive_draws
-from calib.prior_files import prior_file_model
+from calib.prior_files import default_prior_path, prior_file_model
 from calib.problem import Problem, build_problem
 from calib.sampling.sampler import SamplerSettings
 from calib.sensitivity import Sensitivity, prior_sensitivity
 from calib.streams import generator
+from calib.threads import one_thread
 from calib.validate import Validation, leave_one_out, validate_held_out
 
 __all__ = [
-    "Failure", "HoldOut", "OutputResult", "Study", "Task", "choose_model",
-    "he2019_tasks", "plan_tasks", "run_study",
+    "Failure", "HoldOut", "OutputResult", "Study", "Task", "choose_model", "estimate_task",
+    "fitted_rows", "he2019_tasks", "plan_tasks", "run_study",
 ]  # fmt: skip
 
 N_PRIOR_PREDICTIVE = 1000
@@ -271,6 +272,7 @@ def he2019_tasks() -> tuple[Task, ...]:
     return tuple(Task(key, model, load_he2019(key), rows) for key, (model, rows) in models.items())
 
 
+@one_thread()
 def run_study(
     tasks: Sequence[Task],
     seed: int,
@@ -297,7 +299,7 @@ def run_study(
         try:
             results[task.output] = _work_out(task, seed, settings, progress or _silent, workers)
         except Exception as error:  # whatever fails, the other outputs still come
-            results[task.output] = Failure(task, f"{type(error).__name__}: {error}")
+            results[task.output] = Failure(task, _without_folder(task, error))
     return Study(results, seed, time.perf_counter() - began)
 
 
@@ -305,20 +307,29 @@ def _silent(what: str, done: int, planned: int) -> None:
     pass
 
 
+def _without_folder(task: Task, error: Exception) -> str:
+    """Return what failed; where the priors lie on this computer is nobody's business."""
+    text = f"{type(error).__name__}: {error}"
+    path = task.prior_path or default_prior_path(task.model)
+    return text.replace(str(path), path.name)
+
+
+def fitted_rows(task: Task) -> tuple[Table, Table | None]:
+    """Return the rows that are fitted, and those held out."""
+    if task.held_out is None:
+        return task.table, None
+    return hold_out(task.table, task.held_out.column, task.held_out.value)
+
+
 def _work_out(
     task: Task, seed: int, settings: SamplerSettings | None, progress: Progress, workers: int
 ) -> OutputResult:
     seconds: dict[str, float] = {}
-    fitted, held = (
-        hold_out(task.table, task.held_out.column, task.held_out.value)
-        if task.held_out is not None
-        else (task.table, None)
-    )
+    fitted, held = fitted_rows(task)
     problem = build_problem(task.model, fitted, task.prior_path)
     clock = time.perf_counter()
     seeding = (estimate(problem, "least_squares", generator(seed, task.output, "seeding")),)
-    estimates = _estimates(task, problem, seed, progress)
-    by_pressure = _by_pressure(task, seed) if task.model == "magic_formula_pressure" else {}
+    estimates, by_pressure = estimate_task(task, seed, progress=progress)
     seconds["estimate"] = time.perf_counter() - clock
     clock = time.perf_counter()
     calibration = calibrate(
@@ -357,18 +368,32 @@ def _work_out(
     )
 
 
-def _estimates(
-    task: Task, fitted: Problem, seed: int, progress: Progress
-) -> tuple[PointEstimate, ...]:
+def estimate_task(
+    task: Task, seed: int, *, progress: Progress | None = None
+) -> tuple[tuple[PointEstimate, ...], dict[float, tuple[PointEstimate, ...]]]:
+    """Return the point estimates of a task, and those at each inflation pressure on its own.
+
+    Parameters
+    ----------
+    task : Task
+    seed : int
+    progress : callable, optional
+
+    Raises
+    ------
+    CalibError
+        If the data or the priors do not fit the model.
+    """
+    tell = progress or _silent
     # The paper fitted drawbar pull at all pressures, rut depth at the two outer ones.
-    everything = task.model.startswith("magic_formula")
-    problem = build_problem(task.model, task.table, task.prior_path) if everything else fitted
-    return _all_methods(
-        problem,
-        seed,
-        (task.output,),
-        lambda done, n: progress(f"{task.output}: estimating", done, n),
+    everything = task.held_out is None or task.model.startswith("magic_formula")
+    rows = task.table if everything else fitted_rows(task)[0]
+    problem = build_problem(task.model, rows, task.prior_path)
+    estimates = _all_methods(
+        problem, seed, (task.output,), lambda done, n: tell(f"{task.output}: estimating", done, n)
     )
+    pressures = _by_pressure(task, seed) if task.model == "magic_formula_pressure" else {}
+    return estimates, pressures
 
 
 def _all_methods(

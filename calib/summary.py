@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from calib.scores import Scores
 from calib.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 from calib.study import OutputResult, Study
 
-__all__ = ["SCHEMA", "summarise"]
+__all__ = ["SCHEMA", "summarise", "summarise_estimates"]
 
 SCHEMA = "calib/summary/1"
 
@@ -31,7 +32,6 @@ def summarise(study: Study) -> dict[str, Any]:
     document = {
         "schema": SCHEMA,
         "seed": study.seed,
-        "seconds": study.seconds,
         "models": {key: models[key] for key in study.results},
     }
     plain: dict[str, Any] = _finite(document)
@@ -55,12 +55,7 @@ def _output(result: OutputResult) -> dict[str, Any]:
             "held_out": None if result.task.held_out is None else str(result.task.held_out),
         },
         "references": dict(problem.bound.references),
-        "estimates": {e.method: dict(e.reported) for e in result.estimates},
-        "fit": {e.method: _fit(e) for e in result.estimates},
-        "by_pressure": {
-            f"{psi:g} psi": {e.method: {**e.reported, "cost": e.cost} for e in estimates}
-            for psi, estimates in result.by_pressure.items()
-        },
+        **summarise_estimates(result.estimates, result.by_pressure),
         "priors": {
             p.name: {
                 "unit": p.unit,
@@ -75,6 +70,23 @@ def _output(result: OutputResult) -> dict[str, Any]:
         "validation": _validation(result),
         "sampling": _sampling(result.calibration),
     }
+
+
+def summarise_estimates(
+    estimates: Sequence[PointEstimate], by_pressure: Mapping[float, Sequence[PointEstimate]]
+) -> dict[str, Any]:
+    """Return an output's point estimates as they stand in the summary."""
+    plain: dict[str, Any] = _finite(
+        {
+            "estimates": {e.method: dict(e.reported) for e in estimates},
+            "fit": {e.method: _fit(e) for e in estimates},
+            "by_pressure": {
+                f"{psi:g} psi": {e.method: {**e.reported, "cost": e.cost} for e in alone}
+                for psi, alone in by_pressure.items()
+            },
+        }
+    )
+    return plain
 
 
 def _range(values: Array) -> dict[str, float]:
@@ -170,8 +182,9 @@ def _scores(s: Scores) -> dict[str, Any]:
 
 
 def _sampling(calibration: Calibration) -> dict[str, Any]:
-    d = calibration.draws
+    d, problem = calibration.draws, calibration.problem
     r = d.report
+    mode = problem.theta(d.mode[None])[0].tolist()
     return {
         "converged": r.passed,
         "reasons": list(r.reasons),
@@ -188,7 +201,12 @@ def _sampling(calibration: Calibration) -> dict[str, Any]:
         "acceptance": d.acceptance,
         "evaluations": d.evaluations,
         "log_evidence": d.log_evidence,
-        "seconds": d.seconds,
+        "mode": {
+            p.name: value
+            for p, value in zip(problem.priors.entries, mode, strict=True)
+            if not p.fixed
+        },
+        "log_posterior_at_mode": float(problem.log_prob(d.mode[None])[0]),
     }
 
 

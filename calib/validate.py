@@ -19,6 +19,7 @@ from calib.sampling.sampler import Progress, SamplerSettings, sample_posterior
 from calib.scores import Scores, score
 from calib.streams import generator, stream
 from calib.tasks import completed
+from calib.threads import one_thread
 
 __all__ = ["Validation", "leave_one_out", "validate_held_out"]
 
@@ -61,6 +62,7 @@ class Validation:
     unconverged: tuple[int, ...] = ()
 
 
+@one_thread()
 def validate_held_out(calibration: Calibration, held_out: Table) -> Validation:
     """Score the calibration on rows it has not seen.
 
@@ -95,6 +97,7 @@ def validate_held_out(calibration: Calibration, held_out: Table) -> Validation:
     return Validation("held_out", held_out, observed, draws, score(draws, observed))
 
 
+@one_thread()
 def leave_one_out(
     calibration: Calibration,
     *,

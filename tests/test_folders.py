@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -104,6 +107,67 @@ def test_a_folder_without_permission_is_refused(
     # The superuser may write anywhere, so the answer is put in the system's mouth.
     monkeypatch.setattr(os, "access", lambda path, mode: False)
     assert "no permission to write" in refusal(tmp_path / "run")
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from calib.folders import fresh_folder
+with fresh_folder(Path(sys.argv[1]), overwrite=True) as folder:
+    (folder / "half").write_text("x")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def aged(folder: Path) -> Path:
+    earlier = time.time() - 3600.0
+    os.utime(folder, (earlier, earlier))
+    return folder
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    subprocess.run([sys.executable, "-c", KILLED, str(out)], check=False)
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".run-")
+    with fresh_folder(out) as folder:
+        (folder / "a").write_text("x")
+    # It might have been a run that had only just begun.
+    assert contents(tmp_path) == {"run", "run/a", left.name, f"{left.name}/half"}
+    aged(left)
+    with fresh_folder(tmp_path / "other") as folder:
+        (folder / "a").write_text("x")
+    assert left.exists()
+    (out / "a").unlink()
+    with fresh_folder(out) as folder:
+        (folder / "a").write_text("x")
+    assert contents(tmp_path) == {"run", "run/a", "other", "other/a"}
+
+
+def test_what_a_living_run_writes_is_left_alone(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with fresh_folder(out) as first:
+        aged(first)
+        with fresh_folder(out) as second:
+            (second / "b").write_text("x")
+        assert first.exists()
+        (out / "b").unlink()
+        (first / "a").write_text("x")
+
+
+def test_the_only_copy_of_an_earlier_result_is_not_removed(tmp_path: Path) -> None:
+    earlier = tmp_path / ".run-old-abcdef12"
+    (earlier / "old").mkdir(parents=True)
+    mine = tmp_path / ".run-notes"
+    mine.mkdir()
+    aged(earlier), aged(mine)
+    with fresh_folder(tmp_path / "run") as folder:
+        (folder / "run.json").write_text("{}")
+    assert earlier.exists()
+    with fresh_folder(tmp_path / "run", overwrite=True):
+        pass
+    assert not earlier.exists()
+    assert mine.exists()
 
 
 def test_the_current_folder_cannot_be_replaced(

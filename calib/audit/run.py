@@ -26,6 +26,7 @@ from calib.audit.table5_cost import cost_findings
 from calib.audit.untested import untested
 from calib.calibration import Calibration
 from calib.datasets.published import PUBLISHED, Published
+from calib.threads import one_thread
 
 __all__ = ["Audit", "run_audit"]
 
@@ -48,6 +49,8 @@ class Audit:
     quality : QualityStudy
     inverse : InverseStudy
     genetic : GeneticStudy
+    seeds : Seeds
+        How often each search was repeated.
     """
 
     findings: tuple[Finding, ...]
@@ -58,6 +61,7 @@ class Audit:
     quality: QualityStudy
     inverse: InverseStudy
     genetic: GeneticStudy
+    seeds: Seeds
 
     @property
     def counts(self) -> dict[Verdict, int]:
@@ -69,6 +73,7 @@ class Audit:
         return next(f for f in self.findings if f.key == key)
 
 
+@one_thread()
 def run_audit(
     seed: int = 2019,
     *,
@@ -97,7 +102,8 @@ def run_audit(
     Audit
     """
     tell = progress or (lambda what, done, planned: None)
-    genetic = study_convergence(published, seed, seeds, progress)
+    repeated = seeds or Seeds()
+    genetic = study_convergence(published, seed, repeated, progress)
     inverse = study_inverse(
         published, seed, calibration=rut_calibration,
         progress=lambda done, planned: tell("rut depth: sampling", done, planned),
@@ -122,4 +128,6 @@ def run_audit(
     tell("testing printed figures", 2, 2)
     order = list(Verdict)
     ranked = sorted(findings, key=lambda f: order.index(f.verdict))
-    return Audit(tuple(ranked), published, seed, rounding, curvature, quality, inverse, genetic)
+    return Audit(
+        tuple(ranked), published, seed, rounding, curvature, quality, inverse, genetic, repeated
+    )

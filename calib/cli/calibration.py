@@ -50,19 +50,23 @@ def report(
     overwrite: _Overwrite = False,
     pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
     max_steps: _MaxSteps = 25_600,
+    posteriors: Annotated[
+        bool, typer.Option(help="Keep the posteriors, megabytes of netCDF, in the folder.")
+    ] = True,
     workers: Workers = 1,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
-    from calib.audit import run_audit
+    from calib.audit import Seeds
     from calib.cli.display import progress_bars
+    from calib.contents import work_out
     from calib.data import read_table
     from calib.datasets.he2019 import labelled
     from calib.folders import check_folder
     from calib.outputs import OUTPUTS
-    from calib.paper_gaps.find import find_gaps
+    from calib.paper_gaps.cases import paper_gaps
     from calib.report import write_report
     from calib.sampling.sampler import SamplerSettings
-    from calib.study import he2019_tasks, plan_tasks, run_study
+    from calib.study import he2019_tasks, plan_tasks
 
     check_folder(out, overwrite=overwrite)
     if files:
@@ -79,17 +83,15 @@ def report(
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
     with progress_bars() as tell:
-        study = run_study(tasks, seed, settings=settings, progress=tell, workers=workers)
-        gaps = () if files else find_gaps(seed, progress=tell)
-        # The audit is of the source's tables: beside the user's own data it has no place.
-        rut = study.successes.get("rut_depth")
-        rut_calibration = rut.calibration if rut is not None else None
-        audit = None
-        if not files:
-            audit = run_audit(seed, rut_calibration=rut_calibration, progress=tell)
+        # Beside the user's own data, the source's gaps and tables have no place.
+        found = work_out(
+            tasks, seed, settings=settings, gaps=() if files else paper_gaps(),
+            audit=None if files else Seeds(), progress=tell, workers=workers,
+        )  # fmt: skip
+        study = found.study
         page = write_report(
-            study, out, settings=settings, command=_command(), title=title, gaps=gaps,
-            overwrite=overwrite, audit=audit, pdf=pdf, progress=tell,
+            study, out, settings=settings, command=_command(), title=title, gaps=found.gaps,
+            overwrite=overwrite, posteriors=posteriors, audit=found.audit, pdf=pdf, progress=tell,
         )  # fmt: skip
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]
@@ -119,6 +121,7 @@ def fit(
     from calib.cli.display import posterior_table, progress_bars, verdict_line
     from calib.data import hold_out as split
     from calib.data import read_for_model
+    from calib.datasets.he2019 import labelled
     from calib.estimators import estimate
     from calib.folders import check_folder, fresh_folder
     from calib.models import get_model
@@ -131,7 +134,7 @@ def fit(
 
     chosen = get_model(model)
     check_folder(out, overwrite=overwrite)
-    table = read_for_model(file, (*chosen.conditions, chosen.output))
+    table = labelled(read_for_model(file, (*chosen.conditions, chosen.output)))
     kept = _parse_hold_out(hold_out)
     fitted, held = split(table, kept.column, kept.value) if kept else (table, None)
     problem = build_problem(model, fitted, priors)

@@ -21,6 +21,7 @@ from calib.estimators.rut_regression import (
 )  # fmt: skip
 from calib.models import MODELS, get_model
 from calib.problem import Problem
+from calib.threads import one_thread
 
 __all__ = [
     "METHODS", "GeneticSettings", "PointEstimate", "RutRegression", "compare", "estimate",
@@ -60,6 +61,7 @@ def methods_for(model_name: str) -> tuple[str, ...]:
     return tuple(method for method in METHODS if name in _MODELS.get(method, MODELS))
 
 
+@one_thread()
 def estimate(
     problem: Problem, method: str, rng: np.random.Generator, **settings: Any
 ) -> PointEstimate:

@@ -18,6 +18,7 @@ from calib.gap.where import Region, RowGap, regions, row_gaps
 from calib.gap.which import Ranking, rank
 from calib.models.base import Array
 from calib.streams import generator
+from calib.threads import one_thread
 
 __all__ = ["Diagnosis", "diagnose", "verdict"]
 
@@ -63,6 +64,7 @@ class Diagnosis:
     seed: int
 
 
+@one_thread()
 def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFECTS) -> Diagnosis:
     """Find where a calibrated simulator misses, which effect it lacks, and what adding it gains.
 

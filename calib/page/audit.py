@@ -67,7 +67,7 @@ def write_audit(audit: Audit, folder: Path) -> str:
         HTML to be placed in a page that has the report's style.
     """
     (folder / "audit.json").write_text(audit_json(audit), encoding="utf-8")
-    (folder / "audit.csv").write_text(audit_csv(audit), encoding="utf-8")
+    (folder / "audit.csv").write_text(audit_csv(audit.findings), encoding="utf-8")
     plates = audit_plates(audit)
     images = {p.name: png(p) for p in plates if p.figure is not None}
     (folder / "figures").mkdir(exist_ok=True)

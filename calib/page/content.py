@@ -13,7 +13,6 @@ from calib.figures import Plate
 from calib.figures.labels import axis_of, percent, short
 from calib.figures.rows import held_table
 from calib.models import get_model
-from calib.numbers import format_number
 from calib.page.equations import equation, likelihood, parametrisation, prose
 from calib.page.facts import repeats_words, sampling_facts, validation_facts, worst_row
 from calib.page.tables import (
@@ -116,7 +115,6 @@ def section(
         "validation_title": _validation_title(result),
         "figures": {p.name: _figure(key, p, images, names) for p in plates},
         "converged": calibration.converged,
-        "seconds": {k: format_number(v, 2) for k, v in result.seconds.items()},
     }
 
 

@@ -100,6 +100,5 @@ def sampling_facts(result: OutputResult) -> list[list[str]]:
         "Acceptance": f"{100 * d.acceptance:.0f} %",
         "Log evidence": format_number(d.log_evidence, 4),
         "Density evaluations": f"{d.evaluations:,}",
-        "Time": f"{d.seconds:.1f} s",
     }
     return [[label, value] for label, value in facts.items()]

@@ -86,7 +86,6 @@ def render_page(
         audit=Markup(audit_html) if audit_html else None,
         paper=paper if paper is not None and paper.files else None,
         seed=study.seed,
-        seconds=study.seconds,
         command=shlex.join(str(part) for part in manifest.get("command", ())),
         versions=manifest.get("versions", {}),
         settings=manifest.get("settings", {}),

@@ -184,7 +184,6 @@ def _quality_rows(
         row("RMSE", rmse_unit, "rmse", [format_number(e.rmse, 3) for e in estimates]),
         row("R²", NOTHING, "r_squared", [format_number(e.r_squared, 3) for e in estimates]),
         row("Evaluations", NOTHING, "", [f"{e.n_evaluations:,}" for e in estimates]),
-        row("Time", "s", "", [f"{e.seconds:.2f}" for e in estimates]),
         row("Stopped by its own rule", NOTHING, "",
             ["yes" if e.converged else "NO" for e in estimates]),
     ]  # fmt: skip

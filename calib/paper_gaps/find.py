@@ -15,6 +15,7 @@ from calib.paper_gaps.cases import PaperGap, paper_gaps
 from calib.sampling.adapt import Guess, adapt
 from calib.sampling.mode import find_modes
 from calib.streams import generator
+from calib.threads import one_thread
 
 __all__ = ["FoundGap", "Unfitted", "find_gaps", "simulator_sd", "unfitted_errors"]
 
@@ -73,6 +74,7 @@ class Unfitted:
     largest_after: float
 
 
+@one_thread()
 def find_gaps(
     seed: int,
     *,

@@ -17,6 +17,7 @@ from calib.sampling.ensemble import POOR, Ensemble
 from calib.sampling.gate import Gate, GateReport, judge
 from calib.sampling.mode import Mode, find_modes
 from calib.sampling.proposal import AnyProposal
+from calib.threads import one_thread
 
 __all__ = ["Draws", "SamplerSettings", "sample_density", "sample_posterior"]
 
@@ -94,6 +95,7 @@ class Draws:
         return self.t.reshape(-1, self.t.shape[-1])
 
 
+@one_thread()
 def sample_posterior(
     problem: Problem,
     seed: int | np.random.SeedSequence,

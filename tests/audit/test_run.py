@@ -96,7 +96,7 @@ def test_json_is_complete_and_strict(audit):
 
 
 def test_csv_has_a_row_for_each_finding(audit):
-    rows = list(csv.DictReader(io.StringIO(audit_csv(audit))))
+    rows = list(csv.DictReader(io.StringIO(audit_csv(audit.findings))))
     assert [r["key"] for r in rows] == [f.key for f in audit.findings]
     assert {r["depends_on_reconstruction"] for r in rows} == {"yes", "no"}
     inverse = next(r for r in rows if r["key"] == "table6_inverse_regression")

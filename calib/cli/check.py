@@ -1,0 +1,80 @@
+"""The verb that checks a report or a run: everything computed again, and a verdict."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.environment import imitate_processor
+from calib.errors import CalibError
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to an app."""
+    app.command()(check)
+
+
+def check(
+    folder: Annotated[Path, typer.Argument(help="Folder of `calib report` or `calib fit`.")],
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Skip the sampling: hashes, inputs and estimates only.")
+    ] = False,
+    every: Annotated[
+        bool, typer.Option("--all", help="List every number, not only what is not the same.")
+    ] = False,
+    json_to: Annotated[
+        Path | None, typer.Option("--json", help="File for machines to read; - prints it.")
+    ] = None,
+) -> None:
+    """Compute a report or a run again from its own folder and compare everything.
+
+    Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
+    """
+    _imitate(folder)
+    from calib.cli.check_display import show
+    from calib.cli.display import progress_bars
+    from calib.reproduce.check import check as find
+
+    try:
+        with progress_bars() as tell:
+            outcome = find(folder, quick=quick, progress=tell)
+    except CalibError as error:
+        if json_to is not None:
+            document = {"folder": str(folder), "verdict": "cannot be checked", "reason": str(error),
+                        "exit_code": 2}  # fmt: skip
+            _write(json.dumps(document, indent=1), json_to)
+        raise
+    if json_to is not None:
+        _write(json.dumps(outcome.document(), indent=1), json_to)
+    if json_to is None or str(json_to) != "-":
+        show(outcome, every=every)
+    if outcome.exit_code:
+        raise typer.Exit(outcome.exit_code)
+
+
+def _imitate(folder: Path) -> None:
+    """Before NumPy is imported: round as the machine did that made the folder, if this one can."""
+    for name in ("manifest.json", "run.json"):
+        try:
+            machine = json.loads((folder / name).read_text(encoding="utf-8"))["machine"]
+            imitate_processor(machine)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            continue
+
+
+def _write(text: str, path: Path) -> None:
+    if str(path) == "-":
+        print(text)
+        return
+    try:
+        path.write_text(text + "\n", encoding="utf-8")
+    except OSError as error:
+        raise CalibError(
+            f"the file cannot be written ({error.strerror})", where=str(path),
+            mend="choose another file with --json",
+        ) from None  # fmt: skip

@@ -1,0 +1,72 @@
+"""What a report shows: the study, and for the embedded data the source's gaps and its audit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from calib.audit import Audit, Seeds, run_audit
+from calib.paper_gaps.cases import PaperGap
+from calib.paper_gaps.find import FoundGap, find_gaps
+from calib.sampling.sampler import SamplerSettings
+from calib.study import Progress, Study, Task, run_study
+
+__all__ = ["Contents", "work_out"]
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What `calib.report.write_report` writes.
+
+    Parameters
+    ----------
+    study : Study
+    gaps : tuple of FoundGap
+        Empty where none were asked for.
+    audit : Audit, optional
+    """
+
+    study: Study
+    gaps: tuple[FoundGap, ...]
+    audit: Audit | None
+
+
+def work_out(
+    tasks: Sequence[Task],
+    seed: int,
+    *,
+    settings: SamplerSettings | None = None,
+    gaps: Sequence[PaperGap] = (),
+    audit: Seeds | None = None,
+    progress: Progress | None = None,
+    workers: int = 1,
+) -> Contents:
+    """Work everything out that a report shows.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+    seed : int
+        Same seed, same numbers.
+    settings : SamplerSettings, optional
+    gaps : sequence of PaperGap
+        The source's gaps to diagnose.
+    audit : Seeds, optional
+        How often the audit of the source's tables repeats each search; none, no audit.
+    progress : callable, optional
+        Called with what is being done, steps done and steps planned.
+    workers : int
+        Processes for leaving rows out; the numbers do not depend on it.
+    """
+    study = run_study(tasks, seed, settings=settings, progress=progress, workers=workers)
+    found = find_gaps(seed, gaps=gaps, progress=progress) if gaps else ()
+    if audit is None:
+        return Contents(study, found, None)
+    rut = study.successes.get("rut_depth")
+    audited = run_audit(
+        seed,
+        seeds=audit,
+        rut_calibration=None if rut is None else rut.calibration,
+        progress=progress,
+    )
+    return Contents(study, found, audited)

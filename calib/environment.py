@@ -1,0 +1,127 @@
+"""What numbers depend on besides data, priors and seed: versions, processor, the code itself.
+
+Two runs give the same bits where these agree; where they do not, only where chance decides.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Environment", "imitate_processor", "versions"]
+
+_PACKAGES = (
+    "terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-base", "arviz-stats", "xarray",
+    "matplotlib", "corner", "pillow", "jinja2", "h5netcdf", "h5py",
+)  # fmt: skip
+_SOURCES = (".py", ".j2", ".css", ".toml")
+# Only these are ever switched off: no build of NumPy needs them, so it can do without.
+_OPTIONAL = re.compile(r"AVX512[A-Z0-9_]*|X86_V4")
+_SWITCH = "NPY_DISABLE_CPU_FEATURES"
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Where a result was made; nothing in it names a computer or a person.
+
+    Parameters
+    ----------
+    versions : mapping of str to str
+        Of Python and of the packages that numbers and figures depend on.
+    machine : mapping of str to str
+        Processor family, system, C library, linear algebra, and the vector instructions that
+        NumPy uses (``simd``) and could use but does not (``simd_unused``).
+    code : str
+        SHA-256 over the source files of this package.
+    """
+
+    versions: Mapping[str, str]
+    machine: Mapping[str, str]
+    code: str
+
+    @classmethod
+    def here(cls) -> Environment:
+        """Return the environment of this process."""
+        return cls(versions(), _machine(), _code_sha256())
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain dictionaries."""
+        return {"versions": dict(self.versions), "machine": dict(self.machine), "code": self.code}
+
+    def differences(self, other: Environment) -> dict[str, tuple[str, str]]:
+        """Return what differs, as pairs of this one's and the other's value."""
+        mine, theirs = self._flat(), other._flat()
+        names = [*mine, *(name for name in theirs if name not in mine)]
+        pairs = {name: (mine.get(name, "none"), theirs.get(name, "none")) for name in names}
+        return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+
+    def same_program(self, other: Environment) -> bool:
+        """Whether equal numbers must give equal files: the same code and packages."""
+        return not set(self.differences(other)) & {*_PACKAGES, "code"}
+
+    def _flat(self) -> dict[str, str]:
+        return {**self.versions, **self.machine, "code": self.code}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that numbers depend on."""
+    from importlib.metadata import version
+
+    return {"python": sys.version.split()[0], **{name: version(name) for name in _PACKAGES}}
+
+
+def _machine() -> dict[str, str]:
+    import platform
+
+    import numpy as np
+
+    config: Any = np.show_config(mode="dicts")
+    simd, blas = config["SIMD Extensions"], config["Build Dependencies"]["blas"]
+    return {
+        "processor": platform.machine(),
+        "system": platform.system(),
+        "c_library": " ".join(platform.libc_ver()).strip(),
+        "linear_algebra": f"{blas['name']} {blas['version']}",
+        "simd": " ".join([*simd.get("baseline", ()), *simd.get("found", ())]),
+        "simd_unused": " ".join(simd.get("not found", ())),
+    }
+
+
+@cache
+def _code_sha256() -> str:
+    import hashlib
+
+    package = Path(__file__).resolve().parent
+    digest = hashlib.sha256()
+    for path in sorted(package.rglob("*")):
+        if path.suffix in _SOURCES and path.is_file():
+            # Line ends are the checkout's, not the code's.
+            content = path.read_bytes().replace(b"\r\n", b"\n")
+            digest.update(f"{path.relative_to(package).as_posix()}\0{len(content)}\0".encode())
+            digest.update(content)
+    return digest.hexdigest()
+
+
+def imitate_processor(machine: Mapping[str, Any]) -> None:
+    """Let NumPy do without the vector instructions that another machine did not use.
+
+    They round differently: with the same ones, a result of an older processor is computed again
+    bit for bit. Works until NumPy is imported; the user's own choice is left alone.
+
+    Parameters
+    ----------
+    machine : mapping
+        As `Environment.machine`.
+    """
+    if "numpy" in sys.modules or _SWITCH in os.environ:
+        return
+    unused = [name for name in str(machine.get("simd_unused", "")).split()
+              if _OPTIONAL.fullmatch(name)]  # fmt: skip
+    if unused:
+        os.environ[_SWITCH] = " ".join(unused)

@@ -1,0 +1,51 @@
+"""Check a folder: hashes first, then everything computed again and compared."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Literal
+
+from calib.environment import Environment
+from calib.reproduce.check_report import check_report
+from calib.reproduce.check_run import check_run
+from calib.reproduce.outcome import Outcome
+from calib.reproduce.schema import Manifest, read_folder
+from calib.study import Progress
+
+__all__ = ["check"]
+
+
+def check(folder: Path, *, quick: bool = False, progress: Progress | None = None) -> Outcome:
+    """Compute a report or a run again from its own folder and compare.
+
+    Parameters
+    ----------
+    folder : Path
+        Written by `calib report` or `calib fit`; nothing in it is changed.
+    quick : bool
+        Skip the sampling: hashes, data, priors and point estimates only.
+    progress : callable, optional
+        Called with what is being done, steps done and steps planned.
+
+    Returns
+    -------
+    Outcome
+
+    Raises
+    ------
+    CalibError
+        If it cannot be checked: the folder is none of ours, or does not say how it was made.
+    """
+    folder = Path(folder)
+    record = read_folder(folder)
+    here = Environment.here()
+    tell = progress or (lambda what, done, planned: None)
+    with tempfile.TemporaryDirectory(prefix="calib-check-") as scratch:
+        if isinstance(record, Manifest):
+            items, allowed = check_report(record, folder, Path(scratch), here, tell, quick=quick)
+        else:
+            items, allowed = check_run(record, folder, Path(scratch), here, tell, quick=quick)
+    kind: Literal["report", "run"] = "report" if isinstance(record, Manifest) else "run"
+    differing = record.environment.differences(here)
+    return Outcome(str(folder), kind, quick, tuple(items), differing, allowed)

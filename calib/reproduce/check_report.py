@@ -1,0 +1,136 @@
+"""Check a report folder: its hashes, its inputs, and everything computed again from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from calib.environment import Environment
+from calib.errors import CalibError
+from calib.problem import build_problem
+from calib.reproduce.allowances import describe
+from calib.reproduce.compare_files import PAGE, RECORD, SUMMARY, Again
+from calib.reproduce.compare_report import (
+    compare_estimates,
+    compare_report,
+    count_numbers,
+    entry,
+)
+from calib.reproduce.derived import verify_derived, verify_gap_summaries
+from calib.reproduce.files import verify_files
+from calib.reproduce.inputs import verify_hashes, verify_label, verify_priors
+from calib.reproduce.items import Item, Status
+from calib.reproduce.numbers import read_json
+from calib.reproduce.posteriors import GROUP as POSTERIORS
+from calib.reproduce.posteriors import DrawsFile, read_draws, verify_density, verify_summary
+from calib.reproduce.recompute import not_computed, recompute_report, report_tasks
+from calib.reproduce.schema import Manifest
+from calib.reproduce.text import verify_images
+from calib.study import Progress, Task, fitted_rows
+
+__all__ = ["check_report"]
+
+
+def check_report(
+    manifest: Manifest,
+    folder: Path,
+    scratch: Path,
+    here: Environment,
+    progress: Progress,
+    *,
+    quick: bool,
+) -> tuple[list[Item], str]:
+    """Return what was found, and what Monte Carlo error was allowed, in words.
+
+    Parameters
+    ----------
+    manifest : Manifest
+    folder, scratch : Path
+        The report, and an empty folder.
+    here : Environment
+    progress : callable
+    quick : bool
+        Skip the sampling.
+    """
+    items = verify_files(folder, manifest.files, RECORD, manifest.left_out)
+    for key, said in manifest.tasks.items():
+        items += verify_hashes(key, said, folder)
+    summary = read_json(folder / SUMMARY)
+    posteriors, unreadable = _posteriors(folder, manifest)
+    items += unreadable + _consistent(folder, summary, posteriors)
+    allowed = ""
+    with not_computed(items, folder, RECORD):
+        tasks = report_tasks(manifest, folder, scratch / "inputs")
+        items += _named_rightly(manifest, folder, tasks, same_code=manifest.code == here.code)
+        there = [task for task in tasks if task.output in posteriors]
+        items += [_density(task, posteriors[task.output]) for task in there]
+        if quick:
+            items += _left_out(manifest)
+            items += compare_estimates(tasks, manifest.seed, summary, progress)
+        else:
+            study = recompute_report(manifest, tasks, scratch / "again", progress)
+            allowed = describe(count_numbers(study))
+            items += compare_report(
+                Again(manifest, folder, scratch / "again", study, here), summary
+            )
+    items += verify_gap_summaries(folder, summary) + verify_derived(
+        folder, manifest.files, read_json(folder / RECORD), summary,
+        same_code=manifest.code == here.code,
+    )  # fmt: skip
+    return items, allowed
+
+
+def _left_out(manifest: Manifest) -> list[Item]:
+    note = "left out on purpose, and not made again"
+    return [Item(POSTERIORS, name, Status.UNJUDGED, note=note) for name in manifest.left_out]
+
+
+def _posteriors(folder: Path, manifest: Manifest) -> tuple[dict[str, DrawsFile], list[Item]]:
+    """Read the netCDF files that are there, by output; and what cannot be read."""
+    found, unreadable = {}, []
+    for key in manifest.tasks:
+        path = folder / f"{key}.nc"
+        if path.is_file():
+            try:
+                found[key] = read_draws(path)
+            except CalibError as error:
+                item = Item(POSTERIORS, path.name, Status.DIFFERENT, note=error.message)
+                unreadable.append(item)
+    return found, unreadable
+
+
+def _consistent(
+    folder: Path, summary: Mapping[str, Any], posteriors: Mapping[str, DrawsFile]
+) -> list[Item]:
+    """Hold the parts of the folder against each other, without computing anything again."""
+    items = []
+    page = folder / PAGE
+    if page.is_file():
+        items += verify_images(page.read_text(encoding="utf-8", errors="replace"), folder)
+    for key, file in posteriors.items():
+        stated = entry(summary, key).get("posterior")
+        items.append(
+            verify_summary(f"{key}.nc", file, stated if isinstance(stated, Mapping) else {})
+        )
+    return items
+
+
+def _named_rightly(
+    manifest: Manifest, folder: Path, tasks: tuple[Task, ...], *, same_code: bool
+) -> list[Item]:
+    items = []
+    for task in tasks:
+        said = manifest.tasks[task.output]
+        items.append(verify_label(said.data.file, task.table, said.label))
+        items.append(verify_priors(task.output, said, folder, same_code=same_code))
+    return items
+
+
+def _density(task: Task, file: DrawsFile) -> Item:
+    name = f"{task.output}.nc"
+    try:
+        problem = build_problem(task.model, fitted_rows(task)[0], task.prior_path)
+    except CalibError as error:
+        return Item(POSTERIORS, name, Status.DIFFERENT, note=error.message)
+    return verify_density(name, file, problem)

@@ -1,0 +1,151 @@
+"""Check a run folder: its hashes, its inputs, and its posterior sampled again from them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from calib.calibration import Calibration
+from calib.environment import Environment
+from calib.errors import CalibError
+from calib.problem import Problem
+from calib.reproduce.allowances import (
+    count_drawn,
+    describe,
+    run_allowances,
+    run_estimate_allowances,
+)
+from calib.reproduce.files import verify_files
+from calib.reproduce.inputs import GROUP as INPUTS
+from calib.reproduce.inputs import verify_label
+from calib.reproduce.items import Item, Status
+from calib.reproduce.montecarlo import Place
+from calib.reproduce.numbers import Section, compare_section, flatten
+from calib.reproduce.posteriors import GROUP as POSTERIORS
+from calib.reproduce.posteriors import compare_posterior, read_draws, summary_of, verify_density
+from calib.reproduce.recompute import estimate_again, not_computed, recompute_run
+from calib.reproduce.schema import RunRecord
+from calib.store import describe_estimates, run_problem
+from calib.study import Progress
+
+__all__ = ["check_run"]
+
+_RECORD, _POSTERIOR, _PRIORS, _DATA = "run.json", "posterior.nc", "priors.toml", "data.csv"
+_FILES = (_POSTERIOR, _PRIORS, _DATA)
+# Durations, hashes that are verified as such, and estimates, which are compared by themselves.
+_NOT_COMPARED = ("seconds", "sha256", "estimates")
+
+
+def check_run(
+    record: RunRecord,
+    folder: Path,
+    scratch: Path,
+    here: Environment,
+    progress: Progress,
+    *,
+    quick: bool,
+) -> tuple[list[Item], str]:
+    """Return what was found, and what Monte Carlo error was allowed, in words.
+
+    Parameters
+    ----------
+    record : RunRecord
+    folder, scratch : Path
+        The run, and an empty folder.
+    here : Environment
+    progress : callable
+    quick : bool
+        Skip the sampling.
+    """
+    items = verify_files(folder, record.sha256, _RECORD, {})
+    items += [
+        Item(INPUTS, name, Status.DIFFERENT, note="run.json has no hash of it")
+        for name in _FILES
+        if name not in record.sha256
+    ]
+    allowed = ""
+    with not_computed(items, folder, _RECORD):
+        problem = run_problem(record.document, folder / _DATA)
+        items += _consistent(record, folder, problem)
+        if quick:
+            items += _estimates(
+                record.document, describe_estimates(estimate_again(record, problem))
+            )
+        else:
+            calibration = recompute_run(record, problem, scratch / "again", progress)
+            allowed = describe(count_drawn(calibration))
+            same = record.environment.same_program(here)
+            items += _compare(record, calibration, folder, scratch / "again", same_program=same)
+    return items, allowed
+
+
+def _compare(
+    record: RunRecord, calibration: Calibration, folder: Path, made: Path, *, same_program: bool
+) -> list[Item]:
+    again = json.loads((made / _RECORD).read_text(encoding="utf-8"))
+    items = _estimates(record.document, again["estimates"])
+    recorded, found = _document(record.document, folder), _document(again, made)
+    if "posterior" not in recorded:  # it cannot be read, which has been said
+        del found["posterior"]
+    section = Section(_RECORD, (), dict(flatten(recorded)), dict(flatten(found)))
+    paths = {**section.recorded, **section.found}
+    allowances = run_allowances(calibration, section.recorded, paths)
+    items += compare_section(section, allowances, group_of=_group)
+    if "posterior" in recorded:
+        exact = section.exact and same_program
+        files = (folder / _POSTERIOR, made / _POSTERIOR)
+        items.append(compare_posterior(_POSTERIOR, *files, exact=exact))
+    return items + _blame(items)
+
+
+def _consistent(record: RunRecord, folder: Path, problem: Problem) -> list[Item]:
+    """Hold the parts of the folder against each other, without computing anything again."""
+    items = [verify_label(_DATA, problem.table, record.data_label)]
+    priors = folder / _PRIORS
+    if priors.is_file() and priors.read_text("utf-8", "replace") != record.prior_text:
+        note = "not the priors that run.json repeats"
+        items.append(Item(INPUTS, _PRIORS, Status.DIFFERENT, note=note))
+    if (folder / _POSTERIOR).is_file():
+        try:
+            file = read_draws(folder / _POSTERIOR)
+        except CalibError as error:
+            return [*items, Item(POSTERIORS, _POSTERIOR, Status.DIFFERENT, note=error.message)]
+        items.append(verify_density(_POSTERIOR, file, problem))
+    return items
+
+
+def _document(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return what is compared of a run: its record, and the summary of its draws."""
+    document = {key: value for key, value in record.items() if key not in _NOT_COMPARED}
+    with suppress(CalibError):
+        document["posterior"] = summary_of(read_draws(folder / _POSTERIOR).draws)
+    return document
+
+
+def _group(path: Place) -> str:
+    if path[0] in ("posterior", "gate", "mode", "log_evidence", "efficiency", "acceptance",
+                   "evaluations"):  # fmt: skip
+        return "posterior"
+    return "what was computed"
+
+
+def _estimates(record: Mapping[str, Any], again: Sequence[Mapping[str, Any]]) -> list[Item]:
+    found = json.loads(json.dumps(again))
+    place = ("estimates",)
+    old, new = dict(flatten(record["estimates"])), dict(flatten(found))
+    section = Section(_RECORD, place, old, new)
+    allowances = run_estimate_allowances(section.recorded)
+    return compare_section(section, allowances, group_of=lambda _: "estimates")
+
+
+def _blame(items: list[Item]) -> list[Item]:
+    """Name the input that the recorded numbers cannot have been computed from."""
+    mode = [item for item in items if item.name.startswith(f"{_RECORD}: mode.")]
+    different = sum(item.status is Status.DIFFERENT for item in mode)
+    if different <= 0.5 * len(mode):
+        return []
+    note = "the posterior mode in run.json does not follow from the data and priors here"
+    return [Item(INPUTS, f"{_DATA} or {_PRIORS}", Status.DIFFERENT, note=note)]

@@ -1,0 +1,54 @@
+"""What a check finds: one item for each number, file and claim that was looked at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any
+
+__all__ = ["Item", "Status"]
+
+
+class Status(StrEnum):
+    """How something recorded compares with the same computed again."""
+
+    IDENTICAL = "identical"
+    WITHIN = "within tolerance"
+    DIFFERENT = "different"
+    UNJUDGED = "not judged"
+
+
+@dataclass(frozen=True)
+class Item:
+    """One thing that was compared.
+
+    Parameters
+    ----------
+    group : str
+        What it belongs to, such as ``"rut_depth: posterior"``.
+    name : str
+        The file, the path of the number in it, or the claim.
+    status : Status
+    recorded, found : object
+        In the folder, and computed again; None where there is no number to show.
+    allowed : float, optional
+        The largest difference that is taken for the same.
+    note : str
+        Why, in a few words.
+    """
+
+    group: str
+    name: str
+    status: Status
+    recorded: Any = None
+    found: Any = None
+    allowed: float | None = None
+    note: str = ""
+
+    @property
+    def share(self) -> float | None:
+        """Difference over the allowed one; None where either is missing."""
+        values = (self.recorded, self.found)
+        if not self.allowed or not all(isinstance(v, int | float) for v in values):
+            return None
+        return float(abs(self.recorded - self.found) / self.allowed)

@@ -1,0 +1,153 @@
+"""Monte Carlo standard errors of everything that is computed from posterior draws.
+
+Of a posterior's summary they are the stated ones, of its sd ArviZ's. Scores follow from the errors
+of the predictive distributions they are scores of.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.calibration import Calibration
+from calib.chains import mcse, tail_shape
+from calib.models.base import Array
+from calib.scores import LEVELS, RELATIVE_ERROR_FLOOR
+from calib.validate import Validation
+
+__all__ = ["Place", "posterior_errors", "validation_errors"]
+
+type Place = tuple[str, ...]
+"""Keys from the top of a document to one of its numbers; positions in a list count from "0"."""
+
+# Moments that exist: the variance of a mean, and of a variance. The shape is estimated, so a
+# little less is asked of the second.
+_K_MEAN, _K_SD = 0.5, 0.2
+# Draws of the round of importance sampling that estimates the evidence, at least.
+_EVIDENCE_DRAWS = 1500
+
+
+def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:
+    """Return the Monte Carlo standard errors of a posterior summary.
+
+    Parameters
+    ----------
+    calibration : Calibration
+
+    Returns
+    -------
+    dict
+        Paths in ``summary.json`` below the output; None where the posterior's tail is so heavy
+        that there is no such error.
+    """
+    names = tuple(calibration.parameters)
+    stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
+    sd, shape = mcse(stacked, "sd"), tail_shape(stacked)
+    errors: dict[Place, float | None] = {}
+    for j, name in enumerate(names):
+        stated = calibration.summary[name]
+        errors |= {
+            ("posterior", name, "mean"): stated.mcse_mean if shape[j] < _K_MEAN else None,
+            ("posterior", name, "sd"): float(sd[j]) if shape[j] < _K_SD else None,
+            ("posterior", name, "median"): stated.mcse_median,
+            ("posterior", name, "hdi_lower"): stated.mcse_hdi_lower,
+            ("posterior", name, "hdi_upper"): stated.mcse_hdi_upper,
+        }
+    draws = calibration.draws
+    internal = draws.t.reshape(-1, *draws.t.shape[2:])
+    relative = mcse(internal, "sd") / internal.std(axis=(0, 1))
+    for j, name in enumerate(calibration.problem.names):
+        ratio = calibration.summary[name].sd_ratio
+        if np.isfinite(ratio):
+            errors["posterior", name, "posterior_to_prior_sd"] = ratio * float(relative[j])
+    efficiency = max(draws.efficiency, 1e-3)
+    errors["sampling", "log_evidence"] = float(np.sqrt((1.0 / efficiency - 1.0) / _EVIDENCE_DRAWS))
+    return errors
+
+
+def validation_errors(
+    calibration: Calibration, validation: Validation, multiple: float
+) -> dict[Place, float | None]:
+    """Return the Monte Carlo standard errors of a validation's scores.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    validation : Validation
+    multiple : float
+        How many errors will be allowed: so many decide which rows may cross the edge of a band.
+
+    Notes
+    -----
+    A part p of the predictive draws has the error sqrt(p (1 - p) (1/N + 1/ESS)): N draws of the
+    noise on top of ESS effective draws of the parameters. What is a mean over rows has the error
+    of the mean influence of a draw on them.
+    """
+    draws, observed, scores = validation.draws, validation.observed, validation.scores
+    n_draws, n = draws.shape
+    ess = min(float(s.ess_bulk) for s in calibration.summary.values())
+    part = float(np.sqrt(1.0 / n_draws + 1.0 / ess))
+    p = np.clip(scores.pit, 4.0 / n_draws, 1.0 - 4.0 / n_draws)
+    pit = np.sqrt(p * (1.0 - p)) * part
+    slope = (np.quantile(draws, 0.55, axis=0) - np.quantile(draws, 0.45, axis=0)) / 0.1
+    median = 0.5 * part * slope
+    errors: dict[Place, float | None] = {
+        ("validation", "rmse"): part * _rmse_influence(draws, observed, slope, scores.rmse),
+        ("validation", "crps"): part * _crps_influence(draws, observed),
+    }
+    errors |= {("validation", "pit", str(i)): float(pit[i]) for i in range(n)}
+    large = np.abs(observed) > RELATIVE_ERROR_FLOOR * np.abs(observed).max()
+    relative = median[large] / np.abs(observed[large])
+    if relative.size:
+        errors["validation", "max_relative_error"] = float(relative.max())
+        near = np.abs(np.abs(scores.relative_error[large]) - 0.06) <= multiple * relative
+        errors["validation", "n_relative_error_above_6_percent"] = near.sum() / multiple
+    for level in LEVELS:
+        edges = 0.5 + 0.5 * level * np.array([-1.0, 1.0])
+        close = np.abs(scores.pit[:, None] - edges).min(axis=1) <= multiple * pit
+        moved = float(close.sum()) / n / multiple
+        errors["validation", "coverage", f"{100 * level:g}"] = moved
+        # A Jeffreys interval moves a little faster than its proportion.
+        for end in ("0", "1"):
+            errors["validation", "coverage_interval", f"{100 * level:g}", end] = 1.5 * moved
+    if validation.method == "leave_one_out":
+        errors |= _elpd_errors(calibration, ess)
+    return errors
+
+
+def _rmse_influence(draws: Array, observed: Array, slope: Array, rmse: float) -> float:
+    """Standard deviation of one draw's influence on the RMSE of the medians."""
+    if rmse == 0.0:
+        return 0.0
+    medians = np.median(draws, axis=0)
+    influence = slope * (0.5 - (draws < medians))
+    return float(((medians - observed) * influence).mean(axis=1).std() / rmse)
+
+
+def _crps_influence(draws: Array, observed: Array) -> float:
+    """Standard deviation of one draw's influence on the mean CRPS."""
+    m = draws.shape[0]
+    order = np.argsort(draws, axis=0)
+    ordered = np.take_along_axis(draws, order, axis=0)
+    total = np.cumsum(ordered, axis=0)
+    rank = np.arange(1, m + 1)[:, None]
+    # Mean absolute difference of each draw to all others, from the sums of the sorted draws.
+    sorted_apart = (ordered * (2 * rank - m) + total[-1] - 2.0 * total) / m
+    apart = np.empty_like(draws)
+    np.put_along_axis(apart, order, sorted_apart, axis=0)
+    return float((np.abs(draws - observed) - apart).mean(axis=1).std())
+
+
+def _elpd_errors(calibration: Calibration, ess: float) -> dict[Place, float | None]:
+    """Of the sum over rows of -ln E[1/p(y_i | theta)] and of its spread, by their influence."""
+    rows = calibration.problem.log_likelihood_rows(calibration.draws.flat)
+    inverse = np.exp(rows.min(axis=0) - rows)
+    influence = inverse / inverse.mean(axis=0) - 1.0
+    elpd = rows.min(axis=0) - np.log(inverse.mean(axis=0))
+    n = elpd.size
+    spread = float(np.sqrt(n * elpd.var(ddof=1)))
+    lever = n * (elpd - elpd.mean()) / ((n - 1) * spread) if spread > 0.0 else np.zeros(n)
+    root = np.sqrt(ess)
+    return {
+        ("validation", "elpd"): float(influence.sum(axis=1).std() / root),
+        ("validation", "elpd_se"): float((influence @ lever).std() / root),
+    }

@@ -1,0 +1,113 @@
+"""What a result says of where it was made."""
+
+from __future__ import annotations
+
+import getpass
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+import calib.environment as environment_module
+from calib.environment import Environment, imitate_processor
+
+
+def test_it_says_what_decides_the_bits_and_nothing_of_whose_computer_it_is() -> None:
+    here = Environment.here()
+    document = here.document()
+    assert set(document) == {"versions", "machine", "code"}
+    assert {"python", "numpy", "matplotlib", "terracalib"} <= set(here.versions)
+    assert here.machine["processor"] == platform.machine()
+    assert here.machine["simd"]
+    text = json.dumps(document)
+    assert "/" not in text
+    for private in (platform.node(), getpass.getuser()):
+        assert not re.search(rf"\b{re.escape(private)}\b", text)
+    assert re.fullmatch("[0-9a-f]{64}", here.code)
+    assert json.loads(text) == document
+
+
+def test_differences_are_named() -> None:
+    here = Environment.here()
+    there = replace(here, versions={**here.versions, "numpy": "1.0"}, code="0")
+    assert here.differences(here) == {}
+    assert there.differences(here) == {
+        "numpy": ("1.0", here.versions["numpy"]), "code": ("0", here.code),
+    }  # fmt: skip
+    older = replace(here, machine={})
+    assert older.differences(here)["simd"] == ("none", here.machine["simd"])
+
+
+@pytest.mark.parametrize(
+    ("change", "same"),
+    [
+        ({"versions": {"python": "3.99"}}, True),
+        ({"machine": {"simd": "none"}}, True),
+        ({"versions": {"matplotlib": "0"}}, False),
+        ({"versions": {"jinja2": "0"}}, False),
+        ({"code": "0"}, False),
+    ],
+)
+def test_the_processor_does_not_decide_how_equal_numbers_are_written(change, same: bool) -> None:
+    here = Environment.here()
+    merged = {
+        key: {**getattr(here, key), **value} if isinstance(value, dict) else value
+        for key, value in change.items()
+    }
+    assert replace(here, **merged).same_program(here) is same
+
+
+def test_another_line_of_code_is_another_code(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def code(text: bytes) -> str:
+        (tmp_path / "sub").mkdir(exist_ok=True)
+        (tmp_path / "sub" / "module.py").write_bytes(text)
+        (tmp_path / "notes.txt").write_bytes(text)
+        monkeypatch.setattr(environment_module, "__file__", str(tmp_path / "environment.py"))
+        return environment_module._code_sha256.__wrapped__()
+
+    one = code(b"x = 1\ny = 2\n")
+    assert code(b"x = 1\r\ny = 2\r\n") == one
+    assert code(b"x = 1\ny = 3\n") != one
+
+
+IMITATE = """
+import os, sys
+from calib.environment import imitate_processor
+assert "numpy" not in sys.modules
+imitate_processor({"simd_unused": sys.argv[1]})
+print(os.environ.get("NPY_DISABLE_CPU_FEATURES", ""))
+import numpy
+"""
+
+
+@pytest.mark.parametrize(
+    ("unused", "switched_off"),
+    [
+        ("X86_V4 AVX512_ICL AVX512_SPR", "X86_V4 AVX512_ICL AVX512_SPR"),
+        # Never what a build of NumPy may need: it would refuse to start.
+        ("X86_V2 SSE2 X86_V3 NEON AVX512F", "AVX512F"),
+        ("AVX512F;rm", ""),
+        ("", ""),
+    ],
+)
+def test_only_the_newest_instructions_are_done_without(unused: str, switched_off: str) -> None:
+    bare = {k: v for k, v in os.environ.items() if k != "NPY_DISABLE_CPU_FEATURES"}
+    ran = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", IMITATE, unused],
+        env=bare, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert ran.stdout.strip() == switched_off
+
+
+def test_it_is_too_late_once_numpy_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("NPY_DISABLE_CPU_FEATURES", raising=False)
+    imitate_processor({"simd_unused": "X86_V4"})
+    assert "NPY_DISABLE_CPU_FEATURES" not in os.environ
