@@ -3,11 +3,12 @@
 VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.ready
+BENCH_VENV := .venv-bench
 OUT ?= out/he2019
 # Small matrices: threads of the linear algebra would only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: report reference test test-slow lint format clean
+.PHONY: report reference test test-slow bench lint format clean
 
 report: $(READY)
 	$(BIN)/calib report --out $(OUT) --overwrite
@@ -24,17 +25,22 @@ test: $(READY)
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
 
+# Against the peers, written to reports/benchmarks; PART="posterior likelihood" does a part of it.
+bench: $(BENCH_VENV)/.ready
+	$(BENCH_VENV)/bin/python benchmarks/bench.py $(PART)
+
 lint: $(READY)
-	$(BIN)/ruff check calib tests
-	$(BIN)/ruff format --check calib tests
+	$(BIN)/ruff check calib tests benchmarks
+	$(BIN)/ruff format --check calib tests benchmarks
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 format: $(READY)
-	$(BIN)/ruff check --fix calib tests
-	$(BIN)/ruff format calib tests
+	$(BIN)/ruff check --fix calib tests benchmarks
+	$(BIN)/ruff format calib tests benchmarks
 
-$(READY): pyproject.toml constraints.txt
+# $(call setup,extra,constraints): make the target's virtual environment with an optional extra.
+define setup
 	@python=$$(for p in python3.12 python3.13 python3.14 python3 python; do \
 	  $$p -c 'import sys; raise SystemExit(sys.version_info < (3, 12))' >/dev/null 2>&1 \
 	    && echo $$p && break; done); \
@@ -43,10 +49,17 @@ $(READY): pyproject.toml constraints.txt
 	  exit 1; \
 	fi; \
 	set -e; \
-	$(BIN)/python -c 'import sys; raise SystemExit(sys.version_info < (3, 12))' >/dev/null 2>&1 \
-	  || $$python -m venv --clear $(VENV); \
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[test]'; \
+	$(@D)/bin/python -c 'import sys; raise SystemExit(sys.version_info < (3, 12))' >/dev/null 2>&1 \
+	  || $$python -m venv --clear $(@D); \
+	$(@D)/bin/python -m pip install --quiet --disable-pip-version-check $(2) -e '.[$(1)]'; \
 	touch $@
+endef
+
+$(READY): pyproject.toml constraints.txt
+	$(call setup,test,-c constraints.txt)
+
+$(BENCH_VENV)/.ready: pyproject.toml constraints.txt constraints-bench.txt
+	$(call setup,bench,-c constraints.txt -c constraints-bench.txt)
 
 clean:
-	rm -rf $(VENV) out
+	rm -rf $(VENV) $(BENCH_VENV) out

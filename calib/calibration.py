@@ -9,7 +9,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from calib.chains import ess, hdi, hdi_error, median_error, rhat
+from calib.chains import convergence, ess, hdi, hdi_error, median_error
 from calib.estimators import PointEstimate
 from calib.models.base import Array
 from calib.problem import Problem
@@ -126,14 +126,8 @@ def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
     names = tuple(calibration.parameters)
     stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
     ensembles, walkers, steps, _ = calibration.draws.t.shape
-    by_ensemble = (
-        stacked.reshape(ensembles, walkers, steps, -1)
-        .transpose(0, 2, 1, 3)
-        .reshape(ensembles, steps * walkers, -1)
-    )
-    r, bulk, tail, mean_ess = (
-        rhat(by_ensemble), ess(stacked, "bulk"), ess(stacked, "tail"), ess(stacked, "mean")
-    )  # fmt: skip
+    found = convergence(stacked.reshape(ensembles, walkers, steps, -1))
+    mean_ess = ess(stacked, "mean")
     flat = stacked.reshape(-1, len(names))
     interval = [hdi(flat[:, j], _HDI) for j in range(len(names))]
     batches = _batches(stacked.reshape(ensembles, walkers, steps, -1))
@@ -148,9 +142,9 @@ def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
             median=float(np.median(flat[:, j])),
             hdi_lower=interval[j][0],
             hdi_upper=interval[j][1],
-            ess_bulk=float(bulk[j]),
-            ess_tail=float(tail[j]),
-            rhat=float(r[j]),
+            ess_bulk=float(found.ess_bulk[j]),
+            ess_tail=float(found.ess_tail[j]),
+            rhat=float(found.rhat[j]),
             mcse_mean=float(flat[:, j].std(ddof=1) / np.sqrt(mean_ess[j])),
             sd_ratio=_internal_sd(calibration, name) / prior_sd.get(name, np.nan),
             mcse_median=median_error(batches[j]),

@@ -19,7 +19,7 @@ from calib.models.base import Array
 
 __all__ = [
     "Convergence", "autocorrelation_time", "convergence", "ess", "hdi", "hdi_error", "mcse",
-    "median_error", "power_scaled_weights", "power_sensitivity", "psis", "rhat", "tail_shape",
+    "median_error", "power_scaled_weights", "power_sensitivity", "psis", "tail_shape",
 ]  # fmt: skip
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}
@@ -49,7 +49,7 @@ def convergence(draws: Array) -> Convergence:
     Returns
     -------
     Convergence
-        NaN where draws are not finite.
+        NaN where draws are not finite or fewer than four steps.
 
     Notes
     -----
@@ -67,7 +67,7 @@ def convergence(draws: Array) -> Convergence:
     found = np.full((3, d), np.nan)
     for j in range(d):
         x = by_half[..., j]
-        if np.isfinite(x).all():
+        if half > 1 and np.isfinite(x).all():
             found[:, j] = _convergence_of(np.ascontiguousarray(x))
     return Convergence(*found)
 
@@ -124,22 +124,13 @@ def autocorrelation_time(chain: Array, c: float = 5.0) -> Array:
         x = chain[..., j] - chain[..., j].mean(axis=1, keepdims=True)
         spectrum = rfft(x, n=size, axis=1)
         covariance = irfft(spectrum.real**2 + spectrum.imag**2, n=size, axis=1)[:, :steps]
+        # Of a walker that never moved, what the mean leaves is rounding.
+        covariance[np.ptp(chain[..., j], axis=1) == 0.0] = 0.0
         with np.errstate(invalid="ignore"):
             taus = 2.0 * np.cumsum((covariance / covariance[:, :1]).mean(axis=0)) - 1.0
         inside = np.arange(steps) < c * taus
         tau[j] = taus[inside.argmin() if inside.any() else -1]
     return tau
-
-
-def rhat(chains: Array) -> Array:
-    """Rank-normalised split R-hat of each parameter, shape (chains, draws, d) to (d,).
-
-    References
-    ----------
-    Vehtari et al. (2021), doi:10.1214/20-BA1221.
-    """
-    with np.errstate(all="ignore"):
-        return np.asarray(_stats().rhat(chains, method="rank", **_AXES))
 
 
 def ess(chains: Array, method: Literal["bulk", "tail", "mean"]) -> Array:

@@ -23,9 +23,9 @@ from calib.estimators.genetic import estimate_genetic
 from calib.estimators.least_squares import estimate_least_squares
 from calib.prediction import predict
 from calib.problem import Problem
+from calib.sampling.adapt import Guess, adapt
 from calib.sampling.mode import find_modes
 from calib.sampling.moves import IndependenceMove
-from calib.sampling.proposal import Guess, adapt
 from calib.validate import leave_one_out, validate_held_out
 
 SIGMAS = 5.0
@@ -138,7 +138,7 @@ def test_each_move_alone(name: str, problem: Problem, exact: Exact, proposal) ->
         walkers, 3, problem.log_prob, vectorize=True, moves=move(name, proposal)
     )
     sampler.random_state = np.random.RandomState(4).get_state()
-    start = proposal.sample(np.random.default_rng(5), walkers)
+    start, _ = proposal.draw(np.random.default_rng(5), walkers)
     sampler.run_mcmc(start, steps, skip_initial_state_check=True)
     chains = sampler.get_chain()[steps // 3 :].transpose(1, 0, 2)
     # Walkers exchange positions in these moves; whole ensembles are what is independent, so the
@@ -150,8 +150,8 @@ def test_importance_sampling_from_the_fitted_proposal(
     problem: Problem, exact: Exact, proposal
 ) -> None:
     n = 20_000
-    t = proposal.sample(np.random.default_rng(6), n)
-    log_weight = problem.log_prob(t) - proposal.log_prob(t)
+    t, log_q = proposal.draw(np.random.default_rng(6), n)
+    log_weight = problem.log_prob(t) - log_q
     weight = np.exp(log_weight - exact.log_evidence)
     # Normalised by the exact evidence, weights have mean one.
     assert abs(weight.mean() - 1.0) < SIGMAS * weight.std() / np.sqrt(n)

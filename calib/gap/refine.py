@@ -16,7 +16,8 @@ from scipy.special import logsumexp
 
 from calib.gap.fit import Fit, log_joint
 from calib.models.base import Array
-from calib.sampling.proposal import StudentT, tempered_moments
+from calib.sampling.adapt import tempered_moments
+from calib.sampling.mixture import StudentT
 from calib.streams import generator
 
 __all__ = ["refine"]

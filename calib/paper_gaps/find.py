@@ -12,8 +12,8 @@ from calib.gap.diagnose import Diagnosis, diagnose
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.paper_gaps.cases import PaperGap, paper_gaps
+from calib.sampling.adapt import Guess, adapt
 from calib.sampling.mode import find_modes
-from calib.sampling.proposal import Guess, adapt
 from calib.streams import generator
 from calib.threads import one_thread
 
@@ -135,8 +135,8 @@ def simulator_sd(found: Diagnosis) -> Array:
     modes = find_modes(log_prob, priors, rng)
     guesses = [Guess(m.t, np.linalg.cholesky(m.covariance)) for m in modes]
     proposal, _ = adapt(log_prob, guesses, rng)
-    drawn = proposal.sample(rng, _N_DRAWS)
-    log_weight = log_prob(drawn) - proposal.log_prob(drawn)
+    drawn, log_q = proposal.draw(rng, _N_DRAWS)
+    log_weight = log_prob(drawn) - log_q
     weight = np.exp(log_weight - logsumexp(log_weight))
     inside = weight > 0.0
     conditions = o.problem.bound.model.select(found.data.view.conditions)

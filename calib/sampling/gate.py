@@ -48,7 +48,13 @@ class GateReport:
 
 
 def judge(
-    draws: Array, names: tuple[str, ...], gate: Gate, *, tau: Array, min_ensembles: int = 4
+    draws: Array,
+    names: tuple[str, ...],
+    gate: Gate,
+    *,
+    tau: Array,
+    steps: int | None = None,
+    min_ensembles: int = 4,
 ) -> GateReport:
     """Judge draws of independently seeded ensembles.
 
@@ -59,6 +65,8 @@ def judge(
     gate : Gate
     tau : ndarray, shape (d,)
         Integrated autocorrelation time in steps, the worst of the ensembles.
+    steps : int, optional
+        Length of the chain that was run; that of `draws` if it is not thinned.
     min_ensembles : int
         Fewer cannot be compared.
 
@@ -66,7 +74,8 @@ def judge(
     --------
     calib.chains.convergence : How R-hat and effective sample sizes are taken.
     """
-    ensembles, _, steps, _ = draws.shape
+    ensembles = draws.shape[0]
+    steps = draws.shape[2] if steps is None else steps
     found = convergence(draws)
     r, bulk, tail = found.rhat, found.ess_bulk, found.ess_tail
     reasons = []

@@ -100,7 +100,7 @@ def find_modes(
     starts : ndarray, shape (m, d), optional
         Point estimates, in internal coordinates.
     n_screen, n_climb : int
-        Prior draws screened, and how many of them climb.
+        Prior draws screened (if zero, only the given starts climb), and how many of them climb.
     """
     width = prior_widths(priors)
     ends, values = climb(
@@ -135,6 +135,8 @@ def _starts(
     n_screen: int,
     n_climb: int,
 ) -> Array:
+    if starts is not None and n_screen == 0:
+        return np.atleast_2d(starts)
     pool = priors.sample(rng, n_screen)
     value = log_prob(pool)
     # The best of each group rather than the best of all, which may share one basin.

@@ -1,4 +1,4 @@
-"""Our emcee move: independent draws from a proposal fitted to the posterior."""
+"""Our emcee moves: independent draws from a proposal fitted to the posterior, a walk along it."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ import emcee
 import numpy as np
 
 from calib.models.base import Array
-from calib.sampling.proposal import AnyProposal
+from calib.sampling.proposal import AnyProposal, Proposal
 
-__all__ = ["IndependenceMove"]
+__all__ = ["IndependenceMove", "WalkMove"]
 
 
 class IndependenceMove(emcee.moves.Move):  # type: ignore[misc]
@@ -68,9 +68,8 @@ class IndependenceMove(emcee.moves.Move):  # type: ignore[misc]
         return state, accepted
 
     def _refill(self, model: Any, walkers: int) -> None:
-        drawn = self.proposal.sample(self.rng, self.ahead * walkers)
-        log_prob, _ = model.compute_log_prob_fn(drawn)
-        log_q = self.proposal.log_prob(drawn)
+        drawn, log_q = self.proposal.draw(self.rng, self.ahead * walkers)
+        log_prob = model.log_prob_fn(drawn)
         parts = (np.split(a, self.ahead) for a in (drawn, log_prob, log_q))
         self._queue = list(zip(*parts, strict=True))
 
@@ -82,3 +81,48 @@ class IndependenceMove(emcee.moves.Move):  # type: ignore[misc]
         if moved.any():
             self._log_q[moved] = self.proposal.log_prob(coords[moved])
         return self._log_q
+
+
+class WalkMove(emcee.moves.Move):  # type: ignore[misc]
+    """A random walk in straightened coordinates: a local move that follows bends and funnels.
+
+    All walkers step at once, each on its own, by a normal as wide as the posterior there times a
+    factor drawn anew for each step: long ones cross the bulk, short ones are accepted in corners.
+
+    Parameters
+    ----------
+    proposal : Proposal
+        Whose straightened coordinates they are.
+    rng : Generator
+    """
+
+    def __init__(self, proposal: Proposal, rng: np.random.Generator) -> None:
+        self.straightener = proposal.straightener
+        self.cholesky = proposal.mixture.covariance_cholesky()
+        self.rng = rng
+
+    def propose(self, model: Any, state: Any) -> tuple[Any, Array]:
+        """Move the walkers; the interface is emcee's.
+
+        Parameters
+        ----------
+        model : emcee.model.Model
+        state : emcee.State
+
+        Returns
+        -------
+        state : emcee.State
+        accepted : ndarray of bool, shape (walkers,)
+        """
+        walkers, d = state.coords.shape
+        v, before = self.straightener.straighten(state.coords)
+        length = 2.38 / np.sqrt(d) * 0.1 ** self.rng.random((walkers, 1))
+        step = self.rng.standard_normal((walkers, d)) @ self.cholesky.T
+        t, after = self.straightener.bend(v + length * step)
+        log_prob = model.log_prob_fn(t)
+        # Densities of v: those of t over the Jacobian |dv/dt|.
+        ratio = (log_prob - after) - (state.log_prob - before)
+        accepted = np.log1p(-model.random.rand(walkers)) < ratio
+        state.coords[accepted] = t[accepted]
+        state.log_prob[accepted] = log_prob[accepted]
+        return state, accepted

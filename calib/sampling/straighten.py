@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.models.base import Array
 
@@ -20,7 +21,7 @@ __all__ = ["Straightener"]
 # Squares, products and the scale saturate this many standard deviations from the mean: they are
 # fitted to the bulk, and tails beyond it are bent no further.
 _SATURATION = 4.0
-# Draws' worth of evidence that there is no bend.
+# Draws' worth of evidence that coordinates have no relation.
 _RIDGE = 3.0
 _NEWTON_STEPS = 8
 
@@ -63,8 +64,8 @@ class Straightener:
         d = t.shape[1]
         mean = weight @ t
         sd = np.sqrt(weight @ np.square(t - mean))
-        if not (np.isfinite(sd).all() and (sd > 0.0).all()):
-            raise np.linalg.LinAlgError
+        if not (np.isfinite(sd).all() and (sd > 1e-12 * (1.0 + abs(mean))).all()):
+            raise np.linalg.LinAlgError("the draws have no spread")
         z = ((t - mean) / sd)[:, ::-1]
         features = _features(z)
         effective = 1.0 / np.square(weight).sum()
@@ -88,13 +89,13 @@ class Straightener:
         v[:, 1:] *= np.exp(-log_scale)[:, None]
         return v, -(t.shape[1] - 1) * log_scale - np.log(self.sd).sum()
 
-    def bend(self, v: Array) -> Array:
-        """Return t of straightened coordinates, shape (k, d)."""
+    def bend(self, v: Array) -> tuple[Array, Array]:
+        """Return t, shape (k, d), and the log of |dv/dt| there, as `straighten` of it would."""
         k, d = v.shape
         z, bounded = np.empty((d, k)), np.empty((d, k))
         features = np.empty((self.coefficients.shape[0], k))
         features[0] = 1.0
-        scale = np.ones(k)
+        scale, log_scale = np.ones(k), np.zeros(k)
         n = 1
         for i in range(d):
             z[i] = self.coefficients[:n, i] @ features[:n] + v[:, i] * scale
@@ -103,8 +104,9 @@ class Straightener:
             np.multiply(bounded[i], bounded[: i + 1], out=features[n + 1 : n + i + 2])
             n += i + 2
             if i == 0:
-                scale = np.exp(self.rho * bounded[0])
-        return np.asarray(z[::-1].T * self.sd + self.mean)
+                log_scale = self.rho * bounded[0]
+                scale = np.exp(log_scale)
+        return z[::-1].T * self.sd + self.mean, -(d - 1) * log_scale - np.log(self.sd).sum()
 
 
 def _bounded(z: Array) -> Array:
@@ -129,18 +131,36 @@ def _features(z: Array) -> Array:
 
 
 def _regress(features: Array, z: Array, weight: Array, effective: float) -> Array:
-    """Ridge regression of each coordinate on the features of those before it."""
+    """Regress each coordinate on the features of those before it.
+
+    Squares and products are shrunk by as much as noise alone would have made of them (the
+    positive-part rule of James and Stein): a posterior that is straight stays straight.
+    """
     weighted = features * weight[:, None]
     gram, moment = weighted.T @ features, weighted.T @ z
-    penalty = np.full(features.shape[1], _RIDGE / effective)
-    penalty[0] = 0.0
-    coefficients = np.zeros((features.shape[1], z.shape[1]))
+    d = z.shape[1]
+    coefficients = np.zeros((features.shape[1], d))
     n = 1
-    for i in range(z.shape[1]):
-        left = gram[:n, :n] + np.diag(penalty[:n])
-        coefficients[:n, i] = np.linalg.solve(left, moment[:n, i])
+    for i in range(d):
+        plain = np.zeros(n)
+        columns = np.array([0, *(1 + j * (j + 3) // 2 for j in range(i))])
+        plain[columns] = _solve(gram, moment[:, i], columns, effective)
+        full = _solve(gram, moment[:, i], np.arange(n), effective)
+        # Mean squares explained, up to the same constant.
+        gain = float(full @ moment[:n, i] - plain @ moment[:n, i])
+        left = max(float(weight @ np.square(z[:, i]) - full @ moment[:n, i]), 1e-300)
+        noise = (n - columns.size) / effective * left
+        share = max(0.0, 1.0 - noise / gain) if gain > 0.0 else 0.0
+        coefficients[:n, i] = plain + share * (full - plain)
         n += i + 2
     return coefficients
+
+
+def _solve(gram: Array, moment: Array, columns: NDArray[np.intp], effective: float) -> Array:
+    penalty = np.full(columns.size, _RIDGE / effective)
+    penalty[0] = 0.0
+    left = gram[np.ix_(columns, columns)] + np.diag(penalty)
+    return np.asarray(np.linalg.solve(left, moment[columns]))
 
 
 def _growth(squared: Array, bounded: Array, weight: Array) -> float:

@@ -11,7 +11,7 @@ from scipy.special import gammaln
 
 from calib.chains import ess
 from calib.models.base import Array
-from calib.sampling.proposal import Guess
+from calib.sampling.adapt import Guess
 from calib.sampling.sampler import Draws, SamplerSettings, sample_density
 
 # Deviations are allowed five standard errors: by chance one in two million.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.chains import ess, hdi, psis, rhat
+from calib.chains import convergence, ess, hdi, psis
 from calib.sampling.gate import Gate, GateReport, judge
 from calib.sampling.sampler import SamplerSettings
 
@@ -105,20 +105,20 @@ def test_the_limits_are_those_of_the_gate() -> None:
 def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.MonkeyPatch) -> None:
     from calib.sampling import sampler as module
 
-    chain = module._Ensemble.chain
+    drawn = module.Ensemble.drawn
     made: list[object] = []
-    init = module._Ensemble.__init__
+    init = module.Ensemble.__init__
 
     def remember(self, *args, **kwargs):
         init(self, *args, **kwargs)
         made.append(self)
 
-    def stuck(self, target):
-        kept = chain(self, target)
-        return np.repeat(kept[:, :1], target, axis=1) if self is made[1] else kept
+    def stuck(self, steps):
+        t, log_prob = drawn(self, steps)
+        return (np.repeat(t[:, :1], steps.size, axis=1) if self is made[1] else t), log_prob
 
-    monkeypatch.setattr(module._Ensemble, "__init__", remember)
-    monkeypatch.setattr(module._Ensemble, "chain", stuck)
+    monkeypatch.setattr(module.Ensemble, "__init__", remember)
+    monkeypatch.setattr(module.Ensemble, "drawn", stuck)
     settings = SamplerSettings(max_steps=200)
     draws = run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=settings)
     assert len(made) == 4
@@ -162,12 +162,12 @@ def test_effective_sizes_of_an_autoregressive_chain() -> None:
 
 
 def test_r_hat_of_shifted_chains() -> None:
-    x = np.random.default_rng(6).standard_normal((4, 4000, 1))
-    assert rhat(x)[0] == pytest.approx(1.0, abs=2e-3)
+    x = np.random.default_rng(6).standard_normal((4, 1, 4000, 1))
+    assert convergence(x).rhat[0] == pytest.approx(1.0, abs=2e-3)
     x[0] += 2.0
     # The means spread by sd 1 about their mean (0, 0, 0, 2): R-hat near sqrt(1 + 1) = 1.41, less
     # what ranking takes off.
-    assert 1.2 < rhat(x)[0] < 1.5
+    assert 1.2 < convergence(x).rhat[0] < 1.5
 
 
 def test_the_highest_density_interval_of_a_skewed_distribution() -> None:

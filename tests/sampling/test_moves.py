@@ -10,8 +10,8 @@ import pytest
 from scipy import stats
 
 from calib.chains import ess
+from calib.sampling.mixture import Mixture, StudentT
 from calib.sampling.moves import IndependenceMove
-from calib.sampling.proposal import Mixture, StudentT
 
 
 def proposal(mean: float = 0.8, scale: float = 1.7) -> Mixture:
@@ -41,9 +41,9 @@ class Stub:
         assert size == self.uniform.size
         return self.uniform
 
-    def compute_log_prob_fn(self, t: np.ndarray) -> tuple[np.ndarray, None]:
+    def log_prob_fn(self, t: np.ndarray) -> np.ndarray:
         self.evaluations += len(t)
-        return target(t), None
+        return target(t)
 
 
 def at(points: np.ndarray) -> emcee.State:

@@ -15,10 +15,12 @@ from calib.chains import ess
 from calib.data import Table
 from calib.errors import CalibError
 from calib.problem import build_problem
+from calib.sampling import ensemble as ensemble_module
 from calib.sampling import sampler as sampler_module
+from calib.sampling.adapt import Guess
 from calib.sampling.gate import Gate, judge
+from calib.sampling.mixture import Mixture, StudentT
 from calib.sampling.mode import find_modes
-from calib.sampling.proposal import Guess, Mixture, StudentT
 from calib.sampling.sampler import Draws, SamplerSettings, sample_density, sample_posterior
 
 from .closed_form import SIGMAS, assert_distributed, evidence_error, linear, run
@@ -116,13 +118,13 @@ def test_walkers_in_a_mode_the_proposal_does_not_know_are_refused() -> None:
     report = judge(t, ("x0", "x1"), Gate(rhat_max=1.1), tau=np.ones(2))
     known = Mixture(np.ones(1), (StudentT(np.zeros(2), np.eye(2), 6.0),))
     assert report.passed
-    refused = sampler_module._refuse_neglect(report, known, t, log_prob)
+    refused = sampler_module._refuse_neglect(report, known, t, log_prob, steps=200)
     assert not refused.passed
     assert "1.0% of the draws lie where hardly any was proposed" in refused.reasons[0]
     both = Mixture(
         np.array([0.9, 0.1]), (*known.components, StudentT(np.array([40.0, 0.0]), np.eye(2), 6.0))
     )
-    assert sampler_module._refuse_neglect(report, both, t, log_prob) is report
+    assert sampler_module._refuse_neglect(report, both, t, log_prob, steps=200) is report
 
 
 def test_modes_far_apart_are_found_by_the_search() -> None:
@@ -227,7 +229,7 @@ def test_a_run_extends_itself_until_the_gate_passes() -> None:
     draws = run(model.log_prob_known, np.zeros(3), np.eye(3), settings=short)
     assert draws.report.passed
     assert draws.report.steps > 10
-    assert draws.t.shape == (4, 64, min(64, draws.report.steps), 3)
+    assert draws.t.shape == (4, 128, min(32, draws.report.steps), 3)
 
 
 @pytest.mark.parametrize(("steps", "most", "done"), [(10, 39, 20), (200, 30, 30)])
@@ -263,7 +265,7 @@ def test_emcee_takes_the_random_state(monkeypatch: pytest.MonkeyPatch) -> None:
         def random_state(self, state):
             pass
 
-    monkeypatch.setattr(sampler_module.emcee, "EnsembleSampler", Deaf)
+    monkeypatch.setattr(ensemble_module.emcee, "EnsembleSampler", Deaf)
     with pytest.raises(RuntimeError, match="did not take the random state"):
         run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=QUICK)
 

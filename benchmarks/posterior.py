@@ -1,0 +1,211 @@
+"""One posterior on one core: ours, PyMC with nutpie, and emcee's default stretch move.
+
+    python benchmarks/posterior.py --out posterior.json
+
+Same data, priors and likelihood; the peers' repeats take turns with ours. Time is everything but
+compilation: search for modes, adaptation, tuning, burn-in, sampling, our gate. Effective sample
+sizes are ArviZ's, of all draws that were kept, each walker taken as a chain.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import emcee
+import numpy as np
+from shared.agreement import z_scores
+from shared.machine import describe, use_one_core
+from shared.measure import spread
+from shared.peers import pymc_model
+
+from calib.chains import ess
+from calib.models.base import Array
+from calib.problem import Problem, build_problem
+from calib.sampling.gate import Gate
+from calib.sampling.sampler import SamplerSettings, sample_posterior
+from calib.study import he2019_tasks
+
+# Draws of each sampler: its defaults, and so many that what comes before them is of no account.
+OURS = {"default": {}, "long": {"walkers": 512}}
+NUTPIE = {"default": 1000, "long": 10_000}
+NUTPIE_CHAINS = 4
+STRETCH_WALKERS, STRETCH_STEPS, STRETCH_THIN = 128, 16_000, 20
+REPLICATES = 40
+
+
+def ours(problem: Problem, seed: int, length: str) -> tuple[dict[str, float], Array]:
+    """Sample with calib; keep all draws."""
+    settings = SamplerSettings(keep=10**9, **OURS[length])
+    began = time.perf_counter()
+    draws = sample_posterior(problem, seed, settings=settings)
+    taken = time.perf_counter() - began
+    t = draws.t.reshape(-1, *draws.t.shape[2:])
+    return {**worth(t, taken, draws.evaluations), "passed": float(draws.report.passed)}, t
+
+
+def nutpie(compiled: Any, names: tuple[str, ...], seed: int, length: str) -> tuple[dict, Array]:
+    """Sample with nutpie at its own settings, compiled before."""
+    import nutpie as package
+
+    began = time.perf_counter()
+    found = package.sample(
+        compiled, draws=NUTPIE[length], chains=NUTPIE_CHAINS, cores=1, seed=seed,
+        progress_bar=False, save_warmup=True,
+    )  # fmt: skip
+    taken = time.perf_counter() - began
+    t = np.stack([np.asarray(found["posterior"][name]) for name in names], axis=-1)
+    steps = sum(
+        float(np.asarray(found[g]["n_steps"]).sum())
+        for g in ("sample_stats", "warmup_sample_stats")
+    )
+    divergences = float(np.asarray(found["sample_stats"]["diverging"]).sum())
+    return {**worth(t, taken, int(steps)), "divergences": divergences}, t
+
+
+def stretch(problem: Problem, start: Array, seed: int) -> tuple[dict[str, float], Array]:
+    """Sample with emcee as it comes; a tenth of the steps is burn-in, counted as time."""
+    sampler = emcee.EnsembleSampler(
+        STRETCH_WALKERS, problem.n_dim, problem.log_prob, vectorize=True
+    )
+    sampler.random_state = np.random.RandomState(seed).get_state()
+    began = time.perf_counter()
+    stored = STRETCH_STEPS // STRETCH_THIN
+    sampler.run_mcmc(start, stored, thin_by=STRETCH_THIN, skip_initial_state_check=True)
+    taken = time.perf_counter() - began
+    t = sampler.get_chain(discard=stored // 10).transpose(1, 0, 2)
+    tau = sampler.get_autocorr_time(discard=stored // 10, quiet=True).max() * STRETCH_THIN
+    measured = worth(t, taken, STRETCH_WALKERS * (STRETCH_STEPS + 1))
+    return {**measured, "steps_over_tau": 0.9 * STRETCH_STEPS / tau, "tau_steps": tau}, t
+
+
+def worth(t: Array, taken: float, evaluations: int) -> dict[str, float]:
+    """Effective sample sizes of the worst parameter, and what each draw's worth cost."""
+    bulk, tail = float(ess(t, "bulk").min()), float(ess(t, "tail").min())
+    return {
+        "seconds": taken,
+        "ess_bulk": bulk,
+        "ess_tail": tail,
+        "bulk_per_second": bulk / taken,
+        "tail_per_second": tail / taken,
+        "evaluations": float(evaluations),
+        "evaluations_per_bulk": evaluations / bulk,
+        "rhat": rhat(t),
+    }
+
+
+def rhat(t: Array) -> float:
+    """Largest rank-normalised split R-hat over the chains."""
+    from arviz_stats.base import array_stats
+
+    return float(np.max(array_stats.rhat(t, chain_axis=0, draw_axis=1)))
+
+
+def replicated(problem: Problem) -> dict[str, object]:
+    """Effective sizes by what scatters: means of many runs of other seeds.
+
+    An effective size is right if means of runs scatter by sd/sqrt(size).
+    """
+    means, sizes, variances = [], [], []
+    for seed in range(REPLICATES):
+        _, t = ours(problem, 10_000 + seed, "default")
+        means.append(t.mean(axis=(0, 1)))
+        sizes.append(ess(t, "mean"))
+        variances.append(t.var(axis=(0, 1)))
+    expected = np.mean(variances, axis=0) / np.mean(sizes, axis=0)
+    ratio = np.var(means, axis=0, ddof=1) / expected
+    return {
+        "runs": REPLICATES,
+        "variance_over_claimed": ratio.tolist(),
+        "mean": float(ratio.mean()),
+        # Of each parameter, if the claim is right.
+        "standard_error_each": float(np.sqrt(2.0 / (REPLICATES - 1))),
+    }
+
+
+def compare(problem: Problem, repeats: int, long_repeats: int) -> dict[str, object]:
+    """Run all samplers on a problem, in turn."""
+    import nutpie as package
+
+    began = time.perf_counter()
+    compiled = package.compile_pymc_model(pymc_model(problem))
+    compile_seconds = time.perf_counter() - began
+    # What is imported, allocated or cached at first use is no part of a sampler's speed.
+    ours(problem, 999, "default")
+    nutpie(compiled, problem.names, 999, "default")
+
+    runs: dict[str, list[dict[str, float]]] = {}
+    kept: dict[str, list[Array]] = {"calib": [], "nutpie": [], "stretch": []}
+    for length, n in (("default", repeats), ("long", long_repeats)):
+        for seed in range(n):
+            for name in ("calib", "nutpie"):
+                if name == "calib":
+                    found, t = ours(problem, seed, length)
+                else:
+                    found, t = nutpie(compiled, problem.names, seed, length)
+                runs.setdefault(f"{name} {length}", []).append(found)
+                if length == "long":
+                    kept[name].append(t)
+    for seed in range(3):
+        # From where our long run has been: it has no search of its own.
+        start = kept["calib"][seed][:STRETCH_WALKERS, -1]
+        found, t = stretch(problem, start, seed)
+        runs.setdefault("stretch", []).append(found)
+        kept["stretch"].append(t)
+
+    # Chains that never joined the others are left out of the comparison, as any user would.
+    sound = [t for t in kept["nutpie"] if rhat(t) < Gate().rhat_max]
+    a = np.concatenate(kept["calib"])
+    agreement = {
+        "nutpie": z_scores(a, np.concatenate(sound)) if sound else {},
+        "stretch": z_scores(a, np.concatenate(kept["stretch"])),
+    }
+    return {
+        "rows": int(problem.response.size),
+        "parameters": problem.n_dim,
+        "names": problem.names,
+        "nutpie_compile_seconds": compile_seconds,
+        "runs": runs,
+        "spread": {
+            name: {key: spread([r[key] for r in found]) for key in found[0]}
+            for name, found in runs.items()
+        },
+        "nutpie_runs_with_bad_rhat": {
+            length: sum(r["rhat"] > Gate().rhat_max for r in runs[f"nutpie {length}"])
+            for length in NUTPIE
+        },
+        "z_scores": {
+            peer: {what: z.tolist() for what, z in found.items()}
+            for peer, found in agreement.items()
+        },
+        "replicates": replicated(problem),
+    }
+
+
+def main() -> None:
+    """Measure and write."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
+    parser.add_argument("--repeats", type=int, default=9)
+    parser.add_argument("--long-repeats", type=int, default=5)
+    options = parser.parse_args()
+    use_one_core()
+    result: dict[str, object] = {"machine": describe(), "problems": {}}
+    for task in he2019_tasks():
+        problem = build_problem(task.model, task.table)
+        print(f"{task.output}: {problem.response.size} rows, {problem.n_dim} parameters")
+        found = compare(problem, options.repeats, options.long_repeats)
+        result["problems"][task.output] = found
+        for name, s in found["spread"].items():
+            print(
+                f"  {name:16s} {s['bulk_per_second']['median']:10.0f} bulk ESS/s "
+                f"{s['evaluations_per_bulk']['median']:8.1f} evaluations per ESS"
+            )
+    options.out.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""What the benchmarks share: clocks, the machine, the peers' models."""

@@ -1,0 +1,139 @@
+"""Mixtures of multivariate Student-t."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import gammaln
+
+from calib.models.base import Array
+
+__all__ = ["Mixture", "StudentT", "log_sum"]
+
+
+@dataclass(frozen=True)
+class StudentT:
+    """A multivariate Student-t.
+
+    Parameters
+    ----------
+    mean : ndarray, shape (d,)
+    cholesky : ndarray, shape (d, d)
+        Lower factor of the scale matrix.
+    dof : float
+        Degrees of freedom.
+    """
+
+    mean: Array
+    cholesky: Array
+    dof: float
+
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw, shape (size, d)."""
+        normal = rng.standard_normal((size, self.mean.size))
+        chi2 = rng.chisquare(self.dof, size) / self.dof
+        return self.mean + (normal / np.sqrt(chi2)[:, None]) @ self.cholesky.T
+
+    def log_prob(self, t: Array) -> Array:
+        """Log density, shape (k, d) to (k,)."""
+        whiten, constant = self._prepared
+        z = whiten @ (t - self.mean).T
+        squared = np.einsum("dk,dk->k", z, z)
+        power = 0.5 * (self.dof + self.mean.size)
+        return np.asarray(constant - power * np.log1p(squared / self.dof))
+
+    @cached_property
+    def _prepared(self) -> tuple[Array, float]:
+        """Whitening matrix (d, d), and the log density at the mean."""
+        d = self.mean.size
+        constant = (
+            gammaln(0.5 * (self.dof + d))
+            - gammaln(0.5 * self.dof)
+            - 0.5 * d * np.log(self.dof * np.pi)
+            - np.log(np.diag(self.cholesky)).sum()
+        )
+        return np.linalg.inv(self.cholesky), float(constant)
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A mixture of Student-t components.
+
+    Parameters
+    ----------
+    weights : ndarray, shape (m,)
+    components : tuple of StudentT, length m
+    """
+
+    weights: Array
+    components: tuple[StudentT, ...]
+
+    @property
+    def n_dim(self) -> int:
+        """Dimension."""
+        return int(self.components[0].mean.size)
+
+    @cached_property
+    def _stacked(self) -> tuple[Array, Array, Array, Array]:
+        """Whitening matrices (m d, d), whitened means (m, d, 1), constants and dof (m, 1)."""
+        d, m = self.n_dim, len(self.components)
+        inverses = np.linalg.inv(np.stack([c.cholesky for c in self.components]))
+        means = np.stack([c.mean for c in self.components])
+        dof = np.array([[c.dof] for c in self.components])
+        constant = (
+            np.log(self.weights)[:, None]
+            + gammaln(0.5 * (dof + d))
+            - gammaln(0.5 * dof)
+            - 0.5 * d * np.log(dof * np.pi)
+            + np.log(np.diagonal(inverses, axis1=1, axis2=2)).sum(axis=1)[:, None]
+        )
+        whitened = inverses @ means[:, :, None]
+        return inverses.reshape(m * d, d), whitened, constant, dof
+
+    def draw(self, rng: np.random.Generator, size: int) -> tuple[Array, Array]:
+        """Draw, and return the log density there, shapes (size, d) and (size,)."""
+        t = self.sample(rng, size)
+        return t, self.log_prob(t)
+
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw, shape (size, d)."""
+        which = rng.choice(self.weights.size, size=size, p=self.weights)
+        drawn = np.empty((size, self.n_dim))
+        for j, component in enumerate(self.components):
+            mine = np.flatnonzero(which == j)
+            drawn[mine] = component.sample(rng, mine.size)
+        return drawn
+
+    def covariance_cholesky(self) -> Array:
+        """Lower factor of the whole mixture's scale: components' scales and between their means."""
+        mean = self.weights @ np.stack([c.mean for c in self.components])
+        covariance = sum(
+            w * (c.cholesky @ c.cholesky.T + np.outer(c.mean - mean, c.mean - mean))
+            for w, c in zip(self.weights, self.components, strict=True)
+        )
+        return np.linalg.cholesky(covariance)
+
+    def squared_distances(self, t: Array) -> Array:
+        """Squared Mahalanobis distances from each component, shape (k, d) to (m, k)."""
+        whiten, centre, _, _ = self._stacked
+        z = (whiten @ t.T).reshape(len(self.components), self.n_dim, -1)
+        z -= centre
+        z *= z
+        return np.asarray(z.sum(axis=1))
+
+    def log_parts(self, squared: Array) -> Array:
+        """Log of each weighted component density at squared distances, shape (m, k)."""
+        _, _, constant, dof = self._stacked
+        return np.asarray(constant - 0.5 * (dof + self.n_dim) * np.log(1.0 + squared / dof))
+
+    def log_prob(self, t: Array) -> Array:
+        """Log density, shape (k, d) to (k,)."""
+        return log_sum(self.log_parts(self.squared_distances(t)))
+
+
+def log_sum(parts: Array) -> Array:
+    """Log of the sum of exponentials over the first axis, all finite."""
+    top = parts.max(axis=0)
+    return np.asarray(top + np.log(np.exp(parts - top).sum(axis=0)))
