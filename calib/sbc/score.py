@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import norm
 
+from calib.errors import CalibError
 from calib.models.base import Array
 from calib.sbc.uniformity import holm, p_value, pit
 from calib.scores import LEVELS
@@ -53,7 +54,8 @@ class BandCoverage:
     proportion : float
         Mean over campaigns of the part of their measurements inside the band.
     se : float
-        Its standard error between campaigns: rows of one campaign share a posterior.
+        Its standard error between campaigns, whose rows share a posterior; no less than that of as
+        many independent rows of a band that is right, which few campaigns may fall short of.
     """
 
     level: float
@@ -65,8 +67,8 @@ class BandCoverage:
     @property
     def p(self) -> float:
         """Probability of a proportion as far from the level, if the band is right."""
-        if not self.se > 0.0:
-            return 1.0 if self.proportion == self.level else 0.0
+        if not self.rows:
+            return 1.0
         return float(2.0 * norm.sf(abs(self.proportion - self.level) / self.se))
 
     @property
@@ -153,9 +155,17 @@ def score(
     seed, simulations : int
     failed : mapping of str to str, optional
         Errors by the name of the replicate, which begins with its model's.
+
+    Raises
+    ------
+    CalibError
+        If there is no record at all.
     """
     models = dict.fromkeys(r["model"] for r in records)
     errors = failed or {}
+    if not records:
+        why = next(iter(errors.values()), "none was done")
+        raise CalibError(f"no simulated campaign could be calibrated: {why}")
     return SbcScore(
         seed, simulations,
         tuple(
@@ -205,10 +215,13 @@ def _quantity(
 def _coverage(level: float, records: Sequence[Mapping[str, Any]]) -> BandCoverage:
     banded = [r for r in records if r["rows"]]
     part = np.array([r["covered"][f"{100 * level:g}"] / r["rows"] for r in banded])
+    rows = sum(r["rows"] for r in banded)
+    between = float(part.std(ddof=1) / np.sqrt(part.size)) if part.size > 1 else 0.0
+    independent = np.sqrt(level * (1.0 - level) / rows) if rows else float("nan")
     return BandCoverage(
         level=level,
-        rows=sum(r["rows"] for r in banded),
+        rows=rows,
         replicates=len(banded),
         proportion=float(part.mean()) if part.size else float("nan"),
-        se=float(part.std(ddof=1) / np.sqrt(part.size)) if part.size > 1 else float("nan"),
+        se=float(max(between, independent)),
     )
