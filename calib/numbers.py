@@ -189,9 +189,9 @@ def _exponent(value: float, digits: int) -> int:
 
 def _power(values: tuple[float, ...], last: int) -> int:
     """Power of ten to factor out of numbers whose last digit is that of 10^last."""
-    digits = [max(1, _exponent(v, 1) - last + 1) for v in values]
-    largest = max(_exponent(v, d) if v else last for v, d in zip(values, digits, strict=True))
-    largest = max(largest, last)
+    # Of the rounded numbers: 97 to the tens is 10 x 10, written 1.0 x 100.
+    rounded = (round(Decimal(repr(float(v))), -last) for v in values)
+    largest = max([last, *(v.adjusted() for v in rounded if v)])
     return 0 if largest in _PLAIN else largest
 
 

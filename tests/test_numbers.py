@@ -15,6 +15,7 @@ from calib.numbers import (
     TIMES,
     ascii_number,
     format_as_printed,
+    format_at,
     format_interval,
     format_like,
     format_number,
@@ -185,3 +186,11 @@ def test_numbers_for_machines():
     assert ascii_number(330_600.0, 2) == "3.306e+05"
     assert ascii_number(1e-9, -3) == "0"
     assert ascii_number(float("nan"), -3) == ""
+
+
+@pytest.mark.parametrize(
+    ("value", "last", "expected"),
+    [(9.7e7, 7, "1.0×10⁸"), (9.4e7, 7, "9×10⁷"), (9.7e-8, -8, "1.0×10⁻⁷"), (97.0, 1, "100")],
+)
+def test_a_number_that_rounds_up_to_the_next_power_is_written_with_it(value, last, expected):
+    assert format_at(value, last) == expected

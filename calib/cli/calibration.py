@@ -190,16 +190,20 @@ def predict(
     table = read_for_model(at, calibration.problem.bound.model.conditions)
     prediction = predict_at(calibration, table)
     columns = prediction_columns(prediction, table)
+    if not calibration.converged:
+        columns["converged"] = ["no"] * len(table)
     outside = sum(bool(flags) for flags in prediction.outside)
     if out is not None:
         write_table(out, columns)
         print(f"{len(table)} rows written to {out}; {outside} outside the calibrated range")
-        return
-    print(",".join(columns))
-    for row in zip(*columns.values(), strict=True):
-        print(",".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in row))
-    if outside:
-        print(f"calib: {outside} rows lie outside the calibrated range", file=sys.stderr)
+    else:
+        print(",".join(columns))
+        for row in zip(*columns.values(), strict=True):
+            print(",".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in row))
+        if outside:
+            print(f"calib: {outside} rows lie outside the calibrated range", file=sys.stderr)
+    if not calibration.converged:
+        raise typer.Exit(3)
 
 
 def _predict_corrected(run: Path, at: Path, out: Path | None) -> None:

@@ -142,7 +142,9 @@ def test_a_run_that_does_not_converge_says_so_and_ends_with_3(calib: Calib, tmp_
     assert json.loads(Path("run/run.json").read_text())["gate"]["steps"] == 100
     Path("at.csv").write_text("slip_ratio,inflation_pressure_psi\n0.1,30\n")
     predicted = calib("predict", "run", "--at", "at.csv")
-    assert predicted.code == 0
+    assert predicted.code == 3
+    header, row = predicted.out.splitlines()
+    assert (header.split(",")[-1], row.split(",")[-1]) == ("converged", "no")
     assert "did not converge; its bands are not to be used" in predicted.err
 
 
