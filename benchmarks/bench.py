@@ -2,6 +2,7 @@
 
     python benchmarks/bench.py                       # all parts, about 20 minutes on two cores
     python benchmarks/bench.py posterior likelihood  # some of them; the others stay as they were
+    python benchmarks/bench.py --full survival       # 200 diagnoses in the place of 80
 
 Each part runs in a process of its own and leaves its measurements as JSON; tables, figure and
 README are written from whatever parts are there.
@@ -29,8 +30,9 @@ PARTS: dict[str, list[str]] = {
     "genetic": ["genetic.py"],
     "million": ["million.py"],
     "campaign": ["campaign.py", "--cases", "30"],
-    "survival": ["campaign_survival.py"],
+    "survival": ["campaign_survival.py", "--cases", "80"],
 }
+FULL = {"campaign": ["--cases", "200"], "survival": ["--cases", "200"]}
 
 
 def main() -> int:
@@ -38,6 +40,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
     parser.add_argument("--out", type=Path, default=HERE.parent / "reports" / "benchmarks")
+    parser.add_argument("--full", action="store_true", help="campaigns of 200, 15 minutes more")
     parser.add_argument("--only-write", action="store_true", help="measure nothing")
     options = parser.parse_args()
     unknown = set(options.parts) - set(PARTS)
@@ -50,7 +53,9 @@ def main() -> int:
         print(f"--- {part}", flush=True)
         began = time.perf_counter()
         fresh = measured / f"{part}.json.new"
-        command = [sys.executable, HERE / PARTS[part][0], *PARTS[part][1:], "--out", fresh]
+        script, *words = PARTS[part]
+        words += FULL.get(part, []) if options.full else []
+        command = [sys.executable, HERE / script, *words, "--out", fresh]
         code = subprocess.run(command, env={**os.environ, **ONE_THREAD}, check=False).returncode
         if code:
             failed.append(part)
