@@ -78,8 +78,9 @@ def reliability_figure(bins: Sequence[ReliabilityBin], title: str = "") -> Figur
         axes.annotate(
             f"n={b.correct.n}",
             (b.confidence, b.correct.value),
-            xytext=(6, -10),
+            xytext=(-6, 5),
             textcoords="offset points",
+            ha="right",
             fontsize=7,
         )
     axes.set(
@@ -89,7 +90,7 @@ def reliability_figure(bins: Sequence[ReliabilityBin], title: str = "") -> Figur
         ylim=(-0.02, 1.05),
         title=title,
     )
-    axes.legend(loc="upper left", fontsize=8)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=8)
     return figure
 
 
@@ -139,7 +140,8 @@ def levels_figure(tiers: Sequence[TierScore], limit: Limit | None = None) -> Fig
             title=f"{tier.tier}, {tier.n_cases} cases",
         )
         axes.invert_yaxis() if axes is panels[0] else None
-        axes.legend(loc="lower left", fontsize=8)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=2, fontsize=8)
     return figure
 
 
