@@ -33,11 +33,18 @@ name = "blind"
 cases = 1
 draw_seed = 5
 tier = "easy"
+
+[[sbc]]
+name = "ranks"
+simulations = 2
+draw_seed = 3
+models = ["bekker"]
 """
 NAMES = (
     "ruts.data-rut.bekker.shipped.nothing",
     *(f"sites.cases-case-{i}" for i in range(N_CASES)),
     "blind.case-000",
+    *(f"ranks.bekker-000{i}" for i in range(2)),
 )
 
 EFFECT = """

@@ -12,9 +12,11 @@ from calib.calibration import calibrate
 from calib.campaign import read_plan, run_campaign
 from calib.challenge.make import make
 from calib.data import hold_out, read_table
+from calib.errors import CalibError
 from calib.estimators import estimate
 from calib.gap.batch import diagnose_cases
 from calib.problem import build_problem
+from calib.sbc.run import run_sbc
 from calib.store import load_calibration
 from calib.streams import generator
 from calib.templates import template_csv
@@ -48,6 +50,26 @@ def test_a_challenge_case_is_that_of_the_verb(site, serial, tmp_path):
         e["name"]: e["probability"] for e in json.loads(found["diagnosis.json"])["effects"]
     }
     assert numbers["truth_probability"] == probability[truth]
+
+
+def test_a_replicate_is_that_of_the_verb(serial, tmp_path):
+    run_sbc(tmp_path, models=["bekker"], simulations=2, seed=3)
+    for i in range(2):
+        expected = json.loads((tmp_path / "replicates" / f"bekker-000{i}.json").read_text())
+        found = serial / "results" / f"ranks.bekker-000{i}"
+        assert json.loads((found / "replicate.json").read_text()) == expected
+        numbers = json.loads((found / "numbers.json").read_text())
+        assert numbers["converged"] is expected["converged"]
+        for name, (rank, draws) in expected["ranks"].items():
+            assert numbers["rank"][name] == rank / draws
+
+
+def test_a_replicate_of_no_model_is_refused(tmp_path):
+    plan = tmp_path / "plan.toml"
+    plan.write_text('[[sbc]]\nname = "a"\nsimulations = 1\ndraw_seed = 1\nmodels = ["bekkar"]\n')
+    with pytest.raises(CalibError, match="bekkar") as refused:
+        read_plan(plan)
+    assert "[[sbc]], models" in str(refused.value)
 
 
 def test_a_fit_is_that_of_the_verb(site, serial):

@@ -83,7 +83,7 @@ def test_the_readmes_plan_is_one(tmp_path):
     (plan.parent / "my_effects.py").write_text(EFFECT)
     (plan.parent / "wind.toml").write_text(WIND)
     tasks = read_plan(plan).tasks.values()
-    assert {t.kind for t in tasks} == {"fit", "diagnose", "challenge"} <= set(KINDS)
+    assert {t.kind for t in tasks} == {"fit", "diagnose", "challenge", "sbc"} == set(KINDS)
 
 
 FIT = '[[fit]]\nname = "a"\ndata = ["data/*.csv"]\nmodels = ["bekker"]\n'

@@ -11,7 +11,10 @@ from calib.campaign.kinds.base import Kind, Planned, Section, Task, Work
 from calib.campaign.kinds.challenge import Challenge
 from calib.campaign.kinds.diagnose import Diagnose
 from calib.campaign.kinds.fit import Fit
+from calib.campaign.kinds.sbc import Sbc
 
 __all__ = ["KINDS", "Kind", "Planned", "Section", "Task", "Work"]
 
-KINDS: dict[str, Kind[Any, Any]] = {kind.name: kind for kind in (Fit(), Diagnose(), Challenge())}
+KINDS: dict[str, Kind[Any, Any]] = {
+    kind.name: kind for kind in (Fit(), Diagnose(), Challenge(), Sbc())
+}
