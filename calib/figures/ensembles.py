@@ -82,7 +82,7 @@ def _pairs(rows: int, per_row: int, n: int) -> tuple[Figure, list[tuple[Axes, Ax
     total = top + bottom + rows * height + (rows - 1) * gap_y
     fig = Figure(figsize=(DOUBLE_MM / 25.4, total / 25.4))
     # Two in a row leave room for longer tick labels.
-    left, between, right = (14.5, 10.0, 2.5) if per_row == 3 else (20.0, 11.0, 3.0)
+    left, between, right = (17.0, 10.0, 2.5) if per_row == 3 else (20.0, 11.0, 3.0)
     span = cell - left - between - right
     found = []
     for k in range(n):

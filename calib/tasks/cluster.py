@@ -32,7 +32,7 @@ _NO_WARNING = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
 # When the worker of a task dies, the task is tried so many times more among the others.
 ALLOWED_FAILURES = 1
 CONNECT_SECONDS = 10
-SETTLE_SECONDS = 20
+SETTLE_SECONDS, CLOSE_SECONDS = 20, 20
 _SAME = ("numpy", "scipy", "emcee")
 
 
@@ -196,9 +196,10 @@ def _local(workers: int) -> Iterator[Client]:
                 with suppress(TimeoutError):
                     client.wait_for_workers(workers, timeout=SETTLE_SECONDS)
         finally:
-            # Results are here by now; a process that Dask still fails to end ends with this one.
-            with suppress(AssertionError):
-                cluster.close()
+            # Results are here by now; a process that Dask fails to end (one that Ctrl-C met as it
+            # started, say) ends with this one.
+            with suppress(AssertionError, TimeoutError):
+                cluster.close(timeout=CLOSE_SECONDS)
 
 
 class _Client(Client):
