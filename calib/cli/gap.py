@@ -45,6 +45,7 @@ def diagnose(
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.load import load_effects
     from calib.gap.files import write_diagnosis
+    from calib.gap.provenance import INPUTS, inputs_record
     from calib.numbers import format_number
     from calib.page.diagnosis import write_page
 
@@ -64,6 +65,7 @@ def diagnose(
     manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
     with fresh_folder(out, overwrite=overwrite) as folder:
         write_diagnosis(found, folder)
+        (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed))
         write_page(found, folder, manifest)
     for warning in found.data.case.warnings:
         print(f"calib: {warning}", file=sys.stderr)
@@ -190,6 +192,8 @@ def score(
     found = score_all(folder, results, key)
     known = None if limit is None else read_limit(limit, folder)
     table = text_table(found, known)
+    for warning in found.warnings:
+        print(f"calib: {warning}", file=sys.stderr)
     print(table)
     if out is None:
         return

@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +20,14 @@ from calib.priors import Priors
 from calib.problem import Problem, build_problem
 from calib.store import load_calibration
 
-__all__ = ["Campaigns", "Case", "OutputData", "campaigns", "case_from_run", "read_case"]
+__all__ = [
+    "Campaigns", "Case", "OutputData", "campaigns", "case_files", "case_from_run", "read_case",
+]  # fmt: skip
 
 # Fewer field rows cannot tell a gap from noise; a larger ratio is a wrong unit.
 MIN_FIELD_ROWS = 5
 MAX_RATIO = 100.0
+_FILES = ("calibration", "field", "predict")
 
 
 @dataclass(frozen=True)
@@ -155,6 +159,24 @@ def read_case(folder: Path) -> Case:
     field = read_table(folder / str(files["field"]), allow_missing=missing_ok)
     fresh = read_table(folder / content["predict"]) if content.get("predict") else None
     return Case(folder.name, lab, field, models, fresh, _warnings(lab, field, models))
+
+
+def case_files(folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Return what a ``case.toml`` says, and the files of the case; no content if it is not TOML.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the case. Whether the other files are there is not looked at.
+    """
+    path = Path(folder) / "case.toml"
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        content = {}
+    named = {key: content.get(key) for key in _FILES}
+    files = {key: path.parent / name for key, name in named.items() if isinstance(name, str)}
+    return content, {"case.toml": path} | files
 
 
 def _warnings(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, ...]:
