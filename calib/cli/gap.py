@@ -43,6 +43,7 @@ def diagnose(
     from calib.gap.case import case_from_run, read_case
     from calib.gap.diagnose import diagnose as find
     from calib.gap.effects import EFFECTS
+    from calib.gap.effects.check import check_on_case
     from calib.gap.effects.load import load_effects
     from calib.gap.files import write_diagnosis
     from calib.gap.provenance import INPUTS, inputs_record
@@ -60,8 +61,10 @@ def diagnose(
             allowed="a case folder, or --run RUN together with --field CSV",
             mend="give one of the two",
         )
-    known = {**EFFECTS, **load_effects(effects)} if effects is not None else EFFECTS
-    found = find(given, seed, effects=known)
+    own = {} if effects is None else load_effects(effects)
+    if effects is not None:
+        check_on_case(own, given, effects)
+    found = find(given, seed, effects={**EFFECTS, **own})
     manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
     with fresh_folder(out, overwrite=overwrite) as folder:
         write_diagnosis(found, folder)

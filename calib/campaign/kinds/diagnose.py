@@ -18,6 +18,7 @@ from calib.gap.batch import written
 from calib.gap.case import Case, case_files, read_case
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
+from calib.gap.effects.check import check_on_case
 from calib.gap.effects.load import load_effects
 from calib.page.diagnosis import write_page
 
@@ -87,20 +88,23 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
 
     def work(self, item: DiagnosisItem, seed: int) -> Work:
         """Diagnose it."""
-        with _effects(item.effects) as own:
+        with _effects(item.effects, item.case) as own:
             found = diagnose(item.case, seed, effects={**EFFECTS, **own})
             files = written(found) | (_page(found, seed) if item.page else {})
         return Work(diagnosis_numbers(found), files)
 
 
 @contextmanager
-def _effects(files: Mapping[str, bytes]) -> Iterator[Mapping[str, Effect]]:
+def _effects(files: Mapping[str, bytes], case: Case) -> Iterator[Mapping[str, Effect]]:
     """Yield the user's effects; their prior files are read while they are in use."""
     with TemporaryDirectory() as scratch:
         paths = [Path(scratch) / name for name in files]
         for path in paths:
             path.write_bytes(files[path.name])
-        yield load_effects(paths[0]) if paths else {}
+        own = load_effects(paths[0]) if paths else {}
+        if own:
+            check_on_case(own, case, paths[0])
+        yield own
 
 
 def _page(found: Diagnosis, seed: int) -> dict[str, bytes]:
