@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -28,6 +29,7 @@ __all__ = [
 MIN_FIELD_ROWS = 5
 MAX_RATIO = 100.0
 _FILES = ("calibration", "field", "predict")
+_KEYS = (*_FILES, "models")
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,13 @@ def read_case(folder: Path) -> Case:
         ) from None  # fmt: skip
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
+    unknown = [key for key in content if key not in _KEYS]
+    if unknown:
+        near = difflib.get_close_matches(unknown[0], _KEYS, n=1, cutoff=0.5)
+        raise CalibError(
+            f"unknown key {unknown[0]}", where=str(path), allowed=", ".join(_KEYS),
+            mend=f"was {near[0]} meant?" if near else "correct its name, or leave it out",
+        )  # fmt: skip
     models = content.get("models")
     files = {key: content.get(key) for key in ("calibration", "field")}
     if (
@@ -182,6 +191,12 @@ def case_files(folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
 def _warnings(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, ...]:
     """Say what looks odd about a pair of campaigns, without refusing it."""
     said = []
+    same = _identical_rows(lab, field)
+    if same:
+        said.append(
+            f"{same} of {len(field)} field rows are rows of the calibration, value for value; the "
+            "field must be other measurements, or every gap looks smaller than it is"
+        )
     states = ("speed_m_s", "pass_number", "gravimetric_water_content")
     both = [n for n in states if n in lab and n in field]
     varied = [n for n in both if np.ptp(lab[n]) > 0.0 and np.ptp(field[n]) == 0.0]
@@ -203,6 +218,13 @@ def _warnings(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str,
     return tuple(said)
 
 
+def _identical_rows(lab: Table, field: Table) -> int:
+    """Count field rows that are in the calibration too, in every column of both."""
+    both = [name for name in lab if name in field]
+    known = set(zip(*(lab[name].tolist() for name in both), strict=True))
+    return sum(row in known for row in zip(*(field[name].tolist() for name in both), strict=True))
+
+
 def case_from_run(run: Path, field: Path) -> Case:
     """Make a case of an earlier calibration and a field campaign.
 
@@ -222,7 +244,9 @@ def case_from_run(run: Path, field: Path) -> Case:
     model = problem.bound.model
     output = next(key for key, column in OUTPUTS.items() if column == model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))
-    return Case(Path(run).name, problem.table, table, {output: model.name})
+    models = {output: model.name}
+    warnings = _warnings(problem.table, table, models)
+    return Case(Path(run).name, problem.table, table, models, warnings=warnings)
 
 
 def campaigns(case: Case) -> Campaigns:
