@@ -12,6 +12,8 @@ from scipy.stats import beta
 from calib.challenge.answers import FAILED, CaseAnswer, read_answer
 from calib.challenge.effects import NONE, UNKNOWN
 from calib.challenge.seal import open_key
+from calib.errors import CalibError
+from calib.gap.provenance import case_hashes, listed, recorded_inputs
 
 PAIR, OTHER_PAIR = "a pair", "another pair"
 _BINS = 10
@@ -180,11 +182,14 @@ class Score:
         Tier to its confusion matrix.
     answers : tuple of CaseAnswer
         Every case of the key, failed ones included.
+    warnings : tuple of str
+        What could not be made sure of.
     """
 
     tiers: dict[str, TierScore]
     confusion: dict[str, Confusion]
     answers: tuple[CaseAnswer, ...]
+    warnings: tuple[str, ...] = ()
 
 
 def _share(answers: Iterable[CaseAnswer], hit: Callable[[CaseAnswer], bool]) -> Proportion:
@@ -286,9 +291,11 @@ def score(cases_dir: Path, results_dir: Path, key_path: Path) -> Score:
     Raises
     ------
     CalibError
-        If the key does not match the hash published with the cases.
+        If the key does not match the hash published with the cases, there is no diagnosis, or
+        diagnoses are of other cases.
     """
     entries = open_key(cases_dir, key_path)["cases"]
+    warnings = _check_results(cases_dir, results_dir, sorted(entries))
     answers = [read_answer(name, entries[name], results_dir / name) for name in sorted(entries)]
     tiers = {tier: [a for a in answers if a.tier == tier] for tier in ("easy", "hard")}
     tiers = {tier: part for tier, part in tiers.items() if part}
@@ -296,4 +303,36 @@ def score(cases_dir: Path, results_dir: Path, key_path: Path) -> Score:
         tiers={tier: score_tier(tier, part) for tier, part in tiers.items()},
         confusion={tier: confusion(part) for tier, part in tiers.items()},
         answers=tuple(answers),
+        warnings=warnings,
+    )
+
+
+def _check_results(cases_dir: Path, results_dir: Path, names: list[str]) -> tuple[str, ...]:
+    """Refuse diagnoses that are of other cases; say which cannot be told."""
+    there = [name for name in names if (results_dir / name / "diagnosis.json").is_file()]
+    if not there:
+        raise CalibError(
+            "there is no diagnosis of these cases", where=str(results_dir),
+            allowed="a folder that `calib challenge run` wrote",
+            mend=f"correct --results, or run `calib challenge run {cases_dir} --out {results_dir}`",
+        )  # fmt: skip
+    foreign, untold = [], []
+    for name in there:
+        said = recorded_inputs(results_dir / name)
+        if said is None or not (cases_dir / name / "case.toml").is_file():
+            untold.append(name)
+        elif any(said.get(key) != value for key, value in case_hashes(cases_dir / name).items()):
+            foreign.append(name)
+    if foreign:
+        raise CalibError(
+            f"{len(foreign)} of {len(there)} diagnoses are of other cases, or of these before "
+            f"their files were changed: {listed(foreign)}",
+            where=str(results_dir), allowed=f"diagnoses of the cases in {cases_dir}",
+            mend="point to their diagnoses, or diagnose these cases again, into another folder",
+        )  # fmt: skip
+    if not untold:
+        return ()
+    return (
+        f"{len(untold)} of {len(there)} diagnoses cannot be held against the files of their "
+        f"case: {listed(untold)}; they are taken to be of these cases",
     )

@@ -43,8 +43,10 @@ def diagnose(
     from calib.gap.case import case_from_run, read_case
     from calib.gap.diagnose import diagnose as find
     from calib.gap.effects import EFFECTS
+    from calib.gap.effects.check import check_on_case
     from calib.gap.effects.load import load_effects
     from calib.gap.files import write_diagnosis
+    from calib.gap.provenance import INPUTS, inputs_record
     from calib.numbers import format_number
     from calib.page.diagnosis import write_page
 
@@ -59,11 +61,14 @@ def diagnose(
             allowed="a case folder, or --run RUN together with --field CSV",
             mend="give one of the two",
         )
-    known = {**EFFECTS, **load_effects(effects)} if effects is not None else EFFECTS
-    found = find(given, seed, effects=known)
+    own = {} if effects is None else load_effects(effects)
+    if effects is not None:
+        check_on_case(own, given, effects)
+    found = find(given, seed, effects={**EFFECTS, **own})
     manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
     with fresh_folder(out, overwrite=overwrite) as folder:
         write_diagnosis(found, folder)
+        (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed))
         write_page(found, folder, manifest)
     for warning in found.data.case.warnings:
         print(f"calib: {warning}", file=sys.stderr)
@@ -190,6 +195,8 @@ def score(
     found = score_all(folder, results, key)
     known = None if limit is None else read_limit(limit, folder)
     table = text_table(found, known)
+    for warning in found.warnings:
+        print(f"calib: {warning}", file=sys.stderr)
     print(table)
     if out is None:
         return

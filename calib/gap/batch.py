@@ -16,6 +16,7 @@ from calib.folders import read_folder
 from calib.gap.case import Case, read_case
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.files import write_diagnosis
+from calib.gap.provenance import INPUTS, check_resumable, inputs_record
 from calib.tasks import LateItems, run_folder_tasks
 
 __all__ = ["case_folders", "diagnose_cases", "written"]
@@ -63,7 +64,13 @@ def diagnose_cases(
     -------
     dict of str to str
         Cases that failed, with their error.
+
+    Raises
+    ------
+    CalibError
+        If there are diagnoses of other cases, or with another seed.
     """
+    check_resumable(cases, out, seed)
     outcome = run_folder_tasks(
         partial(_diagnose, seed=seed),
         LateItems({case.name: case for case in cases}, read_case),
@@ -80,4 +87,5 @@ def written(found: Diagnosis) -> dict[str, bytes]:
     """Return the files of a diagnosis, by name, to be written elsewhere."""
     with TemporaryDirectory() as scratch:
         write_diagnosis(found, Path(scratch))
-        return read_folder(Path(scratch))
+        files = read_folder(Path(scratch))
+    return files | {INPUTS: inputs_record(found.data.case, found.seed)}

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +21,15 @@ from calib.priors import Priors
 from calib.problem import Problem, build_problem
 from calib.store import load_calibration
 
-__all__ = ["Campaigns", "Case", "OutputData", "campaigns", "case_from_run", "read_case"]
+__all__ = [
+    "Campaigns", "Case", "OutputData", "campaigns", "case_files", "case_from_run", "read_case",
+]  # fmt: skip
 
 # Fewer field rows cannot tell a gap from noise; a larger ratio is a wrong unit.
 MIN_FIELD_ROWS = 5
 MAX_RATIO = 100.0
+_FILES = ("calibration", "field", "predict")
+_KEYS = (*_FILES, "models")
 
 
 @dataclass(frozen=True)
@@ -132,6 +138,13 @@ def read_case(folder: Path) -> Case:
         ) from None  # fmt: skip
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
+    unknown = [key for key in content if key not in _KEYS]
+    if unknown:
+        near = difflib.get_close_matches(unknown[0], _KEYS, n=1, cutoff=0.5)
+        raise CalibError(
+            f"unknown key {unknown[0]}", where=str(path), allowed=", ".join(_KEYS),
+            mend=f"was {near[0]} meant?" if near else "correct its name, or leave it out",
+        )  # fmt: skip
     models = content.get("models")
     files = {key: content.get(key) for key in ("calibration", "field")}
     if (
@@ -157,9 +170,33 @@ def read_case(folder: Path) -> Case:
     return Case(folder.name, lab, field, models, fresh, _warnings(lab, field, models))
 
 
+def case_files(folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
+    """Return what a ``case.toml`` says, and the files of the case; no content if it is not TOML.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the case. Whether the other files are there is not looked at.
+    """
+    path = Path(folder) / "case.toml"
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
+        content = {}
+    named = {key: content.get(key) for key in _FILES}
+    files = {key: path.parent / name for key, name in named.items() if isinstance(name, str)}
+    return content, {"case.toml": path} | files
+
+
 def _warnings(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, ...]:
     """Say what looks odd about a pair of campaigns, without refusing it."""
     said = []
+    same = _identical_rows(lab, field)
+    if same:
+        said.append(
+            f"{same} of {len(field)} field rows are rows of the calibration, value for value; the "
+            "field must be other measurements, or every gap looks smaller than it is"
+        )
     states = ("speed_m_s", "pass_number", "gravimetric_water_content")
     both = [n for n in states if n in lab and n in field]
     varied = [n for n in both if np.ptp(lab[n]) > 0.0 and np.ptp(field[n]) == 0.0]
@@ -181,6 +218,13 @@ def _warnings(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str,
     return tuple(said)
 
 
+def _identical_rows(lab: Table, field: Table) -> int:
+    """Count field rows that are in the calibration too, in every column of both."""
+    both = [name for name in lab if name in field]
+    known = set(zip(*(lab[name].tolist() for name in both), strict=True))
+    return sum(row in known for row in zip(*(field[name].tolist() for name in both), strict=True))
+
+
 def case_from_run(run: Path, field: Path) -> Case:
     """Make a case of an earlier calibration and a field campaign.
 
@@ -200,7 +244,9 @@ def case_from_run(run: Path, field: Path) -> Case:
     model = problem.bound.model
     output = next(key for key, column in OUTPUTS.items() if column == model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))
-    return Case(Path(run).name, problem.table, table, {output: model.name})
+    models = {output: model.name}
+    warnings = _warnings(problem.table, table, models)
+    return Case(Path(run).name, problem.table, table, models, warnings=warnings)
 
 
 def campaigns(case: Case) -> Campaigns:

@@ -50,7 +50,8 @@ def rank_without_outliers(
         far = _field_outliers(data, ranking)
         if not far:
             break
-        case = _noted(without_outputs(case, far), far, "field", OUTLIER)
+        said = _said(case.field, far, OUTLIER)
+        case = replace(without_outputs(case, far), warnings=(*case.warnings, *said))
         data = campaigns(case)
         ranking = rank(data, seed, effects=effects)
     return data, ranking
@@ -68,13 +69,19 @@ def _blanked(table: Table, rows: Mapping[str, Sequence[int] | NDArray[np.int64]]
     return replace(table, columns=columns)
 
 
-def _noted(case: Case, far: Mapping[str, list[int]], campaign: str, bar: float) -> Case:
-    said = [
-        f"{campaign} row {', '.join(map(str, rows))}: {output} lies more than {bar:g} noise sds "
-        "off whatever the hypothesis; it was left out as an outlier"
-        for output, rows in far.items()
-    ]
-    return replace(case, warnings=(*case.warnings, *said))
+def _said(table: Table, far: Mapping[str, list[int]], bar: float) -> list[str]:
+    """Say of each value that is set aside where in its file it is."""
+    said = []
+    for output, rows in far.items():
+        at = ", ".join(
+            f"line {table.lines[row]} ({OUTPUTS[output]} = {table[OUTPUTS[output]][row]:.4g})"
+            for row in rows
+        )
+        said.append(
+            f"{table.source}, {at}: more than {bar:g} noise sds off whatever the hypothesis; "
+            "left out as an outlier"
+        )
+    return said
 
 
 def _field_outliers(data: Campaigns, ranking: Ranking) -> dict[str, list[int]]:
@@ -104,7 +111,8 @@ def _without_lab_outliers(case: Case, seed: int) -> Case:
                 far[o.name] = [int(row) for row in measured[found]]
         if not far:
             return case
-        case = _noted(replace(case, lab=_blanked(case.lab, far)), far, "calibration", LAB_OUTLIER)
+        said = _said(case.lab, far, LAB_OUTLIER)
+        case = replace(case, lab=_blanked(case.lab, far), warnings=(*case.warnings, *said))
     return case
 
 

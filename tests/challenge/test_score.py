@@ -22,6 +22,7 @@ from calib.challenge.score import Proportion, score
 from calib.challenge.seal import KEY_SCHEMA, open_key, publish, seal
 from calib.challenge.table import text_table
 from calib.errors import CalibError
+from calib.gap.provenance import INPUTS, case_hashes
 
 Answer = Callable[[dict[str, Any]], dict[str, Any]]
 TRUTHS = ("none", "none", "unknown", "rate_effect", "force_offset+rate_effect", "parameter_shift")
@@ -206,6 +207,33 @@ def test_changed_key_is_refused(sealed: tuple[Path, Path], tmp_path: Path) -> No
     (cases / "manifest.json").unlink()
     with pytest.raises(CalibError, match="published"):
         score(cases, tmp_path, key)
+
+
+def test_no_diagnosis_is_not_a_failed_one(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    """A folder that does not exist, or holds no diagnosis of these cases, is refused."""
+    (tmp_path / "empty" / "other").mkdir(parents=True)
+    for folder in ("nowhere", "empty"):
+        with pytest.raises(CalibError, match="there is no diagnosis"):
+            score(sealed[0], tmp_path / folder, sealed[1])
+
+
+def test_diagnoses_of_other_cases_are_refused(sealed: tuple[Path, Path], tmp_path: Path) -> None:
+    """Files that changed after the diagnosis are noticed; without a record, that is said."""
+    cases, key = sealed
+    write(tmp_path / "r", key, perfect)
+    assert "12 of 12 diagnoses cannot be held" in score(cases, tmp_path / "r", key).warnings[0]
+    for name in json.loads(key.read_text(encoding="utf-8"))["cases"]:
+        (cases / name).mkdir()
+        text = 'calibration = "lab.csv"\nfield = "field.csv"\n[models]\ndrawbar_pull = "m"\n'
+        (cases / name / "case.toml").write_text(text, encoding="utf-8")
+        for file in ("lab.csv", "field.csv"):
+            (cases / name / file).write_text(f"{file} of {name}", encoding="utf-8")
+        record = json.dumps(case_hashes(cases / name))
+        (tmp_path / "r" / name / INPUTS).write_text(record, encoding="utf-8")
+    assert score(cases, tmp_path / "r", key).warnings == ()
+    (cases / "case-003" / "field.csv").write_text("changed", encoding="utf-8")
+    with pytest.raises(CalibError, match=r"1 of 12 diagnoses .* case-003"):
+        score(cases, tmp_path / "r", key)
 
 
 @given(st.integers(0, 60), st.integers(0, 60))

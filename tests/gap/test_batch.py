@@ -98,3 +98,12 @@ def test_an_interruption_leaves_no_half_written_folder(cases, tmp_path, monkeypa
     with pytest.raises(KeyboardInterrupt):
         diagnose_cases(cases[:1], tmp_path / "out", 1)
     assert [p.name for p in (tmp_path / "out").iterdir()] == ["seconds.csv"]
+
+
+def test_diagnoses_of_other_cases_are_not_taken_for_these(cases, done, tmp_path):
+    made = make_case(models=PULL_ONLY, n_lab=15, n_field=12, seed=9)
+    other = write_case(made, tmp_path / "case-0")
+    with pytest.raises(CalibError, match="of other cases"):
+        diagnose_cases([other], done, 1)
+    with pytest.raises(CalibError, match="--seed 1, not 2"):
+        diagnose_cases(cases, done, 2)

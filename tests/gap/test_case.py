@@ -42,6 +42,12 @@ def test_units_in_column_names_are_converted(tmp_path):
         ('field = "field.csv"\n[models]\nrut_depth = "bekker"\n', "calibration"),
         ('calibration = 3\nfield = "field.csv"\n[models]\nrut_depth = "bekker"\n', "calibration"),
         (
+            'calibration = "lab.csv"\nfield = "field.csv"\nprdict = "fresh.csv"\n[models]\n'
+            'rut_depth = "bekker"\n',
+            "unknown key prdict\n  allowed: calibration, field, predict, models\n"
+            "  to mend: was predict meant?",
+        ),
+        (
             'calibration = "lab.csv"\nfield = "field.csv"\n[models]\nsinkage = "bekker"\n',
             "unknown output sinkage",
         ),
@@ -118,3 +124,16 @@ def test_without_pressures_the_exponent_is_a_half():
         for t in (case.lab, case.field)
     ]
     assert campaigns(Case("bare", *bare, PULL_ONLY)).view.ground_exponent == 0.5
+
+
+def test_field_rows_that_are_the_calibrations_are_counted(tmp_path):
+    case = make_case()
+    columns = {
+        name: np.concatenate([case.lab[name][:3], values[3:]])
+        for name, values in case.field.columns.items()
+    }
+    copied = replace(case, field=table_from_arrays(columns))
+    said = read_case(write_case(copied, tmp_path / "copied")).warnings
+    assert any("3 of 27 field rows are rows of the calibration" in w for w in said)
+    said = read_case(write_case(case, tmp_path / "other")).warnings
+    assert not any("rows of the calibration" in w for w in said)

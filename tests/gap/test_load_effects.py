@@ -6,6 +6,7 @@ import pytest
 
 from calib.errors import CalibError
 from calib.gap.case import campaigns
+from calib.gap.effects.check import check_on_case
 from calib.gap.effects.load import load_effects
 from calib.gap.hypotheses import effect_priors
 from tests.gap.cases import make_case
@@ -69,3 +70,58 @@ def test_what_cannot_be_loaded_is_refused(tmp_path, code, prior, word):
 def test_a_missing_file_is_refused(tmp_path):
     with pytest.raises(CalibError, match="cannot be read"):
         load_effects(tmp_path / "none.py")
+
+
+RETURN = "        return location + phi[:, :1]\n"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('name = "cross_wind"', 'name = "rate_effect"', "an effect of calib's own"),
+        ('outputs = ("drawbar_pull",)', 'outputs = ("drawbar_pul",)', "was drawbar_pull meant?"),
+        ('outputs = ("drawbar_pull",)', 'outputs = "drawbar_pull"', "with the comma"),
+        ('    outputs', '    covariates = ("sped_m_s",)\n    outputs', "was speed_m_s meant?"),
+        ('    outputs', '    covariate = ("speed_m_s",)\n    outputs', "was covariates meant?"),
+        ('    outputs', '    form = ("slope",)\n    outputs', "unknown name 'slope' in form"),
+        ("def on_output", "def on_outputs", "was on_output meant?"),
+    ],
+)  # fmt: skip
+def test_what_an_effect_declares_wrongly_is_named(tmp_path, old, new, words):
+    with pytest.raises(CalibError) as caught:
+        load_effects(write(tmp_path, CODE.replace(old, new)))
+    assert words in str(caught.value)
+    assert "mine.py, effect" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (
+            "        return location + phi[:, :1] * undefined\n",
+            "line 12: it does not run: NameError",
+        ),
+        ('        return location + view.conditions["nothing"]\n', "KeyError: 'nothing'"),
+        ("        return phi[:, 0]\n", "an array of float64 of shape (8,)"),
+        ("        pass\n", "on_output for drawbar_pull returned NoneType"),
+        ('        return location + float("nan")\n', "no finite number for drawbar_pull"),
+        ("        location += phi[:, :1]\n        return location\n", "location it is given"),
+        ("        return location\n", "it changes nothing on this case"),
+        (
+            RETURN + "\n    def on_conditions(self, phi, output, conditions, view):\n"
+            "        return {}\n",
+            "on_conditions returned a dict with",
+        ),
+    ],
+)
+def test_an_effect_that_cannot_be_evaluated_is_refused(tmp_path, code, words):
+    path = write(tmp_path, CODE.replace(RETURN, code))
+    with pytest.raises(CalibError) as caught:
+        check_on_case(load_effects(path), make_case("force_offset"), path)
+    assert words in str(caught.value)
+    assert "mine.py, effect cross_wind" in str(caught.value)
+
+
+def test_a_good_effect_passes_the_trial(tmp_path):
+    path = write(tmp_path)
+    check_on_case(load_effects(path), make_case("force_offset"), path)

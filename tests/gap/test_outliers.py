@@ -22,13 +22,16 @@ def spoiled(case, campaign: str, row: int, factor: float):
     return replace(case, **{campaign: replace(table, columns=columns)})
 
 
-@pytest.mark.parametrize(
-    ("campaign", "said"), [("lab", "calibration row 4"), ("field", "field row 4")]
-)
+@pytest.mark.parametrize("campaign", ["lab", "field"])
 @pytest.mark.parametrize("effect", [None, "force_offset"])
-def test_a_gigantic_outlier_is_set_aside_and_changes_nothing_else(campaign, said, effect):
+def test_a_gigantic_outlier_is_set_aside_and_changes_nothing_else(campaign, effect):
     case = make_case(effect, models=PULL_ONLY)
-    data, ranking = rank_without_outliers(spoiled(case, campaign, 4, 20.0), 1, FEW)
+    bad = spoiled(case, campaign, 4, 20.0)
+    table = getattr(bad, campaign)
+    table = replace(table, source=f"{campaign}.csv", lines=table.lines + 2)
+    data, ranking = rank_without_outliers(replace(bad, **{campaign: table}), 1, FEW)
+    value = table["drawbar_pull_kn"][4]
+    said = f"{campaign}.csv, line 6 (drawbar_pull_kn = {value:.4g}): more than"
     assert any(said in warning for warning in data.case.warnings)
     assert ranking.order[0] == (effect or "none")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,15 +15,14 @@ from calib.campaign.kinds.base import Kind, Planned, Section, Task, Work
 from calib.campaign.place import Place
 from calib.folders import read_folder
 from calib.gap.batch import written
-from calib.gap.case import Case, read_case
+from calib.gap.case import Case, case_files, read_case
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
+from calib.gap.effects.check import check_on_case
 from calib.gap.effects.load import load_effects
 from calib.page.diagnosis import write_page
 
 __all__ = ["Diagnose", "DiagnoseSection", "DiagnosisItem", "diagnosis_numbers"]
-
-_FILES = ("calibration", "field", "predict")
 
 
 class DiagnoseSection(Section):
@@ -76,7 +74,7 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
             settings = {
                 "case": place.name(case), "effects": section.effects, "pages": section.pages
             }  # fmt: skip
-            yield Planned(place.word(case), settings, _case_files(case) | extra)
+            yield Planned(place.word(case), settings, case_files(case)[1] | extra)
 
     def load(self, task: Task) -> DiagnosisItem:
         """Read the case."""
@@ -90,33 +88,23 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
 
     def work(self, item: DiagnosisItem, seed: int) -> Work:
         """Diagnose it."""
-        with _effects(item.effects) as own:
+        with _effects(item.effects, item.case) as own:
             found = diagnose(item.case, seed, effects={**EFFECTS, **own})
             files = written(found) | (_page(found, seed) if item.page else {})
         return Work(diagnosis_numbers(found), files)
 
 
-def _case_files(folder: Path) -> dict[str, Path]:
-    """Return the files of a case; one that cannot be read fails when it is loaded."""
-    path = folder / "case.toml"
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
-        content = {}
-    named = {key: content.get(key) for key in _FILES}
-    return {"case.toml": path} | {
-        key: folder / name for key, name in named.items() if isinstance(name, str)
-    }
-
-
 @contextmanager
-def _effects(files: Mapping[str, bytes]) -> Iterator[Mapping[str, Effect]]:
+def _effects(files: Mapping[str, bytes], case: Case) -> Iterator[Mapping[str, Effect]]:
     """Yield the user's effects; their prior files are read while they are in use."""
     with TemporaryDirectory() as scratch:
         paths = [Path(scratch) / name for name in files]
         for path in paths:
             path.write_bytes(files[path.name])
-        yield load_effects(paths[0]) if paths else {}
+        own = load_effects(paths[0]) if paths else {}
+        if own:
+            check_on_case(own, case, paths[0])
+        yield own
 
 
 def _page(found: Diagnosis, seed: int) -> dict[str, bytes]:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from calib.errors import CalibError
 from calib.gap.effects.base import Effect
+from calib.gap.effects.check import check_declared
 
 __all__ = ["load_effects"]
 
@@ -24,7 +25,8 @@ def load_effects(path: Path) -> dict[str, Effect]:
     Raises
     ------
     CalibError
-        If the file cannot be run, defines no effect, or priors are missing.
+        If the file cannot be run, defines no effect, priors are missing, or an effect is not
+        what it must be.
     """
     path = Path(path)
     spec = importlib.util.spec_from_file_location(f"calib_user_{path.stem}", path)
@@ -46,6 +48,7 @@ def load_effects(path: Path) -> dict[str, Effect]:
     for _, kind in inspect.getmembers(module, inspect.isclass):
         if issubclass(kind, Effect) and kind.__module__ == module.__name__ and kind.name:
             effect = kind()
+            check_declared(effect, path)
             effect.prior_file = path.with_name(f"{effect.name}.toml")
             if not effect.prior_file.is_file():
                 raise CalibError(

@@ -1,0 +1,215 @@
+"""Checks of a user's own effect: what it declares, and one evaluation on a case.
+
+A mistake that the fits would swallow (a misspelt method, a wrong shape) would otherwise read as
+"this effect is improbable".
+"""
+
+from __future__ import annotations
+
+import difflib
+import traceback
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.columns import QUANTITIES
+from calib.errors import CalibError
+from calib.gap.case import Campaigns, Case, OutputData, campaigns
+from calib.gap.effects import EFFECTS, Effect, View
+from calib.gap.forward import Forward, Hypothesis
+from calib.gap.hypotheses import effect_priors
+from calib.models.base import Array
+from calib.outputs import OUTPUTS
+from calib.streams import generator
+
+__all__ = ["check_declared", "check_on_case"]
+
+# Draws of the priors that an effect is evaluated with.
+_TRIALS = 8
+# Likeness from which another attribute is taken for a misspelt one.
+_MISSPELT = 0.8
+_BASE = tuple(name for name in vars(Effect) if not name.startswith("_"))
+_METHODS = tuple(name for name in _BASE if callable(getattr(Effect, name)))
+_FORMS = ("size", "slip", "pressure", "cone", "water", "shape")
+
+
+def check_declared(effect: Effect, path: Path) -> None:
+    """Check what can be seen without data.
+
+    Parameters
+    ----------
+    effect : Effect
+    path : Path
+        Of the file that defines it.
+
+    Raises
+    ------
+    CalibError
+        If the name is taken, an output, covariate or form is unknown, or a method is misspelt.
+    """
+    where = _place(path, effect)
+    if effect.name in EFFECTS:
+        raise CalibError(
+            "the name is that of an effect of calib's own", where=where,
+            allowed=f"any name but {', '.join(EFFECTS)}", mend="give it another name",
+        )  # fmt: skip
+    for attribute, known in (("outputs", OUTPUTS), ("covariates", QUANTITIES), ("form", _FORMS)):
+        given = getattr(effect, attribute)
+        if isinstance(given, str):
+            raise CalibError(
+                f"{attribute} is the text {given!r}", where=where, allowed="a tuple of names",
+                mend=f'write {attribute} = ("{given}",), with the comma',
+            )  # fmt: skip
+        for name in given:
+            if name not in known:
+                raise CalibError(
+                    f"unknown name {name!r} in {attribute}", where=where,
+                    allowed=", ".join(known), mend=_meant(name, known),
+                )  # fmt: skip
+    for kind in type(effect).__mro__[:-2]:
+        for name, value in vars(kind).items():
+            _check_attribute(name, value, where)
+
+
+def _check_attribute(name: str, value: object, where: str) -> None:
+    if name.startswith("_") or name in _BASE:
+        return
+    if callable(value):
+        raise CalibError(
+            f"the method {name} is none of an effect's, so nothing would call it", where=where,
+            allowed=", ".join(_METHODS),
+            mend=f"{_meant(name, _METHODS)} (a helper's name starts with an underscore)",
+        )  # fmt: skip
+    if difflib.get_close_matches(name, _BASE, cutoff=_MISSPELT):
+        raise CalibError(
+            f"the attribute {name} is none of an effect's", where=where, allowed=", ".join(_BASE),
+            mend=f"{_meant(name, _BASE)} (a constant's name starts with an underscore)",
+        )  # fmt: skip
+
+
+def check_on_case(effects: Mapping[str, Effect], case: Case, path: Path) -> None:
+    """Evaluate effects once on a case, at draws of their priors.
+
+    Parameters
+    ----------
+    effects : mapping of str to Effect
+        Those of a file.
+    case : Case
+    path : Path
+        The file.
+
+    Raises
+    ------
+    CalibError
+        If one raises, returns something else than numbers of the right shape, or changes nothing.
+    """
+    data = campaigns(case)
+    for effect in effects.values():
+        where = _place(path, effect)
+        if _call(effect.not_testable, path, where, data.view, data.names) is None:
+            _check_testable(effect, data, path, where)
+
+
+def _check_testable(effect: Effect, data: Campaigns, path: Path, where: str) -> None:
+    hypothesis = Hypothesis(effect.name, (effect,), (effect_priors(data, effect),))
+    units = dict.fromkeys(data.names, 1.0)
+    forward = _call(Forward, path, where, data, hypothesis, units)
+    psi = forward.priors.sample(generator(0, "gap", "effect check", effect.name), _TRIALS)
+    phi = hypothesis.effect_priors[0].to_natural(psi[:, forward.phi_slices[0]])
+    with np.errstate(all="ignore"):
+        plain = forward.simulator(psi, data.view)
+        base = {o.name: o.problem.bound.from_response(plain[o.name]) for o in data.outputs}
+        view = replace(data.view, base=base)
+        changed = [
+            _changes_conditions(effect, phi, o, view, path, where)
+            | _changes_output(effect, phi, o.name, plain[o.name], view, path, where)
+            for o in data.outputs
+        ]
+    if not any(changed):
+        raise CalibError(
+            "it changes nothing on this case", where=where,
+            allowed=f"on_conditions or on_output that changes {' or '.join(effect.outputs)}",
+            mend="correct it, or let not_testable say why the case cannot show it",
+        )  # fmt: skip
+
+
+def _changes_conditions(
+    effect: Effect, phi: Array, o: OutputData, view: View, path: Path, where: str
+) -> bool:
+    given = o.problem.bound.model.select(view.conditions)
+    found = _call(effect.on_conditions, path, where, phi, o.name, dict(given), view)
+    if not isinstance(found, dict) or set(found) != set(given):
+        raise _wrong(f"on_conditions returned {_described(found)} for {o.name}", where,
+                     f"a dict with {', '.join(given)}")  # fmt: skip
+    n = view.slip().size
+    for name, values in found.items():
+        _check_numbers(values, ((n,), (phi.shape[0], n)), f"on_conditions, {name}", where)
+    return any(not np.array_equal(found[name], given[name]) for name in given)
+
+
+def _changes_output(
+    effect: Effect, phi: Array, output: str, plain: Array, view: View, path: Path, where: str
+) -> bool:
+    handed = plain.copy()
+    found = _call(effect.on_output, path, where, phi, output, handed, view)
+    if not np.array_equal(handed, plain, equal_nan=True):
+        raise CalibError(
+            "on_output changes the location it is given", where=where, allowed="a new array",
+            mend="write location = location + ... instead of location += ...",
+        )  # fmt: skip
+    _check_numbers(found, (plain.shape,), f"on_output for {output}", where)
+    if not np.isfinite(found[np.isfinite(plain)]).any():
+        raise _wrong(f"on_output returned no finite number for {output}", where,
+                     "numbers wherever the location is one")  # fmt: skip
+    return not np.array_equal(found, plain, equal_nan=True)
+
+
+def _check_numbers(
+    found: object, shapes: tuple[tuple[int, ...], ...], what: str, where: str
+) -> None:
+    right = isinstance(found, np.ndarray) and found.shape in shapes and found.dtype.kind in "fiu"
+    if not right:
+        raise _wrong(f"{what} returned {_described(found)}", where,
+                     f"an array of numbers of shape {' or '.join(map(str, shapes))}: "
+                     "draws by rows of the field")  # fmt: skip
+
+
+def _wrong(message: str, where: str, allowed: str) -> CalibError:
+    return CalibError(
+        message, where=where, allowed=allowed,
+        mend="correct it; phi[:, :1] is the first parameter as a column, (draws, 1)",
+    )  # fmt: skip
+
+
+def _described(found: object) -> str:
+    if isinstance(found, np.ndarray):
+        return f"an array of {found.dtype} of shape {found.shape}"
+    return f"a dict with {', '.join(found)}" if isinstance(found, dict) else type(found).__name__
+
+
+def _call[R](function: Callable[..., R], path: Path, where: str, *args: Any) -> R:
+    """Call what a user wrote; its exceptions are theirs to mend, at the line they come from."""
+    try:
+        return function(*args)
+    except CalibError:
+        raise
+    except Exception as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        line = next((f.lineno for f in reversed(frames) if f.filename == str(path)), None)
+        at = where if line is None else f"{where}, line {line}"
+        raise CalibError(
+            f"it does not run: {type(error).__name__}: {error}", where=at,
+            mend="correct it; view.conditions holds the columns of the data",
+        ) from error  # fmt: skip
+
+
+def _meant(name: str, known: Collection[str]) -> str:
+    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"was {near[0]} meant?" if near else "correct the name"
+
+
+def _place(path: Path, effect: Effect) -> str:
+    return f"{path}, effect {effect.name}"

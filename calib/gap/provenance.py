@@ -1,0 +1,115 @@
+"""What a diagnosis is of: recorded beside it, so that one of another case is never taken for it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from calib.errors import CalibError
+from calib.gap.case import Case, case_files
+from calib.manifest import sha256
+
+__all__ = ["INPUTS", "case_hashes", "check_resumable", "inputs_record", "listed", "recorded_inputs"]
+
+INPUTS = "inputs.json"
+_SHOWN = 5
+
+
+def inputs_record(case: Case, seed: int) -> bytes:
+    """Return the content of a diagnosis' ``inputs.json``.
+
+    Parameters
+    ----------
+    case : Case
+        As it was diagnosed.
+    seed : int
+    """
+    tables = {"calibration": case.lab, "field": case.field, "predict": case.fresh}
+    content = _made_by(seed) | {
+        "models": dict(case.models),
+        "sha256": {key: table.sha256 for key, table in tables.items() if table is not None},
+    }
+    return (json.dumps(content, indent=1) + "\n").encode()
+
+
+def recorded_inputs(folder: Path) -> dict[str, Any] | None:
+    """Return what a diagnosis says it is of; None where it does not say.
+
+    Parameters
+    ----------
+    folder : Path
+        Of one diagnosis.
+    """
+    try:
+        found = json.loads((folder / INPUTS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def case_hashes(folder: Path) -> dict[str, Any]:
+    """Return models and hashes of a case folder as they are now, as ``inputs.json`` has them.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the case. Files that cannot be read have no hash.
+    """
+    content, files = case_files(folder)
+    hashes = {
+        key: sha256(path.read_bytes())
+        for key, path in files.items()
+        if key != "case.toml" and path.is_file()
+    }
+    return {"models": content.get("models"), "sha256": hashes}
+
+
+def check_resumable(cases: Sequence[Path], out: Path, seed: int) -> None:
+    """Check that diagnoses which are there are of these cases, with this seed and version.
+
+    Raises
+    ------
+    CalibError
+        Saying which are not, and why.
+    """
+    found = _foreign(cases, out, seed)
+    if found:
+        reason, names = next(iter(found.items()))
+        raise CalibError(
+            f"{len(names)} of the diagnoses that are there {reason}: {listed(names)}",
+            where=str(out), allowed="an empty folder, or earlier diagnoses of the same cases",
+            mend="choose another --out, or delete this folder",
+        )  # fmt: skip
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return the first few names."""
+    return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+
+
+def _foreign(cases: Sequence[Path], out: Path, seed: int) -> Mapping[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    made_by = _made_by(seed)
+    for case in cases:
+        if not (out / case.name).exists():
+            continue
+        said = recorded_inputs(out / case.name)
+        if said is None:
+            reason = "do not say which cases they are of"
+        elif any(said.get(key) != value for key, value in case_hashes(case).items()):
+            reason = "are of other cases, or of these before their files were changed"
+        elif said.get("seed") != seed:
+            reason = f"were made with --seed {said.get('seed')}, not {seed}"
+        elif any(said.get(key) != value for key, value in made_by.items()):
+            reason = f"were made by version {said.get('version')}, not {made_by['version']}"
+        else:
+            continue
+        found.setdefault(reason, []).append(case.name)
+    return found
+
+
+def _made_by(seed: int) -> dict[str, Any]:
+    return {"seed": seed, "version": version("terracalib")}

@@ -1,0 +1,65 @@
+"""What diagnoses are of: those of other cases, or of these before a change, are noticed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from calib.errors import CalibError
+from calib.gap.case import read_case
+from calib.gap.provenance import (
+    INPUTS,
+    case_hashes,
+    check_resumable,
+    inputs_record,
+    recorded_inputs,
+)
+from gap.cases import PULL_ONLY, make_case, write_case
+
+
+@pytest.fixture
+def diagnosed(tmp_path) -> tuple[Path, Path]:
+    """Return a case folder, and a folder of results with its record."""
+    made = make_case(models=PULL_ONLY, n_lab=15, n_field=12, n_fresh=3)
+    case = write_case(made, tmp_path / "cases" / "case-0")
+    (tmp_path / "out" / "case-0").mkdir(parents=True)
+    (tmp_path / "out" / "case-0" / INPUTS).write_bytes(inputs_record(read_case(case), 1))
+    return case, tmp_path / "out"
+
+
+def test_the_record_of_a_case_is_what_its_folder_holds(diagnosed):
+    case, out = diagnosed
+    said = recorded_inputs(out / "case-0")
+    assert said is not None
+    assert {key: said[key] for key in ("models", "sha256")} == case_hashes(case)
+    assert set(said["sha256"]) == {"calibration", "field", "predict"}
+    check_resumable([case], out, 1)
+
+
+def test_a_changed_file_another_seed_or_version_are_refused(diagnosed):
+    case, out = diagnosed
+    with pytest.raises(CalibError, match="--seed 1, not 2"):
+        check_resumable([case], out, 2)
+    record = out / "case-0" / INPUTS
+    said = json.loads(record.read_text())
+    record.write_text(json.dumps(said | {"version": "0.0.0"}))
+    with pytest.raises(CalibError, match=r"made by version 0\.0\.0"):
+        check_resumable([case], out, 1)
+    with (case / "field.csv").open("a") as file:
+        file.write("\n")
+    with pytest.raises(CalibError, match="of other cases, or of these before") as caught:
+        check_resumable([case], out, 1)
+    assert "case-0" in str(caught.value)
+    assert caught.value.mend is not None
+
+
+@pytest.mark.parametrize("text", [None, "{", "[]"])
+def test_results_that_do_not_say_what_they_are_of_are_not_resumed(diagnosed, text):
+    case, out = diagnosed
+    (out / "case-0" / INPUTS).unlink()
+    if text is not None:
+        (out / "case-0" / INPUTS).write_text(text)
+    with pytest.raises(CalibError, match="do not say which cases"):
+        check_resumable([case], out, 1)
