@@ -80,7 +80,7 @@ def test_table_and_figure_show_the_limit(three: tuple[Path, Path, Path], tmp_pat
     assert "Monte Carlo error" in text
     assert "limit" not in text_table(score)
     figure = levels_figure(list(tiers.values()), limit)
-    labels = [t.get_text() for t in figure.axes[0].get_legend().get_texts()]
+    labels = [t.get_text() for t in figure.legends[0].get_texts()]
     assert any(label.startswith("limit") for label in labels)
 
 
