@@ -39,6 +39,7 @@ def diagnose(
     overwrite: _Overwrite = False,
 ) -> None:
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
+    from calib.columns import QUANTITIES
     from calib.folders import check_folder, fresh_folder
     from calib.gap.case import case_from_run, read_case
     from calib.gap.diagnose import diagnose as find
@@ -48,6 +49,7 @@ def diagnose(
     from calib.gap.files import write_diagnosis
     from calib.gap.provenance import INPUTS, inputs_record
     from calib.numbers import format_number
+    from calib.outputs import OUTPUTS
     from calib.page.diagnosis import write_page
 
     check_folder(out, overwrite=overwrite)
@@ -77,10 +79,11 @@ def diagnose(
         print(f"  {found.ranking.probability[name]:6.3f}  {name}")
     for output, s in found.shrink.items():
         low, high = s.interval
+        unit = QUANTITIES[OUTPUTS[output]].unit.replace("**", "")
         print(
-            f"{output}: error {format_number(s.rmse_before)} -> {format_number(s.rmse_after)}, "
-            f"shrink {100 * s.fraction:.0f} % ({100 * low:.0f} to {100 * high:.0f}), "
-            f"noise {format_number(s.noise_floor)}"
+            f"{output}: error {format_number(s.rmse_before)} -> {format_number(s.rmse_after)} "
+            f"{unit} rms, shrink {100 * s.fraction:.0f} % (90 % interval {100 * low:.0f} to "
+            f"{100 * high:.0f} %), noise sd {format_number(s.noise_floor)} {unit}"
         )
     print(out / "index.html")
 

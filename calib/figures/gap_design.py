@@ -141,8 +141,9 @@ def _design_caption(design: Isolability) -> str:
     sizes = list(design.detectable.values())
     return (
         f"{text} The smallest size that is named in 80 % of campaigns like this one runs from "
-        f"{short(min(sizes))} to {short(max(sizes))} noise sd (rms over the rows). Only conditions "
-        "and laboratory data were used for this figure; likeness is in hundredths."
+        f"{short(min(sizes))} to {short(max(sizes))} noise sd (rms over the rows; the noise is the "
+        "laboratory's alone here). Only conditions and laboratory data were used for this figure; "
+        "likeness is in hundredths."
     )
 
 
@@ -181,7 +182,7 @@ def left_over_plate(found: Diagnosis) -> Plate:
     share = percent(beyond / max(total, 1)) if beyond else "none"
     caption = (
         f"Residuals of the field rows after {short_name(name)}, the most probable hypothesis: "
-        f"{beyond} of {total} lie beyond 2 noise sds ({share}; 4.6 % are expected). A pattern "
-        "left here would be a second effect, or the wrong first one."
+        f"{beyond} of {total} lie beyond 2 sds of the noise of both campaigns ({share}; 4.6 % "
+        "are expected). A pattern left here would be a second effect, or the wrong first one."
     )
     return Plate(fig, "left_over", caption, "What is left after the best hypothesis")

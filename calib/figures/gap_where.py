@@ -22,7 +22,7 @@ from calib.figures.gap_rows import (
     panel_groups,
     region_text,
 )
-from calib.figures.labels import NO_UNIT, Axis, percent, short
+from calib.figures.labels import MINUS, NO_UNIT, Axis, percent, short
 from calib.figures.plate import Plate
 from calib.figures.style import BLACK, GREY, ORANGE, VERMILION, panels
 from calib.gap.diagnose import Diagnosis
@@ -195,8 +195,8 @@ def _caption(outputs: list[OutputRows]) -> str:
         likely = int((o.probability > 0.5).sum())
         parts.append(
             f"{output_word(o.name)}: {likely} of {o.rows.size} rows have a gap that probably "
-            f"exceeds the noise of {short(float(np.median(o.noise)))} {o.axis.unit}; the largest "
-            f"is {short(float(o.gap[np.abs(o.gap).argmax()]))} {o.axis.unit}"
+            f"exceeds the noise of {short(float(np.median(o.noise)))} {o.axis.unit} (median "
+            f"over the rows, from both campaigns); the largest is {_largest(o)} {o.axis.unit}"
         )
     text = ". ".join(p[0].upper() + p[1:] for p in parts)
     return (
@@ -206,6 +206,13 @@ def _caption(outputs: list[OutputRows]) -> str:
     )
 
 
+def _largest(o: OutputRows) -> str:
+    """The largest gap with its 90 % interval."""
+    row = int(np.abs(o.gap).argmax())
+    gap, half = float(o.gap[row]), 1.64 * float(o.sd[row])
+    return f"{short(gap)} (90 % {short(gap - half)} to {short(gap + half)})".replace("-", MINUS)
+
+
 def _region_caption(found: Diagnosis) -> str:
     if not found.regions:
         return "Over no stretch of any condition does the gap probably exceed the noise."
@@ -213,7 +220,9 @@ def _region_caption(found: Diagnosis) -> str:
     for r in found.regions:
         axis = output_axis(found, r.output)
         p = percent(r.probability) if r.probability < 0.995 else "above 99 %"
-        gap = f"{short(r.gap * axis.factor)} {axis.unit}"
+        low, high = (short(axis.factor * end) for end in r.interval)
+        gap = f"{short(r.gap * axis.factor)} (90 % {low} to {high}) {axis.unit}"
+        gap = gap.replace("-", MINUS)
         parts.append(f"{output_word(r.output)} at {region_text(r)}: {gap} (probability {p})")
     return (
         "Each row once in every panel of its output, in units of the noise. Marked regions, with "

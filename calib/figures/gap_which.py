@@ -194,6 +194,14 @@ def _placebo_caption(placebo: Placebo, named: str) -> str:
             f", and the best of the other single effects, {short_name(runner)}, "
             f"{percent(max(placebo.shrink(runner), 0.0))}"
         )
+    if "none" in placebo.left:
+        text += (
+            f". Without any effect, {short_name('none')}, "
+            f'{percent(max(placebo.shrink("none"), 0.0))} go: the line "simulator" is the model '
+            "as the laboratory alone calibrated it, and every hypothesis, that of no gap too, "
+            "estimates the model's parameters anew from both campaigns, which lets those that the "
+            "laboratory left uncertain follow the field. What an effect adds to that is its own"
+        )
     return (
         f"{text}. Any hypothesis with free parameters removes something, a wrong one too, so the "
         "distance between the diamond and the rest is what counts, not the percentage; "

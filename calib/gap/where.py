@@ -47,11 +47,24 @@ class RowGap:
 
 @dataclass(frozen=True)
 class Region:
-    """A stretch of one condition over which the gap exceeds the noise."""
+    """A stretch of one condition over which the gap exceeds the noise.
+
+    Parameters
+    ----------
+    output : str
+    conditions : mapping of str to (float, float)
+    gap : float
+        Posterior mean of the mean gap over its rows, in the output's unit.
+    interval : tuple of float
+        Of the mean gap, 90 %.
+    probability : float
+        That the mean gap exceeds the noise.
+    """
 
     output: str
     conditions: Mapping[str, tuple[float, float]]
     gap: float
+    interval: tuple[float, float]
     probability: float
 
 
@@ -90,12 +103,17 @@ def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Re
                     o.name,
                     {name: stretch},
                     float(truth.weight @ mean),
+                    (_quantile(truth, mean, 0.05), _quantile(truth, mean, 0.95)),
                     min(float(truth.weight @ beyond), 1.0),
                 )
             )
         own.sort(key=lambda r: -r.probability * abs(r.gap))
         found += [r for r in own if r.probability > 0.5][:_MOST]
     return tuple(found)
+
+
+def _quantile(truth: Truth, draws: Array, q: float) -> float:
+    return float(truth.quantile(draws[:, None], q)[0])
 
 
 def _longest(values: Array, gap: RowGap) -> tuple[float, float] | None:

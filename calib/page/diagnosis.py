@@ -30,7 +30,7 @@ from calib.gap.diagnose import Diagnosis
 from calib.gap.where import Region
 from calib.models import get_model
 from calib.page.content import png_size
-from calib.page.gap_sizes import size_sentences
+from calib.page.gap_sizes import size_sentences, where_to_look
 from calib.page.gap_tables import conditions_text, hypothesis_groups, next_rows
 from calib.page.gap_verdict import (
     Candidate,
@@ -104,7 +104,8 @@ def render_diagnosis(
     str
         HTML that makes no request: style and images are inside.
     """
-    verdict = judge_gap(gap_evidence(found))
+    evidence = gap_evidence(found)
+    verdict = judge_gap(evidence)
     case = found.data.case
     files = [("Calibration", case.lab), ("Field", case.field)]
     if case.fresh is not None:
@@ -127,6 +128,7 @@ def render_diagnosis(
         shrink=_shrink_rows(found),
         unfitted=case.fresh is not None,
         next_rows=next_rows(found),
+        look=evidence.look,
         files=[(word, PurePath(t.source).name, len(t), t.sha256) for word, t in files],
         seed=found.seed,
         command=shlex.join(str(part) for part in manifest.get("command", ())),
@@ -162,14 +164,17 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         ],
         alike=alike,
         smallest=max(design.detectable.values(), default=float("nan")),
+        look=where_to_look(found) if best == "unknown" else "",
     )
 
 
 def _region_words(found: Diagnosis, region: Region) -> tuple[str, str]:
     own = output_axis(found, region.output)
     gap = own.factor * region.gap
-    way = "above" if gap > 0.0 else "below"
-    return region_text(region), f"{short(abs(gap))} {own.unit} {way} the simulator"
+    sign, way = (1.0, "above") if gap > 0.0 else (-1.0, "below")
+    low, high = sorted(sign * own.factor * end for end in region.interval)
+    spread = f"90 % interval {short(low)} to {short(high)}".replace("-", MINUS)
+    return region_text(region), f"{short(abs(gap))} {own.unit} {way} the simulator ({spread})"
 
 
 def _leading_regions(found: Diagnosis) -> list[Region]:
@@ -240,8 +245,9 @@ def _case_facts(found: Diagnosis) -> list[tuple[str, str]]:
             (
                 axis.name,
                 f"{get_model(case.models[o.name]).title}; {len(o.problem.table)} rows of "
-                f"calibration, {o.rows.size} of the field; noise sd {level}"
-                f"{grows if noise.rho > 0.0 else ''}",
+                f"calibration, {o.rows.size} of the field; noise sd of a reading {level}"
+                f"{grows if noise.rho > 0.0 else ''} (both campaigns, the most probable "
+                "hypothesis)",
             )
         )
     return facts

@@ -13,6 +13,7 @@ from calib.figures.gap_rows import (
     best_fit,
     output_axis,
     output_word,
+    region_text,
     unit_after,
 )
 from calib.figures.labels import joined
@@ -23,7 +24,7 @@ from calib.models.base import Array
 from calib.numbers import format_value
 from calib.streams import generator
 
-__all__ = ["size_sentences"]
+__all__ = ["size_sentences", "where_to_look"]
 
 _N_DRAWS = 400
 # A mean change below this part of the noise is not worth a sentence.
@@ -69,8 +70,25 @@ def size_sentences(found: Diagnosis, name: str) -> list[str]:
     return _end_sentences(found, effect, changes)
 
 
-def _lead(found: Diagnosis, fit: Fit) -> str:
-    """Say what an effect that is not listed goes along with: where to look for it."""
+def where_to_look(found: Diagnosis) -> str:
+    """Say which measurements would show what an effect that is not listed goes along with."""
+    fit = best_fit(found, "unknown")
+    h = fit.forward.hypothesis
+    largest = max(found.regions, key=lambda r: r.probability * abs(r.gap), default=None)
+    place = "" if largest is None else f" where the gap is largest ({region_text(largest)})"
+    if (h.onset_over or h.smooth_over) == "all":
+        vary = "one condition at a time, the others held"
+    elif h.onset_over is not None:
+        vary = f"in small steps about {_threshold(found, fit)}, the other conditions held"
+    else:
+        vary = f"over {_along(fit)} in small steps, the other conditions held"
+    return (
+        f"repeat runs{place}, and add runs {vary}; then write the suspected cause as an effect of "
+        "your own (--effects)"
+    )
+
+
+def _along(fit: Fit) -> str:
     h = fit.forward.hypothesis
     own = {output_word(name) for name in h.smooth_outputs}
     level = f"predicted {joined(sorted(own)).lower()}"
@@ -78,6 +96,12 @@ def _lead(found: Diagnosis, fit: Fit) -> str:
         "slip": "slip", "level": f"the {level}", "sinkage": "the predicted rut depth",
         "order": "the order of the runs", "all": "several conditions",
     }  # fmt: skip
+    return along[h.smooth_over]
+
+
+def _lead(found: Diagnosis, fit: Fit) -> str:
+    """Say what an effect that is not listed goes along with: where to look for it."""
+    h = fit.forward.hypothesis
     if h.onset_over is not None:
         return f"what is missing sets in beyond {_threshold(found, fit)}"
     on_top = ""
@@ -85,7 +109,7 @@ def _lead(found: Diagnosis, fit: Fit) -> str:
         on_top = f", on top of {h.effects[0].name.replace('_', ' ')}"
     elif h.shift > 0.0:
         on_top = ", on top of other parameter values"
-    return f"what is missing goes along with {along[h.smooth_over]}{on_top}"
+    return f"what is missing goes along with {_along(fit)}{on_top}"
 
 
 def _threshold(found: Diagnosis, fit: Fit) -> str:

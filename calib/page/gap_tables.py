@@ -78,11 +78,16 @@ def _sizes(found: Diagnosis, name: str) -> list[Markup]:
         return _shifts(found, fit)
     sd = np.sqrt(np.diag(fit.covariance))
     sizes = []
-    for priors, part in zip(hypothesis.effect_priors, fit.forward.phi_slices, strict=True):
+    for effect, priors, part in zip(
+        hypothesis.effects, hypothesis.effect_priors, fit.forward.phi_slices, strict=True
+    ):
+        of = f"{short_name(effect.name)}: " if len(hypothesis.effects) > 1 else ""
+        if name == "unknown":
+            of = f"on top of {short_name(effect.name)}: "
         for prior, value, s in zip(priors.free, fit.psi[part], sd[part], strict=True):
             sizes.append(
-                Markup("{} {}").format(
-                    prior.name.replace("_", " "), parameter_text(prior, float(value), float(s))
+                Markup("{}{} {}").format(
+                    of, prior.name.replace("_", " "), parameter_text(prior, float(value), float(s))
                 )
             )
     return sizes

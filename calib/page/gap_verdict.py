@@ -101,7 +101,9 @@ class GapEvidence:
     alike : sequence of str
         Effects that look like the best one on this design, in words.
     smallest : float
-        Smallest size that this design can name, in noise sds.
+        Smallest size that this design can name, in noise sds of the laboratory.
+    look : str
+        What to measure where nothing that is listed explains the gap.
     """
 
     verdict: str
@@ -113,6 +115,7 @@ class GapEvidence:
     next_facts: Sequence[NextFact]
     alike: Sequence[str] = ()
     smallest: float = float("nan")
+    look: str = ""
 
 
 @dataclass(frozen=True)
@@ -183,8 +186,8 @@ def _judge(e: GapEvidence) -> GapVerdict:
 def _no_gap(e: GapEvidence, best: Candidate) -> GapVerdict:
     sure = best.probability >= SURE
     size = "" if math.isnan(e.smallest) else (
-        f"; an effect of {e.smallest:.1f} noise sd (rms) or more would have shown in four of five "
-        "campaigns like this one"
+        f"; an effect of {e.smallest:.1f} noise sd (rms; the laboratory's noise) or more would "
+        "have shown in four of five campaigns like this one"
     )  # fmt: skip
     facts = [("Which", f"No gap, probability {odds_text(best.probability)}{size}")]
     others = [c for c in e.ranked[1:4] if c.probability >= 0.05]
@@ -249,7 +252,9 @@ def _how_far(e: GapEvidence) -> str:
 
 
 def _next(e: GapEvidence) -> list[tuple[str, str]]:
-    """Say what would separate the first two, unless the first is certain."""
+    """Say what would show the unknown, or separate the first two unless the first is certain."""
+    if e.look and e.verdict == "unknown":
+        return [("Next", e.look)]
     if not e.next_facts or e.ranked[0].probability >= SURE:
         return []
     n = max(e.next_facts, key=lambda fact: (_leading(e, fact), fact.gain_nats))

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
+from calib.manifest import sha256
 from calib.templates import template_csv
 
 from .test_cli import Calib, assert_refused, calib, contents  # noqa: F401
@@ -20,10 +22,29 @@ def test_the_four_cases_are_written_and_can_be_diagnosed(calib: Calib) -> None: 
     assert diagnosed.code == 0, diagnosed.err
     assert "verdict: effect" in diagnosed.out
     assert "slip_sinkage" in diagnosed.out
+    assert re.search(r"-> \S+ mm rms, shrink \d+ % \(90 % interval \d+ to \d+ %\)", diagnosed.out)
+    assert re.search(r"noise sd \S+ mm\n", diagnosed.out)
+    inputs = json.loads(Path("found/inputs.json").read_text())
+    assert inputs["sha256"]["field"] == sha256(Path("gaps/plain_bekker/field.csv").read_bytes())
     assert Path("found/fresh_prediction.csv").exists()
     again = calib("data", "he2019-gaps", "--out", "gaps")
     assert_refused(again, ["plain_bekker", "exist there already", "--overwrite"])
     assert calib("data", "he2019-gaps", "--out", "gaps", "--overwrite").code == 0
+
+
+def test_a_users_effect_that_does_not_run_is_named(calib: Calib) -> None:  # noqa: F811
+    assert calib("data", "he2019-gaps", "--out", "gaps").code == 0
+    Path("mine.py").write_text(
+        "from calib.gap.effects import Effect\n\n\nclass Wind(Effect):\n    name = 'wind'\n"
+        "    parameters = ('deeper',)\n    outputs = ('rut_depth',)\n\n"
+        "    def on_output(self, phi, output, location, view):\n        return location + gust\n"
+    )
+    Path("wind.toml").write_text(
+        'model = "wind"\n[parameters.deeper]\ndist = "normal"\nmean = 0.0\nsd = 0.1\n'
+        'unit = "1"\nreason = "a guess"\nsource = "test"\n'
+    )
+    refused = calib("diagnose", "gaps/plain_bekker", "--effects", "mine.py", "--out", "found")
+    assert_refused(refused, ["mine.py, effect wind, line 10", "NameError", "gust", "to mend"])
 
 
 def test_the_folder_is_called_by_the_name_of_the_data(calib: Calib, tmp_path: Path) -> None:  # noqa: F811

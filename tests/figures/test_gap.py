@@ -21,7 +21,7 @@ from calib.figures.gap_rows import (
     short_name,
     title_of,
 )
-from calib.figures.gap_which import in_play, placebos, probability_text
+from calib.figures.gap_which import in_play, placebo_plate, placebos, probability_text
 from calib.gap.where import Region
 
 NAMES = ("isolability", "where", "where_conditions", "which", "how_far", "placebo", "left_over")
@@ -156,6 +156,12 @@ def test_placebos_are_on_one_noise(found):
     assert not any("+" in n for n in placebo.left if n != best)
 
 
+def test_what_no_effect_removes_is_explained(found):
+    caption = placebo_plate(found).caption
+    assert "Without any effect, none (noise), " in caption
+    assert "estimates the model's parameters anew from both campaigns" in caption
+
+
 def test_shrink_bars_have_the_shrink(found, drawn):
     s = found.shrink["drawbar_pull"]
     heights = [bar.get_height() for bar in drawn["how_far"].figure.axes[2].patches]
@@ -180,8 +186,11 @@ def test_words():
     assert probability_text(0.999) == "> 99 %"
     assert probability_text(0.004) == "< 1 %"
     assert probability_text(0.42) == "42 %"
-    assert region_text(Region("a", {"slip_ratio": (0.304, 0.6)}, 1.0, 1.0)) == "slip 30 to 60 %"
-    assert region_text(Region("a", {"pass_number": (3.0, 3.0)}, 1.0, 1.0)) == "pass 3"
+    assert (
+        region_text(Region("a", {"slip_ratio": (0.304, 0.6)}, 1.0, (0.5, 1.5), 1.0))
+        == "slip 30 to 60 %"
+    )
+    assert region_text(Region("a", {"pass_number": (3.0, 3.0)}, 1.0, (0.5, 1.5), 1.0)) == "pass 3"
 
 
 def test_a_figure_that_fails_does_not_stop_the_rest(found, monkeypatch):

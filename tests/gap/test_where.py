@@ -63,6 +63,13 @@ def test_gaps_of_both_signs_are_not_one_region(data):
     assert low > 0.25 or high < 0.45
 
 
+def test_the_mean_gap_of_a_region_has_its_interval(data):
+    truth = truth_with(np.full(27, -0.15), 0.02)
+    (region, *_) = regions(data, truth, row_gaps(data, truth))
+    # Quantiles of 500 draws: 0.002.
+    assert region.interval == pytest.approx((-0.15 - 0.0329, -0.15 + 0.0329), abs=0.006)
+
+
 def test_no_gap_no_region(data):
     truth = truth_with(np.zeros(27), 0.02)
     assert regions(data, truth, row_gaps(data, truth)) == ()

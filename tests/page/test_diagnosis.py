@@ -81,6 +81,11 @@ def test_a_named_effect_says_everything_at_once():
     assert "Next" not in facts
 
 
+def test_a_sure_unknown_says_where_to_look():
+    e = replace(evidence("unknown", unknown=0.95), look="repeat runs at high slip")
+    assert dict(judge_gap(e).facts)["Next"] == "Repeat runs at high slip"
+
+
 def test_less_than_sure_is_hedged_with_rivals_and_a_measurement():
     found = judge_gap(evidence("effect", drift=0.7, lug_thrust=0.25))
     facts = dict(found.facts)
@@ -260,6 +265,28 @@ def test_sizes_of_other_kinds_of_effect():
     assert pair[0].startswith("together: drawbar pull changes by ")
 
 
+def test_parameters_say_of_which_effect_they_are(found):
+    rows = {r["name"]: r["sizes"] for g in hypothesis_groups(found) for r in g["rows"]}
+    pair = rows["force_offset+sensor_drift"]
+    assert pair[0].startswith("force offset: offset ")
+    assert all(s.startswith("sensor drift: ") for s in pair[1:])
+    assert rows["force_offset"][0].startswith("offset ")
+    on_top = next(f for f in found.ranking.fits["unknown"] if f.forward.hypothesis.effects)
+    fits = dict(found.ranking.fits) | {"unknown": (on_top,)}
+    scores = dict(found.ranking.scores) | {"unknown": (0.0,)}
+    other = replace(found, ranking=replace(found.ranking, fits=fits, scores=scores))
+    rows = {r["name"]: r["sizes"] for g in hypothesis_groups(other) for r in g["rows"]}
+    name = on_top.forward.hypothesis.effects[0].name.replace("_", " ")
+    assert all(s.startswith(f"on top of {name}: ") for s in rows["unknown"])
+
+
+def test_mean_gaps_have_intervals_and_noise_is_said_to_be_whose(page):
+    _, _, reader = page
+    assert re.search(r"the simulator \(90 % interval \S+ to \S+\)", reader.text)
+    assert "(both campaigns, the most probable hypothesis)" in reader.text
+    assert "sd of one reading there, from both campaigns, over all hypotheses" in reader.text
+
+
 def test_a_null_has_a_quiet_page(tmp_path):
     null = pull_diagnosis(None)
     write_page(null, tmp_path, {})
@@ -346,3 +373,10 @@ def test_what_is_unknown_is_described_by_what_it_goes_along_with():
     lead = size_sentences(found, "unknown")[0]
     assert lead.startswith("what is missing sets in beyond a predicted drawbar pull of")
     assert 0.8 < float(lead.split(" of ")[1].split()[0]) < 1.0
+    look = gap_evidence(found).look
+    assert look.startswith("repeat runs where the gap is largest (")
+    assert "in small steps about a predicted drawbar pull of" in look
+    reader = Reader()
+    reader.feed(render_diagnosis(found, [], {}, manifest={}))
+    assert reader.text.count(f"R{look[1:]}") == 2
+    assert "no measurement is needed" not in reader.text

@@ -198,7 +198,10 @@ def _call[R](function: Callable[..., R], path: Path, where: str, *args: Any) -> 
         raise
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
-        line = next((f.lineno for f in reversed(frames) if f.filename == str(path)), None)
+        line = next(
+            (f.lineno for f in reversed(frames) if Path(f.filename).resolve() == path.resolve()),
+            None,
+        )
         at = where if line is None else f"{where}, line {line}"
         raise CalibError(
             f"it does not run: {type(error).__name__}: {error}", where=at,
