@@ -16,6 +16,13 @@ from campaign.sites import refuse_all, results
 from calib.cli import main
 from calib.templates import template_csv
 
+# Tests that run in the background of a shell inherit that Ctrl-C is ignored.
+FROM_A_TERMINAL = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from calib.cli import main
+main()
+"""
 CASES = '[[challenge]]\nname = "blind"\ncases = {}\ndraw_seed = 5\ntier = "easy"\n'
 FIT = '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\nposteriors = false\n'
 
@@ -91,8 +98,7 @@ def test_what_can_be_mended_ends_with_two(calib):
 def test_control_c_says_what_is_kept_and_nothing_else(tmp_path):
     (tmp_path / "plan.toml").write_text(CASES.format(40))
     process = subprocess.Popen(
-        [sys.executable, "-c", "from calib.cli import main; main()", "campaign", "plan.toml",
-         "--out", "out"],
+        [sys.executable, "-c", FROM_A_TERMINAL, "campaign", "plan.toml", "--out", "out"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True,
     )  # fmt: skip
