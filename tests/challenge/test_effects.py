@@ -158,4 +158,7 @@ def test_reality_shares_nothing_with_the_effects_that_explain_it() -> None:
         imported = {n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)}
         imported |= {a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names}
         own = {name for name in imported if name.startswith("calib")}
+        # The score makes no reality: it reads what a diagnosis says it is of.
+        if path.name == "score.py":
+            own -= {"calib.gap.provenance"}
         assert all(name.startswith(allowed) for name in own), path.name
