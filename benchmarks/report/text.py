@@ -20,6 +20,8 @@ that take turns with the peers', with the least and the most of them. Every line
 
 _HOW = """## How it was measured
 
+- **Time** on one core is the process's, all threads together, kept on that core: the time on the
+  clock of a machine that does nothing else. On all cores it is the clock's.
 - **Posterior.** One core. The three problems of the report, with all their rows: same data, priors,
   truncations, likelihood and coordinates for every sampler (`benchmarks/shared/peers.py` writes
   them in PyMC). Time is everything but PyMC's compilation: our search for modes, adaptation and
@@ -54,8 +56,9 @@ Sampler, by bulk ESS per second of the joint drawbar pull on one core:
   products; a random walk in straightened coordinates in the place of differential evolution; the
   gate on the draws that are stored; log densities taken past emcee's loop over scalars; components
   of the mixture limited by the entries of their covariances; a twelfth of the steps before those
-  that are kept; 128 walkers. Together 57,000 to 120,000 per second and 4.9 to 3.8 evaluations per
-  ESS with default settings (six seeds each, in one sitting).
+  that are kept; 128 walkers for 64. A default run took 0.29 s for 0.43 s and gave 34,000 for 21,000
+  ESS: 2.5 times the rate, 2.4 for density and 2.6 for rut depth, and 3.8 for 4.9 evaluations per
+  ESS (medians of six seeds, before and after in turn).
 - Dropped, without gain beyond their cost: Newton's method in the search for modes (quasi-Newton
   ascents in a batch were there), 12,000 draws in the place of 6,000 in each fit, a fifth round of
   adaptation (efficiency 0.72 to 0.79, but as much time), one component only, fewer rounds

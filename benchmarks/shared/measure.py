@@ -10,7 +10,9 @@ __all__ = ["seconds", "spread"]
 
 
 def seconds(call: Callable[[], object], *, at_least: float = 0.2, repeats: int = 7) -> list[float]:
-    """Seconds of one call, several times; short calls are made often enough to be timed.
+    """Processor seconds of one call, several times; short calls are made often enough to be timed.
+
+    On one core they are the seconds on the clock of a machine that does nothing else.
 
     Parameters
     ----------
@@ -20,15 +22,15 @@ def seconds(call: Callable[[], object], *, at_least: float = 0.2, repeats: int =
     repeats : int
     """
     call()
-    began = time.perf_counter()
+    began = time.process_time()
     call()
-    times = max(1, round(at_least / max(time.perf_counter() - began, 1e-7)))
+    times = max(1, round(at_least / max(time.process_time() - began, 1e-7)))
     found = []
     for _ in range(repeats):
-        began = time.perf_counter()
+        began = time.process_time()
         for _ in range(times):
             call()
-        found.append((time.perf_counter() - began) / times)
+        found.append((time.process_time() - began) / times)
     return found
 
 
