@@ -30,6 +30,7 @@ from calib.sampling.mode import prior_widths
 __all__ = ["FORM_ERROR", "Forward", "Hypothesis", "SmoothOver"]
 
 type SmoothOver = Literal["slip", "level", "sinkage", "order", "all"]
+type OnsetOver = Literal["slip", "level", "sinkage", "order", "low_pressure"]
 
 # Relative size by which a formula may misrepresent its effect along one direction.
 FORM_ERROR = 0.3
@@ -39,8 +40,8 @@ MISFIT_OUTPUTS = ("bulk_density",)
 # Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
 _THRESHOLDS = (-0.85, 0.9)
 _ONSET_WIDTH = 0.06
-# Shifts that differ between pressures, relative to those that are common to them.
-SHIFT_DIFFERENCE = 0.35
+# Shifts of how a parameter varies with pressure or slip, relative to those of its value.
+SHIFT_DIFFERENCE = 0.2
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class Hypothesis:
     effect_priors : tuple of Priors
     shift : float
         Prior sd of parameter shifts in units of the parameters' own prior sds; 0 for none.
+    shift_form : tuple of {"slip", "pressure"}
+        Along what the change by the shift may depart from the simulator's own; see `Effect.form`.
     smooth : float
         Prior sd of a free discrepancy, in units of the noise; 0 for none.
     smooth_outputs : tuple of str
@@ -76,11 +79,12 @@ class Hypothesis:
     effects: tuple[Effect, ...] = ()
     effect_priors: tuple[Priors, ...] = ()
     shift: float = 0.0
+    shift_form: tuple[str, ...] = ()
     smooth: float = 0.0
     smooth_outputs: tuple[str, ...] = ()
     smooth_over: SmoothOver = "all"
     smooth_decay: float = 4.0
-    onset_over: SmoothOver | None = None
+    onset_over: OnsetOver | None = None
     share: float = 1.0
 
 
@@ -185,6 +189,11 @@ class Forward:
         mid, half = 0.5 * (reference.max() + reference.min()), 0.5 * np.ptp(reference)
         return np.clip((values - mid) / half, -1.5, 1.5)
 
+    def _pressure(self, view: View) -> Array | None:
+        """Inflation pressure, or else that on the ground, scaled to -1..1."""
+        found = self._scaled(view, "inflation_pressure_psi")
+        return self._scaled(view, "average_ground_pressure_kpa") if found is None else found
+
     def _form(self, view: View) -> Array:
         same = view.conditions is self.data.view.conditions
         return self._field_form if same else self._form_basis(view)
@@ -201,13 +210,20 @@ class Forward:
         """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n)."""
         u = self.onset_covariate(view, output)
         beyond = (u - threshold[:, None]) / _ONSET_WIDTH
-        return expit(beyond), _ONSET_WIDTH * np.logaddexp(0.0, beyond)
+        step = expit(beyond)
+        if self.hypothesis.onset_over == "low_pressure":
+            level = self._level(view, output)
+            return step, step * level
+        return step, _ONSET_WIDTH * np.logaddexp(0.0, beyond)
 
     def onset_covariate(self, view: View, output: str) -> Array:
         """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
         over = self.hypothesis.onset_over
         if over in ("level", "sinkage"):
             u = self._level(view, output if over == "level" else RUT)
+        elif over == "low_pressure":
+            u = self._pressure(view)
+            u = None if u is None else -u
         else:
             u = self._scaled(view, "slip_ratio" if over == "slip" else "run_order")
         if u is None:
@@ -221,12 +237,11 @@ class Forward:
     def _form_basis(self, view: View) -> Array:
         """Basis of the form error, shape (n, m)."""
         wanted = {kind for e in self.hypothesis.effects for kind in e.form}
+        wanted |= set(self.hypothesis.shift_form)
         n = view.slip().size
         basis: list[Array] = []
         slip = self._scaled(view, "slip_ratio")
-        pressure = self._scaled(view, "inflation_pressure_psi")
-        if pressure is None:
-            pressure = self._scaled(view, "average_ground_pressure_kpa")
+        pressure = self._pressure(view)
         if "size" in wanted:
             basis.append(np.ones(n))
         if "slip" in wanted and slip is not None:
@@ -268,9 +283,7 @@ class Forward:
 
     def _condition_terms(self, view: View, *, everything: bool) -> list[tuple[Array, float]]:
         slip = self._scaled(view, "slip_ratio")
-        pressure = self._scaled(view, "inflation_pressure_psi")
-        if pressure is None:
-            pressure = self._scaled(view, "average_ground_pressure_kpa")
+        pressure = self._pressure(view)
         slips = self._cosines(slip, 10, 0.7)
         terms = list(slips)
         if everything:
@@ -374,6 +387,8 @@ class Forward:
             theta = self.theta(psi, o.name, field=True)
             conditions = o.problem.bound.model.select(view.conditions)
             plain[o.name] = self._predict(o, theta, psi, conditions)
+        if self.hypothesis.shift_form:
+            plain = self._with_form(psi, view, self.simulator(psi, view), plain)
         if self.hypothesis.effects:
             plain = self._with_effects(psi, view, plain)
         if self.smooth_slices:
@@ -393,7 +408,6 @@ class Forward:
             p.to_natural(psi[:, s])
             for p, s in zip(self.hypothesis.effect_priors, self.phi_slices, strict=True)
         ]
-        form = self._form(view)
         changed = {}
         for name, o in outputs.items():
             original: dict[str, Array] = o.problem.bound.model.select(view.conditions)
@@ -406,11 +420,21 @@ class Forward:
                 location = self._predict(o, theta, psi, conditions)
             for effect, phi in zip(self.hypothesis.effects, phis, strict=True):
                 location = effect.on_output(phi, name, location, view)
-            if form.shape[1]:
-                factor = 1.0 + psi[:, self.form_slices[name]] @ form.T
-                location = plain[name] + (location - plain[name]) * factor
             changed[name] = location
-        return changed
+        return self._with_form(psi, view, plain, changed)
+
+    def _with_form(
+        self, psi: Array, view: View, plain: dict[str, Array], changed: dict[str, Array]
+    ) -> dict[str, Array]:
+        """Let a change of the outputs depart from what its formula says of it."""
+        form = self._form(view)
+        if not form.shape[1]:
+            return changed
+        return {
+            name: plain[name]
+            + (changed[name] - plain[name]) * (1.0 + psi[:, self.form_slices[name]] @ form.T)
+            for name in plain
+        }
 
 
 def _same(values: Array) -> Array:
@@ -441,11 +465,13 @@ def _misfit_ranges(o: OutputData) -> tuple[tuple[str, float, float], ...]:
 def _shift_map(names: tuple[str, ...]) -> tuple[Array, list[float]]:
     """Map shift coordinates to shifts of parameters, and the relative sds of the coordinates.
 
-    Another soil or tyre changes the traction curve at all pressures much alike: the values at the
-    two end pressures share one shift, and differ, as the bends do, by less.
+    Another soil changes the traction curve at all pressures, and the exponent of sinkage at all
+    slips, much alike: the values at the two end pressures share one shift, and differ by less, as
+    the bends between them and the exponent's growth with slip (n1) do.
     """
     matrix = np.eye(len(names))
-    relative = [SHIFT_DIFFERENCE if name.endswith("_bend") else 1.0 for name in names]
+    varies = [name.endswith("_bend") or name == "n1" for name in names]
+    relative = [SHIFT_DIFFERENCE if v else 1.0 for v in varies]
     for i, name in enumerate(names):
         if name.endswith("_lo") and f"{name[:-3]}_hi" in names:
             j = names.index(f"{name[:-3]}_hi")

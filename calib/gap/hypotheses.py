@@ -9,8 +9,8 @@ import numpy as np
 
 from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.base import DRAWBAR, RUT
-from calib.gap.forward import Hypothesis, SmoothOver
+from calib.gap.effects.base import DENSITY, DRAWBAR, RUT
+from calib.gap.forward import Hypothesis, OnsetOver, SmoothOver
 from calib.prior_files import default_prior_path, read_priors
 from calib.priors import Priors
 
@@ -34,7 +34,6 @@ LN_PRIOR: Mapping[str, float] = {k: float(np.log(v)) for k, v in PRIOR.items()}
 SHIFTS = (0.1, 0.25, 0.6)
 # Size (noise sds) and number of half waves of a free discrepancy.
 SMOOTHS = ((1.5, 4.0), (5.0, 4.0))
-VERY_SMOOTH = (3.0, 1.0)
 # Size (noise sds) of a discrepancy that sets in beyond a threshold.
 ONSET = 4.0
 # Part of `unknown` that comes on top of a listed effect instead of alone.
@@ -43,7 +42,7 @@ REMAINDER = 0.2
 
 # One output that changes beyond some slip or run is what listed effects are: post-peak softening,
 # slip sinkage, rebound and drift may set in anywhere. Nobody could tell the unlisted from them.
-_LISTED_ONSETS: tuple[tuple[SmoothOver, tuple[str, ...]], ...] = (
+_LISTED_ONSETS: tuple[tuple[OnsetOver, tuple[str, ...]], ...] = (
     ("slip", (DRAWBAR,)), ("slip", (RUT,)), ("order", (DRAWBAR,)),
 )  # fmt: skip
 
@@ -90,12 +89,14 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
     smooth = [
         Hypothesis("unknown", smooth=size, smooth_outputs=t, smooth_over=over, smooth_decay=decay)
         for over, t in [*choices, *(("all", t) for t in touched)]
-        # Over slip at every pressure, what is very smooth is a parameter shift.
-        for size, decay in (SMOOTHS if over in ("slip", "all") else (*SMOOTHS, VERY_SMOOTH))
+        for size, decay in SMOOTHS
     ]
+    onsets: list[tuple[OnsetOver, tuple[str, ...]]] = [*choices]
+    if np.ptp(recorded.get("inflation_pressure_psi", np.zeros(1))) > 0:
+        onsets += [("low_pressure", t) for t in touched if DENSITY not in t]
     sudden = [
         Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over=over)
-        for over, t in choices
+        for over, t in onsets
         if (over, t) not in _LISTED_ONSETS
     ]
     share = (1.0 - REMAINDER) / 2.0
