@@ -27,7 +27,7 @@ from calib.models.base import Array
 from calib.priors import Prior, Priors
 from calib.sampling.mode import prior_widths
 
-__all__ = ["FORM_ERROR", "Forward", "Hypothesis", "SmoothOver"]
+__all__ = ["FORM_ERROR", "Forward", "Hypothesis", "OnsetOver", "SmoothOver"]
 
 type SmoothOver = Literal["slip", "level", "sinkage", "order", "all"]
 type OnsetOver = Literal["slip", "level", "sinkage", "order", "low_pressure"]
@@ -56,8 +56,6 @@ class Hypothesis:
     effect_priors : tuple of Priors
     shift : float
         Prior sd of parameter shifts in units of the parameters' own prior sds; 0 for none.
-    shift_form : tuple of {"slip", "pressure"}
-        Along what the change by the shift may depart from the simulator's own; see `Effect.form`.
     smooth : float
         Prior sd of a free discrepancy, in units of the noise; 0 for none.
     smooth_outputs : tuple of str
@@ -68,9 +66,10 @@ class Hypothesis:
         (as weather or another stretch of ground would), or every condition.
     smooth_decay : float
         Number of half waves from which the discrepancy's coefficients fall off.
-    onset_over : {"slip", "level", "sinkage", "order"}, optional
+    onset_over : {"slip", "level", "sinkage", "order", "low_pressure"}, optional
         Instead of smooth, the discrepancy may set in beyond a threshold of one of these: a step
-        and a change of slope there.
+        and a change of slope there. Below a threshold of inflation pressure, where a limp tyre may
+        creep on its rim or buckle: a step, and a part of the output's level.
     share : float
         Part of the prior probability of its name.
     """
@@ -79,7 +78,6 @@ class Hypothesis:
     effects: tuple[Effect, ...] = ()
     effect_priors: tuple[Priors, ...] = ()
     shift: float = 0.0
-    shift_form: tuple[str, ...] = ()
     smooth: float = 0.0
     smooth_outputs: tuple[str, ...] = ()
     smooth_over: SmoothOver = "all"
@@ -207,27 +205,30 @@ class Forward:
         return amplitudes[:, :1] * step + amplitudes[:, 1:2] * bend
 
     def onset(self, view: View, output: str, threshold: Array) -> tuple[Array, Array]:
-        """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n)."""
+        """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n).
+
+        Below a pressure it is a step and a part of the output's level instead.
+        """
         u = self.onset_covariate(view, output)
         beyond = (u - threshold[:, None]) / _ONSET_WIDTH
         step = expit(beyond)
         if self.hypothesis.onset_over == "low_pressure":
-            level = self._level(view, output)
-            return step, step * level
+            # A limp tyre may lose a part of the pull, and more of it the more it pulls.
+            return step, step * self._known(self._level(view, output))
         return step, _ONSET_WIDTH * np.logaddexp(0.0, beyond)
 
     def onset_covariate(self, view: View, output: str) -> Array:
         """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
         over = self.hypothesis.onset_over
+        if over == "low_pressure":
+            return -self._known(self._pressure(view))
         if over in ("level", "sinkage"):
-            u = self._level(view, output if over == "level" else RUT)
-        elif over == "low_pressure":
-            u = self._pressure(view)
-            u = None if u is None else -u
-        else:
-            u = self._scaled(view, "slip_ratio" if over == "slip" else "run_order")
+            return self._known(self._level(view, output if over == "level" else RUT))
+        return self._known(self._scaled(view, "slip_ratio" if over == "slip" else "run_order"))
+
+    def _known(self, u: Array | None) -> Array:
         if u is None:
-            raise ValueError(f"nothing to set in over: {over}")
+            raise ValueError(f"nothing to set in over: {self.hypothesis.onset_over}")
         return u
 
     def _smooth(self, view: View, output: str) -> Array:
@@ -237,7 +238,6 @@ class Forward:
     def _form_basis(self, view: View) -> Array:
         """Basis of the form error, shape (n, m)."""
         wanted = {kind for e in self.hypothesis.effects for kind in e.form}
-        wanted |= set(self.hypothesis.shift_form)
         n = view.slip().size
         basis: list[Array] = []
         slip = self._scaled(view, "slip_ratio")
@@ -387,8 +387,6 @@ class Forward:
             theta = self.theta(psi, o.name, field=True)
             conditions = o.problem.bound.model.select(view.conditions)
             plain[o.name] = self._predict(o, theta, psi, conditions)
-        if self.hypothesis.shift_form:
-            plain = self._with_form(psi, view, self.simulator(psi, view), plain)
         if self.hypothesis.effects:
             plain = self._with_effects(psi, view, plain)
         if self.smooth_slices:
@@ -408,6 +406,7 @@ class Forward:
             p.to_natural(psi[:, s])
             for p, s in zip(self.hypothesis.effect_priors, self.phi_slices, strict=True)
         ]
+        form = self._form(view)
         changed = {}
         for name, o in outputs.items():
             original: dict[str, Array] = o.problem.bound.model.select(view.conditions)
@@ -420,21 +419,11 @@ class Forward:
                 location = self._predict(o, theta, psi, conditions)
             for effect, phi in zip(self.hypothesis.effects, phis, strict=True):
                 location = effect.on_output(phi, name, location, view)
+            if form.shape[1]:
+                factor = 1.0 + psi[:, self.form_slices[name]] @ form.T
+                location = plain[name] + (location - plain[name]) * factor
             changed[name] = location
-        return self._with_form(psi, view, plain, changed)
-
-    def _with_form(
-        self, psi: Array, view: View, plain: dict[str, Array], changed: dict[str, Array]
-    ) -> dict[str, Array]:
-        """Let a change of the outputs depart from what its formula says of it."""
-        form = self._form(view)
-        if not form.shape[1]:
-            return changed
-        return {
-            name: plain[name]
-            + (changed[name] - plain[name]) * (1.0 + psi[:, self.form_slices[name]] @ form.T)
-            for name in plain
-        }
+        return changed
 
 
 def _same(values: Array) -> Array:
