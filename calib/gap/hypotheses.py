@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.base import DENSITY, DRAWBAR, RUT
-from calib.gap.forward import Hypothesis, OnsetOver, SmoothOver
+from calib.gap.forward import Hypothesis, SmoothOver
 from calib.prior_files import default_prior_path, read_priors
 from calib.priors import Priors
 
@@ -40,9 +41,11 @@ ONSET = 4.0
 REMAINDER = 0.2
 
 
+type _Over = Literal["slip", "level", "sinkage", "order"]
+
 # One output that changes beyond some slip or run is what listed effects are: post-peak softening,
 # slip sinkage, rebound and drift may set in anywhere. Nobody could tell the unlisted from them.
-_LISTED_ONSETS: tuple[tuple[OnsetOver, tuple[str, ...]], ...] = (
+_LISTED_ONSETS: tuple[tuple[_Over, tuple[str, ...]], ...] = (
     ("slip", (DRAWBAR,)), ("slip", (RUT,)), ("order", (DRAWBAR,)),
 )  # fmt: skip
 
@@ -79,16 +82,20 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
     each = [(name,) for name in names]
     touched = each + ([names] if len(names) > 1 else [])
     recorded = data.view.conditions
-    choices: list[tuple[SmoothOver, tuple[str, ...]]] = [("level", t) for t in each]
+    choices: list[tuple[_Over, tuple[str, ...]]] = [("level", t) for t in each]
     if "slip_ratio" in recorded:
         choices += [("slip", t) for t in touched]
     if RUT in names:
         choices += [("sinkage", t) for t in touched if t != (RUT,)]
     if "run_order" in recorded and np.ptp(recorded["run_order"]) > 0:
         choices += [("order", t) for t in touched]
+    everywhere: list[tuple[SmoothOver, tuple[str, ...]]] = [
+        *choices,
+        *(("all", t) for t in touched),
+    ]
     smooth = [
         Hypothesis("unknown", smooth=size, smooth_outputs=t, smooth_over=over)
-        for over, t in [*choices, *(("all", t) for t in touched)]
+        for over, t in everywhere
         for size in SMOOTHS
     ]
     sudden = [

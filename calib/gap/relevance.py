@@ -93,12 +93,14 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
     columns = []
     for other in without:
         squares = {
-            o.name: np.square((full[o.name] - other[o.name])[:, o.rows] / noise[o.name].sd(slip[o.rows]))
+            o.name: np.square(
+                (full[o.name] - other[o.name])[:, o.rows] / noise[o.name].sd(slip[o.rows])
+            )
             for o in data.outputs
         }
         if joint:
-            in_each = [squares[name].mean(axis=1) for name in hypothesis.smooth_outputs]
-            columns.append(np.sqrt(np.min(in_each, axis=0)))
+            each = [squares[name].mean(axis=1) for name in hypothesis.smooth_outputs]
+            columns.append(np.sqrt(np.min(each, axis=0)))
         else:
             columns.append(np.sqrt(np.concatenate(list(squares.values()), axis=1).mean(axis=1)))
     return np.stack(columns, axis=1)

@@ -130,7 +130,7 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
             "slip": ("slip_ratio", "a slip of"),
             "order": ("run_order", "run"),
             "low_pressure": ("inflation_pressure_psi", "an inflation pressure of"),
-        }[h.onset_over]
+        }[h.onset_over or ""]
         shown = axis_name(column)
         values, unit = shown.scale(view.conditions[column]), unit_after(shown)
     order = np.argsort(u)
