@@ -144,7 +144,7 @@ class Mixture:
         apart = 2.0 * (whitened - (whiten @ centre).reshape(m, d, 1))
         far = near + 2.0 * (apart.swapaxes(1, 2) @ z)[:, 0] + np.square(apart).sum(axis=1)
         parts = np.concatenate([self.log_parts(near), self.log_parts(np.maximum(far, 0.0))])
-        return log_sum(parts) - np.log(2.0)
+        return np.asarray(log_sum(parts) - np.log(2.0))
 
 
 def log_sum(parts: Array) -> Array:

@@ -50,7 +50,7 @@ class SamplerSettings:
     ensembles: int = 4
     walkers: int | None = None
     steps: int = 96
-    max_steps: int = 6_144
+    max_steps: int = 6144
     keep: int = 4096
     ahead: int = 16
     gate: Gate = field(default_factory=Gate)
