@@ -79,9 +79,10 @@ class Ensemble:
         """Number of walkers."""
         return int(self.state.coords.shape[0])
 
-    def drawn(self, steps: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Draws of some steps of the stretch, (walkers, n, d), and log densities (walkers, n)."""
-        t, log_prob = self.sampler.get_chain()[steps], self.sampler.get_log_prob()[steps]
+    def drawn(self, steps: NDArray[np.intp], who: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Draws of some walkers at some steps of the stretch, (m, n, d), log densities (m, n)."""
+        which = np.ix_(steps, who)
+        t, log_prob = self.sampler.get_chain()[which], self.sampler.get_log_prob()[which]
         return t.transpose(1, 0, 2), log_prob.T
 
     def tau(self, target: int) -> Array:

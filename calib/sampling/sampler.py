@@ -40,8 +40,8 @@ class SamplerSettings:
     max_steps : int
         Where doubling stops; four times as far where the proposal is poor, walkers being fewer.
     keep : int
-        Draws of each ensemble that are stored, thinned evenly from the kept steps; at least
-        eight steps.
+        About so many draws of each ensemble are stored: those of evenly picked walkers at 32 or
+        more evenly picked steps.
     ahead : int
         Steps whose independent proposals are evaluated in one batch.
     gate : Gate
@@ -88,6 +88,8 @@ class Draws:
     evaluations : int
         Parameter vectors whose density was evaluated, all stages included.
     seconds : float
+    walkers : int
+        That were run in each ensemble.
     """
 
     t: Array
@@ -99,6 +101,7 @@ class Draws:
     acceptance: float
     evaluations: int
     seconds: float
+    walkers: int
 
     @property
     def flat(self) -> Array:
@@ -263,11 +266,12 @@ def sample_density(
         acceptance=float(np.mean([e.acceptance for e in ensembles])),
         evaluations=count.evaluations,
         seconds=time.perf_counter() - began,
+        walkers=walkers,
     )
 
 
 def _drawn(ensembles: list[Ensemble], steps: int, draws: int) -> tuple[Array, Array]:
-    """About so many draws of each ensemble, at least eight steps, evenly from its last ones.
+    """About so many draws of each ensemble, of evenly picked walkers and among its last steps.
 
     Returns
     -------
@@ -275,14 +279,18 @@ def _drawn(ensembles: list[Ensemble], steps: int, draws: int) -> tuple[Array, Ar
     ndarray, shape (ensembles, walkers, kept)
         Log densities.
     """
-    kept = min(steps, max(_LEAST_STEPS, draws // ensembles[0].walkers))
+    walkers = ensembles[0].walkers
+    kept = min(steps, max(_LEAST_STEPS, draws // walkers))
+    few = min(walkers, max(1, draws // kept))
     picked = np.linspace(-steps, -1, kept).round().astype(np.intp)
-    chains, log_probs = zip(*(e.drawn(picked) for e in ensembles), strict=True)
+    who = np.linspace(0, walkers - 1, few).round().astype(np.intp)
+    chains, log_probs = zip(*(e.drawn(picked, who) for e in ensembles), strict=True)
     return np.stack(chains), np.stack(log_probs)
 
 
-# Draws of each ensemble that the gate looks at, and steps: effective sizes take four in each half.
-_JUDGED, _LEAST_STEPS = 4096, 8
+# Draws of each ensemble that the gate looks at, and of how many steps at least: of few, effective
+# sizes come out too large (by a tenth of 32).
+_JUDGED, _LEAST_STEPS = 4096, 32
 # One step in so many is run before those that are kept.
 _DISCARDED = 12
 # A region of at least this part of the draws must have been proposed at least so often.

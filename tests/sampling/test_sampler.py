@@ -229,7 +229,8 @@ def test_a_run_extends_itself_until_the_gate_passes() -> None:
     draws = run(model.log_prob_known, np.zeros(3), np.eye(3), settings=short)
     assert draws.report.passed
     assert draws.report.steps > 10
-    assert draws.t.shape == (4, 384, min(4096 // 384, draws.report.steps), 3)
+    assert draws.t.shape == (4, 128, min(32, draws.report.steps), 3)
+    assert draws.walkers == 384
 
 
 @pytest.mark.parametrize(("steps", "most", "done"), [(10, 39, 20), (200, 30, 30)])
