@@ -312,7 +312,7 @@ def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:
         report=report,
         mode=np.array(meta["mode"]),
         # Earlier run folders had all walkers stored.
-        walkers=int(meta.get("walkers", t.shape[1])),
+        walkers=meta["walkers"] if "walkers" in meta else t.shape[1],
         **{k: meta[k] for k in known},
     )
 
