@@ -29,7 +29,7 @@ _HOW = """## How it was measured
   draws of our posterior and searches for nothing. Effective sample sizes are ArviZ's, smallest over
   the parameters, of all draws that were kept, with walkers as chains. calib stores 16,384 draws of
   a posterior unless `SamplerSettings.keep` says more, and they are worth no more than that; here
-  it keeps all. "Default" is 4 ensembles of 384 walkers and 96 steps, and nutpie's 4 chains of
+  it keeps all. "Default" is 4 ensembles of 256 walkers and 80 steps, and nutpie's 4 chains of
   1,000 draws after its tuning; "long" is 1,024 walkers and 320 steps, and 4 chains of 10,000 draws:
   what a sampler does once what comes first is of little account.
 - **Bulk and tail.** Our draws come in opposite pairs, whose errors of a mean cancel: bulk ESS,
@@ -61,7 +61,7 @@ Sampler, by bulk ESS per second of the joint drawbar pull on one core:
   and a step between a pair's points), one mixture with its broad component in straightened
   coordinates for two densities, scales of the straightening map that grow with every coordinate
   and not with the noise alone (a point's opposite is accepted with 0.85 for 0.79, of density 0.70
-  for 0.61), 384 walkers and 96 steps for 128 and 160 (emcee's own work on a step is that of 100
+  for 0.61), 256 walkers and 80 steps for 128 and 160 (emcee's own work on a step is that of 100
   proposals). {before}
 - Kept, before: proposals' densities worked out with the draws; expectation maximisation in two
   matrix products; a random walk in straightened coordinates in the place of differential

@@ -33,12 +33,12 @@ class SamplerSettings:
     ensembles : int
         Independently seeded ensembles.
     walkers : int, optional
-        In each ensemble; by default 384, but fewer and longer chains where the proposal is poor
+        In each ensemble; by default 256, but fewer and longer chains where the proposal is poor
         (128) or data are long (20), and at least twice the dimension plus two.
     steps : int
         Kept steps of the first attempt; doubled until the gate passes.
     max_steps : int
-        Where doubling stops; four times as far where the proposal is poor, walkers being fewer.
+        Where doubling stops; twice as far where the proposal is poor, walkers being fewer.
     keep : int
         About so many draws of each ensemble are stored: those of evenly picked walkers at 32 or
         more evenly picked steps.
@@ -49,15 +49,15 @@ class SamplerSettings:
 
     ensembles: int = 4
     walkers: int | None = None
-    steps: int = 96
-    max_steps: int = 6144
+    steps: int = 80
+    max_steps: int = 10_240
     keep: int = 4096
     ahead: int = 16
     gate: Gate = field(default_factory=Gate)
 
     def n_walkers(self, n_dim: int) -> int:
         """Number of walkers for a dimension."""
-        return self.walkers or max(384, 2 * (n_dim + 1))
+        return self.walkers or max(256, 2 * (n_dim + 1))
 
     def longer(self, walkers: int, n_dim: int, times: int) -> SamplerSettings:
         """So many walkers and so many times the steps, unless walkers were asked for."""
@@ -230,7 +230,7 @@ def sample_density(
     proposal, found = adapt(count, first, rng)
     if found.efficiency <= POOR:
         # Local moves do the work, along the steps.
-        settings = settings.longer(128, proposal.n_dim, 4)
+        settings = settings.longer(128, proposal.n_dim, 2)
     walkers = settings.n_walkers(proposal.n_dim)
     ensembles = [
         Ensemble(count, proposal, seed, walkers=walkers, ahead=settings.ahead) for seed in seeds[1:]
