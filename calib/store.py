@@ -131,6 +131,7 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         "efficiency": calibration.draws.efficiency,
         "acceptance": calibration.draws.acceptance,
         "evaluations": calibration.draws.evaluations,
+        "walkers": calibration.draws.walkers,
         "settings": asdict(calibration.settings),
         "estimates": describe_estimates(calibration.estimates),
         "data_source": problem.table.source,
@@ -304,10 +305,16 @@ def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:
         names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
         reasons=tuple(gate["reasons"]), **figures,
     )  # fmt: skip
+    known = ("log_evidence", "efficiency", "acceptance", "evaluations", "seconds")
     return Draws(
-        t, log_prob, report, np.array(meta["mode"]),
-        *(meta[k] for k in ("log_evidence", "efficiency", "acceptance", "evaluations", "seconds")),
-    )  # fmt: skip
+        t=t,
+        log_prob=log_prob,
+        report=report,
+        mode=np.array(meta["mode"]),
+        # Earlier run folders had all walkers stored.
+        walkers=meta["walkers"] if "walkers" in meta else t.shape[1],
+        **{k: meta[k] for k in known},
+    )
 
 
 def _read_meta(folder: Path) -> dict[str, Any]:

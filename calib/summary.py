@@ -195,7 +195,7 @@ def _sampling(calibration: Calibration) -> dict[str, Any]:
             "smallest_steps_over_tau": float((r.steps / r.tau).min()),
         },
         "ensembles": d.t.shape[0],
-        "walkers": d.t.shape[1],
+        "walkers": d.walkers,
         "steps": r.steps,
         "tau": float(max(r.tau)),
         "acceptance": d.acceptance,

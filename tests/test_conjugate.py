@@ -25,7 +25,7 @@ from calib.prediction import predict
 from calib.problem import Problem
 from calib.sampling.adapt import Guess, adapt
 from calib.sampling.mode import find_modes
-from calib.sampling.moves import IndependenceMove
+from calib.sampling.moves import PairMove
 from calib.validate import leave_one_out, validate_held_out
 
 SIGMAS = 5.0
@@ -124,12 +124,12 @@ def proposal(problem: Problem):
 
 
 def move(name: str, proposal) -> emcee.moves.Move:
-    if name == "independence":
-        return IndependenceMove(proposal, np.random.default_rng(3))
+    if name == "pairs":
+        return PairMove(proposal, np.random.default_rng(3))
     return emcee.moves.DEMove()
 
 
-@pytest.mark.parametrize("name", ["independence", "de"])
+@pytest.mark.parametrize("name", ["pairs", "de"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # numpy 2 and emcee's own moves
 def test_each_move_alone(name: str, problem: Problem, exact: Exact, proposal) -> None:
     """Each leaves the posterior as it is, without the others' help."""

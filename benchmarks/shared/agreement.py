@@ -35,7 +35,6 @@ def z_scores(a: Array, b: Array) -> dict[str, Array]:
 def _z(a: Array, b: Array) -> Array:
     difference, variance = 0.0, 0.0
     for x, sign in ((a, 1.0), (b, -1.0)):
-        n = x.shape[0] * x.shape[1]
         difference = difference + sign * x.mean(axis=(0, 1))
-        variance = variance + x.var(axis=(0, 1)) / np.minimum(ess(x, "mean"), n)
+        variance = variance + x.var(axis=(0, 1)) / ess(x, "mean")
     return np.asarray(difference / np.sqrt(variance))

@@ -137,6 +137,6 @@ def _caption(result: OutputResult) -> str:
         f"{draws.t.shape[0]} independently seeded ensembles {verdict}: the largest R-hat is "
         f"{r.rhat[worst]:.3f} ({plain(r.names[worst])}), the smallest bulk ESS "
         f"{r.ess_bulk[poorest]:.0f} ({plain(r.names[poorest])}), over {r.steps} steps of "
-        f"{draws.t.shape[1]} walkers, {short(float((r.steps / r.tau).min()))} autocorrelation "
+        f"{draws.walkers} walkers, {short(float((r.steps / r.tau).min()))} autocorrelation "
         f"times or more."
     )

@@ -84,11 +84,11 @@ def sampling_facts(result: OutputResult) -> list[list[str]]:
     """Label and value of everything that is known of the sampling."""
     d = result.calibration.draws
     r = d.report
-    ensembles, walkers, stored, _ = d.t.shape
+    ensembles, few, stored, _ = d.t.shape
     facts: Mapping[str, str] = {
         "Convergence gate": "passed" if r.passed else f"NOT PASSED: {'; '.join(r.reasons)}",
         f"Ensembles {TIMES} walkers {TIMES} steps": (
-            f"{ensembles} {TIMES} {walkers} {TIMES} {r.steps} ({stored} stored)"
+            f"{ensembles} {TIMES} {d.walkers} {TIMES} {r.steps} ({few} {TIMES} {stored} stored)"
         ),
         "Largest R-hat (at most 1.01)": f"{np.max(r.rhat):.4f}",
         "Smallest ESS, bulk and tail (at least 400)": (

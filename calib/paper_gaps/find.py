@@ -20,6 +20,7 @@ from calib.threads import one_thread
 __all__ = ["FoundGap", "Unfitted", "find_gaps", "simulator_sd", "unfitted_errors"]
 
 _N_DRAWS = 20_000
+_NEGLIGIBLE = 1e-9
 # Fewer effective draws do not give an sd to 5 %.
 _LEAST_ESS = 400.0
 
@@ -138,7 +139,8 @@ def simulator_sd(found: Diagnosis) -> Array:
     drawn, log_q = proposal.draw(rng, _N_DRAWS)
     log_weight = log_prob(drawn) - log_q
     weight = np.exp(log_weight - logsumexp(log_weight))
-    inside = weight > 0.0
+    # What hardly weighs may lie so far out that the model's value overflows.
+    inside = weight > _NEGLIGIBLE / _N_DRAWS
     conditions = o.problem.bound.model.select(found.data.view.conditions)
     theta = o.problem.theta(drawn[inside])[:, :-1]
     predicted = o.problem.bound.predict(theta, conditions)[:, o.rows]

@@ -70,10 +70,11 @@ def _everything(manifest: Mapping[str, Any], outputs: Sequence[Output]) -> list[
         *sentences,
         f"Posteriors were sampled with emcee {v['emcee']} [@ForemanMackey_2013] by "
         f"{s['ensembles']} independently seeded ensembles, in which an independence move proposes "
-        "from a mixture of Student-t distributions in straightened coordinates, fitted to the "
-        "posterior by adaptive importance sampling [@Cappe_2008] from every mode that was found, "
-        "beside a random walk in the same coordinates or, had the mixture resembled the posterior "
-        "little, differential-evolution moves [@terBraak_2006]; "
+        "pairs of opposite (antithetic) points from a mixture of Student-t distributions in "
+        "straightened coordinates, fitted to the posterior by adaptive importance sampling "
+        "[@Cappe_2008] from every mode that was found, beside a random walk in the same "
+        "coordinates or, had the mixture resembled the posterior little, differential-evolution "
+        "moves [@terBraak_2006]; "
         f"proposals of {s['ahead']} steps at a time were evaluated in one batch.",
         f"Each ensemble ran for {s['steps']} steps, doubled up to at most {s['max_steps']} until "
         "every sampled parameter passed a gate: rank-normalised split R-hat [@Vehtari_2021] of "

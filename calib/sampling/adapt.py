@@ -17,7 +17,8 @@ from scipy.special import logsumexp
 from calib.models.base import Array
 from calib.sampling.expectation import moments
 from calib.sampling.mixture import Mixture, StudentT, log_sum
-from calib.sampling.proposal import AnyProposal, fit_proposal
+from calib.sampling.proposal import Proposal, fit_proposal
+from calib.sampling.straighten import Straightener
 
 __all__ = ["Assessment", "Guess", "adapt", "refit", "tempered_moments"]
 
@@ -56,7 +57,7 @@ class Assessment:
 
 def adapt(
     log_prob: LogProb, guesses: Sequence[Guess], rng: np.random.Generator
-) -> tuple[AnyProposal, Assessment]:
+) -> tuple[Proposal, Assessment]:
     """Fit a proposal to a density by adaptive importance sampling.
 
     Every round draws from the proposal that all rounds before it made, and ends the work if it
@@ -76,7 +77,8 @@ def adapt(
     Assessment
         By the last round's draws.
     """
-    proposal: AnyProposal = Mixture(
+    d = guesses[0].mean.size
+    first = Mixture(
         np.array([share / len(guesses) for _ in guesses for share, _, _ in _FIRST]),
         tuple(
             StudentT(guess.mean, scale * guess.cholesky, dof)
@@ -84,7 +86,7 @@ def adapt(
             for _, scale, dof in _FIRST
         ),
     )
-    d = proposal.n_dim
+    proposal = Proposal(Straightener.identity(d), first)
     memory = _Memory()
     for size in _ROUNDS:
         draws, log_q = proposal.draw(rng, size * (d + 5))
@@ -101,11 +103,11 @@ def adapt(
 
 def refit(
     log_prob: LogProb,
-    old: AnyProposal,
+    old: Proposal,
     draws: Array,
     effective: float,
     rng: np.random.Generator,
-) -> tuple[AnyProposal, Assessment]:
+) -> tuple[Proposal, Assessment]:
     """Fit a proposal to draws of a chain that did not converge with the old one.
 
     Parameters
@@ -150,12 +152,12 @@ class _Memory:
     elsewhere (Cornuet et al. 2012, doi:10.1111/j.1467-9469.2011.00756.x).
     """
 
-    proposals: list[AnyProposal] = field(default_factory=list)
+    proposals: list[Proposal] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
     draws: list[Array] = field(default_factory=list)
     log_probs: list[Array] = field(default_factory=list)
 
-    def add(self, proposal: AnyProposal, draws: Array, log_prob: Array) -> None:
+    def add(self, proposal: Proposal, draws: Array, log_prob: Array) -> None:
         """Remember a round."""
         possible = np.isfinite(log_prob)
         self.proposals.append(proposal)

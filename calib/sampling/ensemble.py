@@ -1,4 +1,4 @@
-"""One emcee ensemble: our independence move beside local ones."""
+"""One emcee ensemble: our pair move beside local ones."""
 
 from __future__ import annotations
 
@@ -12,13 +12,15 @@ from numpy.typing import NDArray
 from calib.chains import autocorrelation_time
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.sampling.moves import IndependenceMove, WalkMove
-from calib.sampling.proposal import AnyProposal, Proposal
+from calib.sampling.moves import PairMove, WalkMove
+from calib.sampling.proposal import Proposal
 
 __all__ = ["POOR", "Ensemble"]
 
 # Efficiency below which the local moves do most of the work.
 POOR = 0.1
+# Efficiency above which they are there for safety only.
+GOOD = 0.5
 # Walkers whose autocorrelations are averaged, evenly picked.
 _WALKERS_OF_TAU = 64
 
@@ -29,7 +31,7 @@ class Ensemble:
     def __init__(
         self,
         log_prob: Callable[[Array], Array],
-        proposal: AnyProposal,
+        proposal: Proposal,
         seed: np.random.SeedSequence,
         *,
         walkers: int,
@@ -41,11 +43,11 @@ class Ensemble:
         self.random_state = np.random.RandomState(np.random.MT19937(seed)).get_state()
         self.state = _start(log_prob, proposal, walkers, start)
 
-    def run(self, proposal: AnyProposal, efficiency: float, steps: int) -> None:
+    def run(self, proposal: Proposal, efficiency: float, steps: int) -> None:
         """Run on with a proposal, forgetting the steps before."""
         # A good proposal does most of the work; a poor one leaves it to the local moves.
-        independent = 0.9 if efficiency > POOR else 0.3
-        if efficiency > POOR and isinstance(proposal, Proposal):
+        independent = 0.95 if efficiency > GOOD else 0.9 if efficiency > POOR else 0.3
+        if efficiency > POOR:
             local = [(WalkMove(proposal, self.rng), 1.0)]
         else:
             # Not emcee's snooker move: with half the exponent of ter Braak & Vrugt (2008) in its
@@ -56,7 +58,7 @@ class Ensemble:
             self.log_prob_fn,
             vectorize=True,
             moves=[
-                (IndependenceMove(proposal, self.rng, self.ahead), independent),
+                (PairMove(proposal, self.rng, self.ahead), independent),
                 *((move, (1.0 - independent) * share) for move, share in local),
             ],
         )
@@ -77,9 +79,10 @@ class Ensemble:
         """Number of walkers."""
         return int(self.state.coords.shape[0])
 
-    def drawn(self, steps: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Draws of some steps of the stretch, (walkers, n, d), and log densities (walkers, n)."""
-        t, log_prob = self.sampler.get_chain()[steps], self.sampler.get_log_prob()[steps]
+    def drawn(self, steps: NDArray[np.intp], who: NDArray[np.intp]) -> tuple[Array, Array]:
+        """Draws of some walkers at some steps of the stretch, (m, n, d), log densities (m, n)."""
+        which = np.ix_(steps, who)
+        t, log_prob = self.sampler.get_chain()[which], self.sampler.get_log_prob()[which]
         return t.transpose(1, 0, 2), log_prob.T
 
     def tau(self, target: int) -> Array:
@@ -97,7 +100,7 @@ class Ensemble:
 
 def _start(
     log_prob: Callable[[Array], Array],
-    proposal: AnyProposal,
+    proposal: Proposal,
     walkers: int,
     rng: np.random.Generator,
 ) -> emcee.State:

@@ -92,10 +92,9 @@ class Mixture:
         whitened = inverses @ means[:, :, None]
         return inverses.reshape(m * d, d), whitened, constant, dof
 
-    def draw(self, rng: np.random.Generator, size: int) -> tuple[Array, Array]:
-        """Draw, and return the log density there, shapes (size, d) and (size,)."""
-        t = self.sample(rng, size)
-        return t, self.log_prob(t)
+    def mean(self) -> Array:
+        """Mean of the components' centres, shape (d,)."""
+        return np.asarray(self.weights @ np.stack([c.mean for c in self.components]))
 
     def sample(self, rng: np.random.Generator, size: int) -> Array:
         """Draw, shape (size, d)."""
@@ -108,7 +107,7 @@ class Mixture:
 
     def covariance_cholesky(self) -> Array:
         """Lower factor of the whole mixture's scale: components' scales and between their means."""
-        mean = self.weights @ np.stack([c.mean for c in self.components])
+        mean = self.mean()
         covariance = sum(
             w * (c.cholesky @ c.cholesky.T + np.outer(c.mean - mean, c.mean - mean))
             for w, c in zip(self.weights, self.components, strict=True)
@@ -120,8 +119,7 @@ class Mixture:
         whiten, centre, _, _ = self._stacked
         z = (whiten @ t.T).reshape(len(self.components), self.n_dim, -1)
         z -= centre
-        z *= z
-        return np.asarray(z.sum(axis=1))
+        return np.asarray(np.einsum("mdk,mdk->mk", z, z))
 
     def log_parts(self, squared: Array) -> Array:
         """Log of each weighted component density at squared distances, shape (m, k)."""
@@ -131,6 +129,22 @@ class Mixture:
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
         return log_sum(self.log_parts(self.squared_distances(t)))
+
+    def log_prob_symmetric(self, t: Array, centre: Array) -> Array:
+        """Log of the mean density of points t and 2 centre - t, shape (k, d) to (k,).
+
+        The second's distances follow from the first's: 2 centre - t is from a component's mean as
+        far as t is from that mean's own opposite.
+        """
+        whiten, whitened, _, _ = self._stacked
+        m, d = len(self.components), self.n_dim
+        z = (whiten @ t.T).reshape(m, d, -1)
+        z -= whitened
+        near = np.einsum("mdk,mdk->mk", z, z)
+        apart = 2.0 * (whitened - (whiten @ centre).reshape(m, d, 1))
+        far = near + 2.0 * (apart.swapaxes(1, 2) @ z)[:, 0] + np.square(apart).sum(axis=1)
+        parts = np.concatenate([self.log_parts(near), self.log_parts(np.maximum(far, 0.0))])
+        return np.asarray(log_sum(parts) - np.log(2.0))
 
 
 def log_sum(parts: Array) -> Array:

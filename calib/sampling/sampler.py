@@ -16,7 +16,7 @@ from calib.sampling.adapt import Guess, adapt, refit
 from calib.sampling.ensemble import POOR, Ensemble
 from calib.sampling.gate import Gate, GateReport, judge
 from calib.sampling.mode import Mode, find_modes
-from calib.sampling.proposal import AnyProposal
+from calib.sampling.proposal import Proposal
 from calib.threads import one_thread
 
 __all__ = ["Draws", "SamplerSettings", "sample_density", "sample_posterior"]
@@ -33,15 +33,15 @@ class SamplerSettings:
     ensembles : int
         Independently seeded ensembles.
     walkers : int, optional
-        In each ensemble; by default 128, of long data 20, but at least twice the dimension plus
-        two.
+        In each ensemble; by default 256, but fewer and longer chains where the proposal is poor
+        (128) or data are long (20), and at least twice the dimension plus two.
     steps : int
         Kept steps of the first attempt; doubled until the gate passes.
     max_steps : int
-        Where doubling stops.
+        Where doubling stops; twice as far where the proposal is poor, walkers being fewer.
     keep : int
-        Draws of each ensemble that are stored, thinned evenly from the kept steps; at least
-        four steps.
+        About so many draws of each ensemble are stored: those of evenly picked walkers at 32 or
+        more evenly picked steps.
     ahead : int
         Steps whose independent proposals are evaluated in one batch.
     gate : Gate
@@ -49,15 +49,26 @@ class SamplerSettings:
 
     ensembles: int = 4
     walkers: int | None = None
-    steps: int = 160
-    max_steps: int = 25_600
+    steps: int = 80
+    max_steps: int = 10_240
     keep: int = 4096
     ahead: int = 16
     gate: Gate = field(default_factory=Gate)
 
     def n_walkers(self, n_dim: int) -> int:
         """Number of walkers for a dimension."""
-        return self.walkers or max(128, 2 * (n_dim + 1))
+        return self.walkers or max(256, 2 * (n_dim + 1))
+
+    def longer(self, walkers: int, n_dim: int, times: int) -> SamplerSettings:
+        """So many walkers and so many times the steps, unless walkers were asked for."""
+        if self.walkers is not None:
+            return self
+        return replace(
+            self,
+            walkers=max(walkers, 2 * (n_dim + 1)),
+            steps=times * self.steps,
+            max_steps=times * self.max_steps,
+        )
 
 
 @dataclass(frozen=True)
@@ -77,6 +88,8 @@ class Draws:
     evaluations : int
         Parameter vectors whose density was evaluated, all stages included.
     seconds : float
+    walkers : int
+        That were run in each ensemble.
     """
 
     t: Array
@@ -88,6 +101,7 @@ class Draws:
     acceptance: float
     evaluations: int
     seconds: float
+    walkers: int
 
     @property
     def flat(self) -> Array:
@@ -162,10 +176,9 @@ def _modes(
 
 def _fitting(settings: SamplerSettings, problem: Problem) -> SamplerSettings:
     """Of long data fewer draws are taken: each is dear, and the posterior all but normal."""
-    if settings.walkers is not None or problem.squares.n_distinct <= _LONG:
+    if problem.squares.n_distinct <= _LONG:
         return settings
-    walkers = max(20, 2 * (problem.n_dim + 1))
-    return replace(settings, walkers=walkers, steps=min(settings.steps, 128), ahead=1)
+    return replace(settings.longer(20, problem.n_dim, 2), ahead=1)
 
 
 _LONG = 5000
@@ -215,6 +228,9 @@ def sample_density(
     began = time.perf_counter() if began is None else began
     count = log_prob if isinstance(log_prob, _Counter) else _Counter(log_prob)
     proposal, found = adapt(count, first, rng)
+    if found.efficiency <= POOR:
+        # Local moves do the work, along the steps.
+        settings = settings.longer(128, proposal.n_dim, 2)
     walkers = settings.n_walkers(proposal.n_dim)
     ensembles = [
         Ensemble(count, proposal, seed, walkers=walkers, ahead=settings.ahead) for seed in seeds[1:]
@@ -250,11 +266,12 @@ def sample_density(
         acceptance=float(np.mean([e.acceptance for e in ensembles])),
         evaluations=count.evaluations,
         seconds=time.perf_counter() - began,
+        walkers=walkers,
     )
 
 
 def _drawn(ensembles: list[Ensemble], steps: int, draws: int) -> tuple[Array, Array]:
-    """About so many draws of each ensemble, at least four steps, evenly from its last ones.
+    """About so many draws of each ensemble, of evenly picked walkers and among its last steps.
 
     Returns
     -------
@@ -262,14 +279,18 @@ def _drawn(ensembles: list[Ensemble], steps: int, draws: int) -> tuple[Array, Ar
     ndarray, shape (ensembles, walkers, kept)
         Log densities.
     """
-    kept = min(steps, max(4, draws // ensembles[0].walkers))
+    walkers = ensembles[0].walkers
+    kept = min(steps, max(_LEAST_STEPS, draws // walkers))
+    few = min(walkers, max(1, draws // kept))
     picked = np.linspace(-steps, -1, kept).round().astype(np.intp)
-    chains, log_probs = zip(*(e.drawn(picked) for e in ensembles), strict=True)
+    who = np.linspace(0, walkers - 1, few).round().astype(np.intp)
+    chains, log_probs = zip(*(e.drawn(picked, who) for e in ensembles), strict=True)
     return np.stack(chains), np.stack(log_probs)
 
 
-# Draws of each ensemble that the gate looks at.
-_JUDGED = 4096
+# Draws of each ensemble that the gate looks at, and of how many steps at least: of few, effective
+# sizes come out too large (by a tenth of 32).
+_JUDGED, _LEAST_STEPS = 4096, 32
 # One step in so many is run before those that are kept.
 _DISCARDED = 12
 # A region of at least this part of the draws must have been proposed at least so often.
@@ -277,7 +298,7 @@ _LEAST_REGION, _LEAST_PROPOSED = 0.003, 5.0
 
 
 def _refuse_neglect(
-    report: GateReport, proposal: AnyProposal, t: Array, log_prob: Array, *, steps: int
+    report: GateReport, proposal: Proposal, t: Array, log_prob: Array, *, steps: int
 ) -> GateReport:
     """Refuse draws some of which lie where the proposal would not have gone.
 

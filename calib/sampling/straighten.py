@@ -2,8 +2,8 @@
 
 Posteriors of nonlinear regressions bend, and widen with the noise scale. Each coordinate, from the
 last (the logarithm of the noise scale) to the first, is regressed on those before it, their
-squares and their products; what is left of it, divided by a scale that grows with the last
-coordinate, is its straightened value. It is the Knothe-Rosenblatt rearrangement to second order
+squares and their products; what is left of it, divided by a scale that grows with those before it,
+is its straightened value. It is the Knothe-Rosenblatt rearrangement to second order
 (Parno & Marzouk 2018, doi:10.1137/17M1134640). A mixture fitted there needs few components.
 """
 
@@ -24,6 +24,8 @@ _SATURATION = 4.0
 # Draws' worth of evidence that coordinates have no relation.
 _RIDGE = 3.0
 _NEWTON_STEPS = 8
+# Of a coordinate's own growth, the sum over those it grows with.
+_MOST_GROWTH = 0.5
 
 
 @dataclass(frozen=True)
@@ -37,14 +39,20 @@ class Straightener:
     coefficients : ndarray, shape (1 + d (d + 3)/2, d)
         Of the regression of each standardised coordinate, in the order last to first, on the
         features of those before it; zero from its own feature on.
-    rho : float
-        Growth of the logarithm of the scale with the last coordinate.
+    growth : ndarray, shape (d, d)
+        Of the logarithm of each coordinate's scale with each of those before it, in the order
+        last to first both.
     """
 
     mean: Array
     sd: Array
     coefficients: Array
-    rho: float
+    growth: Array
+
+    @classmethod
+    def identity(cls, d: int) -> Straightener:
+        """Leave d coordinates as they are."""
+        return cls(np.zeros(d), np.ones(d), np.zeros((1 + d * (d + 3) // 2, d)), np.zeros((d, d)))
 
     @classmethod
     def fit(cls, t: Array, weight: Array) -> Straightener:
@@ -70,24 +78,27 @@ class Straightener:
         features = _features(z)
         effective = 1.0 / np.square(weight).sum()
         coefficients = _regress(features, z, weight, effective)
-        rho = 0.0
+        growth = np.zeros((d, d))
         if d > 1:
             left = np.square(z - features @ coefficients)[:, 1:]
             relative = (left / np.maximum(weight @ left, 1e-300)).mean(axis=1)
-            bounded = _bounded(z[:, 0])
-            rho = _growth(relative, bounded, weight)
+            bounded = _bounded(z)
+            # With the last coordinate all scales grow alike, and often much.
+            growth[1:, 0] = rho = _common_growth(relative, bounded[:, 0], weight)
             # Where the scale is small a draw says more about the bend.
-            precise = weight * np.exp(-2.0 * rho * bounded)
+            precise = weight * np.exp(-2.0 * rho * bounded[:, 0])
             coefficients = _regress(features, z, precise / precise.sum(), effective)
-        return cls(mean, sd, coefficients, rho)
+            left = (z - features @ coefficients) * np.exp(-bounded @ growth.T)
+            growth += _own_growth(np.square(left), bounded, weight, effective)
+        return cls(mean, sd, coefficients, growth)
 
     def straighten(self, t: Array) -> tuple[Array, Array]:
         """Return v, shape (k, d), and the log of the Jacobian |dv/dt|, shape (k,)."""
         z = ((t - self.mean) / self.sd)[:, ::-1]
         v = z - _features(z) @ self.coefficients
-        log_scale = self.rho * _bounded(z[:, 0])
-        v[:, 1:] *= np.exp(-log_scale)[:, None]
-        return v, -(t.shape[1] - 1) * log_scale - np.log(self.sd).sum()
+        log_scale = _bounded(z) @ self.growth.T
+        v *= np.exp(-log_scale)
+        return v[:, ::-1], -log_scale.sum(axis=1) - np.log(self.sd).sum()
 
     def bend(self, v: Array) -> tuple[Array, Array]:
         """Return t, shape (k, d), and the log of |dv/dt| there, as `straighten` of it would."""
@@ -95,18 +106,17 @@ class Straightener:
         z, bounded = np.empty((d, k)), np.empty((d, k))
         features = np.empty((self.coefficients.shape[0], k))
         features[0] = 1.0
-        scale, log_scale = np.ones(k), np.zeros(k)
+        log_scales = np.zeros(k)
         n = 1
         for i in range(d):
-            z[i] = self.coefficients[:n, i] @ features[:n] + v[:, i] * scale
+            log_scale = self.growth[i, :i] @ bounded[:i]
+            log_scales += log_scale
+            z[i] = self.coefficients[:n, i] @ features[:n] + v[:, d - 1 - i] * np.exp(log_scale)
             bounded[i] = _bounded(z[i])
             features[n] = z[i]
             np.multiply(bounded[i], bounded[: i + 1], out=features[n + 1 : n + i + 2])
             n += i + 2
-            if i == 0:
-                log_scale = self.rho * bounded[0]
-                scale = np.exp(log_scale)
-        return z[::-1].T * self.sd + self.mean, -(d - 1) * log_scale - np.log(self.sd).sum()
+        return z[::-1].T * self.sd + self.mean, -log_scales - np.log(self.sd).sum()
 
 
 def _bounded(z: Array) -> Array:
@@ -163,7 +173,7 @@ def _solve(gram: Array, moment: Array, columns: NDArray[np.intp], effective: flo
     return np.asarray(np.linalg.solve(left, moment[columns]))
 
 
-def _growth(squared: Array, bounded: Array, weight: Array) -> float:
+def _common_growth(squared: Array, bounded: Array, weight: Array) -> float:
     """Likeliest rho where squared residuals have a mean proportional to exp(2 rho bounded)."""
     shape = bounded - weight @ bounded
     rho = 0.0
@@ -174,3 +184,25 @@ def _growth(squared: Array, bounded: Array, weight: Array) -> float:
         curvature = 2.0 * (weight * shape * shape) @ np.maximum(ratio, 0.5)
         rho = float(np.clip(rho + slope / curvature, -1.0, 1.0))
     return rho
+
+
+def _own_growth(squared: Array, bounded: Array, weight: Array, effective: float) -> Array:
+    """What the log scale of each coordinate grows by with those before it, shape (d, d).
+
+    One step of Newton's method for the likeliest growth where squared residuals have a mean
+    proportional to exp(2 growth bounded), shrunk by as much as noise alone would have made of it.
+    """
+    d = bounded.shape[1]
+    centred = bounded - weight @ bounded
+    excess = squared / np.maximum(weight @ squared, 1e-300) - 1.0
+    weighted = (centred * weight[:, None]).T
+    gram, moment, noise = weighted @ centred, weighted @ excess, weight @ np.square(excess)
+    growth = np.zeros((d, d))
+    for i in range(1, d):
+        ridge = _RIDGE / effective * np.eye(i)
+        step = np.linalg.solve(gram[:i, :i] + ridge, moment[:i, i])
+        gain = effective * float(step @ moment[:i, i])
+        share = max(0.0, 1.0 - i * float(noise[i]) / gain) if gain > 0.0 else 0.0
+        step *= 0.5 * share
+        growth[i, :i] = step / max(1.0, float(abs(step).sum()) / _MOST_GROWTH)
+    return growth

@@ -29,6 +29,9 @@ __all__ = ["on_cluster"]
 WINDOW, BYTES, BATCH = 5000, 400_000_000, 200
 # Items are sent with their tasks, on purpose: the workers have no other way to them.
 _NO_WARNING = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
+# Dask has the C library give every freed array back to the system at once, and take it again with a
+# page fault for each 4 KiB: of two workers' time a half. Ours are short-lived and keep theirs.
+_TRIM = "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_"
 # When the worker of a task dies, the task is tried so many times more among the others.
 ALLOWED_FAILURES = 1
 CONNECT_SECONDS = 10
@@ -177,7 +180,8 @@ def _local(workers: int) -> Iterator[Client]:
     Dask gives them one thread of the linear algebra each. They end with this process, however it
     ends.
     """
-    with dask.config.set({"distributed.scheduler.allowed-failures": ALLOWED_FAILURES}):
+    settings = {"distributed.scheduler.allowed-failures": ALLOWED_FAILURES, _TRIM: None}
+    with dask.config.set(settings):
         try:
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, memory_limit=1.0 / workers,

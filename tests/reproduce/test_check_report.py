@@ -123,7 +123,7 @@ def swap_figures_on_the_page_too(report: Path) -> None:
     one, other = (base64.b64encode((report / n).read_bytes()).decode() for n in (BANDS, LEARNED))
     swap_figures(report)
     page = (report / "index.html").read_text()
-    page = page.replace(one, "ONE").replace(other, one).replace("ONE", other)
+    page = page.replace(one, "<one>").replace(other, one).replace("<one>", other)
     (report / "index.html").write_text(page)
 
 
@@ -378,7 +378,7 @@ def swap_pictures_on_the_page(report: Path) -> None:
     """Each caption under the other picture; the figure files are what they were."""
     one, other = (base64.b64encode((report / n).read_bytes()).decode() for n in (BANDS, LEARNED))
     page = (report / "index.html").read_text()
-    page = page.replace(one, "ONE").replace(other, one).replace("ONE", other)
+    page = page.replace(one, "<one>").replace(other, one).replace("<one>", other)
     (report / "index.html").write_text(page)
 
 

@@ -1,134 +1,206 @@
-"""The independence move leaves the target as it is."""
+"""The move of opposite pairs leaves the target as it is."""
 
 from __future__ import annotations
 
-import warnings
+from collections.abc import Callable
 
 import emcee
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import expit
 
 from calib.chains import ess
 from calib.sampling.mixture import Mixture, StudentT
-from calib.sampling.moves import IndependenceMove
+from calib.sampling.moves import PairMove
+from calib.sampling.proposal import Proposal
+from calib.sampling.straighten import Straightener
+
+from .densities import (
+    BELOW_ZERO_OF_BIMODAL,
+    LAWS,
+    Stub,
+    assert_share,
+    at,
+    banana,
+    bimodal,
+    chain,
+    fitted,
+    funnel,
+    half,
+    log_volume,
+    normal,
+    student,
+)
+
+N = 300
 
 
-def proposal(mean: float = 0.8, scale: float = 1.7) -> Mixture:
-    """Neither centred on the target nor as wide."""
-    return Mixture(
-        np.array([0.6, 0.4]),
-        (
-            StudentT(np.array([mean]), np.array([[scale]]), 5.0),
-            StudentT(np.array([-1.0]), np.array([[0.7]]), 9.0),
-        ),
-    )
+class Dealt(np.random.Generator):
+    """Random numbers of which those that pick a point of each pair are known."""
+
+    def __init__(self, seed: int, level: np.ndarray) -> None:
+        super().__init__(np.random.PCG64(seed))
+        self.level = level
+
+    def logistic(self, *, size: int) -> np.ndarray:
+        """The logistic number of a uniform one."""
+        return np.log(self.level / (1.0 - self.level))
 
 
-def target(t: np.ndarray) -> np.ndarray:
-    return np.asarray(stats.norm.logpdf(t[:, 0], 0.0, 1.0))
+def pi_of(log_prob: Callable, proposal: Proposal, t: np.ndarray) -> np.ndarray:
+    """Log density in straightened coordinates, where pairs are opposite."""
+    return log_prob(t) - log_volume(proposal, t)
 
 
-class Stub:
-    """What emcee hands a move: the target, and uniform numbers that are known."""
-
-    def __init__(self, uniform: np.ndarray) -> None:
-        self.uniform = uniform
-        self.random = self
-        self.evaluations = 0
-
-    def rand(self, size: int) -> np.ndarray:
-        assert size == self.uniform.size
-        return self.uniform
-
-    def log_prob_fn(self, t: np.ndarray) -> np.ndarray:
-        self.evaluations += len(t)
-        return target(t)
-
-
-def at(points: np.ndarray) -> emcee.State:
-    return emcee.State(points.copy(), log_prob=target(points))
-
-
-def test_detailed_balance_of_every_pair() -> None:
-    """A move from x to y is accepted with probability a(x, y) = min(1, w(y)/w(x)), w = pi/q.
-
-    With it pi(x) q(y) a(x, y) = min(pi(x) q(y), pi(y) q(x)), the same from y to x.
+@pytest.mark.parametrize("log_prob", [banana, funnel, student, bimodal])
+def test_detailed_balance_of_every_step(log_prob: Callable) -> None:
+    """A fresh pair S' comes with density q(S'), and is accepted with probability
+    a = min(1, W(S')/W(S)), W = (pi(t) + pi(t'))/q(S): W(S) q(S) q(S') a(S, S') is symmetric. Of its
+    points, t is taken with probability pi(t)/(pi(t) + pi(t')). Where it is refused, and at every
+    second step, the walker goes over to the other point of its own with min(1, pi(t')/pi(t)).
     """
-    q = proposal()
-    points = np.linspace(-3.0, 3.0, 13)[:, None]
-    log_w = target(points) - q.log_prob(points)
+    proposal = fitted(log_prob)
+    start, _ = proposal.draw(np.random.default_rng(1), N)
+    own, _, own_q = proposal.opposite(start)
+    pairs, _, q = proposal.draw_pairs(np.random.default_rng(2), N)
+    pi = [pi_of(log_prob, proposal, t) for t in (start, own, *pairs)]
+    accept = np.exp(np.minimum(np.logaddexp(*pi[2:]) - q - np.logaddexp(*pi[:2]) + own_q, 0.0))
+    second = expit(pi[3] - pi[2])
+    flip = np.exp(np.minimum(pi[1] - pi[0], 0.0))
+    some = np.random.default_rng(7)
+    for _ in range(20):
+        u_flip, u_accept, u_second = some.random((3, N))
+        # Numbers so near a probability that rounding decides are moved away.
+        for u, p in ((u_flip, flip), (u_accept, accept), (u_second, second)):
+            u[abs(u - p) < 1e-4] = 0.5 * p[abs(u - p) < 1e-4]
+        move = PairMove(proposal, Dealt(2, u_second), ahead=1)
+        stub = Stub(log_prob, 1.0 - u_flip, 1.0 - u_accept)
+        state, moved = move.propose(stub, at(log_prob, start))
+        accepted, flipped = u_accept < accept, u_flip < flip
+        fresh = np.where((u_second < second)[:, None], pairs[1], pairs[0])
+        kept = np.where(flipped[:, None], own, start)
+        expected = np.where(accepted[:, None], fresh, kept)
+        np.testing.assert_allclose(state.coords, expected, rtol=1e-7, atol=1e-7)
+        np.testing.assert_array_equal(moved, accepted | flipped)
+        np.testing.assert_allclose(state.log_prob, log_prob(state.coords), atol=1e-12)
 
-    class Dealt(Mixture):
-        """A proposal of which the draws are known."""
-
-        def sample(self, rng, size):
-            return dealt
-
-    for j in range(13):
-        dealt = np.repeat(points[j : j + 1], 13, axis=0)
-        a = np.exp(np.minimum(0.0, log_w[j] - log_w))
-        for factor in (1.0 - 1e-9, 1.0 + 1e-9):
-            move = IndependenceMove(Dealt(q.weights, q.components), np.random.default_rng(0), 1)
-            # A uniform number of at most one: what is accepted for certain stays so.
-            level = np.minimum(a * factor, 1.0 - 1e-12)
-            state, accepted = move.propose(Stub(1.0 - level), at(points))
-            np.testing.assert_array_equal(accepted, (factor < 1.0) | (a == 1.0))
-            np.testing.assert_array_equal(state.coords, np.where(accepted[:, None], dealt, points))
-            np.testing.assert_array_equal(state.log_prob, target(state.coords))
+        before = state.coords.copy()
+        other, _, _ = proposal.opposite(before)
+        over = np.exp(
+            np.minimum(pi_of(log_prob, proposal, other) - pi_of(log_prob, proposal, before), 0.0)
+        )
+        level = some.random(N)
+        level[abs(level - over) < 1e-4] = 0.5 * over[abs(level - over) < 1e-4]
+        state, moved = move.propose(Stub(log_prob, 1.0 - level), state)
+        np.testing.assert_array_equal(moved, level < over)
+        expected = np.where(moved[:, None], other, before)
+        np.testing.assert_allclose(state.coords, expected, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(state.log_prob, log_prob(state.coords), atol=1e-12)
 
 
 def test_walkers_that_another_move_has_carried_off_are_noticed() -> None:
     uniform = np.full(8, 0.7)
-    points = np.linspace(-2.0, 2.0, 8)[:, None]
-    used, fresh = (IndependenceMove(proposal(), np.random.default_rng(5), 1) for _ in range(2))
-    state, _ = used.propose(Stub(uniform), at(points))
+    proposal = fitted(normal)
+    points, _ = proposal.draw(np.random.default_rng(1), 8)
+    used, fresh = (PairMove(proposal, np.random.default_rng(5), 1) for _ in range(2))
+    state = at(normal, points)
+    for _ in range(2):
+        state, _ = used.propose(Stub(normal, uniform), state)
     used.rng = np.random.default_rng(5)
     elsewhere = state.coords.copy()
     elsewhere[::2] += 0.3
-    after, accepted = used.propose(Stub(uniform), at(elsewhere))
-    expected, also = fresh.propose(Stub(uniform), at(elsewhere))
+    after, accepted = used.propose(Stub(normal, uniform), at(normal, elsewhere))
+    expected, also = fresh.propose(Stub(normal, uniform), at(normal, elsewhere))
     np.testing.assert_array_equal(accepted, also)
-    np.testing.assert_array_equal(after.coords, expected.coords)
+    np.testing.assert_allclose(after.coords, expected.coords, rtol=1e-9)
 
 
-def test_every_proposal_is_evaluated_once_and_used_once() -> None:
-    stub = Stub(np.full(8, 1.0 - 1e-12))  # everything is accepted
-    move = IndependenceMove(proposal(), np.random.default_rng(6), ahead=5)
-    state, seen = at(np.zeros((8, 1))), []
-    for step in range(10):
-        state, accepted = move.propose(stub, state)
-        assert accepted.all()
+def test_every_pair_is_evaluated_once_and_used_once() -> None:
+    """Of ten steps five draw pairs, two for each evaluation ahead; the start's are the first 8."""
+    stub = Stub(normal, np.full(8, 1.0 - 1e-12))  # everything is accepted
+    move = PairMove(fitted(normal), np.random.default_rng(6), ahead=4)
+    state, seen = at(normal, np.zeros((8, 2))), []
+    for step in range(12):
+        state, moved = move.propose(stub, state)
+        assert moved.all()
         seen.append(state.coords.copy())
-        assert stub.evaluations == 8 * 5 * (step // 5 + 1)
-    assert np.unique(np.concatenate(seen)).size == 80
+        assert stub.evaluations == 8 + 8 * 4 * (step // 4 + 1)
+    assert np.unique(np.concatenate(seen), axis=0).shape[0] == 96
 
 
-def run(moves: list, log_prob, walkers: int, start: np.ndarray, steps: int, seed: int = 3):
-    sampler = emcee.EnsembleSampler(walkers, 1, log_prob, vectorize=True, moves=moves)
-    sampler.random_state = np.random.RandomState(seed).get_state()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        sampler.run_mcmc(start, steps)
-    return sampler
+def pairs_alone(log_prob: Callable, ahead: int = 16) -> np.ndarray:
+    proposal = fitted(log_prob)
+    start, _ = proposal.draw(np.random.default_rng(3), 400)
+    start = start[np.isfinite(log_prob(start))][:40]
+    return chain(log_prob, [PairMove(proposal, np.random.default_rng(5), ahead)], start, 2500)
 
 
-@pytest.mark.parametrize("local", [[], [(emcee.moves.DEMove(), 0.3)]])
+@pytest.mark.parametrize(("log_prob", "function", "law"), LAWS)
 @pytest.mark.parametrize("ahead", [1, 16])
-def test_a_chain_of_the_move_has_the_targets_distribution(local: list, ahead: int) -> None:
-    move = IndependenceMove(proposal(), np.random.default_rng(2), ahead)
-    start = np.random.default_rng(3).normal(0.0, 3.0, (20, 1))
-    sampler = run([(move, 0.7), *local], target, 20, start, 2100)
-    chain = sampler.get_chain(discard=100)[..., 0].T
+def test_a_chain_of_pairs_alone(log_prob: Callable, function: Callable, law, ahead: int) -> None:
+    value = function(pairs_alone(log_prob, ahead))
     for p in (0.025, 0.25, 0.5, 0.75, 0.975):
-        below = (chain < stats.norm.ppf(p)).astype(float)
-        size = min(float(ess(below[..., None], "mean")[0]), below.size)
-        assert abs(below.mean() - p) < 5.0 * np.sqrt(p * (1.0 - p) / size)
-    assert sampler.acceptance_fraction.mean() > 0.3
+        assert_share(value < law.ppf(p), p)
 
 
-def test_a_perfect_proposal_is_always_accepted() -> None:
-    q = proposal()
-    move = IndependenceMove(q, np.random.default_rng(4))
-    sampler = run([move], q.log_prob, 10, q.sample(np.random.default_rng(1), 10), 50)
+def test_a_chain_of_pairs_alone_visits_both_modes() -> None:
+    assert_share(pairs_alone(bimodal)[..., 0] < 0.0, BELOW_ZERO_OF_BIMODAL)
+
+
+def test_points_whose_opposites_have_no_density() -> None:
+    value = pairs_alone(half)[..., 0]
+    for p in (0.05, 0.5, 0.95):
+        assert_share(value < stats.expon.ppf(p), p)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # numpy 2 and emcee's own moves
+def test_a_chain_beside_a_local_move() -> None:
+    moves = [(PairMove(fitted(banana), np.random.default_rng(2)), 0.7), (emcee.moves.DEMove(), 0.3)]
+    start, _ = fitted(banana).draw(np.random.default_rng(3), 40)
+    value = chain(banana, moves, start, 3000)[..., 1]
+    # x1 = x0^2 + e: by simulation of many more draws than the chain's.
+    rng = np.random.default_rng(4)
+    known = rng.standard_normal(4_000_000) ** 2 + 0.5 * rng.standard_normal(4_000_000)
+    for p in (0.05, 0.5, 0.95):
+        assert_share(value < np.quantile(known, p), p)
+
+
+def test_a_perfect_symmetric_proposal_is_always_accepted_and_left_for_its_opposite() -> None:
+    mixture = Mixture(np.ones(1), (StudentT(np.array([0.5, 1.0]), np.diag([1.0, 2.0]), 7.0),))
+    perfect = Proposal(Straightener.identity(2), mixture)
+    start, _ = perfect.draw(np.random.default_rng(1), 10)
+    moves = [PairMove(perfect, np.random.default_rng(4))]
+    sampler = emcee.EnsembleSampler(10, 2, perfect.log_prob, vectorize=True, moves=moves)
+    sampler.random_state = np.random.RandomState(6).get_state()
+    sampler.run_mcmc(start, 50)
     assert sampler.acceptance_fraction.min() == 1.0
+    pairs = sampler.get_chain().reshape(25, 2, 10, 2)
+    np.testing.assert_allclose(
+        pairs.mean(axis=1), np.broadcast_to([0.5, 1.0], (25, 10, 2)), atol=1e-12
+    )
+
+
+def test_means_of_opposite_pairs_scatter_less() -> None:
+    """As the effective size says, which counts them for more than their number."""
+    means, sizes = [], []
+    proposal = fitted(normal)
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        start, _ = proposal.draw(rng, 40)
+        sampler = emcee.EnsembleSampler(
+            40, 2, normal, vectorize=True, moves=[PairMove(proposal, rng)]
+        )
+        sampler.random_state = np.random.RandomState(seed).get_state()
+        sampler.run_mcmc(start, 60)
+        t = sampler.get_chain(discard=12).transpose(1, 0, 2)
+        means.append(t.mean(axis=(0, 1)))
+        sizes.append(ess(t, "mean"))
+    assert np.mean(sizes) > 40 * 48
+    ratio = (
+        np.var(means, axis=0, ddof=1)
+        * np.mean(sizes, axis=0)
+        / np.diag(np.array([[1.0, 0.6], [0.6, 0.5]]))
+    )
+    # A ratio of variances of 60 values has a standard error of sqrt(2/59).
+    assert np.all(ratio < 1.0 + 4.0 * np.sqrt(2.0 / 59))

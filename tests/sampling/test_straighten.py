@@ -52,9 +52,8 @@ def test_what_was_bent_and_spread_is_straight_and_even() -> None:
     straightener = fitted(t)
     v, _ = straightener.straighten(t)
     # Per sd of the last coordinate; 4000 draws, and a bend that is not quite a quadratic's.
-    assert straightener.rho == pytest.approx(0.3, abs=0.03)
-    # v comes in the order last to first.
-    last, second, first = v.T
+    np.testing.assert_allclose(straightener.growth[1:, 0], 0.3, atol=0.04)
+    first, second, last = v.T
     for before, after in (
         ((t[:, 1] ** 2, t[:, 2]), (second**2, last)),
         ((t[:, 0], t[:, 1] ** 2), (first, second**2)),
@@ -62,6 +61,26 @@ def test_what_was_bent_and_spread_is_straight_and_even() -> None:
     ):
         assert abs(np.corrcoef(*before)[0, 1]) > 0.2
         assert abs(np.corrcoef(*after)[0, 1]) < 0.1
+
+
+def test_a_scale_of_its_own_is_found_and_noise_is_not_mistaken_for_one() -> None:
+    rng = np.random.default_rng(3)
+    z = rng.standard_normal((6000, 3))
+    t = np.column_stack([np.exp(0.2 * z[:, 1]) * z[:, 0], z[:, 1], z[:, 2]])
+    growth = fitted(t).growth
+    # In the order last to first: the first coordinate's scale grows with the second alone.
+    assert growth[2, 1] == pytest.approx(0.2, abs=0.04)
+    others = growth.copy()
+    others[2, 1] = 0.0
+    assert abs(others).max() < 0.04
+
+
+def test_the_identity_leaves_everything_as_it_is() -> None:
+    t = funnel(50)
+    same, log_jacobian = Straightener.identity(3).straighten(t)
+    np.testing.assert_array_equal(same, t)
+    np.testing.assert_array_equal(log_jacobian, np.zeros(50))
+    np.testing.assert_array_equal(Straightener.identity(3).bend(t)[0], t)
 
 
 def test_draws_without_spread_cannot_be_straightened() -> None:

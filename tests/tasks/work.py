@@ -74,4 +74,8 @@ def second(item: tuple[bytes, int]) -> dict[str, int]:
 
 def where(item: int) -> dict[str, object]:
     time.sleep(0.05)
-    return {"pid": os.getpid(), "threads": os.environ.get("OPENBLAS_NUM_THREADS")}
+    return {
+        "pid": os.getpid(),
+        "threads": os.environ.get("OPENBLAS_NUM_THREADS"),
+        "trim": os.environ.get("MALLOC_TRIM_THRESHOLD_"),
+    }
