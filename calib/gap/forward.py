@@ -27,9 +27,10 @@ from calib.models.base import Array
 from calib.priors import Prior, Priors
 from calib.sampling.mode import prior_widths
 
-__all__ = ["FORM_ERROR", "Forward", "Hypothesis", "SmoothOver"]
+__all__ = ["FORM_ERROR", "Forward", "Hypothesis", "OnsetOver", "SmoothOver"]
 
 type SmoothOver = Literal["slip", "level", "sinkage", "order", "all"]
+type OnsetOver = Literal["slip", "level", "sinkage", "order", "low_pressure"]
 
 # Relative size by which a formula may misrepresent its effect along one direction.
 FORM_ERROR = 0.3
@@ -39,8 +40,8 @@ MISFIT_OUTPUTS = ("bulk_density",)
 # Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
 _THRESHOLDS = (-0.85, 0.9)
 _ONSET_WIDTH = 0.06
-# Shifts that differ between pressures, relative to those that are common to them.
-SHIFT_DIFFERENCE = 0.35
+# Shifts of how a parameter varies with pressure or slip, relative to those of its value.
+SHIFT_DIFFERENCE = 0.2
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,10 @@ class Hypothesis:
         (as weather or another stretch of ground would), or every condition.
     smooth_decay : float
         Number of half waves from which the discrepancy's coefficients fall off.
-    onset_over : {"slip", "level", "sinkage", "order"}, optional
+    onset_over : {"slip", "level", "sinkage", "order", "low_pressure"}, optional
         Instead of smooth, the discrepancy may set in beyond a threshold of one of these: a step
-        and a change of slope there.
+        and a change of slope there. Below a threshold of inflation pressure, where a limp tyre may
+        creep on its rim or buckle: a step, and a part of the output's level.
     share : float
         Part of the prior probability of its name.
     """
@@ -80,7 +82,7 @@ class Hypothesis:
     smooth_outputs: tuple[str, ...] = ()
     smooth_over: SmoothOver = "all"
     smooth_decay: float = 4.0
-    onset_over: SmoothOver | None = None
+    onset_over: OnsetOver | None = None
     share: float = 1.0
 
 
@@ -185,6 +187,11 @@ class Forward:
         mid, half = 0.5 * (reference.max() + reference.min()), 0.5 * np.ptp(reference)
         return np.clip((values - mid) / half, -1.5, 1.5)
 
+    def _pressure(self, view: View) -> Array | None:
+        """Inflation pressure, or else that on the ground, scaled to -1..1."""
+        found = self._scaled(view, "inflation_pressure_psi")
+        return self._scaled(view, "average_ground_pressure_kpa") if found is None else found
+
     def _form(self, view: View) -> Array:
         same = view.conditions is self.data.view.conditions
         return self._field_form if same else self._form_basis(view)
@@ -198,20 +205,30 @@ class Forward:
         return amplitudes[:, :1] * step + amplitudes[:, 1:2] * bend
 
     def onset(self, view: View, output: str, threshold: Array) -> tuple[Array, Array]:
-        """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n)."""
+        """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n).
+
+        Below a pressure it is a step and a part of the output's level instead.
+        """
         u = self.onset_covariate(view, output)
         beyond = (u - threshold[:, None]) / _ONSET_WIDTH
-        return expit(beyond), _ONSET_WIDTH * np.logaddexp(0.0, beyond)
+        step = expit(beyond)
+        if self.hypothesis.onset_over == "low_pressure":
+            # A limp tyre may lose a part of the pull, and more of it the more it pulls.
+            return step, step * self._known(self._level(view, output))
+        return step, _ONSET_WIDTH * np.logaddexp(0.0, beyond)
 
     def onset_covariate(self, view: View, output: str) -> Array:
         """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
         over = self.hypothesis.onset_over
+        if over == "low_pressure":
+            return -self._known(self._pressure(view))
         if over in ("level", "sinkage"):
-            u = self._level(view, output if over == "level" else RUT)
-        else:
-            u = self._scaled(view, "slip_ratio" if over == "slip" else "run_order")
+            return self._known(self._level(view, output if over == "level" else RUT))
+        return self._known(self._scaled(view, "slip_ratio" if over == "slip" else "run_order"))
+
+    def _known(self, u: Array | None) -> Array:
         if u is None:
-            raise ValueError(f"nothing to set in over: {over}")
+            raise ValueError(f"nothing to set in over: {self.hypothesis.onset_over}")
         return u
 
     def _smooth(self, view: View, output: str) -> Array:
@@ -224,9 +241,7 @@ class Forward:
         n = view.slip().size
         basis: list[Array] = []
         slip = self._scaled(view, "slip_ratio")
-        pressure = self._scaled(view, "inflation_pressure_psi")
-        if pressure is None:
-            pressure = self._scaled(view, "average_ground_pressure_kpa")
+        pressure = self._pressure(view)
         if "size" in wanted:
             basis.append(np.ones(n))
         if "slip" in wanted and slip is not None:
@@ -268,9 +283,7 @@ class Forward:
 
     def _condition_terms(self, view: View, *, everything: bool) -> list[tuple[Array, float]]:
         slip = self._scaled(view, "slip_ratio")
-        pressure = self._scaled(view, "inflation_pressure_psi")
-        if pressure is None:
-            pressure = self._scaled(view, "average_ground_pressure_kpa")
+        pressure = self._pressure(view)
         slips = self._cosines(slip, 10, 0.7)
         terms = list(slips)
         if everything:
@@ -441,11 +454,13 @@ def _misfit_ranges(o: OutputData) -> tuple[tuple[str, float, float], ...]:
 def _shift_map(names: tuple[str, ...]) -> tuple[Array, list[float]]:
     """Map shift coordinates to shifts of parameters, and the relative sds of the coordinates.
 
-    Another soil or tyre changes the traction curve at all pressures much alike: the values at the
-    two end pressures share one shift, and differ, as the bends do, by less.
+    Another soil changes the traction curve at all pressures, and the exponent of sinkage at all
+    slips, much alike: the values at the two end pressures share one shift, and differ by less, as
+    the bends between them and the exponent's growth with slip (n1) do.
     """
     matrix = np.eye(len(names))
-    relative = [SHIFT_DIFFERENCE if name.endswith("_bend") else 1.0 for name in names]
+    varies = [name.endswith("_bend") or name == "n1" for name in names]
+    relative = [SHIFT_DIFFERENCE if v else 1.0 for v in varies]
     for i, name in enumerate(names):
         if name.endswith("_lo") and f"{name[:-3]}_hi" in names:
             j = names.index(f"{name[:-3]}_hi")

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 
 from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.base import DRAWBAR, RUT
+from calib.gap.effects.base import DENSITY, DRAWBAR, RUT
 from calib.gap.forward import Hypothesis, SmoothOver
 from calib.prior_files import default_prior_path, read_priors
 from calib.priors import Priors
@@ -32,18 +33,19 @@ PRIOR = {"none": 0.40, "unknown": 0.10, "parameter_shift": 0.10, "single": 0.40}
 LN_PAIR_TO_SINGLE = float(np.log(0.05))
 LN_PRIOR: Mapping[str, float] = {k: float(np.log(v)) for k, v in PRIOR.items()}
 SHIFTS = (0.1, 0.25, 0.6)
-# Size (noise sds) and number of half waves of a free discrepancy.
-SMOOTHS = ((1.5, 4.0), (5.0, 4.0))
-VERY_SMOOTH = (3.0, 1.0)
+# Sizes (noise sds) of a free discrepancy.
+SMOOTHS = (1.5, 5.0)
 # Size (noise sds) of a discrepancy that sets in beyond a threshold.
 ONSET = 4.0
 # Part of `unknown` that comes on top of a listed effect instead of alone.
 REMAINDER = 0.2
 
 
+type _Over = Literal["slip", "level", "sinkage", "order"]
+
 # One output that changes beyond some slip or run is what listed effects are: post-peak softening,
 # slip sinkage, rebound and drift may set in anywhere. Nobody could tell the unlisted from them.
-_LISTED_ONSETS: tuple[tuple[SmoothOver, tuple[str, ...]], ...] = (
+_LISTED_ONSETS: tuple[tuple[_Over, tuple[str, ...]], ...] = (
     ("slip", (DRAWBAR,)), ("slip", (RUT,)), ("order", (DRAWBAR,)),
 )  # fmt: skip
 
@@ -75,31 +77,48 @@ def singles(data: Campaigns, effects: Mapping[str, Effect]) -> list[Hypothesis]:
 
 
 def unknowns(data: Campaigns) -> list[Hypothesis]:
-    """Free smooth discrepancies: of one output or all, over slip, level, …, small or large."""
+    """Free discrepancies: of one output or all, smooth over slip, level, … or setting in there."""
     names = data.names
     each = [(name,) for name in names]
     touched = each + ([names] if len(names) > 1 else [])
     recorded = data.view.conditions
-    choices: list[tuple[SmoothOver, tuple[str, ...]]] = [("level", t) for t in each]
+    choices: list[tuple[_Over, tuple[str, ...]]] = [("level", t) for t in each]
     if "slip_ratio" in recorded:
         choices += [("slip", t) for t in touched]
     if RUT in names:
         choices += [("sinkage", t) for t in touched if t != (RUT,)]
     if "run_order" in recorded and np.ptp(recorded["run_order"]) > 0:
         choices += [("order", t) for t in touched]
+    everywhere: list[tuple[SmoothOver, tuple[str, ...]]] = [
+        *choices,
+        *(("all", t) for t in touched),
+    ]
     smooth = [
-        Hypothesis("unknown", smooth=size, smooth_outputs=t, smooth_over=over, smooth_decay=decay)
-        for over, t in [*choices, *(("all", t) for t in touched)]
-        # Over slip at every pressure, what is very smooth is a parameter shift.
-        for size, decay in (SMOOTHS if over in ("slip", "all") else (*SMOOTHS, VERY_SMOOTH))
+        Hypothesis("unknown", smooth=size, smooth_outputs=t, smooth_over=over)
+        for over, t in everywhere
+        for size in SMOOTHS
     ]
     sudden = [
         Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over=over)
         for over, t in choices
         if (over, t) not in _LISTED_ONSETS
     ]
-    share = (1.0 - REMAINDER) / 2.0
-    return [replace(h, share=share / len(group)) for group in (smooth, sudden) for h in group]
+    # At low inflation a tyre may creep on its rim, buckle or run on it.
+    limp: list[Hypothesis] = []
+    if np.ptp(recorded.get("inflation_pressure_psi", np.zeros(1))) > 0:
+        limp = [
+            Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over="low_pressure")
+            for t in touched
+            if DENSITY not in t
+        ]
+    half = (1.0 - REMAINDER) / 2.0
+    # What a limp tyre does counts as one of the onsets, whichever output shows it.
+    onset = half / (len(sudden) + bool(limp))
+    return [
+        *(replace(h, share=half / len(smooth)) for h in smooth),
+        *(replace(h, share=onset) for h in sudden),
+        *(replace(h, share=onset / len(limp)) for h in limp),
+    ]
 
 
 def remainders(data: Campaigns, best: Sequence[Hypothesis], n_single: int) -> list[Hypothesis]:
@@ -115,8 +134,7 @@ def remainders(data: Campaigns, best: Sequence[Hypothesis], n_single: int) -> li
         replace(
             h,
             name="unknown",
-            smooth=SMOOTHS[0][0],
-            smooth_decay=SMOOTHS[0][1],
+            smooth=SMOOTHS[0],
             smooth_outputs=data.names,
             smooth_over=over,
             share=share,

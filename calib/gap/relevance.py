@@ -66,7 +66,8 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
     """Size of each effect in noise sds, rms over field rows and outputs, shape (k, n_effects).
 
     A parameter shift or a free discrepancy counts as one effect; of a discrepancy on top of an
-    effect the size is that of the discrepancy.
+    effect the size is that of the discrepancy. A discrepancy of several outputs is as large as in
+    the output where it is smallest: what changes one output only is not one of several.
     """
     hypothesis = forward.hypothesis
     data = forward.data
@@ -88,13 +89,20 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
         else:
             without = [_lone(forward, psi, i) for i in range(len(hypothesis.effects))]
     slip = data.view.slip()
+    joint = not named and len(hypothesis.smooth_outputs) > 1
     columns = []
     for other in without:
-        squares = [
-            np.square((full[o.name] - other[o.name])[:, o.rows] / noise[o.name].sd(slip[o.rows]))
+        squares = {
+            o.name: np.square(
+                (full[o.name] - other[o.name])[:, o.rows] / noise[o.name].sd(slip[o.rows])
+            )
             for o in data.outputs
-        ]
-        columns.append(np.sqrt(np.concatenate(squares, axis=1).mean(axis=1)))
+        }
+        if joint:
+            each = [squares[name].mean(axis=1) for name in hypothesis.smooth_outputs]
+            columns.append(np.sqrt(np.min(each, axis=0)))
+        else:
+            columns.append(np.sqrt(np.concatenate(list(squares.values()), axis=1).mean(axis=1)))
     return np.stack(columns, axis=1)
 
 

@@ -103,7 +103,8 @@ def _lead(found: Diagnosis, fit: Fit) -> str:
     """Say what an effect that is not listed goes along with: where to look for it."""
     h = fit.forward.hypothesis
     if h.onset_over is not None:
-        return f"what is missing sets in beyond {_threshold(found, fit)}"
+        side = "below" if h.onset_over == "low_pressure" else "beyond"
+        return f"what is missing sets in {side} {_threshold(found, fit)}"
     on_top = ""
     if h.effects:
         on_top = f", on top of {h.effects[0].name.replace('_', ' ')}"
@@ -125,10 +126,13 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
         values = axis.factor * o.problem.bound.from_response(location)[0]
         name, unit = f"a predicted {output_word(output).lower()} of", f" {axis.unit}"
     else:
-        column = "slip_ratio" if h.onset_over == "slip" else "run_order"
+        column, name = {
+            "slip": ("slip_ratio", "a slip of"),
+            "order": ("run_order", "run"),
+            "low_pressure": ("inflation_pressure_psi", "an inflation pressure of"),
+        }[h.onset_over or ""]
         shown = axis_name(column)
         values, unit = shown.scale(view.conditions[column]), unit_after(shown)
-        name = "a slip of" if column == "slip_ratio" else "run"
     order = np.argsort(u)
     good = order[np.isfinite(values[order])]
     at = float(np.interp(fit.psi[forward.threshold], u[good], values[good]))

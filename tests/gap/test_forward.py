@@ -53,7 +53,8 @@ def test_the_other_hypotheses_reduce_to_it(data, kind):
         if kind == "parameter_shift"
         else unknowns(data)[-1]
     )
-    forward = Forward(data, h, SIGMA)
+    lab_mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in data.outputs}
+    forward = Forward(data, h, SIGMA, lab_mode)
     psi = centre(forward)  # shifts and coefficients are zero in the middle of their priors
     full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
     for o in data.names:

@@ -5,8 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.gap.fit import Noise
+from calib.gap.forward import Forward
+from calib.gap.hypotheses import unknowns
 from calib.gap.relevance import relevance, sizes
-from gap.cases import ranking_of
+from gap.cases import campaigns_of, ranking_of
 
 
 def fit_of(case: str | None, name: str):
@@ -55,3 +58,19 @@ def test_a_large_effect_gains_and_an_invisible_one_loses():
 def test_it_is_the_same_for_the_same_seed():
     fit = fit_of(None, "rate_effect")
     assert relevance(fit, 5, 200) == relevance(fit, 5, 200)
+
+
+def test_a_discrepancy_of_both_outputs_is_as_large_as_where_it_is_smallest():
+    h = next(
+        h
+        for h in unknowns(campaigns_of(None))
+        if h.onset_over == "slip" and len(h.smooth_outputs) == 2
+    )
+    noise = {"drawbar_pull": Noise(0.03, 0.0), "rut_depth": Noise(0.05, 0.0)}
+    forward = Forward(campaigns_of(None), h, {o: n.sigma for o, n in noise.items()})
+    psi = np.array([[p.loc for p in forward.priors.free]] * 2)
+    psi[:, forward.threshold] = -3.0  # everywhere beyond it: a constant
+    psi[:, forward.smooth_slices["drawbar_pull"].start] = 0.3
+    psi[1, forward.smooth_slices["rut_depth"].start] = 0.1
+    # Ten noise sds of the pull, of the rut none and two.
+    np.testing.assert_allclose(sizes(forward, noise, psi)[:, 0], [0.0, 2.0], rtol=1e-6)

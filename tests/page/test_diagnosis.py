@@ -380,3 +380,30 @@ def test_what_is_unknown_is_described_by_what_it_goes_along_with():
     reader.feed(render_diagnosis(found, [], {}, manifest={}))
     assert reader.text.count(f"R{look[1:]}") == 2
     assert "no measurement is needed" not in reader.text
+
+
+def test_what_sets_in_at_low_pressure_is_said_so():
+    from dataclasses import replace
+
+    import numpy as np
+    from gap.cases import make_case
+
+    from calib.data import table_from_arrays
+    from calib.gap.diagnose import diagnose
+    from calib.gap.effects import EFFECTS
+    from calib.page.gap_sizes import size_sentences
+
+    # Below 24 psi the bead creeps on the rim: a third of the pull above 0.6 kN is lost.
+    case = make_case(None, n_field=36)
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    low = columns["inflation_pressure_psi"] < 24.0
+    lost = np.where(low, 0.35 * np.maximum(columns["drawbar_pull_kn"] - 0.6, 0.0), 0.0)
+    columns["drawbar_pull_kn"] = columns["drawbar_pull_kn"] - lost
+    case = replace(case, field=table_from_arrays(columns))
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "pressure_gauge_bias")}
+    found = diagnose(case, 1, effects=few)
+    assert found.verdict == "unknown"
+    lead = size_sentences(found, "unknown")[0]
+    assert lead.startswith("what is missing sets in below an inflation pressure of")
+    assert 18.0 < float(lead.split(" of ")[1].split()[0]) < 30.0
+    assert "in small steps about an inflation pressure of" in gap_evidence(found).look

@@ -1,0 +1,105 @@
+"""The hypotheses themselves: what may be unlisted, and what another soil changes."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.gap.case import campaigns
+from calib.gap.forward import SHIFT_DIFFERENCE, Forward, Hypothesis
+from calib.gap.hypotheses import unknowns
+from calib.sampling.mode import prior_widths
+from gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
+
+SIGMA = {o: NOISE[o] for o in MODELS}
+
+
+@pytest.fixture(scope="module")
+def data():
+    return campaigns_of(None)
+
+
+def lab_mode(data) -> dict[str, np.ndarray]:
+    return {o.name: np.array([p.loc for p in o.priors.free]) for o in data.outputs}
+
+
+def of_low_pressure(data) -> list[Hypothesis]:
+    return [h for h in unknowns(data) if h.onset_over == "low_pressure"]
+
+
+def test_the_shares_of_what_is_unlisted_leave_room_for_what_a_listed_effect_leaves(data):
+    assert sum(h.share for h in unknowns(data)) == pytest.approx(0.8)
+
+
+def test_no_onset_of_one_output_over_slip_or_drift_is_unlisted(data):
+    alone = [(h.onset_over, h.smooth_outputs) for h in unknowns(data) if h.onset_over]
+    assert ("slip", ("drawbar_pull",)) not in alone
+    assert ("slip", ("rut_depth",)) not in alone
+    assert ("order", ("drawbar_pull",)) not in alone
+    assert ("slip", ("drawbar_pull", "rut_depth")) in alone
+
+
+def test_something_may_set_in_below_a_pressure_of_each_output_and_of_both(data):
+    touched = {h.smooth_outputs for h in of_low_pressure(data)}
+    assert touched == {("drawbar_pull",), ("rut_depth",), ("drawbar_pull", "rut_depth")}
+
+
+def test_nothing_sets_in_below_a_pressure_that_is_constant_or_not_recorded():
+    case = make_case(None, models=PULL_ONLY)
+    without = replace(
+        case, lab=table_without(case.lab, "inflation_pressure_psi"),
+        field=table_without(case.field, "inflation_pressure_psi"),
+    )  # fmt: skip
+    assert not of_low_pressure(campaigns(without))
+    columns = {**case.field.columns, "inflation_pressure_psi": np.full(27, 30.0)}
+    constant = replace(case, field=replace(case.field, columns=columns))
+    assert not of_low_pressure(campaigns(constant))
+
+
+def test_below_a_pressure_the_output_is_off_by_a_constant_and_by_part_of_its_level(data):
+    h = next(h for h in of_low_pressure(data) if h.smooth_outputs == ("drawbar_pull",))
+    mode = lab_mode(data)
+    forward = Forward(data, h, SIGMA, mode)
+    psi = np.array([[p.loc for p in forward.priors.free]] * 2)
+    for name, part in forward.theta_slices.items():
+        psi[:, part] = mode[name]
+    # Pressures 18, 30 and 42 psi are at 1, 0 and -1: only the lowest lies beyond a half.
+    psi[:, forward.threshold] = 0.5
+    part = forward.smooth_slices["drawbar_pull"]
+    psi[0, part], psi[1, part] = (0.1, 0.0), (0.0, 0.1)
+    full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
+    gap = full["drawbar_pull"] - plain["drawbar_pull"]
+    np.testing.assert_array_equal(full["rut_depth"], plain["rut_depth"])
+    low = data.view.conditions["inflation_pressure_psi"] < 20.0
+    assert 0 < low.sum() < low.size
+    np.testing.assert_allclose(gap[:, ~low], 0.0, atol=1e-4)
+    np.testing.assert_allclose(gap[0, low], 0.1, rtol=1e-3)
+    # The second grows in proportion to the predicted pull, from -1 to 1 over the field's range.
+    level = np.interp(
+        plain["drawbar_pull"][1],
+        [plain["drawbar_pull"][1].min(), plain["drawbar_pull"][1].max()], [-1.0, 1.0],
+    )  # fmt: skip
+    np.testing.assert_allclose(gap[1, low], 0.1 * level[low], rtol=1e-3, atol=1e-5)
+
+
+def test_another_soil_changes_all_pressures_alike_and_shapes_less(data):
+    forward = Forward(data, Hypothesis("parameter_shift", shift=0.25), SIGMA)
+    rng = np.random.default_rng(1)
+    drawn = forward.priors.sample(rng, 20_000)
+    by_name = {}
+    for o in data.outputs:
+        moved = drawn[:, forward.shift_slices[o.name]] @ forward._shift_maps[o.name].T
+        for name, values, width in zip(
+            o.priors.names, moved.T, prior_widths(o.priors), strict=True
+        ):
+            by_name[name] = values / width
+    sds = {name: float(values.std()) for name, values in by_name.items()}
+    assert sds["D_lo"] == pytest.approx(0.25 * np.hypot(1.0, SHIFT_DIFFERENCE), rel=0.03)
+    assert sds["z_ref"] == pytest.approx(0.25, rel=0.03)
+    for name in ("K_bend", "D_bend", "G_bend", "n1"):
+        assert sds[name] == pytest.approx(0.25 * SHIFT_DIFFERENCE, rel=0.03)
+    between = float(np.corrcoef(by_name["D_lo"], by_name["D_hi"])[0, 1])
+    d2 = SHIFT_DIFFERENCE**2
+    assert between == pytest.approx((1.0 - d2) / (1.0 + d2), abs=0.01)
