@@ -12,8 +12,11 @@ __all__ = ["readme"]
 _HEAD = """# Benchmarks
 
 Made by `make bench`; `make bench PART="posterior likelihood"` renews a part. Medians over repeats
-that take turns with the peers', with the least and the most of them. Every line is in
-[results.md](results.md) and `results.csv`, every measurement in `measured/`.
+that take turns with the peers', with the least and the most of them; the median decides whether a
+level is met. The levels are goals that were set before any of it was built. A range that goes up to
+thousands has a run of nutpie's in it whose chains did not join (R-hat above 1.01; how many is in
+results.md). Every line is in [results.md](results.md) and `results.csv`, every measurement in
+`measured/`.
 
 ![What a posterior costs, and the likelihood against its floor](benchmarks.png)
 """
@@ -28,8 +31,7 @@ _HOW = """## How it was measured
   gate, nutpie's tuning, the stretch move's burn-in (a tenth of it). The stretch move starts from
   draws of our posterior and searches for nothing. Effective sample sizes are ArviZ's, smallest over
   the parameters, of all draws that were kept, with walkers as chains. calib stores 16,384 draws of
-  a posterior unless `SamplerSettings.keep` says more, and they are worth no more than that; here
-  it keeps all. "Default" is 4 ensembles of 256 walkers and 80 steps, and nutpie's 4 chains of
+  a posterior unless `SamplerSettings.keep` says more; here it keeps all. "Default" is 4 ensembles of 256 walkers and 80 steps, and nutpie's 4 chains of
   1,000 draws after its tuning; "long" is 1,024 walkers and 320 steps, and 4 chains of 10,000 draws:
   what a sampler does once what comes first is of little account.
 - **Bulk and tail.** Our draws come in opposite pairs, whose errors of a mean cancel: bulk ESS,

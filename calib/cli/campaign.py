@@ -1,4 +1,4 @@
-"""Verb of campaigns: many fits and diagnoses, here or on a Dask cluster."""
+"""Verb of campaigns: many tasks of one plan, here or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def campaign(
         bool, typer.Option("--overwrite", help="Do again what was made from other inputs.")
     ] = False,
 ) -> None:
-    """Run many fits and diagnoses as independent tasks; run again to resume."""
+    """Run many fits, diagnoses, challenge cases or SBC replicates as tasks; run again to resume."""
     from calib.campaign import read_plan, run_campaign
     from calib.cli.display import progress_bars
 

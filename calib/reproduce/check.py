@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import tempfile
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from calib.environment import Environment
 from calib.reproduce.check_report import check_report
 from calib.reproduce.check_run import check_run
 from calib.reproduce.outcome import Outcome
-from calib.reproduce.schema import Manifest, read_folder
+from calib.reproduce.schema import Manifest, RunRecord, read_folder
 from calib.study import Progress
 
 __all__ = ["check"]
@@ -48,4 +49,21 @@ def check(folder: Path, *, quick: bool = False, progress: Progress | None = None
             items, allowed = check_run(record, folder, Path(scratch), here, tell, quick=quick)
     kind: Literal["report", "run"] = "report" if isinstance(record, Manifest) else "run"
     differing = record.environment.differences(here)
-    return Outcome(str(folder), kind, quick, tuple(items), differing, allowed)
+    return Outcome(
+        str(folder), kind, quick, tuple(items), differing, allowed, _not_converged(record, folder)
+    )
+
+
+def _not_converged(record: Manifest | RunRecord, folder: Path) -> tuple[str, ...]:
+    """Models whose posterior is recorded as one that did not pass the gate.
+
+    What is not as it should be in these records is found by comparing them.
+    """
+    try:
+        if isinstance(record, RunRecord):
+            gate: Any = record.document["gate"]
+            return () if gate["passed"] else (record.model,)
+        models = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["models"]
+        return tuple(m["model"] for m in models if not m["sampling"]["converged"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return ()

@@ -32,6 +32,8 @@ class Outcome:
         What differs between where it was made and here: pairs of there and here.
     allowed : str
         What Monte Carlo error was allowed, in words.
+    not_converged : tuple of str
+        Models whose posterior did not pass the convergence gate, as recorded.
     """
 
     folder: str
@@ -40,6 +42,7 @@ class Outcome:
     items: tuple[Item, ...]
     environment: Mapping[str, tuple[str, str]]
     allowed: str = ""
+    not_converged: tuple[str, ...] = ()
 
     def of(self, *status: Status) -> tuple[Item, ...]:
         """Return the items of some status."""
@@ -72,6 +75,8 @@ class Outcome:
             return f"DIFFERENT: {shown}"
         unjudged = len(self.of(Status.UNJUDGED))
         rest = f"; {unjudged} not judged" if unjudged else ""
+        if self.not_converged:
+            rest += f"; NOT CONVERGED, not to be used: {', '.join(self.not_converged)}"
         if self.quick:
             return f"NOTHING DIFFERENT, BUT ONLY ESTIMATES WERE COMPUTED AGAIN (--quick){rest}"
         identical = len(self.of(Status.IDENTICAL))
@@ -97,6 +102,7 @@ class Outcome:
                 for name, (there, here) in self.environment.items()
             },
             "allowed": self.allowed,
+            "not_converged": list(self.not_converged),
             "items": [{**asdict(item), "status": str(item.status)} for item in self.items],
         }
 

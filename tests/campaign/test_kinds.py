@@ -12,10 +12,12 @@ from calib.calibration import calibrate
 from calib.campaign import read_plan, run_campaign
 from calib.challenge.make import make
 from calib.data import hold_out, read_table
+from calib.datasets import he2019
 from calib.errors import CalibError
 from calib.estimators import estimate
 from calib.gap.batch import diagnose_cases
 from calib.problem import build_problem
+from calib.reproduce.check import check
 from calib.sbc.run import run_sbc
 from calib.store import load_calibration
 from calib.streams import generator
@@ -125,6 +127,14 @@ def test_rows_held_out_are_scored_and_posteriors_can_be_left_out(folder):
     scores = validate_held_out(calibrate(problem, seed, estimates=(point,)), held).scores
     assert found["held_out"]["rmse"] == scores.rmse
     assert found["held_out"]["rows"] == len(held)
+
+
+def test_the_embedded_data_are_called_reconstructed(folder):
+    he2019.write(folder / "he2019")
+    text = '[[fit]]\nname = "a"\ndata = ["he2019/rut*.csv"]\nmodels = ["bekker"]\n'
+    ((name, _),) = run(folder, text).items()
+    found = check(folder / "out" / "results" / name / "run", quick=True)
+    assert found.same, found.verdict
 
 
 def test_a_posterior_that_did_not_converge_is_named(folder, monkeypatch):

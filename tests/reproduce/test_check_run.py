@@ -15,6 +15,7 @@ from calib.errors import CalibError
 from calib.problem import build_problem
 from calib.reproduce.check import check
 from calib.reproduce.items import Status
+from calib.sampling.sampler import SamplerSettings
 from calib.store import load_calibration, save_calibration
 
 from .conftest import SETTINGS, different, edit_json, findings, fitted_run, seal_run
@@ -156,6 +157,16 @@ def test_a_run_with_fixed_parameters_and_its_own_settings(pull_tables, tmp_path:
     record = json.loads((tmp_path / "run.json").read_text())
     assert record["settings"]["steps"] == SETTINGS.steps
     assert record["estimates"] == []
+
+
+def test_the_same_posterior_is_still_one_that_did_not_converge(rut_tables, tmp_path: Path) -> None:
+    problem = build_problem("modified_bekker", rut_tables[0])
+    short = SamplerSettings(steps=40, max_steps=40)
+    save_calibration(calibrate(problem, 3, settings=short), tmp_path)
+    outcome = check(tmp_path)
+    assert outcome.verdict.startswith("SAME, bit for bit")
+    assert outcome.verdict.endswith("; NOT CONVERGED, not to be used: modified_bekker")
+    assert outcome.document()["not_converged"] == ["modified_bekker"]
 
 
 def test_a_run_says_nothing_of_the_computer_it_was_made_on(run: Path) -> None:

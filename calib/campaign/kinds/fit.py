@@ -15,6 +15,7 @@ from calib.calibration import Calibration, calibrate
 from calib.campaign.kinds.base import Kind, Planned, Section, Task, Work
 from calib.campaign.place import Place, word
 from calib.data import Table, hold_out, read_for_model
+from calib.datasets.he2019 import labelled
 from calib.errors import CalibError
 from calib.estimators import estimate
 from calib.folders import read_folder
@@ -100,7 +101,7 @@ class Fit(Kind[FitSection, FitItem]):
     def load(self, task: Task) -> FitItem:
         """Read the file and bind the model to it."""
         model = get_model(task.settings["model"])
-        table = read_for_model(task.inputs["data"], (*model.conditions, model.output))
+        table = labelled(read_for_model(task.inputs["data"], (*model.conditions, model.output)))
         kept = _held(task.settings["hold_out"])
         fitted, held = hold_out(table, kept.column, kept.value) if kept else (table, None)
         problem = build_problem(model.name, fitted, task.inputs["priors"])
