@@ -29,7 +29,7 @@ PARTS: dict[str, list[str]] = {
     "likelihood": ["likelihood.py"],
     "genetic": ["genetic.py"],
     "million": ["million.py"],
-    "campaign": ["campaign.py", "--cases", "100"],
+    "campaign": ["campaign.py", "--cases", "80", "--repeats", "1"],
     "survival": ["campaign_survival.py", "--cases", "80"],
 }
 FULL = {"campaign": ["--cases", "200"], "survival": ["--cases", "200"]}

@@ -33,7 +33,7 @@ class SamplerSettings:
     ensembles : int
         Independently seeded ensembles.
     walkers : int, optional
-        In each ensemble; by default 256, but fewer and longer chains where the proposal is poor
+        In each ensemble; by default 320, but fewer and longer chains where the proposal is poor
         (128) or data are long (20), and at least twice the dimension plus two.
     steps : int
         Kept steps of the first attempt; doubled until the gate passes.
@@ -57,7 +57,7 @@ class SamplerSettings:
 
     def n_walkers(self, n_dim: int) -> int:
         """Number of walkers for a dimension."""
-        return self.walkers or max(256, 2 * (n_dim + 1))
+        return self.walkers or max(320, 2 * (n_dim + 1))
 
     def longer(self, walkers: int, n_dim: int, times: int) -> SamplerSettings:
         """So many walkers and so many times the steps, unless walkers were asked for."""

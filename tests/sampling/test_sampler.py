@@ -230,7 +230,7 @@ def test_a_run_extends_itself_until_the_gate_passes() -> None:
     assert draws.report.passed
     assert draws.report.steps > 10
     assert draws.t.shape == (4, 128, min(32, draws.report.steps), 3)
-    assert draws.walkers == 256
+    assert draws.walkers == 320
 
 
 @pytest.mark.parametrize(("steps", "most", "done"), [(10, 39, 20), (200, 30, 30)])
