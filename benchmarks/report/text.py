@@ -84,11 +84,11 @@ Sampler, by bulk ESS per second of the joint drawbar pull on one core:
 - emcee's snooker move is not used: half the exponent of ter Braak & Vrugt (2008) in its acceptance.
 
 Second worker: two workers took 0.89 of the time of one process (1.12 times) as long as Dask had the
-C library give every freed array back to the system: half of their time went to page faults. Without
-that it is what the table says; on 24 cases 1.39 with 4.5 s of start-up in it, 1.64 without, where two
-plain processes of a core each, without Dask, take 1.78 (as their halves came out). One memory arena
-for all threads changed nothing. The million rows, the likelihood and the genetic algorithm were
-measured with the sampler before the opposite pairs.
+C library give every freed array back to the system: half of their time went to page faults.
+Without that it is what the table says; on 24 cases 1.39 with 4.5 s of start-up in it, 1.64 without,
+where two plain processes of a core each, without Dask, take 1.78 (as their halves came out). One
+memory arena for all threads changed nothing. The million rows, the likelihood and the genetic
+algorithm were measured with the sampler before the opposite pairs.
 
 Likelihood: {libraries}
 A sine is worked out as a tangent of the half argument, for which NumPy has vector instructions:
