@@ -110,7 +110,7 @@ def test_rut_depth_against_a_flat_prior_regression(rut_tables: tuple[Table, Tabl
 
 
 def test_it_is_the_seed_and_the_label_that_count(rut_tables: tuple[Table, Table]) -> None:
-    quick = SamplerSettings(steps=40, max_steps=40, keep=1600)
+    quick = SamplerSettings(steps=50, max_steps=50, keep=1600)
     problem = build_problem("modified_bekker", rut_tables[0])
     one, again, other_seed, other_label = (
         calibrate(problem, seed, label=label, settings=quick)

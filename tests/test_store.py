@@ -141,7 +141,7 @@ def test_fixed_parameters_and_loads_survive(tmp_path: Path) -> None:
         }
     )
     problem = build_problem("magic_formula", table, fixed={"Sh": 0.5, "Sv": 0.0})
-    quick = SamplerSettings(steps=40, max_steps=40, keep=1600)
+    quick = SamplerSettings(steps=50, max_steps=50, keep=1600)
     calibration = calibrate(problem, 1, settings=quick)
     assert not calibration.converged
     save_calibration(calibration, tmp_path)

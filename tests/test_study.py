@@ -229,7 +229,7 @@ def test_pressures_that_cannot_be_fitted_alone_are_left_out() -> None:
 def test_progress_names_what_is_done() -> None:
     seen: list[tuple[str, int, int]] = []
     task = next(t for t in he2019_tasks() if t.output == "rut_depth")
-    run_study([task], 1, settings=SamplerSettings(steps=40, max_steps=40),
+    run_study([task], 1, settings=SamplerSettings(steps=50, max_steps=50),
               progress=lambda *told: seen.append(told))  # fmt: skip
     assert {what for what, _, _ in seen} == {"rut_depth: estimating", "rut_depth: sampling"}
     last = {what: (done, planned) for what, done, planned in seen}

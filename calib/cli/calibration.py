@@ -22,7 +22,7 @@ _HoldOut = Annotated[
     str | None,
     typer.Option("--hold-out", help="Rows kept for validation, e.g. inflation_pressure_psi=30."),
 ]
-_MaxSteps = Annotated[int, typer.Option(help="Where extending the chains stops.", min=50)]
+_MaxSteps = Annotated[int, typer.Option(help="Where extending the chains stops.", min=100)]
 
 
 def register(app: typer.Typer) -> None:
@@ -49,7 +49,7 @@ def report(
     ] = None,
     overwrite: _Overwrite = False,
     pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
-    max_steps: _MaxSteps = 10_240,
+    max_steps: _MaxSteps = 25_600,
     posteriors: Annotated[
         bool, typer.Option(help="Keep the posteriors, megabytes of netCDF, in the folder.")
     ] = True,
@@ -114,7 +114,7 @@ def fit(
     seed: _Seed = 2019,
     hold_out: _HoldOut = None,
     overwrite: _Overwrite = False,
-    max_steps: _MaxSteps = 10_240,
+    max_steps: _MaxSteps = 25_600,
 ) -> None:
     """Calibrate one model on one file and save the posterior."""
     from calib.calibration import calibrate

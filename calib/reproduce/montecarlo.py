@@ -22,6 +22,9 @@ type Place = tuple[str, ...]
 # Moments that exist: the variance of a mean, and of a variance. The shape is estimated, so a
 # little less is asked of the second.
 _K_MEAN, _K_SD = 0.5, 0.2
+# Of an interval's width: an end at the edge of what is possible hangs on the few outermost draws,
+# whose scatter among parts of a run tells little. Between seeds k of the rut depth's moves so far.
+_END = 2e-4
 # Draws of the round of importance sampling that estimates the evidence, at least.
 _EVIDENCE_DRAWS = 1500
 
@@ -45,12 +48,13 @@ def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:
     errors: dict[Place, float | None] = {}
     for j, name in enumerate(names):
         stated = calibration.summary[name]
+        least = _END * (stated.hdi_upper - stated.hdi_lower)
         errors |= {
             ("posterior", name, "mean"): stated.mcse_mean if shape[j] < _K_MEAN else None,
             ("posterior", name, "sd"): float(sd[j]) if shape[j] < _K_SD else None,
             ("posterior", name, "median"): stated.mcse_median,
-            ("posterior", name, "hdi_lower"): stated.mcse_hdi_lower,
-            ("posterior", name, "hdi_upper"): stated.mcse_hdi_upper,
+            ("posterior", name, "hdi_lower"): max(stated.mcse_hdi_lower, least),
+            ("posterior", name, "hdi_upper"): max(stated.mcse_hdi_upper, least),
         }
     draws = calibration.draws
     internal = draws.t.reshape(-1, *draws.t.shape[2:])

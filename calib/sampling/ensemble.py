@@ -86,10 +86,16 @@ class Ensemble:
         return t.transpose(1, 0, 2), log_prob.T
 
     def tau(self, target: int) -> Array:
-        """Autocorrelation times over the last `target` steps, shape (d,)."""
+        """Autocorrelation times over the last `target` steps, shape (d,).
+
+        The larger of a coordinate's own and that of its distance from its median: a walker that
+        goes to and fro between two opposite points has no autocorrelation of its own to show.
+        """
         # A constant chain has no autocorrelation time; it must fail the gate.
         chain = self.sampler.get_chain()[-target:, :: max(1, self.walkers // _WALKERS_OF_TAU)]
-        tau = autocorrelation_time(chain.transpose(1, 0, 2))
+        chain = chain.transpose(1, 0, 2)
+        folded = abs(chain - np.median(chain, axis=(0, 1)))
+        tau = np.maximum(autocorrelation_time(chain), autocorrelation_time(folded))
         return np.where(np.isfinite(tau), np.maximum(tau, 1.0), np.inf)
 
     @property

@@ -33,12 +33,12 @@ class SamplerSettings:
     ensembles : int
         Independently seeded ensembles.
     walkers : int, optional
-        In each ensemble; by default 320, but fewer and longer chains where the proposal is poor
-        (128) or data are long (20), and at least twice the dimension plus two.
+        In each ensemble; by default 160, of long data 20, but at least twice the dimension plus
+        two.
     steps : int
         Kept steps of the first attempt; doubled until the gate passes.
     max_steps : int
-        Where doubling stops; twice as far where the proposal is poor, walkers being fewer.
+        Where doubling stops.
     keep : int
         About so many draws of each ensemble are stored: those of evenly picked walkers at 32 or
         more evenly picked steps.
@@ -49,26 +49,15 @@ class SamplerSettings:
 
     ensembles: int = 4
     walkers: int | None = None
-    steps: int = 80
-    max_steps: int = 10_240
+    steps: int = 192
+    max_steps: int = 25_600
     keep: int = 4096
     ahead: int = 16
     gate: Gate = field(default_factory=Gate)
 
     def n_walkers(self, n_dim: int) -> int:
         """Number of walkers for a dimension."""
-        return self.walkers or max(320, 2 * (n_dim + 1))
-
-    def longer(self, walkers: int, n_dim: int, times: int) -> SamplerSettings:
-        """So many walkers and so many times the steps, unless walkers were asked for."""
-        if self.walkers is not None:
-            return self
-        return replace(
-            self,
-            walkers=max(walkers, 2 * (n_dim + 1)),
-            steps=times * self.steps,
-            max_steps=times * self.max_steps,
-        )
+        return self.walkers or max(160, 2 * (n_dim + 1))
 
 
 @dataclass(frozen=True)
@@ -176,9 +165,9 @@ def _modes(
 
 def _fitting(settings: SamplerSettings, problem: Problem) -> SamplerSettings:
     """Of long data fewer draws are taken: each is dear, and the posterior all but normal."""
-    if problem.squares.n_distinct <= _LONG:
+    if settings.walkers is not None or problem.squares.n_distinct <= _LONG:
         return settings
-    return replace(settings.longer(20, problem.n_dim, 2), ahead=1)
+    return replace(settings, walkers=max(20, 2 * (problem.n_dim + 1)), ahead=1)
 
 
 _LONG = 5000
@@ -228,9 +217,6 @@ def sample_density(
     began = time.perf_counter() if began is None else began
     count = log_prob if isinstance(log_prob, _Counter) else _Counter(log_prob)
     proposal, found = adapt(count, first, rng)
-    if found.efficiency <= POOR:
-        # Local moves do the work, along the steps.
-        settings = settings.longer(128, proposal.n_dim, 2)
     walkers = settings.n_walkers(proposal.n_dim)
     ensembles = [
         Ensemble(count, proposal, seed, walkers=walkers, ahead=settings.ahead) for seed in seeds[1:]

@@ -17,9 +17,9 @@ from calib.tasks import run_tasks
 
 __all__ = ["SETTINGS", "read_records", "run_sbc"]
 
-# As for a report, but a chain is extended to 1280 steps, not 10,240, before it counts as one that
+# As for a report, but a chain is extended to 3200 steps, not 25,600, before it counts as one that
 # did not converge: simulated campaigns are many, and some tell next to nothing.
-SETTINGS = SamplerSettings(max_steps=1280)
+SETTINGS = SamplerSettings(max_steps=3200)
 _RUN = "run.json"
 REPLICATES = "replicates"
 

@@ -102,7 +102,7 @@ CASES = '[[challenge]]\nname = "a"\ndraw_seed = 1\n'
         ("seed = true\n" + FIT, ["the seed is True"]),
         ("[[fit\n", ["not valid TOML", "line 1"]),
         (FIT + "colour = 1", ["[[fit]]", "unknown key colour", "max_steps"]),
-        (FIT + "max_steps = '9'", ["[[fit]], max_steps", "'9' will not do", "50 or more"]),
+        (FIT + "max_steps = '9'", ["[[fit]], max_steps", "'9' will not do", "100 or more"]),
         (FIT + "seed = 1.5", ["[[fit]], seed", "1.5 will not do"]),
         ('[[fit]]\nname = "a"\ndata = ["data/*.csv"]', ["models is missing", "calib models"]),
         ('[[fit]]\nname = "a"\ndata = []\nmodels = ["bekker"]', ["[] will not do", "CSV files"]),

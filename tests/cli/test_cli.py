@@ -134,12 +134,12 @@ def test_a_byte_order_mark_semicolons_and_line_ends_change_nothing(calib: Calib)
 def test_a_run_that_does_not_converge_says_so_and_ends_with_3(calib: Calib, tmp_path: Path) -> None:
     Path("my.csv").write_text(PRESSURES)
     found = calib(
-        "fit", "my.csv", "--model", "magic_formula_pressure", "--max-steps", 50, "--out", "run"
+        "fit", "my.csv", "--model", "magic_formula_pressure", "--max-steps", 100, "--out", "run"
     )
     assert found.code == 3
     assert "NOT CONVERGED, do not use these numbers" in found.out
     assert "Raise --max-steps" in found.out
-    assert json.loads(Path("run/run.json").read_text())["gate"]["steps"] == 50
+    assert json.loads(Path("run/run.json").read_text())["gate"]["steps"] == 100
     Path("at.csv").write_text("slip_ratio,inflation_pressure_psi\n0.1,30\n")
     predicted = calib("predict", "run", "--at", "at.csv")
     assert predicted.code == 3

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import emcee
 import numpy as np
 import pytest
 
 from calib.chains import convergence, ess, hdi, psis
+from calib.sampling.ensemble import Ensemble
 from calib.sampling.gate import Gate, GateReport, judge
 from calib.sampling.sampler import SamplerSettings
 
@@ -123,6 +125,24 @@ def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.Monkey
     draws = run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=settings)
     assert len(made) == 4
     assert not draws.report.passed
+
+
+@pytest.mark.parametrize("length", [2, 20])
+def test_going_to_and_fro_between_opposite_points_is_no_mixing(length: int) -> None:
+    """Walkers that flip at every step and get a new pair after some: that is how long they take."""
+    ensemble = Ensemble.__new__(Ensemble)
+    size = np.random.default_rng(1).standard_normal((4000 // length, 64, 2))
+    chain = np.repeat(size, length, axis=0)
+    chain[1::2] *= -1.0
+
+    class Stub:
+        def get_chain(self) -> np.ndarray:
+            return chain
+
+    ensemble.sampler = Stub()
+    ensemble.state = emcee.State(chain[0])
+    # 64 x 4000 steps give an autocorrelation time to a few per cent.
+    np.testing.assert_allclose(ensemble.tau(len(chain)), length, rtol=0.15)
 
 
 def test_a_run_that_cannot_move_is_refused() -> None:

@@ -163,7 +163,7 @@ def on_ridge(d: int, thinness: float, max_steps: int) -> Draws:
 
 
 def test_an_attempt_that_fails_teaches_the_next() -> None:
-    first, whole = (on_ridge(4, 0.3, steps) for steps in (100, 1600))
+    first, whole = (on_ridge(4, 0.3, steps) for steps in (200, 1600))
     assert not first.report.passed
     assert whole.report.passed
     assert whole.efficiency > first.efficiency
@@ -230,7 +230,7 @@ def test_a_run_extends_itself_until_the_gate_passes() -> None:
     assert draws.report.passed
     assert draws.report.steps > 10
     assert draws.t.shape == (4, 128, min(32, draws.report.steps), 3)
-    assert draws.walkers == 320
+    assert draws.walkers == 160
 
 
 @pytest.mark.parametrize(("steps", "most", "done"), [(10, 39, 20), (200, 30, 30)])

@@ -47,7 +47,7 @@ class FitSection(Section):
         description=f"a list of COLUMN=VALUE, the rows to hold out, and {NOTHING!r}",
     )  # fmt: skip
     max_steps: int = Field(
-        default=10_240, ge=50, description="50 or more steps, where extending the chains stops"
+        default=25_600, ge=100, description="100 or more steps, where extending the chains stops"
     )
     posteriors: bool = Field(
         default=True, description="true or false: whether to keep a run folder for `calib predict`"
