@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 
 from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.fit import Fit, Noise, fit
+from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward, Hypothesis
 from calib.gap.hypotheses import (
     LN_PAIR_TO_SINGLE,
@@ -23,6 +23,7 @@ from calib.gap.hypotheses import (
     unknowns,
 )
 from calib.gap.isolate import Isolability, isolability
+from calib.gap.noise import Noise
 from calib.gap.relevance import relevance
 from calib.models.base import Array
 from calib.sampling.mode import find_mode
