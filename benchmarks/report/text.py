@@ -40,11 +40,11 @@ _HOW = """## How it was measured
   independent draws, as nutpie's own does. Tail ESS, of the shares beyond the 5 and 95 % quantiles,
   gains nothing by it: it is in results.md beside the bulk's, and smaller.
 - **Are those sizes honest?** Not quite. The means of 40 runs of other seeds must scatter by what
-  the sizes claim, and they scatter by more: of chains of 80 steps that alternate, ArviZ's sizes
-  come out a quarter to a half too large (the ratios of variances, for means and for the shares in
-  the tails, are in results.md; the error of one parameter's is 0.23). The ratios at default
+  the sizes claim, and they scatter by more: of chains of 192 steps that alternate, ArviZ's sizes
+  come out a seventh to a quarter too large (the ratios of variances, for means and for the shares
+  in the tails, are in results.md; the error of one parameter's is 0.23). The ratios at default
   settings therefore stand in the table twice, by ArviZ's sizes and by the scatter; nutpie's own
-  sizes are taken as they are. Of the long runs, of 320 steps, the same bias is a quarter as large.
+  sizes are taken as they are.
 - **One posterior?** z-scores of the means and of the shares below the pooled 5, 50 and 95 %
   quantiles of every parameter (`equality.csv`), with the error of that very quantity. The limit is
   what the largest of so many exceeds once in a hundred times. nutpie's runs with an R-hat above
@@ -86,11 +86,12 @@ Sampler, by bulk ESS per second of the joint drawbar pull on one core:
 - emcee's snooker move is not used: half the exponent of ter Braak & Vrugt (2008) in its acceptance.
 
 Second worker: two workers took 0.89 of the time of one process (1.12 times) as long as Dask had the
-C library give every freed array back to the system: half of their time went to page faults.
-Without that it is what the table says; on 24 cases 1.39 with 4.5 s of start-up in it, 1.64 without,
-where two plain processes of a core each, without Dask, take 1.78 (as their halves came out). One
-memory arena for all threads changed nothing. The million rows, the likelihood and the genetic
-algorithm were measured with the sampler before the opposite pairs.
+C library give every freed array back to the system: half of their time went to page faults. Dask
+also looks into a worker a hundred times a second to see what it is at, and fifty times whether its
+event loop is awake; each look takes the interpreter from the task, together a twelfth of the time
+(20 diagnoses on two workers in 21.9 s with and 20.2 s without, in two plain processes without Dask
+in 18.4 s; means of three runs in turn). Both are switched off for workers that calib starts itself.
+Start-up, of about 5 s, is in the figure. One memory arena for all threads changed nothing.
 
 Likelihood: {libraries}
 A sine is worked out as a tangent of the half argument, for which NumPy has vector instructions:
