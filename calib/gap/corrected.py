@@ -18,8 +18,9 @@ from calib.errors import CalibError
 from calib.gap.case import Campaigns, campaigns, read_case
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
+from calib.gap.hypothesis import Hypothesis
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
 from calib.gap.shrink import predict_fresh

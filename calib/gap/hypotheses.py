@@ -11,7 +11,7 @@ import numpy as np
 from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.base import DENSITY, DRAWBAR, RUT
-from calib.gap.forward import Hypothesis, SmoothOver
+from calib.gap.hypothesis import Hypothesis, SmoothOver
 from calib.prior_files import default_prior_path, read_priors
 from calib.priors import Priors
 

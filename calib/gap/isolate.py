@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.gap.case import Campaigns
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import LN_PRIOR
+from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, noise_at
 from calib.models.base import Array
 from calib.sampling.curvature import hessian_scale

@@ -118,7 +118,7 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
     forward, view = fit.forward, found.data.view
     h = forward.hypothesis
     output = h.smooth_outputs[0] if h.onset_over == "level" else "rut_depth"
-    u = forward.onset_covariate(view, output)
+    u = forward.discrepancy.onset_covariate(view, output)
     if h.onset_over in ("level", "sinkage"):
         o = next(o for o in found.data.outputs if o.name == output)
         with np.errstate(all="ignore"):

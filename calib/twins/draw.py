@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.gap.case import Campaigns
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import pair, shifts, singles, split_testable, unknowns
+from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, noise_at
 from calib.gap.relevance import RELEVANT_IN_PAIR, sizes
 from calib.models.base import Array

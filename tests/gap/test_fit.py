@@ -15,8 +15,9 @@ from calib.data import table_from_arrays
 from calib.gap.case import Campaigns, Case, campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit, fit
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
+from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, ln_prior
 from gap.cases import PULL_ONLY, make_case
 

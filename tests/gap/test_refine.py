@@ -11,8 +11,9 @@ import pytest
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import fit, log_joint
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
+from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
 from calib.gap.refine import refine
 from calib.gap.which import rank
