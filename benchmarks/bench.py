@@ -2,7 +2,7 @@
 
     python benchmarks/bench.py                       # all parts, about 40 minutes on two cores
     python benchmarks/bench.py posterior likelihood  # some of them; the others stay as they were
-    python benchmarks/bench.py --full campaign       # 200 diagnoses in the place of 120
+    python benchmarks/bench.py --full campaign       # 200 diagnoses in the place of 100
 
 Each part runs in a process of its own and leaves its measurements as JSON; tables, figure and
 README are written from whatever parts are there.
@@ -29,7 +29,7 @@ PARTS: dict[str, list[str]] = {
     "likelihood": ["likelihood.py"],
     "genetic": ["genetic.py"],
     "million": ["million.py"],
-    "campaign": ["campaign.py", "--cases", "120", "--repeats", "1"],
+    "campaign": ["campaign.py", "--cases", "100", "--repeats", "1"],
     "survival": ["campaign_survival.py", "--cases", "200"],
 }
 FULL = {"campaign": ["--cases", "200"]}
