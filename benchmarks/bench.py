@@ -1,8 +1,8 @@
 """Run the benchmarks and write reports/benchmarks: tables, a figure, and what they say.
 
-    python benchmarks/bench.py                       # all parts, about half an hour on two cores
+    python benchmarks/bench.py                       # all parts, about 40 minutes on two cores
     python benchmarks/bench.py posterior likelihood  # some of them; the others stay as they were
-    python benchmarks/bench.py --full survival       # 200 diagnoses in the place of 80
+    python benchmarks/bench.py --full campaign       # 200 diagnoses in the place of 100
 
 Each part runs in a process of its own and leaves its measurements as JSON; tables, figure and
 README are written from whatever parts are there.
@@ -29,10 +29,10 @@ PARTS: dict[str, list[str]] = {
     "likelihood": ["likelihood.py"],
     "genetic": ["genetic.py"],
     "million": ["million.py"],
-    "campaign": ["campaign.py", "--cases", "80", "--repeats", "1"],
-    "survival": ["campaign_survival.py", "--cases", "80"],
+    "campaign": ["campaign.py", "--cases", "100", "--repeats", "1"],
+    "survival": ["campaign_survival.py", "--cases", "200"],
 }
-FULL = {"campaign": ["--cases", "200"], "survival": ["--cases", "200"]}
+FULL = {"campaign": ["--cases", "200"]}
 
 
 def main() -> int:
@@ -40,7 +40,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
     parser.add_argument("--out", type=Path, default=HERE.parent / "reports" / "benchmarks")
-    parser.add_argument("--full", action="store_true", help="campaigns of 200, 20 minutes more")
+    parser.add_argument("--full", action="store_true", help="campaigns of 200, 10 minutes more")
     parser.add_argument("--only-write", action="store_true", help="measure nothing")
     options = parser.parse_args()
     unknown = set(options.parts) - set(PARTS)

@@ -32,7 +32,7 @@ _HOW = """## How it was measured
   draws of our posterior and searches for nothing. Effective sample sizes are ArviZ's, smallest over
   the parameters, of all draws that were kept, with walkers as chains. calib stores 16,384 draws of
   a posterior unless `SamplerSettings.keep` says more; here it keeps all. "Default" is 4 ensembles
-  of 160 walkers and 192 steps, and nutpie's 4 chains of 1,000 draws after its tuning; "long" is
+  of 320 walkers and 192 steps, and nutpie's 4 chains of 1,000 draws after its tuning; "long" is
   1,024 walkers and 320 steps, and 4 chains of 10,000 draws: what a sampler does once what comes
   first is of little account.
 - **Bulk and tail.** Our draws come in opposite pairs, whose errors of a mean cancel: bulk ESS,
@@ -40,11 +40,11 @@ _HOW = """## How it was measured
   independent draws, as nutpie's own does. Tail ESS, of the shares beyond the 5 and 95 % quantiles,
   gains nothing by it: it is in results.md beside the bulk's, and smaller.
 - **Are those sizes honest?** Not quite. The means of 40 runs of other seeds must scatter by what
-  the sizes claim, and they scatter by more: of chains of 80 steps that alternate, ArviZ's sizes
-  come out a quarter to a half too large (the ratios of variances, for means and for the shares in
-  the tails, are in results.md; the error of one parameter's is 0.23). The ratios at default
+  the sizes claim, and they scatter by more: of chains of 192 steps that alternate, ArviZ's sizes
+  come out a seventh to a quarter too large (the ratios of variances, for means and for the shares
+  in the tails, are in results.md; the error of one parameter's is 0.23). The ratios at default
   settings therefore stand in the table twice, by ArviZ's sizes and by the scatter; nutpie's own
-  sizes are taken as they are. Of the long runs, of 320 steps, the same bias is a quarter as large.
+  sizes are taken as they are.
 - **One posterior?** z-scores of the means and of the shares below the pooled 5, 50 and 95 %
   quantiles of every parameter (`equality.csv`), with the error of that very quantity. The limit is
   what the largest of so many exceeds once in a hundred times. nutpie's runs with an R-hat above
@@ -67,10 +67,12 @@ Sampler, by bulk ESS per second of the joint drawbar pull on one core:
   and a step between a pair's points), one mixture with its broad component in straightened
   coordinates for two densities, scales of the straightening map that grow with every coordinate
   and not with the noise alone (a point's opposite is accepted with 0.85 for 0.79, of density 0.70
-  for 0.61), 160 walkers and 192 steps for 128 and 160. With 320 walkers and 80 steps the rate is a
-  tenth higher, as emcee's own work on a step is that of 100 proposals, but chains so short tell
-  less of how they mix: the autocorrelation time of such chains is that of a coordinate's distance
-  from its median too, and two to three steps.
+  for 0.61), what walkers do with the pairs of 16 steps worked out in one go, no copy of the state
+  of emcee's random numbers at every step, and 320 walkers and 192 steps for 128 and 160. Work on
+  a step, ours and emcee's, was that of 200 proposals: with 320 walkers a run of density takes as
+  long as with 160 before these two (0.24 s for 0.23) and has twice the effective size. Chains of
+  80 steps, tried between, tell little of how they mix: their autocorrelation time is now taken as
+  that of a coordinate's distance from its median too, and is two to three steps.
 - Kept, before: proposals' densities worked out with the draws; expectation maximisation in two
   matrix products; a random walk in straightened coordinates in the place of differential
   evolution; the gate on the draws that are stored; log densities taken past emcee's loop over
@@ -84,11 +86,12 @@ Sampler, by bulk ESS per second of the joint drawbar pull on one core:
 - emcee's snooker move is not used: half the exponent of ter Braak & Vrugt (2008) in its acceptance.
 
 Second worker: two workers took 0.89 of the time of one process (1.12 times) as long as Dask had the
-C library give every freed array back to the system: half of their time went to page faults.
-Without that it is what the table says; on 24 cases 1.39 with 4.5 s of start-up in it, 1.64 without,
-where two plain processes of a core each, without Dask, take 1.78 (as their halves came out). One
-memory arena for all threads changed nothing. The million rows, the likelihood and the genetic
-algorithm were measured with the sampler before the opposite pairs.
+C library give every freed array back to the system: half of their time went to page faults. Dask
+also looks into a worker a hundred times a second to see what it is at, and fifty times whether its
+event loop is awake; each look takes the interpreter from the task, together a twelfth of the time
+(20 diagnoses on two workers in 21.9 s with and 20.2 s without, in two plain processes without Dask
+in 18.4 s; means of three runs in turn). Both are switched off for workers that calib starts itself.
+Start-up, of about 5 s, is in the figure. One memory arena for all threads changed nothing.
 
 Likelihood: {libraries}
 A sine is worked out as a tangent of the half argument, for which NumPy has vector instructions:

@@ -63,7 +63,8 @@ def discard_changed(
     if changed and not overwrite:
         name, what = next(iter(changed.items()))
         raise CalibError(
-            f"{len(changed)} results were made from something else: {name} has another {what}",
+            f"{len(changed)} of the results there {'was' if len(changed) == 1 else 'were'} made "
+            f"from something else than the plan now says: {name} differs in {what}",
             where=str(results),
             allowed="the plan, the data and the versions that the results there were made from",
             mend="choose another --out, or pass --overwrite to do these tasks again",

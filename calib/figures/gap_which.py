@@ -11,6 +11,7 @@ from calib.figures.labels import MINUS, NO_UNIT, joined, percent, short
 from calib.figures.plate import Plate
 from calib.figures.style import BLACK, BLUE, EMBER, GREY, ORANGE, SKY, VERMILION, note, panels
 from calib.gap.diagnose import Diagnosis
+from calib.gap.noise import noise_at
 from calib.models.base import Array
 
 __all__ = ["IN_PLAY", "Placebo", "in_play", "placebos", "probability_text", "which_plate"]
@@ -109,10 +110,10 @@ def placebos(found: Diagnosis) -> Placebo:
     A fit's own residuals are standardised by its own noise, which a wrong hypothesis inflates:
     they are put on the noise of the best hypothesis first.
     """
-    slip = found.data.view.slip()
+    at = noise_at(found.data.view)
     best = best_fit(found, best_of(found))
     rows = {o.name: o.rows for o in found.data.outputs}
-    reference = {o: n.sd(slip[rows[o]]) for o, n in best.noise.items()}
+    reference = {o: n.sd(at.rows(rows[o])) for o, n in best.noise.items()}
     left = {}
     for name in found.ranking.fits:
         if "+" in name and name != best_of(found):
@@ -120,7 +121,7 @@ def placebos(found: Diagnosis) -> Placebo:
         fit = best_fit(found, name)
         left[name] = _rms(
             [
-                r * fit.noise[o].sd(slip[rows[o]]) / reference[o]
+                r * fit.noise[o].sd(at.rows(rows[o])) / reference[o]
                 for o, r in fit.field_residuals.items()
             ]
         )

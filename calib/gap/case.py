@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from calib.data import Table, read_table
 from calib.errors import CalibError
 from calib.gap.effects import View
+from calib.gap.noise import At, noise_at_lab
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.priors import Priors
@@ -88,7 +89,7 @@ class Campaigns:
 
     outputs: tuple[OutputData, ...]
     view: View
-    lab_slips: Mapping[str, Array]
+    lab_at: Mapping[str, At]
     case: Case
 
     @property
@@ -268,11 +269,8 @@ def campaigns(case: Case) -> Campaigns:
         ground_exponent=_ground_exponent(lab, field),
         order_range=(float(order.min()), float(order.max())),
     )
-    slips = {
-        o.name: o.problem.table.columns.get("slip_ratio", np.zeros(len(o.problem.table)))
-        for o in outputs
-    }
-    return Campaigns(outputs, view, slips, case)
+    lab_at = {o.name: noise_at_lab(o.problem.table, view) for o in outputs}
+    return Campaigns(outputs, view, lab_at, case)
 
 
 def _output(case: Case, name: str, model: str) -> OutputData:

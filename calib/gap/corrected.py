@@ -17,10 +17,12 @@ from calib.data import Table, write_table
 from calib.errors import CalibError
 from calib.gap.case import Campaigns, campaigns, read_case
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.fit import Fit, Noise
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.fit import Fit
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
+from calib.gap.hypothesis import Hypothesis
 from calib.gap.mixture import Mixture
+from calib.gap.noise import Noise
 from calib.gap.shrink import predict_fresh
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
@@ -99,7 +101,9 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
         "psi": fit.psi.tolist(),
         "covariance": fit.covariance.tolist(),
         "sample": None if fit.sample is None else _short(fit.sample),
-        "noise": {o: {"sigma": n.sigma, "rho": n.rho} for o, n in fit.noise.items()},
+        "noise": {
+            o: {"sigma": n.sigma, "rho": n.rho, "kappa": n.kappa} for o, n in fit.noise.items()
+        },
     }
 
 
@@ -159,7 +163,7 @@ def _load_fit(
         document["shift"], document["smooth"], tuple(document["smooth_outputs"]),
         document["smooth_over"], document["smooth_decay"], document["onset_over"],
     )  # fmt: skip
-    noise = {o: Noise(n["sigma"], n["rho"]) for o, n in document["noise"].items()}
+    noise = {o: Noise(n["sigma"], n["rho"], n["kappa"]) for o, n in document["noise"].items()}
     forward = Forward(data, hypothesis, {o: n.sigma for o, n in noise.items()}, lab_mode)
     psi, covariance = np.array(document["psi"]), np.array(document["covariance"])
     if psi.shape != (forward.n_dim,) or covariance.shape != (forward.n_dim, forward.n_dim):

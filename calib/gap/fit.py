@@ -18,31 +18,17 @@ from scipy.special import log_ndtr
 
 from calib.gap.case import Campaigns
 from calib.gap.forward import Forward
+from calib.gap.noise import Noise, ln_prior, most_probable, noise_at
 from calib.models.base import Array
 from calib.sampling.mode import prior_widths
 
-__all__ = ["Fit", "Noise", "fit", "log_joint"]
+__all__ = ["Fit", "fit", "log_joint"]
 
-# Growth of the noise with slip: sigma (1 + rho s), and the prior probability of each.
-RHO = np.array([0.0, 1.0, 2.5, 5.0])
-LN_RHO_PRIOR = np.log(np.array([0.5, 0.2, 0.15, 0.15]))
 # The noise of an output is known beforehand to this factor (sd of its logarithm).
 SIGMA_SD_LOG = 1.0
 _MAX_STEPS = 40
 # Guesses closer than this (in prior sds) climb to the same mode.
 _APART = 0.7
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Noise of one output: sd sigma (1 + rho slip) on the scale of the response."""
-
-    sigma: float
-    rho: float
-
-    def sd(self, slip: Array) -> Array:
-        """Noise sd at slips, shape (n,)."""
-        return self.sigma * (1.0 + self.rho * np.maximum(slip, 0.0))
 
 
 @dataclass(frozen=True)
@@ -132,7 +118,9 @@ def _polish(problem: _Residuals, psi: Array, noise: Mapping[str, Noise]) -> Fit:
             psi, raw = problem.clip(psi + step), moved
         new_noise = problem.update_noise(raw, jacobian, hessian)
         changed = max(
-            abs(np.log(new_noise[o].sigma / noise[o].sigma)) + abs(new_noise[o].rho - noise[o].rho)
+            abs(np.log(new_noise[o].sigma / noise[o].sigma))
+            + abs(new_noise[o].rho - noise[o].rho)
+            + abs(new_noise[o].kappa - noise[o].kappa)
             for o in noise
         )
         noise = new_noise
@@ -180,11 +168,8 @@ class _Residuals:
         self.loc, self.precision = np.where(precision > 0, loc, 0.0), precision
         self.lower, self.upper = lower, upper
         self.width = prior_widths(forward.priors)
-        field_slip = data.view.slip()
-        self.slips = {
-            o.name: np.concatenate([data.lab_slips[o.name], field_slip[o.rows]])
-            for o in data.outputs
-        }
+        field_at = noise_at(data.view)
+        self.at = {o.name: data.lab_at[o.name] + field_at.rows(o.rows) for o in data.outputs}
         self.observed = {
             o.name: np.concatenate([o.problem.response, o.field]) for o in data.outputs
         }
@@ -214,12 +199,12 @@ class _Residuals:
         self, psi: Array, raw: Mapping[str, Array], noise: Mapping[str, Noise]
     ) -> Array:
         """All residuals over their sds, the priors' included, shape (k, N)."""
-        parts = [r / noise[o].sd(self.slips[o]) for o, r in raw.items()]
+        parts = [r / noise[o].sd(self.at[o]) for o, r in raw.items()]
         parts.append((psi - self.loc) * self.precision)
         return np.concatenate(parts, axis=1)
 
     def ln_sds(self, noise: Mapping[str, Noise]) -> float:
-        return float(sum(np.log(noise[o].sd(s)).sum() for o, s in self.slips.items()))
+        return float(sum(np.log(noise[o].sd(at)).sum() for o, at in self.at.items()))
 
     def costs(self, psi: Array, raw: Mapping[str, Array], noise: Mapping[str, Noise]) -> Array:
         """Minus log posterior but for constants, shape (k,)."""
@@ -260,7 +245,7 @@ class _Residuals:
             start += n
             # Each residual lost the part of its variance that the parameters took up.
             corrected = np.square(r[0]) / np.clip(1.0 - leverage[rows], 0.1, 1.0)
-            updated[o] = _best_noise(corrected, self.slips[o])
+            updated[o] = most_probable(corrected, self.at[o])
         return updated
 
     def finish(self, psi: Array, noise: dict[str, Noise]) -> Fit:
@@ -268,7 +253,7 @@ class _Residuals:
         hessian = jacobian.T @ jacobian
         gradient = jacobian.T @ residual
         d = psi.size
-        n = sum(s.size for s in self.slips.values())
+        n = sum(at.slip.size for at in self.at.values())
         data_part = residual[:n]
         log_likelihood = (
             -0.5 * float(data_part @ data_part) - self.ln_sds(noise) - 0.5 * n * np.log(2 * np.pi)
@@ -280,12 +265,10 @@ class _Residuals:
         covariance = np.linalg.inv(hessian)
         evidence = log_likelihood + log_prior + 0.5 * d * np.log(2 * np.pi) - 0.5 * log_det
         evidence += self._bounds_correction(psi, gradient, covariance)
-        evidence += float(
-            sum(LN_RHO_PRIOR[int(np.argmin(np.abs(RHO - n.rho)))] for n in noise.values())
-        )
+        evidence += sum(ln_prior(n) for n in noise.values())
         residuals, start = {}, 0
         for o in self.data.outputs:
-            n_lab, n_all = o.problem.response.size, self.slips[o.name].size
+            n_lab, n_all = o.problem.response.size, self.at[o.name].slip.size
             residuals[o.name] = data_part[start + n_lab : start + n_all]
             start += n_all
         return Fit(
@@ -320,22 +303,9 @@ def log_joint(fit: Fit, psi: Array) -> Array:
         prior = fit.forward.priors.log_prob(psi)
         inside = problem.clip(psi)
         squares = [
-            np.square(r / fit.noise[o].sd(problem.slips[o])).sum(axis=1)
+            np.square(r / fit.noise[o].sd(problem.at[o])).sum(axis=1)
             for o, r in problem.raw(inside).items()
         ]
-    n = sum(s.size for s in problem.slips.values())
+    n = sum(at.slip.size for at in problem.at.values())
     constant = problem.ln_sds(fit.noise) + 0.5 * n * np.log(2.0 * np.pi)
     return np.asarray(prior - 0.5 * np.sum(squares, axis=0) - constant)
-
-
-def _best_noise(squared: Array, slip: Array) -> Noise:
-    """Maximise the likelihood over rho on a grid, sigma in closed form."""
-    best, found = -np.inf, Noise(1.0, 0.0)
-    n = squared.size
-    for rho, prior in zip(RHO, LN_RHO_PRIOR, strict=True):
-        growth = 1.0 + rho * np.maximum(slip, 0.0)
-        variance = max(float((squared / growth**2).mean()), 1e-18)
-        value = -0.5 * n * np.log(variance) - np.log(growth).sum() + prior
-        if value > best:
-            best, found = value, Noise(float(np.sqrt(variance)), float(rho))
-    return found

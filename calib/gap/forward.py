@@ -13,77 +13,28 @@ The vector psi of a hypothesis stacks, all with (truncated) normal or uniform pr
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
-from scipy.special import expit
 
 from calib.gap.case import Campaigns, OutputData
-from calib.gap.effects import Effect, View
-from calib.gap.effects.base import RUT
+from calib.gap.covariates import Covariates
+from calib.gap.discrepancy import THRESHOLDS, Discrepancy
+from calib.gap.effects import View
+from calib.gap.hypothesis import Hypothesis
 from calib.models.base import Array
 from calib.priors import Prior, Priors
 from calib.sampling.mode import prior_widths
 
-__all__ = ["FORM_ERROR", "Forward", "Hypothesis", "OnsetOver", "SmoothOver"]
-
-type SmoothOver = Literal["slip", "level", "sinkage", "order", "all"]
-type OnsetOver = Literal["slip", "level", "sinkage", "order", "low_pressure"]
+__all__ = ["FORM_ERROR", "Forward"]
 
 # Relative size by which a formula may misrepresent its effect along one direction.
 FORM_ERROR = 0.3
 # Inadequacy of a simulator at the end of the lab's range of a condition, in noise sds.
 MISFIT = 1.0
 MISFIT_OUTPUTS = ("bulk_density",)
-# Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
-_THRESHOLDS = (-0.85, 0.9)
-_ONSET_WIDTH = 0.06
 # Shifts of how a parameter varies with pressure or slip, relative to those of its value.
 SHIFT_DIFFERENCE = 0.2
-
-
-@dataclass(frozen=True)
-class Hypothesis:
-    """What may cause the gap.
-
-    Parameters
-    ----------
-    name : str
-        Contract name, pairs in alphabetical order.
-    effects : tuple of Effect
-    effect_priors : tuple of Priors
-    shift : float
-        Prior sd of parameter shifts in units of the parameters' own prior sds; 0 for none.
-    smooth : float
-        Prior sd of a free discrepancy, in units of the noise; 0 for none.
-    smooth_outputs : tuple of str
-        Outputs that have the free discrepancy.
-    smooth_over : {"slip", "level", "sinkage", "order", "all"}
-        What it may vary with: slip, the level of the predicted output (as a saturating
-        instrument would), the predicted rut depth (as layered soil would), the order of the runs
-        (as weather or another stretch of ground would), or every condition.
-    smooth_decay : float
-        Number of half waves from which the discrepancy's coefficients fall off.
-    onset_over : {"slip", "level", "sinkage", "order", "low_pressure"}, optional
-        Instead of smooth, the discrepancy may set in beyond a threshold of one of these: a step
-        and a change of slope there. Below a threshold of inflation pressure, where a limp tyre may
-        creep on its rim or buckle: a step, and a part of the output's level.
-    share : float
-        Part of the prior probability of its name.
-    """
-
-    name: str
-    effects: tuple[Effect, ...] = ()
-    effect_priors: tuple[Priors, ...] = ()
-    shift: float = 0.0
-    smooth: float = 0.0
-    smooth_outputs: tuple[str, ...] = ()
-    smooth_over: SmoothOver = "all"
-    smooth_decay: float = 4.0
-    onset_over: OnsetOver | None = None
-    share: float = 1.0
 
 
 class Forward:
@@ -108,7 +59,6 @@ class Forward:
         noise: Mapping[str, float],
         lab_mode: Mapping[str, Array] | None = None,
     ) -> None:
-        self.lab_mode = lab_mode or {}
         self.data = data
         self.hypothesis = hypothesis
         self.noise = noise
@@ -127,11 +77,10 @@ class Forward:
             _append(entries, p.free, e.name)
             for e, p in zip(hypothesis.effects, hypothesis.effect_priors, strict=True)
         ]
+        self.covariates = Covariates(data)
+        self.discrepancy = Discrepancy(data, hypothesis, self.covariates, lab_mode or {})
         # Worked out once for the field rows, which every step of a fit predicts.
         self._field_form = self._form_basis(data.view)
-        self._field_smooth = {
-            name: self._smooth_basis(data.view, name) for name in hypothesis.smooth_outputs
-        }
         self.form_slices: dict[str, slice] = {}
         for o in data.outputs:
             m = self._field_form.shape[1]
@@ -150,14 +99,12 @@ class Forward:
         self.smooth_slices: dict[str, slice] = {}
         for o in data.outputs:
             if o.name in hypothesis.smooth_outputs:
-                weights = self._field_smooth[o.name][1]
                 sd = hypothesis.smooth * noise[o.name]
-                self.smooth_slices[o.name] = _append(
-                    entries, [_normal("smooth", sd * w) for w in weights], o.name
-                )
+                amplitudes = [_normal("smooth", sd * w) for w in self.discrepancy.sds(o.name)]
+                self.smooth_slices[o.name] = _append(entries, amplitudes, o.name)
         self.threshold = len(entries)
         if hypothesis.onset_over is not None:
-            entries.append(_uniform("threshold", *_THRESHOLDS))
+            entries.append(_uniform("threshold", *THRESHOLDS))
         self.priors = Priors(tuple(entries))
 
     @property
@@ -165,83 +112,17 @@ class Forward:
         """Length of psi."""
         return len(self.priors.free)
 
-    @cached_property
-    def _ranges(self) -> dict[str, Array]:
-        lab = self.data.case.lab.columns
-        return {
-            name: np.concatenate([values, lab.get(name, values)])
-            for name, values in self.data.view.conditions.items()
-        }
-
-    def _scaled(self, view: View, name: str, transform: str = "") -> Array | None:
-        if name not in view.conditions:
-            return None
-        values, reference = view.conditions[name], self._ranges[name]
-        if transform == "log":
-            values, reference = (
-                np.log(np.maximum(values, 1e-6)),
-                np.log(np.maximum(reference, 1e-6)),
-            )
-        if np.ptp(reference) < 1e-9 * max(1.0, abs(reference).max()):
-            return None
-        mid, half = 0.5 * (reference.max() + reference.min()), 0.5 * np.ptp(reference)
-        return np.clip((values - mid) / half, -1.5, 1.5)
-
-    def _pressure(self, view: View) -> Array | None:
-        """Inflation pressure, or else that on the ground, scaled to -1..1."""
-        found = self._scaled(view, "inflation_pressure_psi")
-        return self._scaled(view, "average_ground_pressure_kpa") if found is None else found
-
     def _form(self, view: View) -> Array:
         same = view.conditions is self.data.view.conditions
         return self._field_form if same else self._form_basis(view)
-
-    def _discrepancy(self, psi: Array, view: View, name: str) -> Array:
-        """Free discrepancy of an output, shape (k, n)."""
-        amplitudes = psi[:, self.smooth_slices[name]]
-        if self.hypothesis.onset_over is None:
-            return amplitudes @ self._smooth(view, name).T
-        step, bend = self.onset(view, name, psi[:, self.threshold])
-        return amplitudes[:, :1] * step + amplitudes[:, 1:2] * bend
-
-    def onset(self, view: View, output: str, threshold: Array) -> tuple[Array, Array]:
-        """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n).
-
-        Below a pressure it is a step and a part of the output's level instead.
-        """
-        u = self.onset_covariate(view, output)
-        beyond = (u - threshold[:, None]) / _ONSET_WIDTH
-        step = expit(beyond)
-        if self.hypothesis.onset_over == "low_pressure":
-            # A limp tyre may lose a part of the pull, and more of it the more it pulls.
-            return step, step * self._known(self._level(view, output))
-        return step, _ONSET_WIDTH * np.logaddexp(0.0, beyond)
-
-    def onset_covariate(self, view: View, output: str) -> Array:
-        """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
-        over = self.hypothesis.onset_over
-        if over == "low_pressure":
-            return -self._known(self._pressure(view))
-        if over in ("level", "sinkage"):
-            return self._known(self._level(view, output if over == "level" else RUT))
-        return self._known(self._scaled(view, "slip_ratio" if over == "slip" else "run_order"))
-
-    def _known(self, u: Array | None) -> Array:
-        if u is None:
-            raise ValueError(f"nothing to set in over: {self.hypothesis.onset_over}")
-        return u
-
-    def _smooth(self, view: View, output: str) -> Array:
-        same = view.conditions is self.data.view.conditions
-        return (self._field_smooth[output] if same else self._smooth_basis(view, output))[0]
 
     def _form_basis(self, view: View) -> Array:
         """Basis of the form error, shape (n, m)."""
         wanted = {kind for e in self.hypothesis.effects for kind in e.form}
         n = view.slip().size
         basis: list[Array] = []
-        slip = self._scaled(view, "slip_ratio")
-        pressure = self._pressure(view)
+        slip = self.covariates.scaled(view, "slip_ratio")
+        pressure = self.covariates.pressure(view)
         if "size" in wanted:
             basis.append(np.ones(n))
         if "slip" in wanted and slip is not None:
@@ -253,7 +134,7 @@ class Forward:
             ("water", "gravimetric_water_content", ""),
             ("water", "volumetric_water_content", ""),
         ):
-            values = self._scaled(view, name, transform) if kind in wanted else None
+            values = self.covariates.scaled(view, name, transform) if kind in wanted else None
             if values is not None:
                 basis.append(values)
         if "shape" in wanted:
@@ -264,73 +145,6 @@ class Forward:
                     mid = 0.5 * (reference.max() + reference.min())
                     basis.append(np.clip((values - mid) / (0.5 * np.ptp(reference)), -1.5, 1.5))
         return np.stack(basis, axis=1) if basis else np.empty((n, 0))
-
-    def _smooth_basis(self, view: View, output: str) -> tuple[Array, Array]:
-        """Basis of an output's free discrepancy, shape (n, m), and its coefficients' sds."""
-        over = self.hypothesis.smooth_over
-        if self.hypothesis.onset_over is not None:
-            # Its shape depends on the threshold; here are its two amplitudes.
-            return np.empty((0, 2)), np.array([1.0, 2.0])
-        if over in ("level", "sinkage"):
-            terms = self._cosines(self._level(view, output if over == "level" else RUT), 8, 0.8)
-        elif over == "order":
-            terms = self._cosines(self._scaled(view, "run_order"), 12, 0.7)
-        else:
-            terms = self._condition_terms(view, everything=over == "all")
-        n = next(iter(view.conditions.values())).size
-        basis = [np.ones(n)] + [b for b, _ in terms]
-        return np.stack(basis, axis=1), np.array([1.0] + [w for _, w in terms])
-
-    def _condition_terms(self, view: View, *, everything: bool) -> list[tuple[Array, float]]:
-        slip = self._scaled(view, "slip_ratio")
-        pressure = self._pressure(view)
-        slips = self._cosines(slip, 10, 0.7)
-        terms = list(slips)
-        if everything:
-            terms += self._cosines(self._scaled(view, "run_order"), 6, 0.5)
-        if pressure is not None:
-            terms.append((pressure, 0.7))
-            terms += [(pressure * b, 0.6 * w) for b, w in slips[:4]]
-        for name, transform in (
-            ("speed_m_s", "log"), ("pass_number", "log"), ("gravimetric_water_content", ""),
-            ("normal_load_kn", "log"), ("cone_index_kpa", "log"),
-            ("volumetric_water_content", ""),
-        ):  # fmt: skip
-            u = self._scaled(view, name, transform)
-            if u is not None and everything:
-                terms += self._cosines(u, 3, 0.4)
-                if slip is not None:
-                    terms.append((u * slip, 0.4))
-        return terms
-
-    def _cosines(self, u: Array | None, most: int, scale: float) -> list[tuple[Array, float]]:
-        """Cosines of a covariate scaled to -1..1, and the sds of their coefficients."""
-        if u is None:
-            return []
-        angle = 0.5 * np.pi * (np.clip(u, -1.2, 1.2) + 1.0)
-        return [
-            (
-                np.sqrt(2.0) * np.cos(j * angle),
-                scale / (1.0 + (j / self.hypothesis.smooth_decay) ** 2),
-            )
-            for j in range(1, most + 1)
-        ]
-
-    def _level(self, view: View, output: str) -> Array | None:
-        """Predicted level of an output, scaled to the field's range."""
-        if output not in self.lab_mode:
-            return None
-        o = next(o for o in self.data.outputs if o.name == output)
-        theta = o.priors.to_natural(self.lab_mode[output][None])
-
-        def predicted(conditions: Mapping[str, Array]) -> Array:
-            selected = o.problem.bound.model.select(conditions)
-            return np.asarray(o.problem.bound.location(theta, selected)[0])
-
-        reference = predicted(self.data.view.conditions)
-        low, high = float(np.nanmin(reference)), float(np.nanmax(reference))
-        level = np.nan_to_num(predicted(view.conditions), nan=low)
-        return np.clip((level - low) / max(high - low, 1e-12) * 2.0 - 1.0, -1.5, 1.5)
 
     def theta(self, psi: Array, output: str, *, field: bool) -> Array:
         """Natural simulator parameters, shape (k, d)."""
@@ -390,12 +204,9 @@ class Forward:
         if self.hypothesis.effects:
             plain = self._with_effects(psi, view, plain)
         if self.smooth_slices:
-            plain = {
-                name: location + self._discrepancy(psi, view, name)
-                if name in self.smooth_slices
-                else location
-                for name, location in plain.items()
-            }
+            threshold = psi[:, self.threshold :].ravel()  # of one that sets in, else empty
+            for name, part in self.smooth_slices.items():
+                plain[name] = plain[name] + self.discrepancy.at(psi[:, part], threshold, view, name)
         return plain
 
     def _with_effects(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:

@@ -11,7 +11,7 @@ import numpy as np
 from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.base import DENSITY, DRAWBAR, RUT
-from calib.gap.forward import Hypothesis, SmoothOver
+from calib.gap.hypothesis import Hypothesis, SmoothOver
 from calib.prior_files import default_prior_path, read_priors
 from calib.priors import Priors
 
@@ -37,6 +37,8 @@ SHIFTS = (0.1, 0.25, 0.6)
 SMOOTHS = (1.5, 5.0)
 # Size (noise sds) of a discrepancy that sets in beyond a threshold.
 ONSET = 4.0
+# Part of `unknown` that a limp tyre has, whichever output shows it.
+LIMP = 0.06
 # Part of `unknown` that comes on top of a listed effect instead of alone.
 REMAINDER = 0.2
 
@@ -112,12 +114,11 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
             if DENSITY not in t
         ]
     half = (1.0 - REMAINDER) / 2.0
-    # What a limp tyre does counts as one of the onsets, whichever output shows it.
-    onset = half / (len(sudden) + bool(limp))
+    onsets = half - LIMP if limp else half
     return [
         *(replace(h, share=half / len(smooth)) for h in smooth),
-        *(replace(h, share=onset) for h in sudden),
-        *(replace(h, share=onset / len(limp)) for h in limp),
+        *(replace(h, share=onsets / len(sudden)) for h in sudden),
+        *(replace(h, share=LIMP / len(limp)) for h in limp),
     ]
 
 

@@ -15,9 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.gap.case import Campaigns
-from calib.gap.fit import Noise
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import LN_PRIOR
+from calib.gap.hypothesis import Hypothesis
+from calib.gap.noise import Noise, noise_at
 from calib.models.base import Array
 from calib.sampling.curvature import hessian_scale
 from calib.sampling.mode import prior_widths
@@ -123,7 +124,8 @@ def _signatures(
     with np.errstate(all="ignore"):
         full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
     parts = [
-        (full[o.name] - plain[o.name])[:, o.rows] / noise[o.name].sd(data.view.slip()[o.rows])
+        (full[o.name] - plain[o.name])[:, o.rows]
+        / noise[o.name].sd(noise_at(data.view).rows(o.rows))
         for o in data.outputs
     ]
     g = np.concatenate(parts, axis=1)
@@ -146,7 +148,7 @@ def _metric_root(
         d = step.size
         sensitivity = ((location[:d] - location[d:]) / (2.0 * step[:, None])).T
         sensitivity = np.nan_to_num(sensitivity) / noise[o.name].sd(
-            data.view.slip()[o.rows]
+            noise_at(data.view).rows(o.rows)
         ).reshape(-1, 1)
         c = np.eye(o.rows.size) + sensitivity @ covariance @ sensitivity.T
         blocks.append(np.linalg.inv(np.linalg.cholesky(c)))

@@ -10,6 +10,7 @@ import numpy as np
 from calib.gap.case import Campaigns
 from calib.gap.effects import View
 from calib.gap.fit import Fit
+from calib.gap.noise import noise_at
 from calib.gap.refine import refine
 from calib.gap.which import Ranking
 from calib.models.base import Array
@@ -111,7 +112,7 @@ class Mixture:
         simulator, truth, noise, measured = {}, {}, {}, {}
         for o in self.data.outputs:
             bound, location = o.problem.bound, full[o.name][good]
-            sd = fit.noise[o.name].sd(view.slip()) * np.ones_like(location)
+            sd = fit.noise[o.name].sd(noise_at(view)) * np.ones_like(location)
             simulator[o.name] = bound.from_response(plain[o.name][good])
             truth[o.name] = bound.from_response(location)
             noise[o.name] = sd * truth[o.name] if bound.model.response == "log" else sd

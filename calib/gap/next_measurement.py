@@ -11,6 +11,7 @@ import numpy as np
 from calib.gap.case import Campaigns
 from calib.gap.effects import View
 from calib.gap.fit import Fit
+from calib.gap.noise import noise_at
 from calib.gap.which import Ranking
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
@@ -101,7 +102,7 @@ def _moments(data: Campaigns, fit: Fit, view: View, seed: int) -> dict[str, tupl
         location = fit.forward.field(psi, view)
     found = {}
     for o in data.outputs:
-        noise = fit.noise[o.name].sd(view.slip())
+        noise = fit.noise[o.name].sd(noise_at(view))
         found[o.name] = (
             np.nanmean(location[o.name], axis=0),
             np.nanvar(location[o.name], axis=0) + noise**2,

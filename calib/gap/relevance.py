@@ -19,8 +19,9 @@ from functools import partial
 
 import numpy as np
 
-from calib.gap.fit import Fit, Noise
+from calib.gap.fit import Fit
 from calib.gap.forward import Forward
+from calib.gap.noise import Noise, noise_at
 from calib.models.base import Array
 from calib.streams import generator
 
@@ -88,13 +89,13 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
             without = [forward.simulator(psi, data.view)]
         else:
             without = [_lone(forward, psi, i) for i in range(len(hypothesis.effects))]
-    slip = data.view.slip()
+    at = noise_at(data.view)
     joint = not named and len(hypothesis.smooth_outputs) > 1
     columns = []
     for other in without:
         squares = {
             o.name: np.square(
-                (full[o.name] - other[o.name])[:, o.rows] / noise[o.name].sd(slip[o.rows])
+                (full[o.name] - other[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))
             )
             for o in data.outputs
         }

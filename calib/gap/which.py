@@ -10,8 +10,8 @@ from scipy.special import logsumexp
 
 from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.fit import Fit, Noise, fit
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.fit import Fit, fit
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
     LN_PAIR_TO_SINGLE,
     LN_PRIOR,
@@ -22,7 +22,9 @@ from calib.gap.hypotheses import (
     split_testable,
     unknowns,
 )
+from calib.gap.hypothesis import Hypothesis
 from calib.gap.isolate import Isolability, isolability
+from calib.gap.noise import Noise
 from calib.gap.relevance import relevance
 from calib.models.base import Array
 from calib.sampling.mode import find_mode
@@ -220,7 +222,9 @@ class _Worker:
                 continue
             sigma = self.noise[o.name].sigma
             residual = (o.field - plain[o.name][0, o.rows]) / sigma
-            shapes = np.stack(forward.onset(self.data.view, o.name, thresholds), axis=-1)
+            shapes = np.stack(
+                forward.discrepancy.onset(self.data.view, o.name, thresholds), axis=-1
+            )
             part = forward.smooth_slices[o.name]
             precision = np.diag(
                 [forward.priors.free[i].scale ** -2.0 for i in range(part.start, part.stop)]

@@ -60,17 +60,16 @@ def _prepare(conditions: Conditions, references: References) -> Rows:
 
 def _location(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
     gamma_ref, C2, C3, C4 = columns
-    # gamma_ref exp{(ln_index + ln(C2 + (water - C3)^2) - the same at water_ref)/C4}, in place.
+    # exp{(ln_index + ln(C2 + (water - C3)^2))/C4 + ln gamma_ref - the same at water_ref}, in place.
     x: Array = work[0]
     np.subtract(rows["water"], C3, out=x)
     x *= x
     x += C2
     np.log(x, out=x)
     x += rows["ln_index"]
-    x -= _ln_water_term(references["water_ref"], C2, C3)
     x *= 1.0 / C4
+    x += np.log(gamma_ref) - _ln_water_term(references["water_ref"], C2, C3) / C4
     np.exp(x, out=x)
-    x *= gamma_ref
     return x
 
 

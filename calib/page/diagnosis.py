@@ -235,7 +235,13 @@ def _case_facts(found: Diagnosis) -> list[tuple[str, str]]:
     for o in found.data.outputs:
         noise = found.ranking.fits[best_of(found)][0].noise[o.name]
         axis = output_axis(found, o.name)
-        grows = f", growing to {short(1.0 + noise.rho * 0.5)} times that at 50 % slip"
+        grows = ""
+        if noise.rho > 0.0:
+            grows += f", growing to {short(1.0 + noise.rho * 0.5)} times that at 50 % slip"
+        if noise.kappa != 0.0:
+            grows += f", and as the power {-noise.kappa:g} of inflation pressure".replace(
+                "-", MINUS
+            )
         level = (
             f"{short(100.0 * noise.sigma)} % of the value"
             if o.problem.bound.model.response == "log"
@@ -246,7 +252,7 @@ def _case_facts(found: Diagnosis) -> list[tuple[str, str]]:
                 axis.name,
                 f"{get_model(case.models[o.name]).title}; {len(o.problem.table)} rows of "
                 f"calibration, {o.rows.size} of the field; noise sd of a reading {level}"
-                f"{grows if noise.rho > 0.0 else ''} (both campaigns, the most probable "
+                f"{grows} (both campaigns, the most probable "
                 "hypothesis)",
             )
         )

@@ -20,6 +20,7 @@ from calib.figures.labels import joined
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit
+from calib.gap.noise import noise_at
 from calib.models.base import Array
 from calib.numbers import format_value
 from calib.streams import generator
@@ -117,7 +118,7 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
     forward, view = fit.forward, found.data.view
     h = forward.hypothesis
     output = h.smooth_outputs[0] if h.onset_over == "level" else "rut_depth"
-    u = forward.onset_covariate(view, output)
+    u = forward.discrepancy.onset_covariate(view, output)
     if h.onset_over in ("level", "sinkage"):
         o = next(o for o in found.data.outputs if o.name == output)
         with np.errstate(all="ignore"):
@@ -142,14 +143,15 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
 
 
 def _changes(found: Diagnosis, fit: Fit, psi: Array) -> dict[str, _Change]:
-    view, slip = found.data.view, found.data.view.slip()
+    view = found.data.view
+    at = noise_at(view)
     with np.errstate(all="ignore"):
         full, plain = fit.forward.field(psi, view), fit.forward.simulator(psi, view)
     changes = {}
     for o in found.data.outputs:
         bound, factor = o.problem.bound, output_axis(found, o.name).factor
         before, after = (bound.from_response(v[o.name])[:, o.rows] for v in (plain, full))
-        noise = fit.noise[o.name].sd(slip[o.rows])
+        noise = fit.noise[o.name].sd(at.rows(o.rows))
         if bound.model.response == "log":
             noise = noise * np.nanmedian(before, axis=0)
         good = np.isfinite(before).all(axis=1) & np.isfinite(after).all(axis=1)

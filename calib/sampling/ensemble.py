@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import emcee
 import numpy as np
@@ -23,6 +24,20 @@ POOR = 0.1
 GOOD = 0.5
 # Walkers whose autocorrelations are averaged, evenly picked.
 _WALKERS_OF_TAU = 64
+
+
+class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]
+    """emcee's sampler, which would copy the state of its random numbers at every step."""
+
+    random_state = None
+
+    def begin(self, state: Any) -> None:
+        """Take up a state of the random numbers."""
+        self._random.set_state(state)
+
+    def end(self) -> Any:
+        """Return the state of the random numbers."""
+        return self._random.get_state()
 
 
 class Ensemble:
@@ -53,7 +68,7 @@ class Ensemble:
             # Not emcee's snooker move: with half the exponent of ter Braak & Vrugt (2008) in its
             # acceptance it does not keep a normal. Whole differences jump between modes.
             local = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.3)]
-        self.sampler = emcee.EnsembleSampler(
+        self.sampler = _Sampler(
             *self.state.coords.shape,
             self.log_prob_fn,
             vectorize=True,
@@ -62,28 +77,28 @@ class Ensemble:
                 *((move, (1.0 - independent) * share) for move, share in local),
             ],
         )
-        self.sampler.random_state = self.random_state
-        if not np.array_equal(self.sampler.random_state[1], self.random_state[1]):
-            # emcee ignores a state it does not like; the run would not be reproducible.
-            raise RuntimeError("emcee did not take the random state")
+        self.sampler.begin(self.random_state)
         with warnings.catch_warnings():
             # numpy 2 deprecates what emcee does inside its moves.
             warnings.simplefilter("ignore", DeprecationWarning)
             end = self.sampler.run_mcmc(self.state, steps, skip_initial_state_check=True)
         # The random state travels apart, as a start may be without one.
         self.state = emcee.State(end.coords, log_prob=end.log_prob, copy=True)
-        self.random_state = self.sampler.random_state
+        self.random_state = self.sampler.end()
 
     @property
     def walkers(self) -> int:
         """Number of walkers."""
         return int(self.state.coords.shape[0])
 
-    def drawn(self, steps: NDArray[np.intp], who: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Draws of some walkers at some steps of the stretch, (m, n, d), log densities (m, n)."""
-        which = np.ix_(steps, who)
-        t, log_prob = self.sampler.get_chain()[which], self.sampler.get_log_prob()[which]
-        return t.transpose(1, 0, 2), log_prob.T
+    def drawn(
+        self, steps: int, picked: NDArray[np.intp], who: NDArray[np.intp], t: Array, log_prob: Array
+    ) -> None:
+        """Write draws of some walkers at some last steps, (n, m, d), log densities (n, m)."""
+        found = self.sampler.get_chain()[-steps:], self.sampler.get_log_prob()[-steps:]
+        if (picked.size, who.size) != found[1].shape:
+            found = found[0][np.ix_(picked, who)], found[1][np.ix_(picked, who)]
+        t[...], log_prob[...] = found
 
     def tau(self, target: int) -> Array:
         """Autocorrelation times over the last `target` steps, shape (d,).

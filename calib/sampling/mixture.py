@@ -98,12 +98,11 @@ class Mixture:
 
     def sample(self, rng: np.random.Generator, size: int) -> Array:
         """Draw, shape (size, d)."""
-        which = rng.choice(self.weights.size, size=size, p=self.weights)
         drawn = np.empty((size, self.n_dim))
-        for j, component in enumerate(self.components):
-            mine = np.flatnonzero(which == j)
-            drawn[mine] = component.sample(rng, mine.size)
-        return drawn
+        ends = np.cumsum(rng.multinomial(size, self.weights)).tolist()
+        for start, end, component in zip([0, *ends], ends, self.components, strict=False):
+            drawn[start:end] = component.sample(rng, end - start)
+        return drawn[rng.permutation(size)]
 
     def covariance_cholesky(self) -> Array:
         """Lower factor of the whole mixture's scale: components' scales and between their means."""
@@ -122,9 +121,12 @@ class Mixture:
         return np.asarray(np.einsum("mdk,mdk->mk", z, z))
 
     def log_parts(self, squared: Array) -> Array:
-        """Log of each weighted component density at squared distances, shape (m, k)."""
+        """Log of each weighted component density at squared distances, shape (..., m, k)."""
         _, _, constant, dof = self._stacked
-        return np.asarray(constant - 0.5 * (dof + self.n_dim) * np.log(1.0 + squared / dof))
+        parts = np.log1p(squared / dof)
+        parts *= -0.5 * (dof + self.n_dim)
+        parts += constant
+        return np.asarray(parts)
 
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
@@ -140,14 +142,21 @@ class Mixture:
         m, d = len(self.components), self.n_dim
         z = (whiten @ t.T).reshape(m, d, -1)
         z -= whitened
-        near = np.einsum("mdk,mdk->mk", z, z)
         apart = 2.0 * (whitened - (whiten @ centre).reshape(m, d, 1))
-        far = near + 2.0 * (apart.swapaxes(1, 2) @ z)[:, 0] + np.square(apart).sum(axis=1)
-        parts = np.concatenate([self.log_parts(near), self.log_parts(np.maximum(far, 0.0))])
+        squared = np.empty((2, m, t.shape[0]))
+        near, far = squared
+        np.einsum("mdk,mdk->mk", z, z, out=near)
+        np.matmul(2.0 * apart.swapaxes(1, 2), z, out=far[:, None])
+        far += near
+        far += np.square(apart).sum(axis=1)
+        np.maximum(far, 0.0, out=far)
+        parts = self.log_parts(squared).reshape(2 * m, -1)
         return np.asarray(log_sum(parts) - np.log(2.0))
 
 
 def log_sum(parts: Array) -> Array:
     """Log of the sum of exponentials over the first axis, all finite."""
     top = parts.max(axis=0)
-    return np.asarray(top + np.log(np.exp(parts - top).sum(axis=0)))
+    scaled = parts - top
+    np.exp(scaled, out=scaled)
+    return np.asarray(top + np.log(scaled.sum(axis=0)))

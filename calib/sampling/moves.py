@@ -27,7 +27,8 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
 
     Opposite points cancel each other's errors of the mean (antithetic variates), and W varies less
     than pi/q as errors of the proposal that are odd cancel in it. As pairs do not depend on where
-    the walkers are, those of many steps are drawn and evaluated at once.
+    the walkers are, those of many steps are drawn and evaluated at once, and what the walkers do
+    with them is worked out ahead, as long as no other move carries one off.
 
     Parameters
     ----------
@@ -43,11 +44,7 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
         self.proposal = proposal
         self.rng = rng
         self.pairs = max(1, ahead // 2)
-        self._queue: list[_Pairs] = []
-        self._fresh = False
-        # Where the walkers were last seen, and their pairs.
-        self._seen: Array | None = None
-        self._held: _Pairs
+        self._steps: _Steps | None = None
 
     def propose(self, model: Any, state: Any) -> tuple[Any, Array]:
         """Move the walkers; the interface is emcee's.
@@ -62,46 +59,30 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
         state : emcee.State
         moved : ndarray of bool, shape (walkers,)
         """
-        held = self._look(model, state)
-        walkers = state.coords.shape[0]
-        self._fresh = not self._fresh
-        moved = np.log1p(-model.random.rand(walkers)) < held.log_odds
-        if self._fresh:
-            if not self._queue:
-                self._refill(model, walkers)
-            drawn = self._queue.pop()
-            # Not the numbers that decide on the point: the pair is refused whatever they are.
-            accepted = np.log1p(-model.random.rand(walkers)) < drawn.log_weight - held.log_weight
-            held.flip(np.flatnonzero(moved & ~accepted))
-            taken = np.flatnonzero(accepted)
-            held.put(drawn.of(taken), taken)
-            moved |= accepted
+        steps = self._steps
+        if steps is None:
+            held = self._around(model, state.coords, state.log_prob)
+            self._steps = steps = self._ahead(model, held, None)
         else:
-            held.flip(np.flatnonzero(moved))
-        which = np.flatnonzero(moved)
-        state.coords[which], state.log_prob[which] = held.here(which)
-        self._seen = state.coords.copy()
-        return state, moved
+            moved = np.flatnonzero((state.coords != steps.here).any(axis=1))
+            if moved.size:
+                held = steps.held()
+                held.put(self._around(model, state.coords[moved], state.log_prob[moved]), moved)
+                self._steps = steps = self._ahead(model, held, steps.left())
+            elif steps.done == len(steps.moved):
+                self._steps = steps = self._ahead(model, steps.held(), None)
+        return steps.take(state)
 
-    def _refill(self, model: Any, walkers: int) -> None:
-        size = self.pairs * walkers
-        t, log_jacobian, log_q = self.proposal.draw_pairs(self.rng, size)
-        log_prob = model.log_prob_fn(t.reshape(2 * size, -1)).reshape(2, size)
-        pairs = _Pairs.between(t, log_prob, log_jacobian, log_q)
-        # Log odds are what a logistic number stays below with the odds' probability.
-        pairs.flip(np.flatnonzero(self.rng.logistic(size=size) < pairs.log_odds))
-        self._queue = [pairs.of(slice(i, i + walkers)) for i in range(0, size, walkers)]
-
-    def _look(self, model: Any, state: Any) -> _Pairs:
-        """Return the walkers' pairs, worked out where they have been moved since."""
-        if self._seen is None:
-            self._held = self._around(model, state.coords, state.log_prob)
-            return self._held
-        moved = np.flatnonzero((state.coords != self._seen).any(axis=1))
-        if moved.size:
-            found = self._around(model, state.coords[moved], state.log_prob[moved])
-            self._held.put(found, moved)
-        return self._held
+    def _ahead(self, model: Any, held: _Pairs, fresh: _Pairs | None) -> _Steps:
+        """Work out the next steps, with fresh pairs that are left or, without any, new ones."""
+        if fresh is None:
+            size = self.pairs * held.side.size
+            t, log_jacobian, log_q = self.proposal.draw_pairs(self.rng, size)
+            log_prob = model.log_prob_fn(t.reshape(2 * size, -1)).reshape(2, size)
+            fresh = _Pairs.between(t, log_prob, log_jacobian, log_q)
+            # Log odds are what a logistic number stays below with the odds' probability.
+            fresh.side[:] = self.rng.logistic(size=size) < fresh.log_odds
+        return _Steps.work_out(held, fresh, model.random)
 
     def _around(self, model: Any, here: Array, log_prob: Array) -> _Pairs:
         other, log_jacobian, log_q = self.proposal.opposite(here)
@@ -111,16 +92,15 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class _Pairs:
-    """A pair for each walker, of which it stands at one point. Its arrays change in place.
+    """Opposite pairs, and at which of its points a walker stands or would stand.
 
     Parameters
     ----------
     points : ndarray, shape (2, k, d)
     log_prob : ndarray, shape (2, k)
     side : ndarray of int, shape (k,)
-        Which of the two points the walker stands at.
     log_odds : ndarray, shape (k,)
-        Log of the density at the other over that here, in straightened coordinates.
+        Log of the density at the second over that at the first, in straightened coordinates.
     log_weight : ndarray, shape (k,)
     """
 
@@ -132,7 +112,7 @@ class _Pairs:
 
     @classmethod
     def between(cls, t: Array, log_prob: Array, log_jacobian: Array, log_q: Array) -> _Pairs:
-        """Pair points (2, k, d) whose log densities and Jacobians are (2, k), the first is here."""
+        """Pair points (2, k, d) whose log densities and Jacobians are (2, k), at the first."""
         # Densities of v: those of t over the Jacobian |dv/dt|.
         log_pi = log_prob - log_jacobian
         with np.errstate(invalid="ignore"):  # where both densities are zero
@@ -140,28 +120,107 @@ class _Pairs:
         log_weight = np.logaddexp(log_pi[0], log_pi[1]) - log_q
         return cls(t, log_prob, np.zeros(log_q.size, dtype=np.intp), log_odds, log_weight)
 
-    def here(self, which: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Where some of the walkers stand, and the log density there."""
-        side = self.side[which]
-        return self.points[side, which], self.log_prob[side, which]
-
     def of(self, which: NDArray[np.intp] | slice) -> _Pairs:
-        """Pairs of some of the walkers."""
+        """Some of the pairs."""
         return _Pairs(
             self.points[:, which], self.log_prob[:, which], self.side[which],
             self.log_odds[which], self.log_weight[which],
         )  # fmt: skip
 
     def put(self, other: _Pairs, which: NDArray[np.intp]) -> None:
-        """Give some of the walkers other pairs."""
+        """Put others in the place of some, in these arrays."""
         self.points[:, which], self.log_prob[:, which] = other.points, other.log_prob
         self.side[which] = other.side
         self.log_odds[which], self.log_weight[which] = other.log_odds, other.log_weight
 
-    def flip(self, which: NDArray[np.intp]) -> None:
-        """Have some of the walkers go over to the other point."""
-        self.side[which] ^= 1
-        self.log_odds[which] *= -1.0
+    def and_then(self, other: _Pairs) -> _Pairs:
+        """These pairs, then others."""
+        return _Pairs(
+            np.concatenate([self.points, other.points], axis=1),
+            np.concatenate([self.log_prob, other.log_prob], axis=1),
+            np.concatenate([self.side, other.side]),
+            np.concatenate([self.log_odds, other.log_odds]),
+            np.concatenate([self.log_weight, other.log_weight]),
+        )
+
+
+@dataclass
+class _Steps:
+    """Steps that were worked out ahead, and how many of them have been taken.
+
+    Parameters
+    ----------
+    pairs : _Pairs
+        Those the walkers held, one each, then the fresh ones, one each for every second step.
+    start, coords : ndarray, shapes (walkers, d) and (steps, walkers, d)
+    log_prob : ndarray, shape (steps, walkers)
+    which, side : ndarray of int, shape (steps, walkers)
+        The pair that a walker holds after a step, and at which of its points it stands.
+    moved : ndarray of bool, shape (steps, walkers)
+    done : int
+    """
+
+    pairs: _Pairs
+    start: Array
+    coords: Array
+    log_prob: Array
+    which: NDArray[np.intp]
+    side: NDArray[np.intp]
+    moved: NDArray[np.bool_]
+    done: int = 0
+
+    @classmethod
+    def work_out(cls, held: _Pairs, fresh: _Pairs, random: Any) -> _Steps:
+        """Take the walkers through all fresh pairs, two steps for each."""
+        walkers = held.side.size
+        pairs = held.and_then(fresh)
+        rounds = fresh.side.size // walkers
+        which = np.empty((2 * rounds, walkers), dtype=np.intp)
+        side = np.empty((2 * rounds, walkers), dtype=np.intp)
+        moved = np.empty((2 * rounds, walkers), dtype=np.bool_)
+        here, at = np.arange(walkers), held.side
+        log_weight, log_odds = pairs.log_weight, np.stack([pairs.log_odds, -pairs.log_odds])
+        for i in range(0, 2 * rounds, 2):
+            over, accept, again = (np.log1p(-random.rand(walkers)) for _ in range(3))
+            new = np.arange((i // 2 + 1) * walkers, (i // 2 + 2) * walkers)
+            # Not the numbers that decide on the point: a pair is refused whatever they are.
+            taken = accept < log_weight[new] - log_weight[here]
+            flipped = over < log_odds[at, here]
+            moved[i] = taken | flipped
+            which[i] = here = np.where(taken, new, here)
+            side[i] = at = np.where(taken, pairs.side[new], at ^ flipped)
+            which[i + 1] = here
+            moved[i + 1] = flipped = again < log_odds[at, here]
+            side[i + 1] = at = at ^ flipped
+        first = np.arange(walkers)
+        return cls(
+            pairs, held.points[held.side, first], pairs.points[side, which],
+            pairs.log_prob[side, which], which, side, moved,
+        )  # fmt: skip
+
+    @property
+    def here(self) -> Array:
+        """Where the walkers are, shape (walkers, d)."""
+        return self.coords[self.done - 1] if self.done else self.start
+
+    def take(self, state: Any) -> tuple[Any, Array]:
+        """Take the next step."""
+        state.coords[...], state.log_prob[...] = self.coords[self.done], self.log_prob[self.done]
+        self.done += 1
+        return state, self.moved[self.done - 1]
+
+    def held(self) -> _Pairs:
+        """The pairs that the walkers hold now."""
+        if not self.done:
+            return self.pairs.of(np.arange(self.start.shape[0]))
+        held = self.pairs.of(self.which[self.done - 1])
+        held.side[:] = self.side[self.done - 1]
+        return held
+
+    def left(self) -> _Pairs | None:
+        """Fresh pairs that no step that was taken has looked at; None if there are none."""
+        used = (1 + (self.done + 1) // 2) * self.start.shape[0]
+        return self.pairs.of(slice(used, None)) if used < self.pairs.side.size else None
 
 
 class WalkMove(emcee.moves.Move):  # type: ignore[misc]

@@ -33,7 +33,7 @@ class SamplerSettings:
     ensembles : int
         Independently seeded ensembles.
     walkers : int, optional
-        In each ensemble; by default 160, of long data 20, but at least twice the dimension plus
+        In each ensemble; by default 320, of long data 20, but at least twice the dimension plus
         two.
     steps : int
         Kept steps of the first attempt; doubled until the gate passes.
@@ -57,7 +57,7 @@ class SamplerSettings:
 
     def n_walkers(self, n_dim: int) -> int:
         """Number of walkers for a dimension."""
-        return self.walkers or max(160, 2 * (n_dim + 1))
+        return self.walkers or max(320, 2 * (n_dim + 1))
 
 
 @dataclass(frozen=True)
@@ -268,10 +268,13 @@ def _drawn(ensembles: list[Ensemble], steps: int, draws: int) -> tuple[Array, Ar
     walkers = ensembles[0].walkers
     kept = min(steps, max(_LEAST_STEPS, draws // walkers))
     few = min(walkers, max(1, draws // kept))
-    picked = np.linspace(-steps, -1, kept).round().astype(np.intp)
+    picked = np.linspace(0, steps - 1, kept).round().astype(np.intp)
     who = np.linspace(0, walkers - 1, few).round().astype(np.intp)
-    chains, log_probs = zip(*(e.drawn(picked, who) for e in ensembles), strict=True)
-    return np.stack(chains), np.stack(log_probs)
+    t = np.empty((len(ensembles), kept, few, ensembles[0].state.coords.shape[1]))
+    log_prob = np.empty(t.shape[:-1])
+    for i, ensemble in enumerate(ensembles):
+        ensemble.drawn(steps, picked, who, t[i], log_prob[i])
+    return t.swapaxes(1, 2), log_prob.swapaxes(1, 2)
 
 
 # Draws of each ensemble that the gate looks at, and of how many steps at least: of few, effective

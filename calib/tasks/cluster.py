@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import pickle
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,11 +30,19 @@ __all__ = ["on_cluster"]
 WINDOW, BYTES, BATCH = 5000, 400_000_000, 200
 # Items are sent with their tasks, on purpose: the workers have no other way to them.
 _NO_WARNING = {"distributed.admin.large-graph-warning-threshold": "1 TB"}
-# Dask has the C library give every freed array back to the system at once, and take it again with a
-# page fault for each 4 KiB: of two workers' time a half. Ours are short-lived and keep theirs.
-_TRIM = "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_"
-# When the worker of a task dies, the task is tried so many times more among the others.
-ALLOWED_FAILURES = 1
+_ENVIRONMENT, _TRIM = "distributed.nanny.pre-spawn-environ", "MALLOC_TRIM_THRESHOLD_"
+_LOCAL = {
+    # When the worker of a task dies, the task is tried so many times more among the others.
+    "distributed.scheduler.allowed-failures": 1,
+    # Dask has the C library give every freed array back to the system at once, and take it again
+    # with a page fault for each 4 KiB: of two workers' time a half. Ours are short-lived and keep
+    # theirs.
+    f"{_ENVIRONMENT}.{_TRIM}": None,
+    # Looking what a task is at, and whether the event loop is awake, takes the interpreter from it
+    # a hundred and fifty times a second: of two workers' time a twelfth.
+    "distributed.worker.profile.enabled": False,
+    "distributed.admin.tick.interval": "1s",
+}
 CONNECT_SECONDS = 10
 SETTLE_SECONDS, CLOSE_SECONDS = 20, 20
 _SAME = ("numpy", "scipy", "emcee")
@@ -180,8 +189,7 @@ def _local(workers: int) -> Iterator[Client]:
     Dask gives them one thread of the linear algebra each. They end with this process, however it
     ends.
     """
-    settings = {"distributed.scheduler.allowed-failures": ALLOWED_FAILURES, _TRIM: None}
-    with dask.config.set(settings):
+    with _own_environment(), dask.config.set(_LOCAL):
         try:
             cluster = LocalCluster(
                 n_workers=workers, threads_per_worker=1, processes=True, memory_limit=1.0 / workers,
@@ -204,6 +212,20 @@ def _local(workers: int) -> Iterator[Client]:
             # started, say) ends with this one.
             with suppress(AssertionError, TimeoutError):
                 cluster.close(timeout=CLOSE_SECONDS)
+
+
+@contextmanager
+def _own_environment() -> Iterator[None]:
+    """Take out what another cluster of Dask's has left in this process's environment."""
+    left = os.environ.get(_TRIM)
+    if left != str(dask.config.get(_ENVIRONMENT).get(_TRIM)):
+        yield
+        return
+    del os.environ[_TRIM]
+    try:
+        yield
+    finally:
+        os.environ[_TRIM] = left
 
 
 class _Client(Client):

@@ -79,7 +79,8 @@ def run_tasks[I](
     progress : callable, optional
         Called with tasks finished and tasks in all.
     announce : callable, optional
-        Called with one line that says where the tasks are done.
+        Called with one line that says where the tasks are done, and with another if they are
+        interrupted while others do them.
 
     Returns
     -------
@@ -158,6 +159,8 @@ def _run[I, R, C](
                     failed[task.name] = task.error
                 tell(len(found) + len(failed), len(items))
         except KeyboardInterrupt:
+            if announce is not None and (workers > 1 or scheduler is not None):
+                announce("interrupted; letting go of the workers, which takes some seconds")
             raise KeyboardInterrupt(
                 f"interrupted; {len(found)} of {len(items)} results are kept in {landing.folder}, "
                 "and the same command does the others"

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from calib.errors import CalibError
 from calib.gap.case import Campaigns
-from calib.gap.fit import Noise
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import pair, shifts, singles, split_testable, unknowns
+from calib.gap.hypothesis import Hypothesis
+from calib.gap.noise import Noise, noise_at
 from calib.gap.relevance import RELEVANT_IN_PAIR, sizes
 from calib.models.base import Array
 
@@ -109,11 +110,11 @@ def _hypothesis(data: Campaigns, truth: str, rng: np.random.Generator) -> Hypoth
 
 def _gap(forward: Forward, psi: Array, noise: Mapping[str, Noise]) -> NDArray[np.float64]:
     data = forward.data
-    slip = data.view.slip()
+    at = noise_at(data.view)
     with np.errstate(all="ignore"):
         full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
     each = [
-        ((full[o.name] - plain[o.name])[:, o.rows] / noise[o.name].sd(slip[o.rows])) ** 2
+        ((full[o.name] - plain[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))) ** 2
         for o in data.outputs
     ]
     # Where the model has no value somewhere, it is NaN, which is of no size.

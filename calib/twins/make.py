@@ -17,6 +17,7 @@ from calib.data import Table
 from calib.errors import CalibError
 from calib.folders import check_folder
 from calib.gap.case import campaigns, read_case
+from calib.gap.noise import noise_at
 from calib.gap.which import calibrate_lab
 from calib.models.base import Array
 from calib.streams import generator
@@ -134,12 +135,12 @@ def _twin(seed: int, job: _Job) -> CaseFiles:
         back, sd_of = o.problem.bound.from_response, noise[o.name].sd
         for name, values in said.items():
             key.setdefault(name, {})[o.name] = back(values[o.name][0]).tolist()
-        sd = np.broadcast_to(sd_of(view.slip()), in_field[o.name][0].shape)
+        sd = np.broadcast_to(sd_of(noise_at(view)), in_field[o.name][0].shape)
         # On a logarithm the noise is relative; the key states it in the output's own unit.
         log = o.problem.bound.model.response == "log"
         unit = back(in_field[o.name][0]) if log else np.ones_like(sd)
         key["noise_sd"][o.name] = (sd * unit).tolist()
-        lab_sd = np.broadcast_to(sd_of(data.lab_slips[o.name]), lab[o.name][0].shape)
+        lab_sd = np.broadcast_to(sd_of(data.lab_at[o.name]), lab[o.name][0].shape)
         lab_readings[o.name] = back(lab[o.name][0] + lab_sd * rng.standard_normal(lab_sd.size))
         field_readings[o.name] = back(in_field[o.name][0] + sd * rng.standard_normal(sd.size))
     files = {

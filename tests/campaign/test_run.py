@@ -153,7 +153,7 @@ def test_results_of_other_inputs_are_not_mixed_in(own, monkeypatch):
     field = plan.parent / "cases" / "case-1" / "field.csv"
     lines = field.read_text().splitlines()
     field.write_text("\n".join(lines[:-1]) + "\n")
-    with pytest.raises(CalibError, match=r"sites\.cases-case-1 has another field \(inputs\)"):
+    with pytest.raises(CalibError, match=r"sites\.cases-case-1 differs in field \(inputs\)"):
         run_campaign(read_plan(plan), out)
     before = {n: (out / "results" / n).stat().st_mtime_ns for n in results(out)}
     run_campaign(read_plan(plan), out, overwrite=True)
@@ -183,7 +183,7 @@ def test_results_of_other_versions_are_not_mixed_in(site, serial, tmp_path, monk
 
     shutil.copytree(serial, tmp_path / "out")
     monkeypatch.setattr(record, "versions", lambda: {"numpy": "0"})
-    with pytest.raises(CalibError, match=r"has another .*versions"):
+    with pytest.raises(CalibError, match=r"differs in .*versions"):
         run_campaign(read_plan(site), tmp_path / "out")
 
 

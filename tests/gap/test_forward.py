@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from calib.gap.effects import EFFECTS
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors, pair, singles, unknowns
+from calib.gap.hypothesis import Hypothesis
 from gap.cases import NOISE, campaigns_of
 
 SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from calib.gap.case import campaigns
-from calib.gap.forward import SHIFT_DIFFERENCE, Forward, Hypothesis
+from calib.gap.forward import SHIFT_DIFFERENCE, Forward
 from calib.gap.hypotheses import unknowns
+from calib.gap.hypothesis import Hypothesis
 from calib.sampling.mode import prior_widths
 from gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
 

@@ -10,9 +10,9 @@ import pytest
 from calib.data import table_from_arrays
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
-from calib.gap.fit import Noise
 from calib.gap.hypotheses import singles
 from calib.gap.isolate import ALIKE, isolability
+from calib.gap.noise import Noise
 from calib.gap.which import rank
 from gap.cases import CHOICE, campaigns_of, make_case, ranking_of
 

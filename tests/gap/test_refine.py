@@ -10,9 +10,11 @@ import pytest
 
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
-from calib.gap.fit import Noise, fit, log_joint
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.fit import fit, log_joint
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
+from calib.gap.hypothesis import Hypothesis
+from calib.gap.noise import Noise
 from calib.gap.refine import refine
 from calib.gap.which import rank
 from calib.paper_gaps.cases import paper_gaps

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.gap.fit import Noise
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import unknowns
+from calib.gap.noise import Noise, noise_at
 from calib.gap.relevance import relevance, sizes
 from gap.cases import campaigns_of, ranking_of
 
@@ -29,8 +29,8 @@ def test_size_is_in_noise_sds_over_all_rows_and_outputs():
     assert size.shape == (2, 1)
     assert size[0, 0] == pytest.approx(0.0, abs=1e-12)
     # Half of the values are ruts, which an offset of the pull does not touch.
-    slip = fit.forward.data.view.slip()
-    in_noise = 0.1 / fit.noise["drawbar_pull"].sd(slip)
+    at = noise_at(fit.forward.data.view)
+    in_noise = 0.1 / fit.noise["drawbar_pull"].sd(at)
     assert size[1, 0] == pytest.approx(np.sqrt(0.5 * np.mean(np.square(in_noise))))
 
 

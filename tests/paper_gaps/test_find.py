@@ -72,9 +72,7 @@ def test_the_shift_is_found_with_its_sign_and_to_within_half_its_size(found_gaps
         assert abs(values(result, name)["mean_percent"] - 2.0) < 1.0
     # Given back, there is nothing to find.
     assert result.variants["slips given back"].verdict == "none"
-    # Not surer: noise at 18 psi is twice that at 42 psi, which the diagnosis does not model, and in
-    # seven rows it looks a little like something unlisted that sets in at low pressure.
-    assert values(result, "slips_given_back")["probability_none"] > 0.75
+    assert values(result, "slips_given_back")["probability_none"] > 0.9
     probability = result.variants["slips given back"].ranking.probability
     rival = max((n for n in probability if n != "none"), key=lambda n: probability[n])
     assert rival == "unknown"

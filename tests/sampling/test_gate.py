@@ -115,9 +115,10 @@ def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.Monkey
         init(self, *args, **kwargs)
         made.append(self)
 
-    def stuck(self, steps, who):
-        t, log_prob = drawn(self, steps, who)
-        return (np.repeat(t[:, :1], steps.size, axis=1) if self is made[1] else t), log_prob
+    def stuck(self, steps, picked, who, t, log_prob):
+        drawn(self, steps, picked, who, t, log_prob)
+        if self is made[1]:
+            t[1:] = t[:1]
 
     monkeypatch.setattr(module.Ensemble, "__init__", remember)
     monkeypatch.setattr(module.Ensemble, "drawn", stuck)

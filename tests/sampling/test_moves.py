@@ -74,29 +74,26 @@ def test_detailed_balance_of_every_step(log_prob: Callable) -> None:
         # Numbers so near a probability that rounding decides are moved away.
         for u, p in ((u_flip, flip), (u_accept, accept), (u_second, second)):
             u[abs(u - p) < 1e-4] = 0.5 * p[abs(u - p) < 1e-4]
-        move = PairMove(proposal, Dealt(2, u_second), ahead=1)
-        stub = Stub(log_prob, 1.0 - u_flip, 1.0 - u_accept)
-        state, moved = move.propose(stub, at(log_prob, start))
         accepted, flipped = u_accept < accept, u_flip < flip
         fresh = np.where((u_second < second)[:, None], pairs[1], pairs[0])
         kept = np.where(flipped[:, None], own, start)
-        expected = np.where(accepted[:, None], fresh, kept)
-        np.testing.assert_allclose(state.coords, expected, rtol=1e-7, atol=1e-7)
-        np.testing.assert_array_equal(moved, accepted | flipped)
-        np.testing.assert_allclose(state.log_prob, log_prob(state.coords), atol=1e-12)
-
-        before = state.coords.copy()
-        other, _, _ = proposal.opposite(before)
+        middle = np.where(accepted[:, None], fresh, kept)
+        other, _, _ = proposal.opposite(middle)
         over = np.exp(
-            np.minimum(pi_of(log_prob, proposal, other) - pi_of(log_prob, proposal, before), 0.0)
+            np.minimum(pi_of(log_prob, proposal, other) - pi_of(log_prob, proposal, middle), 0.0)
         )
         level = some.random(N)
         level[abs(level - over) < 1e-4] = 0.5 * over[abs(level - over) < 1e-4]
-        state, moved = move.propose(Stub(log_prob, 1.0 - level), state)
-        np.testing.assert_array_equal(moved, level < over)
-        expected = np.where(moved[:, None], other, before)
-        np.testing.assert_allclose(state.coords, expected, rtol=1e-7, atol=1e-7)
-        np.testing.assert_allclose(state.log_prob, log_prob(state.coords), atol=1e-12)
+        end = np.where((level < over)[:, None], other, middle)
+
+        move = PairMove(proposal, Dealt(2, u_second), ahead=1)
+        stub = Stub(log_prob, 1.0 - u_flip, 1.0 - u_accept, 1.0 - level)
+        state = at(log_prob, start)
+        for expected, went in ((middle, accepted | flipped), (end, level < over)):
+            state, moved = move.propose(stub, state)
+            np.testing.assert_allclose(state.coords, expected, rtol=1e-7, atol=1e-7)
+            np.testing.assert_array_equal(moved, went)
+            np.testing.assert_allclose(state.log_prob, log_prob(state.coords), atol=1e-12)
 
 
 def test_walkers_that_another_move_has_carried_off_are_noticed() -> None:
@@ -114,6 +111,51 @@ def test_walkers_that_another_move_has_carried_off_are_noticed() -> None:
     expected, also = fresh.propose(Stub(normal, uniform), at(normal, elsewhere))
     np.testing.assert_array_equal(accepted, also)
     np.testing.assert_allclose(after.coords, expected.coords, rtol=1e-9)
+
+
+@pytest.mark.parametrize("taken", [1, 2, 3, 6, 7])
+def test_pairs_that_are_left_serve_walkers_that_were_carried_off(taken: int) -> None:
+    """Eight steps are worked out ahead; after some of them every second walker is elsewhere."""
+    level = np.full(8, 1.0 - 1e-12)  # everything is accepted
+    proposal = fitted(normal)
+    move = PairMove(proposal, np.random.default_rng(6), ahead=8)
+    stub, state = Stub(normal, level), at(normal, np.zeros((8, 2)))
+    for _ in range(taken):
+        state, _ = move.propose(stub, state)
+    assert stub.evaluations == 8 + 8 * 8
+    state.coords[::2] += 0.3
+    state.log_prob[:] = normal(state.coords)
+    before, left = state.coords.copy(), 4 - (taken + 1) // 2
+    state, moved = move.propose(stub, state)
+    # The opposites of those four; new pairs only where none are left.
+    assert stub.evaluations == 8 + 8 * 8 + 4 + (0 if left else 8 * 8)
+    assert moved.all()
+    fresh = state.coords.copy()
+    assert (fresh != before).any(axis=1).all()
+    state, _ = move.propose(stub, state)
+    np.testing.assert_allclose(state.coords, proposal.opposite(fresh)[0], atol=1e-9)
+
+
+@pytest.mark.parametrize("taken", [1, 2, 3])
+def test_a_walker_that_was_carried_off_has_its_own_opposite(taken: int) -> None:
+    """And the others keep theirs: with every fresh pair refused, a flip shows whose is whose."""
+    proposal = fitted(normal)
+    move = PairMove(proposal, np.random.default_rng(6), ahead=8)
+    start = 0.2 * np.random.default_rng(3).standard_normal((8, 2))
+    # No uniform number is that low, but its logarithm is above that of any ratio.
+    accepted, refused = np.full(8, 1.0 - 1e-12), np.full(8, -1e300)
+    state = at(normal, start)
+    for _ in range(taken):
+        state, _ = move.propose(Stub(normal, accepted), state)
+    state.coords[::2] += 0.3
+    state.log_prob[:] = normal(state.coords)
+    before = state.coords.copy()
+    # Of three numbers the second refuses the fresh pair, the first has the walker go over.
+    stub = Stub(normal, accepted, refused, accepted)
+    state, moved = move.propose(stub, state)
+    assert moved.all()
+    np.testing.assert_allclose(state.coords, proposal.opposite(before)[0], atol=1e-9)
+    np.testing.assert_allclose(state.log_prob, normal(state.coords), atol=1e-12)
 
 
 def test_every_pair_is_evaluated_once_and_used_once() -> None:

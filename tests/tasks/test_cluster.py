@@ -79,12 +79,25 @@ def test_two_workers_and_a_cluster_write_what_one_process_writes(tmp_path, sched
 
 def test_workers_are_processes_of_their_own_with_one_thread_each(tmp_path, monkeypatch):
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    monkeypatch.delenv("MALLOC_TRIM_THRESHOLD_", raising=False)
     run_tasks(work.where, {f"t{i}": i for i in range(8)}, tmp_path, workers=2)
     found = [json.loads(p.read_text()) for p in tmp_path.glob("t*.json")]
     assert len({f["pid"] for f in found} - {os.getpid()}) == 2
     assert {f["threads"] for f in found} == {"1"}
     # Dask's own setting costs them half their time in page faults.
     assert {f["trim"] for f in found} == {None}
+
+
+@pytest.mark.parametrize(("ours", "theirs"), [("65536", None), ("1000000", "1000000")])
+def test_what_another_cluster_left_in_the_environment_is_not_passed_on(
+    tmp_path, monkeypatch, ours, theirs
+):
+    """Dask leaves its 65536 there when it starts workers; any other value is the user's."""
+    monkeypatch.setenv("MALLOC_TRIM_THRESHOLD_", ours)
+    run_tasks(work.where, {f"t{i}": i for i in range(4)}, tmp_path, workers=2)
+    found = [json.loads(p.read_text()) for p in tmp_path.glob("t*.json")]
+    assert {f["trim"] for f in found} == {theirs}
+    assert os.environ["MALLOC_TRIM_THRESHOLD_"] == ours
 
 
 def test_errors_are_those_of_one_process(tmp_path):

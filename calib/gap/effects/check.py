@@ -19,8 +19,9 @@ from calib.columns import QUANTITIES
 from calib.errors import CalibError
 from calib.gap.case import Campaigns, Case, OutputData, campaigns
 from calib.gap.effects import EFFECTS, Effect, View
-from calib.gap.forward import Forward, Hypothesis
+from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
+from calib.gap.hypothesis import Hypothesis
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.streams import generator

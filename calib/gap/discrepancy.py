@@ -1,0 +1,160 @@
+"""A free discrepancy of the field: smooth over conditions, or setting in beyond a threshold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.special import expit
+
+from calib.gap.case import Campaigns
+from calib.gap.covariates import Covariates
+from calib.gap.effects import View
+from calib.gap.effects.base import RUT
+from calib.gap.hypothesis import Hypothesis
+from calib.models.base import Array
+
+__all__ = ["THRESHOLDS", "Discrepancy"]
+
+# Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
+THRESHOLDS = (-0.85, 0.9)
+_ONSET_WIDTH = 0.06
+
+
+class Discrepancy:
+    """What a hypothesis's free discrepancy may look like on a pair of campaigns.
+
+    Parameters
+    ----------
+    data : Campaigns
+    hypothesis : Hypothesis
+    covariates : Covariates
+    lab_mode : mapping of str to ndarray
+        Internal parameters of the simulators as the lab calibrated them; for a discrepancy that
+        varies with the level of the output.
+    """
+
+    def __init__(
+        self,
+        data: Campaigns,
+        hypothesis: Hypothesis,
+        covariates: Covariates,
+        lab_mode: Mapping[str, Array],
+    ) -> None:
+        self.data, self.hypothesis = data, hypothesis
+        self.covariates, self.lab_mode = covariates, lab_mode
+        # Worked out once for the field rows, which every step of a fit predicts.
+        self._of_field = {
+            name: self._smooth_basis(data.view, name) for name in hypothesis.smooth_outputs
+        }
+
+    def sds(self, output: str) -> Array:
+        """Relative prior sds of an output's amplitudes, shape (m,)."""
+        return self._of_field[output][1]
+
+    def at(self, amplitudes: Array, threshold: Array, view: View, output: str) -> Array:
+        """Discrepancy of an output, amplitudes (k, m), thresholds (k,) if it sets in, (k, n)."""
+        if self.hypothesis.onset_over is None:
+            return np.asarray(amplitudes @ self._smooth(view, output).T)
+        step, bend = self.onset(view, output, threshold)
+        return amplitudes[:, :1] * step + amplitudes[:, 1:2] * bend
+
+    def _smooth(self, view: View, output: str) -> Array:
+        same = view.conditions is self.data.view.conditions
+        return (self._of_field[output] if same else self._smooth_basis(view, output))[0]
+
+    def onset(self, view: View, output: str, threshold: Array) -> tuple[Array, Array]:
+        """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n).
+
+        Below a pressure it is a step and a part of the output's level instead.
+        """
+        u = self.onset_covariate(view, output)
+        beyond = (u - threshold[:, None]) / _ONSET_WIDTH
+        step = expit(beyond)
+        if self.hypothesis.onset_over == "low_pressure":
+            # A limp tyre may lose a part of the pull, and more of it the more it pulls.
+            return step, step * self._known(self._level(view, output))
+        return step, _ONSET_WIDTH * np.logaddexp(0.0, beyond)
+
+    def onset_covariate(self, view: View, output: str) -> Array:
+        """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
+        over = self.hypothesis.onset_over
+        if over == "low_pressure":
+            return -self._known(self.covariates.pressure(view))
+        if over in ("level", "sinkage"):
+            return self._known(self._level(view, output if over == "level" else RUT))
+        return self._known(
+            self.covariates.scaled(view, "slip_ratio" if over == "slip" else "run_order")
+        )
+
+    def _known(self, u: Array | None) -> Array:
+        if u is None:
+            raise ValueError(f"nothing to set in over: {self.hypothesis.onset_over}")
+        return u
+
+    def _smooth_basis(self, view: View, output: str) -> tuple[Array, Array]:
+        """Basis of an output's free discrepancy, shape (n, m), and its coefficients' sds."""
+        over = self.hypothesis.smooth_over
+        if self.hypothesis.onset_over is not None:
+            # Its shape depends on the threshold; here are its two amplitudes.
+            return np.empty((0, 2)), np.array([1.0, 2.0])
+        if over in ("level", "sinkage"):
+            terms = self._cosines(self._level(view, output if over == "level" else RUT), 8, 0.8)
+        elif over == "order":
+            terms = self._cosines(self.covariates.scaled(view, "run_order"), 12, 0.7)
+        else:
+            terms = self._condition_terms(view, everything=over == "all")
+        n = next(iter(view.conditions.values())).size
+        basis = [np.ones(n)] + [b for b, _ in terms]
+        return np.stack(basis, axis=1), np.array([1.0] + [w for _, w in terms])
+
+    def _condition_terms(self, view: View, *, everything: bool) -> list[tuple[Array, float]]:
+        slip = self.covariates.scaled(view, "slip_ratio")
+        pressure = self.covariates.pressure(view)
+        slips = self._cosines(slip, 10, 0.7)
+        terms = list(slips)
+        if everything:
+            terms += self._cosines(self.covariates.scaled(view, "run_order"), 6, 0.5)
+        if pressure is not None:
+            terms.append((pressure, 0.7))
+            terms += [(pressure * b, 0.6 * w) for b, w in slips[:4]]
+        for name, transform in (
+            ("speed_m_s", "log"), ("pass_number", "log"), ("gravimetric_water_content", ""),
+            ("normal_load_kn", "log"), ("cone_index_kpa", "log"),
+            ("volumetric_water_content", ""),
+        ):  # fmt: skip
+            u = self.covariates.scaled(view, name, transform)
+            if u is not None and everything:
+                terms += self._cosines(u, 3, 0.4)
+                if slip is not None:
+                    terms.append((u * slip, 0.4))
+        return terms
+
+    def _cosines(self, u: Array | None, most: int, scale: float) -> list[tuple[Array, float]]:
+        """Cosines of a covariate scaled to -1..1, and the sds of their coefficients."""
+        if u is None:
+            return []
+        angle = 0.5 * np.pi * (np.clip(u, -1.2, 1.2) + 1.0)
+        return [
+            (
+                np.sqrt(2.0) * np.cos(j * angle),
+                scale / (1.0 + (j / self.hypothesis.smooth_decay) ** 2),
+            )
+            for j in range(1, most + 1)
+        ]
+
+    def _level(self, view: View, output: str) -> Array | None:
+        """Predicted level of an output, scaled to the field's range."""
+        if output not in self.lab_mode:
+            return None
+        o = next(o for o in self.data.outputs if o.name == output)
+        theta = o.priors.to_natural(self.lab_mode[output][None])
+
+        def predicted(conditions: Mapping[str, Array]) -> Array:
+            selected = o.problem.bound.model.select(conditions)
+            return np.asarray(o.problem.bound.location(theta, selected)[0])
+
+        reference = predicted(self.data.view.conditions)
+        low, high = float(np.nanmin(reference)), float(np.nanmax(reference))
+        level = np.nan_to_num(predicted(view.conditions), nan=low)
+        return np.clip((level - low) / max(high - low, 1e-12) * 2.0 - 1.0, -1.5, 1.5)

@@ -1,0 +1,56 @@
+"""A hypothesis about a gap: which effects, shifts or free discrepancies act in the field."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from calib.gap.effects import Effect
+from calib.priors import Priors
+
+__all__ = ["Hypothesis", "OnsetOver", "SmoothOver"]
+
+type SmoothOver = Literal["slip", "level", "sinkage", "order", "all"]
+type OnsetOver = Literal["slip", "level", "sinkage", "order", "low_pressure"]
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """What may cause the gap.
+
+    Parameters
+    ----------
+    name : str
+        Contract name, pairs in alphabetical order.
+    effects : tuple of Effect
+    effect_priors : tuple of Priors
+    shift : float
+        Prior sd of parameter shifts in units of the parameters' own prior sds; 0 for none.
+    smooth : float
+        Prior sd of a free discrepancy, in units of the noise; 0 for none.
+    smooth_outputs : tuple of str
+        Outputs that have the free discrepancy.
+    smooth_over : {"slip", "level", "sinkage", "order", "all"}
+        What it may vary with: slip, the level of the predicted output (as a saturating
+        instrument would), the predicted rut depth (as layered soil would), the order of the runs
+        (as weather or another stretch of ground would), or every condition.
+    smooth_decay : float
+        Number of half waves from which the discrepancy's coefficients fall off.
+    onset_over : {"slip", "level", "sinkage", "order", "low_pressure"}, optional
+        Instead of smooth, the discrepancy may set in beyond a threshold of one of these: a step
+        and a change of slope there. Below a threshold of inflation pressure, where a limp tyre may
+        creep on its rim or buckle: a step, and a part of the output's level.
+    share : float
+        Part of the prior probability of its name.
+    """
+
+    name: str
+    effects: tuple[Effect, ...] = ()
+    effect_priors: tuple[Priors, ...] = ()
+    shift: float = 0.0
+    smooth: float = 0.0
+    smooth_outputs: tuple[str, ...] = ()
+    smooth_over: SmoothOver = "all"
+    smooth_decay: float = 4.0
+    onset_over: OnsetOver | None = None
+    share: float = 1.0

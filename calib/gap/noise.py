@@ -1,0 +1,114 @@
+"""The noise of an output's readings: how it grows with slip, and as the tyre goes soft."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.data import Table
+from calib.gap.effects import View
+from calib.models.base import Array
+
+__all__ = ["At", "Noise", "ln_prior", "most_probable", "noise_at", "noise_at_lab"]
+
+# Growth of the noise with slip: sigma (1 + rho s), and the prior probability of each.
+RHO = np.array([0.0, 1.0, 2.5, 5.0])
+LN_RHO_PRIOR = np.log(np.array([0.5, 0.2, 0.15, 0.15]))
+# Growth as the inflation pressure falls: (p_lab / p)^kappa. A soft tyre's pull and ruts are less
+# regular; in the source's drawbar pull the noise at 18 psi is twice that at 42 psi (kappa 0.8).
+KAPPA = np.array([0.0, 0.8, -0.8])
+LN_KAPPA_PRIOR = np.log(np.array([0.7, 0.2, 0.1]))
+
+
+@dataclass(frozen=True)
+class At:
+    """What the noise of some rows depends on, shape (n,) each.
+
+    Parameters
+    ----------
+    slip : ndarray
+        Recorded, as a fraction; zero where it is not recorded.
+    softness : ndarray
+        Minus the logarithm of inflation pressure over the median of the calibration's; zero where
+        it is not recorded.
+    """
+
+    slip: Array
+    softness: Array
+
+    def rows(self, rows: NDArray[np.int64]) -> At:
+        """Some of the rows."""
+        return At(self.slip[rows], self.softness[rows])
+
+    def __add__(self, other: At) -> At:
+        """These rows, then others."""
+        return At(
+            np.concatenate([self.slip, other.slip]),
+            np.concatenate([self.softness, other.softness]),
+        )
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of one output: sd sigma (1 + rho slip) (p_lab / p)^kappa on the response's scale."""
+
+    sigma: float
+    rho: float = 0.0
+    kappa: float = 0.0
+
+    def sd(self, at: At) -> Array:
+        """Noise sd, shape (n,)."""
+        return self.sigma * _growth(at, self.rho, self.kappa)
+
+
+def noise_at(view: View) -> At:
+    """What the noise of a view's rows depends on."""
+    return _at(view.conditions, view.lab, view.slip().size)
+
+
+def noise_at_lab(lab: Table, view: View) -> At:
+    """What the noise of calibration rows depends on, beside a view of the field."""
+    return _at(lab.columns, view.lab, len(lab))
+
+
+def _at(conditions: Mapping[str, Array], lab: Mapping[str, float], size: int) -> At:
+    softness = np.zeros(size)
+    pressure, reference = (c.get("inflation_pressure_psi") for c in (conditions, lab))
+    if pressure is not None and reference is not None:
+        softness = -np.log(np.maximum(pressure, 1e-6) / max(reference, 1e-6))
+    return At(conditions.get("slip_ratio", np.zeros(size)), softness)
+
+
+def _growth(at: At, rho: float, kappa: float) -> Array:
+    return np.asarray((1.0 + rho * np.maximum(at.slip, 0.0)) * np.exp(kappa * at.softness))
+
+
+def ln_prior(noise: Noise) -> float:
+    """Log prior probability of how a noise grows."""
+    rho = int(np.argmin(np.abs(RHO - noise.rho)))
+    kappa = int(np.argmin(np.abs(KAPPA - noise.kappa)))
+    return float(LN_RHO_PRIOR[rho] + LN_KAPPA_PRIOR[kappa])
+
+
+def most_probable(squared: Array, at: At) -> Noise:
+    """Maximise likelihood times prior over the grids of rho and kappa, sigma in closed form.
+
+    Parameters
+    ----------
+    squared : ndarray, shape (n,)
+        Squares of the residuals.
+    at : At
+    """
+    best, found = -np.inf, Noise(1.0)
+    for rho, kappa in product(RHO.tolist(), KAPPA.tolist() if np.ptp(at.softness) else [0.0]):
+        growth = _growth(at, rho, kappa)
+        variance = max(float((squared / growth**2).mean()), 1e-18)
+        noise = Noise(float(np.sqrt(variance)), rho, kappa)
+        value = -0.5 * squared.size * np.log(variance) - np.log(growth).sum() + ln_prior(noise)
+        if value > best:
+            best, found = value, noise
+    return found

@@ -1,0 +1,61 @@
+"""Covariates on a scale of -1..1 over both campaigns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.gap.case import campaigns
+from calib.gap.covariates import Covariates
+from gap.cases import PULL_ONLY, make_case, table_without
+
+
+def test_both_campaigns_span_the_scale():
+    data = campaigns(make_case(models=PULL_ONLY))
+    slip = Covariates(data).scaled(data.view, "slip_ratio")
+    both = np.concatenate([data.case.lab["slip_ratio"], data.case.field["slip_ratio"]])
+    expected = 2.0 * (data.case.field["slip_ratio"] - both.min()) / np.ptp(both) - 1.0
+    np.testing.assert_allclose(slip, expected, atol=1e-12)
+
+
+def test_a_logarithm_is_even_in_ratios():
+    data = campaigns(make_case(models=PULL_ONLY))
+    low, high = (
+        float(f(data.case.lab["inflation_pressure_psi"]))
+        for f in (np.min, np.max)
+    )  # fmt: skip
+    columns = {**data.view.conditions, "inflation_pressure_psi": np.full(27, np.sqrt(low * high))}
+    view = replace(data.view, conditions=columns)
+    scaled = Covariates(data).scaled(view, "inflation_pressure_psi", "log")
+    np.testing.assert_allclose(scaled, 0.0, atol=1e-12)
+
+
+def test_far_beyond_both_campaigns_it_ends():
+    data = campaigns(make_case(models=PULL_ONLY))
+    view = replace(data.view, conditions={**data.view.conditions, "slip_ratio": np.full(27, 9.0)})
+    np.testing.assert_array_equal(Covariates(data).scaled(view, "slip_ratio"), 1.5)
+
+
+@pytest.mark.parametrize("name", ["speed_m_s", "no_such_column"])
+def test_what_is_lacking_or_constant_has_no_scale(name: str):
+    data = campaigns(make_case(models=PULL_ONLY))
+    columns = {**data.view.conditions, "speed_m_s": np.full(27, 1.0)}
+    lab = replace(data.case.lab, columns={**data.case.lab.columns, "speed_m_s": np.full(30, 1.0)})
+    view = replace(data.view, conditions=columns)
+    alike = replace(data, view=view, case=replace(data.case, lab=lab))
+    assert Covariates(alike).scaled(view, name) is None
+
+
+def test_pressure_on_the_ground_stands_for_that_in_the_tyre():
+    case = make_case(models={"rut_depth": "modified_bekker"})
+    without = replace(
+        case, lab=table_without(case.lab, "inflation_pressure_psi"),
+        field=table_without(case.field, "inflation_pressure_psi"),
+    )  # fmt: skip
+    data = campaigns(without)
+    covariates = Covariates(data)
+    ground = covariates.scaled(data.view, "average_ground_pressure_kpa")
+    assert ground is not None
+    np.testing.assert_array_equal(covariates.pressure(data.view), ground)

@@ -1,0 +1,62 @@
+"""Free discrepancies: their shapes, and where they set in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.gap.case import Campaigns
+from calib.gap.covariates import Covariates
+from calib.gap.discrepancy import Discrepancy
+from calib.gap.hypothesis import Hypothesis
+from gap.cases import campaigns_of
+
+PULL = ("drawbar_pull",)
+
+
+@pytest.fixture(scope="module")
+def data() -> Campaigns:
+    return campaigns_of(None)
+
+
+def of(data: Campaigns, **kwargs) -> Discrepancy:
+    lab_mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in data.outputs}
+    h = Hypothesis("unknown", smooth=1.0, smooth_outputs=PULL, **kwargs)
+    return Discrepancy(data, h, Covariates(data), lab_mode)
+
+
+def test_over_slip_it_is_cosines_of_slip_and_a_trend_with_pressure(data):
+    found = of(data, smooth_over="slip")
+    sds = found.sds("drawbar_pull")
+    size = sds.size
+    assert sds[0] == 1.0
+    slip = found.covariates.scaled(data.view, "slip_ratio")
+    second = np.zeros((1, size))
+    second[0, 2] = 1.0
+    curve = found.at(second, np.empty(0), data.view, "drawbar_pull")[0]
+    np.testing.assert_allclose(curve, np.sqrt(2.0) * np.cos(np.pi * (slip + 1.0)), atol=1e-12)
+
+
+@pytest.mark.parametrize("over", ["slip", "level", "sinkage", "order", "all"])
+def test_it_is_the_same_function_at_other_conditions(data, over):
+    found = of(data, smooth_over=over)
+    amplitudes = np.random.default_rng(1).standard_normal((3, found.sds("drawbar_pull").size))
+    whole = found.at(amplitudes, np.empty(0), data.view, "drawbar_pull")
+    rows = np.array([4, 0, 17])
+    some = replace(data.view, conditions={k: v[rows] for k, v in data.view.conditions.items()})
+    part = found.at(amplitudes, np.empty(0), some, "drawbar_pull")
+    np.testing.assert_allclose(part, whole[:, rows], atol=1e-12)
+
+
+def test_it_sets_in_at_a_threshold_as_a_step_and_a_bend(data):
+    found = of(data, onset_over="slip")
+    np.testing.assert_array_equal(found.sds("drawbar_pull"), [1.0, 2.0])
+    u = found.onset_covariate(data.view, "drawbar_pull")
+    step, bend = found.onset(data.view, "drawbar_pull", np.array([0.1]))
+    far = abs(u - 0.1) > 0.6  # ten widths
+    np.testing.assert_allclose(step[0, far], (u > 0.1)[far], atol=1e-4)
+    np.testing.assert_allclose(bend[0, far], np.maximum(u - 0.1, 0.0)[far], atol=1e-4)
+    both = found.at(np.array([[0.2, -0.3]]), np.array([0.1]), data.view, "drawbar_pull")
+    np.testing.assert_allclose(both, 0.2 * step - 0.3 * bend)

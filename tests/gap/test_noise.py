@@ -1,0 +1,65 @@
+"""How the noise of readings grows with slip and as the tyre goes soft."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.gap.case import campaigns
+from calib.gap.noise import KAPPA, RHO, At, Noise, ln_prior, most_probable, noise_at
+from gap.cases import PULL_ONLY, make_case
+
+
+def at(n: int, *, pressures: bool = True) -> At:
+    rng = np.random.default_rng(5)
+    pressure = rng.choice([18.0, 30.0, 42.0], n)
+    return At(rng.uniform(0.0, 0.6, n), np.log(30.0 / pressure) if pressures else np.zeros(n))
+
+
+def test_it_grows_as_stated():
+    rows = At(np.array([0.0, 0.5, -0.1]), np.log(30.0 / np.array([30.0, 15.0, 60.0])))
+    found = Noise(0.1, 2.0, 1.0).sd(rows)
+    np.testing.assert_allclose(found, [0.1, 0.1 * 2.0 * 2.0, 0.1 * 0.5])
+
+
+def test_the_reference_is_the_calibrations_median_pressure():
+    data = campaigns(make_case(models=PULL_ONLY))
+    psi = data.view.conditions["inflation_pressure_psi"]
+    median = np.median(data.case.lab["inflation_pressure_psi"])
+    np.testing.assert_allclose(noise_at(data.view).softness, np.log(median / psi))
+    lab = data.lab_at["drawbar_pull"]
+    assert np.median(lab.softness) == pytest.approx(0.0, abs=1e-12)
+    np.testing.assert_array_equal(lab.slip, data.case.lab["slip_ratio"])
+
+
+def test_without_pressures_there_is_nothing_to_be_soft():
+    view = campaigns(make_case(models=PULL_ONLY)).view
+    conditions = {k: v for k, v in view.conditions.items() if k != "inflation_pressure_psi"}
+    bare = type(view)(conditions, view.lab, 5.0, 0.5, (0.0, 1.0))
+    assert not noise_at(bare).softness.any()
+    squared = np.random.default_rng(0).standard_normal(200) ** 2
+    assert most_probable(squared, at(200, pressures=False)).kappa == 0.0
+
+
+@pytest.mark.parametrize("rho", RHO.tolist())
+@pytest.mark.parametrize("kappa", KAPPA.tolist())
+def test_it_is_found_again(rho: float, kappa: float):
+    rows, truth = at(4000), Noise(0.3, rho, kappa)
+    squared = np.square(truth.sd(rows) * np.random.default_rng(2).standard_normal(4000))
+    found = most_probable(squared, rows)
+    assert (found.rho, found.kappa) == (rho, kappa)
+    # sigma of 4000 residuals, 1.1 %.
+    assert found.sigma == pytest.approx(0.3, rel=0.045)
+
+
+def test_it_is_the_most_probable_of_all_it_could_be():
+    rows = at(40)
+    squared = np.random.default_rng(9).standard_normal(40) ** 2
+
+    def log_posterior(noise: Noise) -> float:
+        sd = noise.sd(rows)
+        return float(-np.log(sd).sum() - 0.5 * (squared / sd**2).sum()) + ln_prior(noise)
+
+    best = log_posterior(most_probable(squared, rows))
+    others = [Noise(s, r, k) for s in np.linspace(0.3, 3.0, 400) for r in RHO for k in KAPPA]
+    assert best >= max(map(log_posterior, others)) - 1e-9
