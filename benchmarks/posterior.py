@@ -209,7 +209,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="JSON file to write")
     parser.add_argument("--repeats", type=int, default=7)
-    parser.add_argument("--long-repeats", type=int, default=3)
+    parser.add_argument("--long-repeats", type=int, default=5)
     options = parser.parse_args()
     use_one_core()
     result: dict[str, object] = {"machine": describe(), "problems": {}}

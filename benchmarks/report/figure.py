@@ -26,7 +26,7 @@ __all__ = ["draw"]
 
 _SAMPLERS = (
     ("calib default", "calib, default", BLUE, "o"),
-    ("calib long", "calib, ten times as long", BLUE, "s"),
+    ("calib long", "calib, five times as long", BLUE, "s"),
     ("nutpie default", "PyMC + nutpie, default", VERMILION, "o"),
     ("nutpie long", "PyMC + nutpie, ten times as long", VERMILION, "s"),
     ("stretch", "emcee's stretch move", GREEN, "^"),

@@ -29,6 +29,8 @@ type LogProb = Callable[[Array], Array]
 _FIRST = ((0.6, 1.2, 6.0), (0.25, 2.0, 4.0), (0.15, 4.0, 3.0))
 # Draws of each round per dimension plus five, and the efficiency beyond which more are no use.
 _ROUNDS, _GOOD = (60, 120, 250, 400), 0.9
+# One more round pays where so many draws of the chains follow.
+_LAST, _MANY = 800, 1_000_000
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,7 @@ class Assessment:
 
 
 def adapt(
-    log_prob: LogProb, guesses: Sequence[Guess], rng: np.random.Generator
+    log_prob: LogProb, guesses: Sequence[Guess], rng: np.random.Generator, planned: int = 0
 ) -> tuple[Proposal, Assessment]:
     """Fit a proposal to a density by adaptive importance sampling.
 
@@ -70,6 +72,8 @@ def adapt(
     guesses : sequence of Guess
         One for each mode that is known.
     rng : Generator
+    planned : int
+        Draws that the chains are to have at first.
 
     Returns
     -------
@@ -88,7 +92,7 @@ def adapt(
     )
     proposal = Proposal(Straightener.identity(d), first)
     memory = _Memory()
-    for size in _ROUNDS:
+    for size in (*_ROUNDS, _LAST) if planned >= _MANY else _ROUNDS:
         draws, log_q = proposal.draw(rng, size * (d + 5))
         value = log_prob(draws)
         found = _assess(value - log_q)

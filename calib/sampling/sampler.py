@@ -216,8 +216,9 @@ def sample_density(
     """
     began = time.perf_counter() if began is None else began
     count = log_prob if isinstance(log_prob, _Counter) else _Counter(log_prob)
-    proposal, found = adapt(count, first, rng)
-    walkers = settings.n_walkers(proposal.n_dim)
+    walkers = settings.n_walkers(first[0].mean.size)
+    planned = (len(seeds) - 1) * walkers * min(settings.steps, settings.max_steps)
+    proposal, found = adapt(count, first, rng, planned)
     ensembles = [
         Ensemble(count, proposal, seed, walkers=walkers, ahead=settings.ahead) for seed in seeds[1:]
     ]

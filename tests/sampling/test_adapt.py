@@ -106,6 +106,19 @@ def test_a_chain_teaches_what_importance_sampling_missed() -> None:
     assert abs(after.log_evidence) < error_of(after.efficiency)
 
 
+def test_one_more_round_where_many_draws_follow() -> None:
+    """Of 800 draws for each dimension and five more, where the proposal is not good yet."""
+    seen: list[int] = []
+
+    def counted(t: np.ndarray) -> np.ndarray:
+        seen.append(len(t))
+        return np.where((abs(t) < 1.0).all(axis=1), 0.0, -np.inf)  # a box is hard to match
+
+    for planned in (999_999, 1_000_000):
+        adapt(counted, [Guess(np.zeros(2), np.eye(2))], np.random.default_rng(3), planned)
+    assert seen == [7 * n for n in (60, 120, 250, 400)] * 2 + [7 * 800]
+
+
 def test_draws_that_have_no_spread_leave_the_proposal_as_it_is() -> None:
     rng = np.random.default_rng(10)
     target = stats.multivariate_normal(MEAN, SCALE)
