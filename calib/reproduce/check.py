@@ -64,6 +64,6 @@ def _not_converged(record: Manifest | RunRecord, folder: Path) -> tuple[str, ...
             gate: Any = record.document["gate"]
             return () if gate["passed"] else (record.model,)
         models = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["models"]
-        return tuple(m["model"] for m in models if not m["sampling"]["converged"])
-    except (OSError, ValueError, KeyError, TypeError):
+        return tuple(m["model"] for m in models.values() if not m["sampling"]["converged"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return ()

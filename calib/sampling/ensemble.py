@@ -84,7 +84,10 @@ class Ensemble:
             end = self.sampler.run_mcmc(self.state, steps, skip_initial_state_check=True)
         # The random state travels apart, as a start may be without one.
         self.state = emcee.State(end.coords, log_prob=end.log_prob, copy=True)
-        self.random_state = self.sampler.end()
+        taken, self.random_state = self.random_state, self.sampler.end()
+        if taken[2] == self.random_state[2] and np.array_equal(taken[1], self.random_state[1]):
+            # Another emcee may keep them elsewhere; the run would not be reproducible.
+            raise RuntimeError("emcee did not take the random state")
 
     @property
     def walkers(self) -> int:

@@ -15,8 +15,11 @@ import pytest
 from calib.errors import CalibError
 from calib.manifest import sha256
 from calib.prior_files import default_prior_path
+from calib.report import write_report
 from calib.reproduce.check import check
 from calib.reproduce.items import Status
+from calib.sampling.sampler import SamplerSettings
+from calib.study import he2019_tasks, run_study
 
 from .conftest import different, edit_json, findings, rut_study, seal, write
 
@@ -46,6 +49,19 @@ def test_an_untouched_report_is_the_same_bit_for_bit(report: Path) -> None:
         name = path.relative_to(report).as_posix()
         assert name in (*names, "manifest.json", "summary.json")
     assert {p: p.read_bytes() for p in report.rglob("*") if p.is_file()} == before
+
+
+def test_the_same_report_of_a_posterior_that_did_not_converge(tmp_path: Path) -> None:
+    tasks = [task for task in he2019_tasks() if task.output == "rut_depth"]
+    short = SamplerSettings(steps=40, max_steps=40)
+    write_report(
+        run_study(tasks, 3, settings=short), tmp_path / "report",
+        settings=short, command=["calib", "report"], title="A report",
+    )  # fmt: skip
+    outcome = check(tmp_path / "report")
+    assert outcome.verdict.startswith("SAME, bit for bit")
+    assert outcome.verdict.endswith("; NOT CONVERGED, not to be used: modified_bekker")
+    assert outcome.document()["not_converged"] == ["modified_bekker"]
 
 
 def test_quick_says_that_it_skips_the_sampling(report: Path) -> None:

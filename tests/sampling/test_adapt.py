@@ -95,15 +95,18 @@ def test_a_chain_teaches_what_importance_sampling_missed() -> None:
         one, other = (stats.multivariate_normal([x, 0.0]).logpdf(t) for x in (-15.0, 15.0))
         return np.logaddexp(np.log(0.3) + one, np.log(0.7) + other)
 
-    rng = np.random.default_rng(9)
-    known, before = adapt(log_prob, [Guess(np.array([-15.0, 0.0]), np.eye(2))], rng)
-    assert before.log_evidence == pytest.approx(np.log(0.3), abs=0.1)
-    draws = rng.standard_normal((4000, 2))
-    draws[:, 0] += np.where(np.arange(4000) % 4, -15.0, 15.0)  # in the wrong proportion
-    _, after = refit(log_prob, known, draws, 4000.0, rng)
-    # Of 40 seeds 0.387 to 0.438.
-    assert after.efficiency > 0.36
-    assert abs(after.log_evidence) < error_of(after.efficiency)
+    efficiencies = []
+    for seed in range(9):
+        rng = np.random.default_rng(seed)
+        known, before = adapt(log_prob, [Guess(np.array([-15.0, 0.0]), np.eye(2))], rng)
+        assert before.log_evidence == pytest.approx(np.log(0.3), abs=0.1)
+        draws = rng.standard_normal((4000, 2))
+        draws[:, 0] += np.where(np.arange(4000) % 4, -15.0, 15.0)  # in the wrong proportion
+        _, after = refit(log_prob, known, draws, 4000.0, rng)
+        assert abs(after.log_evidence) < error_of(after.efficiency)
+        efficiencies.append(after.efficiency)
+    # One seed's lies between 0.387 and 0.438.
+    assert np.median(efficiencies) > 0.4
 
 
 def test_one_more_round_where_many_draws_follow() -> None:

@@ -14,6 +14,7 @@ from calib.chains import ess
 from calib.data import Table
 from calib.errors import CalibError
 from calib.problem import build_problem
+from calib.sampling import ensemble as ensemble_module
 from calib.sampling import sampler as sampler_module
 from calib.sampling.adapt import Guess
 from calib.sampling.gate import Gate, judge
@@ -250,6 +251,22 @@ def test_progress_counts_up_to_what_is_planned(rut_tables: tuple[Table, Table]) 
     assert seen[-1][0] == seen[-1][1]
     untold = sample_posterior(problem, 3, settings=QUICK)
     np.testing.assert_array_equal(told.t, untold.t)
+
+
+def test_emcee_takes_the_random_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Moves and splits must come from the numbers that were given, or runs do not repeat."""
+
+    class Deaf(ensemble_module._Sampler):
+        def begin(self, state):
+            super().begin(state)
+            self.given, self._random = self._random, np.random.RandomState()
+
+        def end(self):
+            return self.given.get_state()
+
+    monkeypatch.setattr(ensemble_module, "_Sampler", Deaf)
+    with pytest.raises(RuntimeError, match="did not take the random state"):
+        run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=QUICK)
 
 
 def test_no_parameters_of_positive_probability(rut_tables: tuple[Table, Table]) -> None:
