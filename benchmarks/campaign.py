@@ -4,7 +4,8 @@
 
 Overhead: tiny tasks through `calib.tasks.run_tasks`, which writes a file for each, and through
 Dask's own `Client.map` and `as_completed`, which writes none, on one cluster of two workers.
-Gain: diagnoses of challenge cases in this process and on two workers, start-up included.
+Gain: diagnoses of challenge cases in this process and on two workers, start-up included; and in two
+plain processes without Dask, each with half of the cases: what this machine's two cores can do.
 Each is repeated, the two sides of a comparison in turn, and medians are taken: other work on the
 machine disturbs both.
 """
@@ -13,11 +14,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import statistics
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from shared.machine import describe
@@ -27,7 +30,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 SEED = 77
 # Minutes each.
-GAIN_REPEATS = 2
+GAIN_REPEATS = 3
 
 
 def tiny(item: int) -> dict[str, int]:
@@ -85,24 +88,51 @@ def overhead(tasks: int, repeats: int) -> dict[str, object]:
 
 
 def gain(cases: Path, count: int, repeats: int) -> dict[str, object]:
-    """Seconds for some diagnoses with one worker and with two."""
-    from calib.gap.batch import case_folders, diagnose_cases
+    """Seconds for some diagnoses with one worker, with two, and in two plain processes."""
+    from calib.gap.batch import case_folders
 
     folders = case_folders(cases)[:count]
-    seconds: dict[int, list[float]] = {1: [], 2: []}
+    ways: dict[str, Callable[[Path], None]] = {
+        "one": partial(diagnosed, folders, workers=1),
+        "two": partial(diagnosed, folders, workers=2),
+        "plain": partial(in_two_processes, folders),
+    }
+    seconds: dict[str, list[float]] = {name: [] for name in ways}
     for _ in range(repeats):
-        for workers, runs in seconds.items():
+        for name, way in ways.items():
             with tempfile.TemporaryDirectory() as out:
                 began = time.perf_counter()
-                assert diagnose_cases(folders, Path(out), 1, workers=workers) == {}
-                runs.append(time.perf_counter() - began)
-    ratios = [one / two for one, two in zip(seconds[1], seconds[2], strict=True)]
-    return {
-        "diagnoses": len(folders),
-        "seconds": seconds,
-        "ratios": ratios,
-        "ratio_median": statistics.median(ratios),
+                way(Path(out))
+                seconds[name].append(time.perf_counter() - began)
+    over_one = {
+        name: [one / two for one, two in zip(seconds["one"], seconds[name], strict=True)]
+        for name in ("two", "plain")
     }
+    return {"diagnoses": len(folders), "seconds": seconds, "over_one": over_one}
+
+
+def diagnosed(folders: list[Path], out: Path, *, workers: int) -> None:
+    """Diagnose cases, here or on workers."""
+    from calib.gap.batch import diagnose_cases
+
+    failed = diagnose_cases(folders, out, 1, workers=workers)
+    if failed:
+        raise SystemExit(f"failed: {failed}")
+
+
+def in_two_processes(folders: list[Path], out: Path) -> None:
+    """Diagnose every other case in one process and the others in another, without Dask."""
+    context = multiprocessing.get_context("spawn")
+    halves = [
+        context.Process(target=diagnosed, args=(folders[i::2], out / str(i)), kwargs={"workers": 1})
+        for i in range(2)
+    ]
+    for half in halves:
+        half.start()
+    for half in halves:
+        half.join()
+    if any(half.exitcode for half in halves):
+        raise SystemExit("a plain process failed")
 
 
 def main() -> None:

@@ -56,7 +56,9 @@ _HOW = """## How it was measured
   NumPy, at draws of a Student-t that are weighted by it.
 - **Genetic algorithm.** One core, same likelihood and box, a population in each call for both. A
   seed is at the optimum if its cost is within 1e-6 of the lowest that any run reached.
-- **Campaign.** Two worker processes. `benchmarks/campaign.py` and `campaign_survival.py`.
+- **Campaign.** Two worker processes over one process, start-up of about 5 s included. Beside them, in
+  turn, two plain processes without Dask that have half of the cases each, which is what the two cores
+  of this machine can do (results.md). `benchmarks/campaign.py` and `campaign_survival.py`.
 """
 
 _TRIED = """## What was tried
