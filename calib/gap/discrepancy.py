@@ -98,6 +98,9 @@ class Discrepancy:
         if self.hypothesis.onset_over is not None:
             # Its shape depends on the threshold; here are its two amplitudes.
             return np.empty((0, 2)), np.array([1.0, 2.0])
+        if over == "before":
+            change = self._from_the_run_before(view, output)
+            return change[:, None], np.ones(1)
         if over in ("level", "sinkage"):
             terms = self._cosines(self._level(view, output if over == "level" else RUT), 8, 0.8)
         elif over == "order":
@@ -147,14 +150,30 @@ class Discrepancy:
         """Predicted level of an output, scaled to the field's range."""
         if output not in self.lab_mode:
             return None
+        reference = self._predicted(self.data.view, output)
+        low, high = float(np.nanmin(reference)), float(np.nanmax(reference))
+        level = np.nan_to_num(self._predicted(view, output), nan=low)
+        return np.clip((level - low) / max(high - low, 1e-12) * 2.0 - 1.0, -1.5, 1.5)
+
+    def _predicted(self, view: View, output: str) -> Array:
+        """Prediction of an output as the lab calibrated it, on the response's scale."""
         o = next(o for o in self.data.outputs if o.name == output)
         theta = o.priors.to_natural(self.lab_mode[output][None])
+        selected = o.problem.bound.model.select(view.conditions)
+        return np.asarray(o.problem.bound.location(theta, selected)[0])
 
-        def predicted(conditions: Mapping[str, Array]) -> Array:
-            selected = o.problem.bound.model.select(conditions)
-            return np.asarray(o.problem.bound.location(theta, selected)[0])
+    def _from_the_run_before(self, view: View, output: str) -> Array:
+        """How much more the run before is predicted to give, as a part of its rms in the field."""
 
-        reference = predicted(self.data.view.conditions)
-        low, high = float(np.nanmin(reference)), float(np.nanmax(reference))
-        level = np.nan_to_num(predicted(view.conditions), nan=low)
-        return np.clip((level - low) / max(high - low, 1e-12) * 2.0 - 1.0, -1.5, 1.5)
+        def change(view: View) -> Array:
+            level = np.nan_to_num(self._predicted(view, output))
+            run = view.conditions["run_order"]
+            if not np.ptp(run):
+                return np.zeros(level.size)  # nobody knows what went before
+            order = np.argsort(run, kind="stable")
+            before = np.empty_like(level)
+            before[order] = level[order][np.maximum(np.arange(order.size) - 1, 0)]
+            return before - level
+
+        rms = float(np.sqrt(np.mean(np.square(change(self.data.view)))))
+        return change(view) / max(rms, 1e-12)

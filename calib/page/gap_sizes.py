@@ -79,6 +79,8 @@ def where_to_look(found: Diagnosis) -> str:
     place = "" if largest is None else f" where the gap is largest ({region_text(largest)})"
     if (h.onset_over or h.smooth_over) == "all":
         vary = "one condition at a time, the others held"
+    elif (h.onset_over or h.smooth_over) == "before":
+        vary = "in another order, and a condition several times in a row"
     elif h.onset_over is not None:
         vary = f"in small steps about {_threshold(found, fit)}, the other conditions held"
     else:
@@ -95,7 +97,8 @@ def _along(fit: Fit) -> str:
     level = f"predicted {joined(sorted(own)).lower()}"
     along = {
         "slip": "slip", "level": f"the {level}", "sinkage": "the predicted rut depth",
-        "order": "the order of the runs", "all": "several conditions",
+        "order": "the order of the runs", "before": "how far the run before differed",
+        "all": "several conditions",
     }  # fmt: skip
     return along[h.smooth_over]
 

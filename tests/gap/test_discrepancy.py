@@ -60,3 +60,30 @@ def test_it_sets_in_at_a_threshold_as_a_step_and_a_bend(data):
     np.testing.assert_allclose(bend[0, far], np.maximum(u - 0.1, 0.0)[far], atol=1e-4)
     both = found.at(np.array([[0.2, -0.3]]), np.array([0.1]), data.view, "drawbar_pull")
     np.testing.assert_allclose(both, 0.2 * step - 0.3 * bend)
+
+
+def test_a_reading_that_keeps_part_of_the_run_before(data):
+    found = of(data, smooth_over="before")
+    o = next(o for o in data.outputs if o.name == "drawbar_pull")
+    theta = o.priors.to_natural(found.lab_mode["drawbar_pull"][None])
+    selected = o.problem.bound.model.select(data.view.conditions)
+    pull = o.problem.bound.location(theta, selected)[0]
+    as_they_are = found.at(np.array([[0.3]]), np.empty(0), data.view, "drawbar_pull")[0]
+    np.testing.assert_allclose(np.sqrt(np.mean(as_they_are**2)), 0.3)
+    # The order of the runs counts, not that of the rows.
+    runs = np.random.default_rng(2).permutation(pull.size)
+    order = np.empty(pull.size)
+    order[runs] = np.arange(pull.size)
+    shuffled = replace(data.view, conditions={**data.view.conditions, "run_order": order})
+    gap = found.at(np.array([[0.3]]), np.empty(0), shuffled, "drawbar_pull")[0]
+    kept = gap[runs[1:]] / (pull[runs[:-1]] - pull[runs[1:]])
+    np.testing.assert_allclose(kept, kept[0])
+    assert kept[0] > 0.0
+    assert gap[runs[0]] == 0.0
+
+
+def test_without_an_order_nothing_is_kept_of_the_run_before(data):
+    found = of(data, smooth_over="before")
+    n = data.view.slip().size
+    unknown = replace(data.view, conditions={**data.view.conditions, "run_order": np.full(n, 7.0)})
+    assert not found.at(np.ones((1, 1)), np.empty(0), unknown, "drawbar_pull").any()

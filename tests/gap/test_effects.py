@@ -287,3 +287,9 @@ def test_growth_that_levels_off():
     assert saturating(np.ones(1), 0.6 * one, 0.2 * one) == pytest.approx(1.0)
     warm = saturating(u, one, 0.2 * one)[0]
     np.testing.assert_allclose(warm, 1.2 * u / (u + 0.2))
+
+
+@pytest.mark.parametrize("name", ["lug_thrust", "load_transfer"])
+def test_the_rut_alone_does_not_show_what_acts_on_the_pull(name: str, view: View) -> None:
+    assert EFFECTS[name].not_testable(view, ("rut_depth",)) == "no drawbar_pull output"
+    assert EFFECTS[name].not_testable(view, ("drawbar_pull", "rut_depth")) is None

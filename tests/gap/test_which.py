@@ -119,6 +119,20 @@ def test_waves_along_the_campaign_are_unknown():
     assert ranking.fits["unknown"][best].forward.hypothesis.smooth_over == "order"
 
 
+def test_a_recorder_that_keeps_half_of_the_run_before_is_unknown():
+    case = make_case(None, models=PULL_ONLY, n_field=36)
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    pull = columns[OUTPUTS["drawbar_pull"]]
+    columns["run_order"] = np.random.default_rng(4).permutation(pull.size).astype(float)
+    runs = np.argsort(columns["run_order"])
+    pull[runs[1:]] = 0.5 * (pull[runs[1:]] + pull[runs[:-1]])
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "slip_zero_shift")}
+    ranking = rank(campaigns(replace(case, field=table_from_arrays(columns))), 1, effects=few)
+    assert ranking.order[0] == "unknown"
+    best = int(np.argmax(ranking.scores["unknown"]))
+    assert ranking.fits["unknown"][best].forward.hypothesis.smooth_over == "before"
+
+
 def test_what_a_listed_effect_leaves_is_unknown():
     case = wave(make_case("force_offset", models=PULL_ONLY, n_field=36), "drawbar_pull", 0.15)
     few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}

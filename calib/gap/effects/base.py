@@ -91,6 +91,8 @@ class Effect:
         In the order of the columns of `phi`.
     outputs : tuple of str
         Outputs it touches.
+    needs : tuple of str
+        Those of them without which its trace in the others would be another effect's as well.
     covariates : tuple of str
         Columns it needs.
     varies : bool
@@ -106,6 +108,7 @@ class Effect:
     title: str = ""
     parameters: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
+    needs: tuple[str, ...] = ()
     covariates: tuple[str, ...] = ()
     varies: bool = True
     form: tuple[str, ...] = ()
@@ -159,6 +162,9 @@ class Effect:
         """
         if not set(self.outputs) & set(outputs):
             return f"no {' or '.join(self.outputs)} output"
+        unseen = [o for o in self.needs if o not in outputs]
+        if unseen:
+            return f"no {' and '.join(unseen)} output"
         missing = [c for c in self.covariates if c not in view.conditions]
         if missing:
             return f"the data lack {', '.join(missing)}"

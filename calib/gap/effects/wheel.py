@@ -45,6 +45,7 @@ class LugThrust(Effect):
     parameters = ("thrust", "slip_scale", "digging")
     form = ("slip", "pressure")
     outputs = (DRAWBAR, RUT)
+    needs = (DRAWBAR,)  # a rut alone does not tell lugs that dig from slip sinkage
     covariates = ("slip_ratio",)
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
@@ -144,6 +145,7 @@ class LoadTransfer(Effect):
     parameters = ("transfer", "pull_exponent", "pressure_exponent")
     form = ("slip",)
     outputs = (DRAWBAR, RUT)
+    needs = (DRAWBAR,)
     varies = False
 
     def _ln_load(self, phi: Array, view: View) -> Array:
@@ -165,9 +167,3 @@ class LoadTransfer(Effect):
         if output != DRAWBAR:
             return location
         return np.asarray(location * np.exp(phi[:, 1:2] * self._ln_load(phi, view)))
-
-    def not_testable(self, view: View, outputs: tuple[str, ...]) -> str | None:
-        """It needs the pull to be modelled."""
-        if DRAWBAR not in outputs:
-            return "no drawbar_pull output"
-        return super().not_testable(view, outputs)
