@@ -97,8 +97,8 @@ in 18.4 s; means of three runs in turn). Both are switched off for workers that 
 Start-up, of 3 to 5 s, is in the figure. One memory arena for all threads, and thresholds that keep
 the C library from ever giving memory back (6,000 page faults a diagnosis without, 140 with),
 changed nothing. What is left depends on the hour, on a machine that shares its hardware with
-others: 100 diagnoses in one process took 195 to 212 s in one run, and two workers gave 1.77 and 1.96; 208
-and 216 s in another, and 1.79 and 1.51; 234 to 262 s in a third, and 1.73, 1.71 and 1.87.
+others: 100 diagnoses in one process took 195 to 212 s in one run, and two workers gave 1.77 and
+1.96; 208 and 216 s in another, and 1.79 and 1.51; 234 to 262 s in a third, and 1.73, 1.71 and 1.87.
 
 Likelihood: {libraries}
 A sine is worked out as a tangent of the half argument, for which NumPy has vector instructions:
