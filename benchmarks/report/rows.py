@@ -231,9 +231,11 @@ def _campaign(m: Measured) -> Iterator[Row]:
         g = m["gain"]
         for way, what, least in (
             ("two", "two workers over one", 1.8),
-            ("plain", "two plain processes without Dask over one", None),
+            ("alone", "two plain processes without Dask over one", None),
         ):
-            ratios = g["over_one"][way]
+            ratios = g["over_one"].get(way)
+            if ratios is None:
+                continue
             s = {"median": float(np.median(ratios)), "low": min(ratios), "high": max(ratios)}
             yield _asked(part, f"{g['diagnoses']} diagnoses", what, s, least=least)
 

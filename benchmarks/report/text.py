@@ -56,9 +56,9 @@ _HOW = """## How it was measured
   NumPy, at draws of a Student-t that are weighted by it.
 - **Genetic algorithm.** One core, same likelihood and box, a population in each call for both. A
   seed is at the optimum if its cost is within 1e-6 of the lowest that any run reached.
-- **Campaign.** Two worker processes over one process, start-up of about 5 s included. Beside them, in
-  turn, two plain processes without Dask that have half of the cases each, which is what the two cores
-  of this machine can do (results.md). `benchmarks/campaign.py` and `campaign_survival.py`.
+- **Campaign.** Two worker processes over one process, start-up included. `benchmarks/campaign.py`
+  also times two plain processes without Dask that have half of the cases each: what the two cores
+  can do (not in a run made before that was measured right). `benchmarks/campaign_survival.py`.
 """
 
 _TRIED = """## What was tried
@@ -94,7 +94,11 @@ also looks into a worker a hundred times a second to see what it is at, and fift
 event loop is awake; each look takes the interpreter from the task, together a twelfth of the time
 (20 diagnoses on two workers in 21.9 s with and 20.2 s without, in two plain processes without Dask
 in 18.4 s; means of three runs in turn). Both are switched off for workers that calib starts itself.
-Start-up, of about 5 s, is in the figure. One memory arena for all threads changed nothing.
+Start-up, of 3 to 5 s, is in the figure. One memory arena for all threads, and thresholds that keep
+the C library from ever giving memory back (6,000 page faults a diagnosis without, 140 with),
+changed nothing. What is left depends on the hour, on a machine that shares its hardware with
+others: 100 diagnoses in one process took 195 to 212 s in one run, and two workers gave 1.77 and
+1.96; 208 and 216 s in another, and 1.79 and 1.51; 234 to 262 s in a third, and 1.73, 1.71 and 1.87.
 
 Likelihood: {libraries}
 A sine is worked out as a tangent of the half argument, for which NumPy has vector instructions:

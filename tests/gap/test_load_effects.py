@@ -81,6 +81,11 @@ RETURN = "        return location + phi[:, :1]\n"
         ('name = "cross_wind"', 'name = "rate_effect"', "an effect of calib's own"),
         ('outputs = ("drawbar_pull",)', 'outputs = ("drawbar_pul",)', "was drawbar_pull meant?"),
         ('outputs = ("drawbar_pull",)', 'outputs = "drawbar_pull"', "with the comma"),
+        (
+            'outputs = ("drawbar_pull",)',
+            'outputs = ("drawbar_pull",); needs = ("drawbar",)',
+            "in needs",
+        ),
         ('    outputs', '    covariates = ("sped_m_s",)\n    outputs', "was speed_m_s meant?"),
         ('    outputs', '    covariate = ("speed_m_s",)\n    outputs', "was covariates meant?"),
         ('    outputs', '    form = ("slope",)\n    outputs', "unknown name 'slope' in form"),

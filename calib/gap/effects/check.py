@@ -57,7 +57,9 @@ def check_declared(effect: Effect, path: Path) -> None:
             "the name is that of an effect of calib's own", where=where,
             allowed=f"any name but {', '.join(EFFECTS)}", mend="give it another name",
         )  # fmt: skip
-    for attribute, known in (("outputs", OUTPUTS), ("covariates", QUANTITIES), ("form", _FORMS)):
+    for attribute, known in (
+        ("outputs", OUTPUTS), ("needs", OUTPUTS), ("covariates", QUANTITIES), ("form", _FORMS),
+    ):  # fmt: skip
         given = getattr(effect, attribute)
         if isinstance(given, str):
             raise CalibError(
