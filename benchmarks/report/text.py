@@ -35,8 +35,8 @@ _HOW = """## How it was measured
   of 320 walkers and 192 steps, and nutpie's 4 chains of 1,000 draws after its tuning; "long" is
   1,024 walkers and 320 steps, and 4 chains of 10,000 draws: what a sampler does once what comes
   first is of little account.
-- **The hour.** The machine shares its hardware with others. Three runs of the same code gave, of bulk
-  density's long runs, 54.9, 54.4 and 47.9 times nutpie's; of two workers see below.
+- **The hour.** The machine shares its hardware with others. Three runs of the same code gave, of
+  bulk density's long runs, 54.9, 54.4 and 47.9 times nutpie's; of two workers see below.
 - **Bulk and tail.** Our draws come in opposite pairs, whose errors of a mean cancel: bulk ESS,
   which is that of means of normal scores, then exceeds what evaluations would be worth as
   independent draws, as nutpie's own does. Tail ESS, of the shares beyond the 5 and 95 % quantiles,
