@@ -1,6 +1,6 @@
 """Run the benchmarks and write reports/benchmarks: tables, a figure, and what they say.
 
-    python benchmarks/bench.py                       # all parts, about 40 minutes on two cores
+    python benchmarks/bench.py                       # all parts, about an hour on two cores
     python benchmarks/bench.py posterior likelihood  # some of them; the others stay as they were
     python benchmarks/bench.py --full campaign       # 200 diagnoses in the place of 100
 
@@ -40,7 +40,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
     parser.add_argument("--out", type=Path, default=HERE.parent / "reports" / "benchmarks")
-    parser.add_argument("--full", action="store_true", help="campaigns of 200, 10 minutes more")
+    parser.add_argument("--full", action="store_true", help="campaigns of 200, 20 minutes more")
     parser.add_argument("--only-write", action="store_true", help="measure nothing")
     options = parser.parse_args()
     unknown = set(options.parts) - set(PARTS)
