@@ -43,6 +43,8 @@ _LOCAL = {
     "distributed.worker.profile.enabled": False,
     "distributed.admin.tick.interval": "1s",
 }
+# A nanny replaces a worker that dies, but for one that dies before it is up.
+START_TRIES = 2
 CONNECT_SECONDS = 10
 SETTLE_SECONDS, CLOSE_SECONDS = 20, 20
 _SAME = ("numpy", "scipy", "emcee")
@@ -190,17 +192,7 @@ def _local(workers: int) -> Iterator[Client]:
     ends.
     """
     with _own_environment(), dask.config.set(_LOCAL):
-        try:
-            cluster = LocalCluster(
-                n_workers=workers, threads_per_worker=1, processes=True, memory_limit=1.0 / workers,
-                dashboard_address="127.0.0.1:0",  # any free port: the usual one may be taken
-                silence_logs=logging.CRITICAL, preload=["calib.tasks.worker"],
-            )  # fmt: skip
-        except RuntimeError as error:
-            raise CalibError(
-                f"the worker processes do not start ({error})",
-                mend='in a script of yours, put the call below `if __name__ == "__main__":`',
-            ) from error
+        cluster = _start(workers)
         try:
             with Client(cluster, set_as_default=False) as client:
                 yield client
@@ -212,6 +204,23 @@ def _local(workers: int) -> Iterator[Client]:
             # started, say) ends with this one.
             with suppress(AssertionError, TimeoutError):
                 cluster.close(timeout=CLOSE_SECONDS)
+
+
+def _start(workers: int, tries: int = START_TRIES) -> LocalCluster:
+    """Start a scheduler here and its workers, once more if one of them died as it started."""
+    try:
+        return LocalCluster(
+            n_workers=workers, threads_per_worker=1, processes=True, memory_limit=1.0 / workers,
+            dashboard_address="127.0.0.1:0",  # any free port: the usual one may be taken
+            silence_logs=logging.CRITICAL, preload=["calib.tasks.worker"],
+        )  # fmt: skip
+    except RuntimeError as error:
+        if tries > 1:
+            return _start(workers, tries - 1)
+        raise CalibError(
+            f"the worker processes do not start ({error})",
+            mend='in a script of yours, put the call below `if __name__ == "__main__":`',
+        ) from error
 
 
 @contextmanager

@@ -65,7 +65,7 @@ def test_a_killed_worker_and_a_killed_client_lose_nothing(site, serial, tmp_path
     there = {n: (out / "results" / n).stat().st_mtime_ns for n in results(out)}
     assert 2 <= len(there) < len(NAMES)
     again = start(site, out, "--workers", "2")
-    kill_a_worker(again.pid)
+    kill_a_worker(again.pid, after_seconds=0.0)  # as it starts, before it has met the scheduler
     said = again.communicate(timeout=120)
     assert again.returncode == 0, said
     assert {n: (out / "results" / n).stat().st_mtime_ns for n in there} == there
@@ -78,12 +78,14 @@ def wait_for(condition, process) -> None:
         time.sleep(0.005)
 
 
-def kill_a_worker(client: int, until=lambda: True) -> None:
-    """Kill the first worker of a client that has done some work of its own."""
+def kill_a_worker(client: int, until=lambda: True, after_seconds: float = 0.5) -> None:
+    """Kill the first worker of a client that has computed for so long."""
     deadline = time.monotonic() + 60.0
     while time.monotonic() < deadline:
         for child in psutil.Process(client).children():
-            busy = "spawn_main" in " ".join(child.cmdline()) and child.cpu_times().user > 0.5
+            busy = "spawn_main" in " ".join(child.cmdline()) and (
+                child.cpu_times().user >= after_seconds
+            )
             if busy and until():
                 child.kill()
                 return
