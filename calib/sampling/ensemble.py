@@ -1,4 +1,4 @@
-"""One emcee ensemble: our pair move beside local ones."""
+"""One emcee ensemble: our pair move with local ones between."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from calib.sampling.proposal import Proposal
 
 __all__ = ["POOR", "Ensemble"]
 
-# Efficiency below which the local moves do most of the work.
-POOR = 0.1
-# Efficiency above which they are there for safety only.
-GOOD = 0.5
+# Efficiency of the proposal below which local moves do most of the work, and above which few do.
+POOR, GOOD = 0.1, 0.5
+# Steps with pairs between two of the walk's: a good proposal has the walk for safety only.
+_EVERY, _OFTEN = 32, 8
 # Walkers whose autocorrelations are averaged, evenly picked.
 _WALKERS_OF_TAU = 64
 
@@ -60,22 +60,16 @@ class Ensemble:
 
     def run(self, proposal: Proposal, efficiency: float, steps: int) -> None:
         """Run on with a proposal, forgetting the steps before."""
-        # A good proposal does most of the work; a poor one leaves it to the local moves.
-        independent = 0.95 if efficiency > GOOD else 0.9 if efficiency > POOR else 0.3
         if efficiency > POOR:
-            local = [(WalkMove(proposal, self.rng), 1.0)]
+            walk, every = WalkMove(proposal, self.rng), _EVERY if efficiency > GOOD else _OFTEN
+            moves = [(PairMove(proposal, self.rng, self.ahead, walk=walk, every=every), 1.0)]
         else:
             # Not emcee's snooker move: with half the exponent of ter Braak & Vrugt (2008) in its
             # acceptance it does not keep a normal. Whole differences jump between modes.
-            local = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.3)]
+            pairs, jump = PairMove(proposal, self.rng, self.ahead), emcee.moves.DEMove(gamma0=1.0)
+            moves = [(pairs, 0.3), (emcee.moves.DEMove(), 0.49), (jump, 0.21)]
         self.sampler = _Sampler(
-            *self.state.coords.shape,
-            self.log_prob_fn,
-            vectorize=True,
-            moves=[
-                (PairMove(proposal, self.rng, self.ahead), independent),
-                *((move, (1.0 - independent) * share) for move, share in local),
-            ],
+            *self.state.coords.shape, self.log_prob_fn, vectorize=True, moves=moves
         )
         self.sampler.begin(self.random_state)
         with warnings.catch_warnings():
