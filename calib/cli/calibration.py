@@ -126,6 +126,7 @@ def fit(
     from calib.folders import check_folder, fresh_folder
     from calib.models import get_model
     from calib.numbers import format_number
+    from calib.outlying import outlying_notes
     from calib.problem import build_problem
     from calib.sampling.sampler import SamplerSettings
     from calib.store import save_calibration
@@ -148,7 +149,7 @@ def fit(
         save_calibration(calibration, folder)
     posterior_table(calibration)
     print(verdict_line(calibration))
-    for note in problem.notes:
+    for note in (*problem.notes, *outlying_notes(problem, calibration.draws.mode)):
         print(f"note: {note}", file=sys.stderr)
     if held is not None:
         scores = validate_held_out(calibration, held).scores

@@ -13,6 +13,7 @@ from calib.figures import Plate
 from calib.figures.labels import axis_of, percent, short
 from calib.figures.rows import held_table
 from calib.models import get_model
+from calib.outlying import outlying_notes
 from calib.page.equations import equation, likelihood, parametrisation, prose
 from calib.page.facts import repeats_words, sampling_facts, validation_facts, worst_row
 from calib.page.tables import (
@@ -104,6 +105,7 @@ def section(
         "parametrisation": prose(parametrisation(bound), names),
         "data": _data_facts(result),
         "assumed": [prose(note, names) for note in evidence.notes],
+        "outlying": [prose(n, names) for n in outlying_notes(problem, calibration.draws.mode)],
         "priors": prior_rows(result),
         "prior_source": PurePath(problem.priors.source).name,
         "estimates": estimates_grid(result, published=published),

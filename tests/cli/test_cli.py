@@ -107,6 +107,18 @@ def test_fit_predict_and_read_the_numbers(calib: Calib, he2019: Path, tmp_path: 
     assert Path("bands.csv").read_text().splitlines()[0].split(",") == header
 
 
+def test_fit_names_a_reading_that_is_far_off(calib: Calib, he2019: Path) -> None:
+    header, *rows = (he2019 / "rut_depth.csv").read_text().splitlines()
+    at = header.split(",").index("rut_depth_mm")
+    cells = rows[10].split(",")
+    cells[at] = str(10.0 * float(cells[at]))
+    rows[10] = ",".join(cells)
+    Path("my.csv").write_text("\n".join([header, *rows]) + "\n")
+    ran = calib("fit", "my.csv", "--model", "modified_bekker", "--out", "run")
+    assert f"my.csv, line 12: rut_depth_mm = {float(cells[at]):.4g} is" in ran.err
+    assert "check the reading" in ran.err
+
+
 def fit_rut(calib: Calib, content: bytes, name: str = "run") -> Ran:
     Path("my.csv").write_bytes(content)
     return calib("fit", "my.csv", "--model", "modified_bekker", "--out", name, "--seed", 3)

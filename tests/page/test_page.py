@@ -170,6 +170,16 @@ def test_notes_of_a_problem_are_shown(rut):
     assert "Assumed" not in page({"rut_depth": rut})[1].text
 
 
+def test_readings_far_off_are_named(rut):
+    table = rut.calibration.problem.table
+    columns = dict(table.columns) | {"rut_depth_mm": table["rut_depth_mm"].copy()}
+    columns["rut_depth_mm"][4] *= 30.0
+    problem = rut.calibration.problem.with_table(replace(table, columns=columns))
+    told = replace(rut, calibration=replace(rut.calibration, problem=problem))
+    assert f"line {table.lines[4]}: " in page({"rut_depth": told})[1].text
+    assert "Far off" not in page({"rut_depth": rut})[1].text
+
+
 def test_repeats_that_stay_in_are_named(plate):
     assert repeats_words(plate) == ""
     table = plate.calibration.problem.table
