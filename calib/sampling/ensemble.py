@@ -8,7 +8,6 @@ from typing import Any
 
 import emcee
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.chains import autocorrelation_time
 from calib.errors import CalibError
@@ -40,6 +39,18 @@ class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]
         return self._random.get_state()
 
 
+class _Backend(emcee.backends.Backend):  # type: ignore[misc]
+    """emcee's, in arrays that are given: memory new from the system is as dear as arithmetic."""
+
+    def __init__(self, chain: Array, log_prob: Array) -> None:
+        super().__init__()
+        self._given = chain, log_prob
+
+    def grow(self, ngrow: int, blobs: None) -> None:
+        """Take the arrays that were given as room for the steps."""
+        self.chain, self.log_prob = self._given
+
+
 class Ensemble:
     """One independently seeded emcee ensemble that is run in stretches of a fixed kernel each."""
 
@@ -58,8 +69,8 @@ class Ensemble:
         self.random_state = np.random.RandomState(np.random.MT19937(seed)).get_state()
         self.state = _start(log_prob, proposal, walkers, start)
 
-    def run(self, proposal: Proposal, efficiency: float, steps: int) -> None:
-        """Run on with a proposal, forgetting the steps before."""
+    def run(self, proposal: Proposal, efficiency: float, t: Array, log_prob: Array) -> None:
+        """Run on with a proposal; write steps, (steps, walkers, d), and log densities."""
         if efficiency > POOR:
             walk, every = WalkMove(proposal, self.rng), _EVERY if efficiency > GOOD else _OFTEN
             moves = [(PairMove(proposal, self.rng, self.ahead, walk=walk, every=every), 1.0)]
@@ -69,13 +80,14 @@ class Ensemble:
             pairs, jump = PairMove(proposal, self.rng, self.ahead), emcee.moves.DEMove(gamma0=1.0)
             moves = [(pairs, 0.3), (emcee.moves.DEMove(), 0.49), (jump, 0.21)]
         self.sampler = _Sampler(
-            *self.state.coords.shape, self.log_prob_fn, vectorize=True, moves=moves
-        )
+            *self.state.coords.shape, self.log_prob_fn, vectorize=True, moves=moves,
+            backend=_Backend(t, log_prob),
+        )  # fmt: skip
         self.sampler.begin(self.random_state)
         with warnings.catch_warnings():
             # numpy 2 deprecates what emcee does inside its moves.
             warnings.simplefilter("ignore", DeprecationWarning)
-            end = self.sampler.run_mcmc(self.state, steps, skip_initial_state_check=True)
+            end = self.sampler.run_mcmc(self.state, len(t), skip_initial_state_check=True)
         # The random state travels apart, as a start may be without one.
         self.state = emcee.State(end.coords, log_prob=end.log_prob, copy=True)
         taken, self.random_state = self.random_state, self.sampler.end()
@@ -87,15 +99,6 @@ class Ensemble:
     def walkers(self) -> int:
         """Number of walkers."""
         return int(self.state.coords.shape[0])
-
-    def drawn(
-        self, steps: int, picked: NDArray[np.intp], who: NDArray[np.intp], t: Array, log_prob: Array
-    ) -> None:
-        """Write draws of some walkers at some last steps, (n, m, d), log densities (n, m)."""
-        found = self.sampler.get_chain()[-steps:], self.sampler.get_log_prob()[-steps:]
-        if (picked.size, who.size) != found[1].shape:
-            found = found[0][np.ix_(picked, who)], found[1][np.ix_(picked, who)]
-        t[...], log_prob[...] = found
 
     def tau(self, target: int) -> Array:
         """Autocorrelation times over the last `target` steps, shape (d,).

