@@ -1,4 +1,4 @@
-"""One emcee ensemble: our pair move beside local ones."""
+"""One emcee ensemble: our pair move with local ones between."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import Any
 
 import emcee
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.chains import autocorrelation_time
 from calib.errors import CalibError
@@ -18,10 +17,10 @@ from calib.sampling.proposal import Proposal
 
 __all__ = ["POOR", "Ensemble"]
 
-# Efficiency below which the local moves do most of the work.
-POOR = 0.1
-# Efficiency above which they are there for safety only.
-GOOD = 0.5
+# Efficiency of the proposal below which local moves do most of the work, and above which few do.
+POOR, GOOD = 0.1, 0.5
+# Steps with pairs between two of the walk's: a good proposal has the walk for safety only.
+_EVERY, _OFTEN = 32, 8
 # Walkers whose autocorrelations are averaged, evenly picked.
 _WALKERS_OF_TAU = 64
 
@@ -38,6 +37,18 @@ class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]
     def end(self) -> Any:
         """Return the state of the random numbers."""
         return self._random.get_state()
+
+
+class _Backend(emcee.backends.Backend):  # type: ignore[misc]
+    """emcee's, in arrays that are given: memory new from the system is as dear as arithmetic."""
+
+    def __init__(self, chain: Array, log_prob: Array) -> None:
+        super().__init__()
+        self._given = chain, log_prob
+
+    def grow(self, ngrow: int, blobs: None) -> None:
+        """Take the arrays that were given as room for the steps."""
+        self.chain, self.log_prob = self._given
 
 
 class Ensemble:
@@ -58,30 +69,25 @@ class Ensemble:
         self.random_state = np.random.RandomState(np.random.MT19937(seed)).get_state()
         self.state = _start(log_prob, proposal, walkers, start)
 
-    def run(self, proposal: Proposal, efficiency: float, steps: int) -> None:
-        """Run on with a proposal, forgetting the steps before."""
-        # A good proposal does most of the work; a poor one leaves it to the local moves.
-        independent = 0.95 if efficiency > GOOD else 0.9 if efficiency > POOR else 0.3
+    def run(self, proposal: Proposal, efficiency: float, t: Array, log_prob: Array) -> None:
+        """Run on with a proposal; write steps, (steps, walkers, d), and log densities."""
         if efficiency > POOR:
-            local = [(WalkMove(proposal, self.rng), 1.0)]
+            walk, every = WalkMove(proposal, self.rng), _EVERY if efficiency > GOOD else _OFTEN
+            moves = [(PairMove(proposal, self.rng, self.ahead, walk=walk, every=every), 1.0)]
         else:
             # Not emcee's snooker move: with half the exponent of ter Braak & Vrugt (2008) in its
             # acceptance it does not keep a normal. Whole differences jump between modes.
-            local = [(emcee.moves.DEMove(), 0.7), (emcee.moves.DEMove(gamma0=1.0), 0.3)]
+            pairs, jump = PairMove(proposal, self.rng, self.ahead), emcee.moves.DEMove(gamma0=1.0)
+            moves = [(pairs, 0.3), (emcee.moves.DEMove(), 0.49), (jump, 0.21)]
         self.sampler = _Sampler(
-            *self.state.coords.shape,
-            self.log_prob_fn,
-            vectorize=True,
-            moves=[
-                (PairMove(proposal, self.rng, self.ahead), independent),
-                *((move, (1.0 - independent) * share) for move, share in local),
-            ],
-        )
+            *self.state.coords.shape, self.log_prob_fn, vectorize=True, moves=moves,
+            backend=_Backend(t, log_prob),
+        )  # fmt: skip
         self.sampler.begin(self.random_state)
         with warnings.catch_warnings():
             # numpy 2 deprecates what emcee does inside its moves.
             warnings.simplefilter("ignore", DeprecationWarning)
-            end = self.sampler.run_mcmc(self.state, steps, skip_initial_state_check=True)
+            end = self.sampler.run_mcmc(self.state, len(t), skip_initial_state_check=True)
         # The random state travels apart, as a start may be without one.
         self.state = emcee.State(end.coords, log_prob=end.log_prob, copy=True)
         taken, self.random_state = self.random_state, self.sampler.end()
@@ -93,15 +99,6 @@ class Ensemble:
     def walkers(self) -> int:
         """Number of walkers."""
         return int(self.state.coords.shape[0])
-
-    def drawn(
-        self, steps: int, picked: NDArray[np.intp], who: NDArray[np.intp], t: Array, log_prob: Array
-    ) -> None:
-        """Write draws of some walkers at some last steps, (n, m, d), log densities (n, m)."""
-        found = self.sampler.get_chain()[-steps:], self.sampler.get_log_prob()[-steps:]
-        if (picked.size, who.size) != found[1].shape:
-            found = found[0][np.ix_(picked, who)], found[1][np.ix_(picked, who)]
-        t[...], log_prob[...] = found
 
     def tau(self, target: int) -> Array:
         """Autocorrelation times over the last `target` steps, shape (d,).

@@ -102,7 +102,7 @@ class Mixture:
         ends = np.cumsum(rng.multinomial(size, self.weights)).tolist()
         for start, end, component in zip([0, *ends], ends, self.components, strict=False):
             drawn[start:end] = component.sample(rng, end - start)
-        return drawn[rng.permutation(size)]
+        return drawn.take(rng.permutation(size), axis=0)
 
     def covariance_cholesky(self) -> Array:
         """Lower factor of the whole mixture's scale: components' scales and between their means."""

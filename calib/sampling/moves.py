@@ -38,12 +38,25 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
     ahead : int
         Steps, two for each pair, whose points are evaluated at once. Those left over at the end
         are wasted.
+    walk : WalkMove, optional
+    every : int
+        Steps with pairs between two of the walk's.
     """
 
-    def __init__(self, proposal: Proposal, rng: np.random.Generator, ahead: int = 16) -> None:
+    def __init__(
+        self,
+        proposal: Proposal,
+        rng: np.random.Generator,
+        ahead: int = 16,
+        *,
+        walk: WalkMove | None = None,
+        every: int = 32,
+    ) -> None:
         self.proposal = proposal
         self.rng = rng
         self.pairs = max(1, ahead // 2)
+        self.walk, self.every = walk, every
+        self._since_walk = 0
         self._steps: _Steps | None = None
 
     def propose(self, model: Any, state: Any) -> tuple[Any, Array]:
@@ -59,13 +72,18 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
         state : emcee.State
         moved : ndarray of bool, shape (walkers,)
         """
+        if self.walk is not None and self._since_walk == self.every:
+            self._since_walk = 0
+            return self.walk.propose(model, state)
+        self._since_walk += 1
         steps = self._steps
         if steps is None:
             held = self._around(model, state.coords, state.log_prob)
             self._steps = steps = self._ahead(model, held, None)
         else:
-            moved = np.flatnonzero((state.coords != steps.here).any(axis=1))
-            if moved.size:
+            elsewhere = state.coords != steps.here
+            if elsewhere.any():
+                moved = np.flatnonzero(elsewhere.any(axis=1))
                 held = steps.held()
                 held.put(self._around(model, state.coords[moved], state.log_prob[moved]), moved)
                 self._steps = steps = self._ahead(model, held, steps.left())
@@ -117,7 +135,11 @@ class _Pairs:
         log_pi = log_prob - log_jacobian
         with np.errstate(invalid="ignore"):  # where both densities are zero
             log_odds = log_pi[1] - log_pi[0]
-        log_weight = np.logaddexp(log_pi[0], log_pi[1]) - log_q
+        # The log of the sum, by functions that work on many numbers at once.
+        log_weight = np.maximum(log_pi[0], log_pi[1])
+        some = log_weight > -np.inf
+        log_weight += np.log1p(np.exp(-np.abs(log_odds)), where=some, out=np.zeros(some.size))
+        log_weight -= log_q
         return cls(t, log_prob, np.zeros(log_q.size, dtype=np.intp), log_odds, log_weight)
 
     def of(self, which: NDArray[np.intp] | slice) -> _Pairs:
@@ -193,9 +215,12 @@ class _Steps:
             moved[i + 1] = flipped = again < log_odds[at, here]
             side[i + 1] = at = at ^ flipped
         first = np.arange(walkers)
+        # Taken from flat arrays: a third of the time of two indices.
+        count, flat = pairs.side.size, side * pairs.side.size + which
         return cls(
-            pairs, held.points[held.side, first], pairs.points[side, which],
-            pairs.log_prob[side, which], which, side, moved,
+            pairs, held.points[held.side, first],
+            pairs.points.reshape(2 * count, -1).take(flat, axis=0),
+            pairs.log_prob.ravel().take(flat), which, side, moved,
         )  # fmt: skip
 
     @property

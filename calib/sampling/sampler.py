@@ -226,14 +226,17 @@ def sample_density(
     done = 0
     while True:
         length = target + target // _DISCARDED
+        chain = np.empty((len(ensembles), length, walkers, proposal.n_dim))
+        chain_log_prob = np.empty(chain.shape[:-1])
         for i, ensemble in enumerate(ensembles):
-            ensemble.run(proposal, found.efficiency, length)
+            ensemble.run(proposal, found.efficiency, chain[i], chain_log_prob[i])
             if progress is not None:
                 progress(done + (i + 1) * length, done + len(ensembles) * length)
         done += len(ensembles) * length
         tau = np.stack([e.tau(target) for e in ensembles]).max(axis=0)
         # Fewer draws, evenly thinned, are worth less: what passes is not in doubt.
-        t, log_probs = _drawn(ensembles, target, _JUDGED)
+        last = chain[:, -target:], chain_log_prob[:, -target:]
+        t, log_probs = _drawn(*last, _JUDGED)
         report = judge(t, names, settings.gate, tau=tau, steps=target)
         if report.passed and found.efficiency > POOR:
             report = _refuse_neglect(report, proposal, t, log_probs, steps=target)
@@ -242,7 +245,7 @@ def sample_density(
         target *= 2
         proposal, found = refit(count, proposal, *_pooled(t, report), rng)
     if settings.keep != _JUDGED:
-        t, log_probs = _drawn(ensembles, target, settings.keep)
+        t, log_probs = _drawn(*last, settings.keep)
     return Draws(
         t=t,
         log_prob=log_probs,
@@ -257,8 +260,14 @@ def sample_density(
     )
 
 
-def _drawn(ensembles: list[Ensemble], steps: int, draws: int) -> tuple[Array, Array]:
-    """About so many draws of each ensemble, of evenly picked walkers and among its last steps.
+def _drawn(t: Array, log_prob: Array, draws: int) -> tuple[Array, Array]:
+    """About so many draws of each ensemble, of evenly picked walkers and among its steps.
+
+    Parameters
+    ----------
+    t : ndarray, shape (ensembles, steps, walkers, d)
+    log_prob : ndarray, shape (ensembles, steps, walkers)
+    draws : int
 
     Returns
     -------
@@ -266,15 +275,13 @@ def _drawn(ensembles: list[Ensemble], steps: int, draws: int) -> tuple[Array, Ar
     ndarray, shape (ensembles, walkers, kept)
         Log densities.
     """
-    walkers = ensembles[0].walkers
+    _, steps, walkers, _ = t.shape
     kept = min(steps, max(_LEAST_STEPS, draws // walkers))
     few = min(walkers, max(1, draws // kept))
-    picked = np.linspace(0, steps - 1, kept).round().astype(np.intp)
-    who = np.linspace(0, walkers - 1, few).round().astype(np.intp)
-    t = np.empty((len(ensembles), kept, few, ensembles[0].state.coords.shape[1]))
-    log_prob = np.empty(t.shape[:-1])
-    for i, ensemble in enumerate(ensembles):
-        ensemble.drawn(steps, picked, who, t[i], log_prob[i])
+    if (kept, few) != (steps, walkers):
+        picked = np.linspace(0, steps - 1, kept).round().astype(np.intp)[:, None]
+        who = np.linspace(0, walkers - 1, few).round().astype(np.intp)
+        t, log_prob = t[:, picked, who], log_prob[:, picked, who]
     return t.swapaxes(1, 2), log_prob.swapaxes(1, 2)
 
 

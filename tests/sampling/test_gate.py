@@ -107,7 +107,7 @@ def test_the_limits_are_those_of_the_gate() -> None:
 def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.MonkeyPatch) -> None:
     from calib.sampling import sampler as module
 
-    drawn = module.Ensemble.drawn
+    sampled = module.Ensemble.run
     made: list[object] = []
     init = module.Ensemble.__init__
 
@@ -115,13 +115,13 @@ def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.Monkey
         init(self, *args, **kwargs)
         made.append(self)
 
-    def stuck(self, steps, picked, who, t, log_prob):
-        drawn(self, steps, picked, who, t, log_prob)
+    def stuck(self, proposal, efficiency, t, log_prob):
+        sampled(self, proposal, efficiency, t, log_prob)
         if self is made[1]:
             t[1:] = t[:1]
 
     monkeypatch.setattr(module.Ensemble, "__init__", remember)
-    monkeypatch.setattr(module.Ensemble, "drawn", stuck)
+    monkeypatch.setattr(module.Ensemble, "run", stuck)
     settings = SamplerSettings(max_steps=200)
     draws = run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=settings)
     assert len(made) == 4

@@ -12,7 +12,7 @@ from scipy.special import expit
 
 from calib.chains import ess
 from calib.sampling.mixture import Mixture, StudentT
-from calib.sampling.moves import PairMove
+from calib.sampling.moves import PairMove, WalkMove
 from calib.sampling.proposal import Proposal
 from calib.sampling.straighten import Straightener
 
@@ -184,6 +184,46 @@ def test_a_chain_of_pairs_alone(log_prob: Callable, function: Callable, law, ahe
     value = function(pairs_alone(log_prob, ahead))
     for p in (0.025, 0.25, 0.5, 0.75, 0.975):
         assert_share(value < law.ppf(p), p)
+
+
+@pytest.mark.parametrize(("log_prob", "function", "law"), LAWS)
+def test_a_chain_with_walks_between(log_prob: Callable, function: Callable, law) -> None:
+    proposal = fitted(log_prob)
+    start, _ = proposal.draw(np.random.default_rng(3), 40)
+    rng = np.random.default_rng(5)
+    move = PairMove(proposal, rng, 8, walk=WalkMove(proposal, rng), every=4)
+    value = function(chain(log_prob, [move], start, 2500))
+    for p in (0.025, 0.25, 0.5, 0.75, 0.975):
+        assert_share(value < law.ppf(p), p)
+
+
+class Aside(WalkMove):
+    """In the place of a walk: every walker to a point of no pair."""
+
+    def __init__(self) -> None:
+        self.turns = 0
+
+    def propose(self, model: object, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
+        """Move the walkers."""
+        self.turns += 1
+        state.coords += 0.3
+        state.log_prob[:] = normal(state.coords)
+        return state, np.ones(len(state.coords), dtype=bool)
+
+
+@pytest.mark.parametrize("every", [2, 3, 4, 6])
+def test_the_walk_has_its_turn_after_so_many_steps(every: int) -> None:
+    aside = Aside()
+    move = PairMove(fitted(normal), np.random.default_rng(6), 4, walk=aside, every=every)
+    stub, state = Stub(normal, np.full(8, 0.5)), at(normal, np.zeros((8, 2)))
+    for step in range(20):
+        before = state.coords.copy()
+        state, _ = move.propose(stub, state)
+        assert aside.turns == (step + 1) // (every + 1)
+        if step % (every + 1) == every:
+            np.testing.assert_array_equal(state.coords, before + 0.3)
+        # Also of walkers whose pairs were drawn before they were carried off.
+        np.testing.assert_allclose(state.log_prob, normal(state.coords), atol=1e-12)
 
 
 def test_a_chain_of_pairs_alone_visits_both_modes() -> None:
