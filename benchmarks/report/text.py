@@ -36,8 +36,9 @@ _HOW = """## How it was measured
   1,024 walkers and 320 steps, and 4 chains of 10,000 draws: what a sampler does once what comes
   first is of little account.
 - **The hour.** The machine shares its hardware with others. Three runs of the same code gave, of
-  bulk density's long runs, 54.9, 54.4 and 47.9 times nutpie's (before the first two items of what
-  was tried); of two workers see below.
+  bulk density's long runs, 54.9, 54.4 and 47.9 times nutpie's; the fourth, of the code that is a
+  fifth faster in turn with it, 48.4 (the median of the ratios to the run beside it is 51.9). Its
+  five runs took 0.76 to 1.07 s. Of two workers see below.
 - **Bulk and tail.** Our draws come in opposite pairs, whose errors of a mean cancel: bulk ESS,
   which is that of means of normal scores, then exceeds what evaluations would be worth as
   independent draws, as nutpie's own does. Tail ESS, of the shares beyond the 5 and 95 % quantiles,
@@ -61,7 +62,7 @@ _HOW = """## How it was measured
   seed is at the optimum if its cost is within 1e-6 of the lowest that any run reached.
 - **Campaign.** Two worker processes over one process, start-up included. `benchmarks/campaign.py`
   also times two plain processes without Dask that have half of the cases each: what the two cores
-  can do (not in a run made before that was measured right). `benchmarks/campaign_survival.py`.
+  can do. `benchmarks/campaign_survival.py`.
 """
 
 _TRIED = """## What was tried
@@ -107,7 +108,9 @@ Start-up, of 3 to 5 s, is in the figure. One memory arena for all threads, and t
 the C library from ever giving memory back (6,000 page faults a diagnosis without, 140 with),
 changed nothing. What is left depends on the hour, on a machine that shares its hardware with
 others: 100 diagnoses in one process took 195 to 212 s in one run, and two workers gave 1.77 and
-1.96; 208 and 216 s in another, and 1.79 and 1.51; 234 to 262 s in a third, and 1.73, 1.71 and 1.87.
+1.96; 208 and 216 s in another, and 1.79 and 1.51; 234 to 262 s in a third, and 1.73, 1.71 and 1.87;
+231 to 269 s in a fourth, and 1.95, 1.96 and 1.49, when two plain processes without Dask gave 2.00,
+1.85 and 1.76.
 
 Likelihood: {libraries}
 A sine is worked out as a tangent of the half argument, for which NumPy has vector instructions:
