@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -100,7 +101,8 @@ def outlying_rows(problem: Problem, t: Array) -> tuple[OutlyingRow, ...]:
 def outlying_notes(problem: Problem, t: Array) -> Sequence[str]:
     """Say which rows are outlying, for a reader who may mend them."""
     rows = outlying_rows(problem, t)
-    output, source = problem.bound.model.output, problem.table.source
+    # Not the path: the page goes to others.
+    output, source = problem.bound.model.output, PurePath(problem.table.source).name
     said = [
         f"{source}, line {row.line}: {output} = {row.value:.4g} is {row.sds:.1f} sds from what the "
         "other rows say; check the reading, for one such row moves the posterior and widens it"
