@@ -24,7 +24,7 @@ from calib.estimators.base import PointEstimate
 from calib.estimators.differential_evolution import estimate_differential_evolution
 from calib.estimators.genetic import estimate_genetic
 from calib.problem import Problem, build_problem
-from calib.study import he2019_tasks
+from calib.study_tasks import he2019_tasks
 
 SEEDS = 20
 # A final cost is the optimum's if it exceeds it by less than this part.

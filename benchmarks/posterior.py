@@ -27,7 +27,7 @@ from calib.models.base import Array
 from calib.problem import Problem, build_problem
 from calib.sampling.gate import Gate
 from calib.sampling.sampler import SamplerSettings, sample_posterior
-from calib.study import he2019_tasks
+from calib.study_tasks import he2019_tasks
 
 # Draws of each sampler: its defaults, and so many that what comes before them is of no account.
 OURS = {"default": {}, "long": {"walkers": 1024, "steps": 320}}

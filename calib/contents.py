@@ -9,7 +9,8 @@ from calib.audit import Audit, Seeds, run_audit
 from calib.paper_gaps.cases import PaperGap
 from calib.paper_gaps.find import FoundGap, find_gaps
 from calib.sampling.sampler import SamplerSettings
-from calib.study import Progress, Study, Task, run_study
+from calib.study import Progress, Study, run_study
+from calib.study_tasks import Task
 
 __all__ = ["Contents", "work_out"]
 

@@ -12,7 +12,8 @@ from typing import Any
 from calib.environment import Environment
 from calib.estimators import GeneticSettings
 from calib.sampling.sampler import SamplerSettings
-from calib.study import OutputResult, Study, Task
+from calib.study import OutputResult, Study
+from calib.study_tasks import Task
 
 __all__ = ["SCHEMA", "build_manifest", "file_hashes", "sha256"]
 

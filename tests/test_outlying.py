@@ -13,7 +13,7 @@ from calib.outlying import LEVEL, outlying_notes, outlying_rows
 from calib.outputs import OUTPUTS
 from calib.problem import Problem, build_problem
 from calib.sampling.mode import find_mode
-from calib.study import he2019_tasks
+from calib.study_tasks import he2019_tasks
 
 TASKS = {task.output: task for task in he2019_tasks()}
 

@@ -12,7 +12,7 @@ from calib.cli.parallel import Workers
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
-    from calib.study import HoldOut
+    from calib.study_tasks import HoldOut
 
 __all__ = ["register"]
 
@@ -67,7 +67,7 @@ def report(
     from calib.paper_gaps.cases import paper_gaps
     from calib.report import write_report
     from calib.sampling.sampler import SamplerSettings
-    from calib.study import he2019_tasks, plan_tasks
+    from calib.study_tasks import he2019_tasks, plan_tasks
 
     check_folder(out, overwrite=overwrite)
     if files:
@@ -317,7 +317,7 @@ def _emit(text: str, out: Path | None) -> None:
 
 
 def _parse_hold_out(text: str | None) -> HoldOut | None:
-    from calib.study import HoldOut
+    from calib.study_tasks import HoldOut
 
     return None if text is None else HoldOut.parse(text)
 

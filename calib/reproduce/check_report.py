@@ -27,7 +27,8 @@ from calib.reproduce.posteriors import DrawsFile, read_draws, verify_density, ve
 from calib.reproduce.recompute import not_computed, recompute_report, report_tasks
 from calib.reproduce.schema import Manifest
 from calib.reproduce.text import verify_images
-from calib.study import Progress, Task, fitted_rows
+from calib.study import Progress
+from calib.study_tasks import Task, fitted_rows
 
 __all__ = ["check_report"]
 

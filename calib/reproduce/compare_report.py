@@ -21,7 +21,8 @@ from calib.reproduce.montecarlo import Place
 from calib.reproduce.numbers import Section, compare_section, flatten, read_json
 from calib.reproduce.schema import Manifest
 from calib.reproduce.stated import gap_allowances, sensitivity_allowances
-from calib.study import OutputResult, Progress, Study, Task, estimate_task
+from calib.study import OutputResult, Progress, Study, estimate_task
+from calib.study_tasks import Task
 from calib.summary import summarise_estimates
 
 __all__ = [

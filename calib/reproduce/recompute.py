@@ -25,7 +25,8 @@ from calib.reproduce.items import Item, Status
 from calib.reproduce.schema import Manifest, RunRecord, TaskRecord
 from calib.store import save_calibration
 from calib.streams import generator
-from calib.study import HoldOut, Progress, Study, Task
+from calib.study import Progress, Study
+from calib.study_tasks import HoldOut, Task
 
 __all__ = ["estimate_again", "not_computed", "recompute_report", "recompute_run", "report_tasks"]
 

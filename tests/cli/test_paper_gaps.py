@@ -71,7 +71,7 @@ def test_the_report_of_the_embedded_data_has_the_section(
         asked.append(seed)
         return (found_gaps["plain_bekker"],)
 
-    monkeypatch.setattr("calib.study.he2019_tasks", lambda: ())
+    monkeypatch.setattr("calib.study_tasks.he2019_tasks", lambda: ())
     monkeypatch.setattr("calib.contents.find_gaps", find)
     ran = calib("report", "--out", "rep", "--seed", 5)
     assert ran.code == 0, ran.err

@@ -14,7 +14,8 @@ from calib.outputs import OUTPUTS
 from calib.prediction import predictive_draws
 from calib.problem import Problem, build_problem
 from calib.sensitivity import prior_sensitivity
-from calib.study import HoldOut, OutputResult, Task
+from calib.study import OutputResult
+from calib.study_tasks import HoldOut, Task
 from calib.validate import leave_one_out, validate_held_out
 
 HELD = HoldOut("inflation_pressure_psi", 30.0)

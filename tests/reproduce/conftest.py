@@ -34,7 +34,8 @@ from calib.sampling.gate import Gate
 from calib.sampling.sampler import SamplerSettings
 from calib.store import save_calibration
 from calib.streams import generator
-from calib.study import OutputResult, Study, he2019_tasks, run_study
+from calib.study import OutputResult, Study, run_study
+from calib.study_tasks import he2019_tasks
 
 # Short chains, and a gate that lets them pass.
 SETTINGS = SamplerSettings(steps=100, gate=Gate(taus_min=20.0))

@@ -19,7 +19,8 @@ from calib.report import write_report
 from calib.reproduce.check import check
 from calib.reproduce.items import Status
 from calib.sampling.sampler import SamplerSettings
-from calib.study import he2019_tasks, run_study
+from calib.study import run_study
+from calib.study_tasks import he2019_tasks
 
 from .conftest import different, edit_json, findings, rut_study, seal, write
 

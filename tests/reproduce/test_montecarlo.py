@@ -18,7 +18,8 @@ from calib.reproduce.montecarlo import posterior_errors, validation_errors
 from calib.reproduce.numbers import Section, compare_section, flatten
 from calib.scores import score
 from calib.streams import generator
-from calib.study import he2019_tasks, run_study
+from calib.study import run_study
+from calib.study_tasks import he2019_tasks
 from calib.summary import summarise
 from calib.validate import Validation, leave_one_out, validate_held_out
 

@@ -27,7 +27,8 @@ from calib.paper_gaps.summary import summarise_gaps
 from calib.report import write_report
 from calib.sampling.sampler import SamplerSettings
 from calib.sbc.run import run_sbc
-from calib.study import Task, he2019_tasks, run_study
+from calib.study import run_study
+from calib.study_tasks import Task, he2019_tasks
 from calib.summary import summarise
 
 SHORT = SamplerSettings(steps=60, max_steps=60)

@@ -25,7 +25,7 @@ from calib.problem import Problem, build_problem
 from calib.sampling.sampler import SamplerSettings
 from calib.store import save_calibration
 from calib.streams import generator
-from calib.study import HoldOut
+from calib.study_tasks import HoldOut
 from calib.validate import validate_held_out
 
 __all__ = ["Fit", "FitItem", "FitSection"]
