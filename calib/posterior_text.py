@@ -29,9 +29,10 @@ def skewed(s: ParameterSummary) -> bool:
 def end_scales(s: ParameterSummary) -> tuple[float, float]:
     """Distances that set the digits of the HDI's ends: sd or distance to the median, the smaller.
 
-    The sd of a skewed parameter is that of its long tail, which would round the other end away.
+    The sd of a skewed parameter is that of its long tail, which would round the other end away; of
+    a tail of many decades it says nothing at all, not even how near an end may be to the median.
     """
-    floor = 1e-3 * s.sd
+    floor = 1e-3 * min(s.sd, s.hdi_upper - s.hdi_lower)
     return (
         min(s.sd, max(s.median - s.hdi_lower, floor)),
         min(s.sd, max(s.hdi_upper - s.median, floor)),

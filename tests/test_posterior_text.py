@@ -56,6 +56,14 @@ def test_a_skewed_parameter_has_its_median_and_a_lower_end_that_is_nothing():
     assert interval_text(s) == "0 to 1.1\N{MULTIPLICATION SIGN}10⁻⁸"
 
 
+def test_a_tail_of_many_decades_does_not_round_the_median_away():
+    s = replace(summary(1.2e12, 1.0e14, 3.52e3, 1.2e8, 6.598e5), mcse_median=5e3,
+                mcse_hdi_lower=300.0, mcse_hdi_upper=5e6)  # fmt: skip
+    times = "\N{MULTIPLICATION SIGN}"
+    assert centre_text(s) == f"median 6.6{times}10⁵"
+    assert interval_text(s).endswith(f"1.2{times}10⁸")
+
+
 @pytest.mark.parametrize("kind", ["normal", "lognormal"])
 def test_monte_carlo_errors_are_those_of_repeated_sampling(kind):
     rng = np.random.default_rng(3)

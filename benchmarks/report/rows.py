@@ -233,9 +233,7 @@ def _campaign(m: Measured) -> Iterator[Row]:
             ("two", "two workers over one", 1.8),
             ("alone", "two plain processes without Dask over one", None),
         ):
-            ratios = g["over_one"].get(way)
-            if ratios is None:
-                continue
+            ratios = g["over_one"][way]
             s = {"median": float(np.median(ratios)), "low": min(ratios), "high": max(ratios)}
             yield _asked(part, f"{g['diagnoses']} diagnoses", what, s, least=least)
 

@@ -62,6 +62,7 @@ def report(
     from calib.data import read_table
     from calib.datasets.he2019 import labelled
     from calib.folders import check_folder
+    from calib.outlying import outlying_notes
     from calib.outputs import OUTPUTS
     from calib.paper_gaps.cases import paper_gaps
     from calib.report import write_report
@@ -97,6 +98,8 @@ def report(
         ninety = result.validation.scores.coverage[0.9]
         state = "converged" if result.calibration.converged else "NOT CONVERGED"
         print(f"{key}: {state}; 90 % band covers {ninety.hits} of {ninety.n} rows not fitted")
+        for note in outlying_notes(result.calibration.problem, result.calibration.draws.mode):
+            print(f"note: {note}", file=sys.stderr)
     for key, failure in study.failures.items():
         print(f"{key}: FAILED: {failure.error}", file=sys.stderr)
     print(page)

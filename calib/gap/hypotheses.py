@@ -89,9 +89,10 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
         choices += [("slip", t) for t in touched]
     if RUT in names:
         choices += [("sinkage", t) for t in touched if t != (RUT,)]
+    remembered: list[tuple[str, ...]] = []
     if "run_order" in recorded and np.ptp(recorded["run_order"]) > 0:
         choices += [("order", t) for t in touched]
-    remembered = [t for t in touched if DENSITY not in t] if ("order", each[0]) in choices else []
+        remembered = [t for t in touched if DENSITY not in t]
     everywhere: list[tuple[SmoothOver, tuple[str, ...]]] = [
         *choices,
         *(("before", t) for t in remembered),
