@@ -1,6 +1,6 @@
 """Run the benchmarks and write reports/benchmarks: tables, a figure, and what they say.
 
-    python benchmarks/bench.py                       # all parts, 75 minutes on two cores
+    python benchmarks/bench.py                       # all parts, an hour on two cores
     python benchmarks/bench.py posterior likelihood  # some of them; the others stay as they were
     python benchmarks/bench.py --full campaign       # 200 diagnoses in the place of 100
 

@@ -26,7 +26,7 @@ __all__ = ["draw"]
 
 _SAMPLERS = (
     ("calib default", "calib, default", BLUE, "o"),
-    ("calib long", "calib, five times as long", BLUE, "s"),
+    ("calib long", "calib, ten times as long", BLUE, "s"),
     ("nutpie default", "PyMC + nutpie, default", VERMILION, "o"),
     ("nutpie long", "PyMC + nutpie, ten times as long", VERMILION, "s"),
     ("stretch", "emcee's stretch move", GREEN, "^"),
@@ -102,9 +102,9 @@ def _evaluations(ax: Axes, problems: Mapping[str, Any]) -> None:
     ax.axhline(6.0, color=BLACK, lw=0.8, ls="--")
     ax.annotate("asked: 6", (2.45, 6.3), fontsize=7, ha="right")
     ax.axhline(1.0, color=GREY, lw=0.8, ls=":")
-    ax.annotate("independent draws: 1", (2.45, 1.05), fontsize=7, ha="right", color=GREY)
+    ax.annotate("independent\ndraws: 1", (-0.45, 0.93), fontsize=7, va="top", color=GREY)
     ax.set_xticks(range(len(NAMES)), [n.replace(" ", "\n", 1) for n in NAMES.values()])
-    ax.set(yscale="log", ylim=(0.8, 400.0), xlim=(-0.5, 2.5), ylabel="evaluations per bulk ESS")
+    ax.set(yscale="log", ylim=(0.3, 400.0), xlim=(-0.5, 2.5), ylabel="evaluations per bulk ESS")
     ax.set_title("likelihoods (nutpie: and gradients)")
 
 

@@ -18,7 +18,7 @@ NAMES = {
 }
 SAMPLERS = {
     "calib default": "calib, default settings",
-    "calib long": "calib, 1,024 walkers and 320 steps",
+    "calib long": "calib, 1,024 walkers and 640 steps",
     "nutpie default": "PyMC + nutpie, 4,000 draws",
     "nutpie long": "PyMC + nutpie, 40,000 draws",
     "stretch": "emcee's stretch move",

@@ -33,12 +33,16 @@ _HOW = """## How it was measured
   the parameters, of all draws that were kept, with walkers as chains. calib stores 16,384 draws of
   a posterior unless `SamplerSettings.keep` says more; here it keeps all. "Default" is 4 ensembles
   of 320 walkers and 192 steps, and nutpie's 4 chains of 1,000 draws after its tuning; "long" is
-  1,024 walkers and 320 steps, and 4 chains of 10,000 draws: what a sampler does once what comes
-  first is of little account.
-- **The hour.** The machine shares its hardware with others. Three runs of the same code gave, of
-  bulk density's long runs, 54.9, 54.4 and 47.9 times nutpie's; the fourth, of the code that is a
-  fifth faster in turn with it, 48.4 (the median of the ratios to the run beside it is 51.9). Its
-  five runs took 0.76 to 1.07 s. Of two workers see below.
+  1,024 walkers and 640 steps, and 4 chains of 10,000 draws: what a sampler does once what comes
+  first is of little account (a tenth of ours, of density; a sixth with the 320 steps that "long"
+  was before).
+- **Memory.** The machine is a virtual one that gives freed memory back to its host within seconds
+  and gets it anew at 3 ms for each megabyte: a sixth of the time of a long run, whose draws take
+  100 MB, and nothing of nutpie's, whose draws take 2. Both run in a process that takes 2 GiB
+  before the first of them and keeps what it frees, so that neither pays for the host.
+- **The hour.** The machine shares its hardware with others: seconds of one long run of density
+  were 1.24 to 1.54. Before its memory was held and its long runs were of 640 steps, four runs of
+  the benchmark gave 54.9, 54.4, 47.9 and 48.4 times nutpie's for them. Of two workers see below.
 - **Bulk and tail.** Our draws come in opposite pairs, whose errors of a mean cancel: bulk ESS,
   which is that of means of normal scores, then exceeds what evaluations would be worth as
   independent draws, as nutpie's own does. Tail ESS, of the shares beyond the 5 and 95 % quantiles,
@@ -69,14 +73,16 @@ _TRIED = """## What was tried
 
 Sampler, by bulk ESS per second of the joint drawbar pull on one core:
 
-- Kept, at last: a step of the walk after every 32 of pairs, in its turn, where a twentieth of the
+- Kept, at last: no more than 16 steps before those that are kept, if walkers start at draws of a
+  good proposal (26 of 320 before).
+- Kept, before: a step of the walk after every 32 of pairs, in its turn, where a twentieth of the
   steps were drawn for it (each has every walker's pair found anew: density's long runs a tenth
   faster, 0.80 s for 0.87, with 4 % more effective draws); steps written by emcee's backend to where
   they stay, for memory new from the system is dear on this machine (0.89 s for 1.07 with the walk's
-  turns, where results are kept from run to run, as they are here); flat indices. The numbers drawn
-  are the same for the last two.
-- Kept, before: **opposite pairs** of proposals for single ones (an independence sampler of pairs,
-  and a step between a pair's points), one mixture with its broad component in straightened
+  turns, where results are kept from run to run); flat indices. The numbers drawn are the same for
+  the last two.
+- Kept, before that: **opposite pairs** of proposals for single ones (an independence sampler of
+  pairs, and a step between a pair's points), one mixture with its broad component in straightened
   coordinates for two densities, scales of the straightening map that grow with every coordinate
   and not with the noise alone (a point's opposite is accepted with 0.85 for 0.79, of density 0.70
   for 0.61), what walkers do with the pairs of 16 steps worked out in one go, no copy of the state
@@ -85,7 +91,7 @@ Sampler, by bulk ESS per second of the joint drawbar pull on one core:
   long as with 160 before these two (0.24 s for 0.23) and has twice the effective size. Chains of
   80 steps, tried between, tell little of how they mix: their autocorrelation time is now taken as
   that of a coordinate's distance from its median too, and is two to three steps.
-- Kept, before that: proposals' densities worked out with the draws; expectation maximisation in two
+- Kept, at first: proposals' densities worked out with the draws; expectation maximisation in two
   matrix products; a random walk in straightened coordinates in the place of differential
   evolution; the gate on the draws that are stored; log densities taken past emcee's loop over
   scalars; components of the mixture limited by the entries of their covariances; a twelfth of the
@@ -110,7 +116,8 @@ changed nothing. What is left depends on the hour, on a machine that shares its 
 others: 100 diagnoses in one process took 195 to 212 s in one run, and two workers gave 1.77 and
 1.96; 208 and 216 s in another, and 1.79 and 1.51; 234 to 262 s in a third, and 1.73, 1.71 and 1.87;
 231 to 269 s in a fourth, and 1.95, 1.96 and 1.49, when two plain processes without Dask gave 2.00,
-1.85 and 1.76.
+1.85 and 1.76; 210 to 222 s in a fifth, and 1.85, 1.80 and 1.89, two plain processes 1.89, 1.84 and
+1.85.
 
 Likelihood: {libraries}
 A sine is worked out as a tangent of the half argument, for which NumPy has vector instructions:

@@ -15,7 +15,7 @@ from calib.models.base import Array
 from calib.sampling.moves import PairMove, WalkMove
 from calib.sampling.proposal import Proposal
 
-__all__ = ["POOR", "Ensemble"]
+__all__ = ["GOOD", "POOR", "Ensemble"]
 
 # Efficiency of the proposal below which local moves do most of the work, and above which few do.
 POOR, GOOD = 0.1, 0.5

@@ -13,7 +13,7 @@ from calib.estimators.identified import representative_rows
 from calib.models.base import Array
 from calib.problem import Problem
 from calib.sampling.adapt import Guess, adapt, refit
-from calib.sampling.ensemble import POOR, Ensemble
+from calib.sampling.ensemble import GOOD, POOR, Ensemble
 from calib.sampling.gate import Gate, GateReport, judge
 from calib.sampling.mode import Mode, find_modes
 from calib.sampling.proposal import Proposal
@@ -226,6 +226,8 @@ def sample_density(
     done = 0
     while True:
         length = target + target // _DISCARDED
+        if not done and found.efficiency > GOOD:
+            length = min(length, target + _ENOUGH)
         chain = np.empty((len(ensembles), length, walkers, proposal.n_dim))
         chain_log_prob = np.empty(chain.shape[:-1])
         for i, ensemble in enumerate(ensembles):
@@ -288,8 +290,9 @@ def _drawn(t: Array, log_prob: Array, draws: int) -> tuple[Array, Array]:
 # Draws of each ensemble that the gate looks at, and of how many steps at least: of few, effective
 # sizes come out too large (by a tenth of 32).
 _JUDGED, _LEAST_STEPS = 4096, 32
-# One step in so many is run before those that are kept.
-_DISCARDED = 12
+# One step in so many is run before those that are kept; no more than so many where walkers start
+# at draws from a good proposal.
+_DISCARDED, _ENOUGH = 12, 16
 # A region of at least this part of the draws must have been proposed at least so often.
 _LEAST_REGION, _LEAST_PROPOSED = 0.003, 5.0
 

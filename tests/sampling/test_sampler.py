@@ -253,6 +253,20 @@ def test_progress_counts_up_to_what_is_planned(rut_tables: tuple[Table, Table]) 
     np.testing.assert_array_equal(told.t, untold.t)
 
 
+@pytest.mark.parametrize(("steps", "discarded"), [(120, 10), (480, 16)])
+def test_what_is_discarded_of_a_good_proposals_chain_is_bounded(
+    rut_tables: tuple[Table, Table], steps: int, discarded: int
+) -> None:
+    seen: list[int] = []
+    settings = SamplerSettings(steps=steps, walkers=64)
+    draws = sample_posterior(
+        build_problem("modified_bekker", rut_tables[0]), 3, settings=settings,
+        progress=lambda done, planned: seen.append(planned),
+    )  # fmt: skip
+    assert draws.efficiency > ensemble_module.GOOD
+    assert seen[0] == 4 * (steps + discarded)
+
+
 def test_emcee_takes_the_random_state(monkeypatch: pytest.MonkeyPatch) -> None:
     """Moves and splits must come from the numbers that were given, or runs do not repeat."""
 
