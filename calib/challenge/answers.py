@@ -64,6 +64,8 @@ class CaseAnswer:
         or no rows have one.
     shrinks : tuple of ShrinkAnswer
         For each output with a true gap.
+    outputs : tuple of str
+        That were measured.
     problem : str
         Why the case failed, empty otherwise.
     """
@@ -75,6 +77,7 @@ class CaseAnswer:
     ranked: tuple[tuple[str, float], ...]
     auc: float | None
     shrinks: tuple[ShrinkAnswer, ...]
+    outputs: tuple[str, ...] = ()
     problem: str = ""
 
     @property
@@ -208,6 +211,7 @@ def read_answer(name: str, entry: dict[str, Any], folder: Path) -> CaseAnswer:
     folder : Path
         Where its diagnosis was written.
     """
+    outputs = tuple(entry["noise_sd"])
     try:
         diagnosis = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
         ranked, verdict = _ranked(diagnosis), str(diagnosis["verdict"])
@@ -222,7 +226,9 @@ def read_answer(name: str, entry: dict[str, Any], folder: Path) -> CaseAnswer:
         shrinks = _shrinks(entry, {}, {})
         text = f"{type(problem).__name__}: {problem}"
         return CaseAnswer(
-            name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, text
+            name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs, text
         )
     located = None if entry["truth"] == NONE else located
-    return CaseAnswer(name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks)
+    return CaseAnswer(
+        name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs
+    )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -53,6 +53,15 @@ class Limit:
     density: dict[str, bool]
     seed: int
     effort: int
+
+    def of(self, cases: Collection[str]) -> Limit:
+        """Return the limit of some of the cases."""
+        return replace(
+            self,
+            answers={name: a for name, a in self.answers.items() if name in cases},
+            known_soil={name: a for name, a in self.known_soil.items() if name in cases},
+            errors={name: e for name, e in self.errors.items() if name in cases},
+        )
 
     def tier(self, tier: str) -> TierScore:
         """Return the oracle's figures of merit in a tier, those of its probabilities only."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -276,7 +276,9 @@ def confusion(answers: list[CaseAnswer]) -> Confusion:
     return Confusion(tuple(truths), tuple(calls), tuple(tuple(map(int, row)) for row in counts))
 
 
-def score(cases_dir: Path, results_dir: Path, key_path: Path) -> Score:
+def score(
+    cases_dir: Path, results_dir: Path, key_path: Path, outputs: Collection[str] = ()
+) -> Score:
     """Score the diagnoses of a blind test.
 
     Parameters
@@ -287,16 +289,26 @@ def score(cases_dir: Path, results_dir: Path, key_path: Path) -> Score:
         Folder with ``<case>/diagnosis.json`` and ``<case>/fresh_prediction.csv``.
     key_path : Path
         The sealed key.
+    outputs : collection of str
+        Score the cases that measure these and no others; all cases by default.
 
     Raises
     ------
     CalibError
-        If the key does not match the hash published with the cases, there is no diagnosis, or
-        diagnoses are of other cases.
+        If no case measures these outputs, the key does not match the hash published with the
+        cases, there is no diagnosis, or diagnoses are of other cases.
     """
     entries = open_key(cases_dir, key_path)["cases"]
     warnings = _check_results(cases_dir, results_dir, sorted(entries))
     answers = [read_answer(name, entries[name], results_dir / name) for name in sorted(entries)]
+    if outputs:
+        answers = [a for a in answers if set(a.outputs) == set(outputs)]
+        if not answers:
+            there = sorted({",".join(sorted(entry["noise_sd"])) for entry in entries.values()})
+            raise CalibError(
+                f"no case measures {' and '.join(outputs)} alone", where=str(cases_dir),
+                allowed="; ".join(there), mend="name the outputs of some cases, or leave them out",
+            )  # fmt: skip
     tiers = {tier: [a for a in answers if a.tier == tier] for tier in ("easy", "hard")}
     tiers = {tier: part for tier, part in tiers.items() if part}
     return Score(

@@ -125,6 +125,31 @@ def kinds_table(answers: Iterable[CaseAnswer], limit: Limit) -> str:
     return "\n".join(lines)
 
 
+def outputs_table(answers: Iterable[CaseAnswer]) -> str:
+    """Return how the truth fared where there is a gap, by the outputs that are measured.
+
+    Parameters
+    ----------
+    answers : iterable of CaseAnswer
+    """
+    parts: dict[tuple[str, tuple[str, ...]], list[CaseAnswer]] = {}
+    for answer in answers:
+        if answer.truth != NONE:
+            parts.setdefault((answer.tier, answer.outputs), []).append(answer)
+    lines = [f"  {'':<47} {'first':>16} {'first two':>16} {'mean p':>7}"]
+    for (tier, outputs), part in sorted(
+        parts.items(), key=lambda item: (item[0][0], -len(item[1]))
+    ):
+        label = f"{tier}, {' and '.join(name.replace('_', ' ') for name in outputs)}"
+        cells = []
+        for count in (1, 2):
+            right = sum(a.among_first(count) for a in part)
+            cells.append(f"{right / len(part):8.3f} {f'{right}/{len(part)}':>7}")
+        mean = sum(a.truth_probability for a in part) / len(part)
+        lines.append(f"  {label:<47} {' '.join(cells)} {mean:7.3f}")
+    return "\n".join(lines)
+
+
 def _limit_notes(limit: Limit, tiers: Iterable[str]) -> list[str]:
     lines = [
         "limit: the oracle, Bayes' theorem by one who knows how the cases were made, the soil's",
@@ -157,6 +182,8 @@ def text_table(score: Score, limit: Limit | None = None) -> str:
     if limit is not None:
         parts.append("\n".join(_limit_notes(limit, score.tiers)))
         parts.append("truth named first, by what was true:\n" + kinds_table(score.answers, limit))
+    if len({a.outputs for a in score.answers if a.truth != NONE}) > 1:
+        parts.append("cases with a gap, by what is measured:\n" + outputs_table(score.answers))
     failed = [f"  {a.case}: {a.problem}" for a in score.answers if a.problem]
     if failed:
         parts.append("\n".join(["without a readable diagnosis, counted as wrong:", *failed]))

@@ -183,6 +183,9 @@ def score(
     results: Annotated[Path, typer.Option(help="Folder with the diagnoses.")],
     key: Annotated[Path, typer.Option(help="The sealed answers.")],
     limit: Annotated[Path | None, typer.Option(help="limit.json of these cases.")] = None,
+    outputs: Annotated[
+        str, typer.Option(help="Only cases that measure these, e.g. drawbar_pull,rut_depth.")
+    ] = "",
     out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
     overwrite: _Overwrite = False,
 ) -> None:
@@ -195,8 +198,8 @@ def score(
 
     if out is not None:
         check_folder(out, overwrite=overwrite)
-    found = score_all(folder, results, key)
-    known = None if limit is None else read_limit(limit, folder)
+    found = score_all(folder, results, key, [o.strip() for o in outputs.split(",") if o.strip()])
+    known = None if limit is None else read_limit(limit, folder).of({a.case for a in found.answers})
     table = text_table(found, known)
     for warning in found.warnings:
         print(f"calib: {warning}", file=sys.stderr)

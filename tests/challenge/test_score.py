@@ -291,6 +291,36 @@ def test_reliability_bins_hold_every_case(sealed: tuple[Path, Path], tmp_path: P
     assert tier.brier.value == pytest.approx(0.55**2 + 0.55**2)
 
 
+def test_cases_of_some_outputs_are_scored_alone(tmp_path: Path) -> None:
+    """Half of the cases measure a rut as well; only there the answers are right."""
+    cases = {}
+    for i, truth in enumerate(TRUTHS * 2):
+        case = cases[f"case-{i:03d}"] = entry(truth, "easy")
+        if i >= len(TRUTHS):
+            for name in ("noise_sd", "field_truth", "field_without", "fresh_truth"):
+                case[name]["rut_depth"] = [1.0] * 10
+    (tmp_path / "cases").mkdir()
+    key = {"schema": KEY_SCHEMA, "seed": 1, "salt": "ab", "cases": cases}
+    publish(tmp_path / "cases", key, seal(key, tmp_path / "key.json"), ("easy",))
+
+    def answer(case: dict[str, Any]) -> dict[str, Any]:
+        return perfect(case) if "rut_depth" in case["noise_sd"] else worst(case)
+
+    write(tmp_path / "r", tmp_path / "key.json", answer)
+    where = tmp_path / "cases", tmp_path / "r", tmp_path / "key.json"
+    assert score(*where).tiers["easy"].top_1 == Proportion(4, 8)
+    alone = score(*where, ["rut_depth", "drawbar_pull"])
+    assert alone.tiers["easy"].top_1 == Proportion(4, 4)
+    assert len(alone.answers) == 6
+    assert score(*where, ["drawbar_pull"]).tiers["easy"].top_1 == Proportion(0, 4)
+    with pytest.raises(CalibError, match="no case measures rut_depth alone") as caught:
+        score(*where, ["rut_depth"])
+    assert "drawbar_pull; drawbar_pull,rut_depth" in str(caught.value)
+    lines = {" ".join(line.split()) for line in text_table(score(*where)).splitlines()}
+    assert "easy, drawbar pull and rut depth 1.000 4/4 1.000 4/4 1.000" in lines
+    assert "easy, drawbar pull 0.000 0/4 0.000 0/4 0.000" in lines
+
+
 def test_table_and_figures_show_the_score(sealed: tuple[Path, Path], tmp_path: Path) -> None:
     """Every level has a line; figures are drawn with labels and all counts."""
     write(tmp_path / "r", sealed[1], worst, skip=("case-002",))

@@ -43,6 +43,10 @@ def test_nulls_and_large_gaps_are_told(three: tuple[Path, Path, Path]) -> None:
             assert answer.truth_probability > 0.97
     assert rms_error(limit) < 0.02
     assert limit.expected_first("easy") == pytest.approx(1.0, abs=0.02)
+    part = limit.of({"case-000"})
+    assert part.tier("easy").n_cases == 1
+    assert part.tier("hard").n_cases == part.tier_known_soil("hard").n_cases == 0
+    assert rms_error(part) == pytest.approx(limit.errors["case-000"])
     assert open_key(cases, key)["cases"]["case-000"]["stage"]["design"]["tier"] == "easy"
 
 
