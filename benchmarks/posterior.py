@@ -197,10 +197,6 @@ def compare(problem: Problem, repeats: int, long_repeats: int) -> dict[str, obje
             name: {key: spread([r[key] for r in found]) for key in found[0]}
             for name, found in runs.items()
         },
-        "nutpie_runs_with_bad_rhat": {
-            length: sum(r["rhat"] > Gate().rhat_max for r in runs[f"nutpie {length}"])
-            for length in NUTPIE
-        },
         "z_scores": {
             peer: {what: z.tolist() for what, z in found.items()}
             for peer, found in agreement.items()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
-__all__ = ["NAMES", "Row", "largest_z", "rows_of"]
+__all__ = ["NAMES", "RHAT_MAX", "Row", "largest_z", "rows_of", "sound"]
 
 NAMES = {
     "drawbar_pull": "joint drawbar pull",
@@ -23,6 +23,9 @@ SAMPLERS = {
     "nutpie long": "PyMC + nutpie, 40,000 draws",
     "stretch": "emcee's stretch move",
 }
+
+# Above it chains of nutpie's have not joined: the run is left out, as any user would.
+RHAT_MAX = 1.01
 
 type Measured = Mapping[str, Any]
 
@@ -52,9 +55,10 @@ class Row:
 def _short(value: float | None) -> str:
     if value is None:
         return ""
-    if value != 0.0 and abs(value) >= 1000.0:
+    if abs(value) >= 1000.0:
         return f"{float(f'{value:.3g}'):,.0f}"
-    return f"{value:.3g}"
+    # Zeros at the end are figures too, but not those of a count.
+    return f"{value:.0f}" if float(value).is_integer() else f"{value:#.3g}".rstrip(".")
 
 
 def rows_of(measured: Mapping[str, Measured]) -> list[Row]:
@@ -89,30 +93,39 @@ def _asked(
     return Row(part, subject, quantity, value, s.get("low"), s.get("high"), asked, met)
 
 
+def sound(run: Mapping[str, float]) -> bool:
+    """Whether the chains of a run of nutpie's have joined."""
+    return run["rhat"] <= RHAT_MAX
+
+
+def _ratios(runs: Mapping[str, Any], length: str, kind: str) -> dict[str, float]:
+    """Rates over nutpie's, each run's over that of the run beside it."""
+    name = f"{kind}_per_second"
+    pairs = zip(runs[f"calib {length}"], runs[f"nutpie {length}"], strict=True)
+    ratios = [ours[name] / theirs[name] for ours, theirs in pairs if sound(theirs)]
+    if not ratios:
+        return {"median": float("nan")}
+    return {"median": float(np.median(ratios)), "low": min(ratios), "high": max(ratios)}
+
+
 def _posterior(m: Measured) -> Iterator[Row]:
     part = "posterior"
     for key in NAMES:
         p = m["problems"][key]
         subject, spread = NAMES[key], p["spread"]
         for length in ("default", "long"):
-            ours, theirs = p["runs"][f"calib {length}"], p["runs"][f"nutpie {length}"]
             what = {"default": "both at default settings", "long": "both long"}[length]
-            for kind in ("bulk", "tail"):
-                name = f"{kind}_per_second"
-                ratio = (
-                    spread[f"calib {length}"][name]["median"]
-                    / (spread[f"nutpie {length}"][name]["median"])
+            bulk, tail = (_ratios(p["runs"], length, kind) for kind in ("bulk", "tail"))
+            yield _asked(part, subject, f"bulk ESS/s over nutpie's, {what}", bulk, least=50.0)
+            if length == "default":
+                # What the scatter of means says that the sizes of short chains are worth.
+                worth = 1.0 / float(np.mean(p["replicates"]["variance_over_claimed"]))
+                scattered = {end: value * worth for end, value in bulk.items()}
+                how = f"{what}, ours by the scatter of {p['replicates']['runs']} runs"
+                yield _asked(
+                    part, subject, f"bulk ESS/s over nutpie's, {how}", scattered, least=50.0
                 )
-                pairs = [a[name] / b[name] for a, b in zip(ours, theirs, strict=True)]
-                s = {"median": ratio, "low": min(pairs), "high": max(pairs)}
-                least = 50.0 if kind == "bulk" else None
-                yield _asked(part, subject, f"{kind} ESS/s over nutpie's, {what}", s, least=least)
-                if kind == "bulk" and length == "default":
-                    # What the scatter of means says that the sizes of short chains are worth.
-                    worth = 1.0 / float(np.mean(p["replicates"]["variance_over_claimed"]))
-                    s = {end: value * worth for end, value in s.items()}
-                    what = f"{what}, ours by the scatter of {p['replicates']['runs']} runs"
-                    yield _asked(part, subject, f"bulk ESS/s over nutpie's, {what}", s, least=least)
+            yield _asked(part, subject, f"tail ESS/s over nutpie's, {what}", tail)
         for length in ("default", "long"):
             ratios = [
                 a["bulk_per_second"] / spread["stretch"]["bulk_per_second"]["median"]
@@ -152,21 +165,29 @@ def _posterior(m: Measured) -> Iterator[Row]:
                 ("evaluations_per_bulk", "evaluations per bulk ESS"),
             ):  # fmt: skip
                 yield _asked(part, subject, f"{title}: {label}", spread[name][quantity])
-        for length, count in p["nutpie_runs_with_bad_rhat"].items():
-            n = len(p["runs"][f"nutpie {length}"])
+        for length in ("default", "long"):
+            found = p["runs"][f"nutpie {length}"]
+            title = SAMPLERS[f"nutpie {length}"]
             yield Row(
-                part, subject, f"{SAMPLERS[f'nutpie {length}']}: runs of {n} with R-hat > 1.01",
-                float(count),
+                part, subject, f"{title}: runs of {len(found)} with R-hat > {RHAT_MAX:g}, left out",
+                float(sum(not sound(r) for r in found)),
             )  # fmt: skip
+            diverged = [r["divergences"] for r in found if sound(r)]
+            if diverged:
+                yield Row(
+                    part, subject, f"{title}: divergent transitions in the others",
+                    float(np.median(diverged)), min(diverged), max(diverged),
+                )  # fmt: skip
 
 
 def _likelihood(m: Measured) -> Iterator[Row]:
     part = "likelihood"
     for r in [*m["rows"], m["repeated_conditions"]]:
-        subject = f"{r['rows']:,} rows"
+        subject, what = f"{r['rows']:,} rows", "time over the floor's"
         if r["distinct"] != r["rows"]:
             subject += f" at {r['distinct']} conditions"
-        yield _asked(part, subject, "time over the floor's", r["time_over_floor"], most=1.5)
+            what += " of every row"
+        yield _asked(part, subject, what, r["time_over_floor"], most=1.5)
         yield _asked(part, subject, "vectors times rows per second", r["cells_per_second"])
         yield Row(
             part, subject, f"memory of a call, MiB (all at once: {r['mib_if_all_at_once']:.0f})",
@@ -221,12 +242,13 @@ def _campaign(m: Measured) -> Iterator[Row]:
     part, o = "campaign", m["overhead"]
     pairs = zip(*(o["ms_per_task_wall_and_cpu"][n] for n in ("calib", "dask")), strict=True)
     beyond = [a[0] - b[0] for a, b in pairs]
-    s = {
-        "median": o["beyond_dask_ms_median_wall"],
-        "low": min(beyond),
-        "high": max(beyond),
-    }
-    yield _asked(part, f"{o['tasks']:,} tiny tasks", "ms per task beyond Dask's own", s, most=2.0)
+    s = {"median": o["beyond_dask_ms_median_wall"]}
+    if len(beyond) > 1:
+        s |= {"low": min(beyond), "high": max(beyond)}
+    subject = f"{o['tasks']:,} tiny tasks"
+    yield _asked(part, subject, "ms per task beyond Dask's own, on the clock", s, most=2.0)
+    cpu = {"median": o["beyond_dask_ms_median_cpu"]}
+    yield _asked(part, subject, "ms per task beyond Dask's own, of processors", cpu, most=2.0)
     if "gain" in m:
         g = m["gain"]
         for way, what, least in (

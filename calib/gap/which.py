@@ -32,11 +32,6 @@ from calib.streams import generator
 
 __all__ = ["Ranking", "calibrate_lab", "rank"]
 
-# Evidence is overconfident where every formula is somewhat wrong. On the 600 cases that `calib
-# challenge make` makes of seeds 271828 and 577215, the log score was best with an exponent of 1
-# where rows are many and 1/1.1 where rows are few and effects two; 1/1.25 lost 0.01 a case.
-TEMPER = 1.1
-
 _N_SCREEN = 96
 _N_POLISH = 3
 _N_THRESHOLDS = 24
@@ -136,9 +131,7 @@ def _score(found: Fit, seed: int, draws: int) -> float:
 
 def probabilities(log_evidence: Mapping[str, float], n_single: int) -> dict[str, float]:
     """Posterior probabilities of hypotheses from their evidence."""
-    score = {
-        name: (value + _ln_prior(name, n_single)) / TEMPER for name, value in log_evidence.items()
-    }
+    score = {name: value + _ln_prior(name, n_single) for name, value in log_evidence.items()}
     total = logsumexp(list(score.values()))
     return {name: float(np.exp(value - total)) for name, value in score.items()}
 

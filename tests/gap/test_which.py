@@ -10,7 +10,7 @@ import pytest
 from calib.data import table_from_arrays
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
-from calib.gap.which import TEMPER, probabilities, rank
+from calib.gap.which import probabilities, rank
 from calib.outputs import OUTPUTS
 from gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
@@ -73,8 +73,8 @@ def test_probabilities_from_evidence():
     assert sum(p.values()) == pytest.approx(1.0)
     assert p["a"] == pytest.approx(p["b"])
     assert p["a+b"] < p["a"] < p["none"]
-    better = probabilities(even | {"a": TEMPER * np.log(10.0)}, 2)
-    # Ten times the evidence, tempered, is ten times the odds.
+    better = probabilities(even | {"a": np.log(10.0)}, 2)
+    # Ten times the evidence is ten times the odds.
     assert better["a"] / better["b"] == pytest.approx(10.0)
 
 
