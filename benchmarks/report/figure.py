@@ -26,9 +26,9 @@ __all__ = ["draw"]
 
 _SAMPLERS = (
     ("calib default", "calib, default", BLUE, "o"),
-    ("calib long", "calib, ten times as long", BLUE, "s"),
+    ("calib long", "calib, long", BLUE, "s"),
     ("nutpie default", "PyMC + nutpie, default", VERMILION, "o"),
-    ("nutpie long", "PyMC + nutpie, ten times as long", VERMILION, "s"),
+    ("nutpie long", "PyMC + nutpie, long", VERMILION, "s"),
     ("stretch", "emcee's stretch move", GREEN, "^"),
 )
 _LIBRARIES = (("numexpr", ORANGE, "^"), ("Numba", GREEN, "D"), ("JAX", VERMILION, "v"))
@@ -118,7 +118,7 @@ def _likelihood(ax: Axes, measured: Mapping[str, Any]) -> dict[str, Any]:
     x = [r["rows"] for r in rows]
     for key, label, colour, dash in (
         ("cells_per_second", "calib's log posterior", BLUE, "-"),
-        ("floor_cells_per_second", "floor: NumPy's sin and arctan alone", BLACK, "--"),
+        ("floor_cells_per_second", "floor: NumPy's sin, arctan", BLACK, "--"),
     ):
         s = [r[key] for r in rows]
         (handles[label],) = ax.plot(
@@ -133,7 +133,7 @@ def _likelihood(ax: Axes, measured: Mapping[str, Any]) -> dict[str, Any]:
         found = [r for r in measured["peers"] if name in r["cells_per_second"]]
         if found:
             y = [1e-6 * r["cells_per_second"][name]["median"] for r in found]
-            label = f"{name}, sums of squares alone"
+            label = f"{name}, squares alone"
             (handles[label],) = ax.plot([r["rows"] for r in found], y, ":", marker=marker,
                                         mfc="none", color=colour)  # fmt: skip
     ax.set(
@@ -163,7 +163,7 @@ def _genetic(ax: Axes, problems: Mapping[str, Any]) -> dict[str, Any]:
     ax.set_yticks(range(len(labels)), labels, fontsize=6)
     ax.invert_yaxis()
     high = max(m["seconds"]["high"] for p in problems.values() for m in p["methods"].values())
-    ax.set(xscale="log", xlabel="ms; at the optimum from so many seeds",
+    ax.set(xscale="log", xlabel="milliseconds (seeds at it)",
            xlim=(2.0, 4e3 * high))  # fmt: skip
-    ax.set_title("to the lowest cost: one core")
+    ax.set_title("to the optimum: one core")
     return handles
