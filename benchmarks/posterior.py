@@ -181,7 +181,7 @@ def compare(problem: Problem, repeats: int, long_repeats: int) -> dict[str, obje
         kept["stretch"].append(t)
 
     # Chains that never joined the others are left out of the comparison, as any user would.
-    sound = [t for t in kept["nutpie"] if rhat(t) < Gate().rhat_max]
+    sound = [t for t in kept["nutpie"] if rhat(t) <= Gate().rhat_max]
     a = np.concatenate(kept["calib"])
     agreement = {
         "nutpie": z_scores(a, np.concatenate(sound)) if sound else {},

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from calib.sampling.gate import Gate
+
 __all__ = ["NAMES", "RHAT_MAX", "Row", "largest_z", "rows_of", "sound"]
 
 NAMES = {
@@ -25,7 +27,7 @@ SAMPLERS = {
 }
 
 # Above it chains of nutpie's have not joined: the run is left out, as any user would.
-RHAT_MAX = 1.01
+RHAT_MAX = Gate().rhat_max
 
 type Measured = Mapping[str, Any]
 

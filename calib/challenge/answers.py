@@ -77,7 +77,7 @@ class CaseAnswer:
     ranked: tuple[tuple[str, float], ...]
     auc: float | None
     shrinks: tuple[ShrinkAnswer, ...]
-    outputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...]
     problem: str = ""
 
     @property

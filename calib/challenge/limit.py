@@ -14,7 +14,6 @@ import numpy as np
 from calib.challenge.answers import CaseAnswer
 from calib.challenge.design import Tier
 from calib.challenge.effects import NONE, UNKNOWN
-from calib.challenge.mechanism import DENSITY
 from calib.challenge.oracle.case import CaseItem, examine, read_item
 from calib.challenge.oracle.combine import errors, probabilities
 from calib.challenge.score import TierScore, score_tier
@@ -41,8 +40,6 @@ class Limit:
         Case to its answer with the soil known.
     errors : dict
         Case to the Monte Carlo standard error of the truth's probability.
-    density : dict
-        Case to whether bulk density is among its outputs.
     seed, effort : int
         Where and how closely the oracle looked.
     """
@@ -50,7 +47,6 @@ class Limit:
     answers: dict[str, CaseAnswer]
     known_soil: dict[str, CaseAnswer]
     errors: dict[str, float]
-    density: dict[str, bool]
     seed: int
     effort: int
 
@@ -220,7 +216,6 @@ def read_limit(path: Path, cases_dir: Path) -> Limit:
         answers={name: _answer(name, case, "probabilities") for name, case in cases.items()},
         known_soil={name: _answer(name, case, "known_soil") for name, case in cases.items()},
         errors={name: float(case["error"]) for name, case in cases.items()},
-        density={name: DENSITY in case["outputs"] for name, case in cases.items()},
         seed=int(content["seed"]),
         effort=int(content["effort"]),
     )
@@ -231,7 +226,8 @@ def _answer(name: str, case: Mapping[str, Any], which: str) -> CaseAnswer:
     best, share = ranked[0]
     verdict = best if best in (NONE, UNKNOWN) else "effect"
     verdict = "ambiguous" if share < _NAMED else verdict
-    return CaseAnswer(name, case["tier"], case["truth"], verdict, ranked, None, ())
+    outputs = tuple(case["outputs"])
+    return CaseAnswer(name, case["tier"], case["truth"], verdict, ranked, None, (), outputs)
 
 
 def rms_error(limit: Limit) -> float:

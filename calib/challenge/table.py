@@ -8,6 +8,7 @@ from calib.challenge.answers import CaseAnswer
 from calib.challenge.effects import NONE, SHIFT, UNKNOWN
 from calib.challenge.levels import LEVELS, Level
 from calib.challenge.limit import Limit, rms_error
+from calib.challenge.mechanism import DENSITY
 from calib.challenge.score import Average, Proportion, Score, TierScore
 
 _EXTRA = (
@@ -119,7 +120,7 @@ def kinds_table(answers: Iterable[CaseAnswer], limit: Limit) -> str:
                 add(
                     label,
                     lambda a, t=tier, k=kind, d=density: (  # type: ignore[misc]
-                        (a.tier, _kind(a), limit.density[a.case]) == (t, k, d)
+                        (a.tier, _kind(a), DENSITY in a.outputs) == (t, k, d)
                     ),
                 )
     return "\n".join(lines)
