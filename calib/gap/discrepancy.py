@@ -19,6 +19,8 @@ __all__ = ["THRESHOLDS", "Discrepancy"]
 # Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
 THRESHOLDS = (-0.85, 0.9)
 _ONSET_WIDTH = 0.06
+# Most waves over the range of slips that a ripple may have.
+_WAVES = 12
 
 
 class Discrepancy:
@@ -105,6 +107,8 @@ class Discrepancy:
             terms = self._cosines(self._level(view, output if over == "level" else RUT), 8, 0.8)
         elif over == "order":
             terms = self._cosines(self.covariates.scaled(view, "run_order"), 12, 0.7)
+        elif over == "ripple":
+            terms = self._ripples(view)
         else:
             terms = self._condition_terms(view, everything=over == "all")
         n = next(iter(view.conditions.values())).size
@@ -132,6 +136,12 @@ class Discrepancy:
                 if slip is not None:
                     terms.append((u * slip, 0.4))
         return terms
+
+    def _ripples(self, view: View) -> list[tuple[Array, float]]:
+        """Up to `_WAVES` waves over the slips, none more probable than another, of rms 1 in all."""
+        slip = self.covariates.scaled(view, "slip_ratio")
+        each = (2 * _WAVES) ** -0.5
+        return [(basis, each) for basis, _ in self._cosines(slip, 2 * _WAVES, 1.0)]
 
     def _cosines(self, u: Array | None, most: int, scale: float) -> list[tuple[Array, float]]:
         """Cosines of a covariate scaled to -1..1, and the sds of their coefficients."""

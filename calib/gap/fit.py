@@ -2,7 +2,7 @@
 
 Gauss-Newton on the joint posterior of simulator, effect and form errors, with the noise scales
 re-estimated between steps. Conditional on the noise the model is close to linear in psi where the
-posterior has its mass, so the evidence is Laplace's:
+posterior has its mass, so the evidence is Laplace's at first (`refine` mends it where it counts):
 
     ln Z = ln p(y | psi^, sigma^) + ln p(psi^) + (d/2) ln 2 pi - (1/2) ln |H| + bounds
 """
@@ -42,6 +42,7 @@ class Fit:
     covariance : ndarray, shape (d, d)
     noise : mapping of str to Noise
     log_evidence : float
+        Laplace's, or that of the draws.
     log_likelihood : float
     field_residuals : mapping of str to ndarray
         Standardised residuals of the field rows of each output.

@@ -79,7 +79,15 @@ class Forward:
         ]
         self.covariates = Covariates(data)
         self.discrepancy = Discrepancy(data, hypothesis, self.covariates, lab_mode or {})
-        # Worked out once for the field rows, which every step of a fit predicts.
+        # Worked out once for the lab and field rows, which every step of a fit predicts.
+        self._field_conditions = {o.name: _selected(o, data.view) for o in data.outputs}
+        self._prepared = {
+            o.name: [
+                (conditions, o.problem.bound.prepare(conditions))
+                for conditions in (o.problem.conditions, self._field_conditions[o.name])
+            ]
+            for o in data.outputs
+        }
         self._field_form = self._form_basis(data.view)
         self.form_slices: dict[str, slice] = {}
         for o in data.outputs:
@@ -111,6 +119,10 @@ class Forward:
     def n_dim(self) -> int:
         """Length of psi."""
         return len(self.priors.free)
+
+    def _conditions(self, o: OutputData, view: View) -> dict[str, Array]:
+        same = view.conditions is self.data.view.conditions
+        return self._field_conditions[o.name] if same else _selected(o, view)
 
     def _form(self, view: View) -> Array:
         same = view.conditions is self.data.view.conditions
@@ -159,7 +171,8 @@ class Forward:
         self, o: OutputData, theta: Array, psi: Array, conditions: Mapping[str, Array]
     ) -> Array:
         """Simulator and its inadequacy at conditions, on the scale of the response."""
-        location = o.problem.bound.location(theta, conditions)
+        prepared = (rows for known, rows in self._prepared[o.name] if known is conditions)
+        location = o.problem.bound.location(theta, conditions, next(prepared, None))
         misfit = psi[:, self.misfit_slices[o.name]]
         if not misfit.shape[1]:
             return location
@@ -188,19 +201,17 @@ class Forward:
         """Predict with the calibrated simulator alone, on the scale of the response."""
         return {
             o.name: self._predict(
-                o, self.theta(psi, o.name, field=False), psi,
-                o.problem.bound.model.select(view.conditions),
+                o, self.theta(psi, o.name, field=False), psi, self._conditions(o, view)
             )
             for o in self.data.outputs
-        }  # fmt: skip
+        }
 
     def field(self, psi: Array, view: View) -> dict[str, Array]:
         """Predict field rows with the hypothesis in force, on the scale of the response."""
         plain: dict[str, Array] = {}
         for o in self.data.outputs:
             theta = self.theta(psi, o.name, field=True)
-            conditions = o.problem.bound.model.select(view.conditions)
-            plain[o.name] = self._predict(o, theta, psi, conditions)
+            plain[o.name] = self._predict(o, theta, psi, self._conditions(o, view))
         if self.hypothesis.effects:
             plain = self._with_effects(psi, view, plain)
         if self.smooth_slices:
@@ -220,7 +231,7 @@ class Forward:
         form = self._form(view)
         changed = {}
         for name, o in outputs.items():
-            original: dict[str, Array] = o.problem.bound.model.select(view.conditions)
+            original = self._conditions(o, view)
             conditions = original
             for effect, phi in zip(self.hypothesis.effects, phis, strict=True):
                 conditions = effect.on_conditions(phi, name, conditions, view)
@@ -235,6 +246,10 @@ class Forward:
                 location = plain[name] + (location - plain[name]) * factor
             changed[name] = location
         return changed
+
+
+def _selected(o: OutputData, view: View) -> dict[str, Array]:
+    return o.problem.bound.model.select(view.conditions)
 
 
 def _same(values: Array) -> Array:

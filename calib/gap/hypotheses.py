@@ -95,8 +95,10 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
     if "run_order" in recorded and np.ptp(recorded["run_order"]) > 0:
         choices += [("order", t) for t in touched]
         remembered = [t for t in touched if DENSITY not in t]
+    rippled = [t for t in touched if "slip_ratio" in recorded and DENSITY not in t]
     everywhere: list[tuple[SmoothOver, tuple[str, ...]]] = [
         *choices,
+        *(("ripple", t) for t in rippled),
         *(("before", t) for t in remembered),
         *(("all", t) for t in touched),
     ]

@@ -10,7 +10,7 @@ from calib.priors import Priors
 
 __all__ = ["Hypothesis", "OnsetOver", "SmoothOver"]
 
-type SmoothOver = Literal["slip", "level", "sinkage", "order", "before", "all"]
+type SmoothOver = Literal["slip", "level", "sinkage", "order", "before", "ripple", "all"]
 type OnsetOver = Literal["slip", "level", "sinkage", "order", "low_pressure"]
 
 
@@ -30,11 +30,12 @@ class Hypothesis:
         Prior sd of a free discrepancy, in units of the noise; 0 for none.
     smooth_outputs : tuple of str
         Outputs that have the free discrepancy.
-    smooth_over : {"slip", "level", "sinkage", "order", "before", "all"}
+    smooth_over : {"slip", "level", "sinkage", "order", "before", "ripple", "all"}
         What it may vary with: slip, the level of the predicted output (as a saturating
         instrument would), the predicted rut depth (as layered soil would), the order of the runs
         (as weather or another stretch of ground would), how far the output is from that of the run
-        before (as a recorder that lags would), or every condition.
+        before (as a recorder that lags would), slip in waves too short for the first (as lugs that
+        pass would), or every condition.
     smooth_decay : float
         Number of half waves from which the discrepancy's coefficients fall off.
     onset_over : {"slip", "level", "sinkage", "order", "low_pressure"}, optional

@@ -11,7 +11,6 @@ from calib.gap.case import Campaigns
 from calib.gap.effects import View
 from calib.gap.fit import Fit
 from calib.gap.noise import noise_at
-from calib.gap.refine import refine
 from calib.gap.which import Ranking
 from calib.models.base import Array
 from calib.streams import generator
@@ -21,8 +20,6 @@ __all__ = ["Mixture", "Truth", "mixture"]
 N_DRAWS = 1200
 # Hypotheses less probable than this are not drawn from.
 _NEGLIGIBLE = 2e-3
-# More probable than this, a hypothesis is worth draws of its own posterior.
-_WORTH_DRAWING = 0.05
 
 
 @dataclass(frozen=True)
@@ -134,8 +131,7 @@ def mixture(data: Campaigns, ranking: Ranking, seed: int) -> Mixture:
         share /= share.sum()
         for f, s in zip(group, share, strict=True):
             if s > 0.05:
-                matters = ranking.probability[name] * s > _WORTH_DRAWING
-                fits.append(refine(f, seed) if matters else f)
+                fits.append(f)
                 weights.append(ranking.probability[name] * float(s))
     total = sum(weights)
     return Mixture(data, tuple(fits), tuple(w / total for w in weights), seed)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -103,12 +102,13 @@ def most_probable(squared: Array, at: At) -> Noise:
         Squares of the residuals.
     at : At
     """
-    best, found = -np.inf, Noise(1.0)
-    for rho, kappa in product(RHO.tolist(), KAPPA.tolist() if np.ptp(at.softness) else [0.0]):
-        growth = _growth(at, rho, kappa)
-        variance = max(float((squared / growth**2).mean()), 1e-18)
-        noise = Noise(float(np.sqrt(variance)), rho, kappa)
-        value = -0.5 * squared.size * np.log(variance) - np.log(growth).sum() + ln_prior(noise)
-        if value > best:
-            best, found = value, noise
-    return found
+    kappas = KAPPA if np.ptp(at.softness) else KAPPA[:1]
+    by_slip = 1.0 + RHO[:, None] * np.maximum(at.slip, 0.0)
+    growth = by_slip[:, None] * np.exp(kappas[:, None] * at.softness)  # (rho, kappa, n)
+    variance = np.maximum((squared / growth**2).mean(axis=2), 1e-18)
+    value = -0.5 * squared.size * np.log(variance) - np.log(growth).sum(axis=2)
+    value += LN_RHO_PRIOR[:, None] + LN_KAPPA_PRIOR[: kappas.size]
+    if not np.isfinite(value).all():
+        return Noise(1.0)  # a model without a value somewhere says nothing about the noise
+    i, j = np.unravel_index(int(np.argmax(value)), value.shape)
+    return Noise(float(np.sqrt(variance[i, j])), float(RHO[i]), float(kappas[j]))

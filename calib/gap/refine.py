@@ -7,8 +7,9 @@ posterior itself, conditional on the noise. The draws of all rounds count, weigh
 mixture of all their proposals (Cornuet et al. 2012, doi:10.1111/j.1467-9469.2011.00756.x): a round
 whose proposal happens to be too narrow for the bend then costs little, where by itself one draw
 from beyond it would carry all the weight; what weight such a draw still has is truncated (Ionides
-2008, doi:10.1198/106186008X320456). (The evidence it gives agrees with Laplace's to a few
-tenths of a nat, so the ranking keeps Laplace's.)
+2008, doi:10.1198/106186008X320456). The sum of the weights is the evidence: of the hypotheses in
+play in 600 simulated cases Laplace's was too high by 1.1 nats or more in one of twenty and by 3.9
+in one of a hundred, where a bound or a bend cuts the normal off, and seldom too low by half a nat.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from calib.gap.fit import Fit, log_joint
+from calib.gap.noise import ln_prior
 from calib.models.base import Array
 from calib.sampling.adapt import tempered_moments
 from calib.sampling.mixture import StudentT
@@ -34,7 +36,7 @@ _ENOUGH = 120.0
 
 
 def refine(fit: Fit, seed: int) -> Fit:
-    """Return a fit with draws of its posterior.
+    """Return a fit with draws of its posterior and the evidence that they give.
 
     Parameters
     ----------
@@ -72,7 +74,8 @@ def refine(fit: Fit, seed: int) -> Fit:
     # Systematic resampling: equal weights at the least added noise.
     at = (rng.random() + np.arange(_KEPT)) / _KEPT
     picked = np.minimum(np.searchsorted(np.cumsum(weight), at), weight.size - 1)
-    return replace(fit, sample=pool.draws[picked])
+    evidence = total + sum(ln_prior(noise) for noise in fit.noise.values())
+    return replace(fit, sample=pool.draws[picked], log_evidence=evidence)
 
 
 class _Pool:

@@ -25,6 +25,7 @@ from calib.gap.hypotheses import (
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.isolate import Isolability, isolability
 from calib.gap.noise import Noise
+from calib.gap.refine import refine
 from calib.gap.relevance import relevance
 from calib.models.base import Array
 from calib.sampling.mode import find_mode
@@ -38,8 +39,10 @@ _N_THRESHOLDS = 24
 _N_PAIR_SEEDS = 6
 _N_LEADING = 2
 _IDLE = "it changes nothing that the models of this case predict"
-# Draws for the relevance of a hypothesis: at first, and while it is still in play (nats).
-_QUICK, _CAREFUL, _IN_PLAY = 160, 3000, 7.0
+# Draws for the relevance of a hypothesis: at first, and while it is still in play.
+_QUICK, _CAREFUL = 160, 3000
+# A hypothesis is in play within so many nats of the best, its variants within so many of its best.
+_IN_PLAY, _BESIDE = 5.0, 3.0
 
 
 @dataclass(frozen=True)
@@ -103,7 +106,7 @@ def rank(data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS)
     fits["unknown"] = tuple(worker.fit(h) for h in others)
     for h in _promising_pairs(single, fits):
         fits[h.name] = (worker.fit_pair(h, [fits[e.name][0] for e in h.effects]),)
-    scores = _scored(fits, len(single), seed)
+    fits, scores = _scored(fits, len(single), seed)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
     probability = probabilities(log_evidence, len(single))
     return Ranking(fits, scores, log_evidence, probability, unable, lab_mode, design)
@@ -111,16 +114,22 @@ def rank(data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS)
 
 def _scored(
     fits: Mapping[str, tuple[Fit, ...]], n_single: int, seed: int
-) -> dict[str, tuple[float, ...]]:
-    """Score every variant, and with more care those that are still in play."""
+) -> tuple[dict[str, tuple[Fit, ...]], dict[str, tuple[float, ...]]]:
+    """Score every variant, and by draws of their posteriors those that are still in play."""
     scores = {name: [_score(f, seed, _QUICK) for f in group] for name, group in fits.items()}
     total = {name: max(values) + _ln_prior(name, n_single) for name, values in scores.items()}
     least = max(total.values()) - _IN_PLAY
+    refined = {name: list(group) for name, group in fits.items()}
     for name, values in scores.items():
+        beside = max(values) - _BESIDE
         for i, value in enumerate(values):
-            if value + _ln_prior(name, n_single) > least:
-                values[i] = _score(fits[name][i], seed, _CAREFUL)
-    return {name: tuple(values) for name, values in scores.items()}
+            if value > beside and value + _ln_prior(name, n_single) > least:
+                refined[name][i] = refine(fits[name][i], seed)
+                values[i] = _score(refined[name][i], seed, _CAREFUL)
+    return (
+        {name: tuple(group) for name, group in refined.items()},
+        {name: tuple(values) for name, values in scores.items()},
+    )
 
 
 def _score(found: Fit, seed: int, draws: int) -> float:

@@ -132,13 +132,14 @@ class BoundModel:
     model: Model
     references: References
 
-    def location(self, theta: Array, conditions: Conditions) -> Array:
-        """Predict on the scale of the response, shape (k, n)."""
+    def location(self, theta: Array, conditions: Conditions, rows: Rows | None = None) -> Array:
+        """Predict on the scale of the response, shape (k, n); rows if prepared before."""
         with np.errstate(all="ignore"):
             by_column = columns(np.atleast_2d(theta))
             shape = np.broadcast_shapes(by_column[0].shape, *(v.shape for v in conditions.values()))
             work = np.empty((N_WORK, *shape))
-            return self.model.location(by_column, self.prepare(conditions), self.references, work)
+            rows = self.prepare(conditions) if rows is None else rows
+            return self.model.location(by_column, rows, self.references, work)
 
     def prepare(self, conditions: Conditions) -> Rows:
         """Work out what the equation needs of conditions."""

@@ -96,9 +96,9 @@ def _along(fit: Fit) -> str:
     own = {output_word(name) for name in h.smooth_outputs}
     level = f"predicted {joined(sorted(own)).lower()}"
     along = {
-        "slip": "slip", "level": f"the {level}", "sinkage": "the predicted rut depth",
-        "order": "the order of the runs", "before": "how far the run before differed",
-        "all": "several conditions",
+        "slip": "slip", "ripple": "slip", "level": f"the {level}",
+        "sinkage": "the predicted rut depth", "order": "the order of the runs",
+        "before": "how far the run before differed", "all": "several conditions",
     }  # fmt: skip
     return along[h.smooth_over]
 
@@ -114,7 +114,8 @@ def _lead(found: Diagnosis, fit: Fit) -> str:
         on_top = f", on top of {h.effects[0].name.replace('_', ' ')}"
     elif h.shift > 0.0:
         on_top = ", on top of other parameter values"
-    return f"what is missing goes along with {_along(fit)}{on_top}"
+    waves = ", in short waves" if h.smooth_over == "ripple" else ""
+    return f"what is missing goes along with {_along(fit)}{waves}{on_top}"
 
 
 def _threshold(found: Diagnosis, fit: Fit) -> str:

@@ -39,7 +39,20 @@ def test_over_slip_it_is_cosines_of_slip_and_a_trend_with_pressure(data):
     np.testing.assert_allclose(curve, np.sqrt(2.0) * np.cos(np.pi * (slip + 1.0)), atol=1e-12)
 
 
-@pytest.mark.parametrize("over", ["slip", "level", "sinkage", "order", "all"])
+def test_ripples_are_of_any_length_down_to_a_twelfth_of_the_slips(data):
+    found = of(data, smooth_over="ripple")
+    sds = found.sds("drawbar_pull")
+    assert sds.size == 25
+    np.testing.assert_allclose(sds[1:], sds[1])
+    np.testing.assert_allclose(np.sum(sds[1:] ** 2), 1.0)
+    slip = found.covariates.scaled(data.view, "slip_ratio")
+    shortest = np.zeros((1, 25))
+    shortest[0, 24] = 1.0
+    curve = found.at(shortest, np.empty(0), data.view, "drawbar_pull")[0]
+    np.testing.assert_allclose(curve, np.sqrt(2.0) * np.cos(12.0 * np.pi * (slip + 1.0)))
+
+
+@pytest.mark.parametrize("over", ["slip", "ripple", "level", "sinkage", "order", "all"])
 def test_it_is_the_same_function_at_other_conditions(data, over):
     found = of(data, smooth_over=over)
     amplitudes = np.random.default_rng(1).standard_normal((3, found.sds("drawbar_pull").size))

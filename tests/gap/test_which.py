@@ -119,6 +119,19 @@ def test_waves_along_the_campaign_are_unknown():
     assert ranking.fits["unknown"][best].forward.hypothesis.smooth_over == "order"
 
 
+def test_short_waves_over_slip_are_neither_noise_nor_listed():
+    case = make_case(None, models=PULL_ONLY, n_field=36)
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    wave = np.sin(2.0 * np.pi * columns["slip_ratio"] / 0.09)
+    columns[OUTPUTS["drawbar_pull"]] = columns[OUTPUTS["drawbar_pull"]] + 0.15 * wave
+    few = {n: EFFECTS[n] for n in ("force_offset", "post_peak_softening", "lug_thrust")}
+    ranking = rank(campaigns(replace(case, field=table_from_arrays(columns))), 1, effects=few)
+    assert ranking.order[0] == "unknown"
+    assert ranking.probability["unknown"] > 0.9
+    best = int(np.argmax(ranking.scores["unknown"]))
+    assert ranking.fits["unknown"][best].forward.hypothesis.smooth_over == "ripple"
+
+
 def test_a_recorder_that_keeps_half_of_the_run_before_is_unknown():
     case = make_case(None, models=PULL_ONLY, n_field=36)
     columns = {name: np.array(v) for name, v in case.field.columns.items()}
