@@ -28,8 +28,10 @@ from calib.sampling.mode import prior_widths
 
 __all__ = ["FORM_ERROR", "Forward"]
 
-# Relative size by which a formula may misrepresent its effect along one direction.
-FORM_ERROR = 0.3
+# Relative size by which a formula may misrepresent its effect along one direction. With 0.3 the
+# mean log probability of the truth in 503 cases of `calib challenge make` (seeds 314159, 173205)
+# was less by 0.012 +- 0.008 and 0.028 +- 0.010.
+FORM_ERROR = 0.2
 # Inadequacy of a simulator at the end of the lab's range of a condition, in noise sds.
 MISFIT = 1.0
 MISFIT_OUTPUTS = ("bulk_density",)
