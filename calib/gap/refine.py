@@ -28,7 +28,7 @@ from calib.streams import generator
 
 __all__ = ["refine"]
 
-_ROUNDS, _SIZE, _FINAL, _KEPT = 7, 4000, 12000, 500
+_ROUNDS, _SIZE, _FINAL, _KEPT = 5, 3000, 8000, 500
 # Tails heavy enough for the long ends of sizes that an exponent makes up for.
 _DOF = 6.0
 # Fewer effective draws than this do not replace the normal.
@@ -84,25 +84,27 @@ class _Pool:
     def __init__(self, fit: Fit) -> None:
         self._fit = fit
         self._proposals: list[StudentT] = []
-        self._sizes: list[int] = []
         self.draws: Array = np.empty((0, fit.psi.size))
         self._log_joint: Array = np.empty(0)
+        # Of the mixture at each draw, each proposal times the number of its draws.
+        self._log_q: Array = np.empty(0)
+        self._log_sizes: list[float] = []
 
     def add(self, proposal: StudentT, rng: np.random.Generator, size: int) -> None:
         """Draw a round."""
         drawn = proposal.sample(rng, size)
         self._proposals.append(proposal)
-        self._sizes.append(size)
+        self._log_sizes.append(np.log(size))
+        before = np.logaddexp(self._log_q, self._log_sizes[-1] + proposal.log_prob(self.draws))
+        ways = zip(self._log_sizes, self._proposals, strict=True)
+        new = logsumexp([log_size + q.log_prob(drawn) for log_size, q in ways], axis=0)
         self.draws = np.concatenate([self.draws, drawn])
+        self._log_q = np.concatenate([before, new])
         self._log_joint = np.concatenate([self._log_joint, log_joint(self._fit, drawn)])
 
     def log_weight(self) -> Array:
         """Log weights of all draws, at most sqrt(k) times their mean, shape (k,)."""
-        log_q = [
-            np.log(size) + proposal.log_prob(self.draws)
-            for size, proposal in zip(self._sizes, self._proposals, strict=True)
-        ]
-        log_weight = self._log_joint - logsumexp(log_q, axis=0)
+        log_weight = self._log_joint - self._log_q
         log_weight = np.where(np.isfinite(log_weight), log_weight, -np.inf)
         most = logsumexp(log_weight) - 0.5 * np.log(log_weight.size)
         return np.asarray(np.minimum(log_weight, most))
