@@ -233,7 +233,7 @@ def _case_facts(found: Diagnosis) -> list[tuple[str, str]]:
     """What was compared with what."""
     case, facts = found.data.case, []
     for o in found.data.outputs:
-        noise = found.ranking.fits[best_of(found)][0].noise[o.name]
+        noise = found.ranking.best(best_of(found)).noise[o.name]
         axis = output_axis(found, o.name)
         grows = ""
         if noise.rho > 0.0:

@@ -407,3 +407,34 @@ def test_what_sets_in_at_low_pressure_is_said_so():
     assert lead.startswith("what is missing sets in below an inflation pressure of")
     assert 18.0 < float(lead.split(" of ")[1].split()[0]) < 30.0
     assert "in small steps about an inflation pressure of" in gap_evidence(found).look
+
+
+def test_short_waves_are_said_so_beside_the_noise_that_is_left():
+    from dataclasses import replace
+
+    import numpy as np
+    from gap.cases import PULL_ONLY, make_case
+
+    from calib.data import table_from_arrays
+    from calib.gap.diagnose import diagnose
+    from calib.gap.effects import EFFECTS
+    from calib.page.gap_sizes import size_sentences
+
+    # Lugs that pass one by one rock the pull by 0.15 kN; the noise is a fifth of that.
+    case = make_case(None, models=PULL_ONLY, n_field=36)
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    wave = np.sin(2.0 * np.pi * columns["slip_ratio"] / 0.09)
+    columns["drawbar_pull_kn"] = columns["drawbar_pull_kn"] + 0.15 * wave
+    case = replace(case, field=table_from_arrays(columns))
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")}
+    found = diagnose(case, 1, effects=few)
+    assert found.verdict == "unknown"
+    lead = size_sentences(found, "unknown")[0]
+    assert lead == "what is missing goes along with slip, in short waves"
+    assert "add runs over slip in small steps" in gap_evidence(found).look
+    reader = Reader()
+    reader.feed(render_diagnosis(found, [], {}, manifest={}))
+    # Of the variant that is believed, not of one that takes the waves for noise.
+    noise = re.search(r"noise sd of a reading ([0-9.]+) kN", reader.text)
+    assert noise is not None
+    assert float(noise[1]) < 0.08
