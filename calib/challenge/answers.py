@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 from scipy.stats import rankdata
 
 from calib.challenge.effects import NONE
@@ -68,6 +70,10 @@ class CaseAnswer:
         That were measured.
     problem : str
         Why the case failed, empty otherwise.
+    told_apart : float, optional
+        Probability that one who knows the truth and its nearest rival, both equally probable, and
+        what each does on this design, chooses the truth (linearised); None where nobody worked
+        that out.
     """
 
     case: str
@@ -79,6 +85,7 @@ class CaseAnswer:
     shrinks: tuple[ShrinkAnswer, ...]
     outputs: tuple[str, ...]
     problem: str = ""
+    told_apart: float | None = None
 
     @property
     def called(self) -> str:
@@ -226,9 +233,19 @@ def read_answer(name: str, entry: dict[str, Any], folder: Path) -> CaseAnswer:
         shrinks = _shrinks(entry, {}, {})
         text = f"{type(problem).__name__}: {problem}"
         return CaseAnswer(
-            name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs, text
-        )
+            name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs, text,
+            _told_apart(entry),
+        )  # fmt: skip
     located = None if entry["truth"] == NONE else located
     return CaseAnswer(
-        name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs
-    )
+        name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs,
+        told_apart=_told_apart(entry),
+    )  # fmt: skip
+
+
+def _told_apart(entry: Mapping[str, Any]) -> float | None:
+    """Two laws whose means lie d noise sds apart are told apart with probability Phi(d / 2)."""
+    if entry["truth"] in (NONE, entry.get("rival")) or "rival_nats" not in entry:
+        return None
+    nats = entry["rival_nats"]  # half the square of d; none without a rival
+    return 1.0 if nats is None else float(ndtr(np.sqrt(0.5 * nats)))

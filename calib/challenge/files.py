@@ -125,7 +125,7 @@ def case_files(rng: np.random.Generator, case: DrawnCase) -> CaseFiles:
         "isolable_gap": told.isolable_gap,
         "isolable_nats": told.isolable_nats,
         "rival": told.rival,
-        "rival_nats": told.rival_nats,
+        "rival_nats": told.rival_nats if np.isfinite(told.rival_nats) else None,
         "rival_gap": told.rival_gap,
         "noise_sd": _plain(stage.field_sd),
         "field_truth": _plain(case.field_truth),

@@ -26,9 +26,11 @@ class Identifiability:
     isolable_nats : float
         Cost of explaining the gap by a recalibration of plausible size.
     rival : str
-        The wrong single answer that comes nearest, or ``parameter_shift``.
+        The wrong single answer that comes nearest, ``parameter_shift`` among them; empty where
+        there is none.
     rival_nats : float
-        What the truth is ahead of that rival, the lab's parameter uncertainty allowed for.
+        What the truth is ahead of that rival, the lab's parameter uncertainty allowed for;
+        infinite without a rival.
     rival_gap : float
         The least that any listed effect together with a recalibration leaves.
     """
@@ -107,7 +109,7 @@ def identify(rng: np.random.Generator, stage: Stage, gap: Array, truth: str) -> 
     span = recalibration_span(stage.simulator, stage.field, stage.field_sd)
     isolable_nats = float(0.5 * gap @ whitener(span) @ gap)
     white = whitener(lab_uncertainty(stage))
-    rival, nats = SHIFT, isolable_nats
+    rival, nats = ("", np.inf) if truth == SHIFT else (SHIFT, isolable_nats)
     rival_gap = remaining(gap, span)
     for name, kind in LISTED.items():
         if not can_rival(stage, kind, truth):

@@ -126,6 +126,10 @@ class TierScore:
         Outputs with a gap for which no interval was stated.
     actual_shrink : Average
         Median over outputs with a gap.
+    told_apart : Average
+        Over cases with a gap, the probability to choose the truth rather than its nearest rival
+        for one who knows what both do on the design: how often the truth could be first if its
+        nearest rival were all there is.
     brier : Average
         Mean multi-class Brier score, 0 (best) to 2.
     reliability : tuple of ReliabilityBin
@@ -149,6 +153,7 @@ class TierScore:
     shrink_coverage: Proportion
     no_shrink_interval: Proportion
     actual_shrink: Average
+    told_apart: Average
     brier: Average
     reliability: tuple[ReliabilityBin, ...]
 
@@ -252,6 +257,7 @@ def score_tier(tier: str, answers: list[CaseAnswer]) -> TierScore:
         shrink_coverage=Proportion(sum(s.covered for s in stated), len(stated)),
         no_shrink_interval=Proportion(len(shrinks) - len(stated), len(shrinks)),
         actual_shrink=_average([s.actual for s in shrinks], np.median),
+        told_apart=_average([a.told_apart for a in gaps if a.told_apart is not None], np.mean),
         brier=_average([a.brier for a in answers], np.mean),
         reliability=_reliability([a for a in answers if a.ranked]),
     )

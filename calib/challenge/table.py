@@ -14,6 +14,7 @@ from calib.challenge.score import Average, Proportion, Score, TierScore
 _EXTRA = (
     ("top_1_all", "right hypothesis first, nulls included"),
     ("truth_probability_all", "mean probability of the truth, nulls included"),
+    ("told_apart", "truth told from its nearest rival alone"),
     ("no_shrink_interval", "outputs with a gap without a shrink interval"),
     ("brier", "Brier score (0 best, 2 worst)"),
 )

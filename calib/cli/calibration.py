@@ -170,9 +170,12 @@ def predict(
     run: Annotated[Path, typer.Argument(help="Folder of `calib fit` or `calib diagnose`.")],
     at: Annotated[Path, typer.Option(help="CSV with the conditions.")],
     out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
+    effects: Annotated[
+        Path | None, typer.Option(help="Python file with the effects of your own it was made with.")
+    ] = None,
     overwrite: _Overwrite = False,
 ) -> None:
-    """Predict with 50, 90 and 95 % bands at new conditions."""
+    """Predict at new conditions: with 50, 90 and 95 % bands; a diagnosis with 90 % bands."""
     if out is not None and out.exists() and not overwrite:
         raise CalibError(
             "the file exists already",
@@ -185,8 +188,13 @@ def predict(
     from calib.store import load_calibration
 
     if (run / "corrected.json").exists():
-        _predict_corrected(run, at, out)
+        _predict_corrected(run, at, out, effects)
         return
+    if effects is not None:
+        raise CalibError(
+            "only a diagnosis has effects", where=str(run), allowed="a folder of `calib diagnose`",
+            mend="leave --effects out",
+        )  # fmt: skip
     calibration = load_calibration(run)
     if not calibration.converged:
         print("calib: this calibration did not converge; its bands are not to be used",
@@ -210,14 +218,21 @@ def predict(
         raise typer.Exit(3)
 
 
-def _predict_corrected(run: Path, at: Path, out: Path | None) -> None:
+def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | None) -> None:
     """Predict with the corrected model of a diagnosis, beside the calibrated simulator."""
     from calib.data import read_for_model, write_table
     from calib.gap.corrected import load_corrected, predict_columns
+    from calib.gap.effects import EFFECTS
+    from calib.gap.effects.load import load_effects
 
-    corrected = load_corrected(run)
+    own = {} if effects is None else load_effects(effects)
+    corrected = load_corrected(run, {**EFFECTS, **own})
     used = {c for o in corrected.data.outputs for c in o.problem.bound.model.conditions}
-    columns = predict_columns(corrected, read_for_model(at, sorted(used)))
+    table = read_for_model(at, sorted(used))
+    columns = predict_columns(corrected, table)
+    if "run_order" in corrected.data.view.conditions and "run_order" not in table:
+        print("calib: no run_order is given: what depends on it is predicted as it stood at the "
+              "end of the campaign", file=sys.stderr)  # fmt: skip
     if out is not None:
         write_table(out, columns)
         print(out)

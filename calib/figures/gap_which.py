@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.figures.gap_rows import best_fit, best_of, output_rows, short_name
+from calib.figures.gap_rows import best_fit, best_of, short_name
 from calib.figures.labels import MINUS, NO_UNIT, joined, percent, short
 from calib.figures.plate import Plate
 from calib.figures.style import BLACK, BLUE, EMBER, GREY, ORANGE, SKY, VERMILION, note, panels
@@ -125,10 +125,11 @@ def placebos(found: Diagnosis) -> Placebo:
                 for o, r in fit.field_residuals.items()
             ]
         )
-    response = []
-    for own, o in zip(output_rows(found), found.data.outputs, strict=True):
-        before = o.problem.bound.to_response(own.before)
-        response.append((o.field - before) / reference[o.name])
+    before = found.corrected.calibrated(found.data.view.conditions)
+    response = [
+        (o.field - o.problem.bound.to_response(before[o.name][o.rows])) / reference[o.name]
+        for o in found.data.outputs
+    ]
     return Placebo(left, _rms(response))
 
 

@@ -16,6 +16,7 @@ from calib.data import Table, read_table
 from calib.errors import CalibError
 from calib.gap.effects import View
 from calib.gap.noise import At, noise_at_lab
+from calib.models import MODELS, get_model
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.priors import Priors
@@ -275,6 +276,12 @@ def campaigns(case: Case) -> Campaigns:
 
 def _output(case: Case, name: str, model: str) -> OutputData:
     column = OUTPUTS[name]
+    if get_model(model).output != column:
+        able = [m.name for m in MODELS.values() if m.output == column]
+        raise CalibError(
+            f"the model {model} does not predict {name}", where=f"[models] of {case.name}",
+            allowed=", ".join(able), mend="name a model of this output in case.toml",
+        )  # fmt: skip
     for table in (case.lab, case.field):
         if column not in table or not np.isfinite(table[column]).any():
             raise CalibError(

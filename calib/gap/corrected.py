@@ -155,7 +155,7 @@ def _load_fit(
         raise CalibError(
             f"the corrected model uses the effect {', '.join(unknown)}, which is not known here",
             allowed=", ".join(effects),
-            mend="pass the Python file that defines it",
+            mend="pass the Python file that defines it (`calib predict --effects FILE`)",
         )
     chosen = tuple(effects[name] for name in document["effects"])
     hypothesis = Hypothesis(

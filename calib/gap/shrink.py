@@ -24,7 +24,11 @@ _SURPRISE = 1.25
 
 @dataclass(frozen=True)
 class Shrink:
-    """Root-mean-square error of the noise-free prediction before and after the correction."""
+    """Root-mean-square error of the noise-free prediction before and after the correction.
+
+    The errors and the noise floor are posterior medians, the fraction is that of the errors, the
+    interval holds 90 % of the posterior of the fraction.
+    """
 
     rmse_before: float
     rmse_after: float
@@ -96,10 +100,9 @@ def _shrink_of(truth: Truth, before: Array, after: Array, name: str) -> Shrink |
 
     low, median, high = (quantile(fraction, q) for q in (0.05, 0.5, 0.95))
     left = max(1.0 - median, 1e-12)
-    return Shrink(
-        quantile(before_error, 0.5),
-        quantile(after_error, 0.5),
-        median,
-        (1.0 - left * (max(1.0 - low, left) / left) ** _SURPRISE, high),
-        quantile(floor, 0.5),
-    )
+    low = 1.0 - left * (max(1.0 - low, left) / left) ** _SURPRISE
+    errors = quantile(before_error, 0.5), quantile(after_error, 0.5)
+    # The errors' own ratio, so that the three numbers agree where people read them together.
+    stated = 1.0 - errors[1] / max(errors[0], 1e-12)
+    interval = min(low, stated), max(high, stated)
+    return Shrink(*errors, stated, interval, quantile(floor, 0.5))

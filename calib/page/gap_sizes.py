@@ -75,7 +75,10 @@ def where_to_look(found: Diagnosis) -> str:
     """Say which measurements would show what an effect that is not listed goes along with."""
     fit = best_fit(found, "unknown")
     h = fit.forward.hypothesis
-    largest = max(found.regions, key=lambda r: r.probability * abs(r.gap), default=None)
+    # Runs cannot be repeated at their place in the order, and waves have their largest gaps apart.
+    places = [] if h.smooth_over == "ripple" else found.regions
+    places = [r for r in places if "run_order" not in r.conditions]
+    largest = max(places, key=lambda r: r.probability * abs(r.gap), default=None)
     place = "" if largest is None else f" where the gap is largest ({region_text(largest)})"
     if (h.onset_over or h.smooth_over) == "all":
         vary = "one condition at a time, the others held"
@@ -83,6 +86,8 @@ def where_to_look(found: Diagnosis) -> str:
         vary = "in another order, and a condition several times in a row"
     elif h.onset_over is not None:
         vary = f"in small steps about {_threshold(found, fit)}, the other conditions held"
+    elif h.smooth_over == "ripple":
+        vary = "over slip in steps much smaller than the waves, the other conditions held"
     else:
         vary = f"over {_along(fit)} in small steps, the other conditions held"
     return (

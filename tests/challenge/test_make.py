@@ -119,6 +119,14 @@ def test_no_case_gives_its_answer_away(blind_test: BlindTest) -> None:
             assert not any(word in text for word in words)
 
 
+def test_nothing_is_its_own_rival(blind_test: BlindTest) -> None:
+    """A rival is a wrong answer: not the truth, nor a part of it."""
+    for case in open_key(blind_test.cases, blind_test.key)["cases"].values():
+        if case["truth"] != "none":
+            assert case["rival"] not in case["truth"].split("+")
+            assert (case["rival"] == "") == (case["rival_nats"] is None)
+
+
 def test_same_seed_same_bytes(blind_test: BlindTest, tmp_path: Path) -> None:
     """Two processes write what one wrote, byte for byte; another seed does not."""
     again = make(tmp_path / "c", tmp_path / "key.json", seed=5, n_cases=6, workers=2)

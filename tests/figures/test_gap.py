@@ -156,6 +156,13 @@ def test_placebos_are_on_one_noise(found):
     assert not any("+" in n for n in placebo.left if n != best)
 
 
+def test_placebos_do_not_depend_on_the_unit_that_is_drawn(found, monkeypatch):
+    in_kn = placebos(found)
+    monkeypatch.setattr("calib.figures.gap_rows._SMALL_PULL", np.inf)  # as a small wheel's, in N
+    assert output_axis(found, "drawbar_pull").unit == "N"
+    assert placebos(found).before == pytest.approx(in_kn.before)
+
+
 def test_what_no_effect_removes_is_explained(found):
     caption = placebo_plate(found).caption
     assert "Without any effect, none (noise), " in caption

@@ -75,6 +75,13 @@ def test_a_missing_output_is_named(campaign):
         campaigns(replace(case, **{campaign: table}))
 
 
+def test_a_model_of_another_output_is_refused():
+    case = replace(make_case(None), models={"rut_depth": "magic_formula"})
+    with pytest.raises(CalibError, match="magic_formula does not predict rut_depth") as refused:
+        campaigns(case)
+    assert "bekker, modified_bekker" in str(refused.value)
+
+
 def test_an_unknown_model_is_named():
     with pytest.raises(CalibError, match="no model 'spring'"):
         campaigns(replace(make_case(), models={"drawbar_pull": "spring"}))

@@ -5,13 +5,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from calib.data import table_from_arrays
+from calib.cli import app
+from calib.data import table_from_arrays, write_table
 from calib.errors import CalibError
 from calib.gap.corrected import load_corrected, predict_columns, save_corrected
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
-from tests.gap.cases import make_case
+from calib.gap.effects.load import load_effects
+from calib.outputs import OUTPUTS
+from tests.gap.cases import LARGE, PULL_ONLY, make_case
+from tests.gap.test_load_effects import write
 
 FEW = {name: EFFECTS[name] for name in ("force_offset", "rate_effect")}
 
@@ -50,3 +55,26 @@ def test_missing_covariates_are_named(saved):
     few = table_from_arrays({"slip_ratio": np.array([0.1])})
     with pytest.raises(CalibError, match="the corrected model needs"):
         predict_columns(load_corrected(folder), few)
+
+
+def test_an_effect_of_ones_own_is_passed_to_predict(tmp_path, capsys):
+    path = write(tmp_path)
+    case = make_case("force_offset", models=PULL_ONLY)
+    own = load_effects(path)
+    (tmp_path / "found").mkdir()
+    save_corrected(diagnose(case, 1, effects=own).corrected, tmp_path / "found")
+    conditions = {k: v for k, v in case.field.columns.items() if k not in OUTPUTS.values()}
+    write_table(tmp_path / "at.csv", {k: v for k, v in conditions.items() if k != "run_order"})
+    given = ["predict", str(tmp_path / "found"), "--at", str(tmp_path / "at.csv")]
+    refused = CliRunner().invoke(app, given)
+    assert isinstance(refused.exception, CalibError)
+    assert "--effects" in str(refused.exception)
+    done = CliRunner().invoke(app, [*given, "--effects", str(path)])
+    assert done.exit_code == 0
+    assert "no run_order is given" in done.stderr
+    header, *rows = done.stdout.splitlines()
+    values = np.array([row.split(",") for row in rows], float).T
+    columns = dict(zip(header.split(","), values, strict=True))
+    change = columns["drawbar_pull_kn_after"] - columns["drawbar_pull_kn_before"]
+    # The offset of the case, which the wind explains, to two noise sds of its mean and the lab's.
+    np.testing.assert_allclose(change.mean(), LARGE["force_offset"]["offset"], atol=0.02)

@@ -40,6 +40,7 @@ def test_a_known_gap_shrinks_to_what_is_not_known_of_it(data):
     # The median of |normal| is 0.674 sd.
     assert found.rmse_after == pytest.approx(0.00674, rel=0.1)
     assert found.fraction == pytest.approx(1.0 - 0.0337, abs=0.01)
+    assert found.fraction == pytest.approx(1.0 - found.rmse_after / found.rmse_before)
     low, high = found.interval
     # The 95th percentile of |normal| is 1.96 sd; its logarithm is set a quarter farther off.
     assert low == pytest.approx(1.0 - 0.674 * (1.96 / 0.674) ** 1.25 * 0.01 / 0.2, abs=0.02)
