@@ -232,6 +232,8 @@ def read_answer(name: str, entry: dict[str, Any], folder: Path) -> CaseAnswer:
         located = None if _localisation(entry, {}) is None else 0.5
         shrinks = _shrinks(entry, {}, {})
         text = f"{type(problem).__name__}: {problem}"
+        if isinstance(problem, FileNotFoundError):
+            text = "not diagnosed; go on with `calib challenge run`"
         return CaseAnswer(
             name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs, text,
             _told_apart(entry),

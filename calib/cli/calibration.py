@@ -221,7 +221,7 @@ def predict(
 def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | None) -> None:
     """Predict with the corrected model of a diagnosis, beside the calibrated simulator."""
     from calib.data import read_for_model, write_table
-    from calib.gap.corrected import load_corrected, predict_columns
+    from calib.gap.corrected import conditions_outside, load_corrected, predict_columns
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.load import load_effects
 
@@ -233,6 +233,10 @@ def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | No
     if "run_order" in corrected.data.view.conditions and "run_order" not in table:
         print("calib: no run_order is given: what depends on it is predicted as it stood at the "
               "end of the campaign", file=sys.stderr)  # fmt: skip
+    beyond = conditions_outside(corrected, table)
+    if beyond:
+        told = ", ".join(f"{name} in {count} rows" for name, count in beyond.items())
+        print(f"calib: outside what either campaign covered: {told}", file=sys.stderr)
     if out is not None:
         write_table(out, columns)
         print(out)

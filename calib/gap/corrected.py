@@ -27,7 +27,9 @@ from calib.gap.shrink import predict_fresh
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 
-__all__ = ["Corrected", "load_corrected", "predict_columns", "save_corrected"]
+__all__ = [
+    "Corrected", "conditions_outside", "load_corrected", "predict_columns", "save_corrected",
+]  # fmt: skip
 
 SCHEMA = "calib/corrected/1"
 
@@ -68,10 +70,14 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
     inner.mkdir()
     write_table(inner / "lab.csv", case.lab.columns)
     write_table(inner / "field.csv", case.field.columns)
-    models = "\n".join(f'{output} = "{model}"' for output, model in case.models.items())
-    (inner / "case.toml").write_text(
-        f'calibration = "lab.csv"\nfield = "field.csv"\n\n[models]\n{models}\n', encoding="utf-8"
-    )
+    files = ["calibration", "field"]
+    if case.fresh is not None:
+        write_table(inner / "fresh.csv", case.fresh.columns)
+        files.append("predict")
+    names = {"calibration": "lab.csv", "field": "field.csv", "predict": "fresh.csv"}
+    lines = [f'{name} = "{names[name]}"' for name in files]
+    lines += ["", "[models]", *(f'{output} = "{model}"' for output, model in case.models.items())]
+    (inner / "case.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     content = {
         "schema": SCHEMA,
         "seed": corrected.mixture.seed,
@@ -172,6 +178,31 @@ def _load_fit(
     if sample is not None and sample.shape[1:] != psi.shape:
         raise ValueError("shape")
     return Fit(forward, psi, covariance, noise, 0.0, 0.0, {}, sample)
+
+
+def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
+    """Count rows beyond what either campaign covered.
+
+    Parameters
+    ----------
+    corrected : Corrected
+    table : Table
+        New conditions.
+
+    Returns
+    -------
+    dict of str to int
+        Rows outside by condition; those without any are left out.
+    """
+    case, counts = corrected.data.case, {}
+    for name in corrected.data.view.conditions:
+        if name in OUTPUTS.values() or name not in table:
+            continue
+        known = np.concatenate([t[name] for t in (case.lab, case.field) if name in t])
+        margin = 1e-9 * max(1.0, float(np.nanmax(np.abs(known))))
+        low, high = float(np.nanmin(known)) - margin, float(np.nanmax(known)) + margin
+        counts[name] = int(((table[name] < low) | (table[name] > high)).sum())
+    return {name: count for name, count in counts.items() if count}
 
 
 def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array]:

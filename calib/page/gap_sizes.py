@@ -223,6 +223,10 @@ def _end_sentences(
         where, inside = _end(found, column, rows, change)
         mean = change.draws[:, inside].mean(axis=1)
         centre, sd = float(mean.mean()), float(mean.std())
+        if abs(centre) < 0.9 * np.sqrt(np.mean(np.square(change.draws.mean(axis=0)))):
+            # It does most elsewhere, or has both signs there: an end would understate it.
+            sentences += _rms_sentences(found, {output: change}, together=False)
+            continue
         if abs(centre) < _SMALL * float(change.noise[inside].mean()):
             continue
         unit = output_axis(found, output).unit

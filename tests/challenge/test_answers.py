@@ -34,3 +34,8 @@ def test_a_null_and_keys_that_do_not_say_are_left_out(tmp_path):
     # Keys of before named a shift as its own rival.
     own = {"rival": "parameter_shift", "rival_nats": 1.0}
     assert told_apart(tmp_path, "parameter_shift", **own) is None
+
+
+def test_a_case_without_a_diagnosis_says_how_to_go_on(tmp_path):
+    found = read_answer("case-000", entry("none", "easy"), tmp_path / "nowhere")
+    assert found.problem == "not diagnosed; go on with `calib challenge run`"

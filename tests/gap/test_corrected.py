@@ -10,7 +10,13 @@ from typer.testing import CliRunner
 from calib.cli import app
 from calib.data import table_from_arrays, write_table
 from calib.errors import CalibError
-from calib.gap.corrected import load_corrected, predict_columns, save_corrected
+from calib.gap.case import read_case
+from calib.gap.corrected import (
+    conditions_outside,
+    load_corrected,
+    predict_columns,
+    save_corrected,
+)
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
 from calib.gap.effects.load import load_effects
@@ -55,6 +61,24 @@ def test_missing_covariates_are_named(saved):
     few = table_from_arrays({"slip_ratio": np.array([0.1])})
     with pytest.raises(CalibError, match="the corrected model needs"):
         predict_columns(load_corrected(folder), few)
+
+
+def test_conditions_beyond_both_campaigns_are_counted(saved):
+    found, folder = saved
+    case = found.data.case
+    assert conditions_outside(load_corrected(folder), case.field) == {}
+    fast = {
+        **case.field.columns,
+        "speed_m_s": case.field["speed_m_s"] * np.array([30.0] + [1.0] * 26),
+    }
+    assert conditions_outside(load_corrected(folder), table_from_arrays(fast)) == {"speed_m_s": 1}
+
+
+def test_the_conditions_to_predict_are_kept(saved):
+    found, folder = saved
+    kept = read_case(folder / "case")
+    assert kept.fresh is not None
+    np.testing.assert_allclose(kept.fresh["slip_ratio"], found.data.case.fresh["slip_ratio"])
 
 
 def test_an_effect_of_ones_own_is_passed_to_predict(tmp_path, capsys):

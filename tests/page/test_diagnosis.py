@@ -431,10 +431,41 @@ def test_short_waves_are_said_so_beside_the_noise_that_is_left():
     assert found.verdict == "unknown"
     lead = size_sentences(found, "unknown")[0]
     assert lead == "what is missing goes along with slip, in short waves"
-    assert "add runs over slip in small steps" in gap_evidence(found).look
+    look = gap_evidence(found).look
+    assert look.startswith(
+        "repeat runs, and add runs over slip in steps much smaller than the waves"
+    )
     reader = Reader()
     reader.feed(render_diagnosis(found, [], {}, manifest={}))
     # Of the variant that is believed, not of one that takes the waves for noise.
     noise = re.search(r"noise sd of a reading ([0-9.]+) kN", reader.text)
     assert noise is not None
     assert float(noise[1]) < 0.08
+
+
+def test_what_comes_and_goes_is_not_told_by_its_end(tmp_path):
+    from dataclasses import replace
+
+    import numpy as np
+    from gap.cases import PULL_ONLY, make_case
+    from gap.test_load_effects import CODE, write
+
+    from calib.data import table_from_arrays
+    from calib.gap.diagnose import diagnose
+    from calib.gap.effects.load import load_effects
+    from calib.page.gap_sizes import size_sentences
+
+    # Wind on every other run: over the last runs its mean is half of what it is in a gust.
+    code = CODE.replace("phi[:, :1]", 'phi[:, :1] * (view.conditions["run_order"] % 2.0)')
+    code = code.replace("    outputs =", '    covariates = ("run_order",)\n    outputs =')
+    effects = load_effects(write(tmp_path, code))
+    case = make_case(None, models=PULL_ONLY, n_field=36)
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    gusts = 0.2 * (columns["run_order"] % 2.0)
+    columns["drawbar_pull_kn"] = columns["drawbar_pull_kn"] + gusts
+    found = diagnose(replace(case, field=table_from_arrays(columns)), 1, effects=effects)
+    assert found.ranking.order[0] == "cross_wind"
+    (sentence,) = size_sentences(found, "cross_wind")
+    size = re.search(r"changes by ([0-9.]+) ± [0-9.]+ kN rms over the field rows", sentence)
+    assert size is not None, sentence
+    assert float(size[1]) == pytest.approx(np.sqrt(np.mean(gusts**2)), abs=0.03)
