@@ -18,7 +18,9 @@ from calib.scores import LEVELS
 from calib.streams import generator
 from calib.threads import one_thread
 
-__all__ = ["Bands", "Prediction", "bands", "predict", "prediction_columns", "predictive_draws"]
+__all__ = [
+    "Bands", "Prediction", "bands", "outside", "predict", "prediction_columns", "predictive_draws",
+]  # fmt: skip
 
 N_DRAWS = 4000
 MIN_DEFINED = 0.95
@@ -118,7 +120,7 @@ def predict(calibration: Calibration, table: Table) -> Prediction:
         conditions,
         _join([p[0] for p in parts]),
         _join([p[1] for p in parts]),
-        _outside(problem.conditions, conditions),
+        outside(problem.conditions, conditions),
         np.concatenate([p[2] for p in parts]),
     )
 
@@ -203,9 +205,10 @@ def _names(header: str, output: str) -> bool:
     return column is not None and column.quantity.canonical == output
 
 
-def _outside(
+def outside(
     calibrated: Mapping[str, Array], conditions: Mapping[str, Array]
 ) -> tuple[tuple[str, ...], ...]:
+    """Name, for each row of conditions, those beyond the range of the calibrated ones."""
     n = next(iter(conditions.values())).size
     flags: list[list[str]] = [[] for _ in range(n)]
     for name, values in conditions.items():

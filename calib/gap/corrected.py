@@ -7,6 +7,7 @@ to. A correction is only as good as the diagnosis: its bands hold the doubt abou
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,7 @@ from calib.gap.noise import Noise
 from calib.gap.shrink import predict_fresh
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
+from calib.prediction import outside
 
 __all__ = [
     "Corrected", "conditions_outside", "load_corrected", "predict_columns", "save_corrected",
@@ -194,15 +196,14 @@ def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
     dict of str to int
         Rows outside by condition; those without any are left out.
     """
-    case, counts = corrected.data.case, {}
-    for name in corrected.data.view.conditions:
-        if name in OUTPUTS.values() or name not in table:
-            continue
-        known = np.concatenate([t[name] for t in (case.lab, case.field) if name in t])
-        margin = 1e-9 * max(1.0, float(np.nanmax(np.abs(known))))
-        low, high = float(np.nanmin(known)) - margin, float(np.nanmax(known)) + margin
-        counts[name] = int(((table[name] < low) | (table[name] > high)).sum())
-    return {name: count for name, count in counts.items() if count}
+    case = corrected.data.case
+    known = {
+        name: np.concatenate([t[name] for t in (case.lab, case.field) if name in t])
+        for name in corrected.data.view.conditions
+        if name not in OUTPUTS.values() and name in table
+    }
+    beyond = outside(known, {name: table[name] for name in known})
+    return dict(Counter(name for row in beyond for name in row))
 
 
 def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array]:

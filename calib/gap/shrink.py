@@ -26,8 +26,9 @@ _SURPRISE = 1.25
 class Shrink:
     """Root-mean-square error of the noise-free prediction before and after the correction.
 
-    The errors and the noise floor are posterior medians, the fraction is that of the errors, the
-    interval holds 90 % of the posterior of the fraction.
+    The errors and the noise floor are posterior medians, the fraction is that of the errors. The
+    interval is that of 90 % of the fraction's posterior with its lower end set farther off, by as
+    much as nature surprises, and reaches at least to the fraction.
     """
 
     rmse_before: float
