@@ -33,7 +33,7 @@ __all__ = [
     "Corrected", "conditions_outside", "load_corrected", "predict_columns", "save_corrected",
 ]  # fmt: skip
 
-SCHEMA = "calib/corrected/1"
+SCHEMA = "calib/corrected/2"
 
 
 class Corrected:
@@ -100,6 +100,7 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
         "name": h.name,
         "effects": [e.name for e in h.effects],
         "shift": h.shift,
+        "shift_as": h.shift_as,
         "smooth": h.smooth,
         "smooth_outputs": list(h.smooth_outputs),
         "smooth_over": h.smooth_over,
@@ -168,8 +169,9 @@ def _load_fit(
     chosen = tuple(effects[name] for name in document["effects"])
     hypothesis = Hypothesis(
         document["name"], chosen, tuple(effect_priors(data, e) for e in chosen),
-        document["shift"], document["smooth"], tuple(document["smooth_outputs"]),
-        document["smooth_over"], document["smooth_decay"], document["onset_over"],
+        document["shift"], document["shift_as"], document["smooth"],
+        tuple(document["smooth_outputs"]), document["smooth_over"], document["smooth_decay"],
+        document["onset_over"],
     )  # fmt: skip
     noise = {o: Noise(n["sigma"], n["rho"], n["kappa"]) for o, n in document["noise"].items()}
     forward = Forward(data, hypothesis, {o: n.sigma for o, n in noise.items()}, lab_mode)

@@ -12,6 +12,7 @@ from calib.gap.case import Campaigns
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.base import DENSITY, DRAWBAR, RUT
 from calib.gap.hypothesis import Hypothesis, SmoothOver
+from calib.gap.shifts import ShiftAs
 from calib.prior_files import default_prior_path, read_priors
 from calib.priors import Priors
 
@@ -37,6 +38,8 @@ PRIOR = {"none": 0.40, "unknown": 0.12, "parameter_shift": 0.12, "single": 0.36}
 LN_PAIR_TO_SINGLE = float(np.log(0.04))
 LN_PRIOR: Mapping[str, float] = {k: float(np.log(v)) for k, v in PRIOR.items()}
 SHIFTS = (0.1, 0.25, 0.6)
+# Part of the shifts in which the parameters move together, as another soil moves them.
+SOIL = 2.0 / 3.0
 # Sizes (noise sds) of a free discrepancy.
 SMOOTHS = (1.5, 5.0)
 # Size (noise sds) of a discrepancy that sets in beyond a threshold.
@@ -154,9 +157,16 @@ def remainders(data: Campaigns, best: Sequence[Hypothesis], n_single: int) -> li
     ]
 
 
-def shifts() -> list[Hypothesis]:
-    """Other parameter values in the field, by a little or a lot."""
-    return [Hypothesis("parameter_shift", shift=s, share=1.0 / len(SHIFTS)) for s in SHIFTS]
+def shifts(data: Campaigns) -> list[Hypothesis]:
+    """Other parameter values in the field, by a little or a lot, each by itself or as soils do."""
+    kinds: dict[ShiftAs, float] = {"alone": 1.0 - SOIL, "soil": SOIL}
+    if set(data.names) == {DENSITY}:
+        kinds = {"alone": 1.0}
+    return [
+        Hypothesis("parameter_shift", shift=size, shift_as=kind, share=share / len(SHIFTS))
+        for size in SHIFTS
+        for kind, share in kinds.items()
+    ]
 
 
 def pair(a: Hypothesis, b: Hypothesis) -> Hypothesis:

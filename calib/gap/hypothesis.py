@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from calib.gap.effects import Effect
+from calib.gap.shifts import ShiftAs
 from calib.priors import Priors
 
 __all__ = ["Hypothesis", "OnsetOver", "SmoothOver"]
@@ -26,6 +27,8 @@ class Hypothesis:
     effect_priors : tuple of Priors
     shift : float
         Prior sd of parameter shifts in units of the parameters' own prior sds; 0 for none.
+    shift_as : {"alone", "soil"}
+        Whether parameters shift each by itself, or together as with another soil.
     smooth : float
         Prior sd of a free discrepancy, in units of the noise; 0 for none.
     smooth_outputs : tuple of str
@@ -50,6 +53,7 @@ class Hypothesis:
     effects: tuple[Effect, ...] = ()
     effect_priors: tuple[Priors, ...] = ()
     shift: float = 0.0
+    shift_as: ShiftAs = "alone"
     smooth: float = 0.0
     smooth_outputs: tuple[str, ...] = ()
     smooth_over: SmoothOver = "all"

@@ -94,7 +94,7 @@ def rank(data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS)
     unable |= dict.fromkeys(design.idle, _IDLE)
     worker = _Worker(data, lab_mode, noise, seed)
     fits: dict[str, tuple[Fit, ...]] = {"none": (worker.fit(Hypothesis("none")),)}
-    fits["parameter_shift"] = tuple(worker.fit(h) for h in shifts())
+    fits["parameter_shift"] = tuple(worker.fit(h) for h in shifts(data))
     for h in single:
         fits[h.name] = (worker.fit(h),)
     best = sorted(

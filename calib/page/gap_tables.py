@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,13 +18,14 @@ from calib.figures.gap_rows import (
 )
 from calib.figures.gap_which import placebos
 from calib.figures.labels import MINUS
+from calib.gap.case import OutputData
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
 from calib.numbers import format_number, format_value
 from calib.page.gap_verdict import TIE, odds_text, repeats_needed
 from calib.priors import Prior
 
-__all__ = ["conditions_text", "hypothesis_groups", "next_rows", "parameter_text"]
+__all__ = ["conditions_text", "hypothesis_groups", "next_rows", "parameter_text", "shift_sizes"]
 
 _POSSIBLE = 0.01
 # An sd above this part of the prior's says that the data did not narrow the parameter.
@@ -75,7 +77,7 @@ def _sizes(found: Diagnosis, name: str) -> list[Markup]:
     fit = best_fit(found, name)
     hypothesis = fit.forward.hypothesis
     if hypothesis.shift > 0.0:
-        return _shifts(found, fit)
+        return shift_sizes(found.data.outputs, fit)
     sd = np.sqrt(np.diag(fit.covariance))
     sizes = []
     for effect, priors, part in zip(
@@ -128,13 +130,22 @@ def parameter_text(prior: Prior, value: float, sd: float) -> str:
     return f"{format_value(value, sd)}{unit}{mark}"
 
 
-def _shifts(found: Diagnosis, fit: Fit) -> list[Markup]:
-    """Shifts of the simulator's parameters that stand out from their own sd."""
-    sd = np.sqrt(np.diag(fit.covariance))
+def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
+    """Write the shifts of the simulators' parameters that stand out from their own sd.
+
+    Parameters
+    ----------
+    outputs : sequence of OutputData
+    fit : Fit
+        Of a parameter shift.
+    """
+    part = fit.forward.shift_slice
     sizes = []
-    for o in found.data.outputs:
-        part = fit.forward.shift_slices[o.name]
-        for prior, value, s in zip(o.priors.free, fit.psi[part], sd[part], strict=True):
+    for o in outputs:
+        matrix = fit.forward.shift_maps[o.name]
+        shifts = matrix @ fit.psi[part]
+        sds = np.sqrt(np.einsum("ij,jk,ik->i", matrix, fit.covariance[part, part], matrix))
+        for prior, value, s in zip(o.priors.free, shifts, sds, strict=True):
             if abs(value) < 1.645 * s:
                 continue
             factor = 100.0 if prior.log else 1.0

@@ -95,7 +95,7 @@ def _hypothesis(data: Campaigns, truth: str, rng: np.random.Generator) -> Hypoth
     if truth == "none":
         return Hypothesis("none")
     if truth in ("parameter_shift", "unknown"):
-        variants = shifts() if truth == "parameter_shift" else unknowns(data)
+        variants = shifts(data) if truth == "parameter_shift" else unknowns(data)
         share = np.array([h.share for h in variants])
         return variants[int(rng.choice(share.size, p=share / share.sum()))]
     able, unable = split_testable(data)

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.gap.case import campaigns
-from calib.gap.forward import SHIFT_DIFFERENCE, Forward
-from calib.gap.hypotheses import unknowns
+from calib.data import table_from_arrays
+from calib.gap.case import Case, campaigns
+from calib.gap.forward import Forward
+from calib.gap.hypotheses import SHIFTS, shifts, unknowns
 from calib.gap.hypothesis import Hypothesis
-from calib.sampling.mode import prior_widths
-from gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
+from gap.cases import DENSITY, MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
 
 SIGMA = {o: NOISE[o] for o in MODELS}
 
@@ -85,22 +85,28 @@ def test_below_a_pressure_the_output_is_off_by_a_constant_and_by_part_of_its_lev
     np.testing.assert_allclose(gap[1, low], 0.1 * level[low], rtol=1e-3, atol=1e-5)
 
 
-def test_another_soil_changes_all_pressures_alike_and_shapes_less(data):
-    forward = Forward(data, Hypothesis("parameter_shift", shift=0.25), SIGMA)
-    rng = np.random.default_rng(1)
-    drawn = forward.priors.sample(rng, 20_000)
-    by_name = {}
-    for o in data.outputs:
-        moved = drawn[:, forward.shift_slices[o.name]] @ forward._shift_maps[o.name].T
-        for name, values, width in zip(
-            o.priors.names, moved.T, prior_widths(o.priors), strict=True
-        ):
-            by_name[name] = values / width
-    sds = {name: float(values.std()) for name, values in by_name.items()}
-    assert sds["D_lo"] == pytest.approx(0.25 * np.hypot(1.0, SHIFT_DIFFERENCE), rel=0.03)
-    assert sds["z_ref"] == pytest.approx(0.25, rel=0.03)
-    for name in ("K_bend", "D_bend", "G_bend", "n1"):
-        assert sds[name] == pytest.approx(0.25 * SHIFT_DIFFERENCE, rel=0.03)
-    between = float(np.corrcoef(by_name["D_lo"], by_name["D_hi"])[0, 1])
-    d2 = SHIFT_DIFFERENCE**2
-    assert between == pytest.approx((1.0 - d2) / (1.0 + d2), abs=0.01)
+def test_parameters_shift_by_themselves_or_as_with_another_soil_in_every_size(data):
+    found = {(h.shift, h.shift_as): h.share for h in shifts(data)}
+    assert set(found) == {(size, kind) for size in SHIFTS for kind in ("alone", "soil")}
+    assert sum(found.values()) == pytest.approx(1.0)
+    assert found[SHIFTS[0], "soil"] == pytest.approx(2.0 * found[SHIFTS[0], "alone"])
+
+
+def test_densities_know_no_soil_that_moves_wheels():
+    rng = np.random.default_rng(3)
+    tables = []
+    for n in (20, 15):
+        water, cone = rng.uniform(0.05, 0.2, n), rng.uniform(300.0, 2000.0, n)
+        density = 1.2 + 0.05 * np.log(cone / 300.0) + 0.02 * rng.standard_normal(n)
+        tables.append(
+            table_from_arrays(
+                {
+                    "gravimetric_water_content": water,
+                    "cone_index_kpa": cone,
+                    "bulk_density_g_cm3": density,
+                }
+            )
+        )
+    data = campaigns(Case("density", tables[0], tables[1], DENSITY))
+    assert [h.shift_as for h in shifts(data)] == ["alone"] * len(SHIFTS)
+    assert sum(h.share for h in shifts(data)) == pytest.approx(1.0)

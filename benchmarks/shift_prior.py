@@ -1,0 +1,172 @@
+"""Where priors/shifts/another_soil.toml comes from: `python benchmarks/shift_prior.py`.
+
+Other soils are drawn by the mechanics of `calib challenge make`, the campaigns on them fitted with
+a shift of every parameter by itself, and the covariance of the true shifts estimated by
+expectation-maximisation: each case is a normal likelihood of its shift, each shift a normal draw of
+one covariance times an unknown size. Half of the cases judge what the other half gave.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from calib.challenge.make import make_case
+from calib.gap.case import campaigns, read_case
+from calib.gap.fit import fit
+from calib.gap.forward import Forward
+from calib.gap.hypotheses import SHIFTS
+from calib.gap.hypothesis import Hypothesis
+from calib.gap.shifts import DIFFERENCE, quantities
+from calib.gap.which import calibrate_lab
+from calib.sampling.mode import prior_widths
+from calib.tasks import completed
+from calib.threads import one_thread
+
+type Array = NDArray[np.float64]
+
+QUANTITIES = (
+    "K", "D", "G", "C", "K_difference", "D_difference", "G_difference", "K_bend", "D_bend",
+    "G_bend", "z_ref", "n0", "n1",
+)  # fmt: skip
+SIZES = (0.05, 0.1, 0.2, 0.4, 0.8)
+WAYS = 3
+# Off-diagonal elements are believed to four fifths: 300 cases of one mechanics are not all soils.
+BELIEVED = 0.8
+_ROUNDS = 150
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A case's likelihood of its shift: precision and precision times mean."""
+
+    precision: Array
+    pull: Array
+
+
+def see(seed: np.random.SeedSequence, tier: str) -> Seen | None:
+    """Draw a shift and fit it; None if the case measures no wheel."""
+    with tempfile.TemporaryDirectory() as folder, one_thread():
+        make_case(seed, tier, "parameter_shift").write(Path(folder))  # type: ignore[arg-type]
+        data = campaigns(read_case(Path(folder)))
+        lab_mode, noise = calibrate_lab(data, 0)
+        fits = []
+        for size in SHIFTS:
+            hypothesis = Hypothesis("parameter_shift", shift=size)
+            sigma = {o: n.sigma for o, n in noise.items()}
+            forward = Forward(data, hypothesis, sigma, lab_mode)
+            start = np.array([p.loc for p in forward.priors.free])
+            for o in data.outputs:
+                start[forward.theta_slices[o.name]] = lab_mode[o.name]
+            fits.append(fit(data, forward, start, noise))
+    best = max(fits, key=lambda f: f.log_evidence)
+    part = best.forward.shift_slice
+    names, widths = [], []
+    for o in data.outputs:
+        kinds = quantities(o.priors.names)
+        names += [k if o.name != "bulk_density" else "" for k in kinds]
+        widths += prior_widths(o.priors).tolist()
+    at = [i for i, name in enumerate(names) if name in QUANTITIES]
+    if not at:
+        return None
+    to = [QUANTITIES.index(names[i]) for i in at]
+    own = np.linalg.inv(best.covariance[part, part])
+    prior = np.array([p.scale for p in best.forward.priors.free[part]]) ** -2.0
+    width = np.array(widths)[at]
+    precision, pull = np.zeros((len(QUANTITIES),) * 2), np.zeros(len(QUANTITIES))
+    precision[np.ix_(to, to)] = (own - np.diag(prior))[np.ix_(at, at)] * np.outer(width, width)
+    pull[to] = (own @ best.psi[part])[at] * width
+    return Seen(precision, pull)
+
+
+def weigh(case: Seen, covariance: Array) -> tuple[Array, list[tuple[Array, Array]]]:
+    """Log evidence of each size, and the posterior (covariance, mean) of the shift with it."""
+    evidence, posterior = [], []
+    for size in SIZES:
+        prior = covariance * size**2
+        inner = np.eye(len(prior)) + prior @ case.precision
+        spread = np.linalg.solve(inner, prior)
+        mean = spread @ case.pull
+        evidence.append(-0.5 * np.linalg.slogdet(inner)[1] + 0.5 * case.pull @ mean)
+        posterior.append((spread, mean))
+    return np.array(evidence), posterior
+
+
+def alone() -> Array:
+    """Return the covariance of parameters that shift each by itself."""
+    lesser = [q.endswith(("_bend", "_difference")) or q == "n1" for q in QUANTITIES]
+    return np.diag(np.where(lesser, DIFFERENCE**2, 1.0))
+
+
+def estimate(cases: list[Seen]) -> Array:
+    """Return the covariance of the shifts, K, D and z_ref moving by one prior sd on average."""
+    covariance = alone()
+    for _ in range(_ROUNDS):
+        total = np.zeros_like(covariance)
+        for case in cases:
+            evidence, posterior = weigh(case, covariance)
+            weights = np.exp(evidence - evidence.max())
+            for w, size, (spread, mean) in zip(
+                weights / weights.sum(), SIZES, posterior, strict=True
+            ):
+                total += w * (spread + np.outer(mean, mean)) / size**2
+        covariance = 0.5 * (total + total.T) / len(cases)
+        main = [QUANTITIES.index(name) for name in ("K", "D", "z_ref")]
+        covariance /= np.exp(np.mean(np.log(np.diag(covariance)[main])))
+    return covariance
+
+
+def in_ways(covariance: Array) -> tuple[Array, Array]:
+    """Loadings on the main ways in which soils differ, and the sd of what is left to each."""
+    values, vectors = np.linalg.eigh(covariance)
+    ways = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, ::-1][:, :WAYS] * np.sqrt(BELIEVED)
+    ways *= np.sign(ways[QUANTITIES.index("z_ref")])
+    own = np.sqrt(np.maximum(np.diag(covariance) - np.square(ways).sum(axis=1), 0.0))
+    return ways.round(2), own.round(2)
+
+
+def gained(cases: list[Seen], covariance: Array) -> Array:
+    """Log evidence of each case with a covariance less that with parameters on their own."""
+
+    def total(by: Array) -> Array:
+        found = np.array([weigh(case, by)[0] for case in cases])
+        return np.asarray(logsumexp(found, axis=1))
+
+    return total(covariance) - total(alone())
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seed", type=int, default=8812)
+    parser.add_argument("--cases", type=int, default=300)
+    parser.add_argument("--workers", type=int, default=2)
+    options = parser.parse_args()
+    seeds = np.random.SeedSequence(options.seed).spawn(options.cases)
+    jobs = {f"{i:04d}": (s, ("easy", "hard")[i % 2]) for i, s in enumerate(seeds)}
+    found = {t.name: t.result for t in completed(_see, jobs, workers=options.workers)}
+    cases = [case for name in jobs if (case := found[name]) is not None]
+    ways, own = in_ways(estimate(cases[::2]))
+    gain = gained(cases[1::2], ways @ ways.T + np.diag(own**2))
+    low, middle, high = np.quantile(gain, [0.05, 0.5, 0.95])
+    print(
+        f"# {len(cases)} cases; of the half not used: {gain.mean():+.2f} nats on average, "
+        f"{low:+.1f} / {middle:+.1f} / {high:+.1f} (5, 50, 95 %)"
+    )
+    ways, own = in_ways(estimate(cases))
+    for name, row, left in zip(QUANTITIES, ways.tolist(), own.tolist(), strict=True):
+        print(f"\n[parameters.{name}]\nways = {row}\nown = {left}")
+
+
+def _see(job: tuple[np.random.SeedSequence, str]) -> Seen | None:
+    return see(*job)
+
+
+if __name__ == "__main__":
+    main()

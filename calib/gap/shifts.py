@@ -1,0 +1,160 @@
+"""How the simulators' parameters may shift in the field: each alone, or together as soils do."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from calib.errors import CalibError
+from calib.gap.case import OutputData
+from calib.models.base import Array
+from calib.prior_files import default_prior_path
+from calib.sampling.mode import prior_widths
+
+__all__ = ["DIFFERENCE", "ShiftAs", "another_soil", "quantities", "shift_map"]
+
+type ShiftAs = Literal["alone", "soil"]
+
+# Shifts of how a parameter varies with pressure or slip, relative to those of its value.
+DIFFERENCE = 0.2
+# The same quantity under another name: the exponent of plain Bekker is that without slip.
+_SAME = {"n": "n0"}
+
+
+class _Row(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    ways: tuple[float, ...]
+    own: float = Field(ge=0.0)
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    unit: str
+    reason: str = Field(min_length=1)
+    source: str = Field(min_length=1)
+    ways: tuple[str, ...]
+    parameters: dict[str, _Row]
+
+
+def another_soil() -> dict[str, tuple[Array, float]]:
+    """Read how quantities move together when the soil is another one.
+
+    Returns
+    -------
+    dict
+        Quantity to its loadings on the ways in which soils differ, shape (ways,), and the sd of
+        what it does by itself; in units of the prior sds.
+
+    Raises
+    ------
+    CalibError
+        If the prior file cannot be read or is not complete.
+    """
+    path = default_prior_path("shifts/another_soil")
+    try:
+        file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
+    except (OSError, tomllib.TOMLDecodeError, ValidationError) as error:
+        raise CalibError(
+            f"the prior of parameter shifts cannot be read ({error})", where=str(path),
+            mend="install the package again",
+        ) from None  # fmt: skip
+    if any(len(row.ways) != len(file.ways) for row in file.parameters.values()):
+        raise CalibError(
+            "a parameter has not as many loadings as there are ways", where=str(path),
+            allowed=f"{len(file.ways)} numbers each", mend="correct it",
+        )  # fmt: skip
+    return {name: (np.array(row.ways), row.own) for name, row in file.parameters.items()}
+
+
+def quantities(names: Sequence[str]) -> list[str]:
+    """Name the coordinates in which a model's shifts are described.
+
+    The values at the two end pressures, K_lo and K_hi, become K, which both share, and
+    K_difference, half of what they differ by.
+    """
+    found = []
+    for name in names:
+        stem, _, end = name.rpartition("_")
+        if end in ("lo", "hi") and {f"{stem}_lo", f"{stem}_hi"} <= set(names):
+            found.append(stem if end == "lo" else f"{stem}_difference")
+        else:
+            found.append(_SAME.get(name, name))
+    return found
+
+
+def shift_map(
+    outputs: Sequence[OutputData], shift_as: ShiftAs
+) -> tuple[dict[str, Array], list[float]]:
+    """Map shift coordinates to shifts of each output's parameters.
+
+    Another soil changes the traction curve at all pressures, and the exponent of sinkage at all
+    slips, much alike: the values at the two end pressures share one shift, and differ by less, as
+    the bends between them and the exponent's growth with slip (n1) do. With "soil", what a softer
+    soil does to the traction curve goes along with what it does to the ruts.
+
+    Parameters
+    ----------
+    outputs : sequence of OutputData
+    shift_as : {"alone", "soil"}
+
+    Returns
+    -------
+    dict of str to ndarray, shape (d, k)
+        By output: shifts of its d parameters per unit of the k coordinates.
+    list of float
+        Prior sds of the coordinates for shifts of one prior sd.
+    """
+    blocks: list[Array] = []
+    kinds: list[str] = []
+    parts = {}
+    for o in outputs:
+        names = quantities(o.priors.names)
+        parts[o.name] = slice(len(kinds), len(kinds) + len(names))
+        # Densities have no part in what soils do to wheels.
+        kinds += names if o.name != "bulk_density" else [f"density.{name}" for name in names]
+        blocks.append(prior_widths(o.priors)[:, None] * _unfold(names))
+    matrix = _diagonal(blocks)
+    sds = np.array([DIFFERENCE if _lesser(kind) else 1.0 for kind in kinds])
+    if shift_as == "soil":
+        matrix = matrix @ _together(kinds, sds)
+        sds = np.ones(sds.size)
+    return {name: matrix[part] for name, part in parts.items()}, sds.tolist()
+
+
+def _lesser(kind: str) -> bool:
+    return kind.endswith(("_bend", "_difference")) or kind == "n1"
+
+
+def _unfold(names: Sequence[str]) -> Array:
+    """From what end pressures share and differ by to their values, shape (d, d)."""
+    matrix = np.eye(len(names))
+    for j, name in enumerate(names):
+        if name.endswith("_difference"):
+            i = names.index(name.removesuffix("_difference"))
+            matrix[i, j], matrix[j, i] = -1.0, 1.0
+    return matrix
+
+
+def _diagonal(blocks: Sequence[Array]) -> Array:
+    size = sum(len(block) for block in blocks)
+    matrix, start = np.zeros((size, size)), 0
+    for block in blocks:
+        matrix[start : start + len(block), start : start + len(block)] = block
+        start += len(block)
+    return matrix
+
+
+def _together(kinds: Sequence[str], alone: Array) -> Array:
+    """Square root of the covariance of the quantities, shape (k, k)."""
+    known = another_soil()
+    covariance = np.diag(alone**2)
+    at = [i for i, kind in enumerate(kinds) if kind in known]
+    if at:
+        ways = np.stack([known[kinds[i]][0] for i in at])
+        own = np.array([known[kinds[i]][1] for i in at])
+        covariance[np.ix_(at, at)] = ways @ ways.T + np.diag(own**2)
+    return np.asarray(np.linalg.cholesky(covariance))

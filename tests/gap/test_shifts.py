@@ -1,0 +1,157 @@
+"""How parameters shift: each alone, or together as with another soil."""
+
+from __future__ import annotations
+
+import tomllib
+
+import numpy as np
+import pytest
+
+from calib.errors import CalibError
+from calib.gap import shifts as module
+from calib.gap.case import campaigns
+from calib.gap.corrected import Corrected, load_corrected, predict_columns, save_corrected
+from calib.gap.fit import Fit
+from calib.gap.forward import Forward
+from calib.gap.hypothesis import Hypothesis
+from calib.gap.mixture import Mixture
+from calib.gap.noise import Noise
+from calib.gap.shifts import DIFFERENCE, another_soil, quantities
+from calib.models import MODELS as KNOWN
+from calib.page.gap_tables import shift_sizes
+from calib.prior_files import default_prior_path
+from calib.sampling.mode import prior_widths
+from gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case
+
+SIGMA = {o: NOISE[o] for o in MODELS}
+SIZE = 0.25
+
+
+@pytest.fixture(scope="module")
+def data():
+    return campaigns_of(None)
+
+
+def drawn_shifts(data, shift_as) -> dict[str, np.ndarray]:
+    """Shifts of each parameter in units of its prior sd, drawn from the prior."""
+    forward = Forward(data, Hypothesis("parameter_shift", shift=SIZE, shift_as=shift_as), SIGMA)
+    psi = forward.priors.sample(np.random.default_rng(1), 40_000)[:, forward.shift_slice]
+    return {
+        name: (psi @ forward.shift_maps[o.name].T)[:, i] / width
+        for o in data.outputs
+        for i, (name, width) in enumerate(zip(o.priors.names, prior_widths(o.priors), strict=True))
+    }
+
+
+def test_end_pressures_share_a_shift_and_differ_by_another():
+    assert quantities(("K_lo", "K_hi", "K_bend", "C")) == ["K", "K_difference", "K_bend", "C"]
+    assert quantities(("K", "Sh")) == ["K", "Sh"]
+    assert quantities(("z_ref", "n")) == ["z_ref", "n0"]
+
+
+def test_alone_all_pressures_change_alike_and_shapes_less(data):
+    drawn = drawn_shifts(data, "alone")
+    sds = {name: float(values.std()) for name, values in drawn.items()}
+    assert sds["D_lo"] == pytest.approx(SIZE * np.hypot(1.0, DIFFERENCE), rel=0.03)
+    assert sds["z_ref"] == pytest.approx(SIZE, rel=0.03)
+    for name in ("K_bend", "D_bend", "G_bend", "n1"):
+        assert sds[name] == pytest.approx(SIZE * DIFFERENCE, rel=0.03)
+    between = float(np.corrcoef(drawn["D_lo"], drawn["D_hi"])[0, 1])
+    d2 = DIFFERENCE**2
+    assert between == pytest.approx((1.0 - d2) / (1.0 + d2), abs=0.01)
+    assert np.corrcoef(drawn["D_lo"], drawn["z_ref"])[0, 1] == pytest.approx(0.0, abs=0.02)
+
+
+def test_with_another_soil_they_covary_as_the_prior_file_says(data):
+    file = tomllib.loads(default_prior_path("shifts/another_soil").read_text())["parameters"]
+    ways = {name: np.array(row["ways"]) for name, row in file.items()}
+    drawn = drawn_shifts(data, "soil")
+    shared = {
+        "K": 0.5 * (drawn["K_lo"] + drawn["K_hi"]),
+        "K_difference": 0.5 * (drawn["K_hi"] - drawn["K_lo"]),
+        "D": 0.5 * (drawn["D_lo"] + drawn["D_hi"]),
+        "z_ref": drawn["z_ref"],
+        "n0": drawn["n0"],
+        "n1": drawn["n1"],
+    }
+    for a, x in shared.items():
+        for b, y in shared.items():
+            expected = ways[a] @ ways[b] + (file[a]["own"] ** 2 if a == b else 0.0)
+            scale = x.std() * y.std()
+            assert np.mean(x * y) == pytest.approx(SIZE**2 * expected, abs=0.03 * scale), (a, b)
+
+
+def test_a_softer_soil_gives_less_pull_and_deeper_ruts(data):
+    drawn = drawn_shifts(data, "soil")
+    assert np.corrcoef(drawn["D_lo"], drawn["z_ref"])[0, 1] < -0.2
+    assert np.corrcoef(drawn["K_lo"], drawn["D_lo"])[0, 1] > 0.3
+
+
+def test_what_the_file_does_not_know_shifts_by_itself():
+    data = campaigns(make_case(None, models=PULL_ONLY))
+    drawn = drawn_shifts(data, "soil")
+    assert drawn["Sh"].std() == pytest.approx(SIZE, rel=0.03)
+    assert np.corrcoef(drawn["Sh"], drawn["D"])[0, 1] == pytest.approx(0.0, abs=0.02)
+
+
+def test_the_prior_names_quantities_of_the_models_and_says_where_it_comes_from():
+    known = {q for m in KNOWN.values() for q in quantities(m.parameters)}
+    assert set(another_soil()) <= known
+    content = tomllib.loads(default_prior_path("shifts/another_soil").read_text())
+    for key in ("unit", "reason", "source"):
+        assert len(content[key]) > 5
+    assert len(content["ways"]) == len(next(iter(another_soil().values()))[0])
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("ways = [", "cannot be read"),
+        ('unit = "1"\nreason = "x"\nsource = "y"\nways = []\n', "cannot be read"),
+        (
+            'unit = "1"\nreason = "x"\nsource = "y"\nways = ["a", "b"]\n'
+            "[parameters.K]\nways = [1.0]\nown = 0.5\n",
+            "as many loadings",
+        ),
+    ],
+)
+def test_a_damaged_prior_is_refused(tmp_path, monkeypatch, text, said):
+    (tmp_path / "another_soil.toml").write_text(text)
+    monkeypatch.setattr(module, "default_prior_path", lambda _: tmp_path / "another_soil.toml")
+    with pytest.raises(CalibError, match=said):
+        another_soil()
+
+
+def fitted(data) -> Fit:
+    """A soil that shifted by one sd of its first coordinate."""
+    forward = Forward(data, Hypothesis("parameter_shift", shift=SIZE, shift_as="soil"), SIGMA)
+    psi = np.array([p.loc for p in forward.priors.free])
+    psi[forward.shift_slice.start] = SIZE
+    noise = {o: Noise(s) for o, s in SIGMA.items()}
+    return Fit(forward, psi, 1e-4 * np.eye(psi.size), noise, 0.0, 0.0, {})
+
+
+def test_the_page_tells_the_shift_of_each_parameter_not_of_a_coordinate(data):
+    fit = fitted(data)
+    matrix = fit.forward.shift_maps["drawbar_pull"]
+    names = data.outputs[0].priors.names
+    said = " ".join(shift_sizes(data.outputs, fit))
+    for name in ("K_lo", "K_hi"):
+        i = names.index(name)
+        value = 100.0 * SIZE * matrix[i, 0]
+        sd = 100.0 * 1e-2 * np.linalg.norm(matrix[i])
+        assert abs(value) > 1.645 * sd
+        found = next(float(s.split()[1]) for s in said.split("%") if s.split()[:1] == [name])
+        assert found == pytest.approx(value, rel=0.06)
+
+
+def test_a_shifted_soil_is_saved_and_loaded(data, tmp_path):
+    fit = fitted(data)
+    mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in data.outputs}
+    corrected = Corrected(Mixture(data, (fit,), (1.0,), 3), mode)
+    save_corrected(corrected, tmp_path)
+    loaded = load_corrected(tmp_path)
+    assert loaded.mixture.fits[0].forward.hypothesis.shift_as == "soil"
+    before, after = (predict_columns(c, data.case.field) for c in (corrected, loaded))
+    for name, values in before.items():
+        np.testing.assert_allclose(after[name], values, rtol=1e-9)
