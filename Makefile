@@ -19,8 +19,9 @@ reference: $(READY)
 	NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" \
 	  $(BIN)/calib report --out reports/he2019 --overwrite --no-posteriors
 
+# A file's tests share what it samples, so a file stays in one process.
 test: $(READY)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow

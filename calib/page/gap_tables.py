@@ -156,7 +156,10 @@ def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
                     prior.name, sign, format_value(factor * float(value), factor * float(s)), unit
                 )
             )
-    return sizes or [Markup("no parameter moves clearly")]
+    if not sizes:
+        return [Markup("no parameter moves clearly")]
+    together = fit.forward.hypothesis.shift_as == "soil"
+    return [*sizes, Markup("together, as with another soil")] if together else sizes
 
 
 def conditions_text(found: Diagnosis, conditions: dict[str, float]) -> str:

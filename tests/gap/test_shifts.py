@@ -135,7 +135,9 @@ def test_the_page_tells_the_shift_of_each_parameter_not_of_a_coordinate(data):
     fit = fitted(data)
     matrix = fit.forward.shift_maps["drawbar_pull"]
     names = data.outputs[0].priors.names
-    said = " ".join(shift_sizes(data.outputs, fit))
+    sizes = shift_sizes(data.outputs, fit)
+    assert sizes[-1] == "together, as with another soil"
+    said = " ".join(sizes)
     for name in ("K_lo", "K_hi"):
         i = names.index(name)
         value = 100.0 * SIZE * matrix[i, 0]
