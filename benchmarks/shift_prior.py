@@ -1,15 +1,17 @@
 """Where priors/shifts/another_soil.toml comes from: `python benchmarks/shift_prior.py`.
 
 Other soils are drawn by the mechanics of `calib challenge make`, the campaigns on them fitted with
-a shift of every parameter by itself, and the covariance of the true shifts estimated by
-expectation-maximisation: each case is a normal likelihood of its shift, each shift a normal draw of
-one covariance times an unknown size. Half of the cases judge what the other half gave.
+a shift of every parameter by itself, and the covariance of the true shifts estimated by rounds of
+expectation and maximisation at a fixed scale: each case is a normal likelihood of its shift, each
+shift a normal draw of one covariance times an unknown size. Half of the cases judge what the other
+half gave.
 """
 
 from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,14 +20,13 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calib.challenge.make import make_case
-from calib.gap.case import campaigns, read_case
-from calib.gap.fit import fit
+from calib.gap.case import OutputData, campaigns, read_case
+from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import SHIFTS
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.shifts import DIFFERENCE, quantities
 from calib.gap.which import calibrate_lab
-from calib.sampling.mode import prior_widths
 from calib.tasks import completed
 from calib.threads import one_thread
 
@@ -39,7 +40,7 @@ SIZES = (0.05, 0.1, 0.2, 0.4, 0.8)
 WAYS = 3
 # Off-diagonal elements are believed to four fifths: 300 cases of one mechanics are not all soils.
 BELIEVED = 0.8
-_ROUNDS = 150
+_ROUNDS = 1000
 
 
 @dataclass(frozen=True)
@@ -66,36 +67,48 @@ def see(seed: np.random.SeedSequence, tier: str) -> Seen | None:
                 start[forward.theta_slices[o.name]] = lab_mode[o.name]
             fits.append(fit(data, forward, start, noise))
     best = max(fits, key=lambda f: f.log_evidence)
-    part = best.forward.shift_slice
-    names, widths = [], []
-    for o in data.outputs:
+    return seen(best, data.outputs)
+
+
+def seen(found: Fit, outputs: Sequence[OutputData]) -> Seen | None:
+    """Likelihood of the shift in prior sds, from a fit with a normal prior of each by itself.
+
+    The coordinates of a shift are in prior sds already; those of no interest are averaged over.
+    """
+    names: list[str] = []
+    for o in outputs:
         kinds = quantities(o.priors.names)
-        names += [k if o.name != "bulk_density" else "" for k in kinds]
-        widths += prior_widths(o.priors).tolist()
+        names += kinds if o.name != "bulk_density" else [""] * len(kinds)
     at = [i for i, name in enumerate(names) if name in QUANTITIES]
     if not at:
         return None
-    to = [QUANTITIES.index(names[i]) for i in at]
-    own = np.linalg.inv(best.covariance[part, part])
-    prior = np.array([p.scale for p in best.forward.priors.free[part]]) ** -2.0
-    width = np.array(widths)[at]
+    to = np.ix_(*[[QUANTITIES.index(names[i]) for i in at]] * 2)
+    part = found.forward.shift_slice
+    own = np.linalg.inv(found.covariance[part, part][np.ix_(at, at)])
+    prior = np.array([found.forward.priors.free[part][i].scale for i in at]) ** -2.0
     precision, pull = np.zeros((len(QUANTITIES),) * 2), np.zeros(len(QUANTITIES))
-    precision[np.ix_(to, to)] = (own - np.diag(prior))[np.ix_(at, at)] * np.outer(width, width)
-    pull[to] = (own @ best.psi[part])[at] * width
+    precision[to] = own - np.diag(prior)
+    pull[to[1]] = own @ found.psi[part][at]
     return Seen(precision, pull)
 
 
-def weigh(case: Seen, covariance: Array) -> tuple[Array, list[tuple[Array, Array]]]:
-    """Log evidence of each size, and the posterior (covariance, mean) of the shift with it."""
-    evidence, posterior = [], []
-    for size in SIZES:
-        prior = covariance * size**2
-        inner = np.eye(len(prior)) + prior @ case.precision
-        spread = np.linalg.solve(inner, prior)
-        mean = spread @ case.pull
-        evidence.append(-0.5 * np.linalg.slogdet(inner)[1] + 0.5 * case.pull @ mean)
-        posterior.append((spread, mean))
-    return np.array(evidence), posterior
+def weigh(cases: Sequence[Seen], covariance: Array) -> tuple[Array, Array, Array]:
+    """Log evidence of each case and size, and the posterior of its shift then.
+
+    Returns
+    -------
+    evidence : ndarray, shape (cases, sizes)
+    spread : ndarray, shape (cases, sizes, d, d)
+    mean : ndarray, shape (cases, sizes, d)
+    """
+    precision = np.stack([case.precision for case in cases])[:, None]
+    pull = np.stack([case.pull for case in cases])[:, None, :, None]
+    prior = covariance * np.square(SIZES)[:, None, None]
+    inner = np.eye(len(covariance)) + prior @ precision
+    spread = np.linalg.solve(inner, np.broadcast_to(prior, inner.shape))
+    mean = (spread @ pull)[..., 0]
+    evidence = -0.5 * np.linalg.slogdet(inner)[1] + 0.5 * (pull[..., 0] * mean).sum(axis=-1)
+    return evidence, spread, mean
 
 
 def alone() -> Array:
@@ -104,20 +117,21 @@ def alone() -> Array:
     return np.diag(np.where(lesser, DIFFERENCE**2, 1.0))
 
 
-def estimate(cases: list[Seen]) -> Array:
-    """Return the covariance of the shifts, K, D and z_ref moving by one prior sd on average."""
+def estimate(cases: Sequence[Seen], rounds: int = _ROUNDS) -> Array:
+    """Return the covariance of the shifts, K, D and z_ref moving by one prior sd on average.
+
+    The scale is held in every round: the sizes of the shifts stand for it, and what the cases
+    hardly determine would otherwise keep the scale it was begun with.
+    """
     covariance = alone()
-    for _ in range(_ROUNDS):
-        total = np.zeros_like(covariance)
-        for case in cases:
-            evidence, posterior = weigh(case, covariance)
-            weights = np.exp(evidence - evidence.max())
-            for w, size, (spread, mean) in zip(
-                weights / weights.sum(), SIZES, posterior, strict=True
-            ):
-                total += w * (spread + np.outer(mean, mean)) / size**2
+    main = [QUANTITIES.index(name) for name in ("K", "D", "z_ref")]
+    for _ in range(rounds):
+        evidence, spread, mean = weigh(cases, covariance)
+        weights = np.exp(evidence - logsumexp(evidence, axis=1, keepdims=True))
+        weights = weights / np.square(SIZES)
+        total = np.einsum("cs,csij->ij", weights, spread)
+        total += np.einsum("cs,csi,csj->ij", weights, mean, mean)
         covariance = 0.5 * (total + total.T) / len(cases)
-        main = [QUANTITIES.index(name) for name in ("K", "D", "z_ref")]
         covariance /= np.exp(np.mean(np.log(np.diag(covariance)[main])))
     return covariance
 
@@ -128,17 +142,13 @@ def in_ways(covariance: Array) -> tuple[Array, Array]:
     ways = (vectors * np.sqrt(np.maximum(values, 0.0)))[:, ::-1][:, :WAYS] * np.sqrt(BELIEVED)
     ways *= np.sign(ways[QUANTITIES.index("z_ref")])
     own = np.sqrt(np.maximum(np.diag(covariance) - np.square(ways).sum(axis=1), 0.0))
-    return ways.round(2), own.round(2)
+    return ways.round(2), np.maximum(own.round(2), 0.01)
 
 
-def gained(cases: list[Seen], covariance: Array) -> Array:
+def gained(cases: Sequence[Seen], covariance: Array) -> Array:
     """Log evidence of each case with a covariance less that with parameters on their own."""
-
-    def total(by: Array) -> Array:
-        found = np.array([weigh(case, by)[0] for case in cases])
-        return np.asarray(logsumexp(found, axis=1))
-
-    return total(covariance) - total(alone())
+    first, second = (logsumexp(weigh(cases, by)[0], axis=1) for by in (covariance, alone()))
+    return np.asarray(first - second)
 
 
 def main() -> None:

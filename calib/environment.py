@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Environment", "imitate_processor", "versions"]
+__all__ = ["Environment", "code_sha256", "imitate_processor", "versions"]
 
 _PACKAGES = (
     "terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-base", "arviz-stats", "xarray",
@@ -38,7 +38,7 @@ class Environment:
         Processor family, system, C library, linear algebra, and the vector instructions that
         NumPy uses (``simd``) and could use but does not (``simd_unused``).
     code : str
-        SHA-256 over the source files of this package.
+        SHA-256 over the source files of this package and its priors.
     """
 
     versions: Mapping[str, str]
@@ -48,7 +48,7 @@ class Environment:
     @classmethod
     def here(cls) -> Environment:
         """Return the environment of this process."""
-        return cls(versions(), _machine(), _code_sha256())
+        return cls(versions(), _machine(), code_sha256())
 
     def document(self) -> dict[str, Any]:
         """Return it as plain dictionaries."""
@@ -94,17 +94,26 @@ def _machine() -> dict[str, str]:
 
 
 @cache
-def _code_sha256() -> str:
+def code_sha256() -> str:
+    """Return the SHA-256 over the source files of this package and the priors shipped with it."""
     import hashlib
 
     package = Path(__file__).resolve().parent
+    packaged = package / "_priors"
+    # A checkout has the priors beside the package, a wheel in it; they are named alike.
+    priors = packaged if packaged.is_dir() else package.parent / "priors"
+    files = {
+        f"priors/{path.relative_to(priors).as_posix()}": path for path in priors.rglob("*.toml")
+    }
+    for path in package.rglob("*"):
+        if path.suffix in _SOURCES and path.is_file() and packaged not in path.parents:
+            files[path.relative_to(package).as_posix()] = path
     digest = hashlib.sha256()
-    for path in sorted(package.rglob("*")):
-        if path.suffix in _SOURCES and path.is_file():
-            # Line ends are the checkout's, not the code's.
-            content = path.read_bytes().replace(b"\r\n", b"\n")
-            digest.update(f"{path.relative_to(package).as_posix()}\0{len(content)}\0".encode())
-            digest.update(content)
+    for name, path in sorted(files.items()):
+        # Line ends are the checkout's, not the code's.
+        content = path.read_bytes().replace(b"\r\n", b"\n")
+        digest.update(f"{name}\0{len(content)}\0".encode())
+        digest.update(content)
     return digest.hexdigest()
 
 

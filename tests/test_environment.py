@@ -63,19 +63,26 @@ def test_the_processor_does_not_decide_how_equal_numbers_are_written(change, sam
     assert replace(here, **merged).same_program(here) is same
 
 
-def test_another_line_of_code_is_another_code(
+def test_another_line_of_code_or_another_prior_is_another_code(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def code(text: bytes) -> str:
-        (tmp_path / "sub").mkdir(exist_ok=True)
-        (tmp_path / "sub" / "module.py").write_bytes(text)
-        (tmp_path / "notes.txt").write_bytes(text)
-        monkeypatch.setattr(environment_module, "__file__", str(tmp_path / "environment.py"))
-        return environment_module._code_sha256.__wrapped__()
+    def code(text: bytes, prior: bytes = b"sd = 1\n", folder: str = "priors") -> str:
+        package = tmp_path / folder.replace("/", "_") / "calib"
+        (package / "sub").mkdir(parents=True, exist_ok=True)
+        (package / "sub" / "module.py").write_bytes(text)
+        (package / "notes.txt").write_bytes(text)
+        effects = package.parent / folder / "effects"
+        effects.mkdir(parents=True, exist_ok=True)
+        (effects / "one.toml").write_bytes(prior)
+        monkeypatch.setattr(environment_module, "__file__", str(package / "environment.py"))
+        return environment_module.code_sha256.__wrapped__()
 
     one = code(b"x = 1\ny = 2\n")
     assert code(b"x = 1\r\ny = 2\r\n") == one
     assert code(b"x = 1\ny = 3\n") != one
+    assert code(b"x = 1\ny = 2\n", b"sd = 2\n") != one
+    # A wheel has the same priors inside.
+    assert code(b"x = 1\ny = 2\n", folder="calib/_priors") == one
 
 
 IMITATE = """

@@ -101,6 +101,7 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
         "effects": [e.name for e in h.effects],
         "shift": h.shift,
         "shift_as": h.shift_as,
+        "shift_maps": {o: matrix.tolist() for o, matrix in fit.forward.shift_maps.items()},
         "smooth": h.smooth,
         "smooth_outputs": list(h.smooth_outputs),
         "smooth_over": h.smooth_over,
@@ -174,7 +175,10 @@ def _load_fit(
         document["onset_over"],
     )  # fmt: skip
     noise = {o: Noise(n["sigma"], n["rho"], n["kappa"]) for o, n in document["noise"].items()}
-    forward = Forward(data, hypothesis, {o: n.sigma for o, n in noise.items()}, lab_mode)
+    # What the coordinates of a shift mean is the file's, whatever the priors shipped now say.
+    maps = {o: np.array(matrix) for o, matrix in document["shift_maps"].items()}
+    sigma = {o: n.sigma for o, n in noise.items()}
+    forward = Forward(data, hypothesis, sigma, lab_mode, maps)
     psi, covariance = np.array(document["psi"]), np.array(document["covariance"])
     if psi.shape != (forward.n_dim,) or covariance.shape != (forward.n_dim, forward.n_dim):
         raise ValueError("shape")

@@ -28,12 +28,12 @@ _SAME = {"n": "n0"}
 class _Row(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
     ways: tuple[float, ...]
-    own: float = Field(ge=0.0)
+    own: float = Field(gt=0.0)
 
 
 class _File(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
-    unit: str
+    unit: str = Field(min_length=1)
     reason: str = Field(min_length=1)
     source: str = Field(min_length=1)
     ways: tuple[str, ...]
@@ -114,8 +114,7 @@ def shift_map(
     for o in outputs:
         names = quantities(o.priors.names)
         parts[o.name] = slice(len(kinds), len(kinds) + len(names))
-        # Densities have no part in what soils do to wheels.
-        kinds += names if o.name != "bulk_density" else [f"density.{name}" for name in names]
+        kinds += names
         blocks.append(prior_widths(o.priors)[:, None] * _unfold(names))
     matrix = _diagonal(blocks)
     sds = np.array([DIFFERENCE if _lesser(kind) else 1.0 for kind in kinds])

@@ -52,7 +52,7 @@ class Ranking:
     Parameters
     ----------
     fits : mapping of str to tuple of Fit
-        By name; several where a prior scale was averaged over.
+        By name; several where prior scales, or ways to shift or to be unlisted, were averaged over.
     scores : mapping of str to tuple of float
         Log evidence of each fit, for effects that matter, times its share in its hypothesis.
     log_evidence : mapping of str to float

@@ -148,17 +148,18 @@ def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
         for prior, value, s in zip(o.priors.free, shifts, sds, strict=True):
             if abs(value) < 1.645 * s:
                 continue
-            factor = 100.0 if prior.log else 1.0
             unit = " %" if prior.log else "" if prior.unit == "1" else f" {prior.unit}"
+            if prior.log:  # of a logarithm: the relative change
+                value, s = 100.0 * math.expm1(value), 100.0 * math.exp(value) * s
             sign = "+" if value > 0.0 else ""
             sizes.append(
                 Markup("{} {}{}{}").format(
-                    prior.name, sign, format_value(factor * float(value), factor * float(s)), unit
+                    prior.name, sign, format_value(float(value), float(s)), unit
                 )
             )
     if not sizes:
         return [Markup("no parameter moves clearly")]
-    together = fit.forward.hypothesis.shift_as == "soil"
+    together = len(sizes) > 1 and fit.forward.hypothesis.shift_as == "soil"
     return [*sizes, Markup("together, as with another soil")] if together else sizes
 
 

@@ -9,10 +9,8 @@ import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
-from hashlib import sha256
 from importlib.metadata import version
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import dask
@@ -20,6 +18,7 @@ from distributed import Client, Future, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
 from distributed.utils import silence_logging_cmgr
 
+from calib.environment import code_sha256
 from calib.errors import CalibError
 from calib.tasks.attempt import Finished, attempt, describe
 
@@ -276,12 +275,8 @@ def _existing(address: str) -> Iterator[Client]:
 
 
 def versions() -> dict[str, str]:
-    """Return what numbers depend on: the versions of libraries, and a hash of our own source."""
-    source = sha256()
-    root = Path(__file__).resolve().parents[1]
-    for path in sorted(root.rglob("*.py")):
-        source.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return {**{name: version(name) for name in _SAME}, "calib source": source.hexdigest()[:12]}
+    """Return what numbers depend on: versions of libraries, a hash of our own source and priors."""
+    return {**{name: version(name) for name in _SAME}, "calib source": code_sha256()[:12]}
 
 
 def _unlike(worker: str, why: str) -> CalibError:

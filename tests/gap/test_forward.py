@@ -132,3 +132,26 @@ def test_every_single_effect_has_a_prior_for_each_parameter(data):
         forward = Forward(data, h, SIGMA)
         part = forward.phi_slices[0]
         assert part.stop - part.start == len(h.effects[0].parameters)
+
+
+@pytest.mark.parametrize(
+    ("effect", "sds"),
+    [
+        ("multipass_compaction", [0.15, 0.1, 0.13, 0.18]),  # tilt and bend over slip, psi, pass
+        ("load_transfer", [0.15, 0.1]),
+        ("slip_zero_shift", [0.13]),
+        ("pressure_gauge_bias", [0.2]),
+        ("force_offset", []),
+    ],
+)
+def test_a_formula_is_trusted_less_along_some_directions(data, effect, sds):
+    forward = Forward(data, single(data, effect), SIGMA)
+    for o in data.names:
+        found = [p.scale for p in forward.priors.free[forward.form_slices[o]]]
+        assert found == pytest.approx(sds)
+
+
+def test_two_effects_that_depart_over_pressure_do_so_together(data):
+    both = pair(single(data, "pressure_gauge_bias"), single(data, "slip_zero_shift"))
+    forward = Forward(data, both, SIGMA)
+    assert [p.scale for p in forward.priors.free[forward.form_slices["drawbar_pull"]]] == [0.13]

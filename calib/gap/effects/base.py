@@ -97,8 +97,9 @@ class Effect:
         Columns it needs.
     varies : bool
         Whether the (first) covariate must vary in the field, or differ from the laboratory's.
-    form : tuple of {"size", "slip", "pressure", "cone", "water", "shape"}
-        Along what its size may depart from its formula, by the form error of the diagnosis;
+    form : tuple of {"size", "slip", "pressure", "cone", "water", "shape", "extrapolation"}
+        Along what its size may depart from its formula, by the form error of the diagnosis
+        (extrapolation: along inflation pressure, to values the simulator was not fitted at);
         empty where the formula is exact.
     prior_file : Path, optional
         Where its priors are, if not among the shipped ones.

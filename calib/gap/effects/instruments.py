@@ -80,7 +80,7 @@ class PressureGaugeBias(Effect):
     """True inflation pressure differs from the gauge's by a gain and an offset."""
 
     name = "pressure_gauge_bias"
-    form = ("pressure",)  # the simulator is extrapolated to pressures it was not fitted at
+    form = ("extrapolation",)  # the simulator is used at pressures it was not fitted at
     title = "true inflation pressure differs from the recorded one"
     parameters = ("gain", "offset", "ground_response")
     outputs = (DRAWBAR, RUT)
