@@ -19,13 +19,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from calib.challenge.design import Tier
 from calib.challenge.make import make_case
 from calib.gap.case import OutputData, campaigns, read_case
 from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import SHIFTS
 from calib.gap.hypothesis import Hypothesis
-from calib.gap.shifts import DIFFERENCE, quantities
+from calib.gap.shifts import alone_sd, quantities
 from calib.gap.which import calibrate_lab
 from calib.tasks import completed
 from calib.threads import one_thread
@@ -51,10 +52,10 @@ class Seen:
     pull: Array
 
 
-def see(seed: np.random.SeedSequence, tier: str) -> Seen | None:
+def see(seed: np.random.SeedSequence, tier: Tier) -> Seen | None:
     """Draw a shift and fit it; None if the case measures no wheel."""
     with tempfile.TemporaryDirectory() as folder, one_thread():
-        make_case(seed, tier, "parameter_shift").write(Path(folder))  # type: ignore[arg-type]
+        make_case(seed, tier, "parameter_shift").write(Path(folder))
         data = campaigns(read_case(Path(folder)))
         lab_mode, noise = calibrate_lab(data, 0)
         fits = []
@@ -113,8 +114,7 @@ def weigh(cases: Sequence[Seen], covariance: Array) -> tuple[Array, Array, Array
 
 def alone() -> Array:
     """Return the covariance of parameters that shift each by itself."""
-    lesser = [q.endswith(("_bend", "_difference")) or q == "n1" for q in QUANTITIES]
-    return np.diag(np.where(lesser, DIFFERENCE**2, 1.0))
+    return np.diag([alone_sd(quantity) ** 2 for quantity in QUANTITIES])
 
 
 def estimate(cases: Sequence[Seen], rounds: int = _ROUNDS) -> Array:
@@ -159,7 +159,8 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     options = parser.parse_args()
     seeds = np.random.SeedSequence(options.seed).spawn(options.cases)
-    jobs = {f"{i:04d}": (s, ("easy", "hard")[i % 2]) for i, s in enumerate(seeds)}
+    tiers: tuple[Tier, ...] = ("easy", "hard")
+    jobs = {f"{i:04d}": (s, tiers[i % 2]) for i, s in enumerate(seeds)}
     found = {t.name: t.result for t in completed(_see, jobs, workers=options.workers)}
     cases = [case for name in jobs if (case := found[name]) is not None]
     ways, own = in_ways(estimate(cases[::2]))
@@ -174,7 +175,7 @@ def main() -> None:
         print(f"\n[parameters.{name}]\nways = {row}\nown = {left}")
 
 
-def _see(job: tuple[np.random.SeedSequence, str]) -> Seen | None:
+def _see(job: tuple[np.random.SeedSequence, Tier]) -> Seen | None:
     return see(*job)
 
 

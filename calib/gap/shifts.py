@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from scipy.linalg import block_diag
 
 from calib.errors import CalibError
 from calib.gap.case import OutputData
@@ -15,7 +16,7 @@ from calib.models.base import Array
 from calib.prior_files import default_prior_path
 from calib.sampling.mode import prior_widths
 
-__all__ = ["DIFFERENCE", "ShiftAs", "another_soil", "quantities", "shift_map"]
+__all__ = ["DIFFERENCE", "ShiftAs", "alone_sd", "another_soil", "quantities", "shift_map"]
 
 type ShiftAs = Literal["alone", "soil"]
 
@@ -86,6 +87,12 @@ def quantities(names: Sequence[str]) -> list[str]:
     return found
 
 
+def alone_sd(quantity: str) -> float:
+    """Prior sd of a quantity that shifts by itself, in its parameter's prior sds."""
+    lesser = quantity.endswith(("_bend", "_difference")) or quantity == "n1"
+    return DIFFERENCE if lesser else 1.0
+
+
 def shift_map(
     outputs: Sequence[OutputData], shift_as: ShiftAs
 ) -> tuple[dict[str, Array], list[float]]:
@@ -116,16 +123,12 @@ def shift_map(
         parts[o.name] = slice(len(kinds), len(kinds) + len(names))
         kinds += names
         blocks.append(prior_widths(o.priors)[:, None] * _unfold(names))
-    matrix = _diagonal(blocks)
-    sds = np.array([DIFFERENCE if _lesser(kind) else 1.0 for kind in kinds])
+    matrix = block_diag(*blocks)
+    sds = np.array([alone_sd(kind) for kind in kinds])
     if shift_as == "soil":
         matrix = matrix @ _together(kinds, sds)
         sds = np.ones(sds.size)
     return {name: matrix[part] for name, part in parts.items()}, sds.tolist()
-
-
-def _lesser(kind: str) -> bool:
-    return kind.endswith(("_bend", "_difference")) or kind == "n1"
 
 
 def _unfold(names: Sequence[str]) -> Array:
@@ -135,15 +138,6 @@ def _unfold(names: Sequence[str]) -> Array:
         if name.endswith("_difference"):
             i = names.index(name.removesuffix("_difference"))
             matrix[i, j], matrix[j, i] = -1.0, 1.0
-    return matrix
-
-
-def _diagonal(blocks: Sequence[Array]) -> Array:
-    size = sum(len(block) for block in blocks)
-    matrix, start = np.zeros((size, size)), 0
-    for block in blocks:
-        matrix[start : start + len(block), start : start + len(block)] = block
-        start += len(block)
     return matrix
 
 

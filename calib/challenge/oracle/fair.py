@@ -63,7 +63,8 @@ class Fairness:
 
     def _signature(self, banks: Sequence[Bank]) -> tuple[Array, list[Array]]:
         """Return weights and, per size, whitened directions of an effect in its first sense."""
-        weights, directions = [], [[] for _ in _SIZES]  # type: ignore[var-annotated]
+        weights: list[Array] = []
+        directions: list[list[Array]] = [[] for _ in _SIZES]
         for bank in banks:
             if bank.cause.sign < 0.0:
                 continue
