@@ -14,11 +14,17 @@ from calib.gap.effects.base import RUT
 from calib.gap.hypothesis import Hypothesis
 from calib.models.base import Array
 
-__all__ = ["THRESHOLDS", "Discrepancy"]
+__all__ = ["ONSET_CONDITIONS", "THRESHOLDS", "Discrepancy"]
 
 # Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
 THRESHOLDS = (-0.85, 0.9)
 _ONSET_WIDTH = 0.06
+# Conditions over which it may set in: the first that is recorded.
+ONSET_CONDITIONS = {
+    "slip": ("slip_ratio",), "order": ("run_order",), "cone": ("cone_index_kpa",),
+    "water": ("gravimetric_water_content", "volumetric_water_content"),
+    "low_pressure": ("inflation_pressure_psi",),
+}  # fmt: skip
 # Most waves over the range of slips that a ripple may have.
 _WAVES = 12
 
@@ -85,9 +91,11 @@ class Discrepancy:
             return -self._known(self.covariates.pressure(view))
         if over in ("level", "sinkage"):
             return self._known(self._level(view, output if over == "level" else RUT))
-        return self._known(
-            self.covariates.scaled(view, "slip_ratio" if over == "slip" else "run_order")
+        transform = "log" if over == "cone" else ""
+        scaled = (
+            self.covariates.scaled(view, name, transform) for name in ONSET_CONDITIONS[over or ""]
         )
+        return self._known(next((u for u in scaled if u is not None), None))
 
     def _known(self, u: Array | None) -> Array:
         if u is None:

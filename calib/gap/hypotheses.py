@@ -9,9 +9,10 @@ from typing import Literal
 import numpy as np
 
 from calib.gap.case import Campaigns
+from calib.gap.discrepancy import ONSET_CONDITIONS
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.base import DENSITY, DRAWBAR, RUT
-from calib.gap.hypothesis import Hypothesis, SmoothOver
+from calib.gap.hypothesis import Hypothesis, OnsetOver, SmoothOver
 from calib.gap.shifts import ShiftAs
 from calib.prior_files import default_prior_path, read_priors
 from calib.priors import Priors
@@ -116,14 +117,18 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
         for over, t in everywhere
         for size in SMOOTHS
     ]
+    probes: tuple[OnsetOver, ...] = ("water", "cone") if DENSITY in names else ()
+    setting_in: list[tuple[OnsetOver, tuple[str, ...]]] = [
+        *(choice for choice in choices if choice not in _LISTED_ONSETS),
+        *((over, (DENSITY,)) for over in probes if _varies(data, over)),
+    ]
     sudden = [
         Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over=over)
-        for over, t in choices
-        if (over, t) not in _LISTED_ONSETS
+        for over, t in setting_in
     ]
     # At low inflation a tyre may creep on its rim, buckle or run on it.
     limp: list[Hypothesis] = []
-    if np.ptp(recorded.get("inflation_pressure_psi", np.zeros(1))) > 0:
+    if _varies(data, "low_pressure"):
         limp = [
             Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over="low_pressure")
             for t in touched
@@ -136,6 +141,11 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
         *(replace(h, share=onsets / len(sudden)) for h in sudden),
         *(replace(h, share=LIMP / len(limp)) for h in limp),
     ]
+
+
+def _varies(data: Campaigns, over: OnsetOver) -> bool:
+    recorded = data.view.conditions
+    return any(np.ptp(recorded[c]) > 0 for c in ONSET_CONDITIONS[over] if c in recorded)
 
 
 def remainders(data: Campaigns, best: Sequence[Hypothesis], n_single: int) -> list[Hypothesis]:

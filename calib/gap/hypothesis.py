@@ -12,7 +12,7 @@ from calib.priors import Priors
 __all__ = ["Hypothesis", "OnsetOver", "SmoothOver"]
 
 type SmoothOver = Literal["slip", "level", "sinkage", "order", "before", "ripple", "all"]
-type OnsetOver = Literal["slip", "level", "sinkage", "order", "low_pressure"]
+type OnsetOver = Literal["slip", "level", "sinkage", "order", "water", "cone", "low_pressure"]
 
 
 @dataclass(frozen=True)
@@ -41,10 +41,11 @@ class Hypothesis:
         pass would), or every condition.
     smooth_decay : float
         Number of half waves from which the discrepancy's coefficients fall off.
-    onset_over : {"slip", "level", "sinkage", "order", "low_pressure"}, optional
-        Instead of smooth, the discrepancy may set in beyond a threshold of one of these: a step
-        and a change of slope there. Below a threshold of inflation pressure, where a limp tyre may
-        creep on its rim or buckle: a step, and a part of the output's level.
+    onset_over : {"slip", "level", "sinkage", "order", "water", "cone", "low_pressure"}, optional
+        Instead of smooth, the discrepancy may set in beyond a threshold of one of these, water
+        content and cone index among them: a step and a change of slope there. Below a threshold
+        of inflation pressure, where a limp tyre may creep on its rim or buckle: a step, and a part
+        of the output's level.
     share : float
         Part of the prior probability of its name.
     """

@@ -20,8 +20,11 @@ __all__ = ["DIFFERENCE", "ShiftAs", "alone_sd", "another_soil", "quantities", "s
 
 type ShiftAs = Literal["alone", "soil"]
 
-# Shifts of how a parameter varies with pressure or slip, relative to those of its value.
+# Shifts of how a parameter varies with pressure, slip or water, relative to those of its value.
 DIFFERENCE = 0.2
+# What water does to the strength of a soil: its prior spans all soils there are, of which those of
+# two campaigns with one density relation are near neighbours.
+_OF_WATER = ("C2", "C3")
 # The same quantity under another name: the exponent of plain Bekker is that without slip.
 _SAME = {"n": "n0"}
 
@@ -89,7 +92,7 @@ def quantities(names: Sequence[str]) -> list[str]:
 
 def alone_sd(quantity: str) -> float:
     """Prior sd of a quantity that shifts by itself, in its parameter's prior sds."""
-    lesser = quantity.endswith(("_bend", "_difference")) or quantity == "n1"
+    lesser = quantity.endswith(("_bend", "_difference")) or quantity in ("n1", *_OF_WATER)
     return DIFFERENCE if lesser else 1.0
 
 

@@ -18,6 +18,7 @@ from calib.figures.gap_rows import (
 )
 from calib.figures.labels import joined
 from calib.gap.diagnose import Diagnosis
+from calib.gap.discrepancy import ONSET_CONDITIONS
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit
 from calib.gap.noise import noise_at
@@ -136,11 +137,12 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
         values = axis.factor * o.problem.bound.from_response(location)[0]
         name, unit = f"a predicted {output_word(output).lower()} of", f" {axis.unit}"
     else:
-        column, name = {
-            "slip": ("slip_ratio", "a slip of"),
-            "order": ("run_order", "run"),
-            "low_pressure": ("inflation_pressure_psi", "an inflation pressure of"),
-        }[h.onset_over or ""]
+        over = h.onset_over or ""
+        column = next(c for c in ONSET_CONDITIONS[over] if c in view.conditions)
+        name = {
+            "slip": "a slip of", "order": "run", "water": "a water content of",
+            "cone": "a cone index of", "low_pressure": "an inflation pressure of",
+        }[over]  # fmt: skip
         shown = axis_name(column)
         values, unit = shown.scale(view.conditions[column]), unit_after(shown)
     order = np.argsort(u)
@@ -148,6 +150,10 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
     at = float(np.interp(fit.psi[forward.threshold], u[good], values[good]))
     sd = float(np.sqrt(fit.covariance[forward.threshold, forward.threshold]))
     spread = abs(float(np.interp(fit.psi[forward.threshold] + sd, u[good], values[good])) - at)
+    # No data tell where between two rows it sets in.
+    around = np.sort(values[good])
+    i = int(np.clip(np.searchsorted(around, at), 1, around.size - 1))
+    spread = max(spread, float(around[i] - around[i - 1]) / np.sqrt(12.0))
     return f"{name} {format_value(at, max(spread, 1e-3 * abs(at) + 1e-9))}{unit}"
 
 

@@ -22,7 +22,6 @@ SHARED = Path(__file__).resolve().parents[3] / "shared" / "cases"
 
 MODELS = {"drawbar_pull": "magic_formula_pressure", "rut_depth": "modified_bekker"}
 PULL_ONLY = {"drawbar_pull": "magic_formula"}
-DENSITY = {"bulk_density": "ayers_perumpral"}
 # Noise sd on the scale of the response: kN, ln mm, g/cm^3.
 NOISE = {"drawbar_pull": 0.03, "rut_depth": 0.05, "bulk_density": 0.02}
 # True parameters of the simulators, in the order of the model's parameters.

@@ -9,10 +9,12 @@ import pytest
 
 from calib.data import table_from_arrays
 from calib.gap.case import Case, campaigns
+from calib.gap.diagnose import diagnose
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import SHIFTS, shifts, unknowns
 from calib.gap.hypothesis import Hypothesis
-from gap.cases import DENSITY, MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
+from calib.page.gap_sizes import size_sentences
+from gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
 
 SIGMA = {o: NOISE[o] for o in MODELS}
 
@@ -92,21 +94,60 @@ def test_parameters_shift_by_themselves_or_as_with_another_soil_in_every_size(da
     assert found[SHIFTS[0], "soil"] == pytest.approx(2.0 * found[SHIFTS[0], "alone"])
 
 
-def test_densities_know_no_soil_that_moves_wheels():
+def density_campaigns(water: str = "gravimetric_water_content", step: float = 0.0):
+    """Campaigns of bulk density; beyond a water content of 0.1 the field is off by a step."""
     rng = np.random.default_rng(3)
     tables = []
-    for n in (20, 15):
-        water, cone = rng.uniform(0.05, 0.2, n), rng.uniform(300.0, 2000.0, n)
-        density = 1.2 + 0.05 * np.log(cone / 300.0) + 0.02 * rng.standard_normal(n)
-        tables.append(
-            table_from_arrays(
-                {
-                    "gravimetric_water_content": water,
-                    "cone_index_kpa": cone,
-                    "bulk_density_g_cm3": density,
-                }
-            )
-        )
-    data = campaigns(Case("density", tables[0], tables[1], DENSITY))
+    for n, off in ((30, 0.0), (36, step)):
+        wet, cone = rng.uniform(0.05, 0.2, n), rng.uniform(300.0, 2000.0, n)
+        density = 1.2 + 0.05 * np.log(cone / 300.0) + 0.005 * rng.standard_normal(n)
+        density += off * (wet > 0.1)
+        columns = {water: wet, "cone_index_kpa": cone, "bulk_density_g_cm3": density}
+        tables.append(table_from_arrays(columns))
+    model = "ayers_perumpral" if water.startswith("grav") else "ayers_perumpral_volumetric"
+    return Case("density", tables[0], tables[1], {"bulk_density": model})
+
+
+def test_densities_know_no_soil_that_moves_wheels():
+    data = campaigns(density_campaigns())
     assert [h.shift_as for h in shifts(data)] == ["alone"] * len(SHIFTS)
     assert sum(h.share for h in shifts(data)) == pytest.approx(1.0)
+
+
+def test_what_water_does_to_a_soil_differs_less_than_its_density():
+    data = campaigns(density_campaigns())
+    forward = Forward(data, shifts(data)[0], {"bulk_density": 0.02})
+    part = forward.priors.free[forward.shift_slice]
+    sds = dict(zip(data.outputs[0].priors.names, (p.scale for p in part), strict=True))
+    assert sds == pytest.approx({"gamma_ref": 0.1, "C2": 0.02, "C3": 0.02, "C4": 0.1}, rel=1e-12)
+
+
+@pytest.mark.parametrize("water", ["gravimetric_water_content", "volumetric_water_content"])
+def test_density_may_change_beyond_a_water_content_or_a_cone_index(water):
+    data = campaigns(density_campaigns(water))
+    onsets = [(h.onset_over, h.smooth_outputs) for h in unknowns(data) if h.onset_over]
+    assert ("water", ("bulk_density",)) in onsets
+    assert ("cone", ("bulk_density",)) in onsets
+
+
+def test_wheels_know_no_onset_over_probes(data):
+    assert not {h.onset_over for h in unknowns(data)} & {"water", "cone"}
+
+
+def test_nothing_sets_in_over_a_probe_that_stays_the_same():
+    case = density_campaigns()
+    n = case.field.columns["cone_index_kpa"].size
+    columns = {**case.field.columns, "cone_index_kpa": np.full(n, 700.0)}
+    data = campaigns(replace(case, field=table_from_arrays(columns)))
+    onsets = {h.onset_over for h in unknowns(data)}
+    assert "water" in onsets
+    assert "cone" not in onsets
+
+
+def test_a_soil_that_sets_hard_is_unlisted_and_said_to_change_with_its_water():
+    found = diagnose(density_campaigns(step=0.06), 1)
+    assert found.verdict == "unknown"
+    lead = size_sentences(found, "unknown")[0]
+    assert lead.startswith("what is missing sets in beyond a water content of")
+    assert 9.0 < float(lead.split(" of ")[1].split()[0]) < 11.0
+    assert lead.endswith("% of dry mass")
