@@ -64,13 +64,16 @@ def diagnose(
             mend="give one of the two",
         )
     own = {} if effects is None else load_effects(effects)
+    files: dict[str, bytes] = {}
     if effects is not None:
         check_on_case(own, given, effects)
+        paths = [effects, *(effects.with_name(f"{name}.toml") for name in own)]
+        files = {path.name: path.read_bytes() for path in paths}
     found = find(given, seed, effects={**EFFECTS, **own})
     manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
     with fresh_folder(out, overwrite=overwrite) as folder:
         write_diagnosis(found, folder)
-        (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed))
+        (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed, files))
         write_page(found, folder, manifest)
     for warning in found.data.case.warnings:
         print(f"calib: {warning}", file=sys.stderr)

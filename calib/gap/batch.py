@@ -6,7 +6,7 @@ not among its inputs.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -83,9 +83,16 @@ def _diagnose(case: Case, seed: int) -> dict[str, bytes]:
     return written(diagnose(case, seed))
 
 
-def written(found: Diagnosis) -> dict[str, bytes]:
-    """Return the files of a diagnosis, by name, to be written elsewhere."""
+def written(found: Diagnosis, effects: Mapping[str, bytes] | None = None) -> dict[str, bytes]:
+    """Return the files of a diagnosis, by name, to be written elsewhere.
+
+    Parameters
+    ----------
+    found : Diagnosis
+    effects : mapping of str to bytes, optional
+        Files of the user's own effects, by name.
+    """
     with TemporaryDirectory() as scratch:
         write_diagnosis(found, Path(scratch))
         files = read_folder(Path(scratch))
-    return files | {INPUTS: inputs_record(found.data.case, found.seed)}
+    return files | {INPUTS: inputs_record(found.data.case, found.seed, effects)}

@@ -8,6 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+from calib.environment import code_sha256
 from calib.errors import CalibError
 from calib.gap.case import Case, case_files
 from calib.manifest import sha256
@@ -18,7 +19,7 @@ INPUTS = "inputs.json"
 _SHOWN = 5
 
 
-def inputs_record(case: Case, seed: int) -> bytes:
+def inputs_record(case: Case, seed: int, effects: Mapping[str, bytes] | None = None) -> bytes:
     """Return the content of a diagnosis' ``inputs.json``.
 
     Parameters
@@ -26,12 +27,16 @@ def inputs_record(case: Case, seed: int) -> bytes:
     case : Case
         As it was diagnosed.
     seed : int
+    effects : mapping of str to bytes, optional
+        Files of the user's own effects, by name: code and priors.
     """
     tables = {"calibration": case.lab, "field": case.field, "predict": case.fresh}
     content = _made_by(seed) | {
         "models": dict(case.models),
         "sha256": {key: table.sha256 for key, table in tables.items() if table is not None},
     }
+    if effects:
+        content["effects"] = {name: sha256(found) for name, found in effects.items()}
     return (json.dumps(content, indent=1) + "\n").encode()
 
 
@@ -105,6 +110,10 @@ def _foreign(cases: Sequence[Path], out: Path, seed: int) -> Mapping[str, list[s
             reason = f"were made with --seed {said.get('seed')}, not {seed}"
         elif any(said.get(key) != value for key, value in made_by.items()):
             reason = f"were made by version {said.get('version')}, not {made_by['version']}"
+            if said.get("version") == made_by["version"]:
+                reason = f"were made by other code or priors of version {made_by['version']}"
+        elif "effects" in said:
+            reason = "were made with effects of one's own"
         else:
             continue
         found.setdefault(reason, []).append(case.name)
@@ -112,4 +121,4 @@ def _foreign(cases: Sequence[Path], out: Path, seed: int) -> Mapping[str, list[s
 
 
 def _made_by(seed: int) -> dict[str, Any]:
-    return {"seed": seed, "version": version("terracalib")}
+    return {"seed": seed, "version": version("terracalib"), "code_sha256": code_sha256()}

@@ -79,6 +79,12 @@ class Ranking:
         """Names, most probable first."""
         return sorted(self.probability, key=lambda name: -self.probability[name])
 
+    @property
+    def prior(self) -> dict[str, float]:
+        """Probability of each hypothesis before the data; sums to one."""
+        names = [n for n in self.probability if n not in LN_PRIOR and "+" not in n]
+        return probabilities(dict.fromkeys(self.probability, 0.0), len(names))
+
     def best(self, name: str) -> Fit:
         """The most probable fit of a hypothesis."""
         return self.fits[name][int(np.argmax(self.scores[name]))]

@@ -31,7 +31,7 @@ from calib.gap.where import Region
 from calib.models import get_model
 from calib.page.content import png_size
 from calib.page.gap_sizes import size_sentences, where_to_look
-from calib.page.gap_tables import conditions_text, hypothesis_groups, next_rows
+from calib.page.gap_tables import conditions_text, hypothesis_groups, next_rows, prior_text
 from calib.page.gap_verdict import (
     Candidate,
     GapEvidence,
@@ -119,6 +119,7 @@ def render_diagnosis(
         facts=_case_facts(found),
         warnings=case.warnings,
         groups=hypothesis_groups(found),
+        prior=prior_text(found),
         best=title_of(found, best_of(found)),
         not_testable=[
             [short_name(n), title_of(found, n), reason]

@@ -21,11 +21,19 @@ from calib.figures.labels import MINUS
 from calib.gap.case import OutputData
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
+from calib.gap.hypotheses import LN_PRIOR
 from calib.numbers import format_number, format_value
 from calib.page.gap_verdict import TIE, odds_text, repeats_needed
 from calib.priors import Prior
 
-__all__ = ["conditions_text", "hypothesis_groups", "next_rows", "parameter_text", "shift_sizes"]
+__all__ = [
+    "conditions_text",
+    "hypothesis_groups",
+    "next_rows",
+    "parameter_text",
+    "prior_text",
+    "shift_sizes",
+]
 
 _POSSIBLE = 0.01
 # An sd above this part of the prior's says that the data did not narrow the parameter.
@@ -56,6 +64,24 @@ def hypothesis_groups(found: Diagnosis) -> list[dict[str, Any]]:
         for heading, names in groups
         if names
     ]
+
+
+def prior_text(found: Diagnosis) -> str:
+    """Say how probable the hypotheses were before the data."""
+    prior = found.ranking.prior
+    singles = [n for n in prior if n not in LN_PRIOR and "+" not in n]
+    pairs = [n for n in prior if "+" in n]
+    parts = [
+        f"{short_name(n)} {_percent(prior[n])}" for n in ("none", "parameter_shift", "unknown")
+    ]
+    for names, kind in ((singles, "effects by themselves"), (pairs, "pairs that were tried")):
+        if names:
+            parts.append(f"each of {len(names)} {kind} {_percent(prior[names[0]])}")
+    return ", ".join(parts)
+
+
+def _percent(p: float) -> str:
+    return f"{format_number(100.0 * p, 2)} %"
 
 
 def _row(found: Diagnosis, name: str, left: dict[str, float]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from calib.gap.provenance import (
     inputs_record,
     recorded_inputs,
 )
+from calib.manifest import sha256
 from gap.cases import PULL_ONLY, make_case, write_case
 
 
@@ -47,6 +48,9 @@ def test_a_changed_file_another_seed_or_version_are_refused(diagnosed):
     record.write_text(json.dumps(said | {"version": "0.0.0"}))
     with pytest.raises(CalibError, match=r"made by version 0\.0\.0"):
         check_resumable([case], out, 1)
+    record.write_text(json.dumps(said | {"code_sha256": "0" * 64}))
+    with pytest.raises(CalibError, match=rf"other code or priors of version {said['version']}"):
+        check_resumable([case], out, 1)
     with (case / "field.csv").open("a") as file:
         file.write("\n")
     with pytest.raises(CalibError, match="of other cases, or of these before") as caught:
@@ -62,4 +66,14 @@ def test_results_that_do_not_say_what_they_are_of_are_not_resumed(diagnosed, tex
     if text is not None:
         (out / "case-0" / INPUTS).write_text(text)
     with pytest.raises(CalibError, match="do not say which cases"):
+        check_resumable([case], out, 1)
+
+
+def test_effects_of_ones_own_are_recorded_and_not_resumed_without_them(diagnosed):
+    case, out = diagnosed
+    files = {"mine.py": b"class Wind: ...", "wind.toml": b'model = "wind"'}
+    record = inputs_record(read_case(case), 1, files)
+    assert json.loads(record)["effects"] == {name: sha256(text) for name, text in files.items()}
+    (out / "case-0" / INPUTS).write_bytes(record)
+    with pytest.raises(CalibError, match="made with effects of one's own"):
         check_resumable([case], out, 1)

@@ -151,3 +151,16 @@ def test_what_a_listed_effect_leaves_is_unknown():
     few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}
     ranking = rank(campaigns(case), 1, effects=few)
     assert ranking.order[0] == "unknown"
+
+
+def test_prior_and_evidence_give_the_probabilities():
+    ranking = ranking_of("lug_thrust")
+    assert sum(ranking.prior.values()) == pytest.approx(1.0)
+    odds = {
+        name: ranking.prior[name] * np.exp(value - max(ranking.log_evidence.values()))
+        for name, value in ranking.log_evidence.items()
+    }
+    total = sum(odds.values())
+    assert {n: v / total for n, v in odds.items()} == pytest.approx(ranking.probability)
+    assert ranking.prior["lug_thrust"] == pytest.approx(ranking.prior["force_offset"])
+    assert ranking.prior["lug_thrust"] > ranking.prior["force_offset+lug_thrust"] > 0.0

@@ -11,7 +11,7 @@ from gap.cases import diagnosis_of, pull_diagnosis
 
 from calib.page.diagnosis import gap_evidence, render_diagnosis, write_page
 from calib.page.gap_sizes import size_sentences
-from calib.page.gap_tables import conditions_text, hypothesis_groups, parameter_text
+from calib.page.gap_tables import conditions_text, hypothesis_groups, parameter_text, prior_text
 from calib.page.gap_verdict import (
     Candidate,
     GapEvidence,
@@ -469,3 +469,14 @@ def test_what_comes_and_goes_is_not_told_by_its_end(tmp_path):
     size = re.search(r"changes by ([0-9.]+) ± [0-9.]+ kN rms over the field rows", sentence)
     assert size is not None, sentence
     assert float(size[1]) == pytest.approx(np.sqrt(np.mean(gusts**2)), abs=0.03)
+
+
+def test_prior_probabilities_are_said():
+    said = prior_text(pull_diagnosis(None))
+    assert said.startswith("none (noise) ")
+    assert "each of 3 effects by themselves" in said
+    assert "each of 3 pairs that were tried" in said
+    shares = [float(s) for s in re.findall(r"([0-9.]+) %", said)]
+    # None, shift and unknown once, three effects and three pairs.
+    total = sum(n * p for n, p in zip((1, 1, 1, 3, 3), shares, strict=True))
+    assert total == pytest.approx(100.0, abs=2.0)

@@ -90,7 +90,7 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
         """Diagnose it."""
         with _effects(item.effects, item.case) as own:
             found = diagnose(item.case, seed, effects={**EFFECTS, **own})
-            files = written(found) | (_page(found, seed) if item.page else {})
+            files = written(found, item.effects) | (_page(found, seed) if item.page else {})
         return Work(diagnosis_numbers(found), files)
 
 
