@@ -26,7 +26,7 @@ from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import SHIFTS
 from calib.gap.hypothesis import Hypothesis
-from calib.gap.shifts import alone_sd, quantities
+from calib.gap.shifts import ZERO_OF_SLIP, alone_sd, quantities
 from calib.gap.which import calibrate_lab
 from calib.tasks import completed
 from calib.threads import one_thread
@@ -35,7 +35,7 @@ type Array = NDArray[np.float64]
 
 QUANTITIES = (
     "K", "D", "G", "C", "K_difference", "D_difference", "G_difference", "K_bend", "D_bend",
-    "G_bend", "z_ref", "n0", "n1",
+    "G_bend", "z_ref", "n0", "n1", "slip_zero",
 )  # fmt: skip
 SIZES = (0.05, 0.1, 0.2, 0.4, 0.8)
 WAYS = 3
@@ -80,6 +80,8 @@ def seen(found: Fit, outputs: Sequence[OutputData]) -> Seen | None:
     for o in outputs:
         kinds = quantities(o.priors.names)
         names += kinds if o.name != "bulk_density" else [""] * len(kinds)
+        if o.name == "drawbar_pull":
+            names.append(ZERO_OF_SLIP)
     at = [i for i, name in enumerate(names) if name in QUANTITIES]
     if not at:
         return None

@@ -38,14 +38,21 @@ def test_it_sees_a_shift_in_prior_sds(script: ModuleType) -> None:
     sigma = {o: NOISE[o] for o in MODELS}
     forward = Forward(data, Hypothesis("parameter_shift", shift=0.25), sigma)
     psi = np.array([p.loc for p in forward.priors.free])
-    psi[forward.shift_slice] = np.linspace(-0.2, 0.2, 13)
+    psi[forward.shift_slice] = np.linspace(-0.2, 0.2, 14)
     # As a likelihood of precision 400 would leave it beside the prior.
     prior = np.array([p.scale for p in forward.priors.free]) ** -2.0
     covariance = np.diag(1.0 / (np.where(np.isfinite(prior), prior, 0.0) + 400.0))
     noise = {o: Noise(s) for o, s in sigma.items()}
     found = script.seen(Fit(forward, psi, covariance, noise, 0.0, 0.0, {}), data.outputs)
     np.testing.assert_allclose(np.diag(found.precision), 400.0, rtol=1e-9)
-    names = [q for o in data.outputs for q in script.quantities(o.priors.names)]
+    names = [
+        q
+        for o in data.outputs
+        for q in [
+            *script.quantities(o.priors.names),
+            *([script.ZERO_OF_SLIP] if o.name == "drawbar_pull" else []),
+        ]
+    ]
     order = [names.index(q) for q in script.QUANTITIES]
     expected = (400.0 + prior[forward.shift_slice]) * psi[forward.shift_slice]
     np.testing.assert_allclose(found.pull, expected[order], rtol=1e-9)

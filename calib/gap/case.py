@@ -199,6 +199,19 @@ def _warnings(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str,
             f"{same} of {len(field)} field rows are rows of the calibration, value for value; the "
             "field must be other measurements, or every gap looks smaller than it is"
         )
+    copies = len(field) - len(set(zip(*(field[name].tolist() for name in field), strict=True)))
+    if copies:
+        said.append(
+            f"{copies} of {len(field)} field rows are copies of another, value for value; a copy "
+            "counts as a measurement of its own and makes every probability too sure: leave it out"
+        )
+    used = {name for model in models.values() for name in get_model(model).conditions}
+    held = [n for n in used if n in lab and n in field and not np.ptp(lab[n]) and np.ptp(field[n])]
+    if held:
+        said.append(
+            f"{', '.join(sorted(held))}: held constant in the calibration and varied in the field; "
+            "what it does to the simulator rests on the priors alone"
+        )
     states = ("speed_m_s", "pass_number", "gravimetric_water_content")
     both = [n for n in states if n in lab and n in field]
     varied = [n for n in both if np.ptp(lab[n]) > 0.0 and np.ptp(field[n]) == 0.0]

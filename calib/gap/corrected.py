@@ -24,6 +24,7 @@ from calib.gap.hypotheses import effect_priors
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
+from calib.gap.shifts import ShiftMap
 from calib.gap.shrink import predict_fresh
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
@@ -33,7 +34,7 @@ __all__ = [
     "Corrected", "conditions_outside", "load_corrected", "predict_columns", "save_corrected",
 ]  # fmt: skip
 
-SCHEMA = "calib/corrected/2"
+SCHEMA = "calib/corrected/3"
 
 
 class Corrected:
@@ -101,7 +102,7 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
         "effects": [e.name for e in h.effects],
         "shift": h.shift,
         "shift_as": h.shift_as,
-        "shift_maps": {o: matrix.tolist() for o, matrix in fit.forward.shift_maps.items()},
+        "shift_map": _shift_document(fit.forward.shift),
         "smooth": h.smooth,
         "smooth_outputs": list(h.smooth_outputs),
         "smooth_over": h.smooth_over,
@@ -115,6 +116,20 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
             o: {"sigma": n.sigma, "rho": n.rho, "kappa": n.kappa} for o, n in fit.noise.items()
         },
     }
+
+
+def _shift_document(shift: ShiftMap | None) -> dict[str, Any] | None:
+    if shift is None:
+        return None
+    parameters = {o: matrix.tolist() for o, matrix in shift.parameters.items()}
+    return {"parameters": parameters, "radius_error": shift.radius_error.tolist()}
+
+
+def _load_shift(document: dict[str, Any] | None) -> ShiftMap | None:
+    if document is None:
+        return None
+    parameters = {o: np.array(matrix) for o, matrix in document["parameters"].items()}
+    return ShiftMap(parameters, np.array(document["radius_error"]))
 
 
 def _short(draws: Array) -> list[list[float]]:
@@ -176,9 +191,9 @@ def _load_fit(
     )  # fmt: skip
     noise = {o: Noise(n["sigma"], n["rho"], n["kappa"]) for o, n in document["noise"].items()}
     # What the coordinates of a shift mean is the file's, whatever the priors shipped now say.
-    maps = {o: np.array(matrix) for o, matrix in document["shift_maps"].items()}
+    shift = _load_shift(document["shift_map"])
     sigma = {o: n.sigma for o, n in noise.items()}
-    forward = Forward(data, hypothesis, sigma, lab_mode, maps)
+    forward = Forward(data, hypothesis, sigma, lab_mode, shift)
     psi, covariance = np.array(document["psi"]), np.array(document["covariance"])
     if psi.shape != (forward.n_dim,) or covariance.shape != (forward.n_dim, forward.n_dim):
         raise ValueError("shape")

@@ -210,7 +210,8 @@ class _Residuals:
     def costs(self, psi: Array, raw: Mapping[str, Array], noise: Mapping[str, Noise]) -> Array:
         """Minus log posterior but for constants, shape (k,)."""
         r = self.standardised(psi, raw, noise)
-        return np.asarray(0.5 * np.square(r).sum(axis=1) + self.ln_sds(noise))
+        with np.errstate(over="ignore"):  # a cost beyond all numbers is one as well
+            return np.asarray(0.5 * np.square(r).sum(axis=1) + self.ln_sds(noise))
 
     def best(self, candidates: Array, noise: Mapping[str, Noise], count: int) -> list[Array]:
         """Return the best candidates that lie apart from each other."""

@@ -22,7 +22,7 @@ from calib.gap.covariates import Covariates
 from calib.gap.discrepancy import THRESHOLDS, Discrepancy
 from calib.gap.effects import View
 from calib.gap.hypothesis import Hypothesis
-from calib.gap.shifts import shift_map
+from calib.gap.shifts import ShiftMap, shift_map
 from calib.models.base import Array
 from calib.priors import Prior, Priors
 
@@ -57,8 +57,8 @@ class Forward:
     lab_mode : mapping of str to ndarray, optional
         Internal parameters of the simulators as the lab calibrated them; for a discrepancy that
         varies with the level of the output.
-    shift_maps : mapping of str to ndarray, optional
-        What the coordinates of a shift do to each output's parameters, as `shift_map` once gave.
+    shift : ShiftMap, optional
+        What the coordinates of a shift do, as `shift_map` once gave.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Forward:
         hypothesis: Hypothesis,
         noise: Mapping[str, float],
         lab_mode: Mapping[str, Array] | None = None,
-        shift_maps: Mapping[str, Array] | None = None,
+        shift: ShiftMap | None = None,
     ) -> None:
         self.data = data
         self.hypothesis = hypothesis
@@ -104,10 +104,10 @@ class Forward:
             errors = [_normal("form", sd) for sd in sds]
             self.form_slices[o.name] = _append(entries, errors, o.name)
         self.shift_slice = slice(len(entries), len(entries))
-        self.shift_maps: Mapping[str, Array] = {}
+        self.shift: ShiftMap | None = None
         if hypothesis.shift > 0.0:
-            maps, relative = shift_map(data.outputs, hypothesis.shift_as)
-            self.shift_maps = maps if shift_maps is None else shift_maps
+            current, relative = shift_map(data.outputs, hypothesis.shift_as)
+            self.shift = current if shift is None else shift
             shifts = [_normal("shift", hypothesis.shift * sd) for sd in relative]
             self.shift_slice = _append(entries, shifts, "field")
         self.smooth_slices: dict[str, slice] = {}
@@ -172,8 +172,8 @@ class Forward:
         index = [o.name for o in self.data.outputs].index(output)
         o = self.data.outputs[index]
         t = psi[:, self.theta_slices[output]]
-        if field and self.shift_maps:
-            t = t + psi[:, self.shift_slice] @ self.shift_maps[output].T
+        if field and self.shift is not None:
+            t = t + psi[:, self.shift_slice] @ self.shift.parameters[output].T
         return o.priors.to_natural(t)
 
     def _predict(
@@ -220,7 +220,7 @@ class Forward:
         plain: dict[str, Array] = {}
         for o in self.data.outputs:
             theta = self.theta(psi, o.name, field=True)
-            plain[o.name] = self._predict(o, theta, psi, self._conditions(o, view))
+            plain[o.name] = self._predict(o, theta, psi, self._shifted(psi, o, view))
         if self.hypothesis.effects:
             plain = self._with_effects(psi, view, plain)
         if self.smooth_slices:
@@ -228,6 +228,19 @@ class Forward:
             for name, part in self.smooth_slices.items():
                 plain[name] = plain[name] + self.discrepancy.at(psi[:, part], threshold, view, name)
         return plain
+
+    def _shifted(self, psi: Array, o: OutputData, view: View) -> dict[str, Array]:
+        """Conditions as they truly are: with a shift the zero of slip is another."""
+        conditions = self._conditions(o, view)
+        if (
+            self.shift is None
+            or not self.shift.radius_error.any()
+            or "slip_ratio" not in conditions
+        ):
+            return conditions
+        error = psi[:, self.shift_slice] @ self.shift.radius_error
+        slip = 1.0 - (1.0 - conditions["slip_ratio"]) * (1.0 - error[:, None])
+        return {**conditions, "slip_ratio": slip}
 
     def _with_effects(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
         outputs = {o.name: o for o in self.data.outputs}
@@ -242,13 +255,18 @@ class Forward:
         for name, o in outputs.items():
             original = self._conditions(o, view)
             conditions = original
-            for effect, phi in zip(self.hypothesis.effects, phis, strict=True):
+            acting = [
+                (effect, phi)
+                for effect, phi in zip(self.hypothesis.effects, phis, strict=True)
+                if name in effect.outputs
+            ]
+            for effect, phi in acting:
                 conditions = effect.on_conditions(phi, name, conditions, view)
             location = plain[name]
             if conditions is not original:
                 theta = self.theta(psi, name, field=True)
                 location = self._predict(o, theta, psi, conditions)
-            for effect, phi in zip(self.hypothesis.effects, phis, strict=True):
+            for effect, phi in acting:
                 location = effect.on_output(phi, name, location, view)
             if form.shape[1]:
                 factor = 1.0 + psi[:, self.form_slices[name]] @ form.T

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calib.data import Table
 from calib.gap.case import Campaigns, Case, campaigns
+from calib.gap.conditions import check_units, without_far_conditions
 from calib.gap.effects import Effect
 from calib.gap.which import Ranking, rank
 from calib.models.base import Array
@@ -43,7 +44,8 @@ def rank_without_outliers(
         Of the rows that are left; its case says which were set aside.
     Ranking
     """
-    case = _without_lab_outliers(case, seed)
+    check_units(case)
+    case = _without_lab_outliers(without_far_conditions(case), seed)
     data = campaigns(case)
     ranking = rank(data, seed, effects=effects)
     for _ in range(_MOST_ROUNDS):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -12,21 +13,43 @@ from scipy.linalg import block_diag
 
 from calib.errors import CalibError
 from calib.gap.case import OutputData
+from calib.gap.effects.base import DRAWBAR
 from calib.models.base import Array
 from calib.prior_files import default_prior_path
 from calib.sampling.mode import prior_widths
 
-__all__ = ["DIFFERENCE", "ShiftAs", "alone_sd", "another_soil", "quantities", "shift_map"]
+__all__ = [
+    "DIFFERENCE", "RADIUS_ERROR", "ZERO_OF_SLIP", "ShiftAs", "ShiftMap", "alone_sd",
+    "another_soil", "quantities", "shift_map",
+]  # fmt: skip
 
 type ShiftAs = Literal["alone", "soil"]
 
 # Shifts of how a parameter varies with pressure, slip or water, relative to those of its value.
 DIFFERENCE = 0.2
+# Another zero of slip: unit of the relative error of the rolling radius.
+ZERO_OF_SLIP, RADIUS_ERROR = "slip_zero", 0.03
 # What water does to the strength of a soil: its prior spans all soils there are, of which those of
 # two campaigns with one density relation are near neighbours.
 _OF_WATER = ("C2", "C3")
 # The same quantity under another name: the exponent of plain Bekker is that without slip.
 _SAME = {"n": "n0"}
+
+
+@dataclass(frozen=True)
+class ShiftMap:
+    """What the coordinates of a shift change, per unit of each.
+
+    Attributes
+    ----------
+    parameters : mapping of str to ndarray, shape (d, k)
+        By output, its d parameters in internal coordinates.
+    radius_error : ndarray, shape (k,)
+        Relative error of the rolling radius behind the recorded slip.
+    """
+
+    parameters: Mapping[str, Array]
+    radius_error: Array
 
 
 class _Row(BaseModel):
@@ -96,15 +119,17 @@ def alone_sd(quantity: str) -> float:
     return DIFFERENCE if lesser else 1.0
 
 
-def shift_map(
-    outputs: Sequence[OutputData], shift_as: ShiftAs
-) -> tuple[dict[str, Array], list[float]]:
-    """Map shift coordinates to shifts of each output's parameters.
+def shift_map(outputs: Sequence[OutputData], shift_as: ShiftAs) -> tuple[ShiftMap, list[float]]:
+    """Map shift coordinates to shifts of each output's parameters, and of the zero of slip.
 
     Another soil changes the traction curve at all pressures, and the exponent of sinkage at all
     slips, much alike: the values at the two end pressures share one shift, and differ by less, as
     the bends between them and the exponent's growth with slip (n1) do. With "soil", what a softer
     soil does to the traction curve goes along with what it does to the ruts.
+
+    Slip was zeroed in the laboratory, where the wheel pulled nothing. Elsewhere it pulls nothing at
+    another slip, for the resistance differs: the recorded slip is then wrong as with a wrong
+    rolling radius. It is sought where drawbar pull is measured.
 
     Parameters
     ----------
@@ -113,25 +138,30 @@ def shift_map(
 
     Returns
     -------
-    dict of str to ndarray, shape (d, k)
-        By output: shifts of its d parameters per unit of the k coordinates.
+    ShiftMap
     list of float
         Prior sds of the coordinates for shifts of one prior sd.
     """
     blocks: list[Array] = []
     kinds: list[str] = []
     parts = {}
+    zero = slice(0, 0)
     for o in outputs:
         names = quantities(o.priors.names)
         parts[o.name] = slice(len(kinds), len(kinds) + len(names))
         kinds += names
         blocks.append(prior_widths(o.priors)[:, None] * _unfold(names))
+        if o.name == DRAWBAR:
+            zero = slice(len(kinds), len(kinds) + 1)
+            kinds.append(ZERO_OF_SLIP)
+            blocks.append(np.full((1, 1), RADIUS_ERROR))
     matrix = block_diag(*blocks)
     sds = np.array([alone_sd(kind) for kind in kinds])
     if shift_as == "soil":
         matrix = matrix @ _together(kinds, sds)
         sds = np.ones(sds.size)
-    return {name: matrix[part] for name, part in parts.items()}, sds.tolist()
+    parameters = {name: matrix[part] for name, part in parts.items()}
+    return ShiftMap(parameters, matrix[zero].sum(axis=0)), sds.tolist()
 
 
 def _unfold(names: Sequence[str]) -> Array:

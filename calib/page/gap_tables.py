@@ -165,10 +165,12 @@ def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
     fit : Fit
         Of a parameter shift.
     """
-    part = fit.forward.shift_slice
+    part, shift = fit.forward.shift_slice, fit.forward.shift
+    if shift is None:
+        return []
     sizes = []
     for o in outputs:
-        matrix = fit.forward.shift_maps[o.name]
+        matrix = shift.parameters[o.name]
         shifts = matrix @ fit.psi[part]
         sds = np.sqrt(np.einsum("ij,jk,ik->i", matrix, fit.covariance[part, part], matrix))
         for prior, value, s in zip(o.priors.free, shifts, sds, strict=True):
@@ -183,6 +185,10 @@ def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
                     prior.name, sign, format_value(float(value), float(s)), unit
                 )
             )
+    error = 100.0 * float(shift.radius_error @ fit.psi[part])
+    s = 100.0 * float(shift.radius_error @ fit.covariance[part, part] @ shift.radius_error) ** 0.5
+    if abs(error) > 1.645 * s:
+        sizes.append(Markup("zero of slip {} %").format(format_value(error, s)))
     if not sizes:
         return [Markup("no parameter moves clearly")]
     together = len(sizes) > 1 and fit.forward.hypothesis.shift_as == "soil"

@@ -240,11 +240,12 @@ def _how_far(e: GapEvidence) -> str:
     parts = []
     for s in e.shrink:
         low, high = (_per_cent(v) for v in s.interval)
+        shrinks = "it shrinks by" if s.fraction > 0.0 else "it does not shrink:"
         part = (
-            f"{s.output} error from {s.before} to {s.after} rms (noise {s.floor}): it shrinks by "
+            f"{s.output} error from {s.before} to {s.after} rms (noise {s.floor}): {shrinks} "
             f"{_per_cent(s.fraction)} % (90 % interval {low} to {high} %)"
         )
-        if s.interval[0] <= 0.0:
+        if s.interval[0] <= 0.0 < s.fraction:
             part += ", so it may not shrink at all"
         parts.append(part)
     where = "" if e.unfitted else ", at the field's own conditions"

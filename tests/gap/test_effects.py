@@ -183,6 +183,16 @@ def test_pressure_drags_ground_pressure_along(view):
     # Twenty-one per cent, to the power of a half.
     ratio = changed["average_ground_pressure_kpa"] / view.conditions["average_ground_pressure_kpa"]
     np.testing.assert_allclose(ratio, 1.1)
+    np.testing.assert_allclose(changed["slip_ratio"][0], view.slip(), rtol=1e-12)
+
+
+def test_at_another_pressure_the_wheel_rolls_on_another_radius(view):
+    gain = {"gain": np.log(1.21), "offset": 0.0, "ground": 1.0, "rolling_radius": 0.05}
+    changed = EFFECTS["pressure_gauge_bias"].on_conditions(
+        parameters("pressure_gauge_bias", gain), "drawbar_pull", dict(view.conditions), view
+    )
+    larger = 0.05 * np.log(1.21)
+    np.testing.assert_allclose(1.0 - changed["slip_ratio"][0], (1.0 - larger) * (1.0 - view.slip()))
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.gap.effects import EFFECTS
+from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors, pair, singles, unknowns
 from calib.gap.hypothesis import Hypothesis
+from calib.priors import Prior, Priors
 from gap.cases import NOISE, campaigns_of
 
 SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}
@@ -155,3 +156,25 @@ def test_two_effects_that_depart_over_pressure_do_so_together(data):
     both = pair(single(data, "pressure_gauge_bias"), single(data, "slip_zero_shift"))
     forward = Forward(data, both, SIGMA)
     assert [p.scale for p in forward.priors.free[forward.form_slices["drawbar_pull"]]] == [0.13]
+
+
+def test_an_effect_acts_on_the_outputs_it_names_alone(data):
+    class Wind(Effect):
+        name = "wind"
+        parameters = ("force",)
+        outputs = ("drawbar_pull",)
+
+        def on_conditions(self, phi, output, conditions, view):
+            raised = {k: 1.01 * v for k, v in conditions.items()}
+            return raised if phi.any() else conditions
+
+        def on_output(self, phi, output, location, view):
+            return location + phi[:, :1]
+
+    priors = Priors((Prior("force", "kN", "", "", "", False, 0.0, 0.1),))
+    forward = Forward(data, Hypothesis("wind", (Wind(),), (priors,)), SIGMA)
+    psi = np.array([[p.loc for p in forward.priors.free]])
+    psi[0, forward.phi_slices[0]] = 0.2
+    full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
+    np.testing.assert_array_equal(full["rut_depth"], plain["rut_depth"])
+    assert (full["drawbar_pull"] > plain["drawbar_pull"] + 0.1).all()

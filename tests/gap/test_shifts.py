@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,12 +12,20 @@ from calib.errors import CalibError
 from calib.gap import shifts as module
 from calib.gap.case import campaigns
 from calib.gap.corrected import Corrected, load_corrected, predict_columns, save_corrected
+from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
+from calib.gap.hypotheses import singles
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
-from calib.gap.shifts import DIFFERENCE, another_soil, quantities
+from calib.gap.shifts import (
+    DIFFERENCE,
+    RADIUS_ERROR,
+    ZERO_OF_SLIP,
+    another_soil,
+    quantities,
+)
 from calib.models import MODELS as KNOWN
 from calib.page.gap_tables import shift_sizes
 from calib.prior_files import default_prior_path
@@ -36,11 +45,13 @@ def drawn_shifts(data, shift_as) -> dict[str, np.ndarray]:
     """Shifts of each parameter in units of its prior sd, drawn from the prior."""
     forward = Forward(data, Hypothesis("parameter_shift", shift=SIZE, shift_as=shift_as), SIGMA)
     psi = forward.priors.sample(np.random.default_rng(1), 40_000)[:, forward.shift_slice]
+    shift = forward.shift
+    assert shift is not None
     return {
-        name: (psi @ forward.shift_maps[o.name].T)[:, i] / width
+        name: (psi @ shift.parameters[o.name].T)[:, i] / width
         for o in data.outputs
         for i, (name, width) in enumerate(zip(o.priors.names, prior_widths(o.priors), strict=True))
-    }
+    } | {ZERO_OF_SLIP: psi @ shift.radius_error / RADIUS_ERROR}
 
 
 def test_end_pressures_share_a_shift_and_differ_by_another():
@@ -54,6 +65,7 @@ def test_alone_all_pressures_change_alike_and_shapes_less(data):
     sds = {name: float(values.std()) for name, values in drawn.items()}
     assert sds["D_lo"] == pytest.approx(SIZE * np.hypot(1.0, DIFFERENCE), rel=0.03)
     assert sds["z_ref"] == pytest.approx(SIZE, rel=0.03)
+    assert sds[ZERO_OF_SLIP] == pytest.approx(SIZE, rel=0.03)
     for name in ("K_bend", "D_bend", "G_bend", "n1"):
         assert sds[name] == pytest.approx(SIZE * DIFFERENCE, rel=0.03)
     between = float(np.corrcoef(drawn["D_lo"], drawn["D_hi"])[0, 1])
@@ -73,6 +85,7 @@ def test_with_another_soil_they_covary_as_the_prior_file_says(data):
         "z_ref": drawn["z_ref"],
         "n0": drawn["n0"],
         "n1": drawn["n1"],
+        ZERO_OF_SLIP: drawn[ZERO_OF_SLIP],
     }
     for a, x in shared.items():
         for b, y in shared.items():
@@ -96,7 +109,7 @@ def test_what_the_file_does_not_know_shifts_by_itself():
 
 def test_the_prior_names_quantities_of_the_models_and_says_where_it_comes_from():
     known = {q for m in KNOWN.values() for q in quantities(m.parameters)}
-    assert set(another_soil()) <= known
+    assert set(another_soil()) <= known | {ZERO_OF_SLIP}
     content = tomllib.loads(default_prior_path("shifts/another_soil").read_text())
     for key in ("unit", "reason", "source"):
         assert len(content[key]) > 5
@@ -133,7 +146,9 @@ def fitted(data) -> Fit:
 
 def test_the_page_tells_the_shift_of_each_parameter_not_of_a_coordinate(data):
     fit = fitted(data)
-    matrix = fit.forward.shift_maps["drawbar_pull"]
+    shift = fit.forward.shift
+    assert shift is not None
+    matrix = shift.parameters["drawbar_pull"]
     names = data.outputs[0].priors.names
     sizes = shift_sizes(data.outputs, fit)
     assert sizes[-1] == "together, as with another soil"
@@ -168,3 +183,43 @@ def test_another_table_since_does_not_change_a_saved_model(data, tmp_path, monke
     after = predict_columns(load_corrected(tmp_path), data.case.field)
     for name, values in before.items():
         np.testing.assert_allclose(after[name], values, rtol=1e-9)
+
+
+@pytest.mark.parametrize("shift_as", ["alone", "soil"])
+def test_another_zero_of_slip_is_a_wrong_rolling_radius(data, shift_as):
+    shifted = Forward(data, Hypothesis("parameter_shift", shift=SIZE, shift_as=shift_as), SIGMA)
+    assert shifted.shift is not None
+    psi = np.array([[p.loc for p in shifted.priors.free]])
+    # Coordinates that shift the zero of slip and no parameter.
+    all_rows = np.concatenate(
+        [*shifted.shift.parameters.values(), shifted.shift.radius_error[None]]
+    )
+    only = np.linalg.solve(all_rows, np.eye(len(all_rows))[-1])
+    psi[0, shifted.shift_slice] = 0.04 * only
+    (wrong,) = singles(data, {"slip_zero_shift": EFFECTS["slip_zero_shift"]})
+    known = Forward(data, wrong, SIGMA)
+    other = np.array([[p.loc for p in known.priors.free]])
+    other[0, known.phi_slices[0]] = 0.04
+    found, expected = (f.field(x, data.view) for f, x in ((shifted, psi), (known, other)))
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-9)
+        assert not np.allclose(values, shifted.simulator(psi, data.view)[name], rtol=1e-3)
+
+
+def test_without_a_pull_the_zero_of_slip_is_not_sought():
+    models = {"rut_depth": "modified_bekker"}
+    ruts = campaigns(make_case(None, models=models))
+    forward = Forward(ruts, Hypothesis("parameter_shift", shift=SIZE), {"rut_depth": 0.05})
+    assert forward.shift is not None
+    assert not forward.shift.radius_error.any()
+    assert forward.shift_slice.stop - forward.shift_slice.start == 3
+
+
+def test_the_page_tells_a_clear_shift_of_the_zero_of_slip(data):
+    fit = fitted(data)
+    shift = fit.forward.shift
+    assert shift is not None
+    psi = fit.psi.copy()
+    psi[fit.forward.shift_slice] = 0.02 * shift.radius_error / np.square(shift.radius_error).sum()
+    sizes = shift_sizes(data.outputs, replace(fit, psi=psi, covariance=1e-8 * fit.covariance))
+    assert any(s.startswith("zero of slip 2.0") for s in sizes)

@@ -77,12 +77,16 @@ class SensorDrift(Effect):
 
 
 class PressureGaugeBias(Effect):
-    """True inflation pressure differs from the gauge's by a gain and an offset."""
+    """True inflation pressure differs from the gauge's by a gain and an offset.
+
+    Slip was zeroed at the recorded pressure. At another one the tyre rolls on another radius, and
+    against another resistance: 1 - s_true = (1 - s_recorded)(1 - r ln(p_true/p_recorded)).
+    """
 
     name = "pressure_gauge_bias"
     form = ("extrapolation",)  # the simulator is used at pressures it was not fitted at
     title = "true inflation pressure differs from the recorded one"
-    parameters = ("gain", "offset", "ground_response")
+    parameters = ("gain", "offset", "ground_response", "rolling_radius")
     outputs = (DRAWBAR, RUT)
     covariates = ("inflation_pressure_psi",)
     varies = False
@@ -90,7 +94,7 @@ class PressureGaugeBias(Effect):
     def on_conditions(
         self, phi: Array, output: str, conditions: dict[str, Array], view: View
     ) -> dict[str, Array]:
-        """Correct the inflation pressure, and the ground pressure that goes with it."""
+        """Correct the inflation pressure, and the ground pressure and slip that go with it."""
         recorded = view.conditions["inflation_pressure_psi"]
         true = np.maximum(recorded * np.exp(phi[:, :1]) + phi[:, 1:2], 0.2 * recorded)
         changed = dict(conditions)
@@ -101,6 +105,9 @@ class PressureGaugeBias(Effect):
             changed["average_ground_pressure_kpa"] = (
                 conditions["average_ground_pressure_kpa"] * ratio
             )
+        if "slip_ratio" in conditions:
+            larger = phi[:, 3:4] * np.log(true / recorded)
+            changed["slip_ratio"] = 1.0 - (1.0 - conditions["slip_ratio"]) * (1.0 - larger)
         return changed
 
 

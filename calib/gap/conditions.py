@@ -1,0 +1,106 @@
+"""Conditions that cannot be right: one row's is set aside, a column's in another unit refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.data import Table
+from calib.errors import CalibError
+from calib.gap.case import MAX_RATIO, Case
+from calib.models import get_model
+from calib.models.base import Array
+from calib.outputs import OUTPUTS
+
+__all__ = ["check_units", "without_far_conditions"]
+
+# Runs may come in any order and number.
+_ANY = ("run_order", *OUTPUTS.values())
+# A value is far from all others if it lies this part of their range beyond them, and by no less
+# than a factor of `_LEAST_FACTOR`; of quantities that may be negative, than half their size.
+_FAR = 1.5
+_LEAST_FACTOR = 8.0
+# Part of both campaigns that may lie off before it is the campaigns' own way.
+_MOST = 0.05
+
+
+def check_units(case: Case) -> None:
+    """Refuse campaigns whose conditions cannot be in the same unit.
+
+    Raises
+    ------
+    CalibError
+        Naming the column and its typical values.
+    """
+    for name in _used(case):
+        if name not in case.lab or name not in case.field:
+            continue
+        lab, field = (float(np.median(table[name])) for table in (case.lab, case.field))
+        if min(lab, field) <= 0.0 or 1.0 / MAX_RATIO < field / lab < MAX_RATIO:
+            continue
+        raise CalibError(
+            f"{name} is typically {field:.3g} in the field and {lab:.3g} in the calibration",
+            where=case.field.source,
+            allowed=f"campaigns whose conditions differ by less than a factor of {MAX_RATIO:g}",
+            mend="check the units in the column names",
+        )
+
+
+def without_far_conditions(case: Case) -> Case:
+    """Set rows aside whose conditions are far from those of all others, as a typing error's are.
+
+    Their outputs are left out and the condition taken as it typically is, so that rows keep their
+    numbers. The case's warnings say so.
+    """
+    lab, field, said = case.lab, case.field, list(case.warnings)
+    for name in case.field:
+        if name in _ANY or name not in case.lab:
+            continue
+        far = _far(np.concatenate([lab[name], field[name]]))
+        in_lab, in_field = (np.flatnonzero(part) for part in (far[: len(lab)], far[len(lab) :]))
+        if in_lab.size:
+            said.append(_said(lab, name, in_lab))
+            lab = _blanked(lab, name, in_lab)
+        if in_field.size:
+            said.append(_said(field, name, in_field))
+            field = _blanked(field, name, in_field)
+    return replace(case, lab=lab, field=field, warnings=tuple(said))
+
+
+def _used(case: Case) -> list[str]:
+    """Conditions that the case's models take."""
+    found = [name for model in case.models.values() for name in get_model(model).conditions]
+    return list(dict.fromkeys(found))
+
+
+def _far(values: Array) -> NDArray[np.bool_]:
+    """Which values lie far from all others; none where many do, or nothing is known."""
+    positive = bool(values.min() > 0.0)
+    u = np.log(values) if positive else values
+    order = np.sort(u)
+    k = max(1, int(_MOST * u.size))
+    if u.size < 4 * k:
+        return np.zeros(u.size, dtype=bool)
+    low, high = float(order[k]), float(order[-k - 1])
+    least = float(np.log(_LEAST_FACTOR)) if positive else max(0.5 * max(abs(low), abs(high)), 0.1)
+    reach = max(_FAR * (high - low), least)
+    return np.asarray((u < low - reach) | (u > high + reach))
+
+
+def _blanked(table: Table, name: str, rows: NDArray[np.int64]) -> Table:
+    columns = {column: np.array(values) for column, values in table.columns.items()}
+    columns[name][rows] = np.median(np.delete(columns[name], rows))
+    for output in OUTPUTS.values():
+        if output in columns:
+            columns[output][rows] = np.nan
+    return replace(table, columns=columns)
+
+
+def _said(table: Table, name: str, rows: NDArray[np.int64]) -> str:
+    at = ", ".join(f"line {table.lines[row]} ({name} = {table[name][row]:.4g})" for row in rows)
+    return (
+        f"{table.source}, {at}: far from all other rows of both campaigns; left out as a mistake "
+        "(if it is none, add rows between)"
+    )
