@@ -50,7 +50,8 @@ def diagnose(
     from calib.gap.provenance import INPUTS, inputs_record
     from calib.numbers import format_number
     from calib.outputs import OUTPUTS
-    from calib.page.diagnosis import write_page
+    from calib.page.diagnosis import gap_evidence, write_page
+    from calib.page.gap_verdict import judge_gap
 
     check_folder(out, overwrite=overwrite)
     if case is not None and run is None and field is None:
@@ -77,7 +78,7 @@ def diagnose(
         write_page(found, folder, manifest)
     for warning in found.data.case.warnings:
         print(f"calib: {warning}", file=sys.stderr)
-    print(f"verdict: {found.verdict}")
+    print(f"verdict: {found.verdict} ({judge_gap(gap_evidence(found)).headline})")
     for name in found.ranking.order[:4]:
         print(f"  {found.ranking.probability[name]:6.3f}  {name}")
     for output, s in found.shrink.items():

@@ -303,3 +303,13 @@ def test_growth_that_levels_off():
 def test_the_rut_alone_does_not_show_what_acts_on_the_pull(name: str, view: View) -> None:
     assert EFFECTS[name].not_testable(view, ("rut_depth",)) == "no drawbar_pull output"
     assert EFFECTS[name].not_testable(view, ("drawbar_pull", "rut_depth")) is None
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effect_names_every_output_that_it_changes(name, view):
+    effect = EFFECTS[name]
+    rng = np.random.default_rng(1)
+    phi = rng.uniform(0.05, 0.3, (1, len(effect.parameters)))
+    for output in {"drawbar_pull", "rut_depth", "bulk_density"} - set(effect.outputs):
+        location = np.ones((1, view.slip().size))
+        np.testing.assert_array_equal(effect.on_output(phi, output, location, view), location)

@@ -70,7 +70,8 @@ class SlipSinkage(Effect):
     title = "sinkage grows with slip beyond what the model has"
     parameters = ("growth", "slip_exponent", "pull_loss")
     form = ("slip", "pressure")
-    outputs = (RUT,)
+    outputs = (DRAWBAR, RUT)
+    needs = (RUT,)  # a pull alone does not tell the sinkage that costs it
     covariates = ("slip_ratio",)
 
     def _deepening(self, phi: Array, view: View) -> Array:
