@@ -108,10 +108,10 @@ def _foreign(cases: Sequence[Path], out: Path, seed: int) -> Mapping[str, list[s
             reason = "are of other cases, or of these before their files were changed"
         elif said.get("seed") != seed:
             reason = f"were made with --seed {said.get('seed')}, not {seed}"
-        elif any(said.get(key) != value for key, value in made_by.items()):
+        elif said.get("version") != made_by["version"]:
             reason = f"were made by version {said.get('version')}, not {made_by['version']}"
-            if said.get("version") == made_by["version"]:
-                reason = f"were made by other code or priors of version {made_by['version']}"
+        elif said.get("code_sha256") != made_by["code_sha256"]:
+            reason = f"were made by other code or priors of version {made_by['version']}"
         elif "effects" in said:
             reason = "were made with effects of one's own"
         else:

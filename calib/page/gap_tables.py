@@ -17,7 +17,7 @@ from calib.figures.gap_rows import (
     unit_after,
 )
 from calib.figures.gap_which import placebos
-from calib.figures.labels import MINUS
+from calib.figures.labels import MINUS, percent
 from calib.gap.case import OutputData
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
@@ -71,17 +71,11 @@ def prior_text(found: Diagnosis) -> str:
     prior = found.ranking.prior
     singles = [n for n in prior if n not in LN_PRIOR and "+" not in n]
     pairs = [n for n in prior if "+" in n]
-    parts = [
-        f"{short_name(n)} {_percent(prior[n])}" for n in ("none", "parameter_shift", "unknown")
-    ]
+    parts = [f"{short_name(n)} {percent(prior[n])}" for n in ("none", "parameter_shift", "unknown")]
     for names, kind in ((singles, "effects by themselves"), (pairs, "pairs that were tried")):
         if names:
-            parts.append(f"each of {len(names)} {kind} {_percent(prior[names[0]])}")
+            parts.append(f"each of {len(names)} {kind} {percent(prior[names[0]])}")
     return ", ".join(parts)
-
-
-def _percent(p: float) -> str:
-    return f"{format_number(100.0 * p, 2)} %"
 
 
 def _row(found: Diagnosis, name: str, left: dict[str, float]) -> dict[str, Any]:
