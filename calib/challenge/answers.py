@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from scipy.special import ndtr
 from scipy.stats import rankdata
 
-from calib.challenge.effects import NONE
 from calib.challenge.files import OUTPUT_COLUMNS
+from calib.challenge.mechanism import NONE
 
 type Array = NDArray[np.float64]
 

@@ -9,18 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.challenge.design import Tier
-from calib.challenge.effects import (
-    ABSORBABLE,
-    NONE,
-    SHIFT,
-    UNKNOWN,
-    UNLISTED,
-    kind_of,
-    needs_of,
-)
+from calib.challenge.effects import ABSORBABLE, UNLISTED, kind_of, needs_of
 from calib.challenge.identify import Identifiability, identify, isolable_nats
 from calib.challenge.mechanics import Reality
-from calib.challenge.mechanism import DENSITY, EffectKind, Readings
+from calib.challenge.mechanism import DENSITY, NONE, SHIFT, UNKNOWN, EffectKind, Readings
 from calib.challenge.shift import LARGEST_AMOUNT, SMALLEST_AMOUNT, draw_shift, shifted
 from calib.challenge.stage import LACK_OF_FIT, Stage, draw_stage, rms
 from calib.challenge.surrogate import misfit, recalibrate

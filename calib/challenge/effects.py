@@ -2,17 +2,25 @@
 
 from __future__ import annotations
 
-from calib.challenge import effects_ground, effects_instruments, unlisted
+from calib.challenge import (
+    effects_ground,
+    effects_instruments,
+    unlisted_ground,
+    unlisted_instruments,
+    unlisted_wheel,
+)
 from calib.challenge.design import Needs
 from calib.challenge.mechanism import DENSITY, EffectKind
 from calib.errors import CalibError
 
-NONE, UNKNOWN, SHIFT = "none", "unknown", "parameter_shift"
-
 LISTED: dict[str, EffectKind] = {
     kind.name: kind for kind in (*effects_instruments.KINDS, *effects_ground.KINDS)
 }
-UNLISTED: tuple[EffectKind, ...] = unlisted.KINDS
+UNLISTED: tuple[EffectKind, ...] = (
+    *unlisted_ground.KINDS,
+    *unlisted_wheel.KINDS,
+    *unlisted_instruments.KINDS,
+)
 
 # A recalibrated model absorbs these (nearly) whole: a gauge's gain is another pressure
 # dependence, a probe's gain another constant. Only their simplicity tells them apart.

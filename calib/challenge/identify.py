@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.challenge.effects import LISTED, SHIFT, acts_on
-from calib.challenge.mechanism import RUT, EffectKind
+from calib.challenge.effects import LISTED, acts_on
+from calib.challenge.mechanism import RUT, SHIFT, EffectKind
 from calib.challenge.stage import Stage, rms
 from calib.challenge.surrogate import full_jacobian, recalibration_span
 

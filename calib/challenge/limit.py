@@ -13,7 +13,7 @@ import numpy as np
 
 from calib.challenge.answers import CaseAnswer
 from calib.challenge.design import Tier
-from calib.challenge.effects import NONE, UNKNOWN
+from calib.challenge.mechanism import NONE, UNKNOWN
 from calib.challenge.oracle.case import CaseItem, examine, read_item
 from calib.challenge.oracle.combine import errors, probabilities
 from calib.challenge.score import TierScore, score_tier

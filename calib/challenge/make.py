@@ -11,8 +11,9 @@ import numpy as np
 
 from calib.challenge.build import try_case, unlisted_order
 from calib.challenge.design import Tier
-from calib.challenge.effects import LISTED, NONE, SHIFT, UNKNOWN, wheel_effects
+from calib.challenge.effects import LISTED, wheel_effects
 from calib.challenge.files import CaseFiles, case_files
+from calib.challenge.mechanism import NONE, SHIFT, UNKNOWN
 from calib.challenge.seal import KEY_SCHEMA, check_outside, publish, seal
 from calib.errors import CalibError
 from calib.tasks import completed

@@ -15,6 +15,7 @@ type Array = NDArray[np.float64]
 type Readings = dict[str, Array]
 
 DRAWBAR, RUT, DENSITY = "drawbar_pull", "rut_depth", "bulk_density"
+NONE, UNKNOWN, SHIFT = "none", "unknown", "parameter_shift"
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.stats import beta
 
 from calib.challenge.answers import FAILED, CaseAnswer, read_answer
-from calib.challenge.effects import NONE, UNKNOWN
+from calib.challenge.mechanism import NONE, UNKNOWN
 from calib.challenge.seal import open_key
 from calib.errors import CalibError
 from calib.gap.provenance import case_hashes, listed, recorded_inputs

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 
 from calib.challenge.answers import CaseAnswer
-from calib.challenge.effects import NONE, SHIFT, UNKNOWN
 from calib.challenge.levels import LEVELS, Level
 from calib.challenge.limit import Limit, rms_error
-from calib.challenge.mechanism import DENSITY
+from calib.challenge.mechanism import DENSITY, NONE, SHIFT, UNKNOWN
 from calib.challenge.score import Average, Proportion, Score, TierScore
 
 _EXTRA = (

@@ -54,7 +54,7 @@ CONTRACT = {
 def test_every_effect_of_the_contract_is_there() -> None:
     """Names are those of the contract's table."""
     assert set(LISTED) == CONTRACT
-    assert len({kind.draw(np.random.default_rng(0)).variant for kind in UNLISTED}) >= 6
+    assert len({kind.draw(np.random.default_rng(0)).variant for kind in UNLISTED}) >= 15
 
 
 @pytest.mark.parametrize("name", sorted(CONTRACT))
@@ -162,3 +162,41 @@ def test_reality_shares_nothing_with_the_effects_that_explain_it() -> None:
         if path.name == "score.py":
             own -= {"calib.gap.provenance"}
         assert all(name.startswith(allowed) for name in own), path.name
+
+
+def oddity(variant: str, at: Conditions, seed: int = 0) -> tuple[Readings, Readings]:
+    """Return the readings with and without an unlisted mechanism of a middling strength."""
+    families = (kind.draw(np.random.default_rng(seed)) for kind in UNLISTED)
+    family = next(f for f in families if f.variant == variant)
+    base = reality()
+    strength = (family.low * family.high) ** 0.5
+    return simulate(base.with_mechanisms(family.at(strength)), at), simulate(base, at)
+
+
+@pytest.mark.parametrize(
+    ("variant", "condition", "values"),
+    [
+        ("power_hop", "inflation_kpa", np.linspace(60.0, 400.0, 60)),
+        ("bounce", "speed_m_s", np.geomspace(0.01, 20.0, 60)),
+        ("clogging", "water_content", np.linspace(0.01, 0.15, 60)),
+    ],
+)
+def test_bands_cost_pull_inside_and_nothing_outside(
+    variant: str, condition: str, values: np.ndarray
+) -> None:
+    """Hop, bounce and clogging act in a band of their condition, wherever it is drawn."""
+    at = replace(conditions(60, slip=np.full(60, 0.3)), **{condition: values})
+    for seed in range(4):
+        got, without = oddity(variant, at, seed)
+        lost = without["drawbar_pull"] - got["drawbar_pull"]
+        assert np.abs(lost[[0, -1]]).max() < 1e-3 * lost.max()
+        assert np.all(np.diff(np.sign(np.diff(lost[lost > 1e-3 * lost.max()]))) <= 0)  # one hump
+
+
+def test_every_second_pass_is_driven_back() -> None:
+    """A grade costs one way what it gives the other."""
+    at = conditions(4, slip=np.full(4, 0.3), pass_number=np.array([1.0, 2.0, 3.0, 4.0]))
+    got, without = oddity("to_and_fro", at)
+    gap = got["drawbar_pull"] - without["drawbar_pull"]
+    assert gap == pytest.approx(gap[0] * np.array([1.0, -1.0, 1.0, -1.0]))
+    assert abs(gap[0]) > 0.01

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.challenge.effects import LISTED, SHIFT, UNKNOWN, UNLISTED
+from calib.challenge.effects import LISTED, UNLISTED
 from calib.challenge.mechanics import Reality
-from calib.challenge.mechanism import EffectKind, Family, Mechanism
+from calib.challenge.mechanism import SHIFT, UNKNOWN, EffectKind, Family, Mechanism
 from calib.challenge.oracle.script import Branch, branches
 from calib.challenge.shift import LARGEST_AMOUNT, SMALLEST_AMOUNT, draw_shift, shifted
 

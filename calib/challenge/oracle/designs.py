@@ -9,8 +9,9 @@ import numpy as np
 
 from calib.challenge.build import unlisted_weight
 from calib.challenge.design import Design, Needs, Tier, draw_columns, draw_models, draw_outputs
-from calib.challenge.effects import LISTED, NONE, SHIFT, UNKNOWN, needs_of, wheel_effects
+from calib.challenge.effects import LISTED, needs_of, wheel_effects
 from calib.challenge.make import NULL_FRACTION, PAIR_FRACTION, SHIFT_FRACTION, UNKNOWN_FRACTION
+from calib.challenge.mechanism import NONE, SHIFT, UNKNOWN
 from calib.challenge.oracle.causes import kind_of_state, unlisted_states
 from calib.challenge.oracle.script import branches
 

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.challenge.build import ABSORBABLE_NATS, ISOLABLE_NATS, RIVAL_NATS, UNLISTED_NATS
-from calib.challenge.effects import ABSORBABLE, LISTED, SHIFT, UNKNOWN
+from calib.challenge.effects import ABSORBABLE, LISTED
 from calib.challenge.identify import can_rival, lab_uncertainty, whitener
+from calib.challenge.mechanism import SHIFT, UNKNOWN
 from calib.challenge.oracle.bank import Bank
 from calib.challenge.stage import Stage
 from calib.challenge.surrogate import recalibration_span

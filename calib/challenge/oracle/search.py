@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.challenge.build import PAIR_FLOOR, SINGLE_FLOOR
-from calib.challenge.effects import LISTED, NONE, SHIFT, acts_on
-from calib.challenge.mechanism import RUT
+from calib.challenge.effects import LISTED, acts_on
+from calib.challenge.mechanism import NONE, RUT, SHIFT
 from calib.challenge.oracle.bank import Bank, add_nodes, open_bank
 from calib.challenge.oracle.causes import causes_of, kind_of_state, unlisted_states
 from calib.challenge.oracle.climb import Peak
