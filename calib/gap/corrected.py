@@ -34,7 +34,7 @@ __all__ = [
     "Corrected", "conditions_outside", "load_corrected", "predict_columns", "save_corrected",
 ]  # fmt: skip
 
-SCHEMA = "calib/corrected/3"
+SCHEMA = "calib/corrected/4"
 
 
 class Corrected:

@@ -10,7 +10,18 @@ from calib.gap.case import Campaigns
 from calib.gap.effects import View
 from calib.models.base import Array
 
-__all__ = ["Covariates"]
+__all__ = ["OVER", "Covariates"]
+
+# What something may vary with by itself: the first of the columns that is recorded and varies.
+OVER = {
+    "slip": ("slip_ratio",), "order": ("run_order",), "speed": ("speed_m_s",),
+    "passes": ("pass_number",), "load": ("normal_load_kn",), "cone": ("cone_index_kpa",),
+    "water": ("gravimetric_water_content", "volumetric_water_content"),
+    "pressure": ("inflation_pressure_psi", "average_ground_pressure_kpa"),
+    "low_pressure": ("inflation_pressure_psi",),
+}  # fmt: skip
+# Conditions of which factors count, not differences.
+_LOGS = frozenset({"speed_m_s", "pass_number", "normal_load_kn", "cone_index_kpa"})
 
 
 class Covariates:
@@ -32,12 +43,17 @@ class Covariates:
             for name, values in self.data.view.conditions.items()
         }
 
-    def scaled(self, view: View, name: str, transform: str = "") -> Array | None:
+    def over(self, view: View, what: str) -> Array | None:
+        """What something varies with, a key of `OVER`, scaled, shape (n,); None if nothing does."""
+        columns = (self.scaled(view, name) for name in OVER[what])
+        return next((u for u in columns if u is not None), None)
+
+    def scaled(self, view: View, name: str) -> Array | None:
         """A condition, or its logarithm, shape (n,); None where it is lacking or constant."""
         if name not in view.conditions:
             return None
         values, reference = view.conditions[name], self._ranges[name]
-        if transform == "log":
+        if name in _LOGS:
             values, reference = (
                 np.log(np.maximum(values, 1e-6)),
                 np.log(np.maximum(reference, 1e-6)),
@@ -46,8 +62,3 @@ class Covariates:
             return None
         mid, half = 0.5 * (reference.max() + reference.min()), 0.5 * np.ptp(reference)
         return np.clip((values - mid) / half, -1.5, 1.5)
-
-    def pressure(self, view: View) -> Array | None:
-        """Inflation pressure, or else that on the ground, scaled to -1..1."""
-        found = self.scaled(view, "inflation_pressure_psi")
-        return self.scaled(view, "average_ground_pressure_kpa") if found is None else found

@@ -10,21 +10,17 @@ from scipy.special import expit
 from calib.gap.case import Campaigns
 from calib.gap.covariates import Covariates
 from calib.gap.effects import View
-from calib.gap.effects.base import RUT
-from calib.gap.hypothesis import Hypothesis
+from calib.gap.effects.base import DRAWBAR, RUT
+from calib.gap.hypothesis import Hypothesis, Setting
 from calib.models.base import Array
 
-__all__ = ["ONSET_CONDITIONS", "THRESHOLDS", "Discrepancy"]
+__all__ = ["SETTINGS", "THRESHOLDS", "Discrepancy"]
 
 # Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
 THRESHOLDS = (-0.85, 0.9)
 _ONSET_WIDTH = 0.06
-# Conditions over which it may set in: the first that is recorded.
-ONSET_CONDITIONS = {
-    "slip": ("slip_ratio",), "order": ("run_order",), "cone": ("cone_index_kpa",),
-    "water": ("gravimetric_water_content", "volumetric_water_content"),
-    "low_pressure": ("inflation_pressure_psi",),
-}  # fmt: skip
+# Single conditions that it may vary with, whatever the others are.
+SETTINGS: tuple[Setting, ...] = ("pressure", "speed", "passes", "water")
 # Most waves over the range of slips that a ripple may have.
 _WAVES = 12
 
@@ -86,16 +82,11 @@ class Discrepancy:
 
     def onset_covariate(self, view: View, output: str) -> Array:
         """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
-        over = self.hypothesis.onset_over
-        if over == "low_pressure":
-            return -self._known(self.covariates.pressure(view))
+        over = self.hypothesis.onset_over or ""
         if over in ("level", "sinkage"):
             return self._known(self._level(view, output if over == "level" else RUT))
-        transform = "log" if over == "cone" else ""
-        scaled = (
-            self.covariates.scaled(view, name, transform) for name in ONSET_CONDITIONS[over or ""]
-        )
-        return self._known(next((u for u in scaled if u is not None), None))
+        u = self._known(self.covariates.over(view, over))
+        return -u if over == "low_pressure" else u
 
     def _known(self, u: Array | None) -> Array:
         if u is None:
@@ -114,9 +105,11 @@ class Discrepancy:
         if over in ("level", "sinkage"):
             terms = self._cosines(self._level(view, output if over == "level" else RUT), 8, 0.8)
         elif over == "order":
-            terms = self._cosines(self.covariates.scaled(view, "run_order"), 12, 0.7)
+            terms = self._cosines(self.covariates.over(view, "order"), 12, 0.7)
         elif over == "ripple":
             terms = self._ripples(view)
+        elif over in SETTINGS:
+            terms = self._setting_terms(view, output, over)
         else:
             terms = self._condition_terms(view, everything=over == "all")
         n = next(iter(view.conditions.values())).size
@@ -124,30 +117,39 @@ class Discrepancy:
         return np.stack(basis, axis=1), np.array([1.0] + [w for _, w in terms])
 
     def _condition_terms(self, view: View, *, everything: bool) -> list[tuple[Array, float]]:
-        slip = self.covariates.scaled(view, "slip_ratio")
-        pressure = self.covariates.pressure(view)
+        slip = self.covariates.over(view, "slip")
         slips = self._cosines(slip, 10, 0.7)
         terms = list(slips)
         if everything:
-            terms += self._cosines(self.covariates.scaled(view, "run_order"), 6, 0.5)
-        if pressure is not None:
-            terms.append((pressure, 0.7))
-            terms += [(pressure * b, 0.6 * w) for b, w in slips[:4]]
-        for name, transform in (
-            ("speed_m_s", "log"), ("pass_number", "log"), ("gravimetric_water_content", ""),
-            ("normal_load_kn", "log"), ("cone_index_kpa", "log"),
-            ("volumetric_water_content", ""),
-        ):  # fmt: skip
-            u = self.covariates.scaled(view, name, transform)
-            if u is not None and everything:
-                terms += self._cosines(u, 3, 0.4)
+            terms += self._cosines(self.covariates.over(view, "order"), 6, 0.5)
+        for u, sd in self._cosines(*self._settings(view, "pressure", 2), 0.7):
+            terms.append((u, sd))
+            terms += [(u * b, sd * w) for b, w in slips[:4]]
+        for name in ("speed", "passes", "water", "load", "cone"):
+            values = self.covariates.over(view, name)
+            if values is not None and everything:
+                terms += self._cosines(values, 3, 0.4)
                 if slip is not None:
-                    terms.append((u * slip, 0.4))
+                    terms.append((values * slip, 0.4))
         return terms
+
+    def _setting_terms(self, view: View, output: str, over: str) -> list[tuple[Array, float]]:
+        """Of one condition by itself: added to an output, or a part of its level."""
+        terms = self._cosines(*self._settings(view, over, 6), 0.8)
+        if output == DRAWBAR:  # ruts are on a logarithmic scale, where adding is to be a part of
+            level = self._known(self._level(view, output))
+            terms += [(level, 0.5), *((level * b, 0.6 * w) for b, w in terms)]
+        return terms
+
+    def _settings(self, view: View, over: str, most: int) -> tuple[Array | None, int]:
+        """A condition, and how many cosines of it its values in the field can tell apart."""
+        reference = self.covariates.over(self.data.view, over)
+        values = 1 if reference is None else np.unique(reference).size
+        return self.covariates.over(view, over), min(values - 1, most)
 
     def _ripples(self, view: View) -> list[tuple[Array, float]]:
         """Up to `_WAVES` waves over the slips, none more probable than another, of rms 1 in all."""
-        slip = self.covariates.scaled(view, "slip_ratio")
+        slip = self.covariates.over(view, "slip")
         each = (2 * _WAVES) ** -0.5
         return [(basis, each) for basis, _ in self._cosines(slip, 2 * _WAVES, 1.0)]
 

@@ -22,11 +22,11 @@ from calib.gap.noise import Noise, ln_prior, most_probable, noise_at
 from calib.models.base import Array
 from calib.sampling.mode import prior_widths
 
-__all__ = ["Fit", "fit", "log_joint"]
+__all__ = ["MAX_STEPS", "Fit", "climb_on", "fit", "log_joint"]
 
 # The noise of an output is known beforehand to this factor (sd of its logarithm).
 SIGMA_SD_LOG = 1.0
-_MAX_STEPS = 40
+MAX_STEPS = 40
 # Guesses closer than this (in prior sds) climb to the same mode.
 _APART = 0.7
 
@@ -78,6 +78,7 @@ def fit(
     *,
     starts: Array | None = None,
     polish: int = 1,
+    steps: int = MAX_STEPS,
 ) -> Fit:
     """Fit a hypothesis.
 
@@ -94,22 +95,30 @@ def fit(
     polish : int
         How many of the best guesses, apart from each other, are polished; the most probable
         mode is kept.
+    steps : int
+        Most steps of a climb; fewer give a first look, from which `climb_on` goes on.
     """
     problem = _Residuals(data, forward)
     candidates = problem.clip(start)[None]
     if starts is not None:
         candidates = np.concatenate([candidates, problem.clip(starts)])
-    fits = [_polish(problem, psi, noise) for psi in problem.best(candidates, noise, polish)]
+    fits = [_polish(problem, psi, noise, steps) for psi in problem.best(candidates, noise, polish)]
     return max(fits, key=lambda f: f.log_evidence)
 
 
-def _polish(problem: _Residuals, psi: Array, noise: Mapping[str, Noise]) -> Fit:
+def climb_on(found: Fit) -> Fit:
+    """Climb from where a fit has stopped to the mode beside it."""
+    problem = _Residuals(found.forward.data, found.forward)
+    return _polish(problem, found.psi, found.noise, MAX_STEPS)
+
+
+def _polish(problem: _Residuals, psi: Array, noise: Mapping[str, Noise], steps: int) -> Fit:
     """Climb from a guess to the mode beside it."""
     noise = dict(noise)
     damping = 1e-3
     raw = problem.raw(psi[None])
     quiet = 0
-    for _ in range(_MAX_STEPS):
+    for _ in range(steps):
         jacobian, residual = problem.jacobian(psi, noise)
         gradient = jacobian.T @ residual
         hessian = jacobian.T @ jacobian

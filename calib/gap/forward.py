@@ -139,20 +139,16 @@ class Forward:
         wanted = {kind for e in self.hypothesis.effects for kind in e.form}
         n = view.slip().size
         basis: list[tuple[str, Array]] = []
-        slip = self.covariates.scaled(view, "slip_ratio")
-        pressure = self.covariates.pressure(view)
+        slip = self.covariates.over(view, "slip")
+        pressure = self.covariates.over(view, "pressure")
         if "size" in wanted:
             basis.append(("size", np.ones(n)))
         if "slip" in wanted and slip is not None:
             basis += [("slip", slip), ("bend", 1.5 * slip**2 - 0.5)]
         if pressure is not None:
             basis += [(k, pressure) for k in ("pressure", "extrapolation") if k in wanted][:1]
-        for kind, name, transform in (
-            ("cone", "cone_index_kpa", "log"),
-            ("water", "gravimetric_water_content", ""),
-            ("water", "volumetric_water_content", ""),
-        ):
-            values = self.covariates.scaled(view, name, transform) if kind in wanted else None
+        for kind in ("cone", "water"):
+            values = self.covariates.over(view, kind) if kind in wanted else None
             if values is not None:
                 basis.append((kind, values))
         if "shape" in wanted:

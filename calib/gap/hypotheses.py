@@ -9,7 +9,8 @@ from typing import Literal
 import numpy as np
 
 from calib.gap.case import Campaigns
-from calib.gap.discrepancy import ONSET_CONDITIONS
+from calib.gap.covariates import OVER
+from calib.gap.discrepancy import SETTINGS
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.base import DENSITY, DRAWBAR, RUT
 from calib.gap.hypothesis import Hypothesis, OnsetOver, SmoothOver
@@ -110,6 +111,12 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
         *choices,
         *(("ripple", t) for t in rippled),
         *(("before", t) for t in remembered),
+        *(
+            (over, t)
+            for over in SETTINGS
+            for t in touched
+            if _varies(data, over) and DENSITY not in t
+        ),
         *(("all", t) for t in touched),
     ]
     smooth = [
@@ -143,9 +150,9 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
     ]
 
 
-def _varies(data: Campaigns, over: OnsetOver) -> bool:
+def _varies(data: Campaigns, over: str) -> bool:
     recorded = data.view.conditions
-    return any(np.ptp(recorded[c]) > 0 for c in ONSET_CONDITIONS[over] if c in recorded)
+    return any(np.ptp(recorded[c]) > 0 for c in OVER[over] if c in recorded)
 
 
 def remainders(data: Campaigns, best: Sequence[Hypothesis], n_single: int) -> list[Hypothesis]:

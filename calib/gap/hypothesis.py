@@ -9,9 +9,10 @@ from calib.gap.effects import Effect
 from calib.gap.shifts import ShiftAs
 from calib.priors import Priors
 
-__all__ = ["Hypothesis", "OnsetOver", "SmoothOver"]
+__all__ = ["Hypothesis", "OnsetOver", "Setting", "SmoothOver"]
 
-type SmoothOver = Literal["slip", "level", "sinkage", "order", "before", "ripple", "all"]
+type Setting = Literal["pressure", "speed", "passes", "water"]
+type SmoothOver = Setting | Literal["slip", "level", "sinkage", "order", "before", "ripple", "all"]
 type OnsetOver = Literal["slip", "level", "sinkage", "order", "water", "cone", "low_pressure"]
 
 
@@ -33,15 +34,16 @@ class Hypothesis:
         Prior sd of a free discrepancy, in units of the noise; 0 for none.
     smooth_outputs : tuple of str
         Outputs that have the free discrepancy.
-    smooth_over : {"slip", "level", "sinkage", "order", "before", "ripple", "all"}
+    smooth_over : SmoothOver
         What it may vary with: slip, the level of the predicted output (as a saturating
         instrument would), the predicted rut depth (as layered soil would), the order of the runs
         (as weather or another stretch of ground would), how far the output is from that of the run
         before (as a recorder that lags would), slip in waves too short for the first (as lugs that
-        pass would), or every condition.
+        pass would), one of inflation pressure, speed, passes and water content alone (as a wheel
+        that hops at some pressure would), or every condition.
     smooth_decay : float
         Number of half waves from which the discrepancy's coefficients fall off.
-    onset_over : {"slip", "level", "sinkage", "order", "water", "cone", "low_pressure"}, optional
+    onset_over : OnsetOver, optional
         Instead of smooth, the discrepancy may set in beyond a threshold of one of these, water
         content and cone index among them: a step and a change of slope there. Below a threshold
         of inflation pressure, where a limp tyre may creep on its rim or buckle: a step, and a part

@@ -17,8 +17,8 @@ from calib.figures.gap_rows import (
     unit_after,
 )
 from calib.figures.labels import joined
+from calib.gap.covariates import OVER
 from calib.gap.diagnose import Diagnosis
-from calib.gap.discrepancy import ONSET_CONDITIONS
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit
 from calib.gap.noise import noise_at
@@ -104,7 +104,9 @@ def _along(fit: Fit) -> str:
     along = {
         "slip": "slip", "ripple": "slip", "level": f"the {level}",
         "sinkage": "the predicted rut depth", "order": "the order of the runs",
-        "before": "how far the run before differed", "all": "several conditions",
+        "before": "how far the run before differed", "pressure": "inflation pressure",
+        "speed": "speed", "passes": "the passes", "water": "water content",
+        "all": "several conditions",
     }  # fmt: skip
     return along[h.smooth_over]
 
@@ -138,7 +140,7 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
         name, unit = f"a predicted {output_word(output).lower()} of", f" {axis.unit}"
     else:
         over = h.onset_over or ""
-        column = next(c for c in ONSET_CONDITIONS[over] if c in view.conditions)
+        column = next(c for c in OVER[over] if c in view.conditions)
         name = {
             "slip": "a slip of", "order": "run", "water": "a water content of",
             "cone": "a cone index of", "low_pressure": "an inflation pressure of",

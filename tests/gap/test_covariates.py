@@ -20,15 +20,12 @@ def test_both_campaigns_span_the_scale():
     np.testing.assert_allclose(slip, expected, atol=1e-12)
 
 
-def test_a_logarithm_is_even_in_ratios():
+def test_speeds_are_even_in_ratios():
     data = campaigns(make_case(models=PULL_ONLY))
-    low, high = (
-        float(f(data.case.lab["inflation_pressure_psi"]))
-        for f in (np.min, np.max)
-    )  # fmt: skip
-    columns = {**data.view.conditions, "inflation_pressure_psi": np.full(27, np.sqrt(low * high))}
-    view = replace(data.view, conditions=columns)
-    scaled = Covariates(data).scaled(view, "inflation_pressure_psi", "log")
+    both = np.concatenate([data.view.conditions["speed_m_s"], data.case.lab["speed_m_s"]])
+    middle = np.full(27, np.sqrt(both.min() * both.max()))
+    view = replace(data.view, conditions={**data.view.conditions, "speed_m_s": middle})
+    scaled = Covariates(data).over(view, "speed")
     np.testing.assert_allclose(scaled, 0.0, atol=1e-12)
 
 
@@ -58,4 +55,4 @@ def test_pressure_on_the_ground_stands_for_that_in_the_tyre():
     covariates = Covariates(data)
     ground = covariates.scaled(data.view, "average_ground_pressure_kpa")
     assert ground is not None
-    np.testing.assert_array_equal(covariates.pressure(data.view), ground)
+    np.testing.assert_array_equal(covariates.over(data.view, "pressure"), ground)

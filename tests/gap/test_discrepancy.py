@@ -39,6 +39,21 @@ def test_over_slip_it_is_cosines_of_slip_and_a_trend_with_pressure(data):
     np.testing.assert_allclose(curve, np.sqrt(2.0) * np.cos(np.pi * (slip + 1.0)), atol=1e-12)
 
 
+def test_over_one_condition_alone_it_is_added_or_a_part_of_the_pull(data):
+    found = of(data, smooth_over="pressure")
+    pressures = np.unique(data.view.conditions["inflation_pressure_psi"]).size
+    sds = found.sds("drawbar_pull")
+    # A constant and as many cosines as tell the pressures apart, by themselves and times the pull.
+    assert sds.size == 2 * pressures
+    at = data.view.conditions["inflation_pressure_psi"] == np.median(
+        data.view.conditions["inflation_pressure_psi"]
+    )
+    level = found._level(data.view, "drawbar_pull")
+    basis = found.at(np.eye(sds.size), np.empty(0), data.view, "drawbar_pull").T
+    for wanted in (at * 1.0, at * level):
+        np.testing.assert_allclose(basis @ np.linalg.lstsq(basis, wanted)[0], wanted, atol=1e-9)
+
+
 def test_ripples_are_of_any_length_down_to_a_twelfth_of_the_slips(data):
     found = of(data, smooth_over="ripple")
     sds = found.sds("drawbar_pull")
@@ -52,7 +67,10 @@ def test_ripples_are_of_any_length_down_to_a_twelfth_of_the_slips(data):
     np.testing.assert_allclose(curve, np.sqrt(2.0) * np.cos(12.0 * np.pi * (slip + 1.0)))
 
 
-@pytest.mark.parametrize("over", ["slip", "ripple", "level", "sinkage", "order", "all"])
+@pytest.mark.parametrize(
+    "over",
+    ["slip", "ripple", "level", "sinkage", "order", "pressure", "speed", "passes", "water", "all"],
+)
 def test_it_is_the_same_function_at_other_conditions(data, over):
     found = of(data, smooth_over=over)
     amplitudes = np.random.default_rng(1).standard_normal((3, found.sds("drawbar_pull").size))

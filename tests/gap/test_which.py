@@ -132,6 +132,20 @@ def test_short_waves_over_slip_are_neither_noise_nor_listed():
     assert ranking.fits["unknown"][best].forward.hypothesis.smooth_over == "ripple"
 
 
+def test_a_wheel_that_hops_at_one_pressure_is_unknown():
+    case = make_case(None, models=PULL_ONLY, n_field=36)
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    pressure = columns["inflation_pressure_psi"]
+    pull = columns[OUTPUTS["drawbar_pull"]]
+    columns[OUTPUTS["drawbar_pull"]] = np.where(pressure == np.median(pressure), 0.85, 1.0) * pull
+    few = {n: EFFECTS[n] for n in ("force_offset", "pressure_gauge_bias", "load_transfer")}
+    ranking = rank(campaigns(replace(case, field=table_from_arrays(columns))), 1, effects=few)
+    assert ranking.order[0] == "unknown"
+    assert ranking.probability["unknown"] > 0.9
+    best = int(np.argmax(ranking.scores["unknown"]))
+    assert ranking.fits["unknown"][best].forward.hypothesis.smooth_over == "pressure"
+
+
 def test_a_recorder_that_keeps_half_of_the_run_before_is_unknown():
     case = make_case(None, models=PULL_ONLY, n_field=36)
     columns = {name: np.array(v) for name, v in case.field.columns.items()}
