@@ -122,7 +122,8 @@ class Discrepancy:
         terms = list(slips)
         if everything:
             terms += self._cosines(self.covariates.over(view, "order"), 6, 0.5)
-        for u, sd in self._cosines(*self._settings(view, "pressure", 2), 0.7):
+        bends = 2 if everything else 1
+        for u, sd in self._cosines(*self._settings(view, "pressure", bends), 0.5):
             terms.append((u, sd))
             terms += [(u * b, sd * w) for b, w in slips[:4]]
         for name in ("speed", "passes", "water", "load", "cone"):

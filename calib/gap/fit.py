@@ -9,7 +9,7 @@ posterior has its mass, so the evidence is Laplace's at first (`refine` mends it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,11 +22,14 @@ from calib.gap.noise import Noise, ln_prior, most_probable, noise_at
 from calib.models.base import Array
 from calib.sampling.mode import prior_widths
 
-__all__ = ["MAX_STEPS", "Fit", "climb_on", "fit", "log_joint"]
+__all__ = ["Fit", "climb_on", "finish", "fit", "log_joint", "look"]
 
 # The noise of an output is known beforehand to this factor (sd of its logarithm).
 SIGMA_SD_LOG = 1.0
-MAX_STEPS = 40
+_MAX_STEPS = 40
+# Steps of a first look, how many nats behind the best of several one is given up, and within how
+# many posterior sds of a better one.
+_FIRST_STEPS, _WORTH, _NEAR = 3, 6.0, 1.5
 # Guesses closer than this (in prior sds) climb to the same mode.
 _APART = 0.7
 
@@ -70,17 +73,16 @@ class Fit:
         return np.clip(drawn, lower, upper)
 
 
-def fit(
+def look(
     data: Campaigns,
     forward: Forward,
     start: Array,
     noise: Mapping[str, Noise],
     *,
     starts: Array | None = None,
-    polish: int = 1,
-    steps: int = MAX_STEPS,
-) -> Fit:
-    """Fit a hypothesis.
+    count: int = 1,
+) -> list[Fit]:
+    """Take the first steps of a fit, from one guess or several.
 
     Parameters
     ----------
@@ -92,27 +94,49 @@ def fit(
         First guess.
     starts : ndarray, shape (k, d), optional
         More guesses, screened in one call.
-    polish : int
-        How many of the best guesses, apart from each other, are polished; the most probable
-        mode is kept.
-    steps : int
-        Most steps of a climb; fewer give a first look, from which `climb_on` goes on.
+    count : int
+        How many of the best guesses, apart from each other, to begin from.
     """
     problem = _Residuals(data, forward)
     candidates = problem.clip(start)[None]
     if starts is not None:
         candidates = np.concatenate([candidates, problem.clip(starts)])
-    fits = [_polish(problem, psi, noise, steps) for psi in problem.best(candidates, noise, polish)]
-    return max(fits, key=lambda f: f.log_evidence)
+    begun = problem.best(candidates, noise, count)
+    return [_climb(problem, psi, noise, _FIRST_STEPS) for psi in begun]
+
+
+def fit(
+    data: Campaigns, forward: Forward, start: Array, noise: Mapping[str, Noise],
+    *, starts: Array | None = None, count: int = 1,
+) -> Fit:  # fmt: skip
+    """Fit a hypothesis, the parameters as for `look`."""
+    return finish(look(data, forward, start, noise, starts=starts, count=count))
+
+
+def finish(looks: Sequence[Fit]) -> Fit:
+    """Climb on from the first looks that are worth it, and keep the most probable mode."""
+    ranked = sorted(looks, key=lambda f: -f.log_evidence)
+    kept: list[Fit] = []
+    for found in ranked:
+        worth = found.log_evidence >= ranked[0].log_evidence - _WORTH
+        if worth and not any(_near(found, other) for other in kept):
+            kept.append(found)
+    return max((climb_on(f) for f in kept or ranked[:1]), key=lambda f: f.log_evidence)
+
+
+def _near(found: Fit, other: Fit) -> bool:
+    """Whether two looks are on the way to the same mode."""
+    sd = np.sqrt(np.diag(other.covariance))
+    return bool((np.abs(found.psi - other.psi) < _NEAR * sd).all())
 
 
 def climb_on(found: Fit) -> Fit:
     """Climb from where a fit has stopped to the mode beside it."""
     problem = _Residuals(found.forward.data, found.forward)
-    return _polish(problem, found.psi, found.noise, MAX_STEPS)
+    return _climb(problem, found.psi, found.noise, _MAX_STEPS)
 
 
-def _polish(problem: _Residuals, psi: Array, noise: Mapping[str, Noise], steps: int) -> Fit:
+def _climb(problem: _Residuals, psi: Array, noise: Mapping[str, Noise], steps: int) -> Fit:
     """Climb from a guess to the mode beside it."""
     noise = dict(noise)
     damping = 1e-3
