@@ -26,7 +26,7 @@ from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import SHIFTS
 from calib.gap.hypothesis import Hypothesis
-from calib.gap.shifts import ZERO_OF_SLIP, alone_sd, quantities
+from calib.gap.shifts import alone_sd, coordinates
 from calib.gap.which import calibrate_lab
 from calib.tasks import completed
 from calib.threads import one_thread
@@ -76,12 +76,7 @@ def seen(found: Fit, outputs: Sequence[OutputData]) -> Seen | None:
 
     The coordinates of a shift are in prior sds already; those of no interest are averaged over.
     """
-    names: list[str] = []
-    for o in outputs:
-        kinds = quantities(o.priors.names)
-        names += kinds if o.name != "bulk_density" else [""] * len(kinds)
-        if o.name == "drawbar_pull":
-            names.append(ZERO_OF_SLIP)
+    names = [kind if output != "bulk_density" else "" for output, kind in coordinates(outputs)]
     at = [i for i, name in enumerate(names) if name in QUANTITIES]
     if not at:
         return None

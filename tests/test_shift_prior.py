@@ -14,7 +14,7 @@ from calib.gap.fit import Fit
 from calib.gap.forward import Forward
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
-from calib.gap.shifts import another_soil
+from calib.gap.shifts import ZERO_OF_SLIP, another_soil, quantities
 from tests.gap.cases import MODELS, NOISE, campaigns_of
 
 SCRIPT = Path(__file__).resolve().parents[1] / "benchmarks" / "shift_prior.py"
@@ -49,8 +49,8 @@ def test_it_sees_a_shift_in_prior_sds(script: ModuleType) -> None:
         q
         for o in data.outputs
         for q in [
-            *script.quantities(o.priors.names),
-            *([script.ZERO_OF_SLIP] if o.name == "drawbar_pull" else []),
+            *quantities(o.priors.names),
+            *([ZERO_OF_SLIP] if o.name == "drawbar_pull" else []),
         ]
     ]
     order = [names.index(q) for q in script.QUANTITIES]

@@ -39,6 +39,8 @@ _CONDITIONS = (
 )  # fmt: skip
 _MOST_CONDITIONS = 6
 _NORM = Normalize(0.0, 1.0)
+# Gaps that do not reach this part of the noise are none.
+_TINY = 0.02
 
 
 def where_plate(found: Diagnosis) -> Plate:
@@ -196,7 +198,7 @@ def _caption(outputs: list[OutputRows]) -> str:
         parts.append(
             f"{output_word(o.name)}: {likely} of {o.rows.size} rows have a gap that probably "
             f"exceeds the noise of {short(float(np.median(o.noise)))} {o.axis.unit} (median "
-            f"over the rows, from both campaigns); the largest is {_largest(o)} {o.axis.unit}"
+            f"over the rows, from both campaigns); {_largest(o)}"
         )
     text = ". ".join(p[0].upper() + p[1:] for p in parts)
     return (
@@ -207,10 +209,13 @@ def _caption(outputs: list[OutputRows]) -> str:
 
 
 def _largest(o: OutputRows) -> str:
-    """The largest gap with its 90 % interval."""
+    """Say how large the largest gap is, with its 90 % interval."""
     row = int(np.abs(o.gap).argmax())
     gap, half = float(o.gap[row]), 1.64 * float(o.sd[row])
-    return f"{short(gap)} (90 % {short(gap - half)} to {short(gap + half)})".replace("-", MINUS)
+    if abs(gap) + half < _TINY * float(np.median(o.noise)):
+        return "none of them shows any"
+    interval = f"{short(gap)} (90 % {short(gap - half)} to {short(gap + half)})"
+    return f"the largest is {interval} {o.axis.unit}".replace("-", MINUS)
 
 
 def _region_caption(found: Diagnosis) -> str:

@@ -20,7 +20,7 @@ from calib.sampling.mode import prior_widths
 
 __all__ = [
     "DIFFERENCE", "RADIUS_ERROR", "ZERO_OF_SLIP", "ShiftAs", "ShiftMap", "alone_sd",
-    "another_soil", "quantities", "shift_map",
+    "another_soil", "coordinates", "quantities", "shift_map",
 ]  # fmt: skip
 
 type ShiftAs = Literal["alone", "soil"]
@@ -113,6 +113,17 @@ def quantities(names: Sequence[str]) -> list[str]:
     return found
 
 
+def coordinates(outputs: Sequence[OutputData]) -> list[tuple[str, str]]:
+    """Name output and quantity of every coordinate of a shift, in the order in which they come."""
+    found = []
+    for o in outputs:
+        kinds = quantities(o.priors.names)
+        if o.name == DRAWBAR:
+            kinds.append(ZERO_OF_SLIP)
+        found += [(o.name, kind) for kind in kinds]
+    return found
+
+
 def alone_sd(quantity: str) -> float:
     """Prior sd of a quantity that shifts by itself, in its parameter's prior sds."""
     lesser = quantity.endswith(("_bend", "_difference")) or quantity in ("n1", *_OF_WATER)
@@ -142,25 +153,24 @@ def shift_map(outputs: Sequence[OutputData], shift_as: ShiftAs) -> tuple[ShiftMa
     list of float
         Prior sds of the coordinates for shifts of one prior sd.
     """
+    at = coordinates(outputs)
+    kinds = [kind for _, kind in at]
     blocks: list[Array] = []
-    kinds: list[str] = []
-    parts = {}
-    zero = slice(0, 0)
     for o in outputs:
-        names = quantities(o.priors.names)
-        parts[o.name] = slice(len(kinds), len(kinds) + len(names))
-        kinds += names
+        names = [kind for name, kind in at if name == o.name and kind != ZERO_OF_SLIP]
         blocks.append(prior_widths(o.priors)[:, None] * _unfold(names))
         if o.name == DRAWBAR:
-            zero = slice(len(kinds), len(kinds) + 1)
-            kinds.append(ZERO_OF_SLIP)
             blocks.append(np.full((1, 1), RADIUS_ERROR))
     matrix = block_diag(*blocks)
     sds = np.array([alone_sd(kind) for kind in kinds])
     if shift_as == "soil":
         matrix = matrix @ _together(kinds, sds)
         sds = np.ones(sds.size)
-    parameters = {name: matrix[part] for name, part in parts.items()}
+    parameters = {
+        o.name: matrix[[name == o.name and kind != ZERO_OF_SLIP for name, kind in at]]
+        for o in outputs
+    }
+    zero = [kind == ZERO_OF_SLIP for kind in kinds]
     return ShiftMap(parameters, matrix[zero].sum(axis=0)), sds.tolist()
 
 
