@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,28 +88,27 @@ def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Re
     for o, row_gap in zip(data.outputs, gaps, strict=True):
         draws = (truth.truth[o.name] - truth.simulator[o.name])[:, o.rows]
         noise = truth.noise[o.name][:, o.rows]
-        own: list[Region] = []
+        own: list[tuple[float, Region]] = []
+        seen: set[bytes] = set()  # conditions that move together single out the same rows
         for name in _REGION_CONDITIONS:
             values = data.view.conditions.get(name)
             if values is None or np.ptp(values[o.rows]) == 0.0:
                 continue
-            stretch = _longest(values[o.rows], row_gap)
-            if stretch is None:
-                continue
-            inside = (values[o.rows] >= stretch[0]) & (values[o.rows] <= stretch[1])
-            mean = draws[:, inside].mean(axis=1)
-            beyond = np.abs(mean) > noise[:, inside].mean(axis=1)
-            own.append(
-                Region(
-                    o.name,
-                    {name: stretch},
-                    float(truth.weight @ mean),
-                    (_quantile(truth, mean, 0.05), _quantile(truth, mean, 0.95)),
-                    min(float(truth.weight @ beyond), 1.0),
-                )
-            )
-        own.sort(key=lambda r: -r.probability * abs(r.gap))
-        found += [r for r in own if r.probability > 0.5][:_MOST]
+            for stretch in _stretches(values[o.rows], row_gap):
+                inside = (values[o.rows] >= stretch[0]) & (values[o.rows] <= stretch[1])
+                if inside.tobytes() in seen:
+                    continue
+                seen.add(inside.tobytes())
+                mean = draws[:, inside].mean(axis=1)
+                beyond = np.abs(mean) > noise[:, inside].mean(axis=1)
+                probability = min(float(truth.weight @ beyond), 1.0)
+                gap = float(truth.weight @ mean)
+                ends = _quantile(truth, mean, 0.05), _quantile(truth, mean, 0.95)
+                # As many readings of one mean gap: what tells a long stretch from a short one.
+                weight = probability * abs(gap) * float(np.sqrt(inside.sum()))
+                own.append((weight, Region(o.name, {name: stretch}, gap, ends, probability)))
+        own.sort(key=lambda ranked: -ranked[0])
+        found += [r for _, r in own if r.probability > 0.5][:_MOST]
     return tuple(found)
 
 
@@ -116,22 +116,18 @@ def _quantile(truth: Truth, draws: Array, q: float) -> float:
     return float(truth.quantile(draws[:, None], q)[0])
 
 
-def _longest(values: Array, gap: RowGap) -> tuple[float, float] | None:
-    """The stretch of distinct values with the most rows that probably have a gap of one sign."""
+def _stretches(values: Array, gap: RowGap) -> list[tuple[float, float]]:
+    """The stretches of distinct values whose rows probably have a gap, of one sign each."""
     distinct = np.unique(values)
     groups = np.array_split(distinct, min(8, distinct.size))
-    best: tuple[int, float, float] | None = None
-    for sign in (1.0, -1.0):
-        start: float | None = None
-        rows = 0
-        for group in groups:
-            inside = (values >= group[0]) & (values <= group[-1])
-            likely = float(gap.probability[inside].mean()) > 0.5
-            if likely and float(np.sign(gap.gap[inside].mean())) == sign:
-                start = float(group[0]) if start is None else start
-                rows += int(inside.sum())
-                if rows >= _MIN_ROWS and (best is None or rows > best[0]):
-                    best = (rows, start, float(group[-1]))
-            else:
-                start, rows = None, 0
-    return None if best is None else (best[1], best[2])
+    rows = [(values >= group[0]) & (values <= group[-1]) for group in groups]
+    signs = [
+        float(np.sign(gap.gap[inside].mean())) if gap.probability[inside].mean() > 0.5 else 0.0
+        for inside in rows
+    ]
+    found = []
+    for sign, run in groupby(range(len(groups)), key=signs.__getitem__):
+        at = list(run)
+        if sign and sum(int(rows[i].sum()) for i in at) >= _MIN_ROWS:
+            found.append((float(groups[at[0]][0]), float(groups[at[-1]][-1])))
+    return found

@@ -58,9 +58,23 @@ def test_gaps_of_both_signs_are_not_one_region(data):
     slip = data.view.slip()
     truth = truth_with(np.where(slip > 0.35, 0.15, -0.15))
     found = regions(data, truth, row_gaps(data, truth))
-    (region,) = [r for r in found if "slip_ratio" in r.conditions]
-    low, high = region.conditions["slip_ratio"]
-    assert low > 0.25 or high < 0.45
+    low, high = sorted(
+        (r for r in found if "slip_ratio" in r.conditions), key=lambda r: r.conditions["slip_ratio"]
+    )
+    assert low.gap < 0.0 < high.gap
+    assert low.conditions["slip_ratio"][1] < high.conditions["slip_ratio"][0]
+
+
+def test_a_gap_at_the_middle_pressure_is_a_region_there(data):
+    # Beside it most rows of the lowest have a gap the other way that their mean does not show.
+    pressure = data.view.conditions["inflation_pressure_psi"]
+    middle, lowest = pressure == np.median(pressure), pressure == pressure.min()
+    odd = np.arange(27) % 4 > 0
+    truth = truth_with(np.where(middle, -0.15, np.where(lowest & odd, 0.06, 0.0)))
+    found = regions(data, truth, row_gaps(data, truth))
+    ends = float(np.median(pressure)), float(np.median(pressure))
+    assert found[0].conditions == {"inflation_pressure_psi": ends}
+    assert found[0].gap == pytest.approx(-0.15)
 
 
 def test_the_mean_gap_of_a_region_has_its_interval(data):
