@@ -16,6 +16,7 @@ from calib.data import Table, read_table
 from calib.errors import CalibError
 from calib.gap.effects import View
 from calib.gap.noise import At, noise_at_lab
+from calib.gap.oddities import oddities
 from calib.models import MODELS, get_model
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
@@ -169,7 +170,7 @@ def read_case(folder: Path) -> Case:
     lab = read_table(folder / str(files["calibration"]), allow_missing=missing_ok)
     field = read_table(folder / str(files["field"]), allow_missing=missing_ok)
     fresh = read_table(folder / content["predict"]) if content.get("predict") else None
-    return Case(folder.name, lab, field, models, fresh, _warnings(lab, field, models))
+    return Case(folder.name, lab, field, models, fresh, oddities(lab, field, models))
 
 
 def case_files(folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
@@ -188,56 +189,6 @@ def case_files(folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
     named = {key: content.get(key) for key in _FILES}
     files = {key: path.parent / name for key, name in named.items() if isinstance(name, str)}
     return content, {"case.toml": path} | files
-
-
-def _warnings(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, ...]:
-    """Say what looks odd about a pair of campaigns, without refusing it."""
-    said = []
-    same = _identical_rows(lab, field)
-    if same:
-        said.append(
-            f"{same} of {len(field)} field rows are rows of the calibration, value for value; the "
-            "field must be other measurements, or every gap looks smaller than it is"
-        )
-    copies = len(field) - len(set(zip(*(field[name].tolist() for name in field), strict=True)))
-    if copies:
-        said.append(
-            f"{copies} of {len(field)} field rows are copies of another, value for value; a copy "
-            "counts as a measurement of its own and makes every probability too sure: leave it out"
-        )
-    used = {name for model in models.values() for name in get_model(model).conditions}
-    held = [n for n in used if n in lab and n in field and not np.ptp(lab[n]) and np.ptp(field[n])]
-    if held:
-        said.append(
-            f"{', '.join(sorted(held))}: held constant in the calibration and varied in the field; "
-            "what it does to the simulator rests on the priors alone"
-        )
-    states = ("speed_m_s", "pass_number", "gravimetric_water_content")
-    both = [n for n in states if n in lab and n in field]
-    varied = [n for n in both if np.ptp(lab[n]) > 0.0 and np.ptp(field[n]) == 0.0]
-    if varied:
-        said.append(
-            f"{', '.join(varied)}: it varies in the calibration and not in the field; were the two "
-            "swapped?"
-        )
-    extra = [n for n in field if n not in lab and n not in OUTPUTS.values()]
-    if extra:
-        said.append(
-            f"the calibration has no {', '.join(extra)}: its effects are taken about the field's "
-            "median, and a constant difference from the calibration cannot be seen"
-        )
-    for output in models:
-        missing = int(np.isnan(field[OUTPUTS[output]]).sum()) if OUTPUTS[output] in field else 0
-        if missing:
-            said.append(f"{missing} of {len(field)} field rows have no {output}")
-    return tuple(said)
-
-
-def _identical_rows(lab: Table, field: Table) -> int:
-    """Count field rows that are in the calibration too, in every column of both."""
-    both = [name for name in lab if name in field]
-    known = set(zip(*(lab[name].tolist() for name in both), strict=True))
-    return sum(row in known for row in zip(*(field[name].tolist() for name in both), strict=True))
 
 
 def case_from_run(run: Path, field: Path) -> Case:
@@ -260,7 +211,7 @@ def case_from_run(run: Path, field: Path) -> Case:
     output = next(key for key, column in OUTPUTS.items() if column == model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))
     models = {output: model.name}
-    warnings = _warnings(problem.table, table, models)
+    warnings = oddities(problem.table, table, models)
     return Case(Path(run).name, problem.table, table, models, warnings=warnings)
 
 
@@ -283,6 +234,8 @@ def campaigns(case: Case) -> Campaigns:
         ground_exponent=_ground_exponent(lab, field),
         order_range=(float(order.min()), float(order.max())),
     )
+    if case.fresh is not None:
+        _check_conditions(case.fresh, case.models)
     lab_at = {o.name: noise_at_lab(o.problem.table, view) for o in outputs}
     return Campaigns(outputs, view, lab_at, case)
 
@@ -301,14 +254,26 @@ def _output(case: Case, name: str, model: str) -> OutputData:
                 f"the case models {name}, but there are no values of {column}",
                 where=table.source, mend="add the column, or take the model out of case.toml",
             )  # fmt: skip
+    for table in (case.lab, case.field):
+        _check_conditions(table, {name: model})
     lab = case.lab.take(np.isfinite(case.lab[column]))
     problem = build_problem(model, lab)
-    problem.bound.model.select(case.field.columns)
     rows = np.flatnonzero(np.isfinite(case.field[column]))
     _check_field(case, name, column, rows)
     response = problem.bound.to_response(case.field[column][rows])
     # The noise scale is not a parameter of the simulator: it is inferred beside it.
     return OutputData(name, problem, Priors(problem.priors.entries[:-1]), rows, response)
+
+
+def _check_conditions(table: Table, models: Mapping[str, str]) -> None:
+    """Refuse a table that lacks a condition that a model takes, naming its file."""
+    for model in models.values():
+        try:
+            get_model(model).select(table.columns)
+        except CalibError as error:
+            raise CalibError(
+                error.message, where=table.source, allowed=error.allowed, mend=error.mend
+            ) from None
 
 
 def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) -> None:

@@ -18,13 +18,15 @@ from calib.outputs import OUTPUTS
 from calib.sampling.mode import find_mode
 from calib.streams import generator
 
-__all__ = ["LAB_OUTLIER", "OUTLIER", "rank_without_outliers", "without_outputs"]
+__all__ = ["LAB_OUTLIER", "LEFT_OVER", "OUTLIER", "rank_without_outliers", "without_outputs"]
 
 # Standardised residual beyond which a field row is set aside, and how often that is repeated.
 OUTLIER = 5.0
 # In the laboratory the row itself widens the noise, so the unit is a robust sd, and the bar higher.
 LAB_OUTLIER = 8.0
 _MOST_ROUNDS = 3
+# Beyond this a reading is named; of noise alone, one in 2000 readings is.
+LEFT_OVER = 3.5
 
 
 def rank_without_outliers(
@@ -56,7 +58,27 @@ def rank_without_outliers(
         case = replace(without_outputs(case, far), warnings=(*case.warnings, *said))
         data = campaigns(case)
         ranking = rank(data, seed, effects=effects)
-    return data, ranking
+    left = _left_over(data, ranking)
+    return replace(data, case=replace(case, warnings=(*case.warnings, *left))), ranking
+
+
+def _left_over(data: Campaigns, ranking: Ranking) -> list[str]:
+    """Name the readings that the most probable hypothesis leaves far off, though not set aside."""
+    best = ranking.best(ranking.order[0])
+    field, said = data.case.field, []
+    for o in data.outputs:
+        z = best.field_residuals[o.name]
+        at = ", ".join(
+            f"line {field.lines[o.rows[i]]} ({z[i]:+.1f})"
+            for i in np.argsort(-np.abs(z))
+            if abs(z[i]) > LEFT_OVER
+        )
+        if at:
+            said.append(
+                f"{field.source}, {at}: {o.name.replace('_', ' ')} so many noise sds off what the "
+                "most probable hypothesis says; something may act there that it does not name"
+            )
+    return said
 
 
 def without_outputs(case: Case, rows: Mapping[str, Sequence[int] | NDArray[np.int64]]) -> Case:

@@ -83,51 +83,68 @@ def row_gaps(data: Campaigns, truth: Truth) -> tuple[RowGap, ...]:
 
 
 def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Region, ...]:
-    """Contiguous stretches of a condition in which rows probably have a gap of one sign."""
+    """Contiguous stretches of a condition in which rows probably have a gap of one sign.
+
+    The surest first; the others are sought among the rows that lie in none of those before, or
+    every condition would have a stretch that is but the shadow of the first.
+    """
     found: list[Region] = []
     for o, row_gap in zip(data.outputs, gaps, strict=True):
         draws = (truth.truth[o.name] - truth.simulator[o.name])[:, o.rows]
         noise = truth.noise[o.name][:, o.rows]
-        own: list[tuple[float, Region]] = []
-        seen: set[bytes] = set()  # conditions that move together single out the same rows
-        for name in _REGION_CONDITIONS:
-            values = data.view.conditions.get(name)
-            if values is None or np.ptp(values[o.rows]) == 0.0:
-                continue
-            for stretch in _stretches(values[o.rows], row_gap):
-                inside = (values[o.rows] >= stretch[0]) & (values[o.rows] <= stretch[1])
-                if inside.tobytes() in seen:
+        left = np.ones(o.rows.size, dtype=bool)
+        for _ in range(_MOST):
+            best: tuple[float, Region, NDArray[np.bool_]] | None = None
+            for name in _REGION_CONDITIONS:
+                column = data.view.conditions.get(name)
+                if column is None or np.ptp(column[o.rows]) == 0.0:
                     continue
-                seen.add(inside.tobytes())
-                mean = draws[:, inside].mean(axis=1)
-                beyond = np.abs(mean) > noise[:, inside].mean(axis=1)
-                probability = min(float(truth.weight @ beyond), 1.0)
-                gap = float(truth.weight @ mean)
-                ends = _quantile(truth, mean, 0.05), _quantile(truth, mean, 0.95)
-                # As many readings of one mean gap: what tells a long stretch from a short one.
-                weight = probability * abs(gap) * float(np.sqrt(inside.sum()))
-                own.append((weight, Region(o.name, {name: stretch}, gap, ends, probability)))
-        own.sort(key=lambda ranked: -ranked[0])
-        found += [r for _, r in own if r.probability > 0.5][:_MOST]
+                values = column[o.rows]
+                for low, high in _stretches(values, row_gap, left):
+                    inside = (values >= low) & (values <= high)
+                    region = _region(truth, o.name, {name: (low, high)}, draws, noise, inside)
+                    # As many readings of one mean gap: what tells a long stretch from a short one.
+                    weight = region.probability * abs(region.gap) * np.sqrt((inside & left).sum())
+                    if region.probability > 0.5 and (best is None or weight > best[0]):
+                        best = (float(weight), region, inside)
+            if best is None:
+                break
+            found.append(best[1])
+            left &= ~best[2]
     return tuple(found)
+
+
+def _region(
+    truth: Truth, output: str, conditions: Mapping[str, tuple[float, float]], draws: Array,
+    noise: Array, inside: NDArray[np.bool_],
+) -> Region:  # fmt: skip
+    mean = draws[:, inside].mean(axis=1)
+    beyond = np.abs(mean) > noise[:, inside].mean(axis=1)
+    ends = _quantile(truth, mean, 0.05), _quantile(truth, mean, 0.95)
+    probability = min(float(truth.weight @ beyond), 1.0)
+    return Region(output, conditions, float(truth.weight @ mean), ends, probability)
 
 
 def _quantile(truth: Truth, draws: Array, q: float) -> float:
     return float(truth.quantile(draws[:, None], q)[0])
 
 
-def _stretches(values: Array, gap: RowGap) -> list[tuple[float, float]]:
-    """The stretches of distinct values whose rows probably have a gap, of one sign each."""
+def _stretches(values: Array, gap: RowGap, left: NDArray[np.bool_]) -> list[tuple[float, float]]:
+    """The stretches of distinct values whose rows, those left, probably have a gap of one sign."""
     distinct = np.unique(values)
     groups = np.array_split(distinct, min(8, distinct.size))
-    rows = [(values >= group[0]) & (values <= group[-1]) for group in groups]
-    signs = [
-        float(np.sign(gap.gap[inside].mean())) if gap.probability[inside].mean() > 0.5 else 0.0
-        for inside in rows
-    ]
+    rows = [(values >= group[0]) & (values <= group[-1]) & left for group in groups]
+    signs = [_sign(gap, inside) for inside in rows]
     found = []
     for sign, run in groupby(range(len(groups)), key=signs.__getitem__):
         at = list(run)
         if sign and sum(int(rows[i].sum()) for i in at) >= _MIN_ROWS:
             found.append((float(groups[at[0]][0]), float(groups[at[-1]][-1])))
     return found
+
+
+def _sign(gap: RowGap, inside: NDArray[np.bool_]) -> float:
+    """The sign of the mean gap of some rows; 0 where there are none, or no gap is probable."""
+    if not inside.any() or gap.probability[inside].mean() <= 0.5:
+        return 0.0
+    return float(np.sign(gap.gap[inside].mean()))

@@ -1,0 +1,133 @@
+"""What looks odd about a pair of campaigns: copies, swapped files, other units."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from calib.data import Table
+from calib.models import get_model
+from calib.models.base import Array
+from calib.outputs import OUTPUTS
+
+__all__ = ["oddities"]
+
+DRAWBAR = "drawbar_pull"
+# Typical outputs of two campaigns differ by less than this, whatever acts in the field.
+_ODD_RATIO = 4.0
+# Factors between units that are taken for one another, and how near a ratio has to come.
+_UNITS = {
+    6.895: "psi and kPa", 10.0: "mm and cm", 25.4: "inches and mm", 4.448: "lbf and N",
+    9.807: "kgf and N", 100.0: "a fraction and percent", 1000.0: "thousandths and wholes",
+}  # fmt: skip
+_NEAR = 0.15
+
+
+def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, ...]:
+    """Say what looks odd about a pair of campaigns, without refusing it.
+
+    Parameters
+    ----------
+    lab, field : Table
+        The calibration and the field campaign.
+    models : mapping of str to str
+        Output to model.
+
+    Returns
+    -------
+    tuple of str
+        A sentence each.
+    """
+    said = []
+    same = _identical_rows(lab, field)
+    if same:
+        said.append(
+            f"{same} of {len(field)} field rows are rows of the calibration, value for value; the "
+            "field must be other measurements, or every gap looks smaller than it is"
+        )
+    copies = len(field) - len(set(zip(*(field[name].tolist() for name in field), strict=True)))
+    if copies:
+        said.append(
+            f"{copies} of {len(field)} field rows are copies of another, value for value; a copy "
+            "counts as a measurement of its own and makes every probability too sure: leave it out"
+        )
+    used = {name for model in models.values() for name in get_model(model).conditions}
+    held = [n for n in used if n in lab and n in field and not np.ptp(lab[n]) and np.ptp(field[n])]
+    if held:
+        said.append(
+            f"{', '.join(sorted(held))}: held constant in the calibration and varied in the field; "
+            "what it does to the simulator rests on the priors alone"
+        )
+    states = ("speed_m_s", "pass_number", "gravimetric_water_content")
+    both = [n for n in states if n in lab and n in field]
+    varied = [n for n in both if np.ptp(lab[n]) > 0.0 and np.ptp(field[n]) == 0.0]
+    if varied:
+        said.append(
+            f"{', '.join(varied)}: it varies in the calibration and not in the field; were the two "
+            "swapped?"
+        )
+    extra = [n for n in field if n not in lab and n not in OUTPUTS.values()]
+    if extra:
+        said.append(
+            f"the calibration has no {', '.join(extra)}: its effects are taken about the field's "
+            "median, and a constant difference from the calibration cannot be seen"
+        )
+    for output in models:
+        missing = int(np.isnan(field[OUTPUTS[output]]).sum()) if OUTPUTS[output] in field else 0
+        if missing:
+            said.append(f"{missing} of {len(field)} field rows have no {output}")
+    return (*said, *_other_units(lab, field, models))
+
+
+def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[str]:
+    """Say which columns may be in another unit than their name says, or under another's name."""
+    said = []
+    conditions = {name for model in models.values() for name in get_model(model).conditions}
+    for name in sorted(conditions & set(lab) & set(field)):
+        apart = field[name].min() > lab[name].max() or field[name].max() < lab[name].min()
+        if apart and np.ptp(lab[name]) > 0.0:
+            said.append(
+                f"{name}: no field value lies within the calibration's range, "
+                f"{_times(lab[name], field[name])}; the simulator is used where it was not fitted"
+            )
+    outputs = [OUTPUTS[output] for output in models]
+    for name in outputs:
+        if name in lab and name in field:
+            ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
+            if not 1.0 / _ODD_RATIO < ratio < _ODD_RATIO:
+                said.append(
+                    f"{name}: {_times(lab[name], field[name])}; if the field's is in another unit, "
+                    "or is another column's, the diagnosis means nothing"
+                )
+    for table in (lab, field):
+        if OUTPUTS[DRAWBAR] in outputs and {OUTPUTS[DRAWBAR], "normal_load_kn"} <= set(table):
+            pulls = np.abs(table[OUTPUTS[DRAWBAR]]) / table["normal_load_kn"]
+            if np.nanmedian(pulls) > 1.0:
+                said.append(
+                    f"{table.source}: the drawbar pull is typically {np.nanmedian(pulls):.2g} "
+                    "times the normal load, more than a tyre on soil can pull; check the columns"
+                )
+    return said
+
+
+def _typical(values: Array) -> float:
+    return float(np.nanmedian(np.abs(values)))
+
+
+def _times(lab: Array, field: Array) -> str:
+    """Say how the typical values of two columns compare, and which units do so."""
+    low, high = sorted((_typical(lab), _typical(field)))
+    factor = high / max(low, 1e-300)
+    way = "more" if _typical(field) > _typical(lab) else "less"
+    near = [units for known, units in _UNITS.items() if abs(np.log(factor / known)) < _NEAR]
+    like = f", about the factor between {near[0]}" if near else ""
+    typical = f"typically {_typical(field):.3g} against {_typical(lab):.3g}"
+    return f"{typical}, {factor:.3g} times {way}{like}"
+
+
+def _identical_rows(lab: Table, field: Table) -> int:
+    """Count field rows that are in the calibration too, in every column of both."""
+    both = [name for name in lab if name in field]
+    known = set(zip(*(lab[name].tolist() for name in both), strict=True))
+    return sum(row in known for row in zip(*(field[name].tolist() for name in both), strict=True))
