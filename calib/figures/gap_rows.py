@@ -18,8 +18,8 @@ from calib.models.base import Array
 from calib.outputs import OUTPUTS
 
 __all__ = [
-    "PROBABLE", "OutputRows", "axis_name", "best_fit", "best_of", "output_axis", "output_rows",
-    "output_word", "panel_groups", "region_text", "short_name", "title_of",
+    "EVERYWHERE", "PROBABLE", "OutputRows", "axis_name", "best_fit", "best_of", "output_axis",
+    "output_rows", "output_word", "panel_groups", "region_text", "short_name", "title_of",
     "unit_after",
 ]  # fmt: skip
 
@@ -70,9 +70,17 @@ def unit_after(axis: Axis) -> str:
     return "" if axis.unit == "number" else f" {axis.unit}"
 
 
-def region_text(region: Region) -> str:
-    """Say over which stretch of which condition a region lies."""
+# The words for a region that covers all rows.
+EVERYWHERE = "all conditions"
+
+
+def region_text(found: Diagnosis, region: Region) -> str:
+    """Say over which stretch of which condition a region lies, or that it is everywhere."""
     column, ends = next(iter(region.conditions.items()))
+    rows = next(o.rows for o in found.data.outputs if o.name == region.output)
+    values = found.data.view.conditions[column][rows]
+    if ends[0] <= values.min() and ends[1] >= values.max():
+        return EVERYWHERE
     axis = axis_name(column)
     low, high = (_stretch_end(column, axis.scale(np.array(v)).item()) for v in ends)
     span = low if low == high else f"{low} to {high}"

@@ -228,7 +228,7 @@ def _region_caption(found: Diagnosis) -> str:
         low, high = (short(axis.factor * end) for end in r.interval)
         gap = f"{short(r.gap * axis.factor)} (90 % {low} to {high}) {axis.unit}"
         gap = gap.replace("-", MINUS)
-        parts.append(f"{output_word(r.output)} at {region_text(r)}: {gap} (probability {p})")
+        parts.append(f"{output_word(r.output)} at {region_text(found, r)}: {gap} (probability {p})")
     return (
         "Each row once in every panel of its output, in units of the noise. Marked regions, with "
         f"their mean gap: {'; '.join(parts)}."

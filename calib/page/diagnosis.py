@@ -175,7 +175,8 @@ def _region_words(found: Diagnosis, region: Region) -> tuple[str, str]:
     sign, way = (1.0, "above") if gap > 0.0 else (-1.0, "below")
     low, high = sorted(sign * own.factor * end for end in region.interval)
     spread = f"90 % interval {short(low)} to {short(high)}".replace("-", MINUS)
-    return region_text(region), f"{short(abs(gap))} {own.unit} {way} the simulator ({spread})"
+    text = f"{short(abs(gap))} {own.unit} {way} the simulator ({spread})"
+    return region_text(found, region), text
 
 
 def _leading_regions(found: Diagnosis) -> list[Region]:

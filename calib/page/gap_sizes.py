@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.figures.gap_rows import (
+    EVERYWHERE,
     axis_name,
     best_fit,
     output_axis,
@@ -22,6 +23,7 @@ from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit
 from calib.gap.noise import noise_at
+from calib.models import get_model
 from calib.models.base import Array
 from calib.numbers import format_value
 from calib.streams import generator
@@ -79,8 +81,9 @@ def where_to_look(found: Diagnosis) -> str:
     # Runs cannot be repeated at their place in the order, and waves have their largest gaps apart.
     places = [] if h.smooth_over == "ripple" else found.regions
     places = [r for r in places if "run_order" not in r.conditions]
-    largest = max(places, key=lambda r: r.probability * abs(r.gap), default=None)
-    place = "" if largest is None else f" where the gap is largest ({region_text(largest)})"
+    stretches = [region_text(found, r) for r in places]
+    narrow = [text for text in stretches if text != EVERYWHERE]
+    place = f" where the gap is surest ({narrow[0]})" if narrow else ""
     if (h.onset_over or h.smooth_over) == "all":
         vary = "one condition at a time, the others held"
     elif (h.onset_over or h.smooth_over) == "before":
@@ -116,14 +119,24 @@ def _lead(found: Diagnosis, fit: Fit) -> str:
     h = fit.forward.hypothesis
     if h.onset_over is not None:
         side = "below" if h.onset_over == "low_pressure" else "beyond"
-        return f"what is missing sets in {side} {_threshold(found, fit)}"
+        return f"what is missing sets in {side} {_threshold(found, fit)}{_by_pressure(found, fit)}"
     on_top = ""
     if h.effects:
         on_top = f", on top of {h.effects[0].name.replace('_', ' ')}"
     elif h.shift > 0.0:
         on_top = ", on top of other parameter values"
     waves = ", in short waves" if h.smooth_over == "ripple" else ""
-    return f"what is missing goes along with {_along(fit)}{waves}{on_top}"
+    return f"what is missing goes along with {_along(fit)}{_by_pressure(found, fit)}{waves}{on_top}"
+
+
+def _by_pressure(found: Diagnosis, fit: Fit) -> str:
+    """Say so where a predicted rut depth is nothing but pressure by another name."""
+    h = fit.forward.hypothesis
+    over = h.onset_over or h.smooth_over
+    of_rut = over == "sinkage" or (over == "level" and h.smooth_outputs == ("rut_depth",))
+    conditions = get_model(found.data.case.models["rut_depth"]).conditions if of_rut else ()
+    alone = len(conditions) == 1 and "pressure" in conditions[0]
+    return ", which here is a matter of pressure alone" if alone else ""
 
 
 def _threshold(found: Diagnosis, fit: Fit) -> str:
@@ -206,6 +219,9 @@ def _instrument_sentences(found: Diagnosis, effect: Effect, phi: Array) -> list[
                 continue
             axis = axis_name(column)
             shift = axis.scale((true[column] - values).mean(axis=1))
+            own = not effect.covariates or column in effect.covariates
+            if not own and abs(shift.mean()) < 2.0 * shift.std():
+                continue  # it may follow, but nothing says that it does
             unit = "percentage points" if column == "slip_ratio" else axis.unit
             way = "above" if shift.mean() > 0.0 else "below"
             amount = format_value(abs(float(shift.mean())), float(shift.std()))

@@ -19,7 +19,7 @@ from calib.figures.gap_rows import (
 from calib.figures.gap_which import placebos
 from calib.figures.labels import MINUS, percent
 from calib.gap.case import OutputData
-from calib.gap.diagnose import Diagnosis
+from calib.gap.diagnose import NAMED, Diagnosis
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PRIOR
 from calib.numbers import format_number, format_value
@@ -49,8 +49,13 @@ def hypothesis_groups(found: Diagnosis) -> list[dict[str, Any]]:
     out = [n for n in rest if p[n] < _POSSIBLE and "+" not in n]
     pairs = [n for n in rest if p[n] < _POSSIBLE and "+" in n]
     left = placebos(found).left
+    first = "Tied: the data do not tell these apart"
+    if len(tied) == 1:
+        first = "Most probable"
+    elif p[order[0]] >= NAMED:
+        first = "Most probable, and what could be in its place"
     groups = (
-        ("Most probable" if len(tied) == 1 else "Tied: the data do not tell these apart", tied),
+        (first, tied),
         ("Less probable", possible),
         ("Ruled out (below 1 %)", out),
         (f"Pairs ruled out (below 1 %): {len(pairs)}", pairs),

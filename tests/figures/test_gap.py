@@ -13,6 +13,7 @@ from matplotlib.collections import PathCollection
 from calib.figures import gap as collect
 from calib.figures.gap import gap_plates
 from calib.figures.gap_rows import (
+    EVERYWHERE,
     best_fit,
     output_axis,
     output_rows,
@@ -114,7 +115,7 @@ def test_captions_count_what_the_records_say(found, drawn):
     likely = int((found.gaps[0].probability > 0.5).sum())
     assert f"Drawbar pull: {likely} of 27 rows" in drawn["where"].caption
     for region in found.regions:
-        assert region_text(region) in drawn["where_conditions"].caption
+        assert region_text(found, region) in drawn["where_conditions"].caption
     beyond = sum(
         int((np.abs(r) > 2.0).sum())
         for r in best_fit(found, "sensor_drift").field_residuals.values()
@@ -193,11 +194,18 @@ def test_words():
     assert probability_text(0.999) == "> 99 %"
     assert probability_text(0.004) == "< 1 %"
     assert probability_text(0.42) == "42 %"
-    assert (
-        region_text(Region("a", {"slip_ratio": (0.304, 0.6)}, 1.0, (0.5, 1.5), 1.0))
-        == "slip 30 to 60 %"
-    )
-    assert region_text(Region("a", {"pass_number": (3.0, 3.0)}, 1.0, (0.5, 1.5), 1.0)) == "pass 3"
+
+
+def test_words_of_regions():
+    found = diagnosis_of(None)
+
+    def text(column: str, *ends: float) -> str:
+        return region_text(found, Region("drawbar_pull", {column: ends}, 1.0, (0.5, 1.5), 1.0))
+
+    assert text("slip_ratio", 0.304, 0.6) == "slip 30 to 60 %"
+    assert text("pass_number", 3.0, 3.0) == "pass 3"
+    slip = found.data.view.conditions["slip_ratio"]
+    assert text("slip_ratio", float(slip.min()), float(slip.max())) == EVERYWHERE
 
 
 def test_a_figure_that_fails_does_not_stop_the_rest(found, monkeypatch):

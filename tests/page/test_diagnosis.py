@@ -374,7 +374,7 @@ def test_what_is_unknown_is_described_by_what_it_goes_along_with():
     assert lead.startswith("what is missing sets in beyond a predicted drawbar pull of")
     assert 0.8 < float(lead.split(" of ")[1].split()[0]) < 1.0
     look = gap_evidence(found).look
-    assert look.startswith("repeat runs where the gap is largest (")
+    assert look.startswith("repeat runs where the gap is surest (")
     assert "in small steps about a predicted drawbar pull of" in look
     reader = Reader()
     reader.feed(render_diagnosis(found, [], {}, manifest={}))

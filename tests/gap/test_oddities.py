@@ -1,0 +1,75 @@
+"""What looks odd about a pair of campaigns is said, and nothing else is."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.data import table_from_arrays
+from calib.errors import CalibError
+from calib.gap.case import campaigns
+from calib.gap.effects import EFFECTS
+from calib.gap.noise import noise_at
+from calib.gap.oddities import oddities
+from calib.gap.outliers import rank_without_outliers
+from calib.outputs import OUTPUTS
+from gap.cases import MODELS, make_case, table_without
+
+PULL, RUT = OUTPUTS["drawbar_pull"], OUTPUTS["rut_depth"]
+NAMES = {
+    "ruts in cm": (RUT, 0.1, "mm and cm"),
+    "psi as kPa": ("inflation_pressure_psi", 1.0 / 6.895, "psi and kPa"),
+}
+
+
+def changed(case, **columns):
+    field = {name: np.array(v) for name, v in case.field.columns.items()}
+    return replace(case, field=table_from_arrays({**field, **columns}))
+
+
+def said(case) -> str:
+    return "\n".join(oddities(case.lab, case.field, case.models))
+
+
+def test_a_fair_pair_has_nothing_odd():
+    assert said(make_case(None)) == ""
+    assert said(make_case("sensor_drift")) == ""
+
+
+@pytest.mark.parametrize("what", sorted(NAMES))
+def test_another_unit_is_named_with_its_factor(what):
+    column, factor, units = NAMES[what]
+    case = make_case(None)
+    found = said(changed(case, **{column: factor * case.field[column]}))
+    assert column in found
+    assert units in found
+
+
+def test_columns_that_were_swapped_pull_more_than_the_wheel_carries():
+    case = make_case(None)
+    found = said(changed(case, **{PULL: case.field[RUT], RUT: case.field[PULL]}))
+    assert "times the normal load" in found
+    assert found.count("means nothing") == 2
+
+
+def test_new_conditions_without_a_needed_one_are_refused_by_file():
+    case = make_case(None)
+    fresh = table_without(case.field, "slip_ratio")
+    with pytest.raises(CalibError, match="slip_ratio") as error:
+        campaigns(replace(case, fresh=fresh))
+    assert error.value.where == fresh.source
+
+
+def test_readings_left_far_off_are_named_by_line():
+    case = make_case(None, models={"drawbar_pull": MODELS["drawbar_pull"]}, n_field=36)
+    pull = np.array(case.field[PULL])
+    few = {"force_offset": EFFECTS["force_offset"]}
+    data, ranking = rank_without_outliers(case, 1, few)
+    sd = ranking.best("none").noise["drawbar_pull"].sd(noise_at(data.view))
+    pull[3] += 6.5 * sd[3]
+    pull[20] -= 6.5 * sd[20]
+    data, _ = rank_without_outliers(changed(case, **{PULL: pull}), 1, few)
+    warnings = "\n".join(data.case.warnings)
+    assert all(f"line {data.case.field.lines[row]} " in warnings for row in (3, 20))
