@@ -67,9 +67,9 @@ def test_readings_left_far_off_are_named_by_line():
     pull = np.array(case.field[PULL])
     few = {"force_offset": EFFECTS["force_offset"]}
     data, ranking = rank_without_outliers(case, 1, few)
-    sd = ranking.best("none").noise["drawbar_pull"].sd(noise_at(data.view))
-    pull[3] += 6.5 * sd[3]
-    pull[20] -= 6.5 * sd[20]
+    none = ranking.best("none")
+    row = int(np.argmax(none.field_residuals["drawbar_pull"]))
+    pull[row] += 6.0 * none.noise["drawbar_pull"].sd(noise_at(data.view))[row]
     data, _ = rank_without_outliers(changed(case, **{PULL: pull}), 1, few)
     warnings = "\n".join(data.case.warnings)
-    assert all(f"line {data.case.field.lines[row]} " in warnings for row in (3, 20))
+    assert f"line {data.case.field.lines[row]} (+" in warnings
