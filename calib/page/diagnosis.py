@@ -158,7 +158,7 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         next_facts=[
             NextFact(
                 (short_name(m.separates[0]), short_name(m.separates[1])),
-                conditions_text(found, dict(m.conditions)),
+                conditions_text(found, m),
                 m.gain_nats,
             )
             for m in found.next_measurements

@@ -22,6 +22,8 @@ from calib.gap.case import OutputData
 from calib.gap.diagnose import NAMED, Diagnosis
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PRIOR
+from calib.gap.next_measurement import NextMeasurement
+from calib.models import get_model
 from calib.numbers import format_number, format_value
 from calib.page.gap_verdict import TIE, odds_text, repeats_needed
 from calib.priors import Prior
@@ -194,19 +196,36 @@ def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
     return [*sizes, Markup("together, as with another soil")] if together else sizes
 
 
-def conditions_text(found: Diagnosis, conditions: dict[str, float]) -> str:
-    """Write conditions of a measurement, those that vary in either campaign."""
+def conditions_text(found: Diagnosis, measurement: NextMeasurement) -> str:
+    """Write the conditions of a measurement: those that vary, and that the hypotheses differ by."""
     field, lab = found.data.view.conditions, found.data.case.lab.columns
+    matters = _matter(found, measurement.separates)
     parts = []
-    for column, value in conditions.items():
+    for column, value in measurement.conditions.items():
         both = np.concatenate([field[column], lab.get(column, field[column])])
-        follows = column == "average_ground_pressure_kpa" and "inflation_pressure_psi" in conditions
-        if np.ptp(both) == 0.0 or follows or column == "run_order":
+        follows = (
+            column == "average_ground_pressure_kpa"
+            and "inflation_pressure_psi" in measurement.conditions
+        )
+        if np.ptp(both) == 0.0 or follows or column == "run_order" or column not in matters:
             continue
         axis = axis_name(column)
         shown = f"{100.0 * value:.0f}" if column == "slip_ratio" else _rounded(axis.factor * value)
         parts.append(f"{axis.name.lower()} {shown.replace('-', MINUS)}{unit_after(axis)}")
+    if "run_order" in matters and "run_order" in measurement.conditions:
+        parts.append("after the last run")
     return ", ".join(parts) or "the conditions of the field campaign"
+
+
+def _matter(found: Diagnosis, names: Sequence[str]) -> set[str]:
+    """Conditions that the simulators and the effects of some hypotheses depend on."""
+    matters = {c for m in found.data.case.models.values() for c in get_model(m).conditions}
+    for name in names:
+        h = best_fit(found, name).forward.hypothesis
+        if h.smooth_outputs:
+            return set(found.data.view.conditions)
+        matters |= {c for effect in h.effects for c in effect.covariates}
+    return matters
 
 
 def _rounded(value: float) -> str:
@@ -221,7 +240,7 @@ def next_rows(found: Diagnosis) -> list[list[str]]:
         rows.append(
             [
                 f"{short_name(m.separates[0])} from {short_name(m.separates[1])}",
-                conditions_text(found, dict(m.conditions)),
+                conditions_text(found, m),
                 f"{m.gain_nats:.2f}",
                 "out of reach" if repeats is None else str(repeats),
             ]

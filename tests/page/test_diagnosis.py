@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 from gap.cases import diagnosis_of, pull_diagnosis
 
+from calib.gap.next_measurement import NextMeasurement
 from calib.page.diagnosis import gap_evidence, render_diagnosis, write_page
 from calib.page.gap_sizes import size_sentences
 from calib.page.gap_tables import conditions_text, hypothesis_groups, parameter_text, prior_text
@@ -342,13 +343,19 @@ def test_evidence_is_gathered_from_the_records(found):
     assert [s.fraction for s in e.shrink] == [s.fraction for s in found.shrink.values()]
 
 
-def test_conditions_that_do_not_vary_are_not_asked_for(found):
-    text = conditions_text(
-        found,
-        {"slip_ratio": 0.651, "normal_load_kn": 5.0, "inflation_pressure_psi": 42.0,
-         "average_ground_pressure_kpa": 178.0, "speed_m_s": 2.0, "run_order": 26.0},
-    )  # fmt: skip
-    assert text == "slip 65 %, inflation pressure 42 psi, speed 2 m/s"
+def test_conditions_that_neither_hypothesis_depends_on_are_not_asked_for(found):
+    conditions = {
+        "slip_ratio": 0.651, "normal_load_kn": 5.0, "inflation_pressure_psi": 42.0,
+        "average_ground_pressure_kpa": 178.0, "speed_m_s": 2.0, "run_order": 26.0,
+    }  # fmt: skip
+
+    def text(*separates: str) -> str:
+        return conditions_text(found, NextMeasurement(separates, conditions, 1.0))
+
+    assert text("force_offset", "lug_thrust") == "slip 65 %, inflation pressure 42 psi"
+    assert text("force_offset", "rate_effect").endswith("42 psi, speed 2 m/s")
+    assert text("force_offset", "sensor_drift").endswith("42 psi, after the last run")
+    assert text("force_offset", "unknown").endswith("speed 2 m/s, after the last run")
 
 
 def test_what_is_unknown_is_described_by_what_it_goes_along_with():
