@@ -178,3 +178,28 @@ def test_an_effect_acts_on_the_outputs_it_names_alone(data):
     full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
     np.testing.assert_array_equal(full["rut_depth"], plain["rut_depth"])
     assert (full["drawbar_pull"] > plain["drawbar_pull"] + 0.1).all()
+
+
+def test_beyond_the_pressures_of_both_campaigns_the_pull_goes_on_straight(data):
+    forward = Forward(data, single(data, "pressure_gauge_bias"), NOISE)
+    psi = np.array([[p.loc for p in forward.priors.free]])
+    gain, offset, _, radius = range(forward.phi_slices[0].start, forward.phi_slices[0].stop)
+    psi[:, [gain, offset, radius]] = 0.0
+    recorded = data.view.conditions["inflation_pressure_psi"]
+    high = recorded == recorded.max()
+
+    def pull(shift: float, rows: np.ndarray) -> np.ndarray:
+        moved = psi.copy()
+        moved[:, offset] = shift
+        return forward.field(moved, data.view)["drawbar_pull"][0, rows]
+
+    # Within the range it is the simulator, the parabola and all, ...
+    np.testing.assert_allclose(
+        pull(0.0, high), forward.simulator(psi, data.view)["drawbar_pull"][0, high]
+    )
+    # ... and outside a line of the slope from one end of the range to the other.
+    low = recorded.min() - recorded.max()
+    slope = (pull(0.0, high) - pull(low, high)) / -low
+    for beyond in (3.0, 9.0):
+        np.testing.assert_allclose(pull(beyond, high), pull(0.0, high) + slope * beyond)
+        np.testing.assert_allclose(pull(low - beyond, high), pull(low, high) - slope * beyond)
