@@ -206,7 +206,7 @@ class Forward:
 
         From there on the prediction goes on straight, as from the one end of their range to the
         other: the parabolas of the Magic Formula's coefficients are not to be trusted outside. Of
-        33 true gauge errors (four seeds of the challenge) the rms error is 0.9 noise sds so, 1.5
+        33 true gauge errors (four seeds of the challenge) the rms error is 0.95 noise sds so, 1.5
         along the parabolas.
         """
         pressure = conditions.get(_PRESSURE)
