@@ -27,9 +27,11 @@ __all__ = ["Fit", "climb_on", "finish", "fit", "log_joint", "look"]
 # The noise of an output is known beforehand to this factor (sd of its logarithm).
 SIGMA_SD_LOG = 1.0
 _MAX_STEPS = 40
-# Steps of a first look, how many nats behind the best of several one is given up, and within how
-# many posterior sds of a better one.
-_FIRST_STEPS, _WORTH, _NEAR = 3, 6.0, 1.5
+# Steps of a first look; of one at a discrepancy alone, which predictions are linear in.
+_FIRST_STEPS, _LINEAR_STEPS = 3, 1
+# How many nats behind the best of several looks one is given up, and within how many posterior sds
+# of a better one.
+_WORTH, _NEAR = 6.0, 1.5
 # Guesses closer than this (in prior sds) climb to the same mode.
 _APART = 0.7
 
@@ -102,7 +104,9 @@ def look(
     if starts is not None:
         candidates = np.concatenate([candidates, problem.clip(starts)])
     begun = problem.best(candidates, noise, count)
-    return [_climb(problem, psi, noise, _FIRST_STEPS) for psi in begun]
+    linear = bool(forward.smooth_slices) and not forward.hypothesis.effects
+    steps = _LINEAR_STEPS if linear and forward.shift is None else _FIRST_STEPS
+    return [_climb(problem, psi, noise, steps) for psi in begun]
 
 
 def fit(
@@ -221,8 +225,7 @@ class _Residuals:
     def raw(self, psi: Array) -> dict[str, Array]:
         """Observed minus predicted of lab then field rows, shapes (k, n)."""
         with np.errstate(all="ignore"):
-            lab = self.forward.lab(psi)
-            field = self.forward.field(psi, self.data.view)
+            lab, field = self.forward.campaigns(psi)
         return {
             o.name: self.observed[o.name]
             - np.concatenate([lab[o.name], field[o.name][:, o.rows]], axis=1)
