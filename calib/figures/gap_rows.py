@@ -23,6 +23,8 @@ __all__ = [
     "unit_after",
 ]  # fmt: skip
 
+# The words for a region that covers all rows.
+EVERYWHERE = "all conditions"
 # White to dark: how probable it is that a gap exceeds the noise. It survives greyscale.
 PROBABLE = LinearSegmentedColormap.from_list("probable", ["#ffffff", "#f6c9a5", "#D55E00"])
 
@@ -68,10 +70,6 @@ def axis_name(column: str) -> Axis:
 def unit_after(axis: Axis) -> str:
     """Return a unit to be put after a number; nothing for counts."""
     return "" if axis.unit == "number" else f" {axis.unit}"
-
-
-# The words for a region that covers all rows.
-EVERYWHERE = "all conditions"
 
 
 def region_text(found: Diagnosis, region: Region) -> str:

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 import numpy as np
 
 from calib.data import Table
+from calib.gap.effects.base import DRAWBAR
 from calib.models import get_model
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 
 __all__ = ["oddities"]
 
-DRAWBAR = "drawbar_pull"
 # Typical outputs of two campaigns differ by less than this, whatever acts in the field.
 _ODD_RATIO = 4.0
 # Factors between units that are taken for one another, and how near a ratio has to come.
