@@ -31,7 +31,14 @@ from calib.gap.where import Region
 from calib.models import get_model
 from calib.page.content import png_size
 from calib.page.gap_sizes import size_sentences, where_to_look
-from calib.page.gap_tables import conditions_text, hypothesis_groups, next_rows, prior_text
+from calib.page.gap_tables import (
+    conditions_text,
+    hypothesis_groups,
+    next_rows,
+    parameter_rows,
+    prior_text,
+    simulators,
+)
 from calib.page.gap_verdict import (
     Candidate,
     GapEvidence,
@@ -120,6 +127,8 @@ def render_diagnosis(
         warnings=case.warnings,
         groups=hypothesis_groups(found),
         prior=prior_text(found),
+        parameters=parameter_rows(found),
+        simulators=simulators(found),
         best=title_of(found, best_of(found)),
         not_testable=[
             [short_name(n), title_of(found, n), reason]

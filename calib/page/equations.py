@@ -121,7 +121,7 @@ _PARAMETRISATIONS: Mapping[str, str] = {
     ),
     "magic_formula_pressure": (
         "Each quadratic in pressure is sampled through its values at the lowest (_lo) and highest "
-        "(_hi) calibrated pressure, {p_low:g} and {p_high:g} psi, and its relative curvature "
+        "(_hi) calibrated pressure, {p_low:.4g} and {p_high:.4g} psi, and its relative curvature "
         "between them (_bend): K = BCD, D and G = 1 {minus} E. All three quadratics must stay "
         "positive between these pressures, which truncates the priors (bends below about 1). The "
         "coefficients c1 to c9 of the source follow."

@@ -25,6 +25,7 @@ from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.next_measurement import NextMeasurement
 from calib.models import get_model
 from calib.numbers import format_number, format_value
+from calib.page.equations import equation, parametrisation, prose
 from calib.page.gap_verdict import TIE, odds_text, repeats_needed
 from calib.priors import Prior
 
@@ -32,9 +33,11 @@ __all__ = [
     "conditions_text",
     "hypothesis_groups",
     "next_rows",
+    "parameter_rows",
     "parameter_text",
     "prior_text",
     "shift_sizes",
+    "simulators",
 ]
 
 _POSSIBLE = 0.01
@@ -106,20 +109,55 @@ def _sizes(found: Diagnosis, name: str) -> list[Markup]:
     if hypothesis.shift > 0.0:
         return shift_sizes(found.data.outputs, fit)
     sd = np.sqrt(np.diag(fit.covariance))
-    sizes = []
+    sizes: list[Markup] = []
     for effect, priors, part in zip(
         hypothesis.effects, hypothesis.effect_priors, fit.forward.phi_slices, strict=True
     ):
-        of = f"{short_name(effect.name)}: " if len(hypothesis.effects) > 1 else ""
+        own = [
+            f"{prior.name.replace('_', ' ')} {parameter_text(prior, float(value), float(s))}"
+            for prior, value, s in zip(priors.free, fit.psi[part], sd[part], strict=True)
+        ]
+        # Whose they are is said once, before the first.
         if name == "unknown":
-            of = f"on top of {short_name(effect.name)}: "
-        for prior, value, s in zip(priors.free, fit.psi[part], sd[part], strict=True):
-            sizes.append(
-                Markup("{}{} {}").format(
-                    of, prior.name.replace("_", " "), parameter_text(prior, float(value), float(s))
-                )
-            )
+            own[0] = f"on top of {short_name(effect.name)}: {own[0]}"
+        elif len(hypothesis.effects) > 1:
+            own[0] = f"{short_name(effect.name)}: {own[0]}"
+        sizes += [Markup("{}").format(text) for text in own]
     return sizes
+
+
+def parameter_rows(found: Diagnosis) -> list[list[str]]:
+    """Say what the parameters of the effects that are not ruled out mean, and their priors."""
+    p = found.ranking.probability
+    rows: dict[tuple[str, str], list[str]] = {}
+    for name in found.ranking.order:
+        if p[name] < _POSSIBLE:
+            continue
+        hypothesis = best_fit(found, name).forward.hypothesis
+        for effect, priors in zip(hypothesis.effects, hypothesis.effect_priors, strict=True):
+            for prior in priors.free:
+                unit = "" if prior.unit in ("1", "", "dimensionless") else f" {prior.unit}"
+                words = prior.name.replace("_", " ")
+                text = (
+                    prior.text.replace(" x ", " \N{MULTIPLICATION SIGN} ")
+                    .replace("_kn)", ")")
+                    .replace("_", " ")
+                )
+                row = [short_name(effect.name), words, prior.reason, text + unit]
+                rows.setdefault((effect.name, prior.name), row)
+    return list(rows.values())
+
+
+def simulators(found: Diagnosis) -> list[dict[str, Any]]:
+    """Return title, equation and parametrisation of each output's simulator."""
+    return [
+        {
+            "title": o.problem.bound.model.title,
+            "equation": equation(o.problem.bound),
+            "parameters": prose(parametrisation(o.problem.bound), o.priors.names),
+        }
+        for o in found.data.outputs
+    ]
 
 
 def parameter_text(prior: Prior, value: float, sd: float) -> str:
@@ -138,10 +176,13 @@ def parameter_text(prior: Prior, value: float, sd: float) -> str:
         the data did not narrow is called so.
     """
     unit = "" if prior.unit in ("1", "", "dimensionless") else f" {prior.unit}"
-    narrow = math.isfinite(prior.scale) and sd > _NOT_NARROWED * prior.scale
     half = prior.lower == 0.0 and prior.loc == 0.0
     spread = prior.scale * (math.sqrt(1.0 - 2.0 / math.pi) if half else 1.0)
-    narrow = math.isfinite(prior.scale) and sd > _NOT_NARROWED * spread
+    if not math.isfinite(prior.scale):  # uniform between its bounds
+        spread = (prior.upper - prior.lower) / math.sqrt(12.0)
+    narrow = math.isfinite(spread) and sd > _NOT_NARROWED * spread
+    if narrow and not math.isfinite(prior.scale):
+        value, sd = 0.5 * (prior.lower + prior.upper), spread
     mark = " (prior)" if narrow else ""
     if prior.log:
         centre = math.exp(value)
@@ -153,7 +194,8 @@ def parameter_text(prior: Prior, value: float, sd: float) -> str:
             f"{unit}{mark}"
         )
     if prior.lower == 0.0 and value < sd:
-        return f"< {format_number(value + 1.645 * sd, 2)}{unit}{mark}"
+        limit = min(value + 1.645 * sd, prior.upper)
+        return f"< {format_number(limit, 2)}{unit}{mark}"
     return f"{format_value(value, sd)}{unit}{mark}"
 
 

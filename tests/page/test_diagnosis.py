@@ -12,7 +12,13 @@ from gap.cases import diagnosis_of, pull_diagnosis
 from calib.gap.next_measurement import NextMeasurement
 from calib.page.diagnosis import gap_evidence, render_diagnosis, write_page
 from calib.page.gap_sizes import size_sentences
-from calib.page.gap_tables import conditions_text, hypothesis_groups, parameter_text, prior_text
+from calib.page.gap_tables import (
+    conditions_text,
+    hypothesis_groups,
+    parameter_rows,
+    parameter_text,
+    prior_text,
+)
 from calib.page.gap_verdict import (
     Candidate,
     GapEvidence,
@@ -170,6 +176,10 @@ def prior(**changes) -> Prior:
         (prior(), 0.1, 0.98, "0.10 ± 0.98 kN (prior)"),
         (prior(log=True, loc=0.0), math.log(2.0), 0.1, "2.00 ± 0.20 kN"),
         (prior(log=True, loc=0.0), math.log(2.0), 0.7, "2.0 (0.63 to 6.3) kN"),
+        # Uniform from 0 to 1: as wide as before the data, or narrowed.
+        (prior(scale=math.inf, lower=0.0, upper=1.0), 0.9, 1.8, "0.50 ± 0.29 kN (prior)"),
+        (prior(scale=math.inf, lower=0.0, upper=1.0), 0.7, 0.05, "0.700 ± 0.050 kN"),
+        (prior(scale=math.inf, lower=0.0, upper=1.0), 0.2, 0.25, "< 0.61 kN"),
         # A half-normal's sd is 0.60 of its scale: one of 0.58 has learnt nothing.
         (prior(lower=0.0), 0.0, 0.58, "< 0.95 kN (prior)"),
     ],
@@ -270,7 +280,8 @@ def test_parameters_say_of_which_effect_they_are(found):
     rows = {r["name"]: r["sizes"] for g in hypothesis_groups(found) for r in g["rows"]}
     pair = rows["force_offset+sensor_drift"]
     assert pair[0].startswith("force offset: offset ")
-    assert all(s.startswith("sensor drift: ") for s in pair[1:])
+    assert pair[1].startswith("sensor drift: drift ")
+    assert pair[2].startswith("curvature ")  # said once
     assert rows["force_offset"][0].startswith("offset ")
     on_top = next(f for f in found.ranking.fits["unknown"] if f.forward.hypothesis.effects)
     fits = dict(found.ranking.fits) | {"unknown": (on_top,)}
@@ -278,7 +289,25 @@ def test_parameters_say_of_which_effect_they_are(found):
     other = replace(found, ranking=replace(found.ranking, fits=fits, scores=scores))
     rows = {r["name"]: r["sizes"] for g in hypothesis_groups(other) for r in g["rows"]}
     name = on_top.forward.hypothesis.effects[0].name.replace("_", " ")
-    assert all(s.startswith(f"on top of {name}: ") for s in rows["unknown"])
+    assert rows["unknown"][0].startswith(f"on top of {name}: ")
+    assert not any("on top of" in s for s in rows["unknown"][1:])
+
+
+def test_what_the_parameters_are_can_be_read_on_the_page(found, page):
+    _, _, reader = page
+    rows = {(row[0], row[1]): row[2:] for row in parameter_rows(found)}
+    assert len(rows) == len(parameter_rows(found))
+    meaning, prior = rows["sensor drift", "curvature"]
+    assert meaning.startswith("1 is linear in run order")
+    assert prior == "lognormal(1, 0.6)"
+    assert rows["sensor drift", "drift"][1].endswith(" \N{MULTIPLICATION SIGN} 5 (normal load) kN")
+    for words in (meaning, "sampled through its values at the lowest (", "psi"):
+        assert words in reader.text
+    ruled_out = {n for n, p in found.ranking.probability.items() if p < 0.01 and "+" not in n}
+    in_play = {
+        part for n, p in found.ranking.probability.items() if p >= 0.01 for part in n.split("+")
+    }
+    assert not {name.replace("_", " ") for name in ruled_out - in_play} & {e for e, _ in rows}
 
 
 def test_mean_gaps_have_intervals_and_noise_is_said_to_be_whose(page):
