@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +34,9 @@ __all__ = [
     "Corrected", "conditions_outside", "load_corrected", "predict_columns", "save_corrected",
 ]  # fmt: skip
 
-SCHEMA = "calib/corrected/4"
+SCHEMA = "calib/corrected/5"
+# How far a loaded model may depart from what it said when saved, in noise sds.
+_SAME = 1e-4
 
 
 class Corrected:
@@ -112,9 +114,18 @@ def _fit_document(fit: Fit, probability: float) -> dict[str, Any]:
         "psi": fit.psi.tolist(),
         "covariance": fit.covariance.tolist(),
         "sample": None if fit.sample is None else _short(fit.sample),
+        "field": {o: _short([values])[0] for o, values in _field(fit).items()},
         "noise": {
             o: {"sigma": n.sigma, "rho": n.rho, "kappa": n.kappa} for o, n in fit.noise.items()
         },
+    }
+
+
+def _field(fit: Fit) -> dict[str, Array]:
+    """Predict the field rows at the mode, on the scale of the response."""
+    return {
+        o: values[0]
+        for o, values in fit.forward.field(fit.psi[None], fit.forward.data.view).items()
     }
 
 
@@ -132,7 +143,7 @@ def _load_shift(document: dict[str, Any] | None) -> ShiftMap | None:
     return ShiftMap(parameters, np.array(document["radius_error"]))
 
 
-def _short(draws: Array) -> list[list[float]]:
+def _short(draws: Iterable[Array]) -> list[list[float]]:
     """Twelve digits of each number, so that the file stays small."""
     return [[float(f"{value:.12g}") for value in row] for row in draws]
 
@@ -150,7 +161,8 @@ def load_corrected(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> Cor
     Raises
     ------
     CalibError
-        If the folder has no corrected model, or it is damaged.
+        If the folder has no corrected model, it is damaged, or it predicts otherwise than when it
+        was saved, as with other effects or priors.
     """
     path = Path(folder) / "corrected.json"
     try:
@@ -200,7 +212,17 @@ def _load_fit(
     sample = None if document["sample"] is None else np.array(document["sample"])
     if sample is not None and sample.shape[1:] != psi.shape:
         raise ValueError("shape")
-    return Fit(forward, psi, covariance, noise, 0.0, 0.0, {}, sample)
+    fit = Fit(forward, psi, covariance, noise, 0.0, 0.0, {}, sample)
+    for o, values in _field(fit).items():
+        said = np.array(document["field"][o])
+        if not np.allclose(values, said, rtol=0.0, atol=_SAME * sigma[o], equal_nan=True):
+            raise CalibError(
+                f"the hypothesis {document['name']} no longer predicts the {o} that it was saved "
+                "with: its effects, their priors or a model have changed since",
+                allowed="the code, priors and effects of the diagnosis",
+                mend="run the diagnosis again, or pass the file of effects as it was then",
+            )
+    return fit
 
 
 def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:

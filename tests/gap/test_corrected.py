@@ -56,6 +56,18 @@ def test_a_damaged_one_is_refused(saved, tmp_path):
         load_corrected(tmp_path)
 
 
+def test_a_model_that_has_changed_since_is_refused(saved, tmp_path):
+    """As when the file of one's own effects, or its priors, is no longer what it was."""
+
+    class Other(type(EFFECTS["force_offset"])):
+        def on_output(self, phi, output, location, view):
+            return location + 1.01 * (super().on_output(phi, output, location, view) - location)
+
+    _, folder = saved
+    with pytest.raises(CalibError, match="no longer predicts the drawbar_pull"):
+        load_corrected(folder, {**FEW, "force_offset": Other()})
+
+
 def test_missing_covariates_are_named(saved):
     _, folder = saved
     few = table_from_arrays({"slip_ratio": np.array([0.1])})
