@@ -121,15 +121,15 @@ def levels_figure(tiers: Sequence[TierScore], limit: Limit | None = None) -> Fig
             )
             if not got.n:
                 continue
-            met = level.met(tier.tier, got.value)
+            missed = level.mark(tier.tier, got) == "MISSED"
             arms = np.abs(np.array(got.interval) - got.value)[:, None]
             axes.errorbar(
                 got.value,
                 i,
                 xerr=arms,
-                fmt="o" if met else "X",
+                fmt="X" if missed else "o",
                 capsize=3,
-                color=_BLUE if met else _ORANGE,
+                color=_ORANGE if missed else _BLUE,
             )
         if limit is not None:
             _mark_limit(axes, limit.tier(tier.tier))

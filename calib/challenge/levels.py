@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from calib.challenge.score import Average, Proportion
+
+_ENOUGH_TO_MEET, _ENOUGH_TO_MISS = 10, 30
+
 
 @dataclass(frozen=True)
 class Level:
@@ -35,6 +39,20 @@ class Level:
         """Whether a value reaches the level; a missing value (NaN) does not."""
         low, high = self.limits(tier)
         return low <= value <= high
+
+    def mark(self, tier: str, figure: Proportion | Average) -> str:
+        """Say whether the level is met, missed, or of too few cases to tell.
+
+        A miss of fewer than 30 cases is none while its interval reaches the level; nor is a level
+        met by fewer than 10 whose interval reaches beyond it.
+        """
+        lower, upper = self.limits(tier)
+        low, high = figure.interval
+        if self.met(tier, figure.value):
+            sure = figure.n >= _ENOUGH_TO_MEET or (lower <= low and high <= upper)
+            return "met" if sure else "too few to tell"
+        few = figure.n < _ENOUGH_TO_MISS and low <= upper and high >= lower
+        return "too few to tell" if few or figure.n < _ENOUGH_TO_MEET // 2 else "MISSED"
 
 
 def _at_least(name: str, label: str, easy: float, hard: float) -> Level:

@@ -20,7 +20,6 @@ _EXTRA = (
 
 
 # A miss on fewer than these, whose interval reaches the level, is none yet.
-_FEW = 30
 
 
 def _figure(tier: TierScore, name: str) -> Proportion | Average:
@@ -56,15 +55,6 @@ def _of_limit(limit: TierScore | None, name: str) -> str:
     return f"{figure.value:6.3f} {_span(figure):>14}" if figure.n else f"{'-':>6} {'':>14}"
 
 
-def _mark(level: Level, tier: str, figure: Proportion | Average) -> str:
-    if level.met(tier, figure.value):
-        return "met"
-    lower, upper = level.limits(tier)
-    low, high = figure.interval
-    few = figure.n < _FEW and low <= upper and high >= lower
-    return "too few to tell" if few else "MISSED"
-
-
 def tier_table(tier: TierScore, limit: TierScore | None = None) -> str:
     """Return one tier's table.
 
@@ -80,7 +70,7 @@ def tier_table(tier: TierScore, limit: TierScore | None = None) -> str:
     lines.append(head + (f" {'limit':>6} {'95 % interval':>14}" if limit else ""))
     for level in LEVELS:
         figure = _figure(tier, level.name)
-        mark = _mark(level, tier.tier, figure)
+        mark = level.mark(tier.tier, figure)
         beside = _of_limit(limit, level.name)
         lines.append(_line(level.label, figure, asked(level, tier.tier), beside, mark))
     for name, label in _EXTRA:

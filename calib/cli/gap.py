@@ -80,7 +80,9 @@ def diagnose(
         print(f"calib: {warning}", file=sys.stderr)
     print(f"verdict: {found.verdict} ({judge_gap(gap_evidence(found)).headline})")
     for name in found.ranking.order[:4]:
-        print(f"  {found.ranking.probability[name]:6.3f}  {name}")
+        p = found.ranking.probability[name]
+        text = ">0.999" if p >= 0.9995 else "<0.001" if p < 0.0005 else f"{p:.3f}"
+        print(f"  {text:>6}  {name}")
     for output, s in found.shrink.items():
         low, high = s.interval
         unit = QUANTITIES[OUTPUTS[output]].unit.replace("**", "")

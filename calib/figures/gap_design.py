@@ -60,11 +60,11 @@ def isolability_plate(found: Diagnosis) -> Plate | None:
     axes[0, 2].plot(shown, y, "o", color=BLUE, ms=4.5)
     for yi, value in zip(y, size, strict=True):
         axes[0, 2].text(
-            min(value, 4.0) + 0.12, yi, short(float(value)) if value < 100.0 else "> 100",
+            min(value, 4.0) + 0.12, yi, short(float(value)) if value < 100.0 else "none",
             va="center", fontsize=SMALLEST_PT,
         )  # fmt: skip
     axes[0, 2].set_xlim(0.0, max(1.25 * float(shown.max()), 1.5))
-    axes[0, 2].set_xlabel("Smallest nameable\nsize (noise sd)")
+    axes[0, 2].set_xlabel("Smallest size that\nshows (noise sd)")
     for ax in axes[0, 1:]:
         ax.set_ylim(n - 0.5, -0.5)
         ax.set_yticks([])
@@ -138,12 +138,13 @@ def _design_caption(design: Isolability) -> str:
             f" The simulator's own parameters could take up more than 80 % of "
             f"{joined([short_name(n) for n in hard])}."
         )
-    sizes = list(design.detectable.values())
+    sizes = [size for size in design.detectable.values() if np.isfinite(size)]
+    shows = f"{short(min(sizes))} to {short(max(sizes))} noise sd" if sizes else "no size"
     return (
-        f"{text} The smallest size that is named in 80 % of campaigns like this one runs from "
-        f"{short(min(sizes))} to {short(max(sizes))} noise sd (rms over the rows; the noise is the "
-        "laboratory's alone here). Only conditions and laboratory data were used for this figure; "
-        "likeness is in hundredths."
+        f"{text} What is told from noise in 80 % of campaigns like this one, by whatever name, are "
+        f"effects of at least {shows} (rms over the rows of the output where it is largest; "
+        "the noise is the laboratory's alone here). Only conditions and laboratory data were used "
+        "for this figure; likeness is in hundredths."
     )
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
-from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns
-from calib.gap.corrected import Corrected
+from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns, read_case
+from calib.gap.corrected import Corrected, conditions_outside
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.mixture import Truth, mixture
 from calib.gap.next_measurement import NextMeasurement, next_measurements
@@ -28,7 +29,7 @@ NAMED = 0.5
 _FOLDS = 5
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Diagnosis:
     """What was found for a case.
 
@@ -63,14 +64,23 @@ class Diagnosis:
     corrected: Corrected
     seed: int
 
+    def __repr__(self) -> str:
+        """Name the case, the verdict and the most probable hypotheses."""
+        p = self.ranking.probability
+        best = ", ".join(f"{name} {p[name]:.3f}" for name in self.ranking.order[:3])
+        return f"Diagnosis({self.data.case.name}: {self.verdict}; {best})"
+
 
 @one_thread()
-def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFECTS) -> Diagnosis:
+def diagnose(
+    case: Case | str | Path, seed: int = 1, *, effects: Mapping[str, Effect] = EFFECTS
+) -> Diagnosis:
     """Find where a calibrated simulator misses, which effect it lacks, and what adding it gains.
 
     Parameters
     ----------
-    case : Case
+    case : Case or path
+        A case, or the folder of one (`case.toml`, `lab.csv`, `field.csv`).
     seed : int
         Same seed, same numbers.
     effects : mapping of str to Effect, optional
@@ -85,6 +95,8 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
     CalibError
         If the case cannot be diagnosed: an output or a condition is missing, too few rows.
     """
+    if not isinstance(case, Case):
+        case = read_case(Path(case))
     data, ranking = rank_without_outliers(case, seed, effects)
     mixed = mixture(data, ranking, seed)
     truth = mixed.at(data.view)
@@ -98,7 +110,7 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
     if far and case.fresh is None:
         far = shrink(data, truth, before, _left_out(data, truth, seed, effects))
     return Diagnosis(
-        data,
+        _beyond(data, corrected, before),
         ranking,
         verdict(ranking.probability),
         truth,
@@ -110,6 +122,26 @@ def diagnose(case: Case, seed: int = 1, *, effects: Mapping[str, Effect] = EFFEC
         corrected,
         seed,
     )
+
+
+def _beyond(data: Campaigns, corrected: Corrected, before: Mapping[str, Array]) -> Campaigns:
+    """Warn of conditions to predict that neither campaign covered."""
+    case = data.case
+    if case.fresh is None:
+        return data
+    said = [
+        f"{case.fresh.source}: {rows} of {len(case.fresh)} rows lie outside what either campaign "
+        f"covered in {name}; what is predicted there is extrapolated"
+        for name, rows in conditions_outside(corrected, case.fresh).items()
+    ]
+    for name, values in before.items():
+        empty = int(np.isnan(values).sum())
+        if empty:
+            said.append(
+                f"{case.fresh.source}: the simulator has no {name.replace('_', ' ')} at {empty} of "
+                f"{len(case.fresh)} rows; they are left out of the shrink"
+            )
+    return replace(data, case=replace(case, warnings=(*case.warnings, *said)))
 
 
 def _left_out(

@@ -4,7 +4,7 @@ Each effect is drawn from its prior and its signature computed on the field's co
 sds of the laboratory. What the simulator's parameters could take up instead, given how well the
 lab determined them, is projected out with the metric C^-1, C = I + J S J', where J is the
 simulator's sensitivity and S the lab's posterior covariance. Left are: the part that is absorbed,
-the smallest size that can be named, and the effects that look alike.
+the smallest size that is told from noise, and the effects that look alike.
 """
 
 from __future__ import annotations
@@ -13,22 +13,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import logsumexp
 
 from calib.gap.case import Campaigns
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, noise_at
+from calib.gap.relevance import RELEVANT
 from calib.models.base import Array
 from calib.sampling.curvature import hessian_scale
 from calib.sampling.mode import prior_widths
 from calib.streams import generator
 
-__all__ = ["Isolability", "isolability"]
+__all__ = ["Isolability", "isolability", "smallest_shown"]
 
-_N_DRAWS = 64
+# Draws of each effect's prior: for its sizes, and of these for how alike effects look.
+_N_SIZES, _N_DRAWS = 1024, 64
 _Z_POWER = 0.8416  # 80 % power
-_LN_ODDS = float(np.log(10.0))  # an effect is named when it is ten times as probable as none
+_LN_ODDS = float(np.log(10.0))  # an effect shows when it is ten times as probable as none
 ALIKE = 0.95
 _NOTHING = 1e-6  # noise sds
 
@@ -42,7 +45,8 @@ class Isolability:
     absorbed : mapping of str to float
         Part of each effect's signature (squared) that the simulator's parameters take up.
     detectable : mapping of str to float
-        Smallest size that is named with 80 % power, in noise sds rms over the field rows.
+        Smallest size that is told from noise with 80 % power, in noise sds rms over the field rows
+        of the output where it is largest; infinite if no believable size is.
     likeness : mapping of (str, str) to float
         Cosine between what is left of two effects, best match over their priors.
     idle : tuple of str
@@ -83,23 +87,57 @@ def isolability(
     idle = tuple(name for name, g in raw.items() if not (np.abs(g) > _NOTHING).any())
     raw = {name: g for name, g in raw.items() if name not in idle}
     left = {name: g @ root.T for name, g in raw.items()}
-    absorbed, detectable = {}, {}
+    rows = [o.rows.size for o in data.outputs]
     ln_odds = _LN_ODDS + LN_PRIOR["none"] - LN_PRIOR["single"] + np.log(max(len(single), 1))
-    needed = (_Z_POWER + np.sqrt(_Z_POWER**2 + 2.0 * ln_odds)) ** 2
+    absorbed, detectable = {}, {}
     for name, g in raw.items():
-        size = np.square(g).sum(axis=1)
-        kept = np.square(left[name]).sum(axis=1) / np.maximum(size, 1e-300)
-        share = float(np.median(kept[size > 1e-12])) if (size > 1e-12).any() else 0.0
-        absorbed[name] = 1.0 - share
-        detectable[name] = float(np.sqrt(needed / (g.shape[1] * max(share, 1e-6))))
+        total = np.square(g).sum(axis=1)
+        seen = total > _NOTHING**2
+        kept = np.square(left[name]).sum(axis=1)
+        absorbed[name] = 1.0 - float(np.median((kept / np.maximum(total, 1e-300))[seen]))
+        parts = np.split(np.square(g), np.cumsum(rows)[:-1], axis=1)
+        size = np.sqrt(np.max([part.mean(axis=1) for part in parts], axis=0))
+        sd = size[seen] / np.sqrt(np.maximum(kept[seen], 1e-300))
+        detectable[name] = smallest_shown(size, float(np.median(sd)), float(ln_odds))
     return Isolability(absorbed, detectable, _likeness(left), idle)
+
+
+def smallest_shown(prior: Array, sd: float, ln_odds: float) -> float:
+    """Find the size of an effect that is told from noise in 80 % of campaigns.
+
+    An effect counts from `calib.gap.relevance.RELEVANT` on, so its evidence is that of a prior
+    without smaller sizes.
+
+    Parameters
+    ----------
+    prior : ndarray, shape (draws,)
+        Sizes that are believable beforehand, in noise sds.
+    sd : float
+        Of the estimate of the size.
+    ln_odds : float
+        What the logarithm of the Bayes factor against no effect has to reach.
+
+    Returns
+    -------
+    float
+        Infinite if no size that is believable will do.
+    """
+    relevant = prior[prior >= RELEVANT]
+    if not relevant.size:
+        return float("inf")
+    estimates = np.linspace(0.0, relevant.max() + 4.0 * sd, 2000)
+    exponent = (2.0 * estimates[:, None] * relevant - np.square(relevant)) / (2.0 * sd**2)
+    reached = logsumexp(exponent, axis=1) - np.log(relevant.size) >= ln_odds
+    if not reached.any():
+        return float("inf")
+    return float(estimates[int(np.argmax(reached))]) + _Z_POWER * sd
 
 
 def _likeness(left: Mapping[str, Array]) -> dict[tuple[str, str], float]:
     unit = {}
     for name, g in left.items():
         length = np.linalg.norm(g, axis=1, keepdims=True)
-        unit[name] = (g / np.maximum(length, 1e-300))[length[:, 0] > 1e-6]
+        unit[name] = (g / np.maximum(length, 1e-300))[length[:, 0] > 1e-6][:_N_DRAWS]
     names = sorted(unit)
     found = {}
     for i, a in enumerate(names):
@@ -118,7 +156,7 @@ def _signatures(
 ) -> Array:  # fmt: skip
     """Signatures of prior draws over all field rows and outputs, shape (draws, N)."""
     forward = Forward(data, h, {o: n.sigma for o, n in noise.items()})
-    psi = forward.priors.sample(generator(seed, "gap", "isolability", h.name), _N_DRAWS)
+    psi = forward.priors.sample(generator(seed, "gap", "isolability", h.name), _N_SIZES)
     for o in data.outputs:
         psi[:, forward.theta_slices[o.name]] = lab_mode[o.name]
     with np.errstate(all="ignore"):

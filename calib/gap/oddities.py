@@ -16,12 +16,15 @@ __all__ = ["oddities"]
 
 # Typical outputs of two campaigns differ by less than this, whatever acts in the field.
 _ODD_RATIO = 4.0
+# Typical conditions of two campaigns, their ranges overlapping, differ by less than this.
+_FAR_RATIO = 10.0
 # Factors between units that are taken for one another, and how near a ratio has to come.
 _UNITS = {
     6.895: "psi and kPa", 10.0: "mm and cm", 25.4: "inches and mm", 4.448: "lbf and N",
     9.807: "kgf and N", 100.0: "a fraction and percent", 1000.0: "thousandths and wholes",
 }  # fmt: skip
-_NEAR = 0.15
+# (sd of a logarithm); conditions are other ones in every campaign, so roughly will do.
+_NEAR, _ROUGHLY = 0.15, 0.4
 
 
 def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, ...]:
@@ -86,6 +89,12 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
     conditions = {name for model in models.values() for name in get_model(model).conditions}
     for name in sorted(conditions & set(lab) & set(field)):
         apart = field[name].min() > lab[name].max() or field[name].max() < lab[name].min()
+        ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
+        if not apart and not 1.0 / _FAR_RATIO < ratio < _FAR_RATIO:
+            said.append(
+                f"{name}: {_times(lab[name], field[name], _ROUGHLY)}; if the field's is in another "
+                "unit, the diagnosis means nothing"
+            )
         if apart and np.ptp(lab[name]) > 0.0:
             said.append(
                 f"{name}: no field value lies within the calibration's range, "
@@ -115,15 +124,15 @@ def _typical(values: Array) -> float:
     return float(np.nanmedian(np.abs(values)))
 
 
-def _times(lab: Array, field: Array) -> str:
-    """Say how the typical values of two columns compare, and which units do so."""
+def _times(lab: Array, field: Array, near: float = _NEAR) -> str:
+    """Say how the typical values of two columns compare, and which units do so nearly."""
     low, high = sorted((_typical(lab), _typical(field)))
     factor = high / max(low, 1e-300)
     way = "more" if _typical(field) > _typical(lab) else "less"
-    near = [units for known, units in _UNITS.items() if abs(np.log(factor / known)) < _NEAR]
-    like = f", about the factor between {near[0]}" if near else ""
+    like = [units for known, units in _UNITS.items() if abs(np.log(factor / known)) < near]
+    between = f", about the factor between {' or '.join(like)}" if like else ""
     typical = f"typically {_typical(field):.3g} against {_typical(lab):.3g}"
-    return f"{typical}, {factor:.3g} times {way}{like}"
+    return f"{typical}, {factor:.3g} times {way}{between}"
 
 
 def _identical_rows(lab: Table, field: Table) -> int:

@@ -25,6 +25,9 @@ OUTLIER = 5.0
 # In the laboratory the row itself widens the noise, so the unit is a robust sd, and the bar higher.
 LAB_OUTLIER = 8.0
 _MOST_ROUNDS = 3
+# A reading so many times the spread of the laboratory's off them is none: a code for "missing", a
+# slip of the comma. No gap is a tenth as large.
+_IMPOSSIBLE = 20.0
 # Beyond this a reading is named; of noise alone, one in 2000 readings is.
 LEFT_OVER = 3.5
 
@@ -46,8 +49,10 @@ def rank_without_outliers(
         Of the rows that are left; its case says which were set aside.
     Ranking
     """
+    campaigns(case)  # refuses what cannot be diagnosed, before rows are set aside
     check_units(case)
-    case = _without_lab_outliers(without_far_conditions(case), seed)
+    case = _without_impossible(without_far_conditions(case))
+    case = _without_lab_outliers(case, seed)
     data = campaigns(case)
     ranking = rank(data, seed, effects=effects)
     for _ in range(_MOST_ROUNDS):
@@ -84,6 +89,29 @@ def _left_over(data: Campaigns, ranking: Ranking) -> list[str]:
 def without_outputs(case: Case, rows: Mapping[str, Sequence[int] | NDArray[np.int64]]) -> Case:
     """Take outputs of field rows out of a case, their conditions left in."""
     return replace(case, field=_blanked(case.field, rows))
+
+
+def _without_impossible(case: Case) -> Case:
+    """Set readings aside that cannot be any, unless most of an output's are so."""
+    tables, said = {"lab": case.lab, "field": case.field}, list(case.warnings)
+    for output in case.models:
+        column = OUTPUTS[output]
+        low, middle, high = np.nanquantile(case.lab[column], (0.1, 0.5, 0.9))
+        reach = _IMPOSSIBLE * (high - low)
+        for name, table in tables.items():
+            off = np.abs(table[column] - middle) > reach
+            if reach > 0.0 and 0 < off.sum() < 0.5 * np.isfinite(table[column]).sum():
+                rows = np.flatnonzero(off)
+                at = ", ".join(
+                    f"line {table.lines[row]} ({column} = {table[column][row]:.4g})" for row in rows
+                )
+                said.append(
+                    f"{table.source}, {at}: more than {_IMPOSSIBLE:g} times the range of the "
+                    "calibration's readings off them; left out as no reading at all (leave the "
+                    "cell empty where nothing was measured)"
+                )
+                tables[name] = _blanked(table, {output: rows})
+    return replace(case, **tables, warnings=tuple(said))  # type: ignore[arg-type]
 
 
 def _blanked(table: Table, rows: Mapping[str, Sequence[int] | NDArray[np.int64]]) -> Table:

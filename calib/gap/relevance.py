@@ -1,8 +1,8 @@
 """An effect that nobody could notice is no effect: hypotheses are about gaps that matter.
 
-Every hypothesis but `none` is the claim that its effect is *relevant*: that over the field rows
-its root-mean-square size is at least `RELEVANT` noise sds (of a pair: that each of the two alone is
-at least `RELEVANT_IN_PAIR`).
+Every hypothesis but `none` is the claim that its effect is *relevant*: that in some output its
+root-mean-square size over the field rows is at least `RELEVANT` noise sds (of a pair: that each of
+the two alone is at least `RELEVANT_IN_PAIR`).
 Restricting its prior to relevant sizes multiplies its evidence by
 
     P(relevant | data, hypothesis) / P(relevant | hypothesis),
@@ -64,11 +64,13 @@ def _log_share(size: Array) -> float:
 
 
 def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
-    """Size of each effect in noise sds, rms over field rows and outputs, shape (k, n_effects).
+    """Size of each effect in noise sds, rms over an output's field rows, shape (k, n_effects).
 
-    A parameter shift or a free discrepancy counts as one effect; of a discrepancy on top of an
-    effect the size is that of the discrepancy. A discrepancy of several outputs is as large as in
-    the output where it is smallest: what changes one output only is not one of several.
+    Of several outputs, that in which it is largest: what it does to the pull is no smaller because
+    ruts, which it leaves alone, were measured as well. A parameter shift or a free discrepancy
+    counts as one effect; of a discrepancy on top of an effect the size is that of the discrepancy.
+    A discrepancy of several outputs is as large as in the output where it is smallest: what changes
+    one output only is not one of several.
     """
     hypothesis = forward.hypothesis
     data = forward.data
@@ -99,11 +101,11 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
             )
             for o in data.outputs
         }
+        each = {name: np.sqrt(values.mean(axis=1)) for name, values in squares.items()}
         if joint:
-            each = [squares[name].mean(axis=1) for name in hypothesis.smooth_outputs]
-            columns.append(np.sqrt(np.min(each, axis=0)))
+            columns.append(np.min([each[name] for name in hypothesis.smooth_outputs], axis=0))
         else:
-            columns.append(np.sqrt(np.concatenate(list(squares.values()), axis=1).mean(axis=1)))
+            columns.append(np.max(list(each.values()), axis=0))
     return np.stack(columns, axis=1)
 
 

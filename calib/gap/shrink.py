@@ -87,9 +87,14 @@ def shrink(
 
 
 def _shrink_of(truth: Truth, before: Array, after: Array, name: str) -> Shrink | None:
-    values = truth.truth[name]
-    floor = np.sqrt(np.square(truth.noise[name]).mean(axis=1))
-    gap = np.sqrt(np.square(values - truth.simulator[name]).mean(axis=1))
+    values, simulator = truth.truth[name], truth.simulator[name]
+    # Where the simulator has no value, far outside what it was fitted to, there is no error either.
+    known = np.isfinite(before) & np.isfinite(values + simulator).all(axis=0)
+    if not known.any():
+        return None
+    values, simulator, before, after = (a[..., known] for a in (values, simulator, before, after))
+    floor = np.sqrt(np.square(truth.noise[name][:, known]).mean(axis=1))
+    gap = np.sqrt(np.square(values - simulator).mean(axis=1))
     if float(truth.weight @ (gap > _SMALLEST * floor)) < 0.5:
         return None
     before_error = np.sqrt(np.square(values - before).mean(axis=1))

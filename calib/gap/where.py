@@ -20,7 +20,8 @@ _REGION_CONDITIONS = (
     "pass_number", "gravimetric_water_content", "volumetric_water_content", "cone_index_kpa",
     "normal_load_kn", "run_order",
 )  # fmt: skip
-_MIN_ROWS = 3
+# The fewest rows of a region: this part of an output's rows, and two.
+_FEWEST_PART, _FEWEST = 1 / 12, 2
 _MOST = 3
 
 
@@ -135,16 +136,19 @@ def _stretches(values: Array, gap: RowGap, left: NDArray[np.bool_]) -> list[tupl
     groups = np.array_split(distinct, min(8, distinct.size))
     rows = [(values >= group[0]) & (values <= group[-1]) & left for group in groups]
     signs = [_sign(gap, inside) for inside in rows]
+    fewest = max(_FEWEST, int(_FEWEST_PART * values.size))
     found = []
     for sign, run in groupby(range(len(groups)), key=signs.__getitem__):
         at = list(run)
-        if sign and sum(int(rows[i].sum()) for i in at) >= _MIN_ROWS:
+        if sign and sum(int(rows[i].sum()) for i in at) >= fewest:
             found.append((float(groups[at[0]][0]), float(groups[at[-1]][-1])))
     return found
 
 
 def _sign(gap: RowGap, inside: NDArray[np.bool_]) -> float:
-    """The sign of the mean gap of some rows; 0 where there are none, or no gap is probable."""
-    if not inside.any() or gap.probability[inside].mean() <= 0.5:
+    """The sign of the mean gap of some rows; 0 unless a gap of that sign is probable in them."""
+    if not inside.any():
         return 0.0
-    return float(np.sign(gap.gap[inside].mean()))
+    sign = np.sign(gap.gap[inside].mean())
+    same = gap.probability[inside] * (np.sign(gap.gap[inside]) == sign)
+    return float(sign) if same.mean() > 0.5 else 0.0

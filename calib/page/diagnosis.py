@@ -27,6 +27,7 @@ from calib.figures.gap_shrink import scaled_shrink
 from calib.figures.labels import MINUS, short
 from calib.figures.plate import Plate
 from calib.gap.diagnose import Diagnosis
+from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
 from calib.models import get_model
 from calib.page.content import png_size
@@ -127,6 +128,8 @@ def render_diagnosis(
         warnings=case.warnings,
         groups=hypothesis_groups(found),
         prior=prior_text(found),
+        relevant=f"{RELEVANT:g}",
+        relevant_in_pair=f"{RELEVANT_IN_PAIR:g}",
         parameters=parameter_rows(found),
         simulators=simulators(found),
         best=title_of(found, best_of(found)),

@@ -185,9 +185,9 @@ def _judge(e: GapEvidence) -> GapVerdict:
 
 def _no_gap(e: GapEvidence, best: Candidate) -> GapVerdict:
     sure = best.probability >= SURE
-    size = "" if math.isnan(e.smallest) else (
-        f"; an effect of {e.smallest:.1f} noise sd (rms; the laboratory's noise) or more would "
-        "have shown in four of five campaigns like this one"
+    size = "" if not math.isfinite(e.smallest) else (
+        f"; an effect of {e.smallest:.1f} noise sd (rms in the output where it is largest; the "
+        "laboratory's noise) would have shown in four of five campaigns like this one"
     )  # fmt: skip
     facts = [("Which", f"No gap, probability {odds_text(best.probability)}{size}")]
     others = [c for c in e.ranked[1:4] if c.probability >= 0.05]

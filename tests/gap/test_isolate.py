@@ -6,13 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+from scipy.stats import norm
 
 from calib.data import table_from_arrays
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import singles
-from calib.gap.isolate import ALIKE, isolability
+from calib.gap.isolate import ALIKE, isolability, smallest_shown
 from calib.gap.noise import Noise
+from calib.gap.relevance import RELEVANT
 from calib.gap.which import rank
 from gap.cases import CHOICE, campaigns_of, make_case, ranking_of
 
@@ -80,6 +83,23 @@ def test_more_rows_show_smaller_effects():
         sizes.append(rank(data, 1, effects=few).isolability.detectable)
     for name in few:
         ratio = sizes[0][name] / sizes[1][name]
-        # Four times the rows halve the size at fixed absorption; more rows are absorbed more.
-        assert 1.2 < ratio < 2.2
+        # Four times the rows halve the sd, but not the size from which on an effect counts.
+        assert 1.05 < ratio < 2.0
     assert np.isfinite(list(sizes[1].values())).all()
+
+
+def test_the_smallest_size_shown_is_that_of_the_bayes_factor():
+    """Against a fine sum over a uniform prior from the relevant size on, and its limits."""
+    prior = np.linspace(0.0, 10.0, 100_001)
+    sd, ln_odds = 0.25, 5.0
+    sizes = prior[prior >= RELEVANT]
+
+    def ln_factor(estimate: float) -> float:
+        with_effect = norm.pdf(estimate, sizes, sd).mean()
+        return float(np.log(with_effect / norm.pdf(estimate, 0.0, sd)))
+
+    threshold = brentq(lambda t: ln_factor(t) - ln_odds, 0.1, 3.0)
+    found = smallest_shown(prior, sd, ln_odds)
+    assert found == pytest.approx(threshold + norm.ppf(0.8) * sd, abs=0.01)
+    assert smallest_shown(prior, 1e-3, ln_odds) == pytest.approx(0.5 * RELEVANT, abs=0.02)
+    assert smallest_shown(prior[prior < RELEVANT], sd, ln_odds) == np.inf

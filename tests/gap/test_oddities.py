@@ -21,6 +21,7 @@ PULL, RUT = OUTPUTS["drawbar_pull"], OUTPUTS["rut_depth"]
 NAMES = {
     "ruts in cm": (RUT, 0.1, "mm and cm"),
     "psi as kPa": ("inflation_pressure_psi", 1.0 / 6.895, "psi and kPa"),
+    "ratios as percent": ("slip_ratio", 0.01, "a fraction and percent"),
 }
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib.errors import CalibError
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.outliers import rank_without_outliers
@@ -50,3 +51,26 @@ def test_many_rows_that_lie_off_are_no_outliers():
     data, ranking = rank_without_outliers(case, 1, FEW)
     assert data.outputs[0].rows.size == 27
     assert ranking.probability["none"] < 0.5
+
+
+def test_codes_for_missing_are_no_readings():
+    case = make_case("force_offset", models=PULL_ONLY)
+    coded = case
+    for row in range(0, 27, 3):
+        columns = {name: np.array(v) for name, v in coded.field.columns.items()}
+        columns["drawbar_pull_kn"][row] = -9999.0 if row else 1e300
+        coded = replace(coded, field=replace(coded.field, columns=columns))
+    data, ranking = rank_without_outliers(coded, 1, FEW)
+    assert data.outputs[0].rows.tolist() == [row for row in range(27) if row % 3]
+    (said,) = data.case.warnings
+    assert said.count("-9999") == 8
+    assert "1e+300" in said
+    assert ranking.order[0] == "force_offset"
+
+
+@pytest.mark.parametrize("rows", [1, 3])
+def test_few_rows_are_counted_before_any_is_set_aside(rows):
+    case = make_case(None, models=PULL_ONLY)
+    few = replace(case, field=case.field.take(np.arange(rows)))
+    with pytest.raises(CalibError, match=f"{rows} field rows with drawbar_pull_kn"):
+        rank_without_outliers(few, 1, FEW)

@@ -20,7 +20,7 @@ def test_none_has_no_size_to_restrict():
     assert relevance(fit_of(None, "none"), 1, 200) == 0.0
 
 
-def test_size_is_in_noise_sds_over_all_rows_and_outputs():
+def test_size_is_in_noise_sds_of_the_output_where_it_is_largest():
     fit = fit_of("force_offset", "force_offset")
     psi = np.tile(fit.psi, (2, 1))
     part = fit.forward.phi_slices[0]
@@ -28,10 +28,10 @@ def test_size_is_in_noise_sds_over_all_rows_and_outputs():
     size = sizes(fit.forward, fit.noise, psi)
     assert size.shape == (2, 1)
     assert size[0, 0] == pytest.approx(0.0, abs=1e-12)
-    # Half of the values are ruts, which an offset of the pull does not touch.
+    # Ruts, which an offset of the pull does not touch, make it no smaller.
     at = noise_at(fit.forward.data.view)
     in_noise = 0.1 / fit.noise["drawbar_pull"].sd(at)
-    assert size[1, 0] == pytest.approx(np.sqrt(0.5 * np.mean(np.square(in_noise))))
+    assert size[1, 0] == pytest.approx(np.sqrt(np.mean(np.square(in_noise))))
 
 
 def test_each_of_a_pair_has_its_own_size():

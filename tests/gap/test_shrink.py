@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from calib.data import table_from_arrays
 from calib.gap.case import campaigns
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
 from calib.gap.mixture import Truth, mixture
 from calib.gap.shrink import predict_fresh, shrink
 from calib.gap.which import rank
-from gap.cases import PULL_ONLY, campaigns_of, diagnosis_of, make_case
+from gap.cases import PULL_ONLY, campaigns_of, diagnosis_of, make_case, write_case
 
 N = 27
 
@@ -94,7 +98,6 @@ def test_the_correction_of_a_large_drift_predicts_new_conditions():
     columns = dict(case.fresh.columns) | {
         c: np.linspace(1.0, 2.0, 9) for c in ("drawbar_pull_kn", "rut_depth_mm")
     }
-    from calib.data import table_from_arrays
 
     fresh = table_from_arrays(columns)
     # The drift of the generator at the place that the rows have in the campaign.
@@ -124,3 +127,36 @@ def test_too_few_rows_to_leave_out_are_judged_by_their_own_prediction():
     few = {"force_offset": EFFECTS["force_offset"]}
     found = diagnose(case, 1, effects=few).shrink["drawbar_pull"]
     assert found.fraction > 0.5
+
+
+def test_rows_where_the_simulator_has_no_value_are_left_out(data):
+    known = truth(0.2, 0.01)
+    before, holed = np.ones(N), np.ones(N)
+    holed[3] = np.nan
+    whole, found = (
+        shrink(data, known, {"drawbar_pull": b}, known.means)["drawbar_pull"]
+        for b in (before, holed)
+    )
+    # The rows of a draw are all off by the same, so that one row less changes nothing.
+    assert found.fraction == pytest.approx(whole.fraction)
+    assert found.rmse_before == pytest.approx(whole.rmse_before)
+    nowhere = {"drawbar_pull": np.full(N, np.nan)}
+    assert shrink(data, known, nowhere, known.means) == {}
+
+
+def test_extrapolated_conditions_are_said():
+    few = {"force_offset": EFFECTS["force_offset"]}
+    case = make_case("force_offset", n_fresh=9, size={"offset": 0.3})
+    columns = {name: np.array(v) for name, v in case.fresh.columns.items()}
+    columns["inflation_pressure_psi"][0] = 420.0
+    far = replace(case, fresh=table_from_arrays(columns))
+    said = " ".join(diagnose(far, 1, effects=few).data.case.warnings)
+    assert "1 of 9 rows lie outside what either campaign covered in inflation_pressure_psi" in said
+
+
+def test_a_folder_will_do_and_the_answer_is_short(tmp_path):
+    case = make_case("force_offset", models=PULL_ONLY, size={"offset": 0.3})
+    folder = write_case(case, tmp_path / "offset")
+    few = {"force_offset": EFFECTS["force_offset"]}
+    found = diagnose(folder, 1, effects=few)
+    assert re.fullmatch(r"Diagnosis\(offset: effect; force_offset [\d.]+, .+\)", repr(found))
