@@ -27,8 +27,8 @@ from calib.streams import generator
 
 __all__ = ["RELEVANT", "RELEVANT_IN_PAIR", "relevance", "sizes"]
 
-RELEVANT = 1.25
-RELEVANT_IN_PAIR = 0.8
+RELEVANT = 1.5
+RELEVANT_IN_PAIR = 1.0
 
 
 def relevance(fit: Fit, seed: int, draws: int) -> float:
