@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from calib.challenge.score import Average, Proportion
 
-_ENOUGH_TO_MEET, _ENOUGH_TO_MISS = 10, 30
+# Fewer cases than these tell nothing; or show no level met, or missed, if their interval is wider.
+_ENOUGH, _ENOUGH_TO_MEET, _ENOUGH_TO_MISS = 5, 10, 30
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,7 @@ class Level:
         """Say whether the level is met, missed, or of too few cases to tell.
 
         A miss of fewer than 30 cases is none while its interval reaches the level; nor is a level
-        met by fewer than 10 whose interval reaches beyond it.
+        met by fewer than 10 whose interval reaches beyond it. Fewer than 5 miss nothing.
         """
         lower, upper = self.limits(tier)
         low, high = figure.interval
@@ -52,7 +53,7 @@ class Level:
             sure = figure.n >= _ENOUGH_TO_MEET or (lower <= low and high <= upper)
             return "met" if sure else "too few to tell"
         few = figure.n < _ENOUGH_TO_MISS and low <= upper and high >= lower
-        return "too few to tell" if few or figure.n < _ENOUGH_TO_MEET // 2 else "MISSED"
+        return "too few to tell" if few or figure.n < _ENOUGH else "MISSED"
 
 
 def _at_least(name: str, label: str, easy: float, hard: float) -> Level:

@@ -19,9 +19,6 @@ _EXTRA = (
 )
 
 
-# A miss on fewer than these, whose interval reaches the level, is none yet.
-
-
 def _figure(tier: TierScore, name: str) -> Proportion | Average:
     figure: Proportion | Average = getattr(tier, name)
     return figure

@@ -59,7 +59,7 @@ def rank_without_outliers(
         far = _field_outliers(data, ranking)
         if not far:
             break
-        said = _said(case.field, far, OUTLIER)
+        said = _said(case.field, far, _outlying(OUTLIER))
         case = replace(without_outputs(case, far), warnings=(*case.warnings, *said))
         data = campaigns(case)
         ranking = rank(data, seed, effects=effects)
@@ -93,25 +93,26 @@ def without_outputs(case: Case, rows: Mapping[str, Sequence[int] | NDArray[np.in
 
 def _without_impossible(case: Case) -> Case:
     """Set readings aside that cannot be any, unless most of an output's are so."""
-    tables, said = {"lab": case.lab, "field": case.field}, list(case.warnings)
+    lab, lab_said = _possible(case.lab, case)
+    field, field_said = _possible(case.field, case)
+    return replace(case, lab=lab, field=field, warnings=(*case.warnings, *lab_said, *field_said))
+
+
+def _possible(table: Table, case: Case) -> tuple[Table, list[str]]:
+    """Blank one campaign's readings that cannot be any, and say which."""
+    far: dict[str, list[int]] = {}
     for output in case.models:
-        column = OUTPUTS[output]
-        low, middle, high = np.nanquantile(case.lab[column], (0.1, 0.5, 0.9))
+        values = table[OUTPUTS[output]]
+        low, middle, high = np.nanquantile(case.lab[OUTPUTS[output]], (0.1, 0.5, 0.9))
         reach = _IMPOSSIBLE * (high - low)
-        for name, table in tables.items():
-            off = np.abs(table[column] - middle) > reach
-            if reach > 0.0 and 0 < off.sum() < 0.5 * np.isfinite(table[column]).sum():
-                rows = np.flatnonzero(off)
-                at = ", ".join(
-                    f"line {table.lines[row]} ({column} = {table[column][row]:.4g})" for row in rows
-                )
-                said.append(
-                    f"{table.source}, {at}: more than {_IMPOSSIBLE:g} times the range of the "
-                    "calibration's readings off them; left out as no reading at all (leave the "
-                    "cell empty where nothing was measured)"
-                )
-                tables[name] = _blanked(table, {output: rows})
-    return replace(case, **tables, warnings=tuple(said))  # type: ignore[arg-type]
+        off = np.abs(values - middle) > reach
+        if reach > 0.0 and 0 < off.sum() < 0.5 * np.isfinite(values).sum():
+            far[output] = np.flatnonzero(off).tolist()
+    why = (
+        f"more than {_IMPOSSIBLE:g} times the range of the calibration's readings off them; left "
+        "out as no reading at all (leave the cell empty where nothing was measured)"
+    )
+    return _blanked(table, far), _said(table, far, why)
 
 
 def _blanked(table: Table, rows: Mapping[str, Sequence[int] | NDArray[np.int64]]) -> Table:
@@ -121,18 +122,19 @@ def _blanked(table: Table, rows: Mapping[str, Sequence[int] | NDArray[np.int64]]
     return replace(table, columns=columns)
 
 
-def _said(table: Table, far: Mapping[str, list[int]], bar: float) -> list[str]:
-    """Say of each value that is set aside where in its file it is."""
+def _outlying(bar: float) -> str:
+    return f"more than {bar:g} noise sds off whatever the hypothesis; left out as an outlier"
+
+
+def _said(table: Table, far: Mapping[str, list[int]], why: str) -> list[str]:
+    """Say of each value that is set aside where in its file it is, and why."""
     said = []
     for output, rows in far.items():
         at = ", ".join(
             f"line {table.lines[row]} ({OUTPUTS[output]} = {table[OUTPUTS[output]][row]:.4g})"
             for row in rows
         )
-        said.append(
-            f"{table.source}, {at}: more than {bar:g} noise sds off whatever the hypothesis; "
-            "left out as an outlier"
-        )
+        said.append(f"{table.source}, {at}: {why}")
     return said
 
 
@@ -163,7 +165,7 @@ def _without_lab_outliers(case: Case, seed: int) -> Case:
                 far[o.name] = [int(row) for row in measured[found]]
         if not far:
             return case
-        said = _said(case.lab, far, LAB_OUTLIER)
+        said = _said(case.lab, far, _outlying(LAB_OUTLIER))
         case = replace(case, lab=_blanked(case.lab, far), warnings=(*case.warnings, *said))
     return case
 

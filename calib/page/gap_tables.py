@@ -136,16 +136,20 @@ def parameter_rows(found: Diagnosis) -> list[list[str]]:
         hypothesis = best_fit(found, name).forward.hypothesis
         for effect, priors in zip(hypothesis.effects, hypothesis.effect_priors, strict=True):
             for prior in priors.free:
-                unit = "" if prior.unit in ("1", "", "dimensionless") else f" {prior.unit}"
                 words = prior.name.replace("_", " ")
                 text = (
                     prior.text.replace(" x ", " \N{MULTIPLICATION SIGN} ")
                     .replace("_kn)", ")")
                     .replace("_", " ")
                 )
-                row = [short_name(effect.name), words, prior.reason, text + unit]
+                row = [short_name(effect.name), words, prior.reason, text + _unit_of(prior)]
                 rows.setdefault((effect.name, prior.name), row)
     return list(rows.values())
+
+
+def _unit_of(prior: Prior) -> str:
+    """A parameter's unit, to be put after a number."""
+    return "" if prior.unit in ("1", "", "dimensionless") else f" {prior.unit}"
 
 
 def simulators(found: Diagnosis) -> list[dict[str, Any]]:
@@ -175,7 +179,7 @@ def parameter_text(prior: Prior, value: float, sd: float) -> str:
         A parameter that cannot be told from its bound at zero is an upper limit (95 %); one that
         the data did not narrow is called so.
     """
-    unit = "" if prior.unit in ("1", "", "dimensionless") else f" {prior.unit}"
+    unit = _unit_of(prior)
     half = prior.lower == 0.0 and prior.loc == 0.0
     spread = prior.scale * (math.sqrt(1.0 - 2.0 / math.pi) if half else 1.0)
     if not math.isfinite(prior.scale):  # uniform between its bounds
