@@ -8,7 +8,6 @@ from typing import Annotated
 
 import typer
 
-from calib.environment import imitate_processor
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -35,7 +34,6 @@ def check(
 
     Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
     """
-    _imitate(folder)
     from calib.cli.check_display import show
     from calib.cli.display import progress_bars
     from calib.reproduce.check import check as find
@@ -55,16 +53,6 @@ def check(
         show(outcome, every=every)
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)
-
-
-def _imitate(folder: Path) -> None:
-    """Before NumPy is imported: round as the machine did that made the folder, if this one can."""
-    for name in ("manifest.json", "run.json"):
-        try:
-            machine = json.loads((folder / name).read_text(encoding="utf-8"))["machine"]
-            imitate_processor(machine)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            continue
 
 
 def _write(text: str, path: Path) -> None:
