@@ -31,6 +31,7 @@ __all__ = [
 ]  # fmt: skip
 
 AUDIT_JSON, AUDIT_CSV = "audit.json", "audit.csv"
+_INDENTED = ("summary.json", "manifest.json", AUDIT_JSON)
 # Of the sd of a gap; and a gap that is nil, in kN, mm or g/cm^3.
 _OF_SD, _ROUNDING = 0.25, 1e-6
 _SOURCES = "summary.json and manifest.json"
@@ -116,7 +117,6 @@ def verify_form(folder: Path) -> list[Item]:
     Of two equal keys a machine reads the last, and a person may see the first.
     """
     found = []
-    forms: dict[str, int | None] = {"summary.json": 1, "manifest.json": 1, AUDIT_JSON: 1}
     for path in sorted(folder.rglob("*.json")):
         name = path.relative_to(folder).as_posix()
         try:
@@ -124,8 +124,8 @@ def verify_form(folder: Path) -> list[Item]:
             content = json.loads(text)
         except (OSError, ValueError, RecursionError):
             continue  # which is said where its entries are compared
-        indents = [forms[name]] if name in forms else [None, 1]
-        if text not in {f"{json.dumps(content, indent=indent)}\n" for indent in indents}:
+        forms = (1, None) if name in _INDENTED else (None, 1)
+        if not any(text == f"{json.dumps(content, indent=n)}\n" for n in forms):
             note = "not in the form it is written in: repeated keys, or edited by hand"
             found.append(Item(TEXT, name, Status.DIFFERENT, note=note))
     return found
