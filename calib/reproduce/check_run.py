@@ -66,7 +66,9 @@ def check_run(
         if quick:
             again = {"estimates": describe_estimates(estimate_again(record, problem))}
             recorded = {"estimates": record.document["estimates"]}
-            items += compare_entries(_entries(recorded, folder), _entries(again, folder), _group)
+            old, new = _entries(recorded, folder), _entries(again, folder)
+            points = compare_entries(old, new, _group)
+            items += [item for item in points if item.group == "estimates"]
         else:
             calibration = recompute_run(record, problem, scratch / "again", progress)
             allowed = describe(count_drawn(calibration))
