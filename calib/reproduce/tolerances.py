@@ -35,14 +35,8 @@ from typing import Any
 from calib.reproduce.montecarlo import MONTE_CARLO, Place
 
 __all__ = [
-    "ARITHMETIC",
-    "ORDER_OF_MAGNITUDE",
-    "TABLE",
-    "Of",
-    "Tolerance",
-    "natural_scale",
-    "tolerance_of",
-]
+    "ARITHMETIC", "ORDER_OF_MAGNITUDE", "TABLE", "Of", "Tolerance", "natural_scale", "tolerance_of",
+]  # fmt: skip
 
 ORDER_OF_MAGNITUDE = "order of magnitude"
 
