@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from calib.cli.parallel import CORES, Workers
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -29,6 +30,7 @@ def check(
     json_to: Annotated[
         Path | None, typer.Option("--json", help="File for machines to read; - prints it.")
     ] = None,
+    workers: Workers = CORES,
 ) -> None:
     """Compute a report or a run again from its own folder and compare everything.
 
@@ -37,10 +39,11 @@ def check(
     from calib.cli.check_display import show
     from calib.cli.display import progress_bars
     from calib.reproduce.check import check as find
+    from calib.tasks.pool import pool
 
     try:
-        with progress_bars() as tell:
-            outcome = find(folder, quick=quick, progress=tell)
+        with pool(1 if quick else workers) as side, progress_bars() as tell:
+            outcome = find(folder, quick=quick, progress=tell, pool=side)
     except CalibError as error:
         if json_to is not None:
             document = {"folder": str(folder), "verdict": "cannot be checked", "reason": str(error),

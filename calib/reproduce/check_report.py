@@ -31,6 +31,7 @@ from calib.reproduce.schema import Manifest
 from calib.reproduce.text import verify_images
 from calib.study import Progress
 from calib.study_tasks import Task, fitted_rows
+from calib.tasks.pool import HERE, Pool
 
 __all__ = ["check_report"]
 
@@ -45,6 +46,7 @@ def check_report(
     progress: Progress,
     *,
     quick: bool,
+    pool: Pool = HERE,
 ) -> tuple[list[Item], str]:
     """Return what was found, and what Monte Carlo error was allowed, in words.
 
@@ -57,6 +59,8 @@ def check_report(
     progress : callable
     quick : bool
         Skip the sampling.
+    pool : Pool, optional
+        Where the report is made again.
     """
     items = verify_files(folder, manifest.files, RECORD, manifest.left_out)
     for key, said in manifest.tasks.items():
@@ -75,7 +79,7 @@ def check_report(
             items += _left_out(manifest)
             items += compare_estimates(tasks, manifest.seed, summary, progress)
         else:
-            study = recompute_report(manifest, tasks, scratch / "again", progress)
+            study = recompute_report(manifest, tasks, scratch / "again", progress, pool)
             allowed = describe(count_numbers(study))
             again = Again(manifest, folder, scratch / "again", study, here)
             numbers = compare_numbers(again)

@@ -103,7 +103,7 @@ def computed_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
     """Do the work of equal inputs once: most tampering leaves them as they are."""
     cache, folder = _made
 
-    def again(manifest, tasks, out, progress):
+    def again(manifest, tasks, out, progress, pool):
         key = (
             manifest.model_dump_json(exclude={"files", "left_out"}),
             *(t.table[c].tobytes() for t in tasks for c in t.table),
