@@ -32,13 +32,13 @@ def png_bytes(figure: Figure) -> bytes:
     """
     from PIL import Image
 
-    full, small = io.BytesIO(), io.BytesIO()
+    drawn, small = io.BytesIO(), io.BytesIO()
     with style():
-        figure.savefig(full, format="png", dpi=_DPI)
-    full.seek(0)
-    with Image.open(full) as image:
-        # With its resolution, by which a text processor takes it over at its size in print.
-        image.convert("RGB").quantize(256).save(small, format="png", dpi=(_DPI, _DPI))
+        figure.savefig(drawn, format="rgba", dpi=_DPI)
+    size = tuple(int(inches * _DPI) for inches in figure.get_size_inches())
+    image = Image.frombuffer("RGBA", size, drawn.getvalue())
+    # With its resolution, by which a text processor takes it over at its size in print.
+    image.convert("RGB").quantize(256).save(small, format="png", dpi=(_DPI, _DPI))
     return small.getvalue()
 
 
