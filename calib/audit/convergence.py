@@ -24,8 +24,10 @@ from calib.estimators import (
     GeneticSettings,
     PointEstimate,
     estimate,
-    minimise_genetic,
 )
+from calib.estimators.genetic import minimise_genetic_runs
+from calib.estimators.identified import hold_unidentified
+from calib.estimators.search import search_space
 from calib.models.base import Array
 from calib.problem import Problem, build_problem
 from calib.streams import generator
@@ -215,10 +217,10 @@ def _repeat(
     settings: GeneticSettings,
 ) -> Search:  # fmt: skip
     optimum = estimate(problem, "least_squares", generator(seed, *labels, "optimum")).cost
-    costs = [
-        estimate(problem, "genetic", generator(seed, *labels, i), settings=settings).cost
-        for i in range(n)
-    ]
+    space = search_space(hold_unidentified(problem)[0])
+    streams = [generator(seed, *labels, i) for i in range(n)]
+    runs = minimise_genetic_runs(space.cost, space.lower, space.upper, streams, settings)
+    costs = [run.cost for run in runs]
     return Search(name, min(optimum, *costs), np.array(costs), text)
 
 
@@ -248,7 +250,7 @@ def _in_printed_coordinates(
         return np.asarray(np.einsum("kmn,kmn->k", apart, apart))
 
     streams = [generator(seed, "audit", "genetic", "printed", i) for i in runs]
-    return np.array([minimise_genetic(cost, *box, rng, settings).cost for rng in streams])
+    return np.array([run.cost for run in minimise_genetic_runs(cost, *box, streams, settings)])
 
 
 def convergence_findings(published: Published, study: GeneticStudy) -> list[Finding]:

@@ -35,8 +35,8 @@ def png_bytes(figure: Figure) -> bytes:
     drawn, small = io.BytesIO(), io.BytesIO()
     with style():
         figure.savefig(drawn, format="rgba", dpi=_DPI)
-    size = tuple(int(inches * _DPI) for inches in figure.get_size_inches())
-    image = Image.frombuffer("RGBA", size, drawn.getvalue())
+    width, height = (int(inches * _DPI) for inches in figure.get_size_inches())
+    image = Image.frombuffer("RGBA", (width, height), drawn.getvalue())
     # With its resolution, by which a text processor takes it over at its size in print.
     image.convert("RGB").quantize(256).save(small, format="png", dpi=(_DPI, _DPI))
     return small.getvalue()
