@@ -6,6 +6,7 @@ import difflib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,6 @@ from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.priors import Priors
 from calib.problem import Problem, build_problem
-from calib.store import load_calibration
 
 __all__ = [
     "Campaigns", "Case", "OutputData", "campaigns", "case_files", "case_from_run", "read_case",
@@ -206,7 +206,8 @@ def case_from_run(run: Path, field: Path) -> Case:
     CalibError
         If either cannot be read.
     """
-    problem = load_calibration(run).problem
+    # Needs what writes and reads run folders, and that a sampler: no other case does.
+    problem = import_module("calib.store").load_calibration(run).problem
     model = problem.bound.model
     output = next(key for key, column in OUTPUTS.items() if column == model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))
