@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from calib.gap.case import Campaigns
+from calib.gap.discrepancy import Bases
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit, finish, look
 from calib.gap.forward import Forward
@@ -139,7 +140,7 @@ def _unlisted_and_pairs(
     found = {"unknown": tuple(finished(looks) for looks in unlisted)}
     for (h, members), looks in zip(pairs, paired, strict=True):
         searched = promise(looks) > leading - _SEARCHED
-        more = worker.look_pair(h, members, _N_BEGUN)[1:] if searched else []
+        more = worker.look_pair(h, members, _N_BEGUN, skip=1) if searched else []
         found[h.name] = (finished([*looks, *more]),)
     return found
 
@@ -230,6 +231,7 @@ class _Worker:
         self, data: Campaigns, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise], seed: int
     ) -> None:
         self.data, self.lab_mode, self.noise, self.seed = data, lab_mode, noise, seed
+        self._bases: Bases = {}
 
     def fit(self, hypothesis: Hypothesis) -> Fit:
         """Fit from the lab's calibration."""
@@ -245,7 +247,9 @@ class _Worker:
         starts = self._spread(forward, start, _N_SCREEN, range(len(hypothesis.effects)))
         return look(self.data, forward, start, self.noise, starts=starts, count=_N_BEGUN)
 
-    def look_pair(self, hypothesis: Hypothesis, members: Sequence[Fit], count: int) -> list[Fit]:
+    def look_pair(
+        self, hypothesis: Hypothesis, members: Sequence[Fit], count: int, skip: int = 0
+    ) -> list[Fit]:
         """Begin two effects where each alone has led."""
         forward, start = self._forward(hypothesis)
         parts = []
@@ -256,11 +260,13 @@ class _Worker:
             led[forward.phi_slices[i]] = member.psi[member.forward.phi_slices[0]]
             parts.append(self._spread(forward, led, _N_SCREEN // 2, [1 - i]))
         starts = np.concatenate(parts)
-        return look(self.data, forward, start, self.noise, starts=starts, count=count)
+        return look(
+            self.data, forward, start, self.noise, starts=starts, count=count, skip=skip
+        )
 
     def _forward(self, hypothesis: Hypothesis) -> tuple[Forward, Array]:
         scale = {o: n.sigma for o, n in self.noise.items()}
-        forward = Forward(self.data, hypothesis, scale, self.lab_mode)
+        forward = Forward(self.data, hypothesis, scale, self.lab_mode, bases=self._bases)
         start = np.array([p.loc for p in forward.priors.free])
         for o in self.data.outputs:
             start[forward.theta_slices[o.name]] = self.lab_mode[o.name]

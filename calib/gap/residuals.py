@@ -1,0 +1,125 @@
+"""Residuals of both campaigns as functions of a hypothesis's parameters psi, many psi at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.gap.case import Campaigns
+from calib.gap.forward import Forward
+from calib.gap.noise import Noise, most_probable
+from calib.models.base import Array
+from calib.sampling.mode import prior_widths
+
+__all__ = ["Residuals"]
+
+# Guesses closer than this (in prior sds) climb to the same mode.
+_APART = 0.7
+# Step of differences, in prior sds.
+_DIFFERENCE = 1e-4
+
+
+class Residuals:
+    """Observed minus predicted of lab then field rows, one output after the other.
+
+    Parameters
+    ----------
+    data : Campaigns
+    forward : Forward
+    """
+
+    def __init__(self, data: Campaigns, forward: Forward) -> None:
+        self.data, self.forward = data, forward
+        loc, _, self.lower, self.upper, self.precision = forward.priors._arrays
+        self.loc = np.where(self.precision > 0, loc, 0.0)
+        self.width = prior_widths(forward.priors)
+        sizes = [at.slip.size for at in data.at_rows.values()]
+        ends = np.cumsum(sizes).tolist()
+        self.parts = {
+            o.name: slice(end - size, end)
+            for o, end, size in zip(data.outputs, ends, sizes, strict=True)
+        }
+
+    def clip(self, psi: Array) -> Array:
+        """Move psi inside its bounds."""
+        margin = 1e-7 * self.width
+        return np.clip(psi, self.lower + margin, self.upper - margin)
+
+    def blocked(self, psi: Array, direction: Array) -> NDArray[np.bool_]:
+        """Which coordinates are at a bound that the direction leads beyond, shape (k, d)."""
+        tiny = 2e-7 * self.width
+        return ((psi <= self.lower + tiny) & (direction < 0)) | (
+            (psi >= self.upper - tiny) & (direction > 0)
+        )
+
+    def raw(self, psi: Array) -> Array:
+        """Evaluate, shape (k, d) to (k, N)."""
+        lab, field = self.forward.campaigns(psi)
+        predicted = [
+            part for o in self.data.outputs for part in (lab[o.name], field[o.name][:, o.rows])
+        ]
+        return self.data.observed - np.concatenate(predicted, axis=1)
+
+    def sds(self, noise: Mapping[str, Noise]) -> Array:
+        """Noise sd of every row, shape (N,)."""
+        return np.concatenate([noise[o].sd(at) for o, at in self.data.at_rows.items()])
+
+    def costs(self, psi: Array, raw: Array, sds: Array) -> Array:
+        """Minus log posterior but for constants.
+
+        Parameters
+        ----------
+        psi : ndarray, shape (..., d)
+        raw, sds : ndarray, shape (..., N)
+
+        Returns
+        -------
+        ndarray, shape (...)
+        """
+        with np.errstate(over="ignore"):  # a cost beyond all numbers is one as well
+            squares = np.square(raw / sds).sum(axis=-1)
+            squares += np.square((psi - self.loc) * self.precision).sum(axis=-1)
+            return np.asarray(0.5 * squares + np.log(sds).sum(axis=-1))
+
+    def best(self, candidates: Array, noise: Mapping[str, Noise], count: int) -> Array:
+        """Return the best candidates that lie apart from each other, shape (<= count, d)."""
+        costs = self.costs(candidates, self.raw(candidates), self.sds(noise))
+        picked: list[Array] = []
+        for i in np.argsort(np.where(np.isfinite(costs), costs, np.inf), kind="stable"):
+            apart = [np.abs((candidates[i] - p) / self.width).max() > _APART for p in picked]
+            if all(apart):
+                picked.append(candidates[i])
+            if len(picked) == count:
+                break
+        return np.stack(picked)
+
+    def jacobian(self, psi: Array, raw: Array) -> Array:
+        """Derivatives of the residuals `raw` at psi, shapes (m, d) and (m, N) to (m, d, N)."""
+        m, d = psi.shape
+        step = _DIFFERENCE * self.width
+        step = np.where(psi + step > self.upper, -step, step)
+        points = psi[:, None] + step[:, None] * np.eye(d)
+        moved = self.raw(points.reshape(m * d, d)).reshape(m, d, -1)
+        change = moved - raw[:, None]
+        # Beside ground where the model has no value nothing is known.
+        change = np.where(np.isfinite(change), change, 0.0)
+        return np.asarray(change / step[:, :, None])
+
+    def update_noise(self, raw: Array, scaled: Array, hessian: Array) -> dict[str, Noise]:
+        """Noise scales that maximise the marginal likelihood, parameters allowed for.
+
+        Parameters
+        ----------
+        raw : ndarray, shape (N,)
+        scaled : ndarray, shape (d, N)
+            Derivatives of the residuals over their sds.
+        hessian : ndarray, shape (d, d)
+        """
+        factor = np.linalg.solve(hessian + np.diag(1e-6 / self.width**2), scaled)
+        leverage = (scaled * factor).sum(axis=0)
+        # Each residual lost the part of its variance that the parameters took up.
+        corrected = np.square(raw) / np.clip(1.0 - leverage, 0.1, 1.0)
+        at = self.data.at_rows
+        return {o: most_probable(corrected[part], at[o]) for o, part in self.parts.items()}
