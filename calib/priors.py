@@ -21,7 +21,7 @@ from calib.models.base import Array
 
 __all__ = ["Prior", "Priors"]
 
-type Index = NDArray[np.int64]
+type Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -148,19 +148,21 @@ class Priors:
         """Return all parameters, fixed ones included, shape (k, d) to (k, d_all)."""
         t = np.atleast_2d(t)
         fixed, free, logs = self._layout
-        full = np.empty((t.shape[0], fixed.size))
-        full[:] = fixed
-        full[:, free] = t
-        if logs.size:
-            full[:, logs] = np.exp(np.minimum(full[:, logs], 700.0))
+        if free.all():
+            full = t.copy()
+        else:
+            full = np.tile(fixed, (t.shape[0], 1))
+            full[:, free] = t
+        if logs.any():
+            np.exp(np.minimum(full, 700.0), out=full, where=logs)
         return full
 
     @cached_property
-    def _layout(self) -> tuple[Array, Index, Index]:
-        """Values of the fixed parameters (d_all,), where the free are, and those on a log scale."""
+    def _layout(self) -> tuple[Array, Mask, Mask]:
+        """Values of the fixed parameters, which are free, and which on a log scale, (d_all,)."""
         fixed = np.array([p.loc for p in self.entries])
-        free = np.flatnonzero([not p.fixed for p in self.entries])
-        logs = np.flatnonzero([p.log and not p.fixed for p in self.entries])
+        free = np.array([not p.fixed for p in self.entries])
+        logs = np.array([p.log and not p.fixed for p in self.entries])
         return fixed, free, logs
 
     def to_internal(self, natural: Array, margin: float = 1e-9) -> Array:

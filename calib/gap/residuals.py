@@ -57,10 +57,12 @@ class Residuals:
     def raw(self, psi: Array) -> Array:
         """Evaluate, shape (k, d) to (k, N)."""
         lab, field = self.forward.campaigns(psi)
-        predicted = [
-            part for o in self.data.outputs for part in (lab[o.name], field[o.name][:, o.rows])
-        ]
-        return self.data.observed - np.concatenate(predicted, axis=1)
+        predicted: list[Array] = []
+        for o in self.data.outputs:
+            there = field[o.name]
+            predicted += lab[o.name], there if o.rows.size == there.shape[1] else there[:, o.rows]
+        raw: Array = np.concatenate(predicted, axis=1)
+        return np.subtract(self.data.observed, raw, out=raw)
 
     def sds(self, noise: Mapping[str, Noise]) -> Array:
         """Noise sd of every row, shape (N,)."""

@@ -32,7 +32,10 @@ from calib.models.base import Array
 from calib.sampling.mode import find_mode
 from calib.streams import generator
 
-__all__ = ["Ranking", "calibrate_lab", "rank"]
+__all__ = ["Lab", "Ranking", "calibrate_lab", "rank"]
+
+# Internal parameters of each simulator, and its noise.
+type Lab = tuple[dict[str, Array], dict[str, Noise]]
 
 _N_SCREEN = 96
 _N_BEGUN = 5
@@ -97,10 +100,12 @@ class Ranking:
         return self.fits[name][int(np.argmax(self.scores[name]))]
 
 
-def rank(data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS) -> Ranking:
-    """Fit every hypothesis and rank them."""
+def rank(
+    data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS, lab: Lab | None = None
+) -> Ranking:
+    """Fit every hypothesis and rank them; `lab` if `calibrate_lab` has been called before."""
     able, unable = split_testable(data, effects)
-    lab_mode, noise = calibrate_lab(data, seed)
+    lab_mode, noise = lab or calibrate_lab(data, seed)
     single = singles(data, able)
     design = isolability(data, single, lab_mode, noise, seed)
     single = [h for h in single if h.name not in design.idle]
@@ -214,7 +219,7 @@ def _promising_pairs(
     return [h for h in pairs_of(single) if best & {e.name for e in h.effects}]
 
 
-def calibrate_lab(data: Campaigns, seed: int) -> tuple[dict[str, Array], dict[str, Noise]]:
+def calibrate_lab(data: Campaigns, seed: int) -> Lab:
     """Mode of each output's simulator on the lab, and its noise."""
     modes, noise = {}, {}
     for o in data.outputs:
