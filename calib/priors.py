@@ -148,22 +148,22 @@ class Priors:
         """Return all parameters, fixed ones included, shape (k, d) to (k, d_all)."""
         t = np.atleast_2d(t)
         fixed, free, logs = self._layout
-        if free.all():
+        if free is None:
             full = t.copy()
         else:
             full = np.tile(fixed, (t.shape[0], 1))
             full[:, free] = t
-        if logs.any():
+        if logs is not None:
             np.exp(np.minimum(full, 700.0), out=full, where=logs)
         return full
 
     @cached_property
-    def _layout(self) -> tuple[Array, Mask, Mask]:
-        """Values of the fixed parameters, which are free, and which on a log scale, (d_all,)."""
+    def _layout(self) -> tuple[Array, Mask | None, Mask | None]:
+        """Values of the fixed parameters, which are free (None: all), which on a log scale."""
         fixed = np.array([p.loc for p in self.entries])
         free = np.array([not p.fixed for p in self.entries])
         logs = np.array([p.log and not p.fixed for p in self.entries])
-        return fixed, free, logs
+        return fixed, None if free.all() else free, logs if logs.any() else None
 
     def to_internal(self, natural: Array, margin: float = 1e-9) -> Array:
         """Map all natural parameters, shape (k, d_all), inside the bounds, shape (k, d)."""

@@ -6,7 +6,7 @@ their steps together.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -29,14 +29,14 @@ class Ascent:
     Parameters
     ----------
     psi : ndarray, shape (d,)
-    noise : dict of str to Noise
     raw : ndarray, shape (N,)
         Residuals at psi.
+    noise : dict of str to Noise
     """
 
     psi: Array
+    raw: Array
     noise: dict[str, Noise]
-    raw: Array = field(default_factory=lambda: np.empty(0))
     damping: float = 1e-3
     quiet: int = 0
 
@@ -70,12 +70,10 @@ def climb(problem: Residuals, ascents: list[Ascent], steps: int) -> None:
     ----------
     problem : Residuals
     ascents : list of Ascent
-        Moved where they are; raw residuals need not be there yet.
+        Moved in place.
     steps : int
         At most.
     """
-    for ascent, raw in zip(ascents, problem.raw(np.stack([a.psi for a in ascents])), strict=True):
-        ascent.raw = raw
     going = ascents
     for _ in range(steps):
         slope = slopes(problem, going)

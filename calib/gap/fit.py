@@ -106,10 +106,12 @@ def look(
     candidates = problem.clip(start)[None]
     if starts is not None:
         candidates = np.concatenate([candidates, problem.clip(starts)])
-    begun = problem.best(candidates, noise, count)[skip:]
+    raw = problem.raw(candidates)
+    costs = problem.costs(candidates, raw, problem.sds(noise))
+    begun = problem.best(costs, candidates, count)[skip:]
     linear = bool(forward.smooth_slices) and not forward.hypothesis.effects
     steps = _LINEAR_STEPS if linear and forward.shift is None else _FIRST_STEPS
-    return _climbed(problem, [Ascent(psi, dict(noise)) for psi in begun], steps)
+    return _climbed(problem, [Ascent(candidates[i], raw[i], dict(noise)) for i in begun], steps)
 
 
 def fit(
@@ -141,7 +143,9 @@ def climb_on(looks: Sequence[Fit]) -> list[Fit]:
     """Climb from where fits of one hypothesis have stopped to the modes beside them."""
     forward = looks[0].forward
     problem = Residuals(forward.data, forward)
-    return _climbed(problem, [Ascent(f.psi, dict(f.noise)) for f in looks], _MAX_STEPS)
+    raw = problem.raw(np.stack([f.psi for f in looks]))
+    ascents = [Ascent(f.psi, r, dict(f.noise)) for f, r in zip(looks, raw, strict=True)]
+    return _climbed(problem, ascents, _MAX_STEPS)
 
 
 def _climbed(problem: Residuals, ascents: list[Ascent], steps: int) -> list[Fit]:
@@ -184,9 +188,7 @@ def _laplace(
     )  # fmt: skip
 
 
-def _bounds_correction(
-    problem: Residuals, psi: Array, gradient: Array, covariance: Array
-) -> float:
+def _bounds_correction(problem: Residuals, psi: Array, gradient: Array, covariance: Array) -> float:
     """Mass of the normal that lies inside the bounds, one coordinate at a time."""
     sd = np.sqrt(np.diag(covariance))
     total = 0.0

@@ -32,8 +32,8 @@ __all__ = ["Forward"]
 # effects in 690 single-effect cases of `calib challenge make` (seeds 271828, 577215, 314159,
 # 173205, 602214), pull and rut: 0.13 and 0.12 over slip, 0.08 and 0.06 its bend, 0.12 and 0.06
 # over pressure, 0.28 and 0.16 where a gauge's error takes a simulator to pressures it was not
-# fitted at (less since it goes on straight there, see `Simulated.predict_beyond`), 0.18 and 0.17 over what
-# the effect is named for; density: 0.16 over cone index, 0.06 over water content.
+# fitted at (less since it goes on straight there, see `Simulated.predict_beyond`), 0.18 and 0.17
+# over what the effect is named for; density: 0.16 over cone index, 0.06 over water content.
 FORM_ERROR = {
     "size": 0.2, "slip": 0.15, "bend": 0.1, "pressure": 0.13, "cone": 0.15, "water": 0.1,
     "shape": 0.18, "extrapolation": 0.2,
@@ -216,9 +216,7 @@ class Forward:
         return {**conditions, "slip_ratio": slip}
 
     def _with_effects(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
-        base = {
-            o.name: o.problem.bound.from_response(plain[o.name]) for o in self.data.outputs
-        }
+        base = {o.name: o.problem.bound.from_response(plain[o.name]) for o in self.data.outputs}
         view = replace(view, base=base)
         acting = [
             (effect, p.to_natural(psi[:, s]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,17 +85,16 @@ class Residuals:
             squares += np.square((psi - self.loc) * self.precision).sum(axis=-1)
             return np.asarray(0.5 * squares + np.log(sds).sum(axis=-1))
 
-    def best(self, candidates: Array, noise: Mapping[str, Noise], count: int) -> Array:
-        """Return the best candidates that lie apart from each other, shape (<= count, d)."""
-        costs = self.costs(candidates, self.raw(candidates), self.sds(noise))
-        picked: list[Array] = []
-        for i in np.argsort(np.where(np.isfinite(costs), costs, np.inf), kind="stable"):
-            apart = [np.abs((candidates[i] - p) / self.width).max() > _APART for p in picked]
-            if all(apart):
-                picked.append(candidates[i])
+    def best(self, costs: Array, candidates: Array, count: int) -> list[int]:
+        """Return which candidates are best and lie apart from each other, at most `count`."""
+        picked: list[int] = []
+        for i in np.argsort(np.where(np.isfinite(costs), costs, np.inf), kind="stable").tolist():
+            apart = np.abs((candidates[picked] - candidates[i]) / self.width).max(axis=1) > _APART
+            if apart.all():
+                picked.append(i)
             if len(picked) == count:
                 break
-        return np.stack(picked)
+        return picked
 
     def jacobian(self, psi: Array, raw: Array) -> Array:
         """Derivatives of the residuals `raw` at psi, shapes (m, d) and (m, N) to (m, d, N)."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from calib.gap.effects import View
-from calib.models.base import Array, Rows
+from calib.models.base import Array
 
 if TYPE_CHECKING:
     from calib.gap.case import OutputData
@@ -54,7 +54,7 @@ class Simulated:
         self.field = self._bound.model.select(view.conditions)
         self.both = {k: np.concatenate([self.lab[k], v]) for k, v in self.field.items()}
         self._known = [
-            (c, self._bound.prepare(c), self._bends(c)) for c in (self.lab, self.field, self.both)
+            (c, (self._bound.prepare(c), self._bends(c))) for c in (self.lab, self.field, self.both)
         ]
 
     def conditions(self, view: View) -> dict[str, Array]:
@@ -74,12 +74,8 @@ class Simulated:
             In the unit of the response.
         conditions : mapping of str to ndarray, shape (n,) or (k, n)
         """
-        rows: Rows | None
-        for known, rows, bends in self._known:
-            if known is conditions:
-                break
-        else:
-            rows, bends = None, self._bends(conditions)
+        prepared = (found for known, found in self._known if known is conditions)
+        rows, bends = next(prepared, None) or (None, self._bends(conditions))
         location = self._bound.location(self._priors.to_natural(t), conditions, rows)
         for column, bend in enumerate(bends):
             location = location + misfit[:, column : column + 1] * bend
@@ -95,7 +91,7 @@ class Simulated:
         """
         pressure = conditions.get(PRESSURE)
         low, high = self._pressures
-        if pressure is None or low == high:
+        if pressure is None or low == high or pressure is self._view.conditions.get(PRESSURE):
             return self.predict(t, misfit, conditions)
         inside = np.clip(pressure, low, high)
         beyond = (pressure - inside) / (high - low)

@@ -265,9 +265,7 @@ class _Worker:
             led[forward.phi_slices[i]] = member.psi[member.forward.phi_slices[0]]
             parts.append(self._spread(forward, led, _N_SCREEN // 2, [1 - i]))
         starts = np.concatenate(parts)
-        return look(
-            self.data, forward, start, self.noise, starts=starts, count=count, skip=skip
-        )
+        return look(self.data, forward, start, self.noise, starts=starts, count=count, skip=skip)
 
     def _forward(self, hypothesis: Hypothesis) -> tuple[Forward, Array]:
         scale = {o: n.sigma for o, n in self.noise.items()}
