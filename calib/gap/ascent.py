@@ -1,25 +1,54 @@
 """Climb to modes of a hypothesis's posterior: Gauss-Newton from several guesses in step.
 
 The simulator costs as much for one vector of parameters as for a hundred, so that all guesses take
-their steps together.
+their steps together, and so do hypotheses: a climb is a generator that asks for residuals.
 """
 
 from __future__ import annotations
 
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from calib.gap.noise import Noise
-from calib.gap.residuals import Residuals
+from calib.gap.residuals import Residuals, residuals_of_all
 from calib.models.base import Array
 
-__all__ = ["Ascent", "Slope", "climb", "slopes"]
+__all__ = ["Ascent", "Slope", "Walk", "climb", "slopes", "together"]
+
+# Asks for a problem's residuals at some psi (k, d), is sent them (k, N), until it has a result.
+type Walk[T] = Generator[tuple[Residuals, Array], Array, T]
 
 # Dampings that are tried at each step, relative to the last that was good.
 _DAMPINGS = 10.0 ** np.arange(-1.0, 5.0)
 # A step that gains less, in nats, and changes the noise less, is quiet; two of them are the end.
 _QUIET_GAIN, _QUIET_NOISE = 1e-3, 1e-2
+
+
+def together[T](walks: Sequence[Walk[T]]) -> list[T]:
+    """Run walks on the same campaigns in step and return their results."""
+    results: dict[int, T] = {}
+    asked: dict[int, tuple[Residuals, Array]] = {}
+    for i, walk in enumerate(walks):
+        _go_on(i, walk, None, asked, results)
+    while asked:
+        answers = residuals_of_all(list(asked.values()))
+        asked, before = {}, list(asked)
+        for i, raw in zip(before, answers, strict=True):
+            _go_on(i, walks[i], raw, asked, results)
+    return [results[i] for i in range(len(walks))]
+
+
+def _go_on[T](
+    i: int, walk: Walk[T], raw: Array | None, asked: dict[int, tuple[Residuals, Array]],
+    results: dict[int, T],
+) -> None:  # fmt: skip
+    """Send one walk what it asked for; keep its next question or its result."""
+    try:
+        asked[i] = next(walk) if raw is None else walk.send(raw)
+    except StopIteration as end:
+        results[i] = end.value
 
 
 @dataclass
@@ -63,7 +92,7 @@ class Slope:
     hessian: Array
 
 
-def climb(problem: Residuals, ascents: list[Ascent], steps: int) -> None:
+def climb(problem: Residuals, ascents: list[Ascent], steps: int) -> Walk[None]:
     """Climb from each guess to the mode beside it.
 
     Parameters
@@ -76,8 +105,8 @@ def climb(problem: Residuals, ascents: list[Ascent], steps: int) -> None:
     """
     going = ascents
     for _ in range(steps):
-        slope = slopes(problem, going)
-        gains = _step(problem, going, slope)
+        slope = yield from slopes(problem, going)
+        gains = yield from _step(problem, going, slope)
         for i, (ascent, gained) in enumerate(zip(going, gains, strict=True)):
             noise = problem.update_noise(ascent.raw, slope.scaled[i], slope.hessian[i])
             quiet = gained < _QUIET_GAIN and _change(ascent.noise, noise) < _QUIET_NOISE
@@ -87,11 +116,12 @@ def climb(problem: Residuals, ascents: list[Ascent], steps: int) -> None:
             break
 
 
-def slopes(problem: Residuals, ascents: list[Ascent]) -> Slope:
+def slopes(problem: Residuals, ascents: list[Ascent]) -> Walk[Slope]:
     """Work out the derivatives of ascents where they stand."""
     psi, raw = np.stack([a.psi for a in ascents]), np.stack([a.raw for a in ascents])
     sds = np.stack([problem.sds(a.noise) for a in ascents])
-    scaled = problem.jacobian(psi, raw) / sds[:, None]
+    moved = yield problem, problem.around(psi)
+    scaled = problem.jacobian(psi, raw, moved) / sds[:, None]
     with np.errstate(invalid="ignore", over="ignore"):
         gradient = (scaled @ (raw / sds)[:, :, None])[..., 0]
         gradient += (psi - problem.loc) * problem.precision**2
@@ -100,7 +130,7 @@ def slopes(problem: Residuals, ascents: list[Ascent]) -> Slope:
     return Slope(sds, scaled, gradient, hessian)
 
 
-def _step(problem: Residuals, ascents: list[Ascent], slope: Slope) -> list[float]:
+def _step(problem: Residuals, ascents: list[Ascent], slope: Slope) -> Walk[list[float]]:
     """One Levenberg-Marquardt step of each: several dampings tried in one batched call.
 
     Returns what each gained; without a step the next dampings are larger.
@@ -109,7 +139,7 @@ def _step(problem: Residuals, ascents: list[Ascent], slope: Slope) -> list[float
     dampings = np.array([a.damping for a in ascents])[:, None] * _DAMPINGS
     tried = problem.clip(psi[:, None] + _directions(problem, psi, slope, dampings))
     m, t, d = tried.shape
-    there = problem.raw(tried.reshape(m * t, d)).reshape(m, t, -1)
+    there = (yield problem, tried.reshape(m * t, d)).reshape(m, t, -1)
     cost = problem.costs(psi, raw, slope.sds)
     costs = problem.costs(tried, there, slope.sds[:, None])
     costs = np.where(np.isfinite(costs), costs, np.inf)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
-from calib.gap.ascent import Ascent, climb, slopes
+from calib.gap.ascent import Ascent, Walk, climb, slopes, together
 from calib.gap.case import Campaigns
 from calib.gap.forward import Forward
 from calib.gap.noise import Noise, ln_prior
@@ -84,7 +84,7 @@ def look(
     starts: Array | None = None,
     count: int = 1,
     skip: int = 0,
-) -> list[Fit]:
+) -> Walk[list[Fit]]:
     """Take the first steps of a fit, from one guess or several.
 
     Parameters
@@ -106,12 +106,13 @@ def look(
     candidates = problem.clip(start)[None]
     if starts is not None:
         candidates = np.concatenate([candidates, problem.clip(starts)])
-    raw = problem.raw(candidates)
+    raw = yield problem, candidates
     costs = problem.costs(candidates, raw, problem.sds(noise))
     begun = problem.best(costs, candidates, count)[skip:]
     linear = bool(forward.smooth_slices) and not forward.hypothesis.effects
     steps = _LINEAR_STEPS if linear and forward.shift is None else _FIRST_STEPS
-    return _climbed(problem, [Ascent(candidates[i], raw[i], dict(noise)) for i in begun], steps)
+    ascents = [Ascent(candidates[i], raw[i], dict(noise)) for i in begun]
+    return (yield from _climbed(problem, ascents, steps))
 
 
 def fit(
@@ -119,10 +120,11 @@ def fit(
     *, starts: Array | None = None, count: int = 1,
 ) -> Fit:  # fmt: skip
     """Fit a hypothesis, the parameters as for `look`."""
-    return finish(look(data, forward, start, noise, starts=starts, count=count))
+    (looks,) = together([look(data, forward, start, noise, starts=starts, count=count)])
+    return together([finish(looks)])[0]
 
 
-def finish(looks: Sequence[Fit]) -> Fit:
+def finish(looks: Sequence[Fit]) -> Walk[Fit]:
     """Climb on from the first looks that are worth it, and keep the most probable mode."""
     ranked = sorted(looks, key=lambda f: -f.log_evidence)
     kept: list[Fit] = []
@@ -130,7 +132,8 @@ def finish(looks: Sequence[Fit]) -> Fit:
         worth = found.log_evidence >= ranked[0].log_evidence - _WORTH
         if worth and not any(_near(found, other) for other in kept):
             kept.append(found)
-    return max(climb_on(kept or ranked[:1]), key=lambda f: f.log_evidence)
+    climbed = yield from climb_on(kept or ranked[:1])
+    return max(climbed, key=lambda f: f.log_evidence)
 
 
 def _near(found: Fit, other: Fit) -> bool:
@@ -139,21 +142,21 @@ def _near(found: Fit, other: Fit) -> bool:
     return bool((np.abs(found.psi - other.psi) < _NEAR * sd).all())
 
 
-def climb_on(looks: Sequence[Fit]) -> list[Fit]:
+def climb_on(looks: Sequence[Fit]) -> Walk[list[Fit]]:
     """Climb from where fits of one hypothesis have stopped to the modes beside them."""
     forward = looks[0].forward
     problem = Residuals(forward.data, forward)
-    raw = problem.raw(np.stack([f.psi for f in looks]))
+    raw = yield problem, np.stack([f.psi for f in looks])
     ascents = [Ascent(f.psi, r, dict(f.noise)) for f, r in zip(looks, raw, strict=True)]
-    return _climbed(problem, ascents, _MAX_STEPS)
+    return (yield from _climbed(problem, ascents, _MAX_STEPS))
 
 
-def _climbed(problem: Residuals, ascents: list[Ascent], steps: int) -> list[Fit]:
+def _climbed(problem: Residuals, ascents: list[Ascent], steps: int) -> Walk[list[Fit]]:
     """Climb from guesses to the modes beside them."""
     if not ascents:
         return []
-    climb(problem, ascents, steps)
-    slope = slopes(problem, ascents)
+    yield from climb(problem, ascents, steps)
+    slope = yield from slopes(problem, ascents)
     return [
         _laplace(problem, ascent, sds, gradient, hessian)
         for ascent, sds, gradient, hessian in zip(

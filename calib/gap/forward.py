@@ -115,6 +115,11 @@ class Forward:
         self.priors = Priors(tuple(entries))
 
     @property
+    def n_shared(self) -> int:
+        """Length of the first part of psi, which is that of the simulators."""
+        return int(max(part.stop for part in self.misfit_slices.values()))
+
+    @property
     def n_dim(self) -> int:
         """Length of psi."""
         return len(self.priors.free)
@@ -175,28 +180,38 @@ class Forward:
         """Predict the lab rows and the field rows, as `lab` and `field` do."""
         if self.shift is not None:
             return self.lab(psi), self.field(psi, self.data.view)
+        lab, plain = self.plain(psi)
+        return lab, self.departed(psi, self.data.view, plain)
+
+    @_SILENT
+    def plain(self, psi: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Predict the lab rows and the field rows by the simulators alone.
+
+        Of psi only the first `n_shared` coordinates are used, which all hypotheses have in common.
+        """
         # One simulator for both: half as many calls, of which a fit makes thousands.
         lab, plain = {}, {}
         for o in self.data.outputs:
             both = self._predict(psi, o.name, self._simulated[o.name].both)
             n_lab = o.problem.response.size
             lab[o.name], plain[o.name] = both[:, :n_lab], both[:, n_lab:]
-        return lab, self._departed(psi, self.data.view, plain)
+        return lab, plain
 
     @_SILENT
     def field(self, psi: Array, view: View) -> dict[str, Array]:
         """Predict field rows with the hypothesis in force, on the scale of the response."""
         if self.shift is None:
-            return self._departed(psi, view, self.simulator(psi, view))
+            return self.departed(psi, view, self.simulator(psi, view))
         plain: dict[str, Array] = {}
         shift = psi[:, self.shift_slice]
         for name, s in self._simulated.items():
             t = psi[:, self.theta_slices[name]] + shift @ self.shift.parameters[name].T
             conditions = self._shifted(shift, s.conditions(view))
             plain[name] = s.predict(t, psi[:, self.misfit_slices[name]], conditions)
-        return self._departed(psi, view, plain)
+        return self.departed(psi, view, plain)
 
-    def _departed(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
+    @_SILENT
+    def departed(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
         """Add effects and discrepancies to what the simulators predict."""
         if self.hypothesis.effects:
             plain = self._with_effects(psi, view, plain)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,14 @@ from calib.gap.noise import Noise, most_probable
 from calib.models.base import Array
 from calib.sampling.mode import prior_widths
 
-__all__ = ["Residuals"]
+__all__ = ["Residuals", "residuals_of_all"]
 
 # Guesses closer than this (in prior sds) climb to the same mode.
 _APART = 0.7
 # Step of differences, in prior sds.
 _DIFFERENCE = 1e-4
+# Vectors at once whose predictions stay in the processor's cache.
+_AT_ONCE = 1024
 
 
 class Residuals:
@@ -56,7 +58,10 @@ class Residuals:
 
     def raw(self, psi: Array) -> Array:
         """Evaluate, shape (k, d) to (k, N)."""
-        lab, field = self.forward.campaigns(psi)
+        return self.beside(*self.forward.campaigns(psi))
+
+    def beside(self, lab: Mapping[str, Array], field: Mapping[str, Array]) -> Array:
+        """Observed minus what is predicted for both campaigns."""
         predicted: list[Array] = []
         for o in self.data.outputs:
             there = field[o.name]
@@ -96,17 +101,35 @@ class Residuals:
                 break
         return picked
 
-    def jacobian(self, psi: Array, raw: Array) -> Array:
-        """Derivatives of the residuals `raw` at psi, shapes (m, d) and (m, N) to (m, d, N)."""
-        m, d = psi.shape
-        step = _DIFFERENCE * self.width
-        step = np.where(psi + step > self.upper, -step, step)
-        points = psi[:, None] + step[:, None] * np.eye(d)
-        moved = self.raw(points.reshape(m * d, d)).reshape(m, d, -1)
-        change = moved - raw[:, None]
+    def around(self, psi: Array) -> Array:
+        """Points beside psi that tell the derivatives there, shape (m, d) to (m d, d)."""
+        return (psi[:, None] + self._steps(psi)[:, None] * np.eye(psi.shape[1])).reshape(
+            -1, psi.shape[1]
+        )
+
+    def jacobian(self, psi: Array, raw: Array, moved: Array) -> Array:
+        """Derivatives of the residuals.
+
+        Parameters
+        ----------
+        psi : ndarray, shape (m, d)
+        raw : ndarray, shape (m, N)
+            Residuals there.
+        moved : ndarray, shape (m d, N)
+            Residuals at the points `around`.
+
+        Returns
+        -------
+        ndarray, shape (m, d, N)
+        """
+        change = moved.reshape(*psi.shape, -1) - raw[:, None]
         # Beside ground where the model has no value nothing is known.
         change = np.where(np.isfinite(change), change, 0.0)
-        return np.asarray(change / step[:, :, None])
+        return np.asarray(change / self._steps(psi)[:, :, None])
+
+    def _steps(self, psi: Array) -> Array:
+        step = _DIFFERENCE * self.width
+        return np.where(psi + step > self.upper, -step, step)
 
     def update_noise(self, raw: Array, scaled: Array, hessian: Array) -> dict[str, Noise]:
         """Noise scales that maximise the marginal likelihood, parameters allowed for.
@@ -124,3 +147,40 @@ class Residuals:
         corrected = np.square(raw) / np.clip(1.0 - leverage, 0.1, 1.0)
         at = self.data.at_rows
         return {o: most_probable(corrected[part], at[o]) for o, part in self.parts.items()}
+
+
+def residuals_of_all(asked: Sequence[tuple[Residuals, Array]]) -> list[Array]:
+    """Evaluate problems on the same campaigns at psi of each, shapes (k, d) to (k, N).
+
+    Hypotheses differ in what they add to the simulators: these are asked once for all of them.
+    """
+    found: dict[int, Array] = {}
+    batch: list[int] = []
+    size = 0
+    for i, (problem, psi) in enumerate(asked):
+        if problem.forward.shift is not None:
+            found[i] = problem.raw(psi)
+            continue
+        if batch and size + len(psi) > _AT_ONCE:
+            found |= _batched(asked, batch)
+            batch, size = [], 0
+        batch.append(i)
+        size += len(psi)
+    found |= _batched(asked, batch)
+    return [found[i] for i in range(len(asked))]
+
+
+def _batched(asked: Sequence[tuple[Residuals, Array]], batch: list[int]) -> dict[int, Array]:
+    if not batch:
+        return {}
+    forward = asked[batch[0]][0].forward
+    shared = [asked[i][1][:, : forward.n_shared] for i in batch]
+    lab, plain = forward.plain(np.concatenate(shared))
+    found, end = {}, 0
+    for i, part in zip(batch, shared, strict=True):
+        problem, psi = asked[i]
+        start, end = end, end + len(part)
+        own_lab, own = ({o: v[start:end] for o, v in all_.items()} for all_ in (lab, plain))
+        field = problem.forward.departed(psi, problem.data.view, own)
+        found[i] = problem.beside(own_lab, field)
+    return found

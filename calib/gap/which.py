@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
+from calib.gap.ascent import Walk, together
 from calib.gap.case import Campaigns
 from calib.gap.discrepancy import Bases
 from calib.gap.effects import EFFECTS, Effect
@@ -111,10 +112,7 @@ def rank(
     single = [h for h in single if h.name not in design.idle]
     unable |= dict.fromkeys(design.idle, _IDLE)
     worker = _Worker(data, lab_mode, noise, seed)
-    fits: dict[str, tuple[Fit, ...]] = {"none": (worker.fit(Hypothesis("none")),)}
-    fits["parameter_shift"] = tuple(worker.fit(h) for h in shifts(data))
-    for h in single:
-        fits[h.name] = (worker.fit(h),)
+    fits = worker.fit([Hypothesis("none"), *shifts(data), *single])
     fits |= _unlisted_and_pairs(worker, single, fits)
     fits, scores = _scored(fits, len(single), seed)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
@@ -126,28 +124,39 @@ def _unlisted_and_pairs(
     worker: _Worker, single: Sequence[Hypothesis], fits: Mapping[str, tuple[Fit, ...]]
 ) -> dict[str, tuple[Fit, ...]]:
     """Fit what is not listed, and pairs; finish those that are not hopeless at first look."""
+    n = len(single)
     alone = [fits["parameter_shift"], *(fits[h.name] for h in single)]
     best = sorted((max(group, key=_evidence) for group in alone), key=_evidence, reverse=True)
     leaders = [f.forward.hypothesis for f in best[:_N_LEADING]]
-    others = unknowns(worker.data) + remainders(worker.data, leaders, len(single))
-    unlisted = [worker.look(h) for h in others]
+    others = unknowns(worker.data) + remainders(worker.data, leaders, n)
     pairs = [(h, [fits[e.name][0] for e in h.effects]) for h in _promising_pairs(single, fits)]
-    paired = [worker.look_pair(h, members, 1) for h, members in pairs]
+    looked = together(
+        [worker.look(h) for h in others] + [worker.look_pair(h, members, 1) for h, members in pairs]
+    )
+    leading = max(_promise(looks, n) for looks in (*fits.values(), *looked))
+    first = len(others)
+    searched = [
+        i for i in range(len(pairs)) if _promise(looked[first + i], n) > leading - _SEARCHED
+    ]
+    more = together([worker.look_pair(*pairs[i], _N_BEGUN, skip=1) for i in searched])
+    for i, looks in zip(searched, more, strict=True):
+        looked[first + i] += looks
+    ended = _finished(looked, leading - _HOPELESS, n)
+    found = {h.name: (f,) for (h, _), f in zip(pairs, ended[first:], strict=True)}
+    return {"unknown": tuple(ended[:first])} | found
 
-    def promise(looks: Sequence[Fit]) -> float:
-        return max(_with_prior(f, len(single)) for f in looks)
 
-    leading = max(promise(looks) for looks in (*fits.values(), *unlisted, *paired))
+def _finished(looked: Sequence[Sequence[Fit]], hopeless: float, n_single: int) -> list[Fit]:
+    """Climb on from first looks at hypotheses, but for those that are hopeless."""
+    worth = [i for i, looks in enumerate(looked) if _promise(looks, n_single) > hopeless]
+    ended = [max(looks, key=_evidence) for looks in looked]
+    for i, found in zip(worth, together([finish(looked[i]) for i in worth]), strict=True):
+        ended[i] = found
+    return ended
 
-    def finished(looks: Sequence[Fit]) -> Fit:
-        return finish(looks) if promise(looks) > leading - _HOPELESS else max(looks, key=_evidence)
 
-    found = {"unknown": tuple(finished(looks) for looks in unlisted)}
-    for (h, members), looks in zip(pairs, paired, strict=True):
-        searched = promise(looks) > leading - _SEARCHED
-        more = worker.look_pair(h, members, _N_BEGUN, skip=1) if searched else []
-        found[h.name] = (finished([*looks, *more]),)
-    return found
+def _promise(looks: Sequence[Fit], n_single: int) -> float:
+    return max(_with_prior(f, n_single) for f in looks)
 
 
 def _evidence(found: Fit) -> float:
@@ -238,11 +247,16 @@ class _Worker:
         self.data, self.lab_mode, self.noise, self.seed = data, lab_mode, noise, seed
         self._bases: Bases = {}
 
-    def fit(self, hypothesis: Hypothesis) -> Fit:
-        """Fit from the lab's calibration."""
-        return finish(self.look(hypothesis))
+    def fit(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Fit, ...]]:
+        """Fit from the lab's calibration, by name."""
+        looks = together([self.look(h) for h in hypotheses])
+        fits: dict[str, tuple[Fit, ...]] = {}
+        for found in together([finish(group) for group in looks]):
+            name = found.forward.hypothesis.name
+            fits[name] = (*fits.get(name, ()), found)
+        return fits
 
-    def look(self, hypothesis: Hypothesis) -> list[Fit]:
+    def look(self, hypothesis: Hypothesis) -> Walk[list[Fit]]:
         """Begin at the lab's calibration, effects at several guesses of their prior."""
         forward, start = self._forward(hypothesis)
         if hypothesis.onset_over is not None:
@@ -254,7 +268,7 @@ class _Worker:
 
     def look_pair(
         self, hypothesis: Hypothesis, members: Sequence[Fit], count: int, skip: int = 0
-    ) -> list[Fit]:
+    ) -> Walk[list[Fit]]:
         """Begin two effects where each alone has led."""
         forward, start = self._forward(hypothesis)
         parts = []
