@@ -97,10 +97,10 @@ def test_the_same_seed_gives_the_same_twins_on_any_number_of_workers(blind, twin
 
 def test_twins_are_diagnosed_and_scored_as_any_case(twins, tmp_path):
     folders = case_folders(twins[0])
-    assert diagnose_cases(folders, tmp_path / "results", 1) == {}
+    assert diagnose_cases(folders[:2], tmp_path / "results", 1) == {}
     found = score(twins[0], tmp_path / "results", twins[1])
     assert len(found.answers) == len(folders)
-    assert all(answer.problem == "" for answer in found.answers)
+    assert [answer.problem == "" for answer in found.answers] == [True] * 2 + [False] * 4
 
 
 def test_a_key_of_other_cases_is_refused(blind, tmp_path):
