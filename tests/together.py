@@ -22,6 +22,8 @@ GROUPS = (
     ("page/test_diagnosis.py", "figures/test_gap.py", "gap/test_files.py", "gap/test_shrink.py",
      "gap/test_where.py"),
     ("campaign/test_run.py", "campaign/test_kinds.py", "campaign/test_plan.py"),
+    ("challenge/test_make.py", "twins/test_twins.py"),
+    ("challenge/oracle/test_limit.py",),
     ("figures/test_print.py", "figures/test_plates.py"),
     ("sampling/test_sampler.py",),
     ("cli/test_cli.py",),

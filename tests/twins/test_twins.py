@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from calib.challenge.files import OUTPUT_COLUMNS
-from calib.challenge.make import make
 from calib.challenge.score import score
 from calib.challenge.seal import open_key
 from calib.errors import CalibError
@@ -22,10 +21,8 @@ from calib.twins.draw import SIZE_RATIO, draw_twin
 
 
 @pytest.fixture(scope="module")
-def blind(tmp_path_factory) -> tuple[Path, Path]:
-    root = tmp_path_factory.mktemp("blind")
-    make(root / "cases", root / "key.json", seed=5, n_cases=6)
-    return root / "cases", root / "key.json"
+def blind(blind_test) -> tuple[Path, Path]:
+    return blind_test.cases, blind_test.key
 
 
 @pytest.fixture(scope="module")
