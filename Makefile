@@ -25,8 +25,11 @@ test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
 
 # Against the peers, written to reports/benchmarks; PART="posterior likelihood" does a part of it.
-bench: $(BENCH_VENV)/.ready
-	$(BENCH_VENV)/bin/python benchmarks/bench.py $(PART)
+# The everyday commands have no peers and run where people run them; PART="everyday --full" has the
+# tests too.
+BENCH_IN := $(if $(filter-out everyday --%,$(or $(PART),all)),$(BENCH_VENV),$(VENV))
+bench: $(BENCH_IN)/.ready
+	$(BENCH_IN)/bin/python benchmarks/bench.py $(PART)
 
 lint: $(READY)
 	$(BIN)/ruff check calib tests benchmarks

@@ -3,6 +3,7 @@
     python benchmarks/bench.py                       # all parts, an hour on two cores
     python benchmarks/bench.py posterior likelihood  # some of them; the others stay as they were
     python benchmarks/bench.py --full campaign       # 200 diagnoses in the place of 100
+    python benchmarks/bench.py --full everyday       # `make test` too
 
 Each part runs in a process of its own and leaves its measurements as JSON; tables, figure and
 README are written from whatever parts are there.
@@ -31,8 +32,9 @@ PARTS: dict[str, list[str]] = {
     "million": ["million.py"],
     "campaign": ["campaign.py", "--cases", "100", "--repeats", "1"],
     "survival": ["campaign_survival.py", "--cases", "200"],
+    "everyday": ["everyday.py"],
 }
-FULL = {"campaign": ["--cases", "200"]}
+FULL = {"campaign": ["--cases", "200"], "everyday": ["--tests"]}
 
 
 def main() -> int:
@@ -40,7 +42,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
     parser.add_argument("--out", type=Path, default=HERE.parent / "reports" / "benchmarks")
-    parser.add_argument("--full", action="store_true", help="campaigns of 200, 20 minutes more")
+    parser.add_argument(
+        "--full", action="store_true", help="campaigns of 200, `make test`: 40 minutes more"
+    )
     parser.add_argument("--only-write", action="store_true", help="measure nothing")
     options = parser.parse_args()
     unknown = set(options.parts) - set(PARTS)

@@ -4,6 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from challenge.blind import blind_test  # noqa: F401
+from figures.fixtures import (  # noqa: F401
+    all_plates,
+    density,
+    drawbar,
+    plate,
+    rut,
+    unconverged,
+)
+from together import pytest_collection_modifyitems, pytest_xdist_make_scheduler  # noqa: F401
 
 from calib.audit import Audit, Seeds, run_audit
 from calib.calibration import Calibration, calibrate

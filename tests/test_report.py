@@ -8,7 +8,6 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from figures.fixtures import plate, rut  # noqa: F401
 from PIL import Image
 
 from calib.manifest import file_hashes
@@ -42,7 +41,7 @@ def write(result, out: Path, **kwargs) -> Path:
 
 
 @pytest.fixture(scope="module")
-def report(rut, tmp_path_factory) -> Path:  # noqa: F811
+def report(rut, tmp_path_factory) -> Path:
     return write(rut, tmp_path_factory.mktemp("report") / "rep", pdf=True)
 
 
@@ -93,20 +92,20 @@ def test_every_figure_has_its_pdf_and_its_size_in_print(report):
             assert min(abs(width - w) for w in (90, 140, 190)) < 0.3
 
 
-def test_pdfs_come_on_request_only(plate, tmp_path):  # noqa: F811
+def test_pdfs_come_on_request_only(plate, tmp_path):
     report = write(plate, tmp_path / "rep")
     assert not list(report.rglob("*.pdf"))
     assert json.loads((report / "manifest.json").read_text())["pdf"] is False
 
 
-def test_made_again_it_is_the_same_to_the_last_byte(rut, report, tmp_path):  # noqa: F811
+def test_made_again_it_is_the_same_to_the_last_byte(rut, report, tmp_path):
     again = write(rut, tmp_path / "rep", pdf=True)
     first, second = file_hashes(report), file_hashes(again)
     assert set(first) == set(second)
     assert first == second
 
 
-def test_it_may_be_replaced(rut, tmp_path, monkeypatch):  # noqa: F811
+def test_it_may_be_replaced(rut, tmp_path, monkeypatch):
     monkeypatch.setattr("calib.report.plates", lambda result, published: [])
     out = write(rut, tmp_path / "rep", pdf=True)
     (out / "methods.txt").write_text("old")

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy import stats
+from shared.measure import spread
 
 from calib.sampling.gate import Gate
 
@@ -68,6 +69,7 @@ def rows_of(measured: Mapping[str, Measured]) -> list[Row]:
     makers = {
         "posterior": _posterior, "likelihood": _likelihood, "genetic": _genetic,
         "million": _million, "campaign": _campaign, "survival": _survival,
+        "everyday": _everyday,
     }  # fmt: skip
     return [
         row for part, make in makers.items() if part in measured for row in make(measured[part])
@@ -271,3 +273,20 @@ def _survival(m: Measured) -> Iterator[Row]:
     yield Row(part, subject, f"files of {m['files_compared']} that differ from an undisturbed run",
               float(m["files_that_differ"]), asked="= 0",
               met=m["files_that_differ"] == 0)  # fmt: skip
+
+
+def _everyday(m: Measured) -> Iterator[Row]:
+    part = "everyday"
+    for name, c in m["commands"].items():
+        for by, what in (("clock", "seconds on the clock"), ("processor", "seconds of processors")):
+            most = c["asked"] if by == c["by"] else None
+            yield _asked(part, name, what, spread(c["now"][by]), most=most)
+            if "before" in c:
+                yield _asked(part, name, f"{what}, before", spread(c["before"][by]))
+                pairs = zip(c["now"][by], c["before"][by], strict=True)
+                yield _asked(
+                    part, name, f"{what} over those before", spread([a / b for a, b in pairs])
+                )
+        ends = sorted({*c["now"]["exit_codes"]})
+        if any(ends):
+            yield Row(part, name, "exit code", float(ends[-1]), asked="= 0", met=False)

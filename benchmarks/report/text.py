@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,10 @@ __all__ = ["readme"]
 _HEAD = """# Benchmarks
 
 Made by `make bench`; `make bench PART="posterior likelihood"` renews some of the parts posterior,
-likelihood, genetic, million, campaign and survival. Medians over repeats that take turns with the
-peers', with the least and the most of them; the median decides whether a level is met. The levels
-are goals that were set before any of it was built. Every line is in [results.md](results.md) and
-`results.csv`, every measurement in `measured/`.
+likelihood, genetic, million, campaign, survival and everyday. Medians over repeats that take turns
+with the peers', with the least and the most of them; the median decides whether a level is met. The
+levels are goals that were set before any of it was built. Every line is in [results.md](results.md)
+and `results.csv`, every measurement in `measured/`.
 
 ![What a posterior costs, and the likelihood against its floor](benchmarks.png)
 """
@@ -82,6 +83,11 @@ _HOW = """## How it was measured
 - **Survival.** A worker is killed at a quarter of the results and another at three quarters, the
   client with all it started at a half; the same command is given again, and its files are held
   against those of one process, byte by byte (`benchmarks/campaign_survival.py`).
+- **Everyday.** Whole processes, start-up and children included, modules compiled beforehand; those
+  of the commit before run in a worktree of its own with the same environment, by turns. Five runs
+  each, of report and check three, of the tests one. A ratio is that of a run to the one beside it.
+  One diagnosis and the import are timed inside their process. It needs no peers:
+  `make bench PART=everyday` runs in the ordinary environment (`benchmarks/everyday.py`).
 """
 
 _TRIED = """## What was tried
@@ -156,9 +162,30 @@ def readme(measured: Mapping[str, Mapping[str, Any]], rows: list[Row]) -> str:
     lines += ["| | | median | range | asked | |", "|---|---|---:|---:|---|---|"]
     lines += [r.line for r in asked]
     lines += ["", f"{len(asked) - len(missed)} of {len(asked)} are met.", ""]
+    if "everyday" in measured:
+        lines += ["## Every day, before and after", "", *_everyday(measured["everyday"]), ""]
     lines += ["## On what", "", *_machines(measured), ""]
     how = _HOW.format(**_of_posterior(measured), attribution=_ATTRIBUTION)
     return "\n".join(lines) + "\n" + how + "\n" + _TRIED.format(libraries=_libraries(measured))
+
+
+def _everyday(m: Mapping[str, Any]) -> list[str]:
+    """Return a table of medians, the commit before beside this code."""
+    commit = f"commit {m['before'][:7]}" if "before" in m else "not measured"
+    lines = [f"Medians of seconds; before is {commit}.", "",
+             "| | clock before | now | processors before | now | asked | |",
+             "|---|---:|---:|---:|---:|---|---|"]  # fmt: skip
+    for name, c in m["commands"].items():
+        cells = [
+            f"{median(c[side][by]):.3g}" if side in c else ""
+            for by in ("clock", "processor") for side in ("before", "now")
+        ]  # fmt: skip
+        asked = met = ""
+        if c["asked"] is not None:
+            asked = f"≤ {c['asked']:g} s, {c['by']}"
+            met = "**met**" if median(c["now"][c["by"]]) <= c["asked"] else "**missed**"
+        lines.append(f"| `{name}` | {' | '.join(cells)} | {asked} | {met} |")
+    return lines
 
 
 def _of_posterior(measured: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:

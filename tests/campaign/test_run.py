@@ -8,6 +8,7 @@ import os
 import shutil
 import signal
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import psutil
@@ -83,12 +84,14 @@ def kill_a_worker(client: int, until=lambda: True, after_seconds: float = 0.5) -
     deadline = time.monotonic() + 60.0
     while time.monotonic() < deadline:
         for child in psutil.Process(client).children():
-            busy = "spawn_main" in " ".join(child.cmdline()) and (
-                child.cpu_times().user >= after_seconds
-            )
-            if busy and until():
-                child.kill()
-                return
+            # One that ends just now cannot be asked any more.
+            with suppress(psutil.NoSuchProcess):
+                busy = "spawn_main" in " ".join(child.cmdline()) and (
+                    child.cpu_times().user >= after_seconds
+                )
+                if busy and until():
+                    child.kill()
+                    return
         time.sleep(0.005)
     raise AssertionError("no worker was seen")
 

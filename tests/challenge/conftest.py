@@ -1,36 +1,14 @@
-"""Shared realities and one small blind test, made once."""
+"""Shared realities."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
-
 import numpy as np
-import pytest
 
 from calib.challenge.density import ConeLaw
-from calib.challenge.make import make
 from calib.challenge.mechanics import Reality
 from calib.challenge.mechanism import Conditions
 from calib.challenge.soil import Soil
 from calib.challenge.tyre import Tyre
-
-
-@dataclass(frozen=True)
-class BlindTest:
-    """Where a small blind test was written, and the hash of its key."""
-
-    cases: Path
-    key: Path
-    digest: str
-
-
-@pytest.fixture(scope="session")
-def blind_test(tmp_path_factory: pytest.TempPathFactory) -> BlindTest:
-    """Return six cases of both tiers."""
-    root = tmp_path_factory.mktemp("blind")
-    digest = make(root / "cases", root / "sealed" / "key.json", seed=5, n_cases=6)
-    return BlindTest(root / "cases", root / "sealed" / "key.json", digest)
 
 
 def sandy_loam(**changes: float) -> Soil:

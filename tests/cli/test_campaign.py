@@ -23,6 +23,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 from calib.cli import main
 main()
 """
+RANKS = '[[sbc]]\nname = "ranks"\nsimulations = 400\ndraw_seed = 3\nmodels = ["bekker"]\n'
 CASES = '[[challenge]]\nname = "blind"\ncases = {}\ndraw_seed = 5\ntier = "easy"\n'
 FIT = '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\nposteriors = false\n'
 
@@ -96,7 +97,7 @@ def test_what_can_be_mended_ends_with_two(calib):
 
 
 def test_control_c_says_what_is_kept_and_nothing_else(tmp_path):
-    (tmp_path / "plan.toml").write_text(CASES.format(40))
+    (tmp_path / "plan.toml").write_text(RANKS)
     process = subprocess.Popen(
         [sys.executable, "-c", FROM_A_TERMINAL, "campaign", "plan.toml", "--out", "out"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -110,5 +111,5 @@ def test_control_c_says_what_is_kept_and_nothing_else(tmp_path):
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
     assert "interrupted; letting go of the workers" in err
-    assert "of 40 results are kept in out/results" in err
+    assert "of 400 results are kept in out/results" in err
     assert "Traceback" not in err

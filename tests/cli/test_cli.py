@@ -119,9 +119,10 @@ def test_fit_names_a_reading_that_is_far_off(calib: Calib, he2019: Path) -> None
     assert "check the reading" in ran.err
 
 
-def fit_rut(calib: Calib, content: bytes, name: str = "run") -> Ran:
+def fit_rut(calib: Calib, content: bytes, name: str = "run", *options: object) -> Ran:
     Path("my.csv").write_bytes(content)
-    return calib("fit", "my.csv", "--model", "modified_bekker", "--out", name, "--seed", 3)
+    command = ("fit", "my.csv", "--model", "modified_bekker", "--out", name, "--seed", 3)
+    return calib(*command, *options)
 
 
 def test_a_byte_order_mark_semicolons_and_line_ends_change_nothing(calib: Calib) -> None:
@@ -136,9 +137,10 @@ def test_a_byte_order_mark_semicolons_and_line_ends_change_nothing(calib: Calib)
             + [f"{100 * float(r.split(',')[0]):g},{r.split(',', 1)[1]}" for r in rows[1:]]
         ).encode(),
     }
-    ran = {name: fit_rut(calib, content, name) for name, content in variants.items()}
+    # Too short to converge, which ends with 3: what is read is the same, or the numbers are not.
+    ran = {n: fit_rut(calib, content, n, "--max-steps", 100) for n, content in variants.items()}
     for name, found in ran.items():
-        assert found.code == 0, (name, found.err)
+        assert found.code == 3, (name, found.err)
         assert found.out.replace(name, "plain") == ran["plain"].out, name
     assert "9 rows" in ran["plain"].out
 

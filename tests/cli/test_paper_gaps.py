@@ -63,8 +63,9 @@ def test_the_report_of_the_embedded_data_has_the_section(
     calib: Calib,  # noqa: F811
     monkeypatch: pytest.MonkeyPatch,
     found_gaps,
+    audit,
 ) -> None:
-    """The command passes the gaps on; calibrations, tested elsewhere, are left out here."""
+    """The command passes the gaps on; what is tested elsewhere is left out here."""
     asked = []
 
     def find(seed, **_):
@@ -73,6 +74,7 @@ def test_the_report_of_the_embedded_data_has_the_section(
 
     monkeypatch.setattr("calib.study_tasks.he2019_tasks", lambda: ())
     monkeypatch.setattr("calib.contents.find_gaps", find)
+    monkeypatch.setattr("calib.contents.run_audit", lambda *_, **__: audit)
     ran = calib("report", "--out", "rep", "--seed", 5)
     assert ran.code == 0, ran.err
     assert asked == [5]
@@ -80,7 +82,11 @@ def test_the_report_of_the_embedded_data_has_the_section(
     assert 'id="paper-gaps"' in Path("rep/index.html").read_text()
 
 
-def test_the_report_of_own_data_has_no_such_section(calib: Calib) -> None:  # noqa: F811
+def test_the_report_of_own_data_has_no_such_section(
+    calib: Calib,  # noqa: F811
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("calib.report.plates", lambda result, published: [])
     Path("my.csv").write_text(template_csv("modified_bekker"))
     ran = calib("report", "my.csv", "--out", "rep")
     assert ran.code == 0, ran.err

@@ -9,6 +9,8 @@ import pytest
 
 from calib.calibration import Calibration, calibrate
 from calib.data import Table, table_from_arrays
+from calib.figures import Plate, plates
+from calib.figures.style import style
 from calib.problem import build_problem
 from calib.study import OutputResult
 from figures.results import build
@@ -49,3 +51,17 @@ def unconverged(rut: OutputResult) -> OutputResult:
     draws = replace(rut.calibration.draws, report=report)
     calibration = Calibration(rut.calibration.problem, draws, 1, "rut")
     return replace(rut, calibration=calibration)
+
+
+@pytest.fixture(scope="session")
+def all_plates(
+    drawbar: OutputResult, density: OutputResult, rut: OutputResult, plate: OutputResult
+) -> dict[str, list[Plate]]:
+    """The figures of each output, laid out."""
+    results = {"drawbar": drawbar, "density": density, "rut": rut, "plate": plate}
+    found = {k: plates(r, published=k != "plate") for k, r in results.items()}
+    with style():
+        for p in (p for drawn in found.values() for p in drawn):
+            assert p.figure is not None, p.caption
+            p.figure.draw_without_rendering()
+    return found

@@ -32,12 +32,8 @@ NAMES = ("bands", "validation", "prior_predictive", "learned", "corner", "ensemb
 
 
 @pytest.fixture(scope="module")
-def drawn(drawbar, density, plate) -> dict[str, list[Plate]]:
-    return {
-        "drawbar": plates(drawbar, published=True),
-        "density": plates(density, published=True),
-        "plate": plates(plate, published=False),
-    }
+def drawn(all_plates) -> dict[str, list[Plate]]:
+    return all_plates
 
 
 def test_every_output_has_its_figures(drawn):
@@ -84,7 +80,6 @@ def test_nothing_is_cut_off(drawn):
     # The most parameters and panels, and the longest tick labels.
     for found in (drawn["drawbar"], drawn["density"][:1]):
         for p in found:
-            p.figure.draw_without_rendering()
             inside = p.figure.bbox.padded(2.0)
             for ax in p.figure.axes:
                 box = ax.get_tightbbox()

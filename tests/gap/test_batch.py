@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,8 @@ import pytest
 from calib.errors import CalibError
 from calib.gap import batch
 from calib.gap.batch import case_folders, diagnose_cases
+from calib.gap.diagnose import diagnose
+from calib.gap.effects import EFFECTS
 from gap.cases import PULL_ONLY, make_case, write_case
 
 
@@ -17,7 +21,7 @@ from gap.cases import PULL_ONLY, make_case, write_case
 def cases(tmp_path_factory) -> list[Path]:
     root = tmp_path_factory.mktemp("cases")
     for i, effect in enumerate((None, "force_offset")):
-        case = make_case(effect, models=PULL_ONLY, n_lab=15, n_field=12, seed=i)
+        case = make_case(effect, models=PULL_ONLY, n_lab=15, n_field=12, n_fresh=3, seed=i)
         write_case(case, root / f"case-{i}")
     (root / "not-a-case").mkdir()
     return case_folders(root)
@@ -68,7 +72,7 @@ def test_what_is_there_is_not_done_again(cases, done, monkeypatch):
 
 def test_it_takes_up_where_it_stopped(cases, done, tmp_path):
     out = tmp_path / "out"
-    diagnose_cases(cases[:1], out, 1)
+    shutil.copytree(done / "case-0", out / "case-0")
     before = (out / "case-0" / "diagnosis.json").stat().st_mtime_ns
     seen = []
     diagnose_cases(cases, out, 1, progress=lambda *p: seen.append(p))
@@ -77,7 +81,14 @@ def test_it_takes_up_where_it_stopped(cases, done, tmp_path):
     assert content(out) == content(done)
 
 
-def test_a_case_that_fails_is_reported_and_leaves_nothing(cases, tmp_path):
+@pytest.fixture
+def few_effects(monkeypatch) -> None:
+    """Diagnose among one effect, where what is found does not matter."""
+    few = {"force_offset": EFFECTS["force_offset"]}
+    monkeypatch.setattr(batch, "diagnose", partial(diagnose, effects=few))
+
+
+def test_a_case_that_fails_is_reported_and_leaves_nothing(cases, tmp_path, few_effects):
     bad = write_case(make_case(models=PULL_ONLY, n_lab=15, n_field=12), tmp_path / "bad")
     (bad / "lab.csv").unlink()
     failed = diagnose_cases([bad, cases[0]], tmp_path / "out", 1)
@@ -87,9 +98,7 @@ def test_a_case_that_fails_is_reported_and_leaves_nothing(cases, tmp_path):
     assert json.loads((tmp_path / "out" / "failed.json").read_text()) == failed
 
 
-def test_an_interruption_leaves_no_half_written_folder(cases, tmp_path, monkeypatch):
-    from calib.gap import batch
-
+def test_an_interruption_leaves_no_half_written_folder(cases, tmp_path, few_effects, monkeypatch):
     def stop(found, folder):
         (folder / "diagnosis.json").write_text("{")
         raise KeyboardInterrupt

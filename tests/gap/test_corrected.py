@@ -21,8 +21,8 @@ from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
 from calib.gap.effects.load import load_effects
 from calib.outputs import OUTPUTS
-from tests.gap.cases import LARGE, PULL_ONLY, make_case
-from tests.gap.test_load_effects import write
+from gap.cases import LARGE, PULL_ONLY, make_case
+from gap.test_load_effects import write
 
 FEW = {name: EFFECTS[name] for name in ("force_offset", "rate_effect")}
 
@@ -95,7 +95,7 @@ def test_the_conditions_to_predict_are_kept(saved):
 
 def test_an_effect_of_ones_own_is_passed_to_predict(tmp_path, capsys):
     path = write(tmp_path)
-    case = make_case("force_offset", models=PULL_ONLY)
+    case = make_case("force_offset", models=PULL_ONLY, n_fresh=3)
     own = load_effects(path)
     (tmp_path / "found").mkdir()
     save_corrected(diagnose(case, 1, effects=own).corrected, tmp_path / "found")

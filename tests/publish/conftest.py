@@ -5,7 +5,6 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from figures.fixtures import density, drawbar, plate, rut, unconverged  # noqa: F401
 
 from calib.manifest import build_manifest
 from calib.publish import Publication, publication
@@ -30,7 +29,7 @@ def records(results: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 
 
 @pytest.fixture(scope="session")
-def he2019(density, drawbar, rut) -> tuple[dict[str, Any], dict[str, Any]]:  # noqa: F811
+def he2019(density, drawbar, rut) -> tuple[dict[str, Any], dict[str, Any]]:
     # The genetic algorithm takes seconds: what least squares found stands for what it would find.
     searched = replace(density.estimates[0], method="genetic")
     density = replace(density, estimates=(*density.estimates, searched))
@@ -38,7 +37,7 @@ def he2019(density, drawbar, rut) -> tuple[dict[str, Any], dict[str, Any]]:  # n
 
 
 @pytest.fixture(scope="session")
-def users(plate, unconverged) -> tuple[dict[str, Any], dict[str, Any]]:  # noqa: F811
+def users(plate, unconverged) -> tuple[dict[str, Any], dict[str, Any]]:
     """A user's own data, one output not converged, one that failed."""
     failed = Failure(replace(plate.task, output="bulk_density"), "CalibError: no rows")
     return records({"rut_depth": plate, "drawbar_pull": unconverged, "bulk_density": failed})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import emcee
 import numpy as np
@@ -63,6 +64,7 @@ LAWS = [
 BELOW_ZERO_OF_BIMODAL = 0.3 * stats.norm.cdf(2) + 0.7 * stats.norm.cdf(-2)
 
 
+@cache
 def fitted(log_prob: Callable) -> Proposal:
     proposal, _ = adapt(
         log_prob, [Guess(np.array([0.5, -0.5]), 1.5 * np.eye(2))], np.random.default_rng(4)

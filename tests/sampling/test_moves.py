@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import emcee
 import numpy as np
@@ -171,11 +172,12 @@ def test_every_pair_is_evaluated_once_and_used_once() -> None:
     assert np.unique(np.concatenate(seen), axis=0).shape[0] == 96
 
 
+@cache
 def pairs_alone(log_prob: Callable, ahead: int = 16) -> np.ndarray:
     proposal = fitted(log_prob)
-    start, _ = proposal.draw(np.random.default_rng(3), 400)
-    start = start[np.isfinite(log_prob(start))][:40]
-    return chain(log_prob, [PairMove(proposal, np.random.default_rng(5), ahead)], start, 2500)
+    start, _ = proposal.draw(np.random.default_rng(3), 800)
+    start = start[np.isfinite(log_prob(start))][:200]
+    return chain(log_prob, [PairMove(proposal, np.random.default_rng(5), ahead)], start, 500)
 
 
 @pytest.mark.parametrize(("log_prob", "function", "law"), LAWS)
@@ -186,13 +188,18 @@ def test_a_chain_of_pairs_alone(log_prob: Callable, function: Callable, law, ahe
         assert_share(value < law.ppf(p), p)
 
 
-@pytest.mark.parametrize(("log_prob", "function", "law"), LAWS)
-def test_a_chain_with_walks_between(log_prob: Callable, function: Callable, law) -> None:
+@cache
+def pairs_and_walks(log_prob: Callable) -> np.ndarray:
     proposal = fitted(log_prob)
-    start, _ = proposal.draw(np.random.default_rng(3), 40)
+    start, _ = proposal.draw(np.random.default_rng(3), 200)
     rng = np.random.default_rng(5)
     move = PairMove(proposal, rng, 8, walk=WalkMove(proposal, rng), every=4)
-    value = function(chain(log_prob, [move], start, 2500))
+    return chain(log_prob, [move], start, 500)
+
+
+@pytest.mark.parametrize(("log_prob", "function", "law"), LAWS)
+def test_a_chain_with_walks_between(log_prob: Callable, function: Callable, law) -> None:
+    value = function(pairs_and_walks(log_prob))
     for p in (0.025, 0.25, 0.5, 0.75, 0.975):
         assert_share(value < law.ppf(p), p)
 
@@ -239,8 +246,8 @@ def test_points_whose_opposites_have_no_density() -> None:
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")  # numpy 2 and emcee's own moves
 def test_a_chain_beside_a_local_move() -> None:
     moves = [(PairMove(fitted(banana), np.random.default_rng(2)), 0.7), (emcee.moves.DEMove(), 0.3)]
-    start, _ = fitted(banana).draw(np.random.default_rng(3), 40)
-    value = chain(banana, moves, start, 3000)[..., 1]
+    start, _ = fitted(banana).draw(np.random.default_rng(3), 200)
+    value = chain(banana, moves, start, 600)[..., 1]
     # x1 = x0^2 + e: by simulation of many more draws than the chain's.
     rng = np.random.default_rng(4)
     known = rng.standard_normal(4_000_000) ** 2 + 0.5 * rng.standard_normal(4_000_000)

@@ -28,6 +28,11 @@ from .test_mode import box
 QUICK = SamplerSettings(steps=100, max_steps=100, keep=50)
 
 
+def slow(*case: float):
+    """One more case of the same, for `make test-slow`."""
+    return pytest.param(*case, marks=pytest.mark.slow)
+
+
 def test_a_normal_posterior_with_known_noise() -> None:
     model = linear()
     draws = run(model.log_prob_known, np.zeros(3), np.eye(3))
@@ -91,7 +96,7 @@ def test_two_overlapping_modes_come_out_in_their_proportions() -> None:
 
 
 @pytest.mark.parametrize("distance", [4.0, 6.0])
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, slow(1)])
 def test_a_mode_that_is_hard_to_reach_comes_out_right_or_is_refused(
     distance: float, seed: int
 ) -> None:
@@ -170,14 +175,14 @@ def test_an_attempt_that_fails_teaches_the_next() -> None:
     assert_distributed(whole, lambda t: t[:, 3] - 0.5 * t[:, 0] ** 2, stats.norm(0.0, 0.3))
 
 
-@pytest.mark.parametrize(("d", "thinness"), [(2, 0.05), (4, 0.1), (7, 0.3)])
+@pytest.mark.parametrize(("d", "thinness"), [(2, 0.05), slow(4, 0.1), slow(7, 0.3)])
 def test_thin_bent_ridges_come_out_right_or_are_refused(d: int, thinness: float) -> None:
     draws = on_ridge(d, thinness, 800)
     if draws.report.passed:
         assert_distributed(draws, lambda t: t[:, 0], stats.norm())
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", [0, *(slow(seed) for seed in range(1, 5))])
 def test_distant_modes_come_out_in_their_proportions(seed: int) -> None:
     """A square tells no sign: modes 80 sd apart, which no local move ever crosses."""
     slip = np.linspace(0.0, 0.2, 12)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 import pytest
@@ -71,8 +72,9 @@ def test_a_chain_of_the_walk_alone_visits_both_modes() -> None:
     assert_share(walked(bimodal)[..., 0] < 0.0, BELOW_ZERO_OF_BIMODAL)
 
 
+@cache
 def walked(log_prob: Callable) -> np.ndarray:
     """Draws of the walk alone: each walker is a chain of its own."""
     proposal = fitted(log_prob)
-    start, _ = proposal.draw(np.random.default_rng(3), 40)
-    return chain(log_prob, [WalkMove(proposal, np.random.default_rng(5))], start, 5000)
+    start, _ = proposal.draw(np.random.default_rng(3), 200)
+    return chain(log_prob, [WalkMove(proposal, np.random.default_rng(5))], start, 1000)

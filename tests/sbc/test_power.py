@@ -7,7 +7,7 @@ import pytest
 
 from calib.sbc.uniformity import holm, p_value, pit
 
-SIMULATIONS, DRAWS, ROWS, EXPERIMENTS = 300, 400, 5, 20
+SIMULATIONS, DRAWS, ROWS, EXPERIMENTS = 300, 400, 5, 10
 
 
 def least_p(rng: np.random.Generator, *, scale: float, shift: float) -> float:
@@ -50,5 +50,5 @@ def test_wrong_posteriors_are_found_and_right_ones_pass(
     if found:
         assert alarms >= 0.9 * EXPERIMENTS
     else:
-        # A twentieth by chance: six of twenty would happen three times in ten thousand.
-        assert alarms < 6
+        # A twentieth by chance: five of ten would happen once in sixteen thousand times.
+        assert alarms < 5

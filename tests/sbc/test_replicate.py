@@ -18,7 +18,7 @@ from calib.sbc.score import score, score_model
 
 # One chance in ten thousand of a false alarm in all quantities together.
 RARE = 1e-4
-SEED, CHEAP, FEW = 40, "bekker", 40
+SEED, CHEAP, FEW = 40, "bekker", 24
 
 
 def narrowed(calibration: Calibration, factor: float) -> Calibration:
@@ -54,7 +54,7 @@ def test_a_few_posteriors_of_the_cheapest_model_are_calibrated(few) -> None:
     found = score_model(few[1.0])
     assert found.unconverged == 0
     assert len(found.quantities) == 3 + 1 + len(DERIVED)
-    # Exact p values, so the level holds for forty replicates as for any number.
+    # Exact p values, so the level holds for few replicates as for any number.
     assert min(q.p for q in found.quantities) * len(found.quantities) > RARE
     for band in found.coverage:
         assert abs(band.proportion - band.level) < 4.5 * band.se

@@ -19,6 +19,8 @@ from calib.tasks import cluster, run_folder_tasks, run_tasks
 from tasks import work
 
 TESTS = Path(__file__).parents[1]
+# Started processes import the functions of `work`, and calib from where this process has it.
+ENVIRONMENT = os.environ | {"PYTHONPATH": os.pathsep.join([str(TESTS), str(TESTS.parent)])}
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -38,7 +40,7 @@ def scheduler(tmp_path_factory) -> Iterator[str]:
 @contextmanager
 def scheduler_and_worker(folder: Path) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
     """Yield the address of a scheduler with one worker, started as a user would, and both."""
-    environment = os.environ | {"PYTHONPATH": str(TESTS), "PYTHONWARNINGS": "ignore"}
+    environment = ENVIRONMENT | {"PYTHONWARNINGS": "ignore"}
     file = folder / "scheduler.json"
 
     def start(*command: str) -> subprocess.Popen[bytes]:
@@ -100,22 +102,22 @@ def test_what_another_cluster_left_in_the_environment_is_not_passed_on(
     assert os.environ["MALLOC_TRIM_THRESHOLD_"] == ours
 
 
-def test_errors_are_those_of_one_process(tmp_path):
+def test_errors_are_those_of_one_process(tmp_path, scheduler):
     items = {f"t{i}": i for i in range(6)}
     one = run_tasks(work.fail_on_odd, items, tmp_path / "one")
-    two = run_tasks(work.fail_on_odd, items, tmp_path / "two", workers=2)
+    two = run_tasks(work.fail_on_odd, items, tmp_path / "two", scheduler=scheduler)
     assert one.failed == two.failed
     assert one.done == two.done
     assert content(tmp_path / "one") == content(tmp_path / "two")
 
 
-def test_items_that_cannot_be_sent_fail_alone(tmp_path):
-    outcome = run_tasks(work.draw, {"a": lambda: 0, "b": 1}, tmp_path, workers=2)
+def test_items_that_cannot_be_sent_fail_alone(tmp_path, scheduler):
+    outcome = run_tasks(work.draw, {"a": lambda: 0, "b": 1}, tmp_path, scheduler=scheduler)
     assert outcome.done == ("b",)
     assert "a" in outcome.failed
 
 
-def test_more_tasks_than_the_scheduler_is_given_at_once(tmp_path, monkeypatch):
+def test_more_tasks_than_the_scheduler_is_given_at_once(tmp_path, monkeypatch, scheduler):
     most: list[int] = []
     real = cluster._Sent.come
 
@@ -127,15 +129,15 @@ def test_more_tasks_than_the_scheduler_is_given_at_once(tmp_path, monkeypatch):
     items = {f"t{i}": i for i in range(40)}
     for name, value, expected in (("WINDOW", 7, 7), ("BATCH", 3, 7), ("BYTES", 20, 4)):
         monkeypatch.setattr(cluster, name, value)
-        outcome = run_tasks(work.draw, items, tmp_path / name, workers=2)
+        outcome = run_tasks(work.draw, items, tmp_path / name, scheduler=scheduler)
         assert outcome.done == tuple(items)
         assert max(most) == expected
         most.clear()
 
 
-def test_many_items_are_sent_without_a_warning(tmp_path):
+def test_many_items_are_sent_without_a_warning(tmp_path, scheduler):
     items = {f"t{i}": (bytes(6_000_000), i) for i in range(4)}
-    assert len(run_tasks(work.second, items, tmp_path, workers=2).done) == 4
+    assert len(run_tasks(work.second, items, tmp_path, scheduler=scheduler).done) == 4
 
 
 def test_a_worker_that_dies_loses_nothing(tmp_path):
@@ -171,7 +173,7 @@ def test_a_client_that_is_killed_is_resumed(tmp_path):
     out = tmp_path / "out"
     process = subprocess.Popen(
         [sys.executable, str(tmp_path / "client.py"), str(out)],
-        env=os.environ | {"PYTHONPATH": str(TESTS)}, start_new_session=True,
+        env=ENVIRONMENT, start_new_session=True,
     )  # fmt: skip
     while len(list(out.glob("t*.json"))) < 5:
         assert process.poll() is None
@@ -213,7 +215,7 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
     (tmp_path / "client.py").write_text(script)
     done = subprocess.run(
         [sys.executable, str(tmp_path / "client.py"), str(tmp_path / "out")],
-        env=os.environ | {"PYTHONPATH": str(TESTS)}, capture_output=True, text=True, check=False,
+        env=ENVIRONMENT, capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 1
     assert 'put the call below `if __name__ == "__main__":`' in done.stderr

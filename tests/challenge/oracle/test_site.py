@@ -110,12 +110,13 @@ def test_draws_that_all_miss_the_dials_range_add_no_node() -> None:
     assert after.drawn == (*bank.drawn, (8, nowhere))
 
 
-def test_after_the_lab_the_field_is_standard_normal() -> None:
+@pytest.mark.parametrize("labs", [2, pytest.param(8, marks=pytest.mark.slow)])
+def test_after_the_lab_the_field_is_standard_normal(labs: int) -> None:
     """Whitened residuals of undisturbed fields are normal: chi-squared, over many stages."""
     rng, shares = np.random.default_rng(4), []
     for seed in range(8):
         stage = stage_with(WHEEL if seed % 2 else ("drawbar_pull",), "hard", seed)
-        for _ in range(4):
+        for _ in range(labs):
             lab = noisy(rng, stage.lab_readings, stage.lab_sd)
             residual = rng.standard_normal(len(stage.design.outputs) * stage.field.size)
             view = after_lab(stage, lab, residual)

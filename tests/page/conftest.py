@@ -1,1 +1,0 @@
-from figures.fixtures import density, drawbar, plate, rut, unconverged  # noqa: F401
