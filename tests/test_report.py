@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from calib.figures import plates
 from calib.manifest import file_hashes
 from calib.publish import publication
 from calib.report import write_report
@@ -92,8 +93,10 @@ def test_every_figure_has_its_pdf_and_its_size_in_print(report):
             assert min(abs(width - w) for w in (90, 140, 190)) < 0.3
 
 
-def test_pdfs_come_on_request_only(plate, tmp_path):
+def test_pdfs_come_on_request_only(plate, tmp_path, monkeypatch):
+    monkeypatch.setattr("calib.report.plates", lambda *a, **k: plates(*a, **k)[:1])
     report = write(plate, tmp_path / "rep")
+    assert list(report.rglob("*.png"))
     assert not list(report.rglob("*.pdf"))
     assert json.loads((report / "manifest.json").read_text())["pdf"] is False
 

@@ -51,6 +51,7 @@ def test_each_kind_has_a_table(serial):
     assert float(rows["diagnose"][0]["probability"]) == numbers["probability"]
 
 
+@pytest.mark.slow  # with workers that are killed the bytes are compared in every run
 def test_two_workers_write_the_same_bytes(site, serial, tmp_path):
     run_campaign(read_plan(site), tmp_path / "two", workers=2)
     assert content(tmp_path / "two") == content(serial)
@@ -152,8 +153,9 @@ def test_an_interrupted_campaign_has_a_summary(own):
     assert counts == {"done": 2, "failed": 0, "missing": 2}
 
 
-def test_results_of_other_inputs_are_not_mixed_in(own, monkeypatch):
+def test_results_of_other_inputs_are_not_mixed_in(own):
     plan, out = own
+    plan.write_text(CASES_ONLY.replace("*", "case-[01]"))
     run_campaign(read_plan(plan), out)
     field = plan.parent / "cases" / "case-1" / "field.csv"
     lines = field.read_text().splitlines()
