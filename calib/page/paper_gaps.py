@@ -10,7 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
-from calib.figures.export import pdf_bytes
+from calib.figures.export import pdf_bytes, png_size
 from calib.figures.gap import gap_plates
 from calib.figures.gap_rows import short_name
 from calib.figures.labels import short
@@ -18,7 +18,6 @@ from calib.figures.paper_gaps import gap_plate
 from calib.figures.plate import Plate
 from calib.gap.files import write_diagnosis
 from calib.models import get_model
-from calib.page.content import png_size
 from calib.page.diagnosis import gap_evidence, render_diagnosis
 from calib.page.gap_verdict import Tone, judge_gap, odds_text
 from calib.page.paper_checks import check_text
@@ -78,7 +77,7 @@ def write_gaps(
     Returns
     -------
     str
-        HTML for `calib.page.render_page`.
+        HTML for `calib.page.render.render_page`.
     """
     versions = manifest.get("versions", {})
     section = begin_gaps_section(results, folder, to_png, versions=versions, pdf=pdf, pool=HERE)
