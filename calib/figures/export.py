@@ -25,7 +25,7 @@ class _Canvas(FigureCanvasAgg):
     _parser: Any = None
 
     def get_renderer(self) -> RendererAgg:
-        renderer = super().get_renderer()
+        renderer: RendererAgg = super().get_renderer()  # type: ignore[no-untyped-call]
         _Canvas._parser = _Canvas._parser or renderer.mathtext_parser
         renderer.mathtext_parser = _Canvas._parser
         return renderer
