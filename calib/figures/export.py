@@ -6,7 +6,9 @@ Ticks are placed when a figure is drawn, so the style holds then as well.
 from __future__ import annotations
 
 import io
+from typing import Any
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg, RendererAgg
 from matplotlib.figure import Figure
 
 from calib.figures.plate import Plate
@@ -15,6 +17,18 @@ from calib.figures.style import style
 __all__ = ["pdf_bytes", "png", "png_bytes", "png_size"]
 
 _DPI = 150
+
+
+class _Canvas(FigureCanvasAgg):
+    """Its renderers share what they know of formulas: parsing one takes longer than drawing it."""
+
+    _parser: Any = None
+
+    def get_renderer(self) -> RendererAgg:
+        renderer: RendererAgg = super().get_renderer()  # type: ignore[no-untyped-call]
+        _Canvas._parser = _Canvas._parser or renderer.mathtext_parser
+        renderer.mathtext_parser = _Canvas._parser
+        return renderer
 
 
 def png(plate: Plate) -> bytes:
@@ -34,6 +48,7 @@ def png_bytes(figure: Figure) -> bytes:
 
     full, small = io.BytesIO(), io.BytesIO()
     # Bare pixels: as PNG they would be compressed only to be read again.
+    _Canvas(figure)
     with style():
         figure.savefig(full, format="raw", dpi=_DPI)
     width, height = (int(inches * _DPI) for inches in figure.get_size_inches())
