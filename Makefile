@@ -19,7 +19,7 @@ reference: $(READY)
 	NPY_DISABLE_CPU_FEATURES="X86_V4 AVX512_ICL AVX512_SPR" \
 	  $(BIN)/calib report --out reports/he2019 --overwrite --no-posteriors
 
-# A file's tests share what it samples, so a file stays in one process.
+# Tests that share what they sample stay in one process (tests/together.py).
 test: $(READY)
 	$(BIN)/python -m pytest -n auto --dist loadfile
 
