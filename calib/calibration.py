@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from types import MappingProxyType
 
 import numpy as np
 
@@ -71,7 +70,7 @@ class Calibration:
     summary: Mapping[str, ParameterSummary] = field(init=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "summary", MappingProxyType(_summarise(self)))
+        object.__setattr__(self, "summary", _summarise(self))
 
     def __repr__(self) -> str:
         state = "converged" if self.converged else "NOT CONVERGED"

@@ -6,11 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from calib.audit import Audit, Seeds, run_audit
+from calib.audit.convergence import begin_convergence
+from calib.datasets.published import PUBLISHED
 from calib.paper_gaps.cases import PaperGap
-from calib.paper_gaps.find import FoundGap, find_gaps
+from calib.paper_gaps.find import FoundGap, begin_gaps
 from calib.sampling.sampler import SamplerSettings
-from calib.study import Progress, Study, run_study
+from calib.study import Progress, Study, begin_study
 from calib.study_tasks import Task
+from calib.tasks.pool import HERE, Pool
 
 __all__ = ["Contents", "work_out"]
 
@@ -41,6 +44,7 @@ def work_out(
     audit: Seeds | None = None,
     progress: Progress | None = None,
     workers: int = 1,
+    pool: Pool = HERE,
 ) -> Contents:
     """Work everything out that a report shows.
 
@@ -57,17 +61,27 @@ def work_out(
     progress : callable, optional
         Called with what is being done, steps done and steps planned.
     workers : int
-        Processes for leaving rows out; the numbers do not depend on it.
+        Processes for leaving rows out, where outputs are worked out here.
+    pool : Pool, optional
+        Where outputs, gaps and searches are worked out, in any order. The numbers depend neither
+        on it nor on `workers`.
     """
-    study = run_study(tasks, seed, settings=settings, progress=progress, workers=workers)
-    found = find_gaps(seed, gaps=gaps, progress=progress) if gaps else ()
+    tell = progress or (lambda what, done, planned: None)
+    study = begin_study(
+        tasks, seed, pool, settings=settings, progress=progress,
+        workers=workers if pool.here else 1,
+    )  # fmt: skip
+    searches = begin_convergence(PUBLISHED, seed, audit, pool) if audit is not None else None
+    diagnoses = begin_gaps(seed, gaps, pool)
+    studied = study(tell)
     if audit is None:
-        return Contents(study, found, None)
-    rut = study.successes.get("rut_depth")
+        return Contents(studied, diagnoses(tell), None)
+    rut = studied.successes.get("rut_depth")
     audited = run_audit(
         seed,
         seeds=audit,
         rut_calibration=None if rut is None else rut.calibration,
         progress=progress,
+        genetic=searches,
     )
-    return Contents(study, found, audited)
+    return Contents(studied, diagnoses(tell), audited)

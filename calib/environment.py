@@ -1,12 +1,11 @@
 """What numbers depend on besides data, priors and seed: versions, processor, the code itself.
 
-Two runs give the same bits where these agree; where they do not, only where chance decides.
+Where these differ, numbers may be rounded otherwise; what that may change is stated in
+`calib.reproduce.tolerances`.
 """
 
 from __future__ import annotations
 
-import os
-import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,16 +13,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Environment", "code_sha256", "imitate_processor", "versions"]
+__all__ = ["Environment", "code_sha256", "versions"]
 
 _PACKAGES = (
     "terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-base", "arviz-stats", "xarray",
     "matplotlib", "corner", "pillow", "jinja2", "h5netcdf", "h5py",
 )  # fmt: skip
 _SOURCES = (".py", ".j2", ".css", ".toml")
-# Only these are ever switched off: no build of NumPy needs them, so it can do without.
-_OPTIONAL = re.compile(r"AVX512[A-Z0-9_]*|X86_V4")
-_SWITCH = "NPY_DISABLE_CPU_FEATURES"
 
 
 @dataclass(frozen=True)
@@ -35,8 +31,8 @@ class Environment:
     versions : mapping of str to str
         Of Python and of the packages that numbers and figures depend on.
     machine : mapping of str to str
-        Processor family, system, C library, linear algebra, and the vector instructions that
-        NumPy uses (``simd``) and could use but does not (``simd_unused``).
+        Processor family, system, C library, linear algebra with the kernels it chose for the
+        processor, and the vector instructions that NumPy uses.
     code : str
         SHA-256 over the source files of this package and its priors.
     """
@@ -81,6 +77,8 @@ def _machine() -> dict[str, str]:
 
     import numpy as np
 
+    from calib.threads import blas_kernels
+
     config: Any = np.show_config(mode="dicts")
     simd, blas = config["SIMD Extensions"], config["Build Dependencies"]["blas"]
     return {
@@ -88,8 +86,8 @@ def _machine() -> dict[str, str]:
         "system": platform.system(),
         "c_library": " ".join(platform.libc_ver()).strip(),
         "linear_algebra": f"{blas['name']} {blas['version']}",
+        "kernels": " ".join(blas_kernels()),
         "simd": " ".join([*simd.get("baseline", ()), *simd.get("found", ())]),
-        "simd_unused": " ".join(simd.get("not found", ())),
     }
 
 
@@ -115,22 +113,3 @@ def code_sha256() -> str:
         digest.update(f"{name}\0{len(content)}\0".encode())
         digest.update(content)
     return digest.hexdigest()
-
-
-def imitate_processor(machine: Mapping[str, Any]) -> None:
-    """Let NumPy do without the vector instructions that another machine did not use.
-
-    They round differently: with the same ones, a result of an older processor is computed again
-    bit for bit. Works until NumPy is imported; the user's own choice is left alone.
-
-    Parameters
-    ----------
-    machine : mapping
-        As `Environment.machine`.
-    """
-    if "numpy" in sys.modules or _SWITCH in os.environ:
-        return
-    unused = [name for name in str(machine.get("simd_unused", "")).split()
-              if _OPTIONAL.fullmatch(name)]  # fmt: skip
-    if unused:
-        os.environ[_SWITCH] = " ".join(unused)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.special import ndtri
 
-from calib.calibration import Calibration
 from calib.data import Table
 from calib.errors import CalibError
 from calib.headers import parse_header
@@ -17,6 +17,9 @@ from calib.models.base import Array
 from calib.scores import LEVELS
 from calib.streams import generator
 from calib.threads import one_thread
+
+if TYPE_CHECKING:
+    from calib.calibration import Calibration
 
 __all__ = [
     "Bands", "Prediction", "bands", "outside", "predict", "prediction_columns", "predictive_draws",

@@ -13,12 +13,15 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr, ndtri
 
 from calib.errors import CalibError
 from calib.models.base import Array
 
 __all__ = ["Prior", "Priors"]
+
+type Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -144,15 +147,23 @@ class Priors:
     def to_natural(self, t: Array) -> Array:
         """Return all parameters, fixed ones included, shape (k, d) to (k, d_all)."""
         t = np.atleast_2d(t)
-        full = np.empty((t.shape[0], len(self.entries)))
-        j = 0
-        for i, prior in enumerate(self.entries):
-            if prior.fixed:
-                full[:, i] = prior.loc
-            else:
-                full[:, i] = np.exp(np.minimum(t[:, j], 700.0)) if prior.log else t[:, j]
-                j += 1
+        fixed, free, logs = self._layout
+        if free is None:
+            full = t.copy()
+        else:
+            full = np.tile(fixed, (t.shape[0], 1))
+            full[:, free] = t
+        if logs is not None:
+            np.exp(np.minimum(full, 700.0), out=full, where=logs)
         return full
+
+    @cached_property
+    def _layout(self) -> tuple[Array, Mask | None, Mask | None]:
+        """Values of the fixed parameters, which are free (None: all), which on a log scale."""
+        fixed = np.array([p.loc for p in self.entries])
+        free = np.array([not p.fixed for p in self.entries])
+        logs = np.array([p.log and not p.fixed for p in self.entries])
+        return fixed, None if free.all() else free, logs if logs.any() else None
 
     def to_internal(self, natural: Array, margin: float = 1e-9) -> Array:
         """Map all natural parameters, shape (k, d_all), inside the bounds, shape (k, d)."""

@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from calib.audit import Audit
 from calib.data import write_table
 from calib.environment import Environment
-from calib.figures import Plate, plates
+from calib.figures import Plate
+from calib.figures.collect import plates
 from calib.figures.export import pdf_bytes, png
 from calib.folders import fresh_folder
 from calib.manifest import build_manifest, file_hashes, sha256
-from calib.page import render_page
 from calib.page.audit import write_audit
-from calib.page.paper_gaps import write_gaps
+from calib.page.paper_gaps import begin_gaps_section
+from calib.page.render import render_page
 from calib.paper_gaps.find import FoundGap
 from calib.paper_gaps.summary import summarise_gaps
 from calib.prior_files import default_prior_path
 from calib.publish import publication
 from calib.sampling.sampler import SamplerSettings
 from calib.store import to_datatree, write_netcdf
-from calib.study import Study
+from calib.study import OutputResult, Study
 from calib.summary import summarise
+from calib.tasks.pool import HERE, Pool
 
 __all__ = ["write_report"]
 
@@ -46,6 +48,7 @@ def write_report(
     audit: Audit | None = None,
     pdf: bool = False,
     progress: Progress | None = None,
+    pool: Pool = HERE,
 ) -> Path:
     """Write a report folder.
 
@@ -73,6 +76,8 @@ def write_report(
     pdf : bool
         Whether every figure also comes as PDF, for print.
     progress : callable, optional
+    pool : Pool, optional
+        Where figures are drawn.
 
     Returns
     -------
@@ -85,29 +90,20 @@ def write_report(
         If the folder exists or cannot be written.
     """
     tell = progress or (lambda what, done, planned: None)
+    successes = study.successes
     with fresh_folder(out, overwrite=overwrite) as folder:
         inputs = _copy_inputs(study, folder)
+        (folder / "figures").mkdir()
+        pieces = {
+            key: pool.submit(_write_output, key, result, folder, _embedded(study, key), pdf)
+            for key, result in successes.items()
+        }
+        versions = (environment or Environment.here()).versions
+        section = begin_gaps_section(gaps, folder, png, versions=versions, pdf=pdf, pool=pool)
         summary = summarise(study)
         if gaps:
             summary["paper_gaps"] = summarise_gaps(gaps)
         (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
-        drawn: dict[str, list[Plate]] = {}
-        images: dict[str, bytes] = {}
-        (folder / "figures").mkdir()
-        successes = study.successes
-        for i, (key, result) in enumerate(successes.items()):
-            tell("drawing figures", i, len(successes))
-            write_netcdf(to_datatree(result.calibration), folder / f"{key}.nc")
-            drawn[key] = plates(result, published=_embedded(study, key))
-            for plate in drawn[key]:
-                if plate.figure is not None:
-                    name = f"{key}_{plate.name}.png"
-                    images[name] = png(plate)
-                    (folder / "figures" / name).write_bytes(images[name])
-                    if pdf:
-                        file = folder / "figures" / f"{key}_{plate.name}.pdf"
-                        file.write_bytes(pdf_bytes(plate.figure))
-        tell("drawing figures", len(successes), len(successes))
         manifest = build_manifest(
             study, settings, command, inputs, title=title, environment=environment
         )
@@ -116,21 +112,27 @@ def write_report(
         for path, text in paper.files.items():
             (folder / path).parent.mkdir(exist_ok=True)
             (folder / path).write_text(text, encoding="utf-8")
-        gaps_html = None
         if gaps:
             manifest["paper_gaps"] = {r.gap.name: {"seed": r.found.seed} for r in gaps}
-            gaps_html = write_gaps(gaps, folder, png, manifest=manifest, pdf=pdf, progress=tell)
         if audit is not None:
             manifest["audit"] = {"seed": audit.seed, "seeds": asdict(audit.seeds)}
+        audit_html = write_audit(audit, folder) if audit is not None else None
+        drawn: dict[str, list[Plate]] = {}
+        images: dict[str, bytes] = {}
+        for i, (key, piece) in enumerate(pieces.items()):
+            tell("drawing figures", i, len(pieces))
+            drawn[key], shown = piece.result()
+            images |= shown
+        tell("drawing figures", len(pieces), len(pieces))
         page = render_page(
             study,
             drawn,
             images,
             manifest=manifest,
             title=title,
-            gaps_html=gaps_html,
+            gaps_html=section(tell) if gaps else None,
             reconstructed=any(r.task.table.label for r in study.results.values()),
-            audit_html=write_audit(audit, folder) if audit is not None else None,
+            audit_html=audit_html,
             paper=paper,
         )
         (folder / "index.html").write_text(page, encoding="utf-8")
@@ -142,6 +144,25 @@ def write_report(
         manifest["files"] = files
         (folder / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
     return Path(out) / "index.html"
+
+
+def _write_output(
+    key: str, result: OutputResult, folder: Path, published: bool, pdf: bool
+) -> tuple[list[Plate], dict[str, bytes]]:
+    """Write posterior and figures of an output; return what the page shows of the figures."""
+    write_netcdf(to_datatree(result.calibration), folder / f"{key}.nc")
+    drawn, images = [], {}
+    for plate in plates(result, published=published):
+        drawn.append(replace(plate, figure=None))
+        if plate.figure is None:
+            continue
+        name = f"{key}_{plate.name}.png"
+        images[name] = png(plate)
+        (folder / "figures" / name).write_bytes(images[name])
+        if pdf:
+            file = folder / "figures" / f"{key}_{plate.name}.pdf"
+            file.write_bytes(pdf_bytes(plate.figure))
+    return drawn, images
 
 
 def _embedded(study: Study, key: str) -> bool:

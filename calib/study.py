@@ -24,10 +24,13 @@ from calib.sampling.sampler import SamplerSettings
 from calib.sensitivity import Sensitivity, prior_sensitivity
 from calib.streams import generator
 from calib.study_tasks import Task, fitted_rows
+from calib.tasks.pool import HERE, Pool
 from calib.threads import one_thread
 from calib.validate import Validation, leave_one_out, validate_held_out
 
-__all__ = ["Failure", "OutputResult", "Study", "estimate_task", "run_study"]
+__all__ = [
+    "Failure", "OutputResult", "Study", "begin_study", "estimate_task", "run_study",
+]  # fmt: skip
 
 N_PRIOR_PREDICTIVE = 1000
 
@@ -95,7 +98,6 @@ class Study:
         return {k: r for k, r in self.results.items() if isinstance(r, Failure)}
 
 
-@one_thread()
 def run_study(
     tasks: Sequence[Task],
     seed: int,
@@ -103,6 +105,7 @@ def run_study(
     settings: SamplerSettings | None = None,
     progress: Progress | None = None,
     workers: int = 1,
+    pool: Pool = HERE,
 ) -> Study:
     """Work every task out.
 
@@ -115,15 +118,52 @@ def run_study(
         Called with what is being done, steps done and steps planned.
     workers : int
         Processes for leaving rows out; the numbers do not depend on it.
+    pool : Pool, optional
+        Where outputs are worked out; here, one after the other, by default.
     """
+    asked = begin_study(tasks, seed, pool, settings=settings, progress=progress, workers=workers)
+    return asked(progress or _silent)
+
+
+def begin_study(
+    tasks: Sequence[Task],
+    seed: int,
+    pool: Pool,
+    *,
+    settings: SamplerSettings | None = None,
+    progress: Progress | None = None,
+    workers: int = 1,
+) -> Callable[[Progress], Study]:
+    """Ask for every output, the parameters as for `run_study`; return what waits for them."""
     began = time.perf_counter()
-    results: dict[str, OutputResult | Failure] = {}
-    for task in tasks:
-        try:
-            results[task.output] = _work_out(task, seed, settings, progress or _silent, workers)
-        except Exception as error:  # whatever fails, the other outputs still come
-            results[task.output] = Failure(task, _without_folder(task, error))
-    return Study(results, seed, time.perf_counter() - began)
+    inner = progress if pool.here else None
+    pieces = {
+        t.output: pool.submit(_attempt, t, seed, settings, inner or _silent, workers) for t in tasks
+    }
+
+    def finish(tell: Progress) -> Study:
+        results = {}
+        for i, (key, piece) in enumerate(pieces.items()):
+            results[key] = piece.result()
+            if not pool.here:
+                tell("outputs", i + 1, len(pieces))
+        return Study(results, seed, time.perf_counter() - began)
+
+    return finish
+
+
+@one_thread()
+def _attempt(
+    task: Task,
+    seed: int,
+    settings: SamplerSettings | None,
+    progress: Progress,
+    workers: int,
+) -> OutputResult | Failure:
+    try:
+        return _work_out(task, seed, settings, progress, workers)
+    except Exception as error:  # whatever fails, the other outputs still come
+        return Failure(task, _without_folder(task, error))
 
 
 def _silent(what: str, done: int, planned: int) -> None:

@@ -8,7 +8,7 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-__all__ = ["one_thread"]
+__all__ = ["blas_kernels", "one_thread"]
 
 
 @contextmanager
@@ -19,6 +19,12 @@ def one_thread() -> Iterator[None]:
     """
     with _libraries().limit(limits=1, user_api="blas"):
         yield
+
+
+def blas_kernels() -> list[str]:
+    """Name the processors that the linear algebra's kernels are made for, as it chose them."""
+    found = {str(library.get("architecture", "")) for library in _libraries().info()}
+    return sorted(found - {""})
 
 
 @cache

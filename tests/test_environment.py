@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import getpass
 import json
-import os
 import platform
 import re
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import calib.environment as environment_module
-from calib.environment import Environment, imitate_processor
+from calib.environment import Environment
 
 
 def test_it_says_what_decides_the_bits_and_nothing_of_whose_computer_it_is() -> None:
@@ -83,38 +80,3 @@ def test_another_line_of_code_or_another_prior_is_another_code(
     assert code(b"x = 1\ny = 2\n", b"sd = 2\n") != one
     # A wheel has the same priors inside.
     assert code(b"x = 1\ny = 2\n", folder="calib/_priors") == one
-
-
-IMITATE = """
-import os, sys
-from calib.environment import imitate_processor
-assert "numpy" not in sys.modules
-imitate_processor({"simd_unused": sys.argv[1]})
-print(os.environ.get("NPY_DISABLE_CPU_FEATURES", ""))
-import numpy
-"""
-
-
-@pytest.mark.parametrize(
-    ("unused", "switched_off"),
-    [
-        ("X86_V4 AVX512_ICL AVX512_SPR", "X86_V4 AVX512_ICL AVX512_SPR"),
-        # Never what a build of NumPy may need: it would refuse to start.
-        ("X86_V2 SSE2 X86_V3 NEON AVX512F", "AVX512F"),
-        ("AVX512F;rm", ""),
-        ("", ""),
-    ],
-)
-def test_only_the_newest_instructions_are_done_without(unused: str, switched_off: str) -> None:
-    bare = {k: v for k, v in os.environ.items() if k != "NPY_DISABLE_CPU_FEATURES"}
-    ran = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", IMITATE, unused],
-        env=bare, capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert ran.stdout.strip() == switched_off
-
-
-def test_it_is_too_late_once_numpy_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("NPY_DISABLE_CPU_FEATURES", raising=False)
-    imitate_processor({"simd_unused": "X86_V4"})
-    assert "NPY_DISABLE_CPU_FEATURES" not in os.environ

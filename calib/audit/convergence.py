@@ -24,15 +24,19 @@ from calib.estimators import (
     GeneticSettings,
     PointEstimate,
     estimate,
-    minimise_genetic,
 )
+from calib.estimators.genetic import minimise_genetic_runs
+from calib.estimators.identified import hold_unidentified
+from calib.estimators.search import search_space
 from calib.models.base import Array
 from calib.problem import Problem, build_problem
 from calib.streams import generator
+from calib.tasks.pool import HERE, Pool
+from calib.threads import one_thread
 
 __all__ = [
-    "GeneticStudy", "Search", "Seeds", "convergence_findings", "printed_settings",
-    "study_convergence",
+    "GeneticStudy", "Search", "Seeds", "begin_convergence", "convergence_findings",
+    "printed_settings", "study_convergence",
 ]  # fmt: skip
 
 type _Progress = Callable[[str, int, int], None]
@@ -140,42 +144,66 @@ def study_convergence(
     progress : callable, optional
         Called with what is being done, runs done and runs planned.
     """
-    seeds = seeds or Seeds()
-    settings, table = printed_settings(published), load_he2019("drawbar_pull")
-    planned = seeds.by_pressure * len(published.genetic) + seeds.joint + seeds.printed_coordinates
-    done = 0
+    tell = progress or (lambda what, done, planned: None)
+    return begin_convergence(published, seed, seeds or Seeds(), HERE)(tell)
 
-    def tick() -> None:
-        nonlocal done
-        done += 1
-        if progress is not None:
-            progress("genetic algorithm over seeds", done, planned)
 
-    alone = {psi: _alone(table, psi) for psi in published.genetic}
-    by_pressure = {}
-    for psi, problem in alone.items():
-        text = published.genetic[psi].quality["cost"].text
-        labels = ("audit", "genetic", f"{psi}")
-        by_pressure[psi] = _repeat(
-            problem, f"{psi} psi", text, seed, labels, seeds.by_pressure, settings, tick
-        )
-    text = published.pressure.quality["cost"].text
-    joint = _repeat(
-        build_problem("magic_formula_pressure", table), "all pressures", text, seed,
-        ("audit", "genetic", "joint"), seeds.joint, settings, tick,
-    )  # fmt: skip
-    printed = []
-    for i in range(seeds.printed_coordinates):
-        printed.append(_in_printed_coordinates(published, table, seed, i, settings))
-        tick()
-    read_off = {
-        psi: estimate(problem, "geometric", generator(seed, "audit", "geometric"))
-        for psi, problem in alone.items()
-    }
-    return GeneticStudy(
-        settings, by_pressure, joint,
-        Search("all pressures, c1 to b0", joint.optimum, np.array(printed), text), read_off,
-    )  # fmt: skip
+def begin_convergence(
+    published: Published, seed: int, seeds: Seeds, pool: Pool
+) -> Callable[[_Progress], GeneticStudy]:
+    """Ask for the searches over seeds; return what waits for them."""
+    settings = printed_settings(published)
+    box = _printed_box(published)
+    printed = [
+        pool.submit(_in_printed_coordinates, box, seed, runs, settings)
+        for runs in _parts(seeds.printed_coordinates)
+    ]
+    joint_text = published.pressure.quality["cost"].text
+    joint = pool.submit(_repeat_joint, joint_text, seed, seeds.joint, settings)
+    by_pressure = {
+        psi: pool.submit(_repeat_alone, psi, table.quality["cost"].text, seed, seeds.by_pressure,
+                         settings)
+        for psi, table in published.genetic.items()
+    }  # fmt: skip
+    planned = seeds.by_pressure * len(by_pressure) + seeds.joint + seeds.printed_coordinates
+
+    def finish(tell: _Progress) -> GeneticStudy:
+        what = "genetic algorithm over seeds"
+        alone = {}
+        for i, (psi, piece) in enumerate(by_pressure.items()):
+            alone[psi] = piece.result()
+            tell(what, (i + 1) * seeds.by_pressure, planned)
+        together = joint.result()
+        tell(what, planned - seeds.printed_coordinates, planned)
+        costs = np.concatenate([piece.result() for piece in printed])
+        tell(what, planned, planned)
+        table = load_he2019("drawbar_pull")
+        read_off = {
+            psi: estimate(_alone(table, psi), "geometric", generator(seed, "audit", "geometric"))
+            for psi in published.genetic
+        }
+        return GeneticStudy(
+            settings, alone, together,
+            Search("all pressures, c1 to b0", together.optimum, costs, joint_text), read_off,
+        )  # fmt: skip
+
+    return finish
+
+
+def _parts(n: int) -> list[range]:
+    """Halves of some runs, which take longest, to be done side by side."""
+    return [range(n // 2), range(n // 2, n)] if n > 1 else [range(n)]
+
+
+def _repeat_alone(psi: int, text: str, seed: int, n: int, settings: GeneticSettings) -> Search:
+    problem = _alone(load_he2019("drawbar_pull"), psi)
+    return _repeat(problem, f"{psi} psi", text, seed, ("audit", "genetic", f"{psi}"), n, settings)
+
+
+def _repeat_joint(text: str, seed: int, n: int, settings: GeneticSettings) -> Search:
+    problem = build_problem("magic_formula_pressure", load_he2019("drawbar_pull"))
+    labels = ("audit", "genetic", "joint")
+    return _repeat(problem, "all pressures", text, seed, labels, n, settings)
 
 
 def _alone(table: Table, psi: int) -> Problem:
@@ -183,28 +211,35 @@ def _alone(table: Table, psi: int) -> Problem:
     return build_problem("magic_formula", rows, fixed={"Sh": 0.0, "Sv": 0.0})
 
 
+@one_thread()
 def _repeat(
     problem: Problem, name: str, text: str, seed: int, labels: tuple[str, ...], n: int,
-    settings: GeneticSettings, tick: Callable[[], None],
+    settings: GeneticSettings,
 ) -> Search:  # fmt: skip
     optimum = estimate(problem, "least_squares", generator(seed, *labels, "optimum")).cost
-    costs = []
-    for i in range(n):
-        rng = generator(seed, *labels, i)
-        costs.append(estimate(problem, "genetic", rng, settings=settings).cost)
-        tick()
+    space = search_space(hold_unidentified(problem)[0])
+    streams = [generator(seed, *labels, i) for i in range(n)]
+    runs = minimise_genetic_runs(space.cost, space.lower, space.upper, streams, settings)
+    costs = [run.cost for run in runs]
     return Search(name, min(optimum, *costs), np.array(costs), text)
 
 
-def _in_printed_coordinates(
-    published: Published, table: Table, seed: int, i: int, settings: GeneticSettings
-) -> float:
-    """Return the cost of one search in c1 to c9 and b0."""
+def _printed_box(published: Published) -> tuple[Array, Array]:
+    """Return the box of c1 to c9 and b0 that is searched, shapes (10,)."""
     printed = printed_coefficients(published)
     # The optimum has c9 positive, and so has Table 5 (`calib.audit.curvature_signs`).
     printed[8] = abs(printed[8])
     lower, upper = np.minimum(0.0, _BOX * printed), np.maximum(0.0, _BOX * printed)
     lower[9], upper[9] = _C_RANGE
+    return lower, upper
+
+
+@one_thread()
+def _in_printed_coordinates(
+    box: tuple[Array, Array], seed: int, runs: range, settings: GeneticSettings
+) -> Array:
+    """Return the costs of searches in c1 to c9 and b0, one for each run."""
+    table = load_he2019("drawbar_pull")
     pressures = np.unique(table["inflation_pressure_psi"])
     rows = [np.isclose(table["inflation_pressure_psi"], p) for p in pressures]
     slips = 100.0 * table["slip_ratio"][rows[0]]
@@ -214,8 +249,8 @@ def _in_printed_coordinates(
         apart = pressure_curves(x, pressures, slips) - observed
         return np.asarray(np.einsum("kmn,kmn->k", apart, apart))
 
-    rng = generator(seed, "audit", "genetic", "printed", i)
-    return float(minimise_genetic(cost, lower, upper, rng, settings).cost)
+    streams = [generator(seed, "audit", "genetic", "printed", i) for i in runs]
+    return np.array([run.cost for run in minimise_genetic_runs(cost, *box, streams, settings)])
 
 
 def convergence_findings(published: Published, study: GeneticStudy) -> list[Finding]:

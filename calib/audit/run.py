@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from calib.audit.convergence import (
     GeneticStudy,
     Seeds,
+    begin_convergence,
     convergence_findings,
-    study_convergence,
 )
 from calib.audit.curvature_signs import CurvatureStudy, curvature_signs, study_curvature_signs
 from calib.audit.density import density_findings
@@ -26,6 +26,7 @@ from calib.audit.table5_cost import cost_findings
 from calib.audit.untested import untested
 from calib.calibration import Calibration
 from calib.datasets.published import PUBLISHED, Published
+from calib.tasks.pool import HERE
 from calib.threads import one_thread
 
 __all__ = ["Audit", "run_audit"]
@@ -81,6 +82,7 @@ def run_audit(
     seeds: Seeds | None = None,
     rut_calibration: Calibration | None = None,
     progress: Progress | None = None,
+    genetic: Callable[[Progress], GeneticStudy] | None = None,
 ) -> Audit:
     """Audit the published figures.
 
@@ -96,6 +98,9 @@ def run_audit(
         Of modified_bekker on the reconstructed 18 and 42 psi rows; made here if it is not at hand.
     progress : callable, optional
         Called with what is being done, steps done and steps planned.
+    genetic : callable, optional
+        Waits for the genetic searches, which have been asked for
+        (`calib.audit.convergence.begin_convergence`); they are done here by default.
 
     Returns
     -------
@@ -103,7 +108,7 @@ def run_audit(
     """
     tell = progress or (lambda what, done, planned: None)
     repeated = seeds or Seeds()
-    genetic = study_convergence(published, seed, repeated, progress)
+    asked = genetic or begin_convergence(published, seed, repeated, HERE)
     inverse = study_inverse(
         published, seed, calibration=rut_calibration,
         progress=lambda done, planned: tell("rut depth: sampling", done, planned),
@@ -112,15 +117,16 @@ def run_audit(
     curvature = study_curvature_signs(published, seed)
     tell("testing printed figures", 1, 2)
     rounding, quality = study_rounding(published), study_quality(published)
+    searched = asked(tell)
     findings = [
         *density_findings(published),
-        *geometric_findings(published, genetic.read_off),
+        *geometric_findings(published, searched.read_off),
         *signs(published),
         *curvature_signs(published, curvature),
         pressure_unit(published),
-        *cost_findings(published, genetic.joint.optimum),
+        *cost_findings(published, searched.joint.optimum),
         *rounding_findings(published, rounding),
-        *convergence_findings(published, genetic),
+        *convergence_findings(published, searched),
         *rut_quality_findings(published, quality),
         *inverse_findings(published, inverse),
         untested(published),
@@ -129,5 +135,5 @@ def run_audit(
     order = list(Verdict)
     ranked = sorted(findings, key=lambda f: order.index(f.verdict))
     return Audit(
-        tuple(ranked), published, seed, rounding, curvature, quality, inverse, genetic, repeated
+        tuple(ranked), published, seed, rounding, curvature, quality, inverse, searched, repeated
     )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.parallel import Workers
+from calib.cli.parallel import CORES, Workers
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
@@ -53,7 +53,7 @@ def report(
     posteriors: Annotated[
         bool, typer.Option(help="Keep the posteriors, megabytes of netCDF, in the folder.")
     ] = True,
-    workers: Workers = 1,
+    workers: Workers = CORES,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from calib.audit import Seeds
@@ -68,6 +68,7 @@ def report(
     from calib.report import write_report
     from calib.sampling.sampler import SamplerSettings
     from calib.study_tasks import he2019_tasks, plan_tasks
+    from calib.tasks.pool import pool
 
     check_folder(out, overwrite=overwrite)
     if files:
@@ -83,16 +84,17 @@ def report(
         tasks = he2019_tasks()
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
-    with progress_bars() as tell:
+    with pool(workers) as side, progress_bars() as tell:
         # Beside the user's own data, the source's gaps and tables have no place.
         found = work_out(
             tasks, seed, settings=settings, gaps=() if files else paper_gaps(),
-            audit=None if files else Seeds(), progress=tell, workers=workers,
+            audit=None if files else Seeds(), progress=tell, workers=workers, pool=side,
         )  # fmt: skip
         study = found.study
         page = write_report(
             study, out, settings=settings, command=_command(), title=title, gaps=found.gaps,
             overwrite=overwrite, posteriors=posteriors, audit=found.audit, pdf=pdf, progress=tell,
+            pool=side,
         )  # fmt: skip
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.environment import imitate_processor
+from calib.cli.parallel import CORES, Workers
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -30,19 +30,20 @@ def check(
     json_to: Annotated[
         Path | None, typer.Option("--json", help="File for machines to read; - prints it.")
     ] = None,
+    workers: Workers = CORES,
 ) -> None:
     """Compute a report or a run again from its own folder and compare everything.
 
     Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
     """
-    _imitate(folder)
     from calib.cli.check_display import show
     from calib.cli.display import progress_bars
     from calib.reproduce.check import check as find
+    from calib.tasks.pool import pool
 
     try:
-        with progress_bars() as tell:
-            outcome = find(folder, quick=quick, progress=tell)
+        with pool(1 if quick else workers) as side, progress_bars() as tell:
+            outcome = find(folder, quick=quick, progress=tell, pool=side)
     except CalibError as error:
         if json_to is not None:
             document = {"folder": str(folder), "verdict": "cannot be checked", "reason": str(error),
@@ -55,16 +56,6 @@ def check(
         show(outcome, every=every)
     if outcome.exit_code:
         raise typer.Exit(outcome.exit_code)
-
-
-def _imitate(folder: Path) -> None:
-    """Before NumPy is imported: round as the machine did that made the folder, if this one can."""
-    for name in ("manifest.json", "run.json"):
-        try:
-            machine = json.loads((folder / name).read_text(encoding="utf-8"))["machine"]
-            imitate_processor(machine)
-        except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-            continue
 
 
 def _write(text: str, path: Path) -> None:

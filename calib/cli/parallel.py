@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,8 +10,10 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["Scheduler", "Workers", "announce", "resumable"]
+__all__ = ["CORES", "Scheduler", "Workers", "announce", "resumable"]
 
+# As many processes as there are cores, of which two bring most of what there is to gain.
+CORES = min(2, os.cpu_count() or 1)
 Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1)]
 Scheduler = Annotated[
     str | None,

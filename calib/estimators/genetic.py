@@ -7,7 +7,7 @@ Its mutations do not lead out of a local optimum that all of it has converged on
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,10 @@ from calib.estimators.search import Box, Found, SearchSpace, search_in_box
 from calib.models.base import Array
 from calib.problem import Problem
 
-__all__ = ["GeneticResult", "GeneticSettings", "estimate_genetic", "minimise_genetic"]
+__all__ = [
+    "GeneticResult", "GeneticSettings", "estimate_genetic", "minimise_genetic",
+    "minimise_genetic_runs",
+]  # fmt: skip
 
 # Generations whose random numbers are drawn in one call: the calls would cost more than the
 # numbers. Part of what a seed means; changing it changes the numbers of a run.
@@ -75,37 +78,87 @@ def minimise_genetic(
     Cabrera, Ortiz, Carabias & Simon (2004), doi:10.1076/vesd.41.2.109.26496, as Eqs 10-11 and
     Table 2 of He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003.
     """
+    return minimise_genetic_runs(cost, lower, upper, [rng], settings)[0]
+
+
+def minimise_genetic_runs(
+    cost: Callable[[Array], Array],
+    lower: Array,
+    upper: Array,
+    rngs: Sequence[np.random.Generator],
+    settings: GeneticSettings | None = None,
+) -> list[GeneticResult]:
+    """Minimise a cost in several runs at once, each by its own random numbers.
+
+    The model costs little more for all populations than for one. The parameters are those of
+    `minimise_genetic`; a run's result does not depend on the others.
+    """
     s = settings or GeneticSettings()
-    d = lower.size
-    population = lower + (upper - lower) * rng.random((s.NP, d))
-    costs = cost(population)
-    lead = int(costs.argmin())
-    history = [float(costs[lead])]
-    # An exact fit has no lowest cost to compare with: the costs' rounding then ends the run.
-    finite = costs[np.isfinite(costs)]
-    floor = 1e-24 * float(np.median(finite)) if finite.size else 0.0
-    calm = 0
+    runs = [_Run(lower, upper, rng, s) for rng in rngs]
+    going = list(runs)
+    new = cost(np.concatenate([run.population for run in going]))
+    for run, costs in zip(going, new.reshape(len(going), s.NP), strict=True):
+        run.begin(costs)
     for generation in range(s.max_iterations):
+        children = np.concatenate([run.descend(generation) for run in going])
+        new = cost(children).reshape(len(going), s.NP)
+        apart = children.reshape(len(going), s.NP, -1)
+        for run, mine, costs in zip(going, apart, new, strict=True):
+            run.select(mine, costs)
+        going = [run for run in going if run.calm < s.patience]
+        if not going:
+            break
+    return [run.result() for run in runs]
+
+
+class _Run:
+    """A population on its way."""
+
+    def __init__(
+        self, lower: Array, upper: Array, rng: np.random.Generator, settings: GeneticSettings
+    ) -> None:
+        self._lower, self._upper, self._rng, self._settings = lower, upper, rng, settings
+        self.population = lower + (upper - lower) * rng.random((settings.NP, lower.size))
+        self._costs: Array = np.empty(0)
+        self._history: list[float] = []
+        self._lead, self._floor, self.calm = 0, 0.0, 0
+
+    def begin(self, costs: Array) -> None:
+        """Take over the costs of the first population."""
+        self._costs = np.array(costs)
+        self._lead = int(costs.argmin())
+        self._history.append(float(costs[self._lead]))
+        # An exact fit has no lowest cost to compare with: the costs' rounding then ends the run.
+        finite = costs[np.isfinite(costs)]
+        self._floor = 1e-24 * float(np.median(finite)) if finite.size else 0.0
+
+    def descend(self, generation: int) -> Array:
+        """Make the descendants of a generation, shape (NP, d)."""
         row = generation % _BLOCK
         if row == 0:
-            block = draw_generations(rng, _BLOCK, d, s)
-        draws = GeneticDraws(*(part[row] for part in block))
-        children = descendants(population, population[lead], draws, s.F, lower, upper)
-        new = cost(children)
-        fitter = new < costs
-        population[fitter] = children[fitter]
-        costs[fitter] = new[fitter]
-        lead = int(costs.argmin())
-        lowest = float(costs[lead])
-        history.append(lowest)
-        alike = costs.max() <= lowest * (1.0 + s.tolerance) + floor < np.inf
-        calm = calm + 1 if alike else 0
-        if calm == s.patience:
-            break
-    n_evaluations = s.NP * len(history)
-    return GeneticResult(
-        population[lead].copy(), lowest, n_evaluations, np.array(history), calm == s.patience
-    )
+            self._block = draw_generations(self._rng, _BLOCK, self._lower.size, self._settings)
+        draws = GeneticDraws(*(part[row] for part in self._block))
+        best, F = self.population[self._lead], self._settings.F
+        return descendants(self.population, best, draws, F, self._lower, self._upper)
+
+    def select(self, children: Array, costs: Array) -> None:
+        """Let descendants replace their parents where they are fitter."""
+        fitter = costs < self._costs
+        self.population[fitter] = children[fitter]
+        self._costs[fitter] = costs[fitter]
+        self._lead = int(self._costs.argmin())
+        lowest = float(self._costs[self._lead])
+        self._history.append(lowest)
+        tolerated = lowest * (1.0 + self._settings.tolerance) + self._floor
+        self.calm = self.calm + 1 if self._costs.max() <= tolerated < np.inf else 0
+
+    def result(self) -> GeneticResult:
+        """Return where it ended."""
+        history = np.array(self._history)
+        return GeneticResult(
+            self.population[self._lead].copy(), self._history[-1],
+            self._settings.NP * history.size, history, self.calm == self._settings.patience,
+        )  # fmt: skip
 
 
 def estimate_genetic(

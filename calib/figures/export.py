@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from calib.figures.plate import Plate
 from calib.figures.style import style
 
-__all__ = ["pdf_bytes", "png", "png_bytes"]
+__all__ = ["pdf_bytes", "png", "png_bytes", "png_size"]
 
 _DPI = 150
 
@@ -33,13 +33,19 @@ def png_bytes(figure: Figure) -> bytes:
     from PIL import Image
 
     full, small = io.BytesIO(), io.BytesIO()
+    # Bare pixels: as PNG they would be compressed only to be read again.
     with style():
-        figure.savefig(full, format="png", dpi=_DPI)
-    full.seek(0)
-    with Image.open(full) as image:
-        # With its resolution, by which a text processor takes it over at its size in print.
-        image.convert("RGB").quantize(256).save(small, format="png", dpi=(_DPI, _DPI))
+        figure.savefig(full, format="raw", dpi=_DPI)
+    width, height = (int(inches * _DPI) for inches in figure.get_size_inches())
+    image = Image.frombytes("RGBA", (width, height), full.getvalue())
+    # With its resolution, by which a text processor takes it over at its size in print.
+    image.convert("RGB").quantize(256).save(small, format="png", dpi=(_DPI, _DPI))
     return small.getvalue()
+
+
+def png_size(image: bytes) -> tuple[int, int]:
+    """Return width and height of a PNG file, which keep the page from jumping while it loads."""
+    return int.from_bytes(image[16:20]), int.from_bytes(image[20:24])
 
 
 def pdf_bytes(figure: Figure) -> bytes:

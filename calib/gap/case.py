@@ -6,6 +6,8 @@ import difflib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,15 +16,16 @@ from numpy.typing import NDArray
 
 from calib.data import Table, read_table
 from calib.errors import CalibError
+from calib.gap.covariates import Covariates
 from calib.gap.effects import View
-from calib.gap.noise import At, noise_at_lab
+from calib.gap.noise import At, noise_at, noise_at_lab
 from calib.gap.oddities import oddities
+from calib.gap.simulated import PRESSURE, Simulated
 from calib.models import MODELS, get_model
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.priors import Priors
 from calib.problem import Problem, build_problem
-from calib.store import load_calibration
 
 __all__ = [
     "Campaigns", "Case", "OutputData", "campaigns", "case_files", "case_from_run", "read_case",
@@ -98,6 +101,30 @@ class Campaigns:
     def names(self) -> tuple[str, ...]:
         """Outputs in order."""
         return tuple(o.name for o in self.outputs)
+
+    @cached_property
+    def simulated(self) -> dict[str, Simulated]:
+        """Every output's simulator at the rows of both campaigns."""
+        tables = (self.case.lab, self.case.field)
+        recorded = np.concatenate([t[PRESSURE] for t in tables if PRESSURE in t] or [np.zeros(1)])
+        pressures = float(recorded.min()), float(recorded.max())
+        return {o.name: Simulated(o, self.view, pressures) for o in self.outputs}
+
+    @cached_property
+    def covariates(self) -> Covariates:
+        """Conditions scaled to the range of both campaigns."""
+        return Covariates(self)
+
+    @cached_property
+    def at_rows(self) -> dict[str, At]:
+        """What the noise of every output's lab rows, then field rows, depends on."""
+        field = noise_at(self.view)
+        return {o.name: self.lab_at[o.name] + field.rows(o.rows) for o in self.outputs}
+
+    @cached_property
+    def observed(self) -> Array:
+        """Lab rows, then field rows, of one output after the other, on the responses' scales."""
+        return np.concatenate([v for o in self.outputs for v in (o.problem.response, o.field)])
 
     def at(self, table: Table) -> View:
         """Return the view of other conditions, with the same references."""
@@ -206,7 +233,8 @@ def case_from_run(run: Path, field: Path) -> Case:
     CalibError
         If either cannot be read.
     """
-    problem = load_calibration(run).problem
+    # Needs what writes and reads run folders, and that a sampler: no other case does.
+    problem = import_module("calib.store").load_calibration(run).problem
     model = problem.bound.model
     output = next(key for key, column in OUTPUTS.items() if column == model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.gap.case import Campaigns
 from calib.gap.effects import View
 from calib.models.base import Array
+
+if TYPE_CHECKING:
+    from calib.gap.case import Campaigns
 
 __all__ = ["OVER", "Covariates"]
 
@@ -34,6 +37,7 @@ class Covariates:
 
     def __init__(self, data: Campaigns) -> None:
         self.data = data
+        self._of_field: dict[str, Array | None] = {}
 
     @cached_property
     def _ranges(self) -> dict[str, Array]:
@@ -50,6 +54,14 @@ class Covariates:
 
     def scaled(self, view: View, name: str) -> Array | None:
         """A condition, or its logarithm, shape (n,); None where it is lacking or constant."""
+        if view.conditions is not self.data.view.conditions:
+            return self._scaled(view, name)
+        # The field's own, which all hypotheses ask for, are worked out once.
+        if name not in self._of_field:
+            self._of_field[name] = self._scaled(view, name)
+        return self._of_field[name]
+
+    def _scaled(self, view: View, name: str) -> Array | None:
         if name not in view.conditions:
             return None
         values, reference = view.conditions[name], self._ranges[name]

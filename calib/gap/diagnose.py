@@ -16,7 +16,7 @@ from calib.gap.next_measurement import NextMeasurement, next_measurements
 from calib.gap.outliers import rank_without_outliers, without_outputs
 from calib.gap.shrink import FreshPrediction, Shrink, predict_fresh, shrink
 from calib.gap.where import Region, RowGap, regions, row_gaps
-from calib.gap.which import Ranking, rank
+from calib.gap.which import Ranking, calibrate_lab, rank
 from calib.models.base import Array
 from calib.streams import generator
 from calib.threads import one_thread
@@ -155,12 +155,13 @@ def _left_out(
     n = len(data.case.field)
     order = generator(seed, "gap", "folds").permutation(n)
     predicted = truth.means
+    lab = calibrate_lab(data, seed)  # whatever is left out of the field
     for fold in range(_FOLDS):
         rows = order[fold::_FOLDS]
         if min(np.setdiff1d(o.rows, rows).size for o in data.outputs) < MIN_FIELD_ROWS:
             return truth.means
         part = campaigns(without_outputs(data.case, {o.name: rows for o in data.outputs}))
-        found = mixture(part, rank(part, seed, effects=effects), seed).at(data.view)
+        found = mixture(part, rank(part, seed, effects=effects, lab=lab), seed).at(data.view)
         for name, values in found.means.items():
             predicted[name][rows] = values[rows]
     return predicted

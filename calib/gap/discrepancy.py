@@ -8,13 +8,12 @@ import numpy as np
 from scipy.special import expit
 
 from calib.gap.case import Campaigns
-from calib.gap.covariates import Covariates
 from calib.gap.effects import View
 from calib.gap.effects.base import DRAWBAR, RUT
 from calib.gap.hypothesis import Hypothesis, Setting
 from calib.models.base import Array
 
-__all__ = ["SETTINGS", "THRESHOLDS", "Discrepancy"]
+__all__ = ["SETTINGS", "THRESHOLDS", "Bases", "Discrepancy"]
 
 # Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
 THRESHOLDS = (-0.85, 0.9)
@@ -25,6 +24,10 @@ SETTINGS: tuple[Setting, ...] = ("pressure", "speed", "passes", "water")
 _WAVES = 12
 
 
+# Basis (n, m) and the sds of its coefficients (m,), by what they depend on.
+type Bases = dict[tuple[str, str, float, str | None], tuple[Array, Array]]
+
+
 class Discrepancy:
     """What a hypothesis's free discrepancy may look like on a pair of campaigns.
 
@@ -32,25 +35,30 @@ class Discrepancy:
     ----------
     data : Campaigns
     hypothesis : Hypothesis
-    covariates : Covariates
     lab_mode : mapping of str to ndarray
         Internal parameters of the simulators as the lab calibrated them; for a discrepancy that
         varies with the level of the output.
+    bases : dict, optional
+        Where to keep what other discrepancies of the same case and `lab_mode` share.
     """
 
     def __init__(
         self,
         data: Campaigns,
         hypothesis: Hypothesis,
-        covariates: Covariates,
         lab_mode: Mapping[str, Array],
+        bases: Bases | None = None,
     ) -> None:
         self.data, self.hypothesis = data, hypothesis
-        self.covariates, self.lab_mode = covariates, lab_mode
+        self.covariates, self.lab_mode = data.covariates, lab_mode
         # Worked out once for the field rows, which every step of a fit predicts.
-        self._of_field = {
-            name: self._smooth_basis(data.view, name) for name in hypothesis.smooth_outputs
-        }
+        h, bases = hypothesis, {} if bases is None else bases
+        self._of_field: dict[str, tuple[Array, Array]] = {}
+        for name in h.smooth_outputs:
+            key = (name, h.smooth_over, h.smooth_decay, h.onset_over)
+            if key not in bases:
+                bases[key] = self._smooth_basis(data.view, name)
+            self._of_field[name] = bases[key]
 
     def sds(self, output: str) -> Array:
         """Relative prior sds of an output's amplitudes, shape (m,)."""

@@ -12,15 +12,14 @@ The vector psi of a hypothesis stacks, all with (truncated) normal or uniform pr
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from calib.gap.case import Campaigns, OutputData
-from calib.gap.covariates import Covariates
-from calib.gap.discrepancy import THRESHOLDS, Discrepancy
-from calib.gap.effects import View
+from calib.gap.case import Campaigns
+from calib.gap.discrepancy import THRESHOLDS, Bases, Discrepancy
+from calib.gap.effects import Effect, View
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.shifts import ShiftMap, shift_map
 from calib.models.base import Array
@@ -33,16 +32,16 @@ __all__ = ["Forward"]
 # effects in 690 single-effect cases of `calib challenge make` (seeds 271828, 577215, 314159,
 # 173205, 602214), pull and rut: 0.13 and 0.12 over slip, 0.08 and 0.06 its bend, 0.12 and 0.06
 # over pressure, 0.28 and 0.16 where a gauge's error takes a simulator to pressures it was not
-# fitted at (less since it goes on straight there, see `_predict_beyond`), 0.18 and 0.17 over what
-# the effect is named for; density: 0.16 over cone index, 0.06 over water content.
+# fitted at (less since it goes on straight there, see `Simulated.predict_beyond`), 0.18 and 0.17
+# over what the effect is named for; density: 0.16 over cone index, 0.06 over water content.
 FORM_ERROR = {
     "size": 0.2, "slip": 0.15, "bend": 0.1, "pressure": 0.13, "cone": 0.15, "water": 0.1,
     "shape": 0.18, "extrapolation": 0.2,
 }  # fmt: skip
 # Inadequacy of a simulator at the end of the lab's range of a condition, in noise sds.
 MISFIT = 1.0
-MISFIT_OUTPUTS = ("bulk_density",)
-_PRESSURE = "inflation_pressure_psi"
+# A prediction without a value is none, whatever the warnings.
+_SILENT = np.errstate(all="ignore")
 
 
 class Forward:
@@ -60,6 +59,8 @@ class Forward:
         varies with the level of the output.
     shift : ShiftMap, optional
         What the coordinates of a shift do, as `shift_map` once gave.
+    bases : dict, optional
+        Where to keep what free discrepancies of the same case and `lab_mode` share.
     """
 
     def __init__(
@@ -69,83 +70,59 @@ class Forward:
         noise: Mapping[str, float],
         lab_mode: Mapping[str, Array] | None = None,
         shift: ShiftMap | None = None,
+        bases: Bases | None = None,
     ) -> None:
         self.data = data
         self.hypothesis = hypothesis
         self.noise = noise
+        self._simulated = data.simulated
         entries: list[Prior] = []
-        self.theta_slices: dict[str, slice] = {}
-        for o in data.outputs:
-            self.theta_slices[o.name] = _append(entries, o.priors.free, o.name)
-        self.misfit_slices: dict[str, slice] = {}
-        self._misfit_ranges: dict[str, tuple[tuple[str, float, float], ...]] = {}
-        for o in data.outputs:
-            self._misfit_ranges[o.name] = ranges = _misfit_ranges(o)
-            m = len(ranges) * (len(ranges) + 1) // 2
-            bends = [_normal("misfit", MISFIT * noise[o.name])] * m
-            self.misfit_slices[o.name] = _append(entries, bends, o.name)
+        self.theta_slices = {
+            name: _append(entries, s.priors) for name, s in self._simulated.items()
+        }
+        self.misfit_slices = {
+            name: _append(entries, [_normal(f"{name}.misfit", MISFIT * noise[name])] * s.n_bends)
+            for name, s in self._simulated.items()
+        }
         self.phi_slices = [
-            _append(entries, p.free, e.name)
+            _append(entries, [replace(q, name=f"{e.name}.{q.name}") for q in p.free])
             for e, p in zip(hypothesis.effects, hypothesis.effect_priors, strict=True)
         ]
-        self.covariates = Covariates(data)
-        self.discrepancy = Discrepancy(data, hypothesis, self.covariates, lab_mode or {})
-        # Worked out once for the lab and field rows, which every step of a fit predicts.
-        self._field_conditions = {o.name: _selected(o, data.view) for o in data.outputs}
-        self._all_conditions = {
-            o.name: {
-                name: np.concatenate([o.problem.conditions[name], values])
-                for name, values in self._field_conditions[o.name].items()
-            }
-            for o in data.outputs
-        }
-        self._prepared = {
-            o.name: [
-                (conditions, o.problem.bound.prepare(conditions))
-                for conditions in (
-                    o.problem.conditions,
-                    self._field_conditions[o.name],
-                    self._all_conditions[o.name],
-                )
-            ]
-            for o in data.outputs
-        }
-        campaigns = (data.case.lab, data.case.field)
-        recorded = np.concatenate(
-            [t[_PRESSURE] for t in campaigns if _PRESSURE in t] or [np.zeros(1)]
-        )
-        self._pressures = float(recorded.min()), float(recorded.max())
+        self.covariates = data.covariates
+        self.discrepancy = Discrepancy(data, hypothesis, lab_mode or {}, bases)
         self._field_form, sds = self._form_basis(data.view)
         self.form_slices: dict[str, slice] = {}
         for o in data.outputs:
-            errors = [_normal("form", sd) for sd in sds]
-            self.form_slices[o.name] = _append(entries, errors, o.name)
+            errors = [_normal(f"{o.name}.form", sd) for sd in sds]
+            self.form_slices[o.name] = _append(entries, errors)
         self.shift_slice = slice(len(entries), len(entries))
         self.shift: ShiftMap | None = None
         if hypothesis.shift > 0.0:
             current, relative = shift_map(data.outputs, hypothesis.shift_as)
             self.shift = current if shift is None else shift
-            shifts = [_normal("shift", hypothesis.shift * sd) for sd in relative]
-            self.shift_slice = _append(entries, shifts, "field")
+            shifts = [_normal("field.shift", hypothesis.shift * sd) for sd in relative]
+            self.shift_slice = _append(entries, shifts)
         self.smooth_slices: dict[str, slice] = {}
         for o in data.outputs:
             if o.name in hypothesis.smooth_outputs:
                 sd = hypothesis.smooth * noise[o.name]
-                amplitudes = [_normal("smooth", sd * w) for w in self.discrepancy.sds(o.name)]
-                self.smooth_slices[o.name] = _append(entries, amplitudes, o.name)
+                weights = self.discrepancy.sds(o.name).tolist()
+                amplitudes = [_normal(f"{o.name}.smooth", sd * w) for w in weights]
+                self.smooth_slices[o.name] = _append(entries, amplitudes)
         self.threshold = len(entries)
         if hypothesis.onset_over is not None:
             entries.append(_uniform("threshold", *THRESHOLDS))
         self.priors = Priors(tuple(entries))
 
     @property
+    def n_shared(self) -> int:
+        """Length of the first part of psi, which is that of the simulators."""
+        return int(max(part.stop for part in self.misfit_slices.values()))
+
+    @property
     def n_dim(self) -> int:
         """Length of psi."""
         return len(self.priors.free)
-
-    def _conditions(self, o: OutputData, view: View) -> dict[str, Array]:
-        same = view.conditions is self.data.view.conditions
-        return self._field_conditions[o.name] if same else _selected(o, view)
 
     def _form(self, view: View) -> Array:
         same = view.conditions is self.data.view.conditions
@@ -180,101 +157,61 @@ class Forward:
             return np.empty((n, 0)), []
         return np.stack([b for _, b in basis], axis=1), [FORM_ERROR[kind] for kind, _ in basis]
 
-    def theta(self, psi: Array, output: str, *, field: bool) -> Array:
-        """Natural simulator parameters, shape (k, d)."""
-        index = [o.name for o in self.data.outputs].index(output)
-        o = self.data.outputs[index]
-        t = psi[:, self.theta_slices[output]]
-        if field and self.shift is not None:
-            t = t + psi[:, self.shift_slice] @ self.shift.parameters[output].T
-        return o.priors.to_natural(t)
-
-    def _predict(
-        self, o: OutputData, theta: Array, psi: Array, conditions: Mapping[str, Array]
-    ) -> Array:
+    def _predict(self, psi: Array, output: str, conditions: Mapping[str, Array]) -> Array:
         """Simulator and its inadequacy at conditions, on the scale of the response."""
-        prepared = (rows for known, rows in self._prepared[o.name] if known is conditions)
-        location = o.problem.bound.location(theta, conditions, next(prepared, None))
-        misfit = psi[:, self.misfit_slices[o.name]]
-        if not misfit.shape[1]:
-            return location
-        scaled = [
-            np.clip((_LOGS.get(name, _same)(conditions[name]) - mid) / half, -2.5, 2.5)
-            for name, mid, half in self._misfit_ranges[o.name]
-        ]
-        column = 0
-        for i, u in enumerate(scaled):
-            for j, v in enumerate(scaled[: i + 1]):
-                bend = u * v - (1.0 / 3.0 if i == j else 0.0)
-                location = location + misfit[:, column : column + 1] * bend
-                column += 1
-        return location
+        t, misfit = psi[:, self.theta_slices[output]], psi[:, self.misfit_slices[output]]
+        return self._simulated[output].predict(t, misfit, conditions)
 
-    def _predict_beyond(
-        self, o: OutputData, theta: Array, psi: Array, conditions: Mapping[str, Array]
-    ) -> Array:
-        """Predict where an effect may have taken the pressure beyond those of both campaigns.
-
-        From there on the prediction goes on straight, as from the one end of their range to the
-        other: the parabolas of the Magic Formula's coefficients are not to be trusted outside. Of
-        33 true gauge errors (four seeds of the challenge) the rms error is 0.95 noise sds so, 1.5
-        along the parabolas.
-        """
-        pressure = conditions.get(_PRESSURE)
-        low, high = self._pressures
-        if pressure is None or low == high:
-            return self._predict(o, theta, psi, conditions)
-        inside = np.clip(pressure, low, high)
-        location = self._predict(o, theta, psi, {**conditions, _PRESSURE: inside})
-        beyond = (pressure - inside) / (high - low)
-        if not beyond.any():
-            return location
-        ends = [
-            self._predict(o, theta, psi, {**conditions, _PRESSURE: np.full_like(pressure, end)})
-            for end in (low, high)
-        ]
-        return np.asarray(location + (ends[1] - ends[0]) * beyond)
-
+    @_SILENT
     def lab(self, psi: Array) -> dict[str, Array]:
         """Predict the lab rows on the scale of the response, shapes (k, n_lab)."""
-        return {
-            o.name: self._predict(
-                o, self.theta(psi, o.name, field=False), psi, o.problem.conditions
-            )
-            for o in self.data.outputs
-        }
+        return {name: self._predict(psi, name, s.lab) for name, s in self._simulated.items()}
 
+    @_SILENT
     def simulator(self, psi: Array, view: View) -> dict[str, Array]:
         """Predict with the calibrated simulator alone, on the scale of the response."""
         return {
-            o.name: self._predict(
-                o, self.theta(psi, o.name, field=False), psi, self._conditions(o, view)
-            )
-            for o in self.data.outputs
+            name: self._predict(psi, name, s.conditions(view))
+            for name, s in self._simulated.items()
         }
 
+    @_SILENT
     def campaigns(self, psi: Array) -> tuple[dict[str, Array], dict[str, Array]]:
         """Predict the lab rows and the field rows, as `lab` and `field` do."""
         if self.shift is not None:
             return self.lab(psi), self.field(psi, self.data.view)
+        lab, plain = self.plain(psi)
+        return lab, self.departed(psi, self.data.view, plain)
+
+    @_SILENT
+    def plain(self, psi: Array) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Predict the lab rows and the field rows by the simulators alone.
+
+        Of psi only the first `n_shared` coordinates are used, which all hypotheses have in common.
+        """
         # One simulator for both: half as many calls, of which a fit makes thousands.
         lab, plain = {}, {}
         for o in self.data.outputs:
-            theta = self.theta(psi, o.name, field=False)
-            both = self._predict(o, theta, psi, self._all_conditions[o.name])
+            both = self._predict(psi, o.name, self._simulated[o.name].both)
             n_lab = o.problem.response.size
             lab[o.name], plain[o.name] = both[:, :n_lab], both[:, n_lab:]
-        return lab, self._departed(psi, self.data.view, plain)
+        return lab, plain
 
+    @_SILENT
     def field(self, psi: Array, view: View) -> dict[str, Array]:
         """Predict field rows with the hypothesis in force, on the scale of the response."""
+        if self.shift is None:
+            return self.departed(psi, view, self.simulator(psi, view))
         plain: dict[str, Array] = {}
-        for o in self.data.outputs:
-            theta = self.theta(psi, o.name, field=True)
-            plain[o.name] = self._predict(o, theta, psi, self._shifted(psi, o, view))
-        return self._departed(psi, view, plain)
+        shift = psi[:, self.shift_slice]
+        for name, s in self._simulated.items():
+            t = psi[:, self.theta_slices[name]] + shift @ self.shift.parameters[name].T
+            conditions = self._shifted(shift, s.conditions(view))
+            plain[name] = s.predict(t, psi[:, self.misfit_slices[name]], conditions)
+        return self.departed(psi, view, plain)
 
-    def _departed(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
+    @_SILENT
+    def departed(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
         """Add effects and discrepancies to what the simulators predict."""
         if self.hypothesis.effects:
             plain = self._with_effects(psi, view, plain)
@@ -284,84 +221,55 @@ class Forward:
                 plain[name] = plain[name] + self.discrepancy.at(psi[:, part], threshold, view, name)
         return plain
 
-    def _shifted(self, psi: Array, o: OutputData, view: View) -> dict[str, Array]:
+    def _shifted(self, shift: Array, conditions: dict[str, Array]) -> dict[str, Array]:
         """Conditions as they truly are: with a shift the zero of slip is another."""
-        conditions = self._conditions(o, view)
-        if (
-            self.shift is None
-            or not self.shift.radius_error.any()
-            or "slip_ratio" not in conditions
-        ):
+        radius_error = np.zeros(0) if self.shift is None else self.shift.radius_error
+        if not radius_error.any() or "slip_ratio" not in conditions:
             return conditions
-        error = psi[:, self.shift_slice] @ self.shift.radius_error
+        error = shift @ radius_error
         slip = 1.0 - (1.0 - conditions["slip_ratio"]) * (1.0 - error[:, None])
         return {**conditions, "slip_ratio": slip}
 
     def _with_effects(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
-        outputs = {o.name: o for o in self.data.outputs}
-        base = {name: outputs[name].problem.bound.from_response(v) for name, v in plain.items()}
+        base = {o.name: o.problem.bound.from_response(plain[o.name]) for o in self.data.outputs}
         view = replace(view, base=base)
-        phis = [
-            p.to_natural(psi[:, s])
-            for p, s in zip(self.hypothesis.effect_priors, self.phi_slices, strict=True)
-        ]
+        acting = [
+            (effect, p.to_natural(psi[:, s]))
+            for effect, p, s in zip(
+                self.hypothesis.effects, self.hypothesis.effect_priors, self.phi_slices,
+                strict=True,
+            )
+        ]  # fmt: skip
         form = self._form(view)
-        changed = {}
-        for name, o in outputs.items():
-            original = self._conditions(o, view)
-            conditions = original
-            acting = [
-                (effect, phi)
-                for effect, phi in zip(self.hypothesis.effects, phis, strict=True)
-                if name in effect.outputs
-            ]
-            for effect, phi in acting:
-                conditions = effect.on_conditions(phi, name, conditions, view)
-            location = plain[name]
-            if conditions is not original:
-                theta = self.theta(psi, name, field=True)
-                location = self._predict_beyond(o, theta, psi, conditions)
-            for effect, phi in acting:
-                location = effect.on_output(phi, name, location, view)
-            if form.shape[1]:
-                factor = 1.0 + psi[:, self.form_slices[name]] @ form.T
-                location = plain[name] + (location - plain[name]) * factor
-            changed[name] = location
-        return changed
+        return {name: self._changed(psi, name, view, acting, plain[name], form) for name in plain}
+
+    def _changed(
+        self, psi: Array, name: str, view: View, effects: Sequence[tuple[Effect, Array]],
+        plain: Array, form: Array,
+    ) -> Array:  # fmt: skip
+        """One output with the effects in it; effects with their natural parameters."""
+        acting = [(effect, phi) for effect, phi in effects if name in effect.outputs]
+        if not acting:
+            return plain
+        simulated = self._simulated[name]
+        conditions = original = simulated.conditions(view)
+        for effect, phi in acting:
+            conditions = effect.on_conditions(phi, name, conditions, view)
+        location = plain
+        if conditions is not original:
+            t, misfit = psi[:, self.theta_slices[name]], psi[:, self.misfit_slices[name]]
+            location = simulated.predict_beyond(t, misfit, conditions)
+        for effect, phi in acting:
+            location = effect.on_output(phi, name, location, view)
+        if form.shape[1]:
+            factor = 1.0 + psi[:, self.form_slices[name]] @ form.T
+            location = plain + (location - plain) * factor
+        return location
 
 
-def _selected(o: OutputData, view: View) -> dict[str, Array]:
-    return o.problem.bound.model.select(view.conditions)
-
-
-def _same(values: Array) -> Array:
-    return values
-
-
-def _ln(values: Array) -> Array:
-    return np.asarray(np.log(np.maximum(values, 1e-6)))
-
-
-# Conditions whose effect is even on the logarithm.
-_LOGS = {"cone_index_kpa": _ln, "average_ground_pressure_kpa": _ln}
-
-
-def _misfit_ranges(o: OutputData) -> tuple[tuple[str, float, float], ...]:
-    """Conditions over which a simulator may be bent, with middle and half range in the lab."""
-    if o.name not in MISFIT_OUTPUTS:
-        return ()
-    found = []
-    for name, values in o.problem.conditions.items():
-        values = _LOGS.get(name, _same)(values)
-        half = 0.5 * float(np.ptp(values))
-        if half > 1e-9 * max(1.0, float(np.abs(values).max())):
-            found.append((name, 0.5 * float(values.max() + values.min()), half))
-    return tuple(found)
-
-
-def _append(entries: list[Prior], new: list[Prior] | tuple[Prior, ...], prefix: str) -> slice:
+def _append(entries: list[Prior], new: Sequence[Prior]) -> slice:
     start = len(entries)
-    entries += [replace(p, name=f"{prefix}.{p.name}") for p in new]
+    entries += new
     return slice(start, len(entries))
 
 

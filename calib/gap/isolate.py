@@ -9,11 +9,11 @@ the smallest size that is told from noise, and the effects that look alike.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import logsumexp
 
 from calib.gap.case import Campaigns
 from calib.gap.forward import Forward
@@ -126,11 +126,15 @@ def smallest_shown(prior: Array, sd: float, ln_odds: float) -> float:
     if not relevant.size:
         return float("inf")
     estimates = np.linspace(0.0, relevant.max() + 4.0 * sd, 2000)
-    exponent = (2.0 * estimates[:, None] * relevant - np.square(relevant)) / (2.0 * sd**2)
-    reached = logsumexp(exponent, axis=1) - np.log(relevant.size) >= ln_odds
-    if not reached.any():
-        return float("inf")
-    return float(estimates[int(np.argmax(reached))]) + _Z_POWER * sd
+
+    def reached(estimate: float) -> bool:
+        exponent = relevant * (estimate - 0.5 * relevant) / sd**2
+        top = float(exponent.max())
+        return top + float(np.log(np.exp(exponent - top).mean())) >= ln_odds
+
+    # The evidence grows with the estimate: the first that reaches it is found by halving.
+    first = bisect_left(estimates, True, key=reached)
+    return float(estimates[first]) + _Z_POWER * sd if first < estimates.size else float("inf")
 
 
 def _likeness(left: Mapping[str, Array]) -> dict[tuple[str, str], float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,13 @@ class At:
 
     slip: Array
     softness: Array
+
+    @cached_property
+    def growths(self) -> tuple[Array, Array]:
+        """Growth of the noise for every rho and kappa, (rho, kappa, n); of its log the sums."""
+        kappas = KAPPA if np.ptp(self.softness) else KAPPA[:1]
+        growth = np.array([[_growth(self, rho, kappa) for kappa in kappas] for rho in RHO])
+        return growth, np.log(growth).sum(axis=2)
 
     def rows(self, rows: NDArray[np.int64]) -> At:
         """Some of the rows."""
@@ -102,13 +110,11 @@ def most_probable(squared: Array, at: At) -> Noise:
         Squares of the residuals.
     at : At
     """
-    kappas = KAPPA if np.ptp(at.softness) else KAPPA[:1]
-    by_slip = 1.0 + RHO[:, None] * np.maximum(at.slip, 0.0)
-    growth = by_slip[:, None] * np.exp(kappas[:, None] * at.softness)  # (rho, kappa, n)
+    growth, ln_growth = at.growths
     variance = np.maximum((squared / growth**2).mean(axis=2), 1e-18)
-    value = -0.5 * squared.size * np.log(variance) - np.log(growth).sum(axis=2)
-    value += LN_RHO_PRIOR[:, None] + LN_KAPPA_PRIOR[: kappas.size]
+    value = -0.5 * squared.size * np.log(variance) - ln_growth
+    value += LN_RHO_PRIOR[:, None] + LN_KAPPA_PRIOR[: value.shape[1]]
     if not np.isfinite(value).all():
         return Noise(1.0)  # a model without a value somewhere says nothing about the noise
     i, j = np.unravel_index(int(np.argmax(value)), value.shape)
-    return Noise(float(np.sqrt(variance[i, j])), float(RHO[i]), float(kappas[j]))
+    return Noise(float(np.sqrt(variance[i, j])), float(RHO[i]), float(KAPPA[j]))

@@ -9,14 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
-from calib.gap.case import Campaigns, Case, campaigns
+from calib.gap.case import Campaigns, Case, OutputData, campaigns
 from calib.gap.conditions import check_units, without_far_conditions
 from calib.gap.effects import Effect
-from calib.gap.which import Ranking, rank
+from calib.gap.which import Lab, Ranking, calibrate_lab, rank
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
-from calib.sampling.mode import find_mode
-from calib.streams import generator
 
 __all__ = ["LAB_OUTLIER", "LEFT_OVER", "OUTLIER", "rank_without_outliers", "without_outputs"]
 
@@ -52,9 +50,9 @@ def rank_without_outliers(
     campaigns(case)  # refuses what cannot be diagnosed, before rows are set aside
     check_units(case)
     case = _without_impossible(without_far_conditions(case))
-    case = _without_lab_outliers(case, seed)
-    data = campaigns(case)
-    ranking = rank(data, seed, effects=effects)
+    data, lab = _without_lab_outliers(case, seed)
+    case = data.case
+    ranking = rank(data, seed, effects=effects, lab=lab)
     for _ in range(_MOST_ROUNDS):
         far = _field_outliers(data, ranking)
         if not far:
@@ -62,7 +60,7 @@ def rank_without_outliers(
         said = _said(case.field, far, _outlying(OUTLIER))
         case = replace(without_outputs(case, far), warnings=(*case.warnings, *said))
         data = campaigns(case)
-        ranking = rank(data, seed, effects=effects)
+        ranking = rank(data, seed, effects=effects, lab=lab)
     left = _left_over(data, ranking)
     return replace(data, case=replace(case, warnings=(*case.warnings, *left))), ranking
 
@@ -153,30 +151,30 @@ def _most(n: int) -> int:
     return max(1, n // 10)
 
 
-def _without_lab_outliers(case: Case, seed: int) -> Case:
+def _without_lab_outliers(case: Case, seed: int) -> tuple[Campaigns, Lab]:
+    """The campaigns without them, and the simulators calibrated on what is left of the lab."""
+    data = campaigns(case)
+    lab = calibrate_lab(data, seed)
     for _ in range(_MOST_ROUNDS):
-        data = campaigns(case)
         far = {}
         for o in data.outputs:
-            z = _lab_residuals(data, o.name, seed)
+            z = _lab_residuals(o, lab[0][o.name])
             found = np.abs(z) > LAB_OUTLIER
             if 0 < found.sum() <= _most(z.size):
                 measured = np.flatnonzero(np.isfinite(case.lab[OUTPUTS[o.name]]))
                 far[o.name] = [int(row) for row in measured[found]]
         if not far:
-            return case
+            break
         said = _said(case.lab, far, _outlying(LAB_OUTLIER))
         case = replace(case, lab=_blanked(case.lab, far), warnings=(*case.warnings, *said))
-    return case
+        data = campaigns(case)
+        lab = calibrate_lab(data, seed)
+    return data, lab
 
 
-def _lab_residuals(data: Campaigns, output: str, seed: int) -> Array:
+def _lab_residuals(o: OutputData, mode: Array) -> Array:
     """Residuals of the laboratory fit in robust sds, shape (n,)."""
-    problem = next(o for o in data.outputs if o.name == output).problem
-    mode = find_mode(
-        problem.log_prob, problem.priors, generator(seed, "gap", "outliers", output), n_climb=8
-    )
-    location = problem.bound.location(problem.theta(mode[None])[:, :-1], problem.conditions)[0]
-    residual = problem.response - location
+    location = o.problem.bound.location(o.priors.to_natural(mode[None]), o.problem.conditions)[0]
+    residual = o.problem.response - location
     robust = 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
     return np.asarray(residual / max(robust, 1e-12))

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
+from calib.gap.ascent import Walk, together
 from calib.gap.case import Campaigns
+from calib.gap.discrepancy import Bases
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit, finish, look
 from calib.gap.forward import Forward
@@ -31,7 +33,10 @@ from calib.models.base import Array
 from calib.sampling.mode import find_mode
 from calib.streams import generator
 
-__all__ = ["Ranking", "calibrate_lab", "rank"]
+__all__ = ["Lab", "Ranking", "calibrate_lab", "rank"]
+
+# Internal parameters of each simulator, and its noise.
+type Lab = tuple[dict[str, Array], dict[str, Noise]]
 
 _N_SCREEN = 96
 _N_BEGUN = 5
@@ -96,19 +101,18 @@ class Ranking:
         return self.fits[name][int(np.argmax(self.scores[name]))]
 
 
-def rank(data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS) -> Ranking:
-    """Fit every hypothesis and rank them."""
+def rank(
+    data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS, lab: Lab | None = None
+) -> Ranking:
+    """Fit every hypothesis and rank them; `lab` if `calibrate_lab` has been called before."""
     able, unable = split_testable(data, effects)
-    lab_mode, noise = calibrate_lab(data, seed)
+    lab_mode, noise = lab or calibrate_lab(data, seed)
     single = singles(data, able)
     design = isolability(data, single, lab_mode, noise, seed)
     single = [h for h in single if h.name not in design.idle]
     unable |= dict.fromkeys(design.idle, _IDLE)
     worker = _Worker(data, lab_mode, noise, seed)
-    fits: dict[str, tuple[Fit, ...]] = {"none": (worker.fit(Hypothesis("none")),)}
-    fits["parameter_shift"] = tuple(worker.fit(h) for h in shifts(data))
-    for h in single:
-        fits[h.name] = (worker.fit(h),)
+    fits = worker.fit([Hypothesis("none"), *shifts(data), *single])
     fits |= _unlisted_and_pairs(worker, single, fits)
     fits, scores = _scored(fits, len(single), seed)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
@@ -120,28 +124,39 @@ def _unlisted_and_pairs(
     worker: _Worker, single: Sequence[Hypothesis], fits: Mapping[str, tuple[Fit, ...]]
 ) -> dict[str, tuple[Fit, ...]]:
     """Fit what is not listed, and pairs; finish those that are not hopeless at first look."""
+    n = len(single)
     alone = [fits["parameter_shift"], *(fits[h.name] for h in single)]
     best = sorted((max(group, key=_evidence) for group in alone), key=_evidence, reverse=True)
     leaders = [f.forward.hypothesis for f in best[:_N_LEADING]]
-    others = unknowns(worker.data) + remainders(worker.data, leaders, len(single))
-    unlisted = [worker.look(h) for h in others]
+    others = unknowns(worker.data) + remainders(worker.data, leaders, n)
     pairs = [(h, [fits[e.name][0] for e in h.effects]) for h in _promising_pairs(single, fits)]
-    paired = [worker.look_pair(h, members, 1) for h, members in pairs]
+    looked = together(
+        [worker.look(h) for h in others] + [worker.look_pair(h, members, 1) for h, members in pairs]
+    )
+    leading = max(_promise(looks, n) for looks in (*fits.values(), *looked))
+    first = len(others)
+    searched = [
+        i for i in range(len(pairs)) if _promise(looked[first + i], n) > leading - _SEARCHED
+    ]
+    more = together([worker.look_pair(*pairs[i], _N_BEGUN, skip=1) for i in searched])
+    for i, looks in zip(searched, more, strict=True):
+        looked[first + i] += looks
+    ended = _finished(looked, leading - _HOPELESS, n)
+    found = {h.name: (f,) for (h, _), f in zip(pairs, ended[first:], strict=True)}
+    return {"unknown": tuple(ended[:first])} | found
 
-    def promise(looks: Sequence[Fit]) -> float:
-        return max(_with_prior(f, len(single)) for f in looks)
 
-    leading = max(promise(looks) for looks in (*fits.values(), *unlisted, *paired))
+def _finished(looked: Sequence[Sequence[Fit]], hopeless: float, n_single: int) -> list[Fit]:
+    """Climb on from first looks at hypotheses, but for those that are hopeless."""
+    worth = [i for i, looks in enumerate(looked) if _promise(looks, n_single) > hopeless]
+    ended = [max(looks, key=_evidence) for looks in looked]
+    for i, found in zip(worth, together([finish(looked[i]) for i in worth]), strict=True):
+        ended[i] = found
+    return ended
 
-    def finished(looks: Sequence[Fit]) -> Fit:
-        return finish(looks) if promise(looks) > leading - _HOPELESS else max(looks, key=_evidence)
 
-    found = {"unknown": tuple(finished(looks) for looks in unlisted)}
-    for (h, members), looks in zip(pairs, paired, strict=True):
-        searched = promise(looks) > leading - _SEARCHED
-        more = worker.look_pair(h, members, _N_BEGUN)[1:] if searched else []
-        found[h.name] = (finished([*looks, *more]),)
-    return found
+def _promise(looks: Sequence[Fit], n_single: int) -> float:
+    return max(_with_prior(f, n_single) for f in looks)
 
 
 def _evidence(found: Fit) -> float:
@@ -213,7 +228,7 @@ def _promising_pairs(
     return [h for h in pairs_of(single) if best & {e.name for e in h.effects}]
 
 
-def calibrate_lab(data: Campaigns, seed: int) -> tuple[dict[str, Array], dict[str, Noise]]:
+def calibrate_lab(data: Campaigns, seed: int) -> Lab:
     """Mode of each output's simulator on the lab, and its noise."""
     modes, noise = {}, {}
     for o in data.outputs:
@@ -230,12 +245,18 @@ class _Worker:
         self, data: Campaigns, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise], seed: int
     ) -> None:
         self.data, self.lab_mode, self.noise, self.seed = data, lab_mode, noise, seed
+        self._bases: Bases = {}
 
-    def fit(self, hypothesis: Hypothesis) -> Fit:
-        """Fit from the lab's calibration."""
-        return finish(self.look(hypothesis))
+    def fit(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Fit, ...]]:
+        """Fit from the lab's calibration, by name."""
+        looks = together([self.look(h) for h in hypotheses])
+        fits: dict[str, tuple[Fit, ...]] = {}
+        for found in together([finish(group) for group in looks]):
+            name = found.forward.hypothesis.name
+            fits[name] = (*fits.get(name, ()), found)
+        return fits
 
-    def look(self, hypothesis: Hypothesis) -> list[Fit]:
+    def look(self, hypothesis: Hypothesis) -> Walk[list[Fit]]:
         """Begin at the lab's calibration, effects at several guesses of their prior."""
         forward, start = self._forward(hypothesis)
         if hypothesis.onset_over is not None:
@@ -245,7 +266,9 @@ class _Worker:
         starts = self._spread(forward, start, _N_SCREEN, range(len(hypothesis.effects)))
         return look(self.data, forward, start, self.noise, starts=starts, count=_N_BEGUN)
 
-    def look_pair(self, hypothesis: Hypothesis, members: Sequence[Fit], count: int) -> list[Fit]:
+    def look_pair(
+        self, hypothesis: Hypothesis, members: Sequence[Fit], count: int, skip: int = 0
+    ) -> Walk[list[Fit]]:
         """Begin two effects where each alone has led."""
         forward, start = self._forward(hypothesis)
         parts = []
@@ -256,11 +279,11 @@ class _Worker:
             led[forward.phi_slices[i]] = member.psi[member.forward.phi_slices[0]]
             parts.append(self._spread(forward, led, _N_SCREEN // 2, [1 - i]))
         starts = np.concatenate(parts)
-        return look(self.data, forward, start, self.noise, starts=starts, count=count)
+        return look(self.data, forward, start, self.noise, starts=starts, count=count, skip=skip)
 
     def _forward(self, hypothesis: Hypothesis) -> tuple[Forward, Array]:
         scale = {o: n.sigma for o, n in self.noise.items()}
-        forward = Forward(self.data, hypothesis, scale, self.lab_mode)
+        forward = Forward(self.data, hypothesis, scale, self.lab_mode, bases=self._bases)
         start = np.array([p.loc for p in forward.priors.free])
         for o in self.data.outputs:
             start[forward.theta_slices[o.name]] = self.lab_mode[o.name]

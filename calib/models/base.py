@@ -135,11 +135,11 @@ class BoundModel:
     def location(self, theta: Array, conditions: Conditions, rows: Rows | None = None) -> Array:
         """Predict on the scale of the response, shape (k, n); rows if prepared before."""
         with np.errstate(all="ignore"):
-            by_column = columns(np.atleast_2d(theta))
-            shape = np.broadcast_shapes(by_column[0].shape, *(v.shape for v in conditions.values()))
-            work = np.empty((N_WORK, *shape))
-            rows = self.prepare(conditions) if rows is None else rows
-            return self.model.location(by_column, rows, self.references, work)
+            theta = np.atleast_2d(theta)
+            k = max([len(theta)] + [len(v) for v in conditions.values() if v.ndim > 1])
+            work = np.empty((N_WORK, k, next(iter(conditions.values())).shape[-1]))
+            rows = self.model.prepare(conditions, self.references) if rows is None else rows
+            return self.model.location(columns(theta), rows, self.references, work)
 
     def prepare(self, conditions: Conditions) -> Rows:
         """Work out what the equation needs of conditions."""

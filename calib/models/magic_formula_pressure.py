@@ -28,27 +28,22 @@ from calib.models.magic_formula import half_sine_in_place
 __all__ = ["MAGIC_FORMULA_PRESSURE", "coefficients_at"]
 
 
-def _quadratic(u: Array, low: Array, high: Array, bend: Array) -> Array:
-    mean = 0.5 * (low + high)
-    return mean + 0.5 * (high - low) * u + bend * mean * (u * u - 1.0)
-
-
-def _positive(low: Array, high: Array, bend: Array) -> NDArray[np.bool_]:
-    """Whether a quadratic is positive over -1 <= u <= 1."""
-    mean, half = 0.5 * (low + high), 0.5 * (high - low)
-    curvature = bend * mean
-    vertex_inside = (curvature > 0.0) & (np.abs(half) < 2.0 * curvature)
-    lowest = mean - curvature - half**2 / np.where(vertex_inside, 4.0 * curvature, 1.0)
-    return np.asarray(
-        (low > 0.0) & (high > 0.0) & (~vertex_inside | (lowest > 0.0)), dtype=np.bool_
-    )
+def _positive(mean: Array, half: Array, curvature: Array) -> NDArray[np.bool_]:
+    """Whether mean + half u + curvature (u^2 - 1) is positive over -1 <= u <= 1."""
+    steep = np.abs(half)
+    # Where the vertex lies inside, it is the lowest point: mean - curvature - half^2/(4 curvature).
+    falls_through = 4.0 * curvature * (mean - curvature) <= half * half
+    return np.asarray((mean > steep) & ~((steep < 2.0 * curvature) & falls_through), dtype=np.bool_)
 
 
 def _at(columns: Columns, u: Array) -> tuple[Array, Array, Array, Array]:
     # K, D and G at once: one small array operation in the place of three.
-    low, high, bend = (np.stack(columns[j:9:3]) for j in range(3))
-    allowed = _positive(low, high, bend).all(axis=0)
-    K, D, G = _quadratic(u, low, high, bend)
+    ends = np.stack(columns[:9])
+    low, high, bend = ends[0::3], ends[1::3], ends[2::3]
+    mean, half = 0.5 * (low + high), 0.5 * (high - low)
+    curvature = bend * mean
+    allowed = _positive(mean, half, curvature).all(axis=0)
+    K, D, G = mean + half * u + curvature * (u * u - 1.0)
     return K, columns[9], np.where(allowed, D, np.nan), G
 
 

@@ -1,5 +1,1 @@
-"""The report as one self-contained page."""
-
-from calib.page.render import render_page
-
-__all__ = ["render_page"]
+"""The report as one self-contained page, and the pages of a diagnosis and of an audit."""

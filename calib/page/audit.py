@@ -18,11 +18,10 @@ from calib.audit import Audit, Finding, Quantity, Verdict
 from calib.audit.files import audit_csv, audit_json
 from calib.datasets.published import DOI
 from calib.figures.audit import audit_plates
-from calib.figures.export import png
+from calib.figures.export import png, png_size
 from calib.figures.labels import unbroken
 from calib.figures.plate import Plate
 from calib.numbers import NOTHING, format_number
-from calib.page.content import png_size
 from calib.page.equations import unit_html
 
 __all__ = ["AUDIT_MARKS", "audit_section", "write_audit", "write_audit_page"]

@@ -10,6 +10,7 @@ from pathlib import PurePath
 from typing import Any
 
 from calib.figures import Plate
+from calib.figures.export import png_size
 from calib.figures.labels import axis_of, percent, short
 from calib.figures.rows import held_table
 from calib.models import get_model
@@ -187,8 +188,3 @@ def _figure(
         "uri": f"data:image/png;base64,{base64.b64encode(image).decode()}" if image else "",
         "size": png_size(image) if image else (0, 0),
     }
-
-
-def png_size(image: bytes) -> tuple[int, int]:
-    """Return width and height of a PNG file, which keep the page from jumping while it loads."""
-    return int.from_bytes(image[16:20]), int.from_bytes(image[20:24])

@@ -11,7 +11,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
-from calib.figures.export import png
+from calib.figures.export import png, png_size
 from calib.figures.gap import gap_plates
 from calib.figures.gap_rows import (
     best_fit,
@@ -30,7 +30,6 @@ from calib.gap.diagnose import Diagnosis
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
 from calib.models import get_model
-from calib.page.content import png_size
 from calib.page.gap_sizes import size_sentences, where_to_look
 from calib.page.gap_tables import (
     conditions_text,

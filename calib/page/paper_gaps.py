@@ -10,7 +10,7 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
-from calib.figures.export import pdf_bytes
+from calib.figures.export import pdf_bytes, png_size
 from calib.figures.gap import gap_plates
 from calib.figures.gap_rows import short_name
 from calib.figures.labels import short
@@ -18,14 +18,14 @@ from calib.figures.paper_gaps import gap_plate
 from calib.figures.plate import Plate
 from calib.gap.files import write_diagnosis
 from calib.models import get_model
-from calib.page.content import png_size
 from calib.page.diagnosis import gap_evidence, render_diagnosis
 from calib.page.gap_verdict import Tone, judge_gap, odds_text
 from calib.page.paper_checks import check_text
 from calib.paper_gaps.checks import checks, probability_of
 from calib.paper_gaps.find import FoundGap
+from calib.tasks.pool import HERE, Pool
 
-__all__ = ["write_gaps"]
+__all__ = ["begin_gaps_section", "write_gaps"]
 
 _MARKS = {
     Tone.FINE: "\N{HEAVY CHECK MARK}",
@@ -77,34 +77,53 @@ def write_gaps(
     Returns
     -------
     str
-        HTML for `calib.page.render_page`.
+        HTML for `calib.page.render.render_page`.
     """
-    tell = progress or (lambda what, done, planned: None)
-    blocks = []
-    for i, result in enumerate(results):
-        tell("the paper's own gaps: drawing", i, len(results))
-        plate = gap_plate(result)
-        image = to_png(plate)
-        (folder / "figures" / f"gap_{plate.name}.png").write_bytes(image)
-        if pdf and plate.figure is not None:
-            file = folder / "figures" / f"gap_{plate.name}.pdf"
-            file.write_bytes(pdf_bytes(plate.figure))
-        _write_diagnosis_page(result, folder / "gaps" / result.gap.name, to_png, manifest)
-        blocks.append(_block(result, plate, image))
-    tell("the paper's own gaps: drawing", len(results), len(results))
-    return _template().render(gaps=blocks)
+    versions = manifest.get("versions", {})
+    section = begin_gaps_section(results, folder, to_png, versions=versions, pdf=pdf, pool=HERE)
+    return section(progress or (lambda what, done, planned: None))
 
 
-def _write_diagnosis_page(
-    result: FoundGap, folder: Path, to_png: ToPng, manifest: Mapping[str, Any]
-) -> None:
-    folder.mkdir(parents=True)
-    write_diagnosis(result.found, folder)
+def begin_gaps_section(
+    results: Sequence[FoundGap],
+    folder: Path,
+    to_png: ToPng,
+    *,
+    versions: Mapping[str, str],
+    pdf: bool,
+    pool: Pool,
+) -> Callable[[Progress], str]:
+    """Ask for figures and pages as `write_gaps` does; return what waits for the section."""
+    pieces = [pool.submit(_write_gap, r, folder, to_png, versions, pdf) for r in results]
+
+    def finish(tell: Progress) -> str:
+        blocks = []
+        for i, piece in enumerate(pieces):
+            tell("the paper's own gaps: drawing", i, len(pieces))
+            blocks.append(piece.result())
+        tell("the paper's own gaps: drawing", len(pieces), len(pieces))
+        return _template().render(gaps=blocks)
+
+    return finish
+
+
+def _write_gap(
+    result: FoundGap, folder: Path, to_png: ToPng, versions: Mapping[str, str], pdf: bool
+) -> dict[str, Any]:
+    plate = gap_plate(result)
+    image = to_png(plate)
+    (folder / "figures" / f"gap_{plate.name}.png").write_bytes(image)
+    if pdf and plate.figure is not None:
+        file = folder / "figures" / f"gap_{plate.name}.pdf"
+        file.write_bytes(pdf_bytes(plate.figure))
+    inner = folder / "gaps" / result.gap.name
+    inner.mkdir(parents=True)
+    write_diagnosis(result.found, inner)
     drawn = gap_plates(result.found)
     images = {f"{p.name}.png": to_png(p) for p in drawn if p.figure is not None}
-    versions = {"versions": manifest.get("versions", {})}
-    page = render_diagnosis(result.found, drawn, images, manifest=versions)
-    (folder / "index.html").write_text(page, encoding="utf-8")
+    page = render_diagnosis(result.found, drawn, images, manifest={"versions": versions})
+    (inner / "index.html").write_text(page, encoding="utf-8")
+    return _block(result, plate, image)
 
 
 def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:

@@ -19,7 +19,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,7 +71,7 @@ class PaperGap:
     case: Case
     withheld: str | None = None
     unfitted: Table | None = None
-    variants: Mapping[str, Case] = field(default_factory=lambda: MappingProxyType({}))
+    variants: Mapping[str, Case] = field(default_factory=dict)
 
 
 def paper_gaps() -> tuple[PaperGap, ...]:
@@ -137,12 +136,10 @@ def _nominal_slip() -> PaperGap:
         case("nominal_slip", first, nominal=True),
         "slip_zero_shift",
         unfitted,
-        MappingProxyType(
-            {
-                "halves swapped": case("nominal_slip_swapped", ~first, nominal=True),
-                "slips given back": case("nominal_slip_given_back", first, nominal=False),
-            }
-        ),
+        {
+            "halves swapped": case("nominal_slip_swapped", ~first, nominal=True),
+            "slips given back": case("nominal_slip_given_back", first, nominal=False),
+        },
     )
 
 
@@ -195,12 +192,10 @@ def _post_peak() -> PaperGap:
         "pressures. Rows of 18 psi alone make no case: the Magic Formula needs those up to 17 % "
         "slip to be calibrated at all, which leaves nothing of the peak to be missed.",
         case("post_peak_18_psi", 0),
-        variants=MappingProxyType(
-            {
-                "field begins one slip level later": case("post_peak_later", 1),
-                "field begins two slip levels later": case("post_peak_latest", 2),
-            }
-        ),
+        variants={
+            "field begins one slip level later": case("post_peak_later", 1),
+            "field begins two slip levels later": case("post_peak_latest", 2),
+        },
     )
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
+from calib.gap.case import Case
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
@@ -15,9 +16,12 @@ from calib.paper_gaps.cases import PaperGap, paper_gaps
 from calib.sampling.adapt import Guess, adapt
 from calib.sampling.mode import find_modes
 from calib.streams import generator
+from calib.tasks.pool import HERE, Pool
 from calib.threads import one_thread
 
-__all__ = ["FoundGap", "Unfitted", "find_gaps", "simulator_sd", "unfitted_errors"]
+__all__ = [
+    "FoundGap", "Unfitted", "begin_gaps", "find_gaps", "simulator_sd", "unfitted_errors",
+]  # fmt: skip
 
 _N_DRAWS = 20_000
 _NEGLIGIBLE = 1e-9
@@ -75,7 +79,6 @@ class Unfitted:
     largest_after: float
 
 
-@one_thread()
 def find_gaps(
     seed: int,
     *,
@@ -94,23 +97,37 @@ def find_gaps(
         Called with what is being done, steps done and steps planned.
     """
     chosen = paper_gaps() if gaps is None else tuple(gaps)
-    planned = sum(1 + len(gap.variants) for gap in chosen)
-    done = 0
+    return begin_gaps(seed, chosen, HERE)(progress or (lambda what, done, planned: None))
 
-    def one(gap: PaperGap, variant: str | None = None) -> Diagnosis:
-        nonlocal done
-        found = diagnose(gap.case if variant is None else gap.variants[variant], seed)
-        done += 1
-        if progress is not None:
-            progress("the paper's own gaps: diagnosing", done, planned)
-        return found
 
-    results = []
-    for gap in chosen:
-        found = one(gap)
-        variants = {name: one(gap, name) for name in gap.variants}
-        results.append(FoundGap(gap, found, variants, simulator_sd(found)))
-    return tuple(results)
+def begin_gaps(
+    seed: int, gaps: Sequence[PaperGap], pool: Pool
+) -> Callable[[Progress], tuple[FoundGap, ...]]:
+    """Ask for the diagnoses of gaps and of their variants; return what waits for them."""
+    asked = [
+        (gap, pool.submit(_with_sd, gap.case, seed),
+         {name: pool.submit(diagnose, case, seed) for name, case in gap.variants.items()})
+        for gap in gaps
+    ]  # fmt: skip
+    planned = sum(1 + len(gap.variants) for gap in gaps)
+
+    def finish(tell: Progress) -> tuple[FoundGap, ...]:
+        results = []
+        for gap, piece, pieces in asked:
+            found, open_sd = piece.result()
+            variants = {name: variant.result() for name, variant in pieces.items()}
+            results.append(FoundGap(gap, found, variants, open_sd))
+            done = sum(1 + len(r.variants) for r in results)
+            tell("the paper's own gaps: diagnosing", done, planned)
+        return tuple(results)
+
+    return finish
+
+
+@one_thread()
+def _with_sd(case: Case, seed: int) -> tuple[Diagnosis, Array]:
+    found = diagnose(case, seed)
+    return found, simulator_sd(found)
 
 
 def simulator_sd(found: Diagnosis) -> Array:

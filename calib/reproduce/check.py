@@ -13,11 +13,14 @@ from calib.reproduce.check_run import check_run
 from calib.reproduce.outcome import Outcome
 from calib.reproduce.schema import Manifest, RunRecord, read_folder
 from calib.study import Progress
+from calib.tasks.pool import HERE, Pool
 
 __all__ = ["check"]
 
 
-def check(folder: Path, *, quick: bool = False, progress: Progress | None = None) -> Outcome:
+def check(
+    folder: Path, *, quick: bool = False, progress: Progress | None = None, pool: Pool = HERE
+) -> Outcome:
     """Compute a report or a run again from its own folder and compare.
 
     Parameters
@@ -28,6 +31,8 @@ def check(folder: Path, *, quick: bool = False, progress: Progress | None = None
         Skip the sampling: hashes, data, priors and point estimates only.
     progress : callable, optional
         Called with what is being done, steps done and steps planned.
+    pool : Pool, optional
+        Where a report is made again; what is found does not depend on it.
 
     Returns
     -------
@@ -44,7 +49,9 @@ def check(folder: Path, *, quick: bool = False, progress: Progress | None = None
     tell = progress or (lambda what, done, planned: None)
     with tempfile.TemporaryDirectory(prefix="calib-check-") as scratch:
         if isinstance(record, Manifest):
-            items, allowed = check_report(record, folder, Path(scratch), here, tell, quick=quick)
+            items, allowed = check_report(
+                record, folder, Path(scratch), here, tell, quick=quick, pool=pool
+            )
         else:
             items, allowed = check_run(record, folder, Path(scratch), here, tell, quick=quick)
     kind: Literal["report", "run"] = "report" if isinstance(record, Manifest) else "run"

@@ -9,18 +9,20 @@ from typing import Any
 from calib.environment import Environment
 from calib.errors import CalibError
 from calib.problem import build_problem
-from calib.reproduce.allowances import describe
-from calib.reproduce.compare_files import PAGE, RECORD, SUMMARY, Again
-from calib.reproduce.compare_report import (
+from calib.reproduce.compare import (
+    RECORD,
+    SUMMARY,
+    Again,
     compare_estimates,
-    compare_report,
+    compare_numbers,
     count_numbers,
-    entry,
+    output_entry,
 )
-from calib.reproduce.derived import verify_derived, verify_gap_summaries
-from calib.reproduce.files import verify_files
-from calib.reproduce.inputs import verify_hashes, verify_label, verify_priors
+from calib.reproduce.derived import verify_derived, verify_form, verify_gaps
+from calib.reproduce.files import compare_files, moved_parts
+from calib.reproduce.inputs import verify_files, verify_hashes, verify_label, verify_priors
 from calib.reproduce.items import Item, Status
+from calib.reproduce.montecarlo import describe
 from calib.reproduce.numbers import read_json
 from calib.reproduce.posteriors import GROUP as POSTERIORS
 from calib.reproduce.posteriors import DrawsFile, read_draws, verify_density, verify_summary
@@ -29,8 +31,11 @@ from calib.reproduce.schema import Manifest
 from calib.reproduce.text import verify_images
 from calib.study import Progress
 from calib.study_tasks import Task, fitted_rows
+from calib.tasks.pool import HERE, Pool
 
 __all__ = ["check_report"]
+
+_PAGE = "index.html"
 
 
 def check_report(
@@ -41,6 +46,7 @@ def check_report(
     progress: Progress,
     *,
     quick: bool,
+    pool: Pool = HERE,
 ) -> tuple[list[Item], str]:
     """Return what was found, and what Monte Carlo error was allowed, in words.
 
@@ -53,6 +59,8 @@ def check_report(
     progress : callable
     quick : bool
         Skip the sampling.
+    pool : Pool, optional
+        Where the report is made again.
     """
     items = verify_files(folder, manifest.files, RECORD, manifest.left_out)
     for key, said in manifest.tasks.items():
@@ -61,24 +69,24 @@ def check_report(
     posteriors, unreadable = _posteriors(folder, manifest)
     items += unreadable + _consistent(folder, summary, posteriors)
     allowed = ""
+    same_code = manifest.code == here.code
     with not_computed(items, folder, RECORD):
         tasks = report_tasks(manifest, folder, scratch / "inputs")
-        items += _named_rightly(manifest, folder, tasks, same_code=manifest.code == here.code)
+        items += _named_rightly(manifest, folder, tasks, same_code=same_code)
         there = [task for task in tasks if task.output in posteriors]
         items += [_density(task, posteriors[task.output]) for task in there]
         if quick:
             items += _left_out(manifest)
             items += compare_estimates(tasks, manifest.seed, summary, progress)
         else:
-            study = recompute_report(manifest, tasks, scratch / "again", progress)
+            study = recompute_report(manifest, tasks, scratch / "again", progress, pool)
             allowed = describe(count_numbers(study))
-            items += compare_report(
-                Again(manifest, folder, scratch / "again", study, here), summary
-            )
-    items += verify_gap_summaries(folder, summary) + verify_derived(
-        folder, manifest.files, read_json(folder / RECORD), summary,
-        same_code=manifest.code == here.code,
-    )  # fmt: skip
+            again = Again(manifest, folder, scratch / "again", study, here)
+            numbers = compare_numbers(again)
+            items += numbers + compare_files(again, moved_parts(numbers))
+    items += verify_form(folder) + verify_gaps(folder, summary, same_code=same_code)
+    record = read_json(folder / RECORD)
+    items += verify_derived(folder, manifest.files, record, summary, same_code=same_code)
     return items, allowed
 
 
@@ -106,11 +114,11 @@ def _consistent(
 ) -> list[Item]:
     """Hold the parts of the folder against each other, without computing anything again."""
     items = []
-    page = folder / PAGE
+    page = folder / _PAGE
     if page.is_file():
         items += verify_images(page.read_text(encoding="utf-8", errors="replace"), folder)
     for key, file in posteriors.items():
-        stated = entry(summary, key).get("posterior")
+        stated = output_entry(summary, key).get("posterior")
         items.append(
             verify_summary(f"{key}.nc", file, stated if isinstance(stated, Mapping) else {})
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,18 +12,11 @@ from calib.calibration import Calibration
 from calib.environment import Environment
 from calib.errors import CalibError
 from calib.problem import Problem
-from calib.reproduce.allowances import (
-    count_drawn,
-    describe,
-    run_allowances,
-    run_estimate_allowances,
-)
-from calib.reproduce.files import verify_files
 from calib.reproduce.inputs import GROUP as INPUTS
-from calib.reproduce.inputs import verify_label
+from calib.reproduce.inputs import verify_files, verify_label
 from calib.reproduce.items import Item, Status
-from calib.reproduce.montecarlo import Place
-from calib.reproduce.numbers import Section, compare_section, flatten
+from calib.reproduce.montecarlo import Place, count_drawn, describe, drawn_in_run
+from calib.reproduce.numbers import compare_entries, flatten
 from calib.reproduce.posteriors import GROUP as POSTERIORS
 from calib.reproduce.posteriors import compare_posterior, read_draws, summary_of, verify_density
 from calib.reproduce.recompute import estimate_again, not_computed, recompute_run
@@ -35,8 +28,8 @@ __all__ = ["check_run"]
 
 _RECORD, _POSTERIOR, _PRIORS, _DATA = "run.json", "posterior.nc", "priors.toml", "data.csv"
 _FILES = (_POSTERIOR, _PRIORS, _DATA)
-# Durations, hashes that are verified as such, and estimates, which are compared by themselves.
-_NOT_COMPARED = ("seconds", "sha256", "estimates")
+# Durations, and hashes that are verified as such.
+_NOT_COMPARED = ("seconds", "sha256")
 
 
 def check_run(
@@ -71,33 +64,28 @@ def check_run(
         problem = run_problem(record.document, folder / _DATA)
         items += _consistent(record, folder, problem)
         if quick:
-            items += _estimates(
-                record.document, describe_estimates(estimate_again(record, problem))
-            )
+            again = {"estimates": describe_estimates(estimate_again(record, problem))}
+            recorded = {"estimates": record.document["estimates"]}
+            old, new = _entries(recorded, folder), _entries(again, folder)
+            points = compare_entries(old, new, _group)
+            items += [item for item in points if item.group == "estimates"]
         else:
             calibration = recompute_run(record, problem, scratch / "again", progress)
             allowed = describe(count_drawn(calibration))
-            same = record.environment.same_program(here)
-            items += _compare(record, calibration, folder, scratch / "again", same_program=same)
+            items += _compare(record, calibration, folder, scratch / "again")
     return items, allowed
 
 
-def _compare(
-    record: RunRecord, calibration: Calibration, folder: Path, made: Path, *, same_program: bool
-) -> list[Item]:
+def _compare(record: RunRecord, calibration: Calibration, folder: Path, made: Path) -> list[Item]:
     again = json.loads((made / _RECORD).read_text(encoding="utf-8"))
-    items = _estimates(record.document, again["estimates"])
-    recorded, found = _document(record.document, folder), _document(again, made)
-    if "posterior" not in recorded:  # it cannot be read, which has been said
-        del found["posterior"]
-    section = Section(_RECORD, (), dict(flatten(recorded)), dict(flatten(found)))
-    paths = {**section.recorded, **section.found}
-    allowances = run_allowances(calibration, section.recorded, paths)
-    items += compare_section(section, allowances, group_of=_group)
-    if "posterior" in recorded:
-        exact = section.exact and same_program
-        files = (folder / _POSTERIOR, made / _POSTERIOR)
-        items.append(compare_posterior(_POSTERIOR, *files, exact=exact))
+    recorded, found = _entries(record.document, folder), _entries(again, made)
+    if not any(path[1] == "posterior" for path in recorded):  # unreadable, which has been said
+        found = {path: value for path, value in found.items() if path[1] != "posterior"}
+    drawn = drawn_in_run(calibration, recorded.get((_RECORD, "gate", "steps")))
+    sizes = {(_RECORD, *path): size for path, size in drawn.items()}
+    items = compare_entries(recorded, found, _group, sizes)
+    if (folder / _POSTERIOR).is_file():
+        items += compare_posterior(_POSTERIOR, folder / _POSTERIOR, made / _POSTERIOR)
     return items + _blame(items)
 
 
@@ -117,28 +105,19 @@ def _consistent(record: RunRecord, folder: Path, problem: Problem) -> list[Item]
     return items
 
 
-def _document(record: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+def _entries(record: Mapping[str, Any], folder: Path) -> dict[Place, Any]:
     """Return what is compared of a run: its record, and the summary of its draws."""
     document = {key: value for key, value in record.items() if key not in _NOT_COMPARED}
     with suppress(CalibError):
         document["posterior"] = summary_of(read_draws(folder / _POSTERIOR).draws)
-    return document
+    return dict(flatten(json.loads(json.dumps(document)), (_RECORD,)))
 
 
 def _group(path: Place) -> str:
-    if path[0] in ("posterior", "gate", "mode", "log_evidence", "efficiency", "acceptance",
+    if path[1] in ("posterior", "gate", "mode", "log_evidence", "efficiency", "acceptance",
                    "evaluations"):  # fmt: skip
         return "posterior"
-    return "what was computed"
-
-
-def _estimates(record: Mapping[str, Any], again: Sequence[Mapping[str, Any]]) -> list[Item]:
-    found = json.loads(json.dumps(again))
-    place = ("estimates",)
-    old, new = dict(flatten(record["estimates"])), dict(flatten(found))
-    section = Section(_RECORD, place, old, new)
-    allowances = run_estimate_allowances(section.recorded)
-    return compare_section(section, allowances, group_of=lambda _: "estimates")
+    return "estimates" if path[1] == "estimates" else "what was computed"
 
 
 def _blame(items: list[Item]) -> list[Item]:

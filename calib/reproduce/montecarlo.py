@@ -7,6 +7,7 @@ of the predictive distributions they are scores of.
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import norm
 
 from calib.calibration import Calibration
 from calib.chains import mcse, tail_shape
@@ -14,7 +15,12 @@ from calib.models.base import Array
 from calib.scores import LEVELS, RELATIVE_ERROR_FLOOR
 from calib.validate import Validation
 
-__all__ = ["Place", "posterior_errors", "validation_errors"]
+__all__ = [
+    "MONTE_CARLO", "Place", "count_drawn", "describe", "drawn_in_output", "drawn_in_run",
+    "posterior_errors", "validation_errors",
+]  # fmt: skip
+
+MONTE_CARLO = "Monte Carlo"
 
 type Place = tuple[str, ...]
 """Keys from the top of a document to one of its numbers; positions in a list count from "0"."""
@@ -25,8 +31,79 @@ _K_MEAN, _K_SD = 0.5, 0.2
 # Of an interval's width: an end at the edge of what is possible hangs on the few outermost draws,
 # whose scatter among parts of a run tells little. Between seeds k of the rut depth's moves so far.
 _END = 2e-4
+# Chance of one false alarm or more in a whole check.
+_FAMILY = 1e-3
+# Over 24 seeds of the embedded problems, numbers moved by up to 1.4 times what ArviZ expects: the
+# walkers of an ensemble are not quite independent chains.
+_SAFETY = 1.5
 # Draws of the round of importance sampling that estimates the evidence, at least.
 _EVIDENCE_DRAWS = 1500
+
+
+def multiple(n: int) -> float:
+    """Return how many standard errors of a difference are allowed where `n` are looked at.
+
+    So many that one check in a thousand finds a difference where there is none: seven of the
+    some hundred numbers of a report.
+    """
+    return float(_SAFETY * norm.isf(_FAMILY / (2 * max(n, 1))))
+
+
+def describe(n: int) -> str:
+    """Say in words what is allowed to `n` numbers that follow from posterior draws."""
+    return (
+        f"{multiple(n):.1f} Monte Carlo errors of a difference (one false alarm in "
+        f"{1.0 / _FAMILY:g} checks of {n} such numbers, times {_SAFETY:g})"
+    )
+
+
+def count_drawn(calibration: Calibration, n_validated: int = 0) -> int:
+    """Return how many numbers of an output follow from posterior draws, at most.
+
+    Six of each parameter, the evidence; of a validation one for each row, and fourteen scores.
+    """
+    return 6 * len(calibration.parameters) + 1 + (n_validated + 14 if n_validated else 0)
+
+
+def drawn_in_output(
+    calibration: Calibration, validation: Validation, n: int, steps: object
+) -> dict[Place, float | None]:
+    """Return what Monte Carlo error allows to the numbers of one output of a report.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    validation : Validation
+    n : int
+        How many numbers follow from posterior draws, in the whole report.
+    steps : object
+        Recorded length of the other run.
+    """
+    times = multiple(n) * _of_difference(calibration, steps)
+    errors = posterior_errors(calibration)
+    errors |= validation_errors(calibration, validation, times)
+    return _scaled(errors, times)
+
+
+def drawn_in_run(calibration: Calibration, steps: object) -> dict[Place, float | None]:
+    """Return the same for a run, and the posterior sds that its mode is judged by."""
+    errors = posterior_errors(calibration)
+    errors["log_evidence",] = errors.pop(("sampling", "log_evidence"))
+    times = multiple(count_drawn(calibration)) * _of_difference(calibration, steps)
+    sds = enumerate(calibration.draws.flat.std(axis=0).tolist())
+    return _scaled(errors, times) | {("mode", str(j)): sd for j, sd in sds}
+
+
+def _of_difference(calibration: Calibration, steps: object) -> float:
+    """Error of the difference of two runs over that of this one, should the other be shorter."""
+    ratio = 1.0
+    if isinstance(steps, int | float) and steps > 0:
+        ratio = calibration.draws.report.steps / steps
+    return float(np.sqrt(1.0 + np.clip(ratio, 1.0, 4.0)))
+
+
+def _scaled(errors: dict[Place, float | None], times: float) -> dict[Place, float | None]:
+    return {place: None if error is None else times * error for place, error in errors.items()}
 
 
 def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:

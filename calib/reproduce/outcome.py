@@ -6,8 +6,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from calib.reproduce.allowances import MONTE_CARLO
 from calib.reproduce.items import Item, Status
+from calib.reproduce.montecarlo import MONTE_CARLO
 
 __all__ = ["SCHEMA", "Outcome"]
 

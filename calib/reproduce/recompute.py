@@ -27,6 +27,7 @@ from calib.store import save_calibration
 from calib.streams import generator
 from calib.study import Progress, Study
 from calib.study_tasks import HoldOut, Task
+from calib.tasks.pool import HERE, Pool
 
 __all__ = ["estimate_again", "not_computed", "recompute_report", "recompute_run", "report_tasks"]
 
@@ -87,7 +88,11 @@ def _task(key: str, entry: TaskRecord, folder: Path, scratch: Path) -> Task:
 
 
 def recompute_report(
-    manifest: Manifest, tasks: tuple[Task, ...], out: Path, progress: Progress
+    manifest: Manifest,
+    tasks: tuple[Task, ...],
+    out: Path,
+    progress: Progress,
+    pool: Pool = HERE,
 ) -> Study:
     """Work a report out again and write it into a new folder."""
     repeats = manifest.audit and manifest.audit.seeds
@@ -98,6 +103,7 @@ def recompute_report(
         gaps=[gap for gap in paper_gaps() if gap.name in manifest.paper_gaps],
         audit=Seeds(**repeats.model_dump()) if repeats else None,
         progress=progress,
+        pool=pool,
     )
     write_report(
         contents.study,
@@ -110,6 +116,7 @@ def recompute_report(
         title=manifest.title,
         environment=manifest.environment,
         progress=progress,
+        pool=pool,
     )
     return contents.study
 

@@ -1,4 +1,9 @@
-"""Compare pages and tables, and hold a page against the figures beside it."""
+"""Compare pages, and hold a page against the figures beside it.
+
+What a page says follows from numbers. Where those agree up to rounding it must say the same, and
+show the same digits but for the last; where they moved within their tolerance, a reading beside a
+threshold may be another, and the words cannot be judged.
+"""
 
 from __future__ import annotations
 
@@ -6,23 +11,23 @@ import base64
 import binascii
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from calib.manifest import sha256
 from calib.reproduce.items import Item, Status
-from calib.reproduce.numbers import without_numbers
+from calib.reproduce.numbers import NUMBER, without_numbers
 
-__all__ = [
-    "GROUP", "compare_text", "differing_lines", "own_pictures", "readable", "verify_images",
-]  # fmt: skip
+__all__ = ["GROUP", "compare_page", "differing_lines", "own_pictures", "verify_images"]
 
 GROUP = "page and tables"
 _IMAGE = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]*)")
 _TAG = re.compile(r"<[^>]*>")
 _PICTURE = re.compile(r"\[picture [^\]]*\]")
+_SECTION = re.compile(r'<section\b[^>]*aria-labelledby="([^"]*)"')
 _SHOWN = 3
 _WIDTH = 120
+_PLAIN = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻\u2212", "0123456789--")
 
 
 def verify_images(page: str, folder: Path) -> list[Item]:
@@ -62,66 +67,108 @@ def _decoded(encoded: str) -> bytes:
         return b""
 
 
-def readable(content: bytes, folder: Path) -> list[str]:
-    """Return the lines of a text, with the names of the folder's figures in their place."""
-    text = content.decode("utf-8", errors="replace")
-    names = _figures(folder) if _IMAGE.search(text) else {}
-    return _IMAGE.sub(
-        lambda m: f"[picture {names.get(_hash(m[1]), 'of another file')}]", text
-    ).splitlines()
-
-
-def own_pictures(content: bytes, folder: Path) -> list[bytes]:
+def own_pictures(content: str, folder: Path) -> list[bytes]:
     """Return the pictures of a page that are none of the folder's figures, in their order."""
     known = _figures(folder)
-    encoded = _IMAGE.findall(content.decode("utf-8", errors="replace"))
-    return [_decoded(text) for text in encoded if _hash(text) not in known]
+    return [_decoded(text) for text in _IMAGE.findall(content) if _hash(text) not in known]
 
 
-def compare_text(
+def compare_page(
     name: str,
-    recorded: Sequence[str],
-    written: Sequence[str],
-    *,
-    same: bool,
-    exact: bool,
-    why_not: str,
+    recorded: Path,
+    written: Path,
+    judged: Callable[[str], tuple[str | None, bool]],
 ) -> Item:
-    """Compare a file of text with the one written again.
+    """Compare a page, or another text, with the one written again.
 
     Parameters
     ----------
     name : str
-    recorded, written : sequence of str
-        Their lines, as `readable` returns them.
-    same : bool
-        Whether their bytes are the same.
-    exact : bool
-        Whether the same numbers were written by the same code and versions.
-    why_not : str
-        Why differences cannot be judged otherwise.
+        Its path in the folder.
+    recorded, written : Path
+        The folders it is in.
+    judged : callable
+        Tells by the name of a section why its words cannot be judged (None where they can), and
+        whether its numbers can.
     """
-    if same:
+    if (recorded / name).read_bytes() == (written / name).read_bytes():
         return Item(GROUP, name, Status.IDENTICAL)
-    if list(recorded) == list(written):
+    old, new = (_readable(folder, name) for folder in (recorded, written))
+    if old == new:
         note = "the same but for its pictures, which are compared as figures, or its line ends"
         return Item(GROUP, name, Status.WITHIN, note=note)
-    if exact:
-        return Item(GROUP, name, Status.DIFFERENT, note=differing_lines(recorded, written))
-    old, new = ("\n".join(text) for text in (recorded, written))
-    if _PICTURE.findall(old) != _PICTURE.findall(new):
+    if _pictures(old) != _pictures(new):
         note = "it shows other pictures, or in another order"
         return Item(GROUP, name, Status.DIFFERENT, note=note)
-    old_words, new_words = (
-        [without_numbers(_TAG.sub(" ", line)).strip() for line in text]
-        for text in (recorded, written)
+    parts, again = list(_sections(old)), list(_sections(new))
+    if [section for section, _ in parts] != [section for section, _ in again]:
+        return Item(GROUP, name, Status.DIFFERENT, note="it has other sections")
+    status, note = Status.WITHIN, "the same words; numbers are judged where they come from"
+    for (section, lines), (_, lines_again) in zip(parts, again, strict=True):
+        why, numbers = judged(section)
+        if _alike(lines, lines_again, numbers=numbers):
+            continue
+        said = differing_lines(lines, lines_again)
+        if why is None:
+            return Item(GROUP, name, Status.DIFFERENT, note=said)
+        status, note = Status.UNJUDGED, f"{why}: {said}"
+    return Item(GROUP, name, status, note=note)
+
+
+def _readable(folder: Path, name: str) -> list[str]:
+    """Lines of a text, with the names of the folder's figures in the place of the pictures."""
+    text = (folder / name).read_text(encoding="utf-8", errors="replace")
+    names = _figures(folder) if _IMAGE.search(text) else {}
+    return _IMAGE.sub(
+        lambda m: f"[picture {names.get(_hash(m[1]), 'of its own')}]", text
+    ).splitlines()
+
+
+def _pictures(lines: Sequence[str]) -> list[str]:
+    return [picture for line in lines for picture in _PICTURE.findall(line)]
+
+
+def _sections(lines: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
+    """Yield the lines of each section of a page, by what it is labelled by; first, its head."""
+    name, part = "", list[str]()
+    for line in lines:
+        begun = _SECTION.search(line)
+        if begun:
+            yield name, part
+            name, part = begun[1], []
+        part.append(line)
+    yield name, part
+
+
+def _alike(old: Sequence[str], new: Sequence[str], *, numbers: bool) -> bool:
+    """Whether texts have the same words in the same order and, if asked, the same numbers."""
+    return len(old) == len(new) and all(
+        a == b or (without_numbers(a) == without_numbers(b) and (not numbers or _near(a, b)))
+        for a, b in zip(old, new, strict=True)
     )
-    if old_words == new_words:
-        lines = sum(a != b for a, b in zip(recorded, written, strict=True))
-        note = f"{why_not}; the words are the same, {lines} lines differ in their numbers"
-        return Item(GROUP, name, Status.UNJUDGED, note=note)
-    note = f"{why_not}; beside numbers, {differing_lines(old_words, new_words)}"
-    return Item(GROUP, name, Status.UNJUDGED, note=note)
+
+
+def _near(old: str, new: str) -> bool:
+    """Whether the numbers of two lines differ by one unit of their last digit at the most."""
+    numbers = (NUMBER.findall(_TAG.sub(" ", line)) for line in (old, new))
+    return all(a == b or _one_unit(a, b) for a, b in zip(*numbers, strict=False))
+
+
+def _one_unit(old: str, new: str) -> bool:
+    (a, unit_a), (b, unit_b) = _parsed(old), _parsed(new)
+    return abs(a - b) <= 1.001 * max(unit_a, unit_b)
+
+
+def _parsed(text: str) -> tuple[float, float]:
+    """Return a number as shown and one unit of its last digit."""
+    plain = text.translate(_PLAIN).replace("\u00d710", "e").replace(",", "")
+    mantissa, _, exponent = plain.lower().partition("e")
+    decimals = len(mantissa.partition(".")[2])
+    power = int(exponent or 0)
+    try:
+        return float(f"{mantissa}e{power}"), 10.0 ** (power - decimals)
+    except ValueError:  # such as 1.2.3 of a version
+        return float("nan"), 0.0
 
 
 def differing_lines(old: Sequence[str], new: Sequence[str]) -> str:

@@ -12,12 +12,14 @@ from matplotlib import rcParams
 from matplotlib.collections import LineCollection
 
 from calib.data import table_from_arrays
-from calib.figures import Plate, collect, plates
+from calib.figures import collect
 from calib.figures.bands import bands_plate
+from calib.figures.collect import plates
 from calib.figures.corner import corner_plate
 from calib.figures.ensembles import ensembles_plate, rank_histograms
 from calib.figures.estimates import distances, estimates_plate
 from calib.figures.learned import learned_plate
+from calib.figures.plate import Plate
 from calib.figures.prior_predictive import prior_predictive_plate
 from calib.figures.reference import published_curve, published_sampled
 from calib.figures.residuals import residuals_plate, sign_changes, standardise

@@ -16,9 +16,10 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from calib.figures import Plate, plates
 from calib.figures.bands import FILLS
+from calib.figures.collect import plates
 from calib.figures.export import pdf_bytes, png_bytes
+from calib.figures.plate import Plate
 from calib.figures.style import (
     BLACK,
     CYCLE,

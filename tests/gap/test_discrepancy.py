@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from calib.gap.case import Campaigns
-from calib.gap.covariates import Covariates
 from calib.gap.discrepancy import Discrepancy
 from calib.gap.hypothesis import Hypothesis
 from gap.cases import campaigns_of
@@ -24,7 +23,7 @@ def data() -> Campaigns:
 def of(data: Campaigns, **kwargs) -> Discrepancy:
     lab_mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in data.outputs}
     h = Hypothesis("unknown", smooth=1.0, smooth_outputs=PULL, **kwargs)
-    return Discrepancy(data, h, Covariates(data), lab_mode)
+    return Discrepancy(data, h, lab_mode)
 
 
 def test_over_slip_it_is_cosines_of_slip_and_a_trend_with_pressure(data):

@@ -11,12 +11,13 @@ import pytest
 from matplotlib.figure import Figure
 
 from calib.figures import Plate
+from calib.figures.export import png_size
 from calib.models import MODELS
 from calib.models.base import BoundModel
-from calib.page import render_page
-from calib.page.content import failed_section, png_size
+from calib.page.content import failed_section
 from calib.page.equations import equation, parametrisation, prose, symbol_html, unit_html
 from calib.page.facts import repeats_words, validation_facts
+from calib.page.render import render_page
 from calib.page.tables import estimates_grid, posterior_rows, pressure_grids, sensitivity_grid
 from calib.study import Failure, Study
 

@@ -1,108 +1,86 @@
-"""A small report and a run, made once, and copies of them to tamper with."""
+"""A small report, a whole one and a run, and copies of them to tamper with.
+
+They are made in processes that round as another processor would; what is tampered with is to be
+found there as here. ``CALIB_MADE_UNDER`` names another setting (`kernels.Setting`).
+"""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import pytest
 
 import calib.reproduce.check_report as check_report_module
-from calib.audit import Seeds
-from calib.calibration import Calibration, calibrate
-from calib.contents import work_out
-from calib.data import Table
-from calib.estimators import estimate
-from calib.figures import Plate
-from calib.figures.bands import bands_plate
-from calib.figures.learned import learned_plate
-from calib.figures.style import style
 from calib.manifest import file_hashes, sha256
-from calib.paper_gaps.cases import paper_gaps
-from calib.problem import Problem, build_problem
 from calib.publish import publication
-from calib.report import write_report
 from calib.reproduce.check import check
 from calib.reproduce.items import Status
 from calib.reproduce.outcome import Outcome
 from calib.reproduce.recompute import recompute_report
-from calib.sampling.gate import Gate
-from calib.sampling.sampler import SamplerSettings
-from calib.store import save_calibration
-from calib.streams import generator
-from calib.study import OutputResult, Study, run_study
-from calib.study_tasks import he2019_tasks
+from calib.study import Study
 
-# Short chains, and a gate that lets them pass.
-SETTINGS = SamplerSettings(steps=100, gate=Gate(taus_min=20.0))
+from . import made
+from .kernels import ALL, FEW, Setting
 
 
-def two_plates(result: OutputResult, published: bool = False) -> list[Plate]:
-    with style():
-        return [
-            bands_plate(result, published=published),
-            learned_plate(result, published=published),
-        ]
+def made_under() -> Setting | None:
+    """The processor that the originals are made on; None for this one."""
+    named = os.environ.get("CALIB_MADE_UNDER")
+    if named:
+        return next(setting for setting in ALL if str(setting) == named)
+    return FEW[0] if FEW else None
 
 
-@pytest.fixture(scope="package", autouse=True)
-def _few_figures() -> Iterator[None]:
-    """Drawing takes most of the time of a report: two figures do for these tests."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("calib.report.plates", two_plates)
-        yield
-
-
-def rut_study(seed: int = 2019) -> Study:
-    tasks = [task for task in he2019_tasks() if task.output == "rut_depth"]
-    return run_study(tasks, seed, settings=SETTINGS)
-
-
-def write(study: Study, out: Path, **kwargs: Any) -> Path:
-    write_report(
-        study, out, settings=SETTINGS, command=["calib", "report"], title="A report", **kwargs
-    )
-    return out
+def original_of(kind: str, factory: pytest.TempPathFactory) -> Path:
+    setting, out = made_under(), factory.mktemp("original") / kind
+    return getattr(made, kind)(out) if setting is None else made.elsewhere(kind, out, setting)
 
 
 @pytest.fixture(scope="package")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report of rut depth, posterior included."""
-    return write(rut_study(), tmp_path_factory.mktemp("original") / "report")
+    return original_of("report", tmp_path_factory)
 
 
 @pytest.fixture(scope="package")
 def original_whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report with one of the source's gaps, the audit and figures for print."""
-    tasks = [task for task in he2019_tasks() if task.output == "rut_depth"]
-    gaps = [gap for gap in paper_gaps() if gap.name == "plain_bekker"]
-    found = work_out(tasks, 2019, settings=SETTINGS, gaps=gaps, audit=Seeds(1, 1, 1))
-    out = tmp_path_factory.mktemp("original") / "whole"
-    return write(found.study, out, gaps=found.gaps, audit=found.audit, pdf=True)
+    return original_of("whole", tmp_path_factory)
 
 
 @pytest.fixture(scope="package")
-def original_run(rut_tables: tuple[Table, Table], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def original_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run as `calib fit` makes it."""
-    folder = tmp_path_factory.mktemp("original") / "run"
-    folder.mkdir()
-    save_calibration(fitted_run(build_problem("modified_bekker", rut_tables[0]), 2019), folder)
-    return folder
+    return original_of("run", tmp_path_factory)
 
 
-def fitted_run(problem: Problem, seed: int) -> Calibration:
-    rng = generator(seed, problem.bound.model.name, "least_squares")
-    point = estimate(problem, "least_squares", rng)
-    return calibrate(problem, seed, estimates=(point,), settings=SETTINGS)
+@pytest.fixture(autouse=True)
+def _few_figures() -> Any:
+    with patch("calib.report.plates", made.two_plates):
+        yield
 
 
 @pytest.fixture
 def report(original: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(original, tmp_path / "report"))
+
+
+@pytest.fixture(scope="package")
+def original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report as this processor makes it."""
+    return made.report(tmp_path_factory.mktemp("original") / "here")
+
+
+@pytest.fixture
+def report_here(original_here: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original_here, tmp_path / "here"))
 
 
 @pytest.fixture
@@ -125,7 +103,7 @@ def computed_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
     """Do the work of equal inputs once: most tampering leaves them as they are."""
     cache, folder = _made
 
-    def again(manifest, tasks, out, progress):
+    def again(manifest, tasks, out, progress, pool):
         key = (
             manifest.model_dump_json(exclude={"files", "left_out"}),
             *(t.table[c].tobytes() for t in tasks for c in t.table),

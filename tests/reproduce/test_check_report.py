@@ -22,7 +22,8 @@ from calib.sampling.sampler import SamplerSettings
 from calib.study import run_study
 from calib.study_tasks import he2019_tasks
 
-from .conftest import different, edit_json, findings, rut_study, seal, write
+from .conftest import different, edit_json, findings, seal
+from .made import rut_study, write
 
 pytestmark = pytest.mark.usefixtures("computed_once")
 
@@ -31,7 +32,8 @@ CONTRADICTION = "summary.json and rut_depth.nc"
 BANDS, LEARNED = "figures/rut_depth_bands.png", "figures/rut_depth_learned.png"
 
 
-def test_an_untouched_report_is_the_same_bit_for_bit(report: Path) -> None:
+def test_an_untouched_report_is_the_same_bit_for_bit(report_here: Path) -> None:
+    report = report_here
     before = {p: p.read_bytes() for p in report.rglob("*") if p.is_file()}
     outcome = check(report)
     assert {item.status for item in outcome.items} == {Status.IDENTICAL}
@@ -78,7 +80,7 @@ def test_quick_says_that_it_skips_the_sampling(report: Path) -> None:
 
 
 def change_number(report: Path) -> None:
-    edit_json(report / "summary.json", lambda s: scale(s, "posterior", "n1", "mean"))
+    edit_json(report / "summary.json", lambda s: scale(s, "posterior", "n1", "mean", by=1.1))
 
 
 def change_estimate(report: Path) -> None:
@@ -86,7 +88,7 @@ def change_estimate(report: Path) -> None:
 
 
 def change_score(report: Path) -> None:
-    edit_json(report / "summary.json", lambda s: scale(s, "validation", "rmse"))
+    edit_json(report / "summary.json", lambda s: scale(s, "validation", "rmse", by=1.2))
 
 
 def scale(summary, *place: str, by: float = 1.001) -> None:
@@ -171,7 +173,7 @@ TAMPERING: dict[str, tuple[Callable[[Path], None], list[str], list[str]]] = {
         ["priors/rut_depth.toml", f"{SUMMARY}.sampling.mode.n1", "rut_depth.nc"]),
     "the reason of a prior": (
         replace_text("priors/rut_depth.toml", "Slip sinkage raises", "Everybody knows that"),
-        ["priors/rut_depth.toml"], ["priors/rut_depth.toml", "index.html"]),
+        ["priors/rut_depth.toml"], ["priors/rut_depth.toml", f"{SUMMARY}.priors.n1.reason"]),
     "two figures swapped": (swap_figures, [BANDS, LEARNED], [BANDS, LEARNED]),
     "two figures swapped on the page too": (
         swap_figures_on_the_page_too, [BANDS, LEARNED, "index.html"], [BANDS, LEARNED]),
@@ -266,8 +268,8 @@ def test_another_seed_is_not_the_one_that_was_used(report: Path) -> None:
     assert "summary.json: seed" in findings(report)
 
 
-def test_a_posterior_may_be_left_out_on_purpose(original: Path, tmp_path: Path) -> None:
-    whole = json.loads((original / "manifest.json").read_text())
+def test_a_posterior_may_be_left_out_on_purpose(original_here: Path, tmp_path: Path) -> None:
+    whole = json.loads((original_here / "manifest.json").read_text())
     folder = write(rut_study(), tmp_path / "lean", posteriors=False)
     assert not (folder / "rut_depth.nc").exists()
     manifest = json.loads((folder / "manifest.json").read_text())
@@ -278,8 +280,11 @@ def test_a_posterior_may_be_left_out_on_purpose(original: Path, tmp_path: Path) 
     assert item.status is Status.IDENTICAL
     assert "left out on purpose" in item.note
 
+    # The hash of a file that is not there says nothing: another processor makes another file.
     edit_json(folder / "manifest.json", lambda m: m["left_out"].update({"rut_depth.nc": "0" * 64}))
-    assert "rut_depth.nc" in findings(folder)
+    outcome = check(folder)
+    assert outcome.exit_code == 0
+    assert [item.name for item in outcome.of(Status.UNJUDGED)] == ["rut_depth.nc"]
 
 
 def test_nothing_else_may_be_left_out(report: Path) -> None:
@@ -326,7 +331,7 @@ def test_other_draws_are_the_same_within_their_error(other: Path) -> None:
     assert mean.allowed is not None
     # Half a posterior sd at the most, and more than a hundredth.
     assert 0.01 < mean.allowed / by_name[f"{SUMMARY}.posterior.n1.sd"].found < 0.5
-    assert by_name["index.html"].status is Status.UNJUDGED
+    assert by_name["index.html"].status in (Status.WITHIN, Status.UNJUDGED)
     assert by_name[BANDS].status is Status.WITHIN
 
 
@@ -409,8 +414,9 @@ def test_a_picture_under_another_caption_is_found(
     assert list(findings(folder)) == ["index.html"]
 
 
-def test_the_same_picture_stored_otherwise_is_the_same(report: Path) -> None:
+def test_the_same_picture_stored_otherwise_is_the_same(report_here: Path) -> None:
     """As another compression library would store it, in the folder and on the page."""
+    report = report_here
     from PIL import Image
 
     old = (report / BANDS).read_bytes()
@@ -454,13 +460,21 @@ def test_rounding_is_no_difference(report: Path) -> None:
 
 
 def test_among_rounded_numbers_one_that_moved_is_found(report: Path) -> None:
-    """By less than other draws might move it."""
     edit_json(report / "summary.json", round_otherwise)
-    edit_json(report / "summary.json", lambda s: scale(s, "posterior", "n1", "mean", by=1.004))
+    edit_json(report / "summary.json", lambda s: scale(s, "posterior", "n1", "mean", by=1.1))
     seal(report)
-    found = findings(report)
-    assert set(found) == {f"{SUMMARY}.posterior.n1.mean", CONTRADICTION}
-    assert "agree far better" in found[f"{SUMMARY}.posterior.n1.mean"]
+    assert set(findings(report)) == {f"{SUMMARY}.posterior.n1.mean", CONTRADICTION}
+
+
+def test_less_than_the_monte_carlo_error_is_found_by_the_draws_alone(report: Path) -> None:
+    """Other draws might have moved it as far, but not the ones in the folder."""
+    edit_json(report / "summary.json", lambda s: scale(s, "posterior", "n1", "mean", by=1.001))
+    seal(report)
+    assert list(findings(report)) == [CONTRADICTION]
+    (report / "rut_depth.nc").unlink()
+    edit_json(report / "manifest.json", lambda m: m["files"].pop("rut_depth.nc"))
+    edit_json(report / "manifest.json", lambda m: m["left_out"].update({"rut_depth.nc": "0" * 64}))
+    assert findings(report) == {}
 
 
 def test_one_wrong_estimate_does_not_make_the_data_wrong(report: Path) -> None:
@@ -514,7 +528,8 @@ def test_another_folder_cannot_be_checked(tmp_path: Path) -> None:
 # Versions
 
 
-def test_another_version_explains_another_page_and_does_not_hide_it(report: Path) -> None:
+def test_another_version_explains_another_page_and_does_not_hide_it(report_here: Path) -> None:
+    report = report_here
     replace_text("index.html", "Do not trust:", "Trust too:")(report)
     edit_json(report / "manifest.json", lambda m: m.update(code="0" * 64))
     seal(report)
@@ -539,13 +554,20 @@ def test_priors_of_another_version_are_not_called_wrong(report: Path) -> None:
     assert item.name == "priors/rut_depth.toml"
 
 
-def test_numbers_are_read_as_they_are_written(report: Path) -> None:
-    """The last bit of one number."""
+@pytest.mark.parametrize("what", ["posterior.n1.mean", "fit.least_squares.cost"])
+def test_the_last_bit_of_one_number_is_no_difference(report_here: Path, what: str) -> None:
+    """However many others are the same to the last bit."""
+    report = report_here
 
     def change(summary) -> None:
-        entry = summary["models"]["rut_depth"]["posterior"]["n1"]
-        entry["mean"] = float(np.nextafter(entry["mean"], 1e9))
+        *place, last = what.split(".")
+        entry = summary["models"]["rut_depth"]
+        for key in place:
+            entry = entry[key]
+        entry[last] = float(np.nextafter(entry[last], 1e9))
 
     edit_json(report / "summary.json", change)
     seal(report)
-    assert f"{SUMMARY}.posterior.n1.mean" in findings(report)
+    outcome = check(report)
+    assert different(outcome) == {}
+    assert [item.name for item in outcome.of(Status.WITHIN)] == [f"{SUMMARY}.{what}"]

@@ -18,10 +18,13 @@ from calib.reproduce.items import Status
 from calib.sampling.sampler import SamplerSettings
 from calib.store import load_calibration, save_calibration
 
-from .conftest import SETTINGS, different, edit_json, findings, fitted_run, seal_run
+from . import made
+from .conftest import different, edit_json, findings, seal_run
+from .made import SETTINGS, fitted_run
 
 
-def test_an_untouched_run_is_the_same_bit_for_bit(run: Path) -> None:
+def test_an_untouched_run_is_the_same_bit_for_bit(tmp_path: Path) -> None:
+    run = made.run(tmp_path / "run")
     outcome = check(run)
     assert {item.status for item in outcome.items} == {Status.IDENTICAL}
     assert outcome.verdict.startswith("SAME, bit for bit")
@@ -80,11 +83,11 @@ def change_derived_draws(run: Path) -> None:
 
 
 def change_evidence(run: Path) -> None:
-    edit_json(run / "run.json", lambda m: m.update(log_evidence=m["log_evidence"] + 0.001))
+    edit_json(run / "run.json", lambda m: m.update(log_evidence=m["log_evidence"] + 0.5))
 
 
 def change_gate(run: Path) -> None:
-    edit_json(run / "run.json", lambda m: m["gate"]["rhat"].__setitem__(0, 1.0))
+    edit_json(run / "run.json", lambda m: m["gate"]["rhat"].__setitem__(0, 1.02))
 
 
 def add_a_file(run: Path) -> None:

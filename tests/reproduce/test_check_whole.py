@@ -28,12 +28,12 @@ BOTH = f"summary.json and {DIAGNOSIS}"
 PICTURE = re.compile(r"(data:image/png;base64,)([A-Za-z0-9+/=]*)")
 
 
-def test_an_untouched_report_is_the_same_bit_for_bit(whole: Path) -> None:
+def test_an_untouched_report_is_the_same(whole: Path) -> None:
     outcome = check(whole)
-    assert {item.status for item in outcome.items} == {Status.IDENTICAL}
+    assert different(outcome) == {}
     names = {item.name for item in outcome.items}
     there = {p.relative_to(whole).as_posix() for p in whole.rglob("*") if p.is_file()}
-    assert there <= names | {"manifest.json"}
+    assert there <= {name.partition(": ")[0] for name in names}
     assert f"{GAP}.probability.slip_sinkage" in names
     assert f"{GAP}.checks.kept_out_rows.rmse_after_mm" in names
     # As files, and made again from what they show.
@@ -46,7 +46,7 @@ def test_an_untouched_report_is_the_same_bit_for_bit(whole: Path) -> None:
 
 
 def change_gap(whole: Path) -> None:
-    edit_json(whole / "summary.json", lambda s: move(gap_of(s)["probability"], "none", 0.01))
+    edit_json(whole / "summary.json", lambda s: move(gap_of(s)["probability"], "none", 0.03))
 
 
 def gap_of(summary: dict[str, Any]) -> dict[str, Any]:
@@ -73,7 +73,7 @@ def change_shrink_everywhere(whole: Path) -> None:
 
 
 def change_where(whole: Path) -> None:
-    edit_json(whole / DIAGNOSIS, lambda d: move(d["where"][3], "probability", -1e-3))
+    edit_json(whole / DIAGNOSIS, lambda d: move(d["where"][3], "probability", -0.1))
 
 
 def change_corrected(whole: Path) -> None:
@@ -94,7 +94,7 @@ def change_prediction(whole: Path) -> None:
     path = whole / "gaps/plain_bekker/fresh_prediction.csv"
     *rows, last = path.read_text().splitlines()
     *cells, value = last.split(",")
-    path.write_text("\n".join([*rows, ",".join([*cells, repr(float(value) * 1.01)])]) + "\n")
+    path.write_text("\n".join([*rows, ",".join([*cells, repr(float(value) * 1.05)])]) + "\n")
 
 
 def swap_pictures_of_a_gap(whole: Path) -> None:
@@ -163,7 +163,7 @@ def swap_prints(whole: Path) -> None:
 
 
 def change_sensitivity(whole: Path) -> None:
-    edit_json(whole / "summary.json", lambda s: move(sensitivity_of(s), "likelihood", -0.01))
+    edit_json(whole / "summary.json", lambda s: move(sensitivity_of(s), "likelihood", 0.5))
 
 
 def sensitivity_of(summary: dict[str, Any]) -> dict[str, Any]:
@@ -191,7 +191,7 @@ TAMPERING: dict[str, tuple[Callable[[Path], None], str, list[str]]] = {
     "where a gap lies": (change_where, DIAGNOSIS, [f"{DIAGNOSIS}: where.3.probability"]),
     "a corrected model": (
         change_corrected, "gaps/plain_bekker/corrected.json",
-        ["gaps/plain_bekker/corrected.json: fits.0.psi.2"]),
+        ["gaps/plain_bekker/corrected.json"]),
     "a row of a gap": (
         change_case, "gaps/plain_bekker/case/field.csv",
         ["gaps/plain_bekker/case/field.csv: 13.rut_depth_mm"]),

@@ -12,10 +12,14 @@ from calib.calibration import calibrate
 from calib.data import hold_out
 from calib.estimators import estimate
 from calib.problem import build_problem
-from calib.reproduce.allowances import output_allowances, run_allowances
 from calib.reproduce.items import Status
-from calib.reproduce.montecarlo import posterior_errors, validation_errors
-from calib.reproduce.numbers import Section, compare_section, flatten
+from calib.reproduce.montecarlo import (
+    drawn_in_output,
+    drawn_in_run,
+    posterior_errors,
+    validation_errors,
+)
+from calib.reproduce.numbers import compare_entries, flatten
 from calib.scores import score
 from calib.streams import generator
 from calib.study import run_study
@@ -162,11 +166,12 @@ def test_no_false_alarm_over_the_pairs_of_many_seeds() -> None:
             if i == j:
                 continue
             for key, result in study.successes.items():
-                section = Section("summary.json", ("models", key), dict(flatten(other[key])),
-                                  dict(flatten(documents[i][key])))  # fmt: skip
-                paths = {**section.recorded, **section.found}
-                rules = output_allowances(result, 300, section.recorded, paths)
-                items = compare_section(section, rules, group_of=lambda p: p[0])
+                place = ("summary.json", "models", key)
+                old, new = (dict(flatten(d[key], place)) for d in (other, documents[i]))
+                steps = old[*place, "sampling", "steps"]
+                sizes = drawn_in_output(result.calibration, result.validation, 300, steps)
+                drawn_by = {(*place, *path): size for path, size in sizes.items()}
+                items = compare_entries(old, new, lambda _: "", drawn_by)
                 # Other seeds search otherwise: only what is drawn from posteriors is meant here.
                 drawn = [i for i in items if any(f".{part}." in i.name for part in DRAWN)]
                 compared += len(drawn)
@@ -176,10 +181,13 @@ def test_no_false_alarm_over_the_pairs_of_many_seeds() -> None:
 
 
 def test_a_run_is_allowed_what_a_report_is(rut_calibration) -> None:
-    paths = [("gate", "rhat", "0"), ("evaluations",), ("acceptance",)]
-    rules = run_allowances(rut_calibration, {}, paths)
-    assert rules["log_evidence",].why == "Monte Carlo error"
-    assert rules["gate", "rhat", "0"].size == 0.01
-    assert rules["evaluations",].factor == 10.0
+    sizes = drawn_in_run(rut_calibration, None)
+    errors = posterior_errors(rut_calibration)
+    # Seven errors of a difference, times what ensembles are short of independence.
+    times = sizes["log_evidence",] / errors["sampling", "log_evidence"]
+    assert 6.0 < times < 10.0
+    assert sizes["posterior", "n1", "mean"] == pytest.approx(
+        times * errors["posterior", "n1", "mean"]
+    )
     sd = rut_calibration.draws.flat.std(axis=0)
-    assert rules["mode", "1"].size == pytest.approx(0.01 * sd[1])
+    assert sizes["mode", "1"] == pytest.approx(sd[1])

@@ -1,0 +1,186 @@
+"""Residuals of both campaigns as functions of a hypothesis's parameters psi, many psi at once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.gap.case import Campaigns
+from calib.gap.forward import Forward
+from calib.gap.noise import Noise, most_probable
+from calib.models.base import Array
+from calib.sampling.mode import prior_widths
+
+__all__ = ["Residuals", "residuals_of_all"]
+
+# Guesses closer than this (in prior sds) climb to the same mode.
+_APART = 0.7
+# Step of differences, in prior sds.
+_DIFFERENCE = 1e-4
+# Vectors at once whose predictions stay in the processor's cache.
+_AT_ONCE = 1024
+
+
+class Residuals:
+    """Observed minus predicted of lab then field rows, one output after the other.
+
+    Parameters
+    ----------
+    data : Campaigns
+    forward : Forward
+    """
+
+    def __init__(self, data: Campaigns, forward: Forward) -> None:
+        self.data, self.forward = data, forward
+        loc, _, self.lower, self.upper, self.precision = forward.priors._arrays
+        self.loc = np.where(self.precision > 0, loc, 0.0)
+        self.width = prior_widths(forward.priors)
+        sizes = [at.slip.size for at in data.at_rows.values()]
+        ends = np.cumsum(sizes).tolist()
+        self.parts = {
+            o.name: slice(end - size, end)
+            for o, end, size in zip(data.outputs, ends, sizes, strict=True)
+        }
+
+    def clip(self, psi: Array) -> Array:
+        """Move psi inside its bounds."""
+        margin = 1e-7 * self.width
+        return np.clip(psi, self.lower + margin, self.upper - margin)
+
+    def blocked(self, psi: Array, direction: Array) -> NDArray[np.bool_]:
+        """Which coordinates are at a bound that the direction leads beyond, shape (k, d)."""
+        tiny = 2e-7 * self.width
+        return ((psi <= self.lower + tiny) & (direction < 0)) | (
+            (psi >= self.upper - tiny) & (direction > 0)
+        )
+
+    def raw(self, psi: Array) -> Array:
+        """Evaluate, shape (k, d) to (k, N)."""
+        return self.beside(*self.forward.campaigns(psi))
+
+    def beside(self, lab: Mapping[str, Array], field: Mapping[str, Array]) -> Array:
+        """Observed minus what is predicted for both campaigns."""
+        predicted: list[Array] = []
+        for o in self.data.outputs:
+            there = field[o.name]
+            predicted += lab[o.name], there if o.rows.size == there.shape[1] else there[:, o.rows]
+        raw: Array = np.concatenate(predicted, axis=1)
+        return np.subtract(self.data.observed, raw, out=raw)
+
+    def sds(self, noise: Mapping[str, Noise]) -> Array:
+        """Noise sd of every row, shape (N,)."""
+        return np.concatenate([noise[o].sd(at) for o, at in self.data.at_rows.items()])
+
+    def costs(self, psi: Array, raw: Array, sds: Array) -> Array:
+        """Minus log posterior but for constants.
+
+        Parameters
+        ----------
+        psi : ndarray, shape (..., d)
+        raw, sds : ndarray, shape (..., N)
+
+        Returns
+        -------
+        ndarray, shape (...)
+        """
+        with np.errstate(over="ignore"):  # a cost beyond all numbers is one as well
+            squares = np.square(raw / sds).sum(axis=-1)
+            squares += np.square((psi - self.loc) * self.precision).sum(axis=-1)
+            return np.asarray(0.5 * squares + np.log(sds).sum(axis=-1))
+
+    def best(self, costs: Array, candidates: Array, count: int) -> list[int]:
+        """Return which candidates are best and lie apart from each other, at most `count`."""
+        picked: list[int] = []
+        for i in np.argsort(np.where(np.isfinite(costs), costs, np.inf), kind="stable").tolist():
+            apart = np.abs((candidates[picked] - candidates[i]) / self.width).max(axis=1) > _APART
+            if apart.all():
+                picked.append(i)
+            if len(picked) == count:
+                break
+        return picked
+
+    def around(self, psi: Array) -> Array:
+        """Points beside psi that tell the derivatives there, shape (m, d) to (m d, d)."""
+        return (psi[:, None] + self._steps(psi)[:, None] * np.eye(psi.shape[1])).reshape(
+            -1, psi.shape[1]
+        )
+
+    def jacobian(self, psi: Array, raw: Array, moved: Array) -> Array:
+        """Derivatives of the residuals.
+
+        Parameters
+        ----------
+        psi : ndarray, shape (m, d)
+        raw : ndarray, shape (m, N)
+            Residuals there.
+        moved : ndarray, shape (m d, N)
+            Residuals at the points `around`.
+
+        Returns
+        -------
+        ndarray, shape (m, d, N)
+        """
+        change = moved.reshape(*psi.shape, -1) - raw[:, None]
+        # Beside ground where the model has no value nothing is known.
+        change = np.where(np.isfinite(change), change, 0.0)
+        return np.asarray(change / self._steps(psi)[:, :, None])
+
+    def _steps(self, psi: Array) -> Array:
+        step = _DIFFERENCE * self.width
+        return np.where(psi + step > self.upper, -step, step)
+
+    def update_noise(self, raw: Array, scaled: Array, hessian: Array) -> dict[str, Noise]:
+        """Noise scales that maximise the marginal likelihood, parameters allowed for.
+
+        Parameters
+        ----------
+        raw : ndarray, shape (N,)
+        scaled : ndarray, shape (d, N)
+            Derivatives of the residuals over their sds.
+        hessian : ndarray, shape (d, d)
+        """
+        factor = np.linalg.solve(hessian + np.diag(1e-6 / self.width**2), scaled)
+        leverage = (scaled * factor).sum(axis=0)
+        # Each residual lost the part of its variance that the parameters took up.
+        corrected = np.square(raw) / np.clip(1.0 - leverage, 0.1, 1.0)
+        at = self.data.at_rows
+        return {o: most_probable(corrected[part], at[o]) for o, part in self.parts.items()}
+
+
+def residuals_of_all(asked: Sequence[tuple[Residuals, Array]]) -> list[Array]:
+    """Evaluate problems on the same campaigns at psi of each, shapes (k, d) to (k, N).
+
+    Hypotheses differ in what they add to the simulators: these are asked once for all of them.
+    """
+    found: dict[int, Array] = {}
+    batch: list[int] = []
+    size = 0
+    for i, (problem, psi) in enumerate(asked):
+        if problem.forward.shift is not None:
+            found[i] = problem.raw(psi)
+            continue
+        if batch and size + len(psi) > _AT_ONCE:
+            found |= _batched(asked, batch)
+            batch, size = [], 0
+        batch.append(i)
+        size += len(psi)
+    found |= _batched(asked, batch)
+    return [found[i] for i in range(len(asked))]
+
+
+def _batched(asked: Sequence[tuple[Residuals, Array]], batch: list[int]) -> dict[int, Array]:
+    if not batch:
+        return {}
+    forward = asked[batch[0]][0].forward
+    shared = [asked[i][1][:, : forward.n_shared] for i in batch]
+    lab, plain = forward.plain(np.concatenate(shared))
+    found, end = {}, 0
+    for i, part in zip(batch, shared, strict=True):
+        problem, psi = asked[i]
+        start, end = end, end + len(part)
+        own_lab, own = ({o: v[start:end] for o, v in all_.items()} for all_ in (lab, plain))
+        field = problem.forward.departed(psi, problem.data.view, own)
+        found[i] = problem.beside(own_lab, field)
+    return found

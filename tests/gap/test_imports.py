@@ -1,0 +1,28 @@
+"""What a diagnosis imports: nothing that it does not need, for it is waited for."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+_HEAVY = (
+    "arviz", "corner", "dask", "distributed", "emcee", "jinja2", "matplotlib", "pandas", "pint",
+    "scipy.stats", "xarray",
+)  # fmt: skip
+
+
+def _imported(statement: str) -> list[str]:
+    code = f"import json, sys\n{statement}\nprint(json.dumps(sorted(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return list(json.loads(done.stdout))
+
+
+def test_a_diagnosis_needs_no_sampler_no_figures_and_no_data_frames():
+    found = _imported("import calib.gap.case, calib.gap.diagnose")
+    assert "calib.gap.which" in found
+    assert [name for name in _HEAVY if name in found] == []
+
+
+def test_the_package_by_itself_needs_nothing():
+    assert [name for name in ("numpy", "scipy", *_HEAVY) if name in _imported("import calib")] == []

@@ -1,0 +1,60 @@
+"""Processors that this one can stand in for: kernels of its linear algebra, NumPy's instructions.
+
+OpenBLAS is told which processor's kernels to use, NumPy which vector instructions to do without.
+Both decide how sums are rounded, as another processor would.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from itertools import product
+from typing import Any, NamedTuple
+
+import numpy as np
+
+# By kernel, the newest vector instructions that it needs.
+_NEEDS = {
+    "Prescott": "SSE3", "Nehalem": "SSE42", "Sandybridge": "AVX", "Haswell": "AVX2", "Zen": "AVX2",
+    "SkylakeX": "AVX512_SKX",
+}  # fmt: skip
+
+
+class Setting(NamedTuple):
+    """Kernel of the linear algebra, whether NumPy uses all vector instructions, threads."""
+
+    kernel: str
+    vectors: bool
+    threads: int
+
+    def environment(self) -> dict[str, str]:
+        """Return the environment of a process that stands in for such a processor."""
+        config: Any = np.show_config(mode="dicts")
+        # What a build needs at the least cannot be switched off.
+        optional = " ".join(config["SIMD Extensions"].get("found", ()))
+        bare = {k: v for k, v in os.environ.items() if k != "NPY_DISABLE_CPU_FEATURES"}
+        return bare | {
+            "OPENBLAS_CORETYPE": self.kernel,
+            "OPENBLAS_NUM_THREADS": str(self.threads),
+            **({} if self.vectors or not optional else {"NPY_DISABLE_CPU_FEATURES": optional}),
+        }
+
+    def __str__(self) -> str:
+        """Name the setting, for a test's id."""
+        return f"{self.kernel}-{'all' if self.vectors else 'few'}-{self.threads}"
+
+
+def _can_run(kernel: str) -> bool:
+    from numpy._core._multiarray_umath import __cpu_features__
+
+    return platform.machine() in ("x86_64", "AMD64") and __cpu_features__.get(_NEEDS[kernel], False)
+
+
+KERNELS = tuple(filter(_can_run, _NEEDS))
+ALL = tuple(Setting(*s) for s in product(KERNELS, (True, False), (1, 2)))
+# The oldest and the newest, and one thread and two, all instructions and few.
+FEW = tuple(
+    Setting(*s)
+    for s in (("Prescott", False, 1), ("Haswell", True, 2), ("SkylakeX", True, 1))
+    if s[0] in KERNELS
+)
