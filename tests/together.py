@@ -11,9 +11,10 @@ TESTS = Path(__file__).parent
 # has them once. The longest groups first: no process is left with one when the others are done.
 # A file that is not here is a group of its own, after these.
 GROUPS = (
-    ("reproduce/test_check_report.py",),
-    ("reproduce/test_check_run.py",),
+    ("test_reference_report.py",),
+    ("reproduce/test_check_report.py", "reproduce/test_processors.py"),
     ("reproduce/test_check_whole.py",),
+    ("reproduce/test_check_run.py",),
     ("paper_gaps/test_find.py", "paper_gaps/test_cases.py", "cli/test_paper_gaps.py",
      "figures/test_paper_gaps.py", "page/test_paper_gaps.py"),
     ("campaign/test_run.py", "campaign/test_kinds.py", "campaign/test_plan.py"),
