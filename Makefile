@@ -17,7 +17,7 @@ report: $(READY)
 reference: $(READY)
 	$(BIN)/calib report --out reports/he2019 --overwrite --no-posteriors
 
-# A file's tests share what it samples, so a file stays in one process.
+# Tests that share what they sample stay in one process (tests/together.py).
 test: $(READY)
 	$(BIN)/python -m pytest -n auto --dist loadfile
 

@@ -92,6 +92,16 @@ def test_too_few_draws_are_refused() -> None:
     assert any("bulk ESS" in r and "at least 400" in r for r in report.reasons)
 
 
+def test_tails_that_are_seldom_visited_are_refused_though_the_middle_mixes() -> None:
+    """Signs are independent, but sizes stay for fifty steps: the means know, the tails do not."""
+    draws = good()
+    sizes = np.random.default_rng(3).choice([0.3, 3.0], (4, 20, 4))
+    draws[..., 0] *= np.repeat(sizes, 50, axis=2)
+    report = judged(draws, rhat_max=1.1, ess_min=8000.0)
+    assert report.ess_bulk.min() > 12_000.0
+    assert [r.split(" is ")[0] for r in report.reasons] == ["tail ESS of a"]
+
+
 def test_fewer_than_four_ensembles_cannot_be_compared() -> None:
     report = judged(good()[:3])
     assert not report.passed
