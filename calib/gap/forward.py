@@ -213,13 +213,23 @@ class Forward:
     @_SILENT
     def departed(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
         """Add effects and discrepancies to what the simulators predict."""
+        changed = dict(plain)
         if self.hypothesis.effects:
-            plain = self._with_effects(psi, view, plain)
+            changed = self._with_effects(psi, view, changed)
         if self.smooth_slices:
             threshold = psi[:, self.threshold :].ravel()  # of one that sets in, else empty
             for name, part in self.smooth_slices.items():
-                plain[name] = plain[name] + self.discrepancy.at(psi[:, part], threshold, view, name)
-        return plain
+                added = self.discrepancy.at(psi[:, part], threshold, view, name)
+                changed[name] = changed[name] + added
+        return changed
+
+    @_SILENT
+    def field_and_plain(self, psi: Array, view: View) -> tuple[dict[str, Array], dict[str, Array]]:
+        """Predict as `field` and as `simulator` do."""
+        plain = self.simulator(psi, view)
+        if self.shift is not None:
+            return self.field(psi, view), plain
+        return self.departed(psi, view, plain), plain
 
     def _shifted(self, shift: Array, conditions: dict[str, Array]) -> dict[str, Array]:
         """Conditions as they truly are: with a shift the zero of slip is another."""

@@ -100,8 +100,7 @@ class Mixture:
         size = max(100, int(N_DRAWS * probability))
         rng = generator(self.seed, "gap", "truth", fit.forward.hypothesis.name, index)
         psi = fit.draws(rng, size)
-        with np.errstate(all="ignore"):
-            plain, full = fit.forward.simulator(psi, view), fit.forward.field(psi, view)
+        full, plain = fit.forward.field_and_plain(psi, view)
         # Draws for which a model has no value somewhere are left out for all outputs.
         good = np.ones(size, dtype=np.bool_)
         for o in self.data.outputs:

@@ -81,14 +81,14 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
         for s in forward.form_slices.values():
             psi[:, s] = 0.0
     with np.errstate(all="ignore"):
-        full = forward.field(psi, data.view)
+        full, plain = forward.field_and_plain(psi, data.view)
         if hypothesis.smooth_outputs and named:
             rest = psi.copy()
             for s in forward.smooth_slices.values():
                 rest[:, s] = 0.0
             without = [forward.field(rest, data.view)]
         elif len(hypothesis.effects) <= 1:
-            without = [forward.simulator(psi, data.view)]
+            without = [plain]
         else:
             without = [_lone(forward, psi, i) for i in range(len(hypothesis.effects))]
     at = noise_at(data.view)

@@ -141,8 +141,8 @@ class Residuals:
             Derivatives of the residuals over their sds.
         hessian : ndarray, shape (d, d)
         """
-        factor = np.linalg.solve(hessian + np.diag(1e-6 / self.width**2), scaled)
-        leverage = (scaled * factor).sum(axis=0)
+        inverse = np.linalg.inv(hessian + np.diag(1e-6 / self.width**2))
+        leverage = (scaled * (inverse @ scaled)).sum(axis=0)
         # Each residual lost the part of its variance that the parameters took up.
         corrected = np.square(raw) / np.clip(1.0 - leverage, 0.1, 1.0)
         at = self.data.at_rows
@@ -174,13 +174,16 @@ def _batched(asked: Sequence[tuple[Residuals, Array]], batch: list[int]) -> dict
     if not batch:
         return {}
     forward = asked[batch[0]][0].forward
-    shared = [asked[i][1][:, : forward.n_shared] for i in batch]
-    lab, plain = forward.plain(np.concatenate(shared))
+    shared = np.concatenate([asked[i][1][:, : forward.n_shared] for i in batch])
+    # Guesses and differences mostly leave the simulators' parameters as in the row before.
+    new = np.append(True, (shared[1:] != shared[:-1]).any(axis=1))
+    index = np.cumsum(new) - 1
+    lab, plain = forward.plain(shared[new])
     found, end = {}, 0
-    for i, part in zip(batch, shared, strict=True):
+    for i in batch:
         problem, psi = asked[i]
-        start, end = end, end + len(part)
-        own_lab, own = ({o: v[start:end] for o, v in all_.items()} for all_ in (lab, plain))
+        start, end = end, end + len(psi)
+        own_lab, own = ({o: v[index[start:end]] for o, v in p.items()} for p in (lab, plain))
         field = problem.forward.departed(psi, problem.data.view, own)
         found[i] = problem.beside(own_lab, field)
     return found
