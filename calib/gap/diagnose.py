@@ -10,18 +10,19 @@ import numpy as np
 
 from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns, read_case
 from calib.gap.corrected import Corrected, conditions_outside
-from calib.gap.effects import EFFECTS, Effect
+from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.mixture import Truth, mixture
 from calib.gap.next_measurement import NextMeasurement, next_measurements
 from calib.gap.outliers import rank_without_outliers, without_outputs
 from calib.gap.shrink import FreshPrediction, Shrink, predict_fresh, shrink
 from calib.gap.where import Region, RowGap, regions, row_gaps
-from calib.gap.which import Ranking, calibrate_lab, rank
+from calib.gap.which import Lab, Ranking, calibrate_lab, rank
 from calib.models.base import Array
 from calib.streams import generator
+from calib.tasks.pool import HERE, Pool
 from calib.threads import one_thread
 
-__all__ = ["Diagnosis", "diagnose", "verdict"]
+__all__ = ["Diagnosis", "diagnose", "diagnose_once", "verdict", "with_unseen_rows"]
 
 # A single hypothesis is named when it is at least this probable.
 NAMED = 0.5
@@ -71,9 +72,12 @@ class Diagnosis:
         return f"Diagnosis({self.data.case.name}: {self.verdict}; {best})"
 
 
-@one_thread()
 def diagnose(
-    case: Case | str | Path, seed: int = 1, *, effects: Mapping[str, Effect] = EFFECTS
+    case: Case | str | Path,
+    seed: int = 1,
+    *,
+    effects: Mapping[str, Effect] = EFFECTS,
+    pool: Pool = HERE,
 ) -> Diagnosis:
     """Find where a calibrated simulator misses, which effect it lacks, and what adding it gains.
 
@@ -85,6 +89,8 @@ def diagnose(
         Same seed, same numbers.
     effects : mapping of str to Effect, optional
         The effects to consider, by name.
+    pool : Pool, optional
+        Where field rows are left out, if they have to be; the numbers do not depend on it.
 
     Returns
     -------
@@ -97,6 +103,15 @@ def diagnose(
     """
     if not isinstance(case, Case):
         case = read_case(Path(case))
+    return with_unseen_rows(diagnose_once(case, seed, effects), effects, pool)
+
+
+@one_thread()
+def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS) -> Diagnosis:
+    """Diagnose a case; how far the gap shrinks is judged on the rows it was found on.
+
+    Unless there are other conditions to predict, `with_unseen_rows` has to follow.
+    """
     data, ranking = rank_without_outliers(case, seed, effects)
     mixed = mixture(data, ranking, seed)
     truth = mixed.at(data.view)
@@ -107,8 +122,6 @@ def diagnose(
     corrected = Corrected(mixed, ranking.lab_mode)
     before = corrected.calibrated(target.conditions)
     far = shrink(data, at_target, before, at_target.means)
-    if far and case.fresh is None:
-        far = shrink(data, truth, before, _left_out(data, truth, seed, effects))
     return Diagnosis(
         _beyond(data, corrected, before),
         ranking,
@@ -122,6 +135,18 @@ def diagnose(
         corrected,
         seed,
     )
+
+
+def with_unseen_rows(
+    found: Diagnosis, effects: Mapping[str, Effect] = EFFECTS, pool: Pool = HERE
+) -> Diagnosis:
+    """Judge how far a gap shrinks on rows that were left out, where there is nothing to predict."""
+    data = found.data
+    if not found.shrink or data.case.fresh is not None:
+        return found
+    before = found.corrected.calibrated(data.view.conditions)
+    predicted = _left_out(data, found.truth, found.seed, effects, pool)
+    return replace(found, shrink=shrink(data, found.truth, before, predicted))
 
 
 def _beyond(data: Campaigns, corrected: Corrected, before: Mapping[str, Array]) -> Campaigns:
@@ -145,7 +170,7 @@ def _beyond(data: Campaigns, corrected: Corrected, before: Mapping[str, Array]) 
 
 
 def _left_out(
-    data: Campaigns, truth: Truth, seed: int, effects: Mapping[str, Effect]
+    data: Campaigns, truth: Truth, seed: int, effects: Mapping[str, Effect], pool: Pool
 ) -> dict[str, Array]:
     """Predict each field row by a diagnosis that has not seen it, hypotheses chosen anew.
 
@@ -154,17 +179,28 @@ def _left_out(
     """
     n = len(data.case.field)
     order = generator(seed, "gap", "folds").permutation(n)
-    predicted = truth.means
+    folds = [order[fold::_FOLDS] for fold in range(_FOLDS)]
+    left = min(np.setdiff1d(o.rows, rows).size for o in data.outputs for rows in folds)
+    if left < MIN_FIELD_ROWS:
+        return truth.means
     lab = calibrate_lab(data, seed)  # whatever is left out of the field
-    for fold in range(_FOLDS):
-        rows = order[fold::_FOLDS]
-        if min(np.setdiff1d(o.rows, rows).size for o in data.outputs) < MIN_FIELD_ROWS:
-            return truth.means
-        part = campaigns(without_outputs(data.case, {o.name: rows for o in data.outputs}))
-        found = mixture(part, rank(part, seed, effects=effects, lab=lab), seed).at(data.view)
-        for name, values in found.means.items():
+    parts = [without_outputs(data.case, {o.name: rows for o in data.outputs}) for rows in folds]
+    pieces = [pool.submit(_unseen, p, data.view, seed, dict(effects), lab) for p in parts]
+    predicted = truth.means
+    for rows, piece in zip(folds, pieces, strict=True):
+        for name, values in piece.result().items():
             predicted[name][rows] = values[rows]
     return predicted
+
+
+@one_thread()
+def _unseen(
+    case: Case, view: View, seed: int, effects: Mapping[str, Effect], lab: Lab
+) -> dict[str, Array]:
+    """Predict all rows of a field campaign from those that a case still has."""
+    part = campaigns(case)
+    ranking = rank(part, seed, effects=effects, lab=lab)
+    return mixture(part, ranking, seed).at(view).means
 
 
 def verdict(probability: Mapping[str, float]) -> str:

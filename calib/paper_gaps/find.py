@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from calib.gap.case import Case
-from calib.gap.diagnose import Diagnosis, diagnose
+from calib.gap.diagnose import Diagnosis, diagnose_once, with_unseen_rows
 from calib.models.base import Array
 from calib.outputs import OUTPUTS
 from calib.paper_gaps.cases import PaperGap, paper_gaps
@@ -106,7 +106,7 @@ def begin_gaps(
     """Ask for the diagnoses of gaps and of their variants; return what waits for them."""
     asked = [
         (gap, pool.submit(_with_sd, gap.case, seed),
-         {name: pool.submit(diagnose, case, seed) for name, case in gap.variants.items()})
+         {name: pool.submit(diagnose_once, case, seed) for name, case in gap.variants.items()})
         for gap in gaps
     ]  # fmt: skip
     planned = sum(1 + len(gap.variants) for gap in gaps)
@@ -114,8 +114,12 @@ def begin_gaps(
     def finish(tell: Progress) -> tuple[FoundGap, ...]:
         results = []
         for gap, piece, pieces in asked:
-            found, open_sd = piece.result()
-            variants = {name: variant.result() for name, variant in pieces.items()}
+            once, open_sd = piece.result()
+            found = with_unseen_rows(once, pool=pool)
+            variants = {
+                name: with_unseen_rows(variant.result(), pool=pool)
+                for name, variant in pieces.items()
+            }
             results.append(FoundGap(gap, found, variants, open_sd))
             done = sum(1 + len(r.variants) for r in results)
             tell("the paper's own gaps: diagnosing", done, planned)
@@ -126,7 +130,7 @@ def begin_gaps(
 
 @one_thread()
 def _with_sd(case: Case, seed: int) -> tuple[Diagnosis, Array]:
-    found = diagnose(case, seed)
+    found = diagnose_once(case, seed)
     return found, simulator_sd(found)
 
 
