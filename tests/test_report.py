@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from calib.figures import plates
+from calib.figures.collect import plates
 from calib.manifest import file_hashes
 from calib.publish import publication
 from calib.report import write_report

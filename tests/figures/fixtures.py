@@ -9,7 +9,8 @@ import pytest
 
 from calib.calibration import Calibration, calibrate
 from calib.data import Table, table_from_arrays
-from calib.figures import Plate, plates
+from calib.figures import Plate
+from calib.figures.collect import plates
 from calib.figures.style import style
 from calib.problem import build_problem
 from calib.study import OutputResult
