@@ -23,14 +23,12 @@ from calib.gap.fit import Fit, log_joint
 from calib.gap.noise import ln_prior
 from calib.models.base import Array
 from calib.sampling.adapt import tempered_moments
-from calib.sampling.mixture import StudentT
+from calib.sampling.mixture import StudentT, log_sum
 from calib.streams import generator
 
 __all__ = ["refine"]
 
 _ROUNDS, _SIZE, _FINAL, _KEPT = 5, 3000, 8000, 500
-# Effective draws from which more are no use: the evidence is then known to 1.3 %.
-_PLENTY = 6000.0
 # Tails heavy enough for the long ends of sizes that an exponent makes up for.
 _DOF = 6.0
 # Fewer effective draws than this do not replace the normal.
@@ -59,21 +57,19 @@ def refine(fit: Fit, seed: int) -> Fit:
     except np.linalg.LinAlgError:
         return fit
     pool = _Pool(fit)
-    for size in (*[_SIZE] * _ROUNDS, _FINAL):
-        pool.add(proposal, rng, size)
-        log_weight = pool.log_weight()
-        total = float(logsumexp(log_weight))
-        if not np.isfinite(total):
-            return fit
-        weight = np.exp(log_weight - total)
-        effective = 1.0 / float(np.square(weight).sum())
-        if effective > _PLENTY:
-            break
-        moved = tempered_moments(pool.draws, log_weight)
+    for _ in range(_ROUNDS):
+        pool.add(proposal, rng, _SIZE)
+        moved = tempered_moments(pool.draws, pool.log_weight())
         if moved is None:
             return fit
         proposal = StudentT(*moved, _DOF)
-    if effective < _ENOUGH:
+    pool.add(proposal, rng, _FINAL)
+    log_weight = pool.log_weight()
+    total = float(logsumexp(log_weight))
+    if not np.isfinite(total):
+        return fit
+    weight = np.exp(log_weight - total)
+    if 1.0 / np.square(weight).sum() < _ENOUGH:
         return fit
     # Systematic resampling: equal weights at the least added noise.
     at = (rng.random() + np.arange(_KEPT)) / _KEPT
@@ -101,7 +97,7 @@ class _Pool:
         self._log_sizes.append(np.log(size))
         before = np.logaddexp(self._log_q, self._log_sizes[-1] + proposal.log_prob(self.draws))
         ways = zip(self._log_sizes, self._proposals, strict=True)
-        new = logsumexp([log_size + q.log_prob(drawn) for log_size, q in ways], axis=0)
+        new = log_sum(np.stack([log_size + q.log_prob(drawn) for log_size, q in ways]))
         self.draws = np.concatenate([self.draws, drawn])
         self._log_q = np.concatenate([before, new])
         self._log_joint = np.concatenate([self._log_joint, log_joint(self._fit, drawn)])
