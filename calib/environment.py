@@ -6,6 +6,7 @@ Where these differ, numbers may be rounded otherwise; what that may change is st
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Environment", "code_sha256", "versions"]
+__all__ = ["Environment", "code_sha256", "sha256", "versions"]
 
 _PACKAGES = (
     "terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-base", "arviz-stats", "xarray",
@@ -91,11 +92,14 @@ def _machine() -> dict[str, str]:
     }
 
 
+def sha256(content: bytes) -> str:
+    """Return the SHA-256 of bytes in hexadecimal."""
+    return hashlib.sha256(content).hexdigest()
+
+
 @cache
 def code_sha256() -> str:
     """Return the SHA-256 over the source files of this package and the priors shipped with it."""
-    import hashlib
-
     package = Path(__file__).resolve().parent
     packaged = package / "_priors"
     # A checkout has the priors beside the package, a wheel in it; they are named alike.

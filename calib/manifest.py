@@ -2,27 +2,21 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from calib.environment import Environment
+from calib.environment import Environment, sha256
 from calib.estimators import GeneticSettings
 from calib.sampling.sampler import SamplerSettings
 from calib.study import OutputResult, Study
 from calib.study_tasks import Task
 
-__all__ = ["SCHEMA", "build_manifest", "file_hashes", "sha256"]
+__all__ = ["SCHEMA", "build_manifest", "file_hashes"]
 
 SCHEMA = "calib/manifest/2"
-
-
-def sha256(content: bytes) -> str:
-    """Return the SHA-256 of bytes in hexadecimal."""
-    return hashlib.sha256(content).hexdigest()
 
 
 def file_hashes(folder: Path) -> dict[str, str]:

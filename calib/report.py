@@ -10,12 +10,12 @@ from typing import Any
 
 from calib.audit import Audit
 from calib.data import write_table
-from calib.environment import Environment
+from calib.environment import Environment, sha256
 from calib.figures import Plate
 from calib.figures.collect import plates
 from calib.figures.export import pdf_bytes, png
 from calib.folders import fresh_folder
-from calib.manifest import build_manifest, file_hashes, sha256
+from calib.manifest import build_manifest, file_hashes
 from calib.page.audit import write_audit
 from calib.page.paper_gaps import begin_gaps_section
 from calib.page.render import render_page

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -25,9 +26,28 @@ def _registry() -> pint.UnitRegistry:
     return pint.UnitRegistry()
 
 
+# The usual units in SI, by definition: pint takes longer to start than a diagnosis to draw. All
+# others are asked of pint.
+_POUND, _INCH, _GRAVITY = 0.45359237, 0.0254, 9.80665
+_USUAL: Mapping[str, Mapping[str, float]] = {
+    "pressure": {
+        "Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "psi": _POUND * _GRAVITY / _INCH**2,
+    },
+    "force": {"N": 1.0, "kN": 1e3, "lbf": _POUND * _GRAVITY},
+    "length": {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": _INCH},
+    "ratio": {"dimensionless": 1.0, "percent": 1e-2},
+    "density": {"g/cm**3": 1e3, "kg/m**3": 1.0},
+    "speed": {"m/s": 1.0, "km/h": 1.0 / 3.6},
+}  # fmt: skip
+
+
 @cache
 def _factor(from_unit: str, to_unit: str) -> float:
     """Return how many `to_unit` one `from_unit` is."""
+    for si in _USUAL.values():
+        if from_unit in si and to_unit in si:
+            # Fifteen digits drop the last-bit noise of chained definitions (999.9999999999999).
+            return float(f"{si[from_unit] / si[to_unit]:.15g}")
     import pint
 
     registry = _registry()
@@ -51,7 +71,6 @@ def _factor(from_unit: str, to_unit: str) -> float:
             allowed="units that differ by a factor only",
             mend="use an absolute unit",
         )
-    # Fifteen digits drop the last-bit noise of chained definitions (999.9999999999999).
     return float(f"{one:.15g}")
 
 

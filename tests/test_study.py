@@ -16,7 +16,8 @@ from calib.data import read_table
 from calib.datasets import he2019
 from calib.datasets.he2019 import load_he2019
 from calib.datasets.published import PUBLISHED
-from calib.manifest import build_manifest, file_hashes, sha256
+from calib.environment import sha256
+from calib.manifest import build_manifest, file_hashes
 from calib.outputs import OUTPUTS
 from calib.prior_files import default_prior_path
 from calib.sampling.sampler import SamplerSettings

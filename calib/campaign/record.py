@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from calib.campaign.kinds import Task
-from calib.environment import versions
+from calib.environment import sha256, versions
 from calib.errors import CalibError
-from calib.manifest import sha256
 
 __all__ = ["RECORD", "describe", "discard_changed"]
 

@@ -8,10 +8,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from calib.environment import code_sha256
+from calib.environment import code_sha256, sha256
 from calib.errors import CalibError
 from calib.gap.case import Case, case_files
-from calib.manifest import sha256
 
 __all__ = ["INPUTS", "case_hashes", "check_resumable", "inputs_record", "listed", "recorded_inputs"]
 

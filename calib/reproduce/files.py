@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from calib.manifest import sha256
+from calib.environment import sha256
 from calib.reproduce.compare import RECORD, SUMMARY, Again, is_document, part_of
 from calib.reproduce.derived import derived_files
 from calib.reproduce.figures import compare_figure, compare_pictures, compare_prints, thumbnails

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from calib.data import Table
 from calib.datasets import he2019
-from calib.manifest import sha256
+from calib.environment import sha256
 from calib.prior_files import default_prior_path
 from calib.reproduce.items import Item, Status
 from calib.reproduce.schema import TaskRecord

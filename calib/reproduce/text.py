@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from calib.manifest import sha256
+from calib.environment import sha256
 from calib.reproduce.items import Item, Status
 from calib.reproduce.numbers import NUMBER, without_numbers
 

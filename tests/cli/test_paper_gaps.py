@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.manifest import sha256
+from calib.environment import sha256
 from calib.templates import template_csv
 
 from .test_cli import Calib, assert_refused, calib, contents  # noqa: F401

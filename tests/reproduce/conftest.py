@@ -18,7 +18,8 @@ from unittest.mock import patch
 import pytest
 
 import calib.reproduce.check_report as check_report_module
-from calib.manifest import file_hashes, sha256
+from calib.environment import sha256
+from calib.manifest import file_hashes
 from calib.publish import publication
 from calib.reproduce.check import check
 from calib.reproduce.items import Status

@@ -12,8 +12,8 @@ import h5py
 import numpy as np
 import pytest
 
+from calib.environment import sha256
 from calib.errors import CalibError
-from calib.manifest import sha256
 from calib.prior_files import default_prior_path
 from calib.report import write_report
 from calib.reproduce.check import check
