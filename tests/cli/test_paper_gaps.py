@@ -68,12 +68,13 @@ def test_the_report_of_the_embedded_data_has_the_section(
     """The command passes the gaps on; what is tested elsewhere is left out here."""
     asked = []
 
-    def find(seed, **_):
+    def begin(seed, *_):
         asked.append(seed)
-        return (found_gaps["plain_bekker"],)
+        return lambda tell: (found_gaps["plain_bekker"],)
 
     monkeypatch.setattr("calib.study_tasks.he2019_tasks", lambda: ())
-    monkeypatch.setattr("calib.contents.find_gaps", find)
+    monkeypatch.setattr("calib.contents.begin_gaps", begin)
+    monkeypatch.setattr("calib.contents.begin_convergence", lambda *_: None)
     monkeypatch.setattr("calib.contents.run_audit", lambda *_, **__: audit)
     ran = calib("report", "--out", "rep", "--seed", 5)
     assert ran.code == 0, ran.err

@@ -73,9 +73,9 @@ def test_corner_labels_every_parameter_with_its_unit(drawbar):
     assert any("dashed: published" in t for t in texts)
 
 
-def test_saved_without_a_warning(drawn):
-    for p in drawn["plate"][:2]:
-        p.figure.savefig(io.BytesIO(), format="png", dpi=40)
+def test_saved_without_a_warning(plate):
+    for draw in (bands_plate, validation_plate):
+        draw(plate, published=False).figure.savefig(io.BytesIO(), format="png", dpi=40)
 
 
 def test_nothing_is_cut_off(drawn):
