@@ -26,6 +26,7 @@ GROUPS = (
     ("cli/test_cli.py",),
     ("sbc/test_run.py",),
     ("test_report.py",),
+    ("test_contents.py",),
     ("test_validate.py",),
     ("cli/test_campaign.py",),
     ("page/test_diagnosis.py", "figures/test_gap.py", "gap/test_files.py", "gap/test_shrink.py",
