@@ -15,6 +15,7 @@ import argparse
 import json
 import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -227,6 +228,8 @@ def main() -> None:
     parser.add_argument("--only", default="", help="commands whose name has this pattern")
     parser.add_argument("--tests", action="store_true", help="`make test` too, once")
     options = parser.parse_args()
+    # A polite kill takes the worktree away as an interrupt does.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     result = {
         "machine": describe(),
         "load_before": os.getloadavg(),
