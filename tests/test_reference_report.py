@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.reproduce.kernels import ALL, FEW, Setting
+from tests.reproduce.kernels import ALL, FEW, Setting, skip_what_crashes
 
 FOLDER = Path(__file__).resolve().parents[1] / "reports" / "he2019"
 PROGRAM = "from calib.cli import main; main()"
@@ -17,6 +17,7 @@ PROGRAM = "from calib.cli import main; main()"
 
 def checked(setting: Setting) -> dict:
     """Check the report in a process that stands in for another processor."""
+    skip_what_crashes(setting)
     ran = subprocess.run(
         [sys.executable, "-c", PROGRAM, "check", str(FOLDER), "--json", "-"],
         env=setting.environment(), capture_output=True, text=True, check=False,

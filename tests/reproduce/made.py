@@ -30,7 +30,7 @@ from calib.streams import generator
 from calib.study import OutputResult, Study, run_study
 from calib.study_tasks import Task, he2019_tasks
 
-from .kernels import Setting
+from .kernels import Setting, skip_what_crashes
 
 ROOT = Path(__file__).resolve().parents[2]
 # Short chains, and a gate that lets them pass.
@@ -91,6 +91,7 @@ def fitted_run(problem: Problem, seed: int) -> Calibration:
 
 def elsewhere(kind: str, out: Path, setting: Setting) -> Path:
     """Make one of them as another processor would."""
+    skip_what_crashes(setting)
     subprocess.run(
         [sys.executable, "-m", "tests.reproduce.made", kind, str(out)],
         env=setting.environment(), cwd=ROOT, check=True, capture_output=True,
