@@ -219,9 +219,10 @@ def _tick_texts(values: Array) -> list[str]:
 
 
 def _caption(draws: Array, names: list[str], marked: bool) -> str:
-    correlation = np.corrcoef(draws, rowvar=False) - np.eye(len(names))
+    # Of a pair once, or rounding decides which of the two is named first.
+    correlation = np.tril(np.corrcoef(draws, rowvar=False), -1)
     i, j = np.unravel_index(np.abs(correlation).argmax(), correlation.shape)
-    strong = int((np.abs(np.tril(correlation)) > 0.8).sum())
+    strong = int((np.abs(correlation) > 0.8).sum())
     pairs = len(names) * (len(names) - 1) // 2
     marks = " Dashed: what the published figures amount to." if marked else ""
     verb = "exceeds" if strong in (0, 1) else "exceed"

@@ -33,7 +33,7 @@ __all__ = [
 AUDIT_JSON, AUDIT_CSV = "audit.json", "audit.csv"
 _INDENTED = ("summary.json", "manifest.json", AUDIT_JSON)
 # Of the sd of a gap; and a gap that is nil, in kN, mm or g/cm^3.
-_OF_SD, _ROUNDING = 0.25, 1e-6
+_OF_SD, _ROUNDING = 0.3, 1e-6
 _SOURCES = "summary.json and manifest.json"
 
 
@@ -181,7 +181,7 @@ def _corrected(gap: str, folder: Path, diagnosis: Mapping[str, Any], *, same_cod
     """Check that a corrected model predicts the gaps that its diagnosis states.
 
     It is drawn from, and a normal may be drawn otherwise by another processor: the means of
-    hundreds of draws agree within a quarter of their sd.
+    hundreds of draws agree within a third of their sd.
     """
     name = f"gaps/{gap}/corrected.json"
     try:

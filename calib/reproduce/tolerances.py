@@ -152,29 +152,30 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     ("summary.json/models/*/prior_sensitivity/parameters/*/contraction",
      Tolerance(MONTE_CARLO, 0.7, Of.REST)),
     ("summary.json/models/*/prior_sensitivity/parameters/*/{identified,reading}", _READ_OFF),
-    # The source's gaps. Eleven processors' rounding moved probabilities by 0.001, a gap by 0.002
-    # of its sd; hypotheses that hardly count may be found at another mode.
+    # The source's gaps. What is drawn there rests on 1200 draws, and has seven Monte Carlo errors
+    # of a difference: of an end of a 90 % band 0.2 of its width, of a gap 0.3 of its sd. Eight
+    # seeds moved probabilities by 0.025 at the most, rounding by 0.002.
     ("summary.json/paper_gaps/*/variants/*/probability/*", _chance(0.1)),
     ("summary.json/paper_gaps/*/variants/*", _JUMPS),
     ("{summary.json/paper_gaps,gaps}/*{,/diagnosis.json}/shrink/*/{fraction,interval/*}",
-     _chance(0.02)),
+     _chance(0.1)),
     ("{summary.json/paper_gaps,gaps}/*{,/diagnosis.json}/shrink/*/*", Tolerance("diagnosis", 0.1)),
     ("summary.json/paper_gaps/*/checks/*/probability*", _chance(0.1)),
     ("summary.json/paper_gaps/*/checks/*/in_90_band", _chance(1.0)),
     ("summary.json/paper_gaps/*/checks/*/*", Tolerance("diagnosis", 0.2)),
-    ("summary.json/paper_gaps/*/probability/*", _chance(0.02)),
+    ("summary.json/paper_gaps/*/probability/*", _chance(0.05)),
     ("summary.json/paper_gaps/*/open_sd_rms", Tolerance("diagnosis", 0.05)),
-    ("gaps/*/diagnosis.json/effects/*/probability", _chance(0.02)),
+    ("gaps/*/diagnosis.json/effects/*/probability", _chance(0.05)),
     ("{summary.json/paper_gaps/*/parameters,gaps/*/diagnosis.json/effects/*/parameters}/*/mean",
      Tolerance("diagnosis", 0.1, Of.ITS_SD)),
     ("{summary.json/paper_gaps/*/parameters,gaps/*/diagnosis.json/effects/*/parameters}/*/sd",
      Tolerance("diagnosis", 0.1)),
-    ("gaps/*/diagnosis.json/where/*/gap", Tolerance("diagnosis", 0.25, Of.ITS_SD)),
+    ("gaps/*/diagnosis.json/where/*/gap", Tolerance("diagnosis", 0.3, Of.ITS_SD)),
     ("gaps/*/diagnosis.json/where/*/gap_sd", Tolerance("diagnosis", 0.25)),
-    ("gaps/*/diagnosis.json/where/*/probability", _chance(0.05)),
+    ("gaps/*/diagnosis.json/where/*/probability", _chance(0.15)),
     ("gaps/*/diagnosis.json/{regions,next_measurement}*", _JUMPS),
     ("gaps/*/fresh_prediction.csv/*/*_{before,after,after_lower,after_upper}",
-     Tolerance("diagnosis", 0.02, Of.BAND)),
+     Tolerance("diagnosis", 0.2, Of.BAND)),
     # The audit: least costs of searches from many starts; two findings rest on posterior draws.
     ("audit.json/findings/genetic_joint/found*", _JUMPS),
     ("audit.json/findings/{table6_likelihood,table6_prediction_at_30}/found/*",
@@ -183,8 +184,8 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     ("audit.json/findings/*/evidence", _WORDS),
 )  # fmt: skip
 
-# Parameters of hypotheses less probable than this are not judged.
-_COUNTS = 0.01
+# Parameters of hypotheses less probable than this are not judged: they may be at another mode.
+_COUNTS = 0.2
 _SIBLINGS = {"mean": "sd", "gap": "gap_sd"}
 
 

@@ -64,7 +64,12 @@ FEW = tuple(Setting(*s) for s in _CHOSEN if s[0] in KERNELS)
 @cache
 def crashes(kernel: str) -> bool:
     """Whether a library's kernel takes the process down on this machine, as some do on some."""
-    product = "import numpy as np; x = np.ones((8000, 11)); (x * x[:, :1]).T @ x"
+    product = (
+        "import numpy as np\n"
+        "for n in (1000, 3000, 8000, 23000):\n"
+        "    for d in (3, 5, 9, 11, 16, 26):\n"
+        "        x = np.random.default_rng(1).normal(size=(n, d)); (x * x[:, :1]).T @ x; x @ x[0]"
+    )
     environment = Setting(kernel, True, 1).environment()
     ran = subprocess.run([sys.executable, "-c", product], env=environment, check=False)
     return ran.returncode != 0

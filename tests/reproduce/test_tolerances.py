@@ -64,9 +64,9 @@ N1 = ("models", "rut_depth", "prior_sensitivity", "parameters", "n1")
 @pytest.mark.parametrize(
     ("name", "place", "little", "much"),
     [
-        (SUMMARY, (*BEKKER, "probability", "slip_sinkage"), -0.01, -0.03),
+        (SUMMARY, (*BEKKER, "probability", "slip_sinkage"), -0.03, -0.06),
         (SUMMARY, (*BEKKER, "parameters", "growth", "mean"), 0.05, 0.2),
-        (SUMMARY, (*BEKKER, "shrink", "rut_depth", "fraction"), 0.01, -0.03),
+        (SUMMARY, (*BEKKER, "shrink", "rut_depth", "fraction"), 0.05, -0.15),
         (SUMMARY, (*BEKKER, "open_sd_rms"), 1e-2, 0.1),
         (SUMMARY, (*BEKKER, "rows", "field"), None, 1),
         (SUMMARY, (*BEKKER, "verdict"), None, "none"),
@@ -81,7 +81,7 @@ N1 = ("models", "rut_depth", "prior_sensitivity", "parameters", "n1")
         ("audit.json", ("findings", "table5_joint_cost", "found", "minimum at any slips", "upper"),
          1e-5, 1e-3),
         ("audit.json", ("findings", "table5_joint_cost", "verdict"), None, "confirmed"),
-        ("gaps/plain_bekker/fresh_prediction.csv", ("0", "rut_depth_mm_after"), 1e-3, 1.0),
+        ("gaps/plain_bekker/fresh_prediction.csv", ("0", "rut_depth_mm_after"), 1e-3, 2.0),
     ],
 )  # fmt: skip
 def test_what_a_row_lets_pass(name: str, place: tuple[str, ...], little: Any, much: Any) -> None:
