@@ -152,7 +152,9 @@ def _dot(ax: Axes, d: float, y: float, marker: str, colour: str, *, ring: bool =
 
 
 def _caption(result: OutputResult, reported: Mapping[str, Array], published: bool) -> str:
-    best = min(result.estimates, key=lambda e: e.cost, default=None)
+    lowest = min((e.cost for e in result.estimates), default=0.0)
+    # Of costs that are equal but for their rounding, that of the most exact method: it comes last.
+    best = next((e for e in reversed(result.estimates) if e.cost <= lowest * (1.0 + 1e-9)), None)
     if best is None:
         return "No method gave an estimate."
     names = list(reported)
