@@ -330,8 +330,10 @@ def rounded(whole: Path) -> Path:
 def test_rounding_is_no_difference(rounded: Path) -> None:
     outcome = check(rounded)
     assert different(outcome) == {}
-    # But for parameters of hypotheses that hardly count.
-    assert all(".parameters." in item.name for item in outcome.of(Status.UNJUDGED))
+    # Another processor made it: parameters of hypotheses that hardly count, and the words of a
+    # page whose numbers moved within their tolerance, cannot be judged.
+    left = [item for item in outcome.of(Status.UNJUDGED) if ".parameters." not in item.name]
+    assert all(item.name.endswith("index.html") for item in left), left
     assert outcome.verdict.startswith("SAME up to rounding")
 
 
