@@ -13,6 +13,7 @@ from figures.fixtures import (  # noqa: F401
     rut,
     unconverged,
 )
+from hypothesis import settings
 from together import pytest_collection_modifyitems, pytest_xdist_make_scheduler  # noqa: F401
 
 from calib.audit import Audit, Seeds, run_audit
@@ -24,6 +25,10 @@ from calib.paper_gaps.find import FoundGap, find_gaps
 from calib.problem import build_problem
 
 SEED = 2019
+
+# How long an example takes depends on the machine and on what else it does.
+settings.register_profile("untimed", deadline=None)
+settings.load_profile("untimed")
 
 
 def he2019_table(name: str) -> Table:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from calib.cli.parallel import Scheduler, Workers, announce, resumable
+from calib.cli.parallel import CORES, Scheduler, Workers, announce, resumable
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -37,6 +37,7 @@ def diagnose(
     field: Annotated[Path | None, typer.Option(help="CSV of the field campaign.")] = None,
     effects: Annotated[Path | None, typer.Option(help="Python file with your effects.")] = None,
     overwrite: _Overwrite = False,
+    workers: Workers = CORES,
 ) -> None:
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
     from calib.columns import QUANTITIES
@@ -50,8 +51,8 @@ def diagnose(
     from calib.gap.provenance import INPUTS, inputs_record
     from calib.numbers import format_number
     from calib.outputs import OUTPUTS
-    from calib.page.diagnosis import gap_evidence, write_page
     from calib.page.gap_verdict import judge_gap
+    from calib.tasks.pool import pool
 
     check_folder(out, overwrite=overwrite)
     if case is not None and run is None and field is None:
@@ -70,12 +71,15 @@ def diagnose(
         check_on_case(own, given, effects)
         paths = [effects, *(effects.with_name(f"{name}.toml") for name in own)]
         files = {path.name: path.read_bytes() for path in paths}
-    found = find(given, seed, effects={**EFFECTS, **own})
     manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
-    with fresh_folder(out, overwrite=overwrite) as folder:
-        write_diagnosis(found, folder)
-        (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed, files))
-        write_page(found, folder, manifest)
+    with pool(workers, ["calib.page.diagnosis"]) as side:
+        found = find(given, seed, effects={**EFFECTS, **own}, pool=side)
+        from calib.page.diagnosis import gap_evidence, write_page
+
+        with fresh_folder(out, overwrite=overwrite) as folder:
+            write_diagnosis(found, folder)
+            (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed, files))
+            write_page(found, folder, manifest, pool=side)
     for warning in found.data.case.warnings:
         print(f"calib: {warning}", file=sys.stderr)
     print(f"verdict: {found.verdict} ({judge_gap(gap_evidence(found)).headline})")

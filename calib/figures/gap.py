@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 from calib.figures.gap_design import isolability_plate, left_over_plate
@@ -12,7 +12,7 @@ from calib.figures.gap_which import placebo_plate, which_plate
 from calib.figures.plate import Plate, draw_all
 from calib.gap.diagnose import Diagnosis
 
-__all__ = ["gap_plates"]
+__all__ = ["GAP_FIGURES", "gap_plates"]
 
 type _Draw = Callable[[Diagnosis], Plate | None]
 
@@ -27,16 +27,21 @@ _DRAWINGS: dict[str, _Draw] = {
 }
 
 
-def gap_plates(found: Diagnosis) -> list[Plate]:
+GAP_FIGURES = tuple(_DRAWINGS)
+
+
+def gap_plates(found: Diagnosis, names: Sequence[str] = GAP_FIGURES) -> list[Plate]:
     """Draw the figures of a diagnosis.
 
     Parameters
     ----------
     found : Diagnosis
+    names : sequence of str, optional
+        Of those to draw; all by default.
 
     Returns
     -------
     list of Plate
         In reading order. A figure that failed has ``figure=None`` and a caption saying why.
     """
-    return draw_all({name: partial(draw, found) for name, draw in _DRAWINGS.items()})
+    return draw_all({name: partial(_DRAWINGS[name], found) for name in names})

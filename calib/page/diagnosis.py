@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path, PurePath
 from typing import Any
@@ -12,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 
 from calib.figures.export import png, png_size
-from calib.figures.gap import gap_plates
+from calib.figures.gap import GAP_FIGURES, gap_plates
 from calib.figures.gap_rows import (
     best_fit,
     best_of,
@@ -47,6 +48,7 @@ from calib.page.gap_verdict import (
     WhereFact,
     judge_gap,
 )
+from calib.tasks.pool import HERE, Pool
 
 __all__ = ["gap_evidence", "render_diagnosis", "write_page"]
 
@@ -69,7 +71,9 @@ def _template() -> Template:
     return environment.get_template("diagnosis.html.j2")
 
 
-def write_page(found: Diagnosis, folder: Path, manifest: Mapping[str, Any]) -> None:
+def write_page(
+    found: Diagnosis, folder: Path, manifest: Mapping[str, Any], *, pool: Pool = HERE
+) -> None:
     """Draw the figures and write them and the page into an existing folder.
 
     Parameters
@@ -79,14 +83,24 @@ def write_page(found: Diagnosis, folder: Path, manifest: Mapping[str, Any]) -> N
         Gets ``figures/*.png`` and ``index.html``.
     manifest : mapping
         ``command`` and ``versions``, as `calib.manifest.build_manifest` has them; both optional.
+    pool : Pool, optional
+        Where the first figures are drawn; the others are drawn here meanwhile.
     """
-    plates = gap_plates(found)
-    images = {f"{p.name}.png": png(p) for p in plates if p.figure is not None}
+    there = pool.submit(_drawn, found, GAP_FIGURES[:3])
+    drawn = _drawn(found, GAP_FIGURES[3:]) | there.result()
+    plates = [drawn[name][0] for name in GAP_FIGURES if name in drawn]
+    images = {f"{plate.name}.png": image for plate, image in drawn.values() if image}
     (folder / "figures").mkdir(exist_ok=True)
     for name, image in images.items():
         (folder / "figures" / name).write_bytes(image)
     page = render_diagnosis(found, plates, images, manifest=manifest)
     (folder / "index.html").write_text(page, encoding="utf-8")
+
+
+def _drawn(found: Diagnosis, names: Sequence[str]) -> dict[str, tuple[Plate, bytes]]:
+    """Draw figures; return each without its canvas, and as a file."""
+    plates = gap_plates(found, names)
+    return {p.name: (replace(p, figure=None), png(p)) for p in plates}
 
 
 def render_diagnosis(

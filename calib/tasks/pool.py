@@ -7,16 +7,19 @@ outlive a kill are for `calib.tasks.run_tasks`.
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_all_start_methods, get_context
+from threading import Thread
 from typing import Protocol
 
 from calib.errors import CalibError
 
 __all__ = ["HERE", "Later", "Pool", "pool"]
+
+_REPORT = ("calib.contents", "calib.report")
 
 
 class Later[R](Protocol):
@@ -86,13 +89,15 @@ HERE = Pool()
 
 
 @contextmanager
-def pool(workers: int) -> Iterator[Pool]:
+def pool(workers: int, modules: Sequence[str] = _REPORT) -> Iterator[Pool]:
     """Yield a pool of some processes; of this one with a single worker.
 
     Parameters
     ----------
     workers : int
         A script that asks for more than one needs ``if __name__ == "__main__":``.
+    modules : sequence of str, optional
+        What the processes import while the caller still does: what a report needs by default.
     """
     if workers < 2:
         yield HERE
@@ -101,8 +106,10 @@ def pool(workers: int) -> Iterator[Pool]:
     forked = "forkserver" in get_all_start_methods()
     context = get_context("forkserver" if forked else "spawn")
     if forked:
-        context.set_forkserver_preload(["calib.contents", "calib.report"])
+        context.set_forkserver_preload(list(modules))
     executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_quiet)
+    # A first process starts now, not when there is work for it; it starts where it can wait.
+    Thread(target=executor.submit, args=(_quiet,), daemon=True).start()
     try:
         yield Pool(executor)
     finally:
