@@ -2,8 +2,9 @@
 
     python benchmarks/campaign.py --out campaign.json
 
-Overhead: tiny tasks through `calib.tasks.run_tasks`, which writes a file for each, and through
-Dask's own `Client.map` and `as_completed`, which writes none, on one cluster of two workers.
+Overhead: tiny tasks through `calib.batch.tasks.run_tasks`, which writes a file for each, and
+through Dask's own `Client.map` and `as_completed`, which writes none, on one cluster of two
+workers.
 Gain: diagnoses of challenge cases in this process and on two workers, start-up included; and in two
 plain processes without Dask, each with half of the cases: what this machine's two cores can do.
 Each is repeated, the two sides of a comparison in turn, and medians are taken: other work on the
@@ -49,7 +50,7 @@ def overhead(tasks: int, repeats: int) -> dict[str, object]:
     """Milliseconds for each of many tiny tasks, ours and Dask's own."""
     from distributed import Client, LocalCluster, as_completed
 
-    from calib.tasks import run_tasks
+    from calib.batch.tasks import run_tasks
 
     items = {f"task-{i}": i for i in range(tasks)}
     found: dict[str, list[tuple[float, float]]] = {"dask": [], "calib": []}

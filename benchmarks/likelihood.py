@@ -23,8 +23,8 @@ from shared.machine import describe, use_one_core
 from shared.measure import seconds, spread
 
 from calib.data import table_from_arrays
+from calib.inference.problem import Problem, build_problem
 from calib.models.base import Array
-from calib.problem import Problem, build_problem
 
 ROWS = (42, 420, 4_200, 42_000, 1_000_000)
 CELLS = 8_000_000

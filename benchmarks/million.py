@@ -21,11 +21,11 @@ import numpy as np
 from likelihood import plain, problem_of
 from shared.machine import describe
 
-from calib.calibration import calibrate
-from calib.chains import ess
+from calib.inference.calibration import calibrate
+from calib.inference.diagnostics import ess
+from calib.inference.problem import Problem
+from calib.inference.sampling.mixture import StudentT
 from calib.models.base import Array
-from calib.problem import Problem
-from calib.sampling.mixture import StudentT
 
 _DRAWS, _DOF, _WIDER = 600, 12.0, 1.1
 

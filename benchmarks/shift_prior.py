@@ -19,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from calib.batch.tasks import completed
+from calib.batch.threads import one_thread
 from calib.challenge.design import Tier
 from calib.challenge.make import make_case
 from calib.gap.case import OutputData, campaigns, read_case
@@ -28,8 +30,6 @@ from calib.gap.hypotheses import SHIFTS
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.shifts import alone_sd, coordinates
 from calib.gap.which import calibrate_lab
-from calib.tasks import completed
-from calib.threads import one_thread
 
 type Array = NDArray[np.float64]
 

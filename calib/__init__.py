@@ -10,55 +10,55 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from calib.audit import Audit, run_audit
-    from calib.calibration import Calibration, calibrate
-    from calib.campaign import read_plan, run_campaign
+    from calib.batch.campaign import read_plan, run_campaign
+    from calib.check.check import check
     from calib.data import Table, hold_out, read_table, table_from_arrays
-    from calib.datasets.he2019 import load_he2019
     from calib.errors import CalibError
-    from calib.estimators import PointEstimate, estimate
     from calib.gap.case import Case, read_case
     from calib.gap.diagnose import Diagnosis, diagnose
+    from calib.he2019.audit import Audit, run_audit
+    from calib.he2019.datasets.embedded import load_he2019
+    from calib.inference.calibration import Calibration, calibrate
+    from calib.inference.estimators import PointEstimate, estimate
+    from calib.inference.io import load_calibration, save_calibration, to_datatree
+    from calib.inference.problem import Problem, build_problem
+    from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import MODELS
-    from calib.prediction import Prediction, predict
-    from calib.problem import Problem, build_problem
-    from calib.reproduce.check import check
-    from calib.sampling.sampler import SamplerSettings
-    from calib.store import load_calibration, save_calibration, to_datatree
-    from calib.validate import Validation, leave_one_out, validate_held_out
+    from calib.validation.prediction import Prediction, predict
+    from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
 _HOME = {
-    "Audit": "calib.audit",
-    "run_audit": "calib.audit",
-    "Calibration": "calib.calibration",
-    "calibrate": "calib.calibration",
-    "read_plan": "calib.campaign",
-    "run_campaign": "calib.campaign",
+    "Audit": "calib.he2019.audit",
+    "run_audit": "calib.he2019.audit",
+    "Calibration": "calib.inference.calibration",
+    "calibrate": "calib.inference.calibration",
+    "read_plan": "calib.batch.campaign",
+    "run_campaign": "calib.batch.campaign",
     "Table": "calib.data",
     "hold_out": "calib.data",
     "read_table": "calib.data",
     "table_from_arrays": "calib.data",
-    "load_he2019": "calib.datasets.he2019",
+    "load_he2019": "calib.he2019.datasets.embedded",
     "CalibError": "calib.errors",
-    "PointEstimate": "calib.estimators",
-    "estimate": "calib.estimators",
+    "PointEstimate": "calib.inference.estimators",
+    "estimate": "calib.inference.estimators",
     "Case": "calib.gap.case",
     "read_case": "calib.gap.case",
     "Diagnosis": "calib.gap.diagnose",
     "diagnose": "calib.gap.diagnose",
     "MODELS": "calib.models",
-    "Prediction": "calib.prediction",
-    "predict": "calib.prediction",
-    "Problem": "calib.problem",
-    "build_problem": "calib.problem",
-    "check": "calib.reproduce.check",
-    "SamplerSettings": "calib.sampling.sampler",
-    "load_calibration": "calib.store",
-    "save_calibration": "calib.store",
-    "to_datatree": "calib.store",
-    "Validation": "calib.validate",
-    "leave_one_out": "calib.validate",
-    "validate_held_out": "calib.validate",
+    "Prediction": "calib.validation.prediction",
+    "predict": "calib.validation.prediction",
+    "Problem": "calib.inference.problem",
+    "build_problem": "calib.inference.problem",
+    "check": "calib.check.check",
+    "SamplerSettings": "calib.inference.sampling.sampler",
+    "load_calibration": "calib.inference.io",
+    "save_calibration": "calib.inference.io",
+    "to_datatree": "calib.inference.io",
+    "Validation": "calib.validation.validate",
+    "leave_one_out": "calib.validation.validate",
+    "validate_held_out": "calib.validation.validate",
 }
 
 __all__ = [

@@ -4,8 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from challenge.blind import blind_test  # noqa: F401
-from figures.fixtures import (  # noqa: F401
+from hypothesis import settings
+
+from calib.data import Table, hold_out, table_from_arrays
+from calib.he2019.audit import Audit, Seeds, run_audit
+from calib.he2019.datasets import embedded
+from calib.he2019.gaps.find import FoundGap, find_gaps
+from calib.inference.calibration import Calibration, calibrate
+from calib.inference.estimators import estimate
+from calib.inference.problem import build_problem
+from tests.challenge.blind import blind_test  # noqa: F401
+from tests.report.figures.fixtures import (  # noqa: F401
     all_plates,
     density,
     drawbar,
@@ -13,16 +22,7 @@ from figures.fixtures import (  # noqa: F401
     rut,
     unconverged,
 )
-from hypothesis import settings
-from together import pytest_collection_modifyitems, pytest_xdist_make_scheduler  # noqa: F401
-
-from calib.audit import Audit, Seeds, run_audit
-from calib.calibration import Calibration, calibrate
-from calib.data import Table, hold_out, table_from_arrays
-from calib.datasets import he2019
-from calib.estimators import estimate
-from calib.paper_gaps.find import FoundGap, find_gaps
-from calib.problem import build_problem
+from tests.together import pytest_collection_modifyitems, pytest_xdist_make_scheduler  # noqa: F401
 
 SEED = 2019
 
@@ -32,8 +32,8 @@ settings.load_profile("untimed")
 
 
 def he2019_table(name: str) -> Table:
-    columns = he2019.tables()[name]
-    return table_from_arrays(columns, source=f"he2019 {name}", label=he2019.LABEL)
+    columns = embedded.tables()[name]
+    return table_from_arrays(columns, source=f"he2019 {name}", label=embedded.LABEL)
 
 
 def _calibrated(model: str, table: Table) -> Calibration:

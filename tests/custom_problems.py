@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from calib.data import table_from_arrays
+from calib.inference.priors import Prior, Priors
+from calib.inference.problem import Problem
 from calib.models.base import Model
-from calib.priors import Prior, Priors
-from calib.problem import Problem
 
 type Array = np.ndarray
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from calib.figures.style import (
+from calib.report.figures.style import (
     BLACK,
     BLUE,
     GREEN,

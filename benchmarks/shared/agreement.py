@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.chains import ess
+from calib.inference.diagnostics import ess
 from calib.models.base import Array
 
 __all__ = ["z_scores"]

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.problem import Problem
+from calib.inference.problem import Problem
 
 __all__ = ["pymc_model"]
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.batch.tasks import LateItems, run_tasks
 from calib.challenge.answers import CaseAnswer
 from calib.challenge.design import Tier
 from calib.challenge.mechanism import NONE, UNKNOWN
@@ -19,7 +20,6 @@ from calib.challenge.oracle.combine import errors, probabilities
 from calib.challenge.score import TierScore, score_tier
 from calib.challenge.seal import check_outside, open_key, published_hash
 from calib.errors import CalibError
-from calib.tasks import LateItems, run_tasks
 
 LIMIT_SCHEMA = "calib/challenge-limit/1"
 LIMIT_NAME = "limit.json"
@@ -113,7 +113,7 @@ def find_limit(
     effort : int
         Multiplies their number.
     workers, scheduler, progress, announce
-        As for `calib.tasks.run_tasks`.
+        As for `calib.batch.tasks.run_tasks`.
 
     Returns
     -------

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.batch.tasks import completed
 from calib.challenge.build import try_case, unlisted_order
 from calib.challenge.design import Tier
 from calib.challenge.effects import LISTED, wheel_effects
@@ -16,7 +17,6 @@ from calib.challenge.files import CaseFiles, case_files
 from calib.challenge.mechanism import NONE, SHIFT, UNKNOWN
 from calib.challenge.seal import KEY_SCHEMA, check_outside, publish, seal
 from calib.errors import CalibError
-from calib.tasks import completed
 
 type Progress = Callable[[int, int], None]
 type Job = tuple[np.random.SeedSequence, Tier, str]
@@ -186,7 +186,7 @@ def make(
     null_fraction : float
         Share of cases without any effect.
     workers, scheduler
-        As for `calib.tasks.completed`; the result does not depend on them.
+        As for `calib.batch.tasks.completed`; the result does not depend on them.
     progress : callable, optional
         Called with the number of cases done and their total.
 

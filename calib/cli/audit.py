@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from calib.audit import Audit
+    from calib.he2019.audit import Audit
 
 __all__ = ["register"]
 
@@ -32,16 +32,16 @@ def audit(
     ] = False,
 ) -> None:
     """Audit the published tables of He, Sandu & Osorio (2019): every figure and its verdict."""
-    from calib.audit import audit_json, run_audit
+    from calib.batch.folders import check_folder, fresh_folder
     from calib.cli.display import progress_bars
-    from calib.folders import check_folder, fresh_folder
+    from calib.he2019.audit import audit_json, run_audit
 
     if out is not None:
         check_folder(out, overwrite=overwrite)
     with progress_bars() as tell:
         found = run_audit(seed, progress=tell)
         if out is not None:
-            from calib.page.audit import write_audit_page
+            from calib.he2019.page.audit import write_audit_page
 
             tell("drawing figures", 0, 1)
             with fresh_folder(out, overwrite=overwrite) as folder:
@@ -60,7 +60,7 @@ def _print(found: Audit) -> None:
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    from calib.page.audit import AUDIT_MARKS
+    from calib.he2019.page.audit import AUDIT_MARKS
 
     table = RichTable(title="Audit of He, Sandu & Osorio (2019)", show_lines=True)
     for heading in ("verdict", "where", "claim or reading", "evidence"):

@@ -12,7 +12,7 @@ from calib.cli.parallel import CORES, Workers
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
-    from calib.study_tasks import HoldOut
+    from calib.report.study_tasks import HoldOut
 
 __all__ = ["register"]
 
@@ -56,19 +56,19 @@ def report(
     workers: Workers = CORES,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
-    from calib.audit import Seeds
+    from calib.batch.folders import check_folder
+    from calib.batch.pool import pool
     from calib.cli.display import progress_bars
-    from calib.contents import work_out
     from calib.data import read_table
-    from calib.datasets.he2019 import labelled
-    from calib.folders import check_folder
-    from calib.outlying import outlying_notes
-    from calib.outputs import OUTPUTS
-    from calib.paper_gaps.cases import paper_gaps
-    from calib.report import write_report
-    from calib.sampling.sampler import SamplerSettings
-    from calib.study_tasks import he2019_tasks, plan_tasks
-    from calib.tasks.pool import pool
+    from calib.data.outputs import OUTPUTS
+    from calib.he2019.audit import Seeds
+    from calib.he2019.datasets.embedded import labelled
+    from calib.he2019.gaps.cases import paper_gaps
+    from calib.inference.sampling.sampler import SamplerSettings
+    from calib.report.contents import work_out
+    from calib.report.study_tasks import he2019_tasks, plan_tasks
+    from calib.report.writer import write_report
+    from calib.validation.outliers import outlying_notes
 
     check_folder(out, overwrite=overwrite)
     if files:
@@ -122,21 +122,21 @@ def fit(
     max_steps: _MaxSteps = 25_600,
 ) -> None:
     """Calibrate one model on one file and save the posterior."""
-    from calib.calibration import calibrate
+    from calib.batch.folders import check_folder, fresh_folder
     from calib.cli.display import posterior_table, progress_bars, verdict_line
     from calib.data import hold_out as split
     from calib.data import read_for_model
-    from calib.datasets.he2019 import labelled
-    from calib.estimators import estimate
-    from calib.folders import check_folder, fresh_folder
+    from calib.he2019.datasets.embedded import labelled
+    from calib.inference.calibration import calibrate
+    from calib.inference.estimators import estimate
+    from calib.inference.io import save_calibration
+    from calib.inference.problem import build_problem
+    from calib.inference.random import generator
+    from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import get_model
-    from calib.numbers import format_number
-    from calib.outlying import outlying_notes
-    from calib.problem import build_problem
-    from calib.sampling.sampler import SamplerSettings
-    from calib.store import save_calibration
-    from calib.streams import generator
-    from calib.validate import validate_held_out
+    from calib.report.numbers import format_number
+    from calib.validation.outliers import outlying_notes
+    from calib.validation.validate import validate_held_out
 
     chosen = get_model(model)
     check_folder(out, overwrite=overwrite)
@@ -185,9 +185,9 @@ def predict(
             mend="choose another --out, or pass --overwrite",
         )
     from calib.data import read_for_model, write_table
-    from calib.prediction import predict as predict_at
-    from calib.prediction import prediction_columns
-    from calib.store import load_calibration
+    from calib.inference.io import load_calibration
+    from calib.validation.prediction import predict as predict_at
+    from calib.validation.prediction import prediction_columns
 
     if (run / "corrected.json").exists():
         _predict_corrected(run, at, out, effects)
@@ -272,20 +272,20 @@ def data(
 
 
 def _write_he2019(out: Path, overwrite: bool) -> list[Path]:
-    from calib.datasets import he2019
+    from calib.he2019.datasets import embedded
 
-    existing = [f"{key}.csv" for key in he2019.tables() if (out / f"{key}.csv").exists()]
+    existing = [f"{key}.csv" for key in embedded.tables() if (out / f"{key}.csv").exists()]
     if existing and not overwrite:
         raise CalibError(
             f"{', '.join(existing)} exist there already", where=str(out),
             mend="choose another --out, or pass --overwrite",
         )  # fmt: skip
-    return he2019.write(out)
+    return embedded.write(out)
 
 
 def _write_he2019_gaps(out: Path, overwrite: bool) -> list[Path]:
-    from calib.paper_gaps.cases import paper_gaps
-    from calib.paper_gaps.folders import write_cases
+    from calib.he2019.gaps.cases import paper_gaps
+    from calib.he2019.gaps.folders import write_cases
 
     return write_cases(paper_gaps(), out, overwrite=overwrite)
 
@@ -296,7 +296,7 @@ def template(
 ) -> None:
     """Write an example CSV of a model to fill in."""
     from calib.models import get_model
-    from calib.templates import template_csv
+    from calib.models.templates import template_csv
 
     _emit(template_csv(get_model(model).name), out)
 
@@ -306,8 +306,8 @@ def priors(
     out: Annotated[Path | None, typer.Option(help="TOML to write; printed if none.")] = None,
 ) -> None:
     """Write the shipped priors of a model, to copy and edit."""
+    from calib.inference.prior_files import default_prior_path
     from calib.models import get_model
-    from calib.prior_files import default_prior_path
 
     _emit(default_prior_path(get_model(model).name).read_text(encoding="utf-8"), out)
 
@@ -338,7 +338,7 @@ def _emit(text: str, out: Path | None) -> None:
 
 
 def _parse_hold_out(text: str | None) -> HoldOut | None:
-    from calib.study_tasks import HoldOut
+    from calib.report.study_tasks import HoldOut
 
     return None if text is None else HoldOut.parse(text)
 

@@ -33,7 +33,7 @@ def campaign(
     ] = False,
 ) -> None:
     """Run many fits, diagnoses, challenge cases or SBC replicates as tasks; run again to resume."""
-    from calib.campaign import read_plan, run_campaign
+    from calib.batch.campaign import read_plan, run_campaign
     from calib.cli.display import progress_bars
 
     planned = read_plan(plan)

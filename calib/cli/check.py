@@ -36,10 +36,10 @@ def check(
 
     Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
     """
+    from calib.batch.pool import pool
+    from calib.check.check import check as find
     from calib.cli.check_display import show
     from calib.cli.display import progress_bars
-    from calib.reproduce.check import check as find
-    from calib.tasks.pool import pool
 
     try:
         with pool(1 if quick else workers) as side, progress_bars() as tell:

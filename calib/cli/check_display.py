@@ -9,8 +9,8 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from calib.reproduce.items import Item, Status
-from calib.reproduce.outcome import Outcome
+from calib.check.items import Item, Status
+from calib.check.outcome import Outcome
 
 __all__ = ["show"]
 

@@ -6,8 +6,8 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from calib.calibration import Calibration
-from calib.posterior_text import centre_text, interval_text
+from calib.inference.calibration import Calibration
+from calib.report.posterior_text import centre_text, interval_text
 
 __all__ = ["posterior_table", "progress_bars", "verdict_line"]
 

@@ -40,8 +40,10 @@ def diagnose(
     workers: Workers = CORES,
 ) -> None:
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
-    from calib.columns import QUANTITIES
-    from calib.folders import check_folder, fresh_folder
+    from calib.batch.folders import check_folder, fresh_folder
+    from calib.batch.pool import pool
+    from calib.data.outputs import OUTPUTS
+    from calib.data.quantities import QUANTITIES
     from calib.gap.case import case_from_run, read_case
     from calib.gap.diagnose import diagnose as find
     from calib.gap.effects import EFFECTS
@@ -49,10 +51,8 @@ def diagnose(
     from calib.gap.effects.load import load_effects
     from calib.gap.files import write_diagnosis
     from calib.gap.provenance import INPUTS, inputs_record
-    from calib.numbers import format_number
-    from calib.outputs import OUTPUTS
-    from calib.page.gap_verdict import judge_gap
-    from calib.tasks.pool import pool
+    from calib.report.numbers import format_number
+    from calib.report.page.gap_verdict import judge_gap
 
     check_folder(out, overwrite=overwrite)
     if case is not None and run is None and field is None:
@@ -72,9 +72,9 @@ def diagnose(
         paths = [effects, *(effects.with_name(f"{name}.toml") for name in own)]
         files = {path.name: path.read_bytes() for path in paths}
     manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
-    with pool(workers, ["calib.page.diagnosis"]) as side:
+    with pool(workers, ["calib.report.page.diagnosis"]) as side:
         found = find(given, seed, effects={**EFFECTS, **own}, pool=side)
-        from calib.page.diagnosis import gap_evidence, write_page
+        from calib.report.page.diagnosis import gap_evidence, write_page
 
         with fresh_folder(out, overwrite=overwrite) as folder:
             write_diagnosis(found, folder)
@@ -200,11 +200,11 @@ def score(
     overwrite: _Overwrite = False,
 ) -> None:
     """Compare diagnoses with the sealed answers."""
+    from calib.batch.folders import check_folder, fresh_folder
     from calib.challenge.figures import confusion_figure, levels_figure, reliability_figure
     from calib.challenge.limit import read_limit
     from calib.challenge.score import score as score_all
     from calib.challenge.table import text_table
-    from calib.folders import check_folder, fresh_folder
 
     if out is not None:
         check_folder(out, overwrite=overwrite)

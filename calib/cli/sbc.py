@@ -32,9 +32,9 @@ def sbc(
     from dataclasses import asdict
 
     from calib.cli.display import progress_bars
-    from calib.sbc.files import write_sbc
-    from calib.sbc.page import text_table
-    from calib.sbc.run import SETTINGS, run_sbc
+    from calib.report.page.sbc import text_table
+    from calib.report.sbc import write_sbc
+    from calib.validation.sbc.run import SETTINGS, run_sbc
 
     with progress_bars() as tell:
         score = run_sbc(

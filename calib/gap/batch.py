@@ -11,13 +11,13 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from calib.batch.folders import read_folder
+from calib.batch.tasks import LateItems, run_folder_tasks
 from calib.errors import CalibError
-from calib.folders import read_folder
 from calib.gap.case import Case, read_case
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.files import write_diagnosis
 from calib.gap.provenance import INPUTS, check_resumable, inputs_record
-from calib.tasks import LateItems, run_folder_tasks
 
 __all__ = ["case_folders", "diagnose_cases", "written"]
 
@@ -58,7 +58,7 @@ def diagnose_cases(
     seed : int
         Results do not depend on the number of workers.
     workers, scheduler, progress, announce
-        As for `calib.tasks.run_tasks`.
+        As for `calib.batch.tasks.run_tasks`.
 
     Returns
     -------

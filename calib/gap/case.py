@@ -15,17 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table, read_table
+from calib.data.outputs import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.covariates import Covariates
 from calib.gap.effects import View
 from calib.gap.noise import At, noise_at, noise_at_lab
 from calib.gap.oddities import oddities
 from calib.gap.simulated import PRESSURE, Simulated
+from calib.inference.priors import Priors
+from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS, get_model
 from calib.models.base import Array
-from calib.outputs import OUTPUTS
-from calib.priors import Priors
-from calib.problem import Problem, build_problem
 
 __all__ = [
     "Campaigns", "Case", "OutputData", "campaigns", "case_files", "case_from_run", "read_case",
@@ -48,7 +48,7 @@ class Case:
     lab, field : Table
         The campaign of the calibration, and the one the simulator is used for.
     models : mapping of str to str
-        Output (`calib.outputs.OUTPUTS`) to model.
+        Output (`calib.data.outputs.OUTPUTS`) to model.
     fresh : Table, optional
         Conditions to predict.
     warnings : tuple of str
@@ -70,7 +70,7 @@ class OutputData:
     Parameters
     ----------
     name : str
-        Key of `calib.outputs.OUTPUTS`.
+        Key of `calib.data.outputs.OUTPUTS`.
     problem : Problem
         On the lab rows that have the output.
     priors : Priors
@@ -234,7 +234,7 @@ def case_from_run(run: Path, field: Path) -> Case:
         If either cannot be read.
     """
     # Needs what writes and reads run folders, and that a sampler: no other case does.
-    problem = import_module("calib.store").load_calibration(run).problem
+    problem = import_module("calib.inference.io").load_calibration(run).problem
     model = problem.bound.model
     output = next(key for key, column in OUTPUTS.items() if column == model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))

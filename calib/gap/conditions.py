@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
+from calib.data.outputs import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import MAX_RATIO, Case
 from calib.models import get_model
 from calib.models.base import Array
-from calib.outputs import OUTPUTS
 
 __all__ = ["check_units", "without_far_conditions"]
 

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from calib.data import Table, write_table
+from calib.data.outputs import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import Campaigns, campaigns, read_case
 from calib.gap.effects import EFFECTS, Effect
@@ -27,8 +28,7 @@ from calib.gap.noise import Noise
 from calib.gap.shifts import ShiftMap
 from calib.gap.shrink import predict_fresh
 from calib.models.base import Array
-from calib.outputs import OUTPUTS
-from calib.prediction import outside
+from calib.validation.prediction import outside
 
 __all__ = [
     "Corrected", "conditions_outside", "load_corrected", "predict_columns", "save_corrected",

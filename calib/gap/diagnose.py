@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.batch.pool import HERE, Pool
+from calib.batch.threads import one_thread
 from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns, read_case
 from calib.gap.corrected import Corrected, conditions_outside
 from calib.gap.effects import EFFECTS, Effect, View
@@ -17,10 +19,8 @@ from calib.gap.outliers import rank_without_outliers, without_outputs
 from calib.gap.shrink import FreshPrediction, Shrink, predict_fresh, shrink
 from calib.gap.where import Region, RowGap, regions, row_gaps
 from calib.gap.which import Lab, Ranking, calibrate_lab, rank
+from calib.inference.random import generator
 from calib.models.base import Array
-from calib.streams import generator
-from calib.tasks.pool import HERE, Pool
-from calib.threads import one_thread
 
 __all__ = ["Diagnosis", "diagnose", "diagnose_once", "verdict", "with_unseen_rows"]
 

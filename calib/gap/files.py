@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from calib.data import write_table
+from calib.data.outputs import OUTPUTS
 from calib.gap.corrected import save_corrected
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
 from calib.models.base import Array
-from calib.outputs import OUTPUTS
 
 __all__ = ["SCHEMA", "document", "write_diagnosis"]
 

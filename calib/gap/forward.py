@@ -22,8 +22,8 @@ from calib.gap.discrepancy import THRESHOLDS, Bases, Discrepancy
 from calib.gap.effects import Effect, View
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.shifts import ShiftMap, shift_map
+from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
-from calib.priors import Prior, Priors
 
 __all__ = ["Forward"]
 

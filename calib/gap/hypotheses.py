@@ -15,8 +15,8 @@ from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.base import DENSITY, DRAWBAR, RUT
 from calib.gap.hypothesis import Hypothesis, OnsetOver, SmoothOver
 from calib.gap.shifts import ShiftAs
-from calib.prior_files import default_prior_path, read_priors
-from calib.priors import Priors
+from calib.inference.prior_files import default_prior_path, read_priors
+from calib.inference.priors import Priors
 
 __all__ = [
     "LN_PAIR_TO_SINGLE",

@@ -7,7 +7,7 @@ from typing import Literal
 
 from calib.gap.effects import Effect
 from calib.gap.shifts import ShiftAs
-from calib.priors import Priors
+from calib.inference.priors import Priors
 
 __all__ = ["Hypothesis", "OnsetOver", "Setting", "SmoothOver"]
 

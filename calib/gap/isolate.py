@@ -21,10 +21,10 @@ from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, noise_at
 from calib.gap.relevance import RELEVANT
+from calib.inference.random import generator
+from calib.inference.sampling.curvature import hessian_scale
+from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
-from calib.sampling.curvature import hessian_scale
-from calib.sampling.mode import prior_widths
-from calib.streams import generator
 
 __all__ = ["Isolability", "isolability", "smallest_shown"]
 

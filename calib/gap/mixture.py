@@ -12,8 +12,8 @@ from calib.gap.effects import View
 from calib.gap.fit import Fit
 from calib.gap.noise import noise_at
 from calib.gap.which import Ranking
+from calib.inference.random import generator
 from calib.models.base import Array
-from calib.streams import generator
 
 __all__ = ["Mixture", "Truth", "mixture"]
 

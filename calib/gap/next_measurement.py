@@ -8,14 +8,14 @@ from itertools import combinations
 
 import numpy as np
 
+from calib.data.outputs import OUTPUTS
 from calib.gap.case import Campaigns
 from calib.gap.effects import View
 from calib.gap.fit import Fit
 from calib.gap.noise import noise_at
 from calib.gap.which import Ranking
+from calib.inference.random import generator
 from calib.models.base import Array
-from calib.outputs import OUTPUTS
-from calib.streams import generator
 
 __all__ = ["NextMeasurement", "next_measurements"]
 

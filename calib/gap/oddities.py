@@ -7,10 +7,10 @@ from collections.abc import Mapping
 import numpy as np
 
 from calib.data import Table
+from calib.data.outputs import OUTPUTS
 from calib.gap.effects.base import DRAWBAR
 from calib.models import get_model
 from calib.models.base import Array
-from calib.outputs import OUTPUTS
 
 __all__ = ["oddities"]
 

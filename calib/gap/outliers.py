@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
+from calib.data.outputs import OUTPUTS
 from calib.gap.case import Campaigns, Case, OutputData, campaigns
 from calib.gap.conditions import check_units, without_far_conditions
 from calib.gap.effects import Effect
 from calib.gap.which import Lab, Ranking, calibrate_lab, rank
 from calib.models.base import Array
-from calib.outputs import OUTPUTS
 
 __all__ = ["LAB_OUTLIER", "LEFT_OVER", "OUTLIER", "rank_without_outliers", "without_outputs"]
 

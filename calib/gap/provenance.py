@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from calib.environment import code_sha256, sha256
+from calib.batch.environment import code_sha256, sha256
 from calib.errors import CalibError
 from calib.gap.case import Case, case_files
 

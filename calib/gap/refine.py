@@ -21,10 +21,10 @@ from scipy.special import logsumexp
 
 from calib.gap.fit import Fit, log_joint
 from calib.gap.noise import ln_prior
+from calib.inference.random import generator
+from calib.inference.sampling.adapt import tempered_moments
+from calib.inference.sampling.mixture import StudentT, log_sum
 from calib.models.base import Array
-from calib.sampling.adapt import tempered_moments
-from calib.sampling.mixture import StudentT, log_sum
-from calib.streams import generator
 
 __all__ = ["refine"]
 

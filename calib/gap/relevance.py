@@ -22,8 +22,8 @@ import numpy as np
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
 from calib.gap.noise import Noise, noise_at
+from calib.inference.random import generator
 from calib.models.base import Array
-from calib.streams import generator
 
 __all__ = ["RELEVANT", "RELEVANT_IN_PAIR", "relevance", "sizes"]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from calib.gap.case import Campaigns
 from calib.gap.forward import Forward
 from calib.gap.noise import Noise, most_probable
+from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
-from calib.sampling.mode import prior_widths
 
 __all__ = ["Residuals", "residuals_of_all"]
 

@@ -14,9 +14,9 @@ from scipy.linalg import block_diag
 from calib.errors import CalibError
 from calib.gap.case import OutputData
 from calib.gap.effects.base import DRAWBAR
+from calib.inference.prior_files import default_prior_path
+from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
-from calib.prior_files import default_prior_path
-from calib.sampling.mode import prior_widths
 
 __all__ = [
     "DIFFERENCE", "RADIUS_ERROR", "ZERO_OF_SLIP", "ShiftAs", "ShiftMap", "alone_sd",

@@ -29,9 +29,9 @@ from calib.gap.isolate import Isolability, isolability
 from calib.gap.noise import Noise
 from calib.gap.refine import refine
 from calib.gap.relevance import relevance
+from calib.inference.random import generator
+from calib.inference.sampling.mode import find_mode
 from calib.models.base import Array
-from calib.sampling.mode import find_mode
-from calib.streams import generator
 
 __all__ = ["Lab", "Ranking", "calibrate_lab", "rank"]
 

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
+from calib.batch.folders import check_folder
+from calib.batch.tasks import completed
 from calib.challenge.files import OUTPUT_COLUMNS, CaseFiles
 from calib.challenge.seal import KEY_SCHEMA, check_outside, open_key, publish, seal
 from calib.data import Table
 from calib.errors import CalibError
-from calib.folders import check_folder
 from calib.gap.case import campaigns, read_case
 from calib.gap.noise import noise_at
 from calib.gap.which import calibrate_lab
+from calib.inference.random import generator
 from calib.models.base import Array
-from calib.streams import generator
-from calib.tasks import completed
 from calib.twins.draw import draw_twin
 
 __all__ = ["make_twins"]
@@ -60,7 +60,7 @@ def make_twins(
         New: the twins, and their sealed answers, outside them.
     seed : int
     workers, scheduler, announce
-        As for `calib.tasks.completed`; the result does not depend on them.
+        As for `calib.batch.tasks.completed`; the result does not depend on them.
     progress : callable, optional
         Called with the number of twins done and their total.
 

@@ -9,8 +9,7 @@ import pytest
 from scipy.stats import norm
 
 from calib.challenge.answers import read_answer
-
-from .test_score import entry
+from tests.challenge.test_score import entry
 
 
 def told_apart(tmp_path: Path, truth: str, **rival: Any) -> float | None:

@@ -18,8 +18,7 @@ from calib.challenge.files import OUTPUT_COLUMNS
 from calib.challenge.make import make, make_case, plan
 from calib.challenge.seal import open_key, sha256
 from calib.errors import CalibError
-
-from .blind import BlindTest
+from tests.challenge.blind import BlindTest
 
 CONTRACT_COLUMNS = (
     "run_order", "slip_ratio", "inflation_pressure_kpa", "inflation_pressure_psi",

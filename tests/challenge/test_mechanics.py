@@ -12,8 +12,7 @@ from calib.challenge.density import draw_cone_law
 from calib.challenge.mechanics import self_propelled_slip, simulate
 from calib.challenge.soil import draw_soil, shear_stress
 from calib.challenge.tyre import PSI_KPA, Tyre, average_ground_pressure
-
-from .conftest import conditions, reality, sandy_loam
+from tests.challenge.conftest import conditions, reality, sandy_loam
 
 
 def test_contact_lengths_are_the_measured_ones() -> None:

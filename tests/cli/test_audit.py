@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-import calib.audit
+import calib.he2019.audit
 from calib.cli import main
 
 
@@ -23,7 +23,7 @@ def run(monkeypatch, capsys, tmp_path, audit):
         seeds.append(seed)
         return audit
 
-    monkeypatch.setattr(calib.audit, "run_audit", made_before)
+    monkeypatch.setattr(calib.he2019.audit, "run_audit", made_before)
 
     def command(*arguments):
         monkeypatch.setattr(sys, "argv", ["calib", *map(str, arguments)])

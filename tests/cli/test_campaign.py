@@ -11,10 +11,10 @@ import time
 from pathlib import Path
 
 import pytest
-from campaign.sites import refuse_all, results
 
 from calib.cli import main
-from calib.templates import template_csv
+from calib.models.templates import template_csv
+from tests.batch.campaign.sites import refuse_all, results
 
 # Tests that run in the background of a shell inherit that Ctrl-C is ignored.
 FROM_A_TERMINAL = """

@@ -7,15 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from calib.datasets import he2019
-
-from .test_cli import Calib, calib  # noqa: F401
+from calib.he2019.datasets import embedded
+from tests.cli.test_cli import Calib, calib  # noqa: F401
 
 
 @pytest.fixture
 def run(calib: Calib) -> Path:  # noqa: F811
     """A run folder, in the current folder."""
-    he2019.write(Path("data"))
+    embedded.write(Path("data"))
     made = calib(
         "fit", "data/rut_depth.csv", "--model", "bekker", "--out", "run",
         "--hold-out", "inflation_pressure_psi=30", "--seed", 4,
@@ -89,7 +88,7 @@ def test_what_cannot_be_checked_ends_with_2(calib: Calib, run: Path) -> None:  #
 
 def test_a_report_without_posteriors_is_whole(calib: Calib) -> None:  # noqa: F811
     """And one with an output that failed can be checked too."""
-    he2019.write(Path("data"))
+    embedded.write(Path("data"))
     Path("few.csv").write_text("slip_ratio,drawbar_pull_kn\n0.1,1\n0.2,1.1\n")
     made = calib(
         "report", "data/rut_depth.csv", "few.csv", "--out", "rep", "--model", "bekker",

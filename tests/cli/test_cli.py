@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 
 from calib.cli import main
-from calib.manifest import file_hashes
+from calib.inference.prior_files import default_prior_path
 from calib.models import MODELS
-from calib.prior_files import default_prior_path
-from calib.templates import template_csv
+from calib.models.templates import template_csv
+from calib.report.manifest import file_hashes
 
 RUT = template_csv("modified_bekker")
 PRESSURES = template_csv("magic_formula_pressure")
@@ -62,10 +62,10 @@ def contents(folder: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def he2019(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from calib.datasets import he2019
+    from calib.he2019.datasets import embedded
 
     folder = tmp_path_factory.mktemp("he2019")
-    he2019.write(folder)
+    embedded.write(folder)
     return folder
 
 
@@ -345,7 +345,7 @@ def test_bad_data(calib: Calib, tmp_path: Path, name: str) -> None:
 def test_bad_data_of_a_report_and_a_prediction(
     calib: Calib, tmp_path: Path, name: str, rut_calibration
 ) -> None:
-    from calib.store import save_calibration
+    from calib.inference.io import save_calibration
 
     _, content, words = BAD_DATA[name]
     Path("my.csv").write_text(str(content))
@@ -469,7 +469,7 @@ def test_an_interruption_is_no_traceback(calib: Calib, monkeypatch: pytest.Monke
     def interrupt(name: str) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("calib.templates.template_csv", interrupt)
+    monkeypatch.setattr("calib.models.templates.template_csv", interrupt)
     ran = calib("template", "bekker")
     assert ran.code == 130
     assert "Traceback" not in ran.err

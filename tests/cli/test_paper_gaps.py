@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from calib.environment import sha256
-from calib.templates import template_csv
-
-from .test_cli import Calib, assert_refused, calib, contents  # noqa: F401
+from calib.batch.environment import sha256
+from calib.models.templates import template_csv
+from tests.cli.test_cli import Calib, assert_refused, calib, contents  # noqa: F401
 
 
 def test_the_four_cases_are_written_and_can_be_diagnosed(calib: Calib) -> None:  # noqa: F811
@@ -72,10 +71,10 @@ def test_the_report_of_the_embedded_data_has_the_section(
         asked.append(seed)
         return lambda tell: (found_gaps["plain_bekker"],)
 
-    monkeypatch.setattr("calib.study_tasks.he2019_tasks", lambda: ())
-    monkeypatch.setattr("calib.contents.begin_gaps", begin)
-    monkeypatch.setattr("calib.contents.begin_convergence", lambda *_: None)
-    monkeypatch.setattr("calib.contents.run_audit", lambda *_, **__: audit)
+    monkeypatch.setattr("calib.report.study_tasks.he2019_tasks", lambda: ())
+    monkeypatch.setattr("calib.report.contents.begin_gaps", begin)
+    monkeypatch.setattr("calib.report.contents.begin_convergence", lambda *_: None)
+    monkeypatch.setattr("calib.report.contents.run_audit", lambda *_, **__: audit)
     ran = calib("report", "--out", "rep", "--seed", 5)
     assert ran.code == 0, ran.err
     assert asked == [5]
@@ -87,7 +86,7 @@ def test_the_report_of_own_data_has_no_such_section(
     calib: Calib,  # noqa: F811
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("calib.report.plates", lambda result, published: [])
+    monkeypatch.setattr("calib.report.writer.plates", lambda result, published: [])
     Path("my.csv").write_text(template_csv("modified_bekker"))
     ran = calib("report", "my.csv", "--out", "rep")
     assert ran.code == 0, ran.err

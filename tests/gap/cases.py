@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from calib.data import Table, table_from_arrays, write_table
+from calib.data.outputs import OUTPUTS
 from calib.gap.case import Campaigns, Case, campaigns
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.which import Ranking, rank
-from calib.outputs import OUTPUTS
-from calib.prior_files import default_prior_path, read_priors
-from calib.problem import build_problem
+from calib.inference.prior_files import default_prior_path, read_priors
+from calib.inference.problem import build_problem
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "cases"
 

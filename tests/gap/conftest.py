@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from gap.cases import SHARED
+from tests.gap.cases import SHARED
 
 
 @pytest.fixture(scope="session")

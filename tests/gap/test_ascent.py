@@ -13,7 +13,7 @@ from calib.gap.hypotheses import pair, shifts, singles, split_testable, unknowns
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
 from calib.gap.residuals import Residuals, residuals_of_all
-from gap.cases import NOISE, make_case
+from tests.gap.cases import NOISE, make_case
 
 SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}
 

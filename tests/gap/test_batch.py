@@ -14,7 +14,7 @@ from calib.gap import batch
 from calib.gap.batch import case_folders, diagnose_cases
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
-from gap.cases import PULL_ONLY, make_case, write_case
+from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 
 @pytest.fixture(scope="module")

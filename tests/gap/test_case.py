@@ -10,7 +10,7 @@ import pytest
 from calib.data import table_from_arrays, write_table
 from calib.errors import CalibError
 from calib.gap.case import Case, campaigns, read_case
-from gap.cases import MODELS, PULL_ONLY, make_case, table_without, write_case
+from tests.gap.cases import MODELS, PULL_ONLY, make_case, table_without, write_case
 
 
 def test_a_written_case_is_read_back(tmp_path):

@@ -12,7 +12,7 @@ from calib.gap.case import Case, read_case
 from calib.gap.conditions import check_units, without_far_conditions
 from calib.gap.effects import EFFECTS
 from calib.gap.outliers import rank_without_outliers
-from gap.cases import PULL_ONLY, make_case, write_case
+from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 
 def changed(case: Case, campaign: str, column: str, rows, factor: float) -> Case:

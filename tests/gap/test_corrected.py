@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 from calib.cli import app
 from calib.data import table_from_arrays, write_table
+from calib.data.outputs import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.corrected import (
@@ -20,9 +21,8 @@ from calib.gap.corrected import (
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
 from calib.gap.effects.load import load_effects
-from calib.outputs import OUTPUTS
-from gap.cases import LARGE, PULL_ONLY, make_case
-from gap.test_load_effects import write
+from tests.gap.cases import LARGE, PULL_ONLY, make_case
+from tests.gap.test_load_effects import write
 
 FEW = {name: EFFECTS[name] for name in ("force_offset", "rate_effect")}
 

@@ -9,7 +9,7 @@ import pytest
 
 from calib.gap.case import campaigns
 from calib.gap.covariates import Covariates
-from gap.cases import PULL_ONLY, make_case, table_without
+from tests.gap.cases import PULL_ONLY, make_case, table_without
 
 
 def test_both_campaigns_span_the_scale():

@@ -10,7 +10,7 @@ import pytest
 from calib.gap.case import Campaigns
 from calib.gap.discrepancy import Discrepancy
 from calib.gap.hypothesis import Hypothesis
-from gap.cases import campaigns_of
+from tests.gap.cases import campaigns_of
 
 PULL = ("drawbar_pull",)
 

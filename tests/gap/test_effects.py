@@ -10,8 +10,8 @@ import pytest
 
 from calib.gap.effects import EFFECTS, View
 from calib.gap.effects.base import saturating
-from calib.prior_files import default_prior_path, read_priors
-from gap.cases import make_case, parameters, simulate
+from calib.inference.prior_files import default_prior_path, read_priors
+from tests.gap.cases import make_case, parameters, simulate
 
 OUTPUTS = ("drawbar_pull", "rut_depth", "bulk_density")
 # Parameters that make an effect vanish when they are zero; those of its shape keep some value.

@@ -12,7 +12,7 @@ from calib.data import read_table
 from calib.gap.case import read_case
 from calib.gap.diagnose import diagnose
 from calib.gap.files import document, write_diagnosis
-from gap.cases import CHOICE, diagnosis_of, make_case, pull_diagnosis, write_case
+from tests.gap.cases import CHOICE, diagnosis_of, make_case, pull_diagnosis, write_case
 
 
 @pytest.fixture(scope="module")

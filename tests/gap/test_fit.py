@@ -20,7 +20,7 @@ from calib.gap.hypotheses import effect_priors
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, ln_prior
 from calib.gap.refine import refine
-from gap.cases import PULL_ONLY, make_case
+from tests.gap.cases import PULL_ONLY, make_case
 
 SIZE = 0.12
 

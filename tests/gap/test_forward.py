@@ -9,8 +9,8 @@ from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors, pair, singles, unknowns
 from calib.gap.hypothesis import Hypothesis
-from calib.priors import Prior, Priors
-from gap.cases import NOISE, campaigns_of
+from calib.inference.priors import Prior, Priors
+from tests.gap.cases import NOISE, campaigns_of
 
 SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}
 

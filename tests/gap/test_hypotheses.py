@@ -13,8 +13,8 @@ from calib.gap.diagnose import diagnose
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import SHIFTS, shifts, unknowns
 from calib.gap.hypothesis import Hypothesis
-from calib.page.gap_sizes import size_sentences
-from gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
+from calib.report.page.gap_sizes import size_sentences
+from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
 
 SIGMA = {o: NOISE[o] for o in MODELS}
 

@@ -18,7 +18,7 @@ from calib.gap.isolate import ALIKE, isolability, smallest_shown
 from calib.gap.noise import Noise
 from calib.gap.relevance import RELEVANT
 from calib.gap.which import rank
-from gap.cases import CHOICE, campaigns_of, make_case, ranking_of
+from tests.gap.cases import CHOICE, campaigns_of, make_case, ranking_of
 
 
 def test_shares_sizes_and_cosines_are_in_their_ranges():

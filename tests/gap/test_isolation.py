@@ -11,8 +11,8 @@ from pathlib import Path
 
 import calib
 import calib.gap
-from calib.prior_files import default_prior_path
-from gap.cases import PULL_ONLY, make_case, write_case
+from calib.inference.prior_files import default_prior_path
+from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 GAP = Path(calib.gap.__file__).parent
 
@@ -98,7 +98,7 @@ def test_a_case_of_the_challenge_is_diagnosed(tmp_path):
 def test_a_shared_null_case_has_no_gap(shared_cases):
     from calib.gap.case import read_case
     from calib.gap.diagnose import diagnose
-    from gap.cases import CHOICE
+    from tests.gap.cases import CHOICE
 
     found = diagnose(read_case(shared_cases / "case-003"), effects=CHOICE)
     assert found.verdict == "none"

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.gap.next_measurement import next_measurements
-from gap.cases import campaigns_of, ranking_of
+from tests.gap.cases import campaigns_of, ranking_of
 
 
 def tied(case: str | None, *names: str):

@@ -7,7 +7,7 @@ import pytest
 
 from calib.gap.case import campaigns
 from calib.gap.noise import KAPPA, RHO, At, Noise, ln_prior, most_probable, noise_at
-from gap.cases import PULL_ONLY, make_case
+from tests.gap.cases import PULL_ONLY, make_case
 
 
 def at(n: int, *, pressures: bool = True) -> At:

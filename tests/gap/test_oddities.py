@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from calib.data import table_from_arrays
+from calib.data.outputs import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.noise import noise_at
 from calib.gap.oddities import oddities
 from calib.gap.outliers import rank_without_outliers
-from calib.outputs import OUTPUTS
-from gap.cases import MODELS, make_case, table_without
+from tests.gap.cases import MODELS, make_case, table_without
 
 PULL, RUT = OUTPUTS["drawbar_pull"], OUTPUTS["rut_depth"]
 NAMES = {

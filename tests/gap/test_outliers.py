@@ -11,7 +11,7 @@ from calib.errors import CalibError
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.outliers import rank_without_outliers
-from gap.cases import PULL_ONLY, make_case
+from tests.gap.cases import PULL_ONLY, make_case
 
 FEW = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}
 

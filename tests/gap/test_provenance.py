@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.environment import sha256
+from calib.batch.environment import sha256
 from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.provenance import (
@@ -17,7 +17,7 @@ from calib.gap.provenance import (
     inputs_record,
     recorded_inputs,
 )
-from gap.cases import PULL_ONLY, make_case, write_case
+from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 
 @pytest.fixture

@@ -17,8 +17,8 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
 from calib.gap.refine import refine
 from calib.gap.which import rank
-from calib.paper_gaps.cases import paper_gaps
-from gap.cases import make_case
+from calib.he2019.gaps.cases import paper_gaps
+from tests.gap.cases import make_case
 
 
 def fitted(name: str, models: dict[str, str], **case):

@@ -9,7 +9,7 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import unknowns
 from calib.gap.noise import Noise, noise_at
 from calib.gap.relevance import relevance, sizes
-from gap.cases import campaigns_of, ranking_of
+from tests.gap.cases import campaigns_of, ranking_of
 
 
 def fit_of(case: str | None, name: str):

@@ -26,11 +26,11 @@ from calib.gap.shifts import (
     another_soil,
     quantities,
 )
+from calib.inference.prior_files import default_prior_path
+from calib.inference.sampling.mode import prior_widths
 from calib.models import MODELS as KNOWN
-from calib.page.gap_tables import shift_sizes
-from calib.prior_files import default_prior_path
-from calib.sampling.mode import prior_widths
-from gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case
+from calib.report.page.gap_tables import shift_sizes
+from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case
 
 SIGMA = {o: NOISE[o] for o in MODELS}
 SIZE = 0.25

@@ -15,7 +15,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.mixture import Truth, mixture
 from calib.gap.shrink import predict_fresh, shrink
 from calib.gap.which import rank
-from gap.cases import PULL_ONLY, campaigns_of, diagnosis_of, make_case, write_case
+from tests.gap.cases import PULL_ONLY, campaigns_of, diagnosis_of, make_case, write_case
 
 N = 27
 
@@ -91,7 +91,7 @@ def test_the_correction_of_a_large_drift_predicts_new_conditions():
     assert 0.0 < s.interval[0] < s.fraction < s.interval[1] <= 1.0
     # The true field at the fresh conditions, from the generator.
     from calib.gap.case import Case
-    from gap.cases import simulate
+    from tests.gap.cases import simulate
 
     case = make_case("sensor_drift", n_fresh=9)
     assert case.fresh is not None

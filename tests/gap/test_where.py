@@ -7,7 +7,7 @@ import pytest
 
 from calib.gap.mixture import Truth
 from calib.gap.where import regions, row_gaps
-from gap.cases import campaigns_of, diagnosis_of
+from tests.gap.cases import campaigns_of, diagnosis_of
 
 NOISE = 0.05
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from calib.data import table_from_arrays
+from calib.data.outputs import OUTPUTS
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.which import probabilities, rank
-from calib.outputs import OUTPUTS
-from gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
+from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
 
 @pytest.mark.parametrize("name", [None, *LARGE])

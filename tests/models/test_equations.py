@@ -16,8 +16,7 @@ from scipy.optimize import brentq
 
 from calib.errors import CalibError
 from calib.models import MODELS, get_model
-
-from .ranges import CONDITIONS, draw
+from tests.models.ranges import CONDITIONS, draw
 
 CLOSE = {"rtol": 1e-9, "atol": 1e-12}
 SEEDS = st.integers(0, 2**32 - 1)

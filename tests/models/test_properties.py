@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from calib.errors import CalibError
 from calib.models import MODELS
 from calib.models.magic_formula_pressure import coefficients_at
-
-from .ranges import THETA, draw
+from tests.models.ranges import THETA, draw
 
 SEEDS = st.integers(0, 2**32 - 1)
 FEW = settings(max_examples=30, deadline=None)

@@ -19,7 +19,7 @@ from calib.challenge.oracle.search import Search
 from calib.challenge.record import read_stage
 from calib.challenge.stage import Stage
 from calib.errors import CalibError
-from calib.streams import generator
+from calib.inference.random import generator
 
 type Array = NDArray[np.float64]
 

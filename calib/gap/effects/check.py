@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
-from calib.columns import QUANTITIES
+from calib.data.outputs import OUTPUTS
+from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.gap.case import Campaigns, Case, OutputData, campaigns
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
 from calib.gap.hypothesis import Hypothesis
+from calib.inference.random import generator
 from calib.models.base import Array
-from calib.outputs import OUTPUTS
-from calib.streams import generator
 
 __all__ = ["check_declared", "check_on_case"]
 

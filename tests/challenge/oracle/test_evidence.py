@@ -23,7 +23,7 @@ from calib.challenge.oracle.finding import mixed
 from calib.challenge.oracle.pairs import place_shares
 from calib.challenge.oracle.proposal import Proposal, log_prior
 from calib.challenge.stage import Stage, rms
-from challenge.oracle.stages import search, stage_with
+from tests.challenge.oracle.stages import search, stage_with
 
 PULL, WHEEL = ("drawbar_pull",), ("drawbar_pull", "rut_depth")
 

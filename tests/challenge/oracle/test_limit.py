@@ -19,7 +19,7 @@ from calib.challenge.score import Score, confusion, score_tier
 from calib.challenge.seal import open_key, publish, seal
 from calib.challenge.table import text_table
 from calib.errors import CalibError
-from challenge.oracle.stages import drawn, sealed
+from tests.challenge.oracle.stages import drawn, sealed
 
 
 @pytest.fixture(scope="module")

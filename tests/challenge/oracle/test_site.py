@@ -17,7 +17,7 @@ from calib.challenge.oracle.proposal import Proposal
 from calib.challenge.oracle.site import Site
 from calib.challenge.record import read_stage, stage_record
 from calib.challenge.shift import draw_shift, shifted
-from challenge.oracle.stages import noisy, stage_with
+from tests.challenge.oracle.stages import noisy, stage_with
 
 WHEEL = ("drawbar_pull", "rut_depth")
 

@@ -1,0 +1,1 @@
+"""Work spread over processes, folders that appear whole, campaigns of many tasks."""

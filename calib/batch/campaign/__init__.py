@@ -1,0 +1,7 @@
+"""Campaigns: a plan of many fits and diagnoses in, a folder of results and their summary out."""
+
+from calib.batch.campaign.plan import Plan, read_plan
+from calib.batch.campaign.run import run_campaign
+from calib.batch.campaign.summary import Summary
+
+__all__ = ["Plan", "Summary", "read_plan", "run_campaign"]

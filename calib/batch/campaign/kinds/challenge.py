@@ -1,0 +1,87 @@
+"""Challenge cases: made of known cause, diagnosed without it, and held against it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
+from calib.batch.campaign.kinds.diagnose import diagnosis_numbers
+from calib.batch.campaign.place import Place
+from calib.challenge.answers import read_answer
+from calib.challenge.make import NULL_FRACTION, Job, case_jobs, make_job
+from calib.gap.batch import written
+from calib.gap.case import read_case
+from calib.gap.diagnose import diagnose
+
+__all__ = ["Challenge", "ChallengeSection"]
+
+
+class ChallengeSection(Section):
+    """``[[challenge]]``: cases drawn from a seed."""
+
+    cases: int = Field(ge=1, description="how many, 1 or more")
+    draw_seed: int = Field(ge=0, description="0 or a positive whole number: which cases are drawn")
+    tier: Literal["both", "easy", "hard"] = Field(
+        default="both", description="'easy', 'hard' or 'both'"
+    )
+    null_fraction: float = Field(
+        default=NULL_FRACTION, ge=0.0, le=0.7, description="the share without a gap, 0 to 0.7"
+    )
+
+
+class Challenge(Kind[ChallengeSection, Job]):
+    """Make, diagnose and mark one case.
+
+    The cases are those of `calib challenge make --seed DRAW_SEED`, but their answers lie beside
+    the diagnoses: this is for figures over many cases, not for a test that others should believe.
+    """
+
+    name = "challenge"
+    section = ChallengeSection
+
+    def plan(self, section: ChallengeSection, place: Place) -> Iterator[Planned]:
+        """Yield a task for each case."""
+        tiers: tuple[Any, ...] = ("easy", "hard") if section.tier == "both" else (section.tier,)
+        jobs, _ = case_jobs(section.draw_seed, section.cases, tiers, section.null_fraction)
+        for name, (own, tier, truth) in jobs.items():
+            yield Planned(
+                name,
+                {"draw_seed": section.draw_seed, "spawn_key": list(own.spawn_key), "tier": tier,
+                 "truth": truth},
+            )  # fmt: skip
+
+    def load(self, task: Task) -> Job:
+        """Return what the case is made from."""
+        s = task.settings
+        own = np.random.SeedSequence(s["draw_seed"], spawn_key=tuple(s["spawn_key"]))
+        return own, s["tier"], s["truth"]
+
+    def work(self, item: Job, seed: int) -> Work:
+        """Make the case, diagnose its files, and mark the diagnosis with its key."""
+        made = make_job(item)
+        with TemporaryDirectory() as scratch:
+            folder = Path(scratch) / "case"
+            made.write(folder)
+            found = diagnose(read_case(folder), seed)
+            files = written(found)
+            for name in ("diagnosis.json", "fresh_prediction.csv"):
+                (folder / name).write_bytes(files[name])
+            answer = read_answer("case", made.key, folder)
+        numbers = {
+            "tier": answer.tier,
+            "truth": answer.truth,
+            "truth_probability": answer.truth_probability,
+            "right_first": answer.among_first(1),
+            "right_first_two": answer.among_first(2),
+            "localisation_auc": answer.auc,
+            "gap_over_noise": made.key["gap_over_noise"],
+            "actual_shrink": {s.output: s.actual for s in answer.shrinks},
+            "shrink_covered": {s.output: s.covered for s in answer.shrinks},
+        }
+        return Work(numbers | diagnosis_numbers(found), files)

@@ -1,0 +1,146 @@
+"""A plan: a TOML file that says which tasks a campaign has."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from calib.batch.campaign.kinds import KINDS, Kind, Section, Task
+from calib.batch.campaign.place import Place
+from calib.errors import CalibError
+from calib.inference.random import stream
+
+__all__ = ["Plan", "read_plan"]
+
+SEED = 2019
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A plan that has been checked.
+
+    Parameters
+    ----------
+    path : Path
+    text : bytes
+        As it was read.
+    tasks : mapping of str to Task
+        By name, in the order of the plan.
+    """
+
+    path: Path
+    text: bytes
+    tasks: Mapping[str, Task]
+
+
+def read_plan(path: Path) -> Plan:
+    """Read and check a plan.
+
+    Parameters
+    ----------
+    path : Path
+        TOML with an optional ``seed`` and tables ``[[fit]]``, ``[[diagnose]]``, ... (see
+        `calib.batch.campaign.kinds`). Files are named relative to its folder.
+
+    Raises
+    ------
+    CalibError
+        Naming table and key, what is allowed there and how to mend it.
+    """
+    path = Path(path)
+    text, content = _read(path)
+    seed = content.pop("seed", SEED)
+    if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
+        raise CalibError(
+            f"the seed is {seed!r}", where=f"{path}, seed", allowed="0 or a positive whole number",
+            mend="correct it, or leave it out",
+        )  # fmt: skip
+    unknown = [key for key in content if key not in KINDS]
+    if unknown or not content:
+        raise CalibError(
+            f"unknown table {', '.join(unknown)}" if unknown else "the plan has no tasks",
+            where=str(path), allowed="seed, " + ", ".join(f"[[{kind}]]" for kind in KINDS),
+            mend="correct the name" if unknown else "add a table",
+        )  # fmt: skip
+    tasks: dict[str, Task] = {}
+    sections: dict[str, str] = {}
+    for name, kind in KINDS.items():
+        for i, table in enumerate(_tables(content.get(name, []), name, path)):
+            where = f"{path}, [[{name}]]" + (f" number {i + 1}" if i else "")
+            section = _section(kind, table, where)
+            if section.name in sections:
+                raise CalibError(
+                    f"the name {section.name!r} is that of {sections[section.name]} too",
+                    where=where, mend="give each table a name of its own",
+                )  # fmt: skip
+            sections[section.name] = where
+            _add(tasks, kind, section, Place(path.parent, where), seed)
+    return Plan(path, text, tasks)
+
+
+def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
+    try:
+        text = path.read_bytes()
+        return text, tomllib.loads(text.decode("utf-8"))
+    except OSError as error:
+        raise CalibError(
+            f"the plan cannot be read ({error.strerror})", where=str(path),
+            mend="give the path of a TOML file",
+        ) from None  # fmt: skip
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
+
+
+def _tables(found: Any, name: str, path: Path) -> list[Any]:
+    if not isinstance(found, list) or not all(isinstance(table, dict) for table in found):
+        raise CalibError(
+            f"{name} is not a list of tables", where=str(path), allowed=f"[[{name}]]",
+            mend="write two brackets",
+        )  # fmt: skip
+    return found
+
+
+def _section(kind: Kind[Any, Any], table: dict[str, Any], where: str) -> Section:
+    try:
+        section: Section = kind.section.model_validate(table)
+    except ValidationError as error:
+        raise _explain(error, kind, where) from None
+    return section
+
+
+def _explain(error: ValidationError, kind: Kind[Any, Any], where: str) -> CalibError:
+    """Say what is wrong with a table: a misspelt key before a missing one, which it may be."""
+    fields = kind.section.model_fields
+    first = min(error.errors(), key=lambda e: e["type"] != "extra_forbidden")
+    key = str(first["loc"][0])
+    if first["type"] == "extra_forbidden":
+        return CalibError(
+            f"unknown key {key}", where=where, allowed=", ".join(fields), mend="correct its name"
+        )
+    allowed = f"{key} = {fields[key].description}"
+    if first["type"] == "missing":
+        return CalibError(f"{key} is missing", where=where, allowed=allowed, mend="add it")
+    found = first["input"]
+    return CalibError(
+        f"{found!r} will not do", where=f"{where}, {key}", allowed=allowed, mend="correct it"
+    )
+
+
+def _add(
+    tasks: dict[str, Task], kind: Kind[Any, Any], section: Section, place: Place, seed: int
+) -> None:
+    seed = seed if section.seed is None else section.seed
+    for planned in kind.plan(section, place):
+        name = f"{section.name}.{planned.label}"
+        if name in tasks:
+            raise CalibError(
+                f"two tasks would be called {name}", where=place.where,
+                mend="rename a file, or put its task into a table of another name",
+            )  # fmt: skip
+        own = int(stream(seed, "campaign", name).generate_state(1)[0])
+        tasks[name] = Task(name, kind.name, own, planned.settings, planned.inputs)

@@ -1,0 +1,119 @@
+"""What numbers depend on besides data, priors and seed: versions, processor, the code itself.
+
+Where these differ, numbers may be rounded otherwise; what that may change is stated in
+`calib.check.tolerances`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Environment", "code_sha256", "sha256", "versions"]
+
+_PACKAGES = (
+    "terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-base", "arviz-stats", "xarray",
+    "matplotlib", "corner", "pillow", "jinja2", "h5netcdf", "h5py",
+)  # fmt: skip
+_SOURCES = (".py", ".j2", ".css", ".toml")
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Where a result was made; nothing in it names a computer or a person.
+
+    Parameters
+    ----------
+    versions : mapping of str to str
+        Of Python and of the packages that numbers and figures depend on.
+    machine : mapping of str to str
+        Processor family, system, C library, linear algebra with the kernels it chose for the
+        processor, and the vector instructions that NumPy uses.
+    code : str
+        SHA-256 over the source files of this package and its priors.
+    """
+
+    versions: Mapping[str, str]
+    machine: Mapping[str, str]
+    code: str
+
+    @classmethod
+    def here(cls) -> Environment:
+        """Return the environment of this process."""
+        return cls(versions(), _machine(), code_sha256())
+
+    def document(self) -> dict[str, Any]:
+        """Return it as plain dictionaries."""
+        return {"versions": dict(self.versions), "machine": dict(self.machine), "code": self.code}
+
+    def differences(self, other: Environment) -> dict[str, tuple[str, str]]:
+        """Return what differs, as pairs of this one's and the other's value."""
+        mine, theirs = self._flat(), other._flat()
+        names = [*mine, *(name for name in theirs if name not in mine)]
+        pairs = {name: (mine.get(name, "none"), theirs.get(name, "none")) for name in names}
+        return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+
+    def same_program(self, other: Environment) -> bool:
+        """Whether equal numbers must give equal files: the same code and packages."""
+        return not set(self.differences(other)) & {*_PACKAGES, "code"}
+
+    def _flat(self) -> dict[str, str]:
+        return {**self.versions, **self.machine, "code": self.code}
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that numbers depend on."""
+    from importlib.metadata import version
+
+    return {"python": sys.version.split()[0], **{name: version(name) for name in _PACKAGES}}
+
+
+def _machine() -> dict[str, str]:
+    import platform
+
+    import numpy as np
+
+    from calib.batch.threads import blas_kernels
+
+    config: Any = np.show_config(mode="dicts")
+    simd, blas = config["SIMD Extensions"], config["Build Dependencies"]["blas"]
+    return {
+        "processor": platform.machine(),
+        "system": platform.system(),
+        "c_library": " ".join(platform.libc_ver()).strip(),
+        "linear_algebra": f"{blas['name']} {blas['version']}",
+        "kernels": " ".join(blas_kernels()),
+        "simd": " ".join([*simd.get("baseline", ()), *simd.get("found", ())]),
+    }
+
+
+def sha256(content: bytes) -> str:
+    """Return the SHA-256 of bytes in hexadecimal."""
+    return hashlib.sha256(content).hexdigest()
+
+
+@cache
+def code_sha256() -> str:
+    """Return the SHA-256 over the source files of this package and the priors shipped with it."""
+    package = Path(__file__).resolve().parents[1]
+    packaged = package / "_priors"
+    # A checkout has the priors beside the package, a wheel in it; they are named alike.
+    priors = packaged if packaged.is_dir() else package.parent / "priors"
+    files = {
+        f"priors/{path.relative_to(priors).as_posix()}": path for path in priors.rglob("*.toml")
+    }
+    for path in package.rglob("*"):
+        if path.suffix in _SOURCES and path.is_file() and packaged not in path.parents:
+            files[path.relative_to(package).as_posix()] = path
+    digest = hashlib.sha256()
+    for name, path in sorted(files.items()):
+        # Line ends are the checkout's, not the code's.
+        content = path.read_bytes().replace(b"\r\n", b"\n")
+        digest.update(f"{name}\0{len(content)}\0".encode())
+        digest.update(content)
+    return digest.hexdigest()

@@ -1,0 +1,121 @@
+"""Pieces of one result, worked out side by side in a few processes of this machine.
+
+For seconds of work, of which the caller waits for every piece; many tasks whose results are to
+outlive a kill are for `calib.batch.tasks.run_tasks`.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import get_all_start_methods, get_context
+from threading import Thread
+from typing import Protocol
+
+from calib.errors import CalibError
+
+__all__ = ["HERE", "Later", "Pool", "pool"]
+
+_REPORT = ("calib.report.contents", "calib.report.writer")
+
+
+class Later[R](Protocol):
+    """A piece that was asked for."""
+
+    def result(self) -> R:
+        """Return it, or raise what went wrong with it."""
+
+
+class _Here[R]:
+    """A piece that is worked out when it is wanted."""
+
+    def __init__(self, work: Callable[[], R]) -> None:
+        self._work = work
+
+    def result(self) -> R:
+        return self._work()
+
+
+class _There[R]:
+    """A piece that another process works out."""
+
+    def __init__(self, future: Future[R]) -> None:
+        self._future = future
+
+    def result(self) -> R:
+        try:
+            return self._future.result()
+        except BrokenProcessPool:
+            raise CalibError(
+                "a process died while it worked: it was killed, or there was no memory left",
+                mend="run it again, with --workers 1 if it happens again",
+            ) from None
+
+
+class Pool:
+    """Where pieces are worked out: in other processes, or here, one after the other.
+
+    Parameters
+    ----------
+    executor : ProcessPoolExecutor, optional
+        Here, by default.
+    """
+
+    def __init__(self, executor: ProcessPoolExecutor | None = None) -> None:
+        self._executor = executor
+
+    @property
+    def here(self) -> bool:
+        """Whether pieces are worked out in this process, which can then tell its progress."""
+        return self._executor is None
+
+    def submit[**P, R](
+        self, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
+    ) -> Later[R]:
+        """Ask for a piece: a call of a module's function with arguments that can be pickled.
+
+        It takes every random number from a stream of its own, so that it does not matter where
+        it is worked out.
+        """
+        if self._executor is None:
+            return _Here(lambda: function(*args, **kwargs))
+        return _There(self._executor.submit(function, *args, **kwargs))
+
+
+HERE = Pool()
+
+
+@contextmanager
+def pool(workers: int, modules: Sequence[str] = _REPORT) -> Iterator[Pool]:
+    """Yield a pool of some processes; of this one with a single worker.
+
+    Parameters
+    ----------
+    workers : int
+        A script that asks for more than one needs ``if __name__ == "__main__":``.
+    modules : sequence of str, optional
+        What the processes import while the caller still does: what a report needs by default.
+    """
+    if workers < 2:
+        yield HERE
+        return
+    # Forked from a process that has imported what the work needs, and has no threads.
+    forked = "forkserver" in get_all_start_methods()
+    context = get_context("forkserver" if forked else "spawn")
+    if forked:
+        context.set_forkserver_preload(list(modules))
+    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_quiet)
+    # A first process starts now, not when there is work for it; it starts where it can wait.
+    Thread(target=executor.submit, args=(_quiet,), daemon=True).start()
+    try:
+        yield Pool(executor)
+    finally:
+        executor.shutdown(wait=False, cancel_futures=True)
+
+
+def _quiet() -> None:
+    """Leave an interruption to the process that waits for the pieces."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,0 +1,16 @@
+"""Many independent tasks: on one process, on several, or on a Dask cluster, with the same results.
+
+`run_tasks` and `run_folder_tasks` write one file or one folder for each task, and do only what is
+missing when they are called again; `completed` hands results over as they come and writes nothing.
+"""
+
+from calib.batch.tasks.attempt import Finished
+from calib.batch.tasks.items import LateItems
+from calib.batch.tasks.landing import check_names, failed_tasks
+from calib.batch.tasks.run import Outcome, run_folder_tasks, run_tasks
+from calib.batch.tasks.stream import completed
+
+__all__ = [
+    "Finished", "LateItems", "Outcome", "check_names", "completed", "failed_tasks",
+    "run_folder_tasks", "run_tasks",
+]  # fmt: skip

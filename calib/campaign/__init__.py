@@ -1,7 +1,0 @@
-"""Campaigns: a plan of many fits and diagnoses in, a folder of results and their summary out."""
-
-from calib.campaign.plan import Plan, read_plan
-from calib.campaign.run import run_campaign
-from calib.campaign.summary import Summary
-
-__all__ = ["Plan", "Summary", "read_plan", "run_campaign"]

@@ -1,0 +1,145 @@
+"""Check a report folder: its hashes, its inputs, and everything computed again from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from calib.batch.environment import Environment
+from calib.batch.pool import HERE, Pool
+from calib.check.compare import (
+    RECORD,
+    SUMMARY,
+    Again,
+    compare_estimates,
+    compare_numbers,
+    count_numbers,
+    output_entry,
+)
+from calib.check.derived import verify_derived, verify_form, verify_gaps
+from calib.check.files import compare_files, moved_parts
+from calib.check.inputs import verify_files, verify_hashes, verify_label, verify_priors
+from calib.check.items import Item, Status
+from calib.check.montecarlo import describe
+from calib.check.numbers import read_json
+from calib.check.posteriors import GROUP as POSTERIORS
+from calib.check.posteriors import DrawsFile, read_draws, verify_density, verify_summary
+from calib.check.recompute import not_computed, recompute_report, report_tasks
+from calib.check.schema import Manifest
+from calib.check.text import verify_images
+from calib.errors import CalibError
+from calib.inference.problem import build_problem
+from calib.report.study import Progress
+from calib.report.study_tasks import Task, fitted_rows
+
+__all__ = ["check_report"]
+
+_PAGE = "index.html"
+
+
+def check_report(
+    manifest: Manifest,
+    folder: Path,
+    scratch: Path,
+    here: Environment,
+    progress: Progress,
+    *,
+    quick: bool,
+    pool: Pool = HERE,
+) -> tuple[list[Item], str]:
+    """Return what was found, and what Monte Carlo error was allowed, in words.
+
+    Parameters
+    ----------
+    manifest : Manifest
+    folder, scratch : Path
+        The report, and an empty folder.
+    here : Environment
+    progress : callable
+    quick : bool
+        Skip the sampling.
+    pool : Pool, optional
+        Where the report is made again.
+    """
+    items = verify_files(folder, manifest.files, RECORD, manifest.left_out)
+    for key, said in manifest.tasks.items():
+        items += verify_hashes(key, said, folder)
+    summary = read_json(folder / SUMMARY)
+    posteriors, unreadable = _posteriors(folder, manifest)
+    items += unreadable + _consistent(folder, summary, posteriors)
+    allowed = ""
+    same_code = manifest.code == here.code
+    with not_computed(items, folder, RECORD):
+        tasks = report_tasks(manifest, folder, scratch / "inputs")
+        items += _named_rightly(manifest, folder, tasks, same_code=same_code)
+        there = [task for task in tasks if task.output in posteriors]
+        items += [_density(task, posteriors[task.output]) for task in there]
+        if quick:
+            items += _left_out(manifest)
+            items += compare_estimates(tasks, manifest.seed, summary, progress)
+        else:
+            study = recompute_report(manifest, tasks, scratch / "again", progress, pool)
+            allowed = describe(count_numbers(study))
+            again = Again(manifest, folder, scratch / "again", study, here)
+            numbers = compare_numbers(again)
+            items += numbers + compare_files(again, moved_parts(numbers))
+    items += verify_form(folder) + verify_gaps(folder, summary, same_code=same_code)
+    record = read_json(folder / RECORD)
+    items += verify_derived(folder, manifest.files, record, summary, same_code=same_code)
+    return items, allowed
+
+
+def _left_out(manifest: Manifest) -> list[Item]:
+    note = "left out on purpose, and not made again"
+    return [Item(POSTERIORS, name, Status.UNJUDGED, note=note) for name in manifest.left_out]
+
+
+def _posteriors(folder: Path, manifest: Manifest) -> tuple[dict[str, DrawsFile], list[Item]]:
+    """Read the netCDF files that are there, by output; and what cannot be read."""
+    found, unreadable = {}, []
+    for key in manifest.tasks:
+        path = folder / f"{key}.nc"
+        if path.is_file():
+            try:
+                found[key] = read_draws(path)
+            except CalibError as error:
+                item = Item(POSTERIORS, path.name, Status.DIFFERENT, note=error.message)
+                unreadable.append(item)
+    return found, unreadable
+
+
+def _consistent(
+    folder: Path, summary: Mapping[str, Any], posteriors: Mapping[str, DrawsFile]
+) -> list[Item]:
+    """Hold the parts of the folder against each other, without computing anything again."""
+    items = []
+    page = folder / _PAGE
+    if page.is_file():
+        items += verify_images(page.read_text(encoding="utf-8", errors="replace"), folder)
+    for key, file in posteriors.items():
+        stated = output_entry(summary, key).get("posterior")
+        items.append(
+            verify_summary(f"{key}.nc", file, stated if isinstance(stated, Mapping) else {})
+        )
+    return items
+
+
+def _named_rightly(
+    manifest: Manifest, folder: Path, tasks: tuple[Task, ...], *, same_code: bool
+) -> list[Item]:
+    items = []
+    for task in tasks:
+        said = manifest.tasks[task.output]
+        items.append(verify_label(said.data.file, task.table, said.label))
+        items.append(verify_priors(task.output, said, folder, same_code=same_code))
+    return items
+
+
+def _density(task: Task, file: DrawsFile) -> Item:
+    name = f"{task.output}.nc"
+    try:
+        problem = build_problem(task.model, fitted_rows(task)[0], task.prior_path)
+    except CalibError as error:
+        return Item(POSTERIORS, name, Status.DIFFERENT, note=error.message)
+    return verify_density(name, file, problem)

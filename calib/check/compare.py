@@ -1,0 +1,217 @@
+"""Compare the numbers of a report folder with those of the report that was made again from it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from calib.batch.environment import Environment
+from calib.check.derived import AUDIT_JSON
+from calib.check.inputs import GROUP as INPUTS
+from calib.check.items import Item, Status
+from calib.check.montecarlo import Place, count_drawn, drawn_in_output
+from calib.check.numbers import compare_entries, flatten, read_json
+from calib.check.schema import Manifest
+from calib.report.study import Progress, Study, estimate_task
+from calib.report.study_tasks import Task
+from calib.report.summary import summarise_estimates
+
+__all__ = [
+    "RECORD", "SUMMARY", "Again", "compare_estimates", "compare_numbers", "count_numbers",
+    "is_document", "output_entry", "part_of",
+]  # fmt: skip
+
+RECORD, SUMMARY = "manifest.json", "summary.json"
+# What a manifest has about itself: durations, and hashes that are verified as such.
+_NOT_COMPARED = ("seconds", "files", "left_out")
+_VERIFIED = ("sha256", "shipped")
+_POINTS = ("estimates", "fit", "by_pressure")
+_CHAIN = ("posterior", "prior_sensitivity", "validation", "sampling")
+_SEARCHES = ("(genetic", "(differential_evolution")
+
+
+@dataclass(frozen=True)
+class Again:
+    """A report folder and the same made again.
+
+    Parameters
+    ----------
+    manifest : Manifest
+    folder, made : Path
+        The report, and the one made again.
+    study : Study
+        What the second shows.
+    here : Environment
+    """
+
+    manifest: Manifest
+    folder: Path
+    made: Path
+    study: Study
+    here: Environment
+
+    @cached_property
+    def same_program(self) -> bool:
+        """Whether equal numbers must give equal words."""
+        return self.manifest.environment.same_program(self.here)
+
+
+def part_of(group: str) -> str:
+    """Return the part of a report that a group of items belongs to: output, gap, or audit."""
+    return group if group.startswith("gap: ") else group.partition(":")[0]
+
+
+def is_document(name: str) -> bool:
+    """Whether a file of a report is compared entry by entry, beside its summary."""
+    diagnosed = name.startswith("gaps/") and name.endswith((".json", ".csv"))
+    # What a corrected model predicts is held against its diagnosis (`derived`).
+    return name == AUDIT_JSON or (diagnosed and not name.endswith("corrected.json"))
+
+
+def count_numbers(study: Study) -> int:
+    """Return how many numbers of a study follow from posterior draws."""
+    results = study.successes.values()
+    return sum(count_drawn(r.calibration, r.validation.scores.n) for r in results)
+
+
+def compare_numbers(again: Again) -> list[Item]:
+    """Return an item for each number of the summary, the manifest and the other documents."""
+    recorded, made = (read_json(f / SUMMARY) for f in (again.folder, again.made))
+    old, new = ({} if d is None else _entries(SUMMARY, d) for d in (recorded, made))
+    items = compare_entries(old, new, _summary_group, _drawn(again.study, old))
+    for key in again.manifest.tasks:
+        items += _blame(again.manifest, key, items)
+    items += _record(again)
+    names = {p.relative_to(again.made).as_posix() for p in again.made.rglob("*") if p.is_file()}
+    for name in sorted(filter(is_document, names)):
+        items += _document(name, again)
+    return items
+
+
+def compare_estimates(
+    tasks: Iterable[Task], seed: int, summary: Mapping[str, Any], progress: Progress
+) -> list[Item]:
+    """Compare the point estimates alone, computed again without sampling."""
+    items = []
+    for task in tasks:
+        place, recorded = (SUMMARY, "models", task.output), output_entry(summary, task.output)
+        if "error" in recorded:
+            note = "it failed; to see whether it does again, check without --quick"
+            name = f"{SUMMARY}: {'.'.join(place[1:])}"
+            items.append(Item(f"{task.output}: error", name, Status.UNJUDGED, note=note))
+            continue
+        estimates, by_pressure = estimate_task(task, seed, progress=progress)
+        again = json.loads(json.dumps(summarise_estimates(estimates, by_pressure)))
+        # The recorded posterior says how wide a parameter's scale is.
+        scale = _entries(place, {"posterior": recorded.get("posterior", {})})
+        points = {key: recorded.get(key, {}) for key in _POINTS}
+        found = {**_entries(place, again), **scale}
+        compared = compare_entries({**_entries(place, points), **scale}, found, _summary_group)
+        items += [item for item in compared if ": posterior" not in item.group]
+    return items
+
+
+def output_entry(summary: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    """Return what a summary says of an output; empty where it says nothing."""
+    models = summary.get("models")
+    found = models.get(key) if isinstance(models, Mapping) else None
+    return found if isinstance(found, Mapping) else {}
+
+
+def _entries(place: str | Place, document: Any) -> dict[Place, Any]:
+    return dict(flatten(document, (place,) if isinstance(place, str) else place))
+
+
+def _drawn(study: Study, recorded: Mapping[Place, Any]) -> dict[Place, float | None]:
+    """What Monte Carlo error allows, by path in the summary."""
+    n = count_numbers(study)
+    found: dict[Place, float | None] = {}
+    for key, result in study.successes.items():
+        place = (SUMMARY, "models", key)
+        steps = recorded.get((*place, "sampling", "steps"))
+        sizes = drawn_in_output(result.calibration, result.validation, n, steps)
+        found |= {(*place, *path): size for path, size in sizes.items()}
+    return found
+
+
+def _summary_group(path: Place) -> str:
+    if path[1:2] == ("paper_gaps",):
+        return f"gap: {path[2]}"
+    if path[1:2] != ("models",):
+        return SUMMARY
+    key, *rest = path[2:]
+    what = rest[0] if rest else ""
+    if what == "by_pressure":
+        return f"{key}: estimates ({' '.join(rest[1:3])})"
+    if what in _POINTS:
+        return f"{key}: estimates ({rest[1]})"
+    # Posterior, scores and sampling figures come of the same draws.
+    return f"{key}: posterior" if what in _CHAIN else f"{key}: what was computed"
+
+
+def _blame(manifest: Manifest, key: str, items: list[Item]) -> list[Item]:
+    """Name the input that the recorded numbers cannot have been computed from."""
+    task = manifest.tasks[key]
+    own = [item for item in items if part_of(item.group) == key]
+    points = [item for item in own if ": estimates" in item.group]
+    strict = [item for item in points if not any(search in item.group for search in _SEARCHES)]
+    if _mostly_different(strict):
+        note = "most estimates in summary.json do not follow from these rows"
+        return [Item(INPUTS, task.data.file, Status.DIFFERENT, note=note)]
+    if _mostly_different([item for item in own if ".sampling.mode." in item.name]):
+        note = "the posterior mode in summary.json does not follow from these priors and the data"
+        return [Item(INPUTS, task.priors.file, Status.DIFFERENT, note=note)]
+    return []
+
+
+def _mostly_different(items: list[Item]) -> bool:
+    numbers = [item for item in items if isinstance(item.recorded, float)]
+    different = sum(item.status is Status.DIFFERENT for item in numbers)
+    return different > 0.5 * len(numbers)
+
+
+def _record(again: Again) -> list[Item]:
+    """Compare what the manifests say, beyond what was taken over from the first."""
+    old, new = (_comparable(read_json(f / RECORD)) for f in (again.folder, again.made))
+    return compare_entries(_entries(RECORD, old), _entries(RECORD, new), lambda _: RECORD)
+
+
+def _comparable(manifest: dict[str, Any]) -> dict[str, Any]:
+    kept = {key: value for key, value in manifest.items() if key not in _NOT_COMPARED}
+    for task in kept.get("tasks", {}).values():
+        for file in ("data", "priors"):
+            task[file] = {k: v for k, v in task[file].items() if k not in _VERIFIED}
+    return kept
+
+
+def _document(name: str, again: Again) -> list[Item]:
+    group = "audit" if name == AUDIT_JSON else f"gap: {name.split('/')[1]}"
+    path = again.folder / name
+    if not path.is_file():
+        return [Item(group, name, Status.DIFFERENT, note="missing")]
+    try:
+        old = _entries(name, _read(path))
+    except (OSError, ValueError, RecursionError) as error:
+        note = f"it cannot be read ({type(error).__name__})"
+        return [Item(group, name, Status.DIFFERENT, note=note)]
+    return compare_entries(old, _entries(name, _read(again.made / name)), lambda _: group)
+
+
+def _read(path: Path) -> Any:
+    text = path.read_text(encoding="utf-8")
+    if path.suffix != ".csv":
+        return json.loads(text)
+    rows = csv.DictReader(text.splitlines())
+    return [{str(k): _cell(v) for k, v in row.items()} for row in rows]
+
+
+def _cell(text: Any) -> Any:
+    try:
+        return float(text)
+    except (TypeError, ValueError):
+        return text

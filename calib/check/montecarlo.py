@@ -1,0 +1,234 @@
+"""Monte Carlo standard errors of everything that is computed from posterior draws.
+
+Of a posterior's summary they are the stated ones, of its sd ArviZ's. Scores follow from the errors
+of the predictive distributions they are scores of.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.stats import norm
+
+from calib.inference.calibration import Calibration
+from calib.inference.diagnostics import mcse, tail_shape
+from calib.models.base import Array
+from calib.validation.scores import LEVELS, RELATIVE_ERROR_FLOOR
+from calib.validation.validate import Validation
+
+__all__ = [
+    "MONTE_CARLO", "Place", "count_drawn", "describe", "drawn_in_output", "drawn_in_run",
+    "posterior_errors", "validation_errors",
+]  # fmt: skip
+
+MONTE_CARLO = "Monte Carlo"
+
+type Place = tuple[str, ...]
+"""Keys from the top of a document to one of its numbers; positions in a list count from "0"."""
+
+# Moments that exist: the variance of a mean, and of a variance. The shape is estimated, so a
+# little less is asked of the second.
+_K_MEAN, _K_SD = 0.5, 0.2
+# Of an interval's width: an end at the edge of what is possible hangs on the few outermost draws,
+# whose scatter among parts of a run tells little. Between seeds k of the rut depth's moves so far.
+_END = 2e-4
+# Chance of one false alarm or more in a whole check.
+_FAMILY = 1e-3
+# Over 24 seeds of the embedded problems, numbers moved by up to 1.4 times what ArviZ expects: the
+# walkers of an ensemble are not quite independent chains.
+_SAFETY = 1.5
+# Draws of the round of importance sampling that estimates the evidence, at least.
+_EVIDENCE_DRAWS = 1500
+
+
+def multiple(n: int) -> float:
+    """Return how many standard errors of a difference are allowed where `n` are looked at.
+
+    So many that one check in a thousand finds a difference where there is none: seven of the
+    some hundred numbers of a report.
+    """
+    return float(_SAFETY * norm.isf(_FAMILY / (2 * max(n, 1))))
+
+
+def describe(n: int) -> str:
+    """Say in words what is allowed to `n` numbers that follow from posterior draws."""
+    return (
+        f"{multiple(n):.1f} Monte Carlo errors of a difference (one false alarm in "
+        f"{1.0 / _FAMILY:g} checks of {n} such numbers, times {_SAFETY:g})"
+    )
+
+
+def count_drawn(calibration: Calibration, n_validated: int = 0) -> int:
+    """Return how many numbers of an output follow from posterior draws, at most.
+
+    Six of each parameter, the evidence; of a validation one for each row, and fourteen scores.
+    """
+    return 6 * len(calibration.parameters) + 1 + (n_validated + 14 if n_validated else 0)
+
+
+def drawn_in_output(
+    calibration: Calibration, validation: Validation, n: int, steps: object
+) -> dict[Place, float | None]:
+    """Return what Monte Carlo error allows to the numbers of one output of a report.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    validation : Validation
+    n : int
+        How many numbers follow from posterior draws, in the whole report.
+    steps : object
+        Recorded length of the other run.
+    """
+    times = multiple(n) * _of_difference(calibration, steps)
+    errors = posterior_errors(calibration)
+    errors |= validation_errors(calibration, validation, times)
+    return _scaled(errors, times)
+
+
+def drawn_in_run(calibration: Calibration, steps: object) -> dict[Place, float | None]:
+    """Return the same for a run, and the posterior sds that its mode is judged by."""
+    errors = posterior_errors(calibration)
+    errors["log_evidence",] = errors.pop(("sampling", "log_evidence"))
+    times = multiple(count_drawn(calibration)) * _of_difference(calibration, steps)
+    sds = enumerate(calibration.draws.flat.std(axis=0).tolist())
+    return _scaled(errors, times) | {("mode", str(j)): sd for j, sd in sds}
+
+
+def _of_difference(calibration: Calibration, steps: object) -> float:
+    """Error of the difference of two runs over that of this one, should the other be shorter."""
+    ratio = 1.0
+    if isinstance(steps, int | float) and steps > 0:
+        ratio = calibration.draws.report.steps / steps
+    return float(np.sqrt(1.0 + np.clip(ratio, 1.0, 4.0)))
+
+
+def _scaled(errors: dict[Place, float | None], times: float) -> dict[Place, float | None]:
+    return {place: None if error is None else times * error for place, error in errors.items()}
+
+
+def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:
+    """Return the Monte Carlo standard errors of a posterior summary.
+
+    Parameters
+    ----------
+    calibration : Calibration
+
+    Returns
+    -------
+    dict
+        Paths in ``summary.json`` below the output; None where the posterior's tail is so heavy
+        that there is no such error.
+    """
+    names = tuple(calibration.parameters)
+    stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
+    sd, shape = mcse(stacked, "sd"), tail_shape(stacked)
+    errors: dict[Place, float | None] = {}
+    for j, name in enumerate(names):
+        stated = calibration.summary[name]
+        least = _END * (stated.hdi_upper - stated.hdi_lower)
+        errors |= {
+            ("posterior", name, "mean"): stated.mcse_mean if shape[j] < _K_MEAN else None,
+            ("posterior", name, "sd"): float(sd[j]) if shape[j] < _K_SD else None,
+            ("posterior", name, "median"): stated.mcse_median,
+            ("posterior", name, "hdi_lower"): max(stated.mcse_hdi_lower, least),
+            ("posterior", name, "hdi_upper"): max(stated.mcse_hdi_upper, least),
+        }
+    draws = calibration.draws
+    internal = draws.t.reshape(-1, *draws.t.shape[2:])
+    relative = mcse(internal, "sd") / internal.std(axis=(0, 1))
+    for j, name in enumerate(calibration.problem.names):
+        ratio = calibration.summary[name].sd_ratio
+        if np.isfinite(ratio):
+            errors["posterior", name, "posterior_to_prior_sd"] = ratio * float(relative[j])
+    efficiency = max(draws.efficiency, 1e-3)
+    errors["sampling", "log_evidence"] = float(np.sqrt((1.0 / efficiency - 1.0) / _EVIDENCE_DRAWS))
+    return errors
+
+
+def validation_errors(
+    calibration: Calibration, validation: Validation, multiple: float
+) -> dict[Place, float | None]:
+    """Return the Monte Carlo standard errors of a validation's scores.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    validation : Validation
+    multiple : float
+        How many errors will be allowed: so many decide which rows may cross the edge of a band.
+
+    Notes
+    -----
+    A part p of the predictive draws has the error sqrt(p (1 - p) (1/N + 1/ESS)): N draws of the
+    noise on top of ESS effective draws of the parameters. What is a mean over rows has the error
+    of the mean influence of a draw on them.
+    """
+    draws, observed, scores = validation.draws, validation.observed, validation.scores
+    n_draws, n = draws.shape
+    ess = min(float(s.ess_bulk) for s in calibration.summary.values())
+    part = float(np.sqrt(1.0 / n_draws + 1.0 / ess))
+    p = np.clip(scores.pit, 4.0 / n_draws, 1.0 - 4.0 / n_draws)
+    pit = np.sqrt(p * (1.0 - p)) * part
+    slope = (np.quantile(draws, 0.55, axis=0) - np.quantile(draws, 0.45, axis=0)) / 0.1
+    median = 0.5 * part * slope
+    errors: dict[Place, float | None] = {
+        ("validation", "rmse"): part * _rmse_influence(draws, observed, slope, scores.rmse),
+        ("validation", "crps"): part * _crps_influence(draws, observed),
+    }
+    errors |= {("validation", "pit", str(i)): float(pit[i]) for i in range(n)}
+    large = np.abs(observed) > RELATIVE_ERROR_FLOOR * np.abs(observed).max()
+    relative = median[large] / np.abs(observed[large])
+    if relative.size:
+        errors["validation", "max_relative_error"] = float(relative.max())
+        near = np.abs(np.abs(scores.relative_error[large]) - 0.06) <= multiple * relative
+        errors["validation", "n_relative_error_above_6_percent"] = near.sum() / multiple
+    for level in LEVELS:
+        edges = 0.5 + 0.5 * level * np.array([-1.0, 1.0])
+        close = np.abs(scores.pit[:, None] - edges).min(axis=1) <= multiple * pit
+        moved = float(close.sum()) / n / multiple
+        errors["validation", "coverage", f"{100 * level:g}"] = moved
+        # A Jeffreys interval moves a little faster than its proportion.
+        for end in ("0", "1"):
+            errors["validation", "coverage_interval", f"{100 * level:g}", end] = 1.5 * moved
+    if validation.method == "leave_one_out":
+        errors |= _elpd_errors(calibration, ess)
+    return errors
+
+
+def _rmse_influence(draws: Array, observed: Array, slope: Array, rmse: float) -> float:
+    """Standard deviation of one draw's influence on the RMSE of the medians."""
+    if rmse == 0.0:
+        return 0.0
+    medians = np.median(draws, axis=0)
+    influence = slope * (0.5 - (draws < medians))
+    return float(((medians - observed) * influence).mean(axis=1).std() / rmse)
+
+
+def _crps_influence(draws: Array, observed: Array) -> float:
+    """Standard deviation of one draw's influence on the mean CRPS."""
+    m = draws.shape[0]
+    order = np.argsort(draws, axis=0)
+    ordered = np.take_along_axis(draws, order, axis=0)
+    total = np.cumsum(ordered, axis=0)
+    rank = np.arange(1, m + 1)[:, None]
+    # Mean absolute difference of each draw to all others, from the sums of the sorted draws.
+    sorted_apart = (ordered * (2 * rank - m) + total[-1] - 2.0 * total) / m
+    apart = np.empty_like(draws)
+    np.put_along_axis(apart, order, sorted_apart, axis=0)
+    return float((np.abs(draws - observed) - apart).mean(axis=1).std())
+
+
+def _elpd_errors(calibration: Calibration, ess: float) -> dict[Place, float | None]:
+    """Of the sum over rows of -ln E[1/p(y_i | theta)] and of its spread, by their influence."""
+    rows = calibration.problem.log_likelihood_rows(calibration.draws.flat)
+    inverse = np.exp(rows.min(axis=0) - rows)
+    influence = inverse / inverse.mean(axis=0) - 1.0
+    elpd = rows.min(axis=0) - np.log(inverse.mean(axis=0))
+    n = elpd.size
+    spread = float(np.sqrt(n * elpd.var(ddof=1)))
+    lever = n * (elpd - elpd.mean()) / ((n - 1) * spread) if spread > 0.0 else np.zeros(n)
+    root = np.sqrt(ess)
+    return {
+        ("validation", "elpd"): float(influence.sum(axis=1).std() / root),
+        ("validation", "elpd_se"): float((influence @ lever).std() / root),
+    }

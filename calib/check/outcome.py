@@ -1,0 +1,111 @@
+"""The verdict of a check, in one sentence and as a document."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal
+
+from calib.check.items import Item, Status
+from calib.check.montecarlo import MONTE_CARLO
+
+__all__ = ["SCHEMA", "Outcome"]
+
+SCHEMA = "calib/check/1"
+# Below this part of what is allowed, the draws are the same ones and rounding differs.
+_ROUNDED = 1e-3
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a check found.
+
+    Parameters
+    ----------
+    folder : str
+        As it was given.
+    kind : {"report", "run"}
+    quick : bool
+        Whether sampling was skipped.
+    items : tuple of Item
+    environment : mapping of str to (str, str)
+        What differs between where it was made and here: pairs of there and here.
+    allowed : str
+        What Monte Carlo error was allowed, in words.
+    not_converged : tuple of str
+        Models whose posterior did not pass the convergence gate, as recorded.
+    """
+
+    folder: str
+    kind: Literal["report", "run"]
+    quick: bool
+    items: tuple[Item, ...]
+    environment: Mapping[str, tuple[str, str]]
+    allowed: str = ""
+    not_converged: tuple[str, ...] = ()
+
+    def of(self, *status: Status) -> tuple[Item, ...]:
+        """Return the items of some status."""
+        return tuple(item for item in self.items if item.status in status)
+
+    @property
+    def same(self) -> bool:
+        """Whether nothing is different."""
+        return not self.of(Status.DIFFERENT)
+
+    @property
+    def exit_code(self) -> int:
+        """0 where everything is the same, 1 where something is different."""
+        return 0 if self.same else 1
+
+    @property
+    def draws_differ(self) -> bool:
+        """Whether the posterior was drawn by other random draws than those recorded."""
+        return any(
+            item.note == MONTE_CARLO and item.share is not None and item.share > _ROUNDED
+            for item in self.of(Status.WITHIN)
+        )
+
+    @property
+    def verdict(self) -> str:
+        """The verdict in one sentence."""
+        different = _names(self.of(Status.DIFFERENT))
+        if different:
+            shown = ", ".join(different[:4]) + (", ..." if len(different) > 4 else "")
+            return f"DIFFERENT: {shown}"
+        unjudged = len(self.of(Status.UNJUDGED))
+        rest = f"; {unjudged} not judged" if unjudged else ""
+        if self.not_converged:
+            rest += f"; NOT CONVERGED, not to be used: {', '.join(self.not_converged)}"
+        if self.quick:
+            return f"NOTHING DIFFERENT, BUT ONLY ESTIMATES WERE COMPUTED AGAIN (--quick){rest}"
+        identical = len(self.of(Status.IDENTICAL))
+        if not self.of(Status.WITHIN):
+            return f"SAME, bit for bit: {identical} numbers and files{rest}"
+        if self.draws_differ:
+            return f"SAME within Monte Carlo error, not bit for bit{rest}"
+        return f"SAME up to rounding, not bit for bit{rest}"
+
+    def document(self) -> dict[str, Any]:
+        """Return everything as plain dictionaries."""
+        return {
+            "schema": SCHEMA,
+            "folder": self.folder,
+            "kind": self.kind,
+            "quick": self.quick,
+            "verdict": "same" if self.same else "different",
+            "headline": self.verdict,
+            "exit_code": self.exit_code,
+            "counts": {str(status): len(self.of(status)) for status in Status},
+            "environment": {
+                name: {"there": there, "here": here}
+                for name, (there, here) in self.environment.items()
+            },
+            "allowed": self.allowed,
+            "not_converged": list(self.not_converged),
+            "items": [{**asdict(item), "status": str(item.status)} for item in self.items],
+        }
+
+
+def _names(items: Iterable[Item]) -> list[str]:
+    return list(dict.fromkeys(item.name for item in items))

@@ -1,0 +1,197 @@
+"""Compare netCDF files: byte by byte, draw by draw, and with the numbers stated of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.check.items import Item, Status
+from calib.errors import CalibError
+from calib.inference.diagnostics import hdi
+from calib.inference.problem import Problem
+from calib.models.base import Array
+
+__all__ = [
+    "GROUP", "DrawsFile", "compare_posterior", "read_draws", "summary_of", "verify_density",
+    "verify_summary",
+]  # fmt: skip
+
+GROUP = "posteriors"
+_HDI = 0.95
+# The summary is computed from the same draws in another order of summation.
+_ROUNDING = 1e-6
+# Of the sd of what goes with draws: chains of the shortest run that passes the gate agree so far.
+_OF_SD = 0.5
+# Part of the draws that may fall on the wrong side of a bound when they are transformed back.
+_AT_BOUNDS = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class DrawsFile:
+    """What is compared of a netCDF file.
+
+    Parameters
+    ----------
+    draws : mapping of str to ndarray, shape (chains, draws)
+        By parameter.
+    log_prob : ndarray, shape (chains, draws)
+    """
+
+    draws: Mapping[str, Array]
+    log_prob: Array
+
+
+def read_draws(path: Path) -> DrawsFile:
+    """Read the posterior draws in a file.
+
+    Raises
+    ------
+    CalibError
+        If the file cannot be read.
+    """
+    import xarray as xr
+
+    try:
+        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as group:
+            draws = {str(k): np.asarray(v.values) for k, v in group.data_vars.items()}
+        with xr.open_dataset(path, group="sample_stats", engine="h5netcdf") as group:
+            log_prob = np.asarray(group["lp"].values)
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise CalibError(
+            f"the file cannot be read ({type(error).__name__})", where=str(path)
+        ) from None
+    if log_prob.ndim != 2 or not log_prob.size:
+        raise CalibError("there are no draws in it", where=str(path))
+    if not draws or any(v.shape != log_prob.shape for v in draws.values()):
+        raise CalibError("its draws differ in number", where=str(path))
+    return DrawsFile(draws, log_prob)
+
+
+def summary_of(draws: Mapping[str, Array]) -> dict[str, dict[str, float]]:
+    """Return mean, sd, median and 95 % highest-density interval of each parameter."""
+    found = {}
+    for name, values in draws.items():
+        flat = values.reshape(-1)
+        low, high = hdi(flat, _HDI)
+        found[name] = {
+            "mean": float(flat.mean()),
+            "sd": float(flat.std(ddof=1)),
+            "median": float(np.median(flat)),
+            "hdi_lower": low,
+            "hdi_upper": high,
+        }
+    return found
+
+
+def verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Item:
+    """Check that a file's draws have the summary that is stated of them."""
+    computed = summary_of(file.draws)
+    for parameter, values in computed.items():
+        entry = stated.get(parameter)
+        entry = entry if isinstance(entry, Mapping) else {}
+        scale = values["sd"]
+        for key, value in values.items():
+            given = entry.get(key)
+            if not isinstance(given, int | float) or not math.isclose(
+                given, value, rel_tol=_ROUNDING, abs_tol=_ROUNDING * scale
+            ):
+                # Which of the two is wrong is for the sampling to say.
+                both, note = f"summary.json and {name}", f"{key} of {parameter} is not the same"
+                return Item(GROUP, both, Status.DIFFERENT, given, value, note=note)
+    return Item(GROUP, name, Status.IDENTICAL, note="its draws have the summary that is stated")
+
+
+def verify_density(name: str, file: DrawsFile, problem: Problem) -> Item:
+    """Check that a file's draws have the log density that data and priors give them.
+
+    And that what is derived from parameters follows from them.
+    """
+    stated = file.log_prob.reshape(-1)
+    missing = [p.name for p in problem.priors.entries if not p.fixed and p.name not in file.draws]
+    if missing:
+        return Item(GROUP, name, Status.DIFFERENT, note=f"there is no {missing[0]} in it")
+    natural = np.stack(
+        [
+            np.full(stated.size, p.loc) if p.fixed else file.draws[p.name].reshape(-1)
+            for p in problem.priors.entries
+        ],
+        axis=-1,
+    )
+    with np.errstate(all="ignore"):
+        t = problem.priors.to_internal(natural, margin=0.0)
+        derived = problem.bound.report(natural[:, :-1])
+    for key, values in derived.items():
+        said = file.draws.get(key, values)
+        if not np.allclose(said.reshape(-1), values, rtol=_ROUNDING, atol=0.0, equal_nan=True):
+            note = f"{key} does not follow from the other parameters"
+            return Item(GROUP, name, Status.DIFFERENT, note=note)
+    computed = problem.log_prob(t)
+    close = np.abs(computed - stated) <= _ROUNDING * (1.0 + np.abs(stated))
+    if np.mean(close) < 1.0 - _AT_BOUNDS:
+        worst = int(np.argmin(close))
+        note = "the log density of its draws is not what data and priors give"
+        return Item(GROUP, name, Status.DIFFERENT, float(stated[worst]), float(computed[worst]),
+                    note=note)  # fmt: skip
+    return Item(GROUP, name, Status.IDENTICAL, note="its draws have the density of data and priors")
+
+
+def compare_posterior(name: str, recorded: Path, drawn: Path) -> list[Item]:
+    """Compare what is beside the posterior draws in a file with the same written again.
+
+    The draws themselves may be others. They are held against their summary and their density; all
+    that goes with them may be apart by a part of its own sd.
+
+    Parameters
+    ----------
+    name : str
+    recorded, drawn : Path
+    """
+    if recorded.read_bytes() == drawn.read_bytes():
+        return [Item(GROUP, name, Status.IDENTICAL)]
+    try:
+        old, new = (_groups(path) for path in (recorded, drawn))
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        note = f"the file cannot be read ({type(error).__name__})"
+        return [Item(GROUP, name, Status.DIFFERENT, note=note)]
+    apart = [key for key in {**old, **new} if not _alike(old.get(key), new.get(key))]
+    if apart:
+        note = f"{', '.join(sorted(apart)[:3])} in it: not what is written again"
+        return [Item(GROUP, name, Status.DIFFERENT, note=note)]
+    return [Item(GROUP, name, Status.WITHIN, note="its draws are compared by their summary")]
+
+
+def _groups(path: Path) -> dict[str, Array]:
+    """Read every variable of a file by its path; of drawn ones, moments by row."""
+    import xarray as xr
+
+    found: dict[str, Array] = {}
+    with xr.open_datatree(path, engine="h5netcdf") as tree:
+        for node in tree.subtree:
+            for key, values in node.data_vars.items():
+                where = f"{node.path.strip('/')}/{key}"
+                x = np.asarray(values.values, dtype=np.float64)
+                if {"chain", "draw"} <= set(map(str, values.dims)):
+                    found[where] = _moments(x.reshape(x.shape[0] * x.shape[1], -1))
+                else:
+                    found[where] = x
+    return found
+
+
+def _moments(draws: Array) -> Array:
+    """Median and sd of each row over the draws, (draws, n) to (2, n), whatever their tails."""
+    low, median, high = np.quantile(draws, [0.16, 0.5, 0.84], axis=0)
+    return np.stack([median, 0.5 * (high - low)])
+
+
+def _alike(old: Array | None, new: Array | None) -> bool:
+    if old is None or new is None or old.shape != new.shape:
+        return False
+    if old.ndim == 2 and old.shape[0] == 2:
+        return bool((np.abs(old - new) <= _OF_SD * np.maximum(new[1], old[1]) + _ROUNDING).all())
+    scale = max(float(np.abs(new).max(initial=0.0)), 1e-300)
+    return bool(np.allclose(old, new, rtol=_ROUNDING, atol=_ROUNDING * scale, equal_nan=True))

@@ -1,0 +1,158 @@
+"""Do the work of a report or a run again, from the folder's own data, priors, seed and settings."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from calib.batch.pool import HERE, Pool
+from calib.check.inputs import GROUP as INPUTS
+from calib.check.items import Item, Status
+from calib.check.schema import Manifest, RunRecord, TaskRecord
+from calib.data import read_table
+from calib.data.outputs import OUTPUTS
+from calib.errors import CalibError
+from calib.he2019.audit import Seeds
+from calib.he2019.gaps.cases import paper_gaps
+from calib.inference.calibration import Calibration, calibrate
+from calib.inference.estimators import PointEstimate, estimate
+from calib.inference.io import save_calibration
+from calib.inference.problem import Problem
+from calib.inference.random import generator
+from calib.report.contents import work_out
+from calib.report.study import Progress, Study
+from calib.report.study_tasks import HoldOut, Task
+from calib.report.writer import write_report
+
+__all__ = ["estimate_again", "not_computed", "recompute_report", "recompute_run", "report_tasks"]
+
+
+@contextmanager
+def not_computed(items: list[Item], folder: Path, record: str) -> Iterator[None]:
+    """Turn whatever stops the work into one more item.
+
+    The record is somebody else's: what it makes fail is a finding, with what was found before.
+    """
+    try:
+        yield
+    except CalibError as error:
+        path = Path((error.where or "").partition(",")[0])
+        where = path.relative_to(folder).as_posix() if path.is_relative_to(folder) else record
+        note = f"not computed again: {error.message}"
+        items.append(Item(INPUTS, where, Status.DIFFERENT, note=note))
+    except Exception as error:
+        note = f"not computed again: {type(error).__name__}: {error}"
+        items.append(Item(INPUTS, record, Status.DIFFERENT, note=note))
+
+
+def report_tasks(manifest: Manifest, folder: Path, scratch: Path) -> tuple[Task, ...]:
+    """Return the tasks of a report, with the folder's own data and priors.
+
+    Parameters
+    ----------
+    manifest : Manifest
+    folder : Path
+    scratch : Path
+        Where priors are copied to under their first names, which the page shows.
+
+    Raises
+    ------
+    CalibError
+        If a data file cannot be read.
+    """
+    return tuple(_task(key, entry, folder, scratch / key) for key, entry in manifest.tasks.items())
+
+
+def _task(key: str, entry: TaskRecord, folder: Path, scratch: Path) -> Task:
+    table = read_table(folder / entry.data.file, allow_missing=tuple(OUTPUTS.values()))
+    table = replace(
+        table,
+        source=entry.data.source,
+        sha256=entry.data.source_sha256,
+        label=entry.label,
+        ignored=entry.data.ignored,
+    )
+    scratch.mkdir(parents=True)
+    prior_path = scratch / entry.priors.source
+    shutil.copyfile(folder / entry.priors.file, prior_path)
+    held = entry.held_out
+    return Task(
+        key, entry.model, table, None if held is None else HoldOut(held.column, held.value),
+        prior_path,
+    )  # fmt: skip
+
+
+def recompute_report(
+    manifest: Manifest,
+    tasks: tuple[Task, ...],
+    out: Path,
+    progress: Progress,
+    pool: Pool = HERE,
+) -> Study:
+    """Work a report out again and write it into a new folder."""
+    repeats = manifest.audit and manifest.audit.seeds
+    contents = work_out(
+        tasks,
+        manifest.seed,
+        settings=manifest.settings,
+        gaps=[gap for gap in paper_gaps() if gap.name in manifest.paper_gaps],
+        audit=Seeds(**repeats.model_dump()) if repeats else None,
+        progress=progress,
+        pool=pool,
+    )
+    write_report(
+        contents.study,
+        out,
+        gaps=contents.gaps,
+        audit=contents.audit,
+        pdf=manifest.pdf,
+        settings=manifest.settings,
+        command=manifest.command,
+        title=manifest.title,
+        environment=manifest.environment,
+        progress=progress,
+        pool=pool,
+    )
+    return contents.study
+
+
+def estimate_again(record: RunRecord, problem: Problem) -> tuple[PointEstimate, ...]:
+    """Return the point estimates of a run, computed again."""
+    return tuple(
+        estimate(problem, e.method, generator(record.seed, record.model, e.method))
+        for e in record.estimates
+    )
+
+
+def recompute_run(
+    record: RunRecord, problem: Problem, out: Path, progress: Progress
+) -> Calibration:
+    """Sample a run again and write it into a new folder.
+
+    Sampled from the recorded starts, whoever chose them; the estimates in the new folder are
+    computed again, to be compared with them.
+    """
+    starts = tuple(
+        PointEstimate(
+            e.method, np.array(e.theta), dict(e.reported), e.cost, "", e.rmse, float("nan"), 0,
+            float("nan"), True,
+        )
+        for e in record.estimates
+    )  # fmt: skip
+    calibration = calibrate(
+        problem,
+        record.seed,
+        label=record.label,
+        estimates=starts,
+        settings=record.settings,
+        progress=lambda done, planned: progress("sampling", done, planned),
+    )
+    calibration = replace(calibration, estimates=estimate_again(record, problem))
+    out.mkdir()
+    save_calibration(calibration, out, environment=record.environment)
+    return calibration

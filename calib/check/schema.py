@@ -1,0 +1,239 @@
+"""What a folder says of itself: `manifest.json` of a report and `run.json` of a run, checked."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, Literal
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    JsonValue,
+    StringConstraints,
+    ValidationError,
+)
+
+from calib.batch.environment import Environment
+from calib.data.outputs import OUTPUTS
+from calib.errors import CalibError
+from calib.he2019.gaps.cases import paper_gaps
+from calib.inference.io import SCHEMA as RUN_SCHEMA
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.models import MODELS
+from calib.report.manifest import SCHEMA as REPORT_SCHEMA
+
+__all__ = ["Manifest", "RunRecord", "TaskRecord", "read_folder"]
+
+
+def _inside(path: str) -> str:
+    """A path that leaves the folder is no path of one of its files."""
+    pure = PurePosixPath(path)
+    if pure.is_absolute() or ".." in pure.parts or "\\" in path or not pure.parts:
+        raise ValueError("not a path inside the folder")
+    return path
+
+
+def _name(text: str) -> str:
+    if text != PurePosixPath(text).name or "\\" in text:
+        raise ValueError("not the name of a file")
+    return text
+
+
+def _known_model(name: str) -> str:
+    if name not in MODELS:
+        raise ValueError(f"not one of {', '.join(MODELS)}")
+    return name
+
+
+def _known_gap(name: str) -> str:
+    known = [gap.name for gap in paper_gaps()]
+    if name not in known:
+        raise ValueError(f"not one of {', '.join(known)}")
+    return name
+
+
+type _Hash = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
+type _File = Annotated[str, AfterValidator(_inside)]
+type _Name = Annotated[str, AfterValidator(_name)]
+type _Model = Annotated[str, AfterValidator(_known_model)]
+type _Seed = Annotated[int, Field(ge=0)]
+type _Repeat = Annotated[int, Field(ge=1, le=1000)]
+type _Gap = Annotated[str, AfterValidator(_known_gap)]
+
+
+class _Record(BaseModel):
+    # What later versions add is compared as numbers are, and not needed to compute again.
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+
+class _HeldOut(_Record):
+    column: str
+    value: float
+
+
+class _Data(_Record):
+    file: _File
+    sha256: _Hash
+    source: str
+    source_sha256: _Hash
+    ignored: tuple[str, ...]
+
+
+class _PriorFile(_Record):
+    file: _File
+    sha256: _Hash
+    source: _Name
+    shipped: bool
+
+
+class TaskRecord(_Record):
+    """One output of a report: model, rows held out, data and priors."""
+
+    model: _Model
+    held_out: _HeldOut | None
+    label: str
+    data: _Data
+    priors: _PriorFile
+
+
+class _Made(_Record):
+    versions: dict[str, str]
+    machine: dict[str, str]
+    code: str
+
+    @property
+    def environment(self) -> Environment:
+        """Where it was made, as it says."""
+        return Environment(self.versions, self.machine, self.code)
+
+
+class _Seeded(_Record):
+    seed: _Seed
+
+
+class _Repeats(_Record):
+    by_pressure: _Repeat
+    joint: _Repeat
+    printed_coordinates: _Repeat
+
+
+class _Audit(_Seeded):
+    seeds: _Repeats
+
+
+class Manifest(_Made):
+    """`manifest.json` of a report folder."""
+
+    schema_: Literal["calib/manifest/2"] = Field(alias="schema")
+    title: str
+    command: tuple[str, ...]
+    seed: _Seed
+    settings: SamplerSettings
+    tasks: dict[str, TaskRecord]
+    pdf: bool = False
+    paper_gaps: dict[_Gap, _Seeded] = {}
+    audit: _Audit | None = None
+    files: dict[_File, _Hash]
+    left_out: dict[_File, _Hash]
+
+
+class _Estimate(_Record):
+    method: str
+    theta: tuple[float, ...]
+    reported: dict[str, float]
+    cost: float
+    rmse: float
+
+
+class RunRecord(_Made):
+    """`run.json` of a run folder."""
+
+    schema_: Literal["calib/run/1"] = Field(alias="schema")
+    model: _Model
+    seed: _Seed
+    label: str
+    settings: SamplerSettings
+    estimates: tuple[_Estimate, ...]
+    fixed: dict[str, float]
+    references: dict[str, float]
+    prior_file: _Name
+    prior_text: str
+    prior_references: dict[str, float]
+    data_source: str
+    data_label: str
+    sha256: dict[_File, _Hash]
+    document: dict[str, JsonValue]
+    """The whole file."""
+
+
+def read_folder(folder: Path) -> Manifest | RunRecord:
+    """Read what a folder says of itself.
+
+    Raises
+    ------
+    CalibError
+        If it is neither a report nor a run, or its record is damaged or of an earlier version.
+    """
+    found = [name for name in ("manifest.json", "run.json") if (folder / name).is_file()]
+    if not found:
+        raise CalibError(
+            "this is neither a report nor a run folder (no manifest.json or run.json in it)",
+            where=str(folder),
+            allowed="a folder written by `calib report` or `calib fit`",
+            mend="give the folder that --out named",
+        )
+    path = folder / found[0]
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise _damaged(path, f"it cannot be read ({type(error).__name__})") from None
+    return _manifest(content, path) if path.name == "manifest.json" else _run(content, path)
+
+
+def _manifest(content: Any, path: Path) -> Manifest:
+    _check_schema(content, REPORT_SCHEMA, path)
+    try:
+        manifest = Manifest.model_validate(content)
+    except ValidationError as error:
+        raise _damaged(path, _first(error)) from None
+    unknown = [key for key in manifest.tasks if key not in OUTPUTS]
+    if unknown or not manifest.tasks:
+        raise _damaged(path, f"tasks: there is no output {', '.join(unknown) or 'at all'}")
+    return manifest
+
+
+def _run(content: Any, path: Path) -> RunRecord:
+    _check_schema(content, RUN_SCHEMA, path)
+    try:
+        return RunRecord.model_validate({**content, "document": content})
+    except ValidationError as error:
+        raise _damaged(path, _first(error)) from None
+
+
+def _check_schema(content: Any, schema: str, path: Path) -> None:
+    given = content.get("schema") if isinstance(content, Mapping) else None
+    if given != schema:
+        raise CalibError(
+            f"the schema is {given!r}",
+            where=str(path),
+            allowed=schema,
+            mend="make the folder again with this version, or check it with the one that made it",
+        )
+
+
+def _first(error: ValidationError) -> str:
+    first = error.errors()[0]
+    return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+
+
+def _damaged(path: Path, found: str) -> CalibError:
+    return CalibError(
+        found,
+        where=str(path),
+        allowed="the file as it was written",
+        mend="restore the file, or make the folder again",
+    )

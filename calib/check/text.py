@@ -1,0 +1,182 @@
+"""Compare pages, and hold a page against the figures beside it.
+
+What a page says follows from numbers. Where those agree up to rounding it must say the same, and
+show the same digits but for the last; where they moved within their tolerance, a reading beside a
+threshold may be another, and the words cannot be judged.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import difflib
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from calib.batch.environment import sha256
+from calib.check.items import Item, Status
+from calib.check.numbers import NUMBER, without_numbers
+
+__all__ = ["GROUP", "compare_page", "differing_lines", "own_pictures", "verify_images"]
+
+GROUP = "page and tables"
+_IMAGE = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]*)")
+_TAG = re.compile(r"<[^>]*>")
+_PICTURE = re.compile(r"\[picture [^\]]*\]")
+_SECTION = re.compile(r'<section\b[^>]*aria-labelledby="([^"]*)"')
+_SHOWN = 3
+_WIDTH = 120
+_PLAIN = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻\u2212", "0123456789--")
+
+
+def verify_images(page: str, folder: Path) -> list[Item]:
+    """Check that every picture in a page is one of the folder's figures, and the other way."""
+    figures = _figures(folder)
+    shown = {_hash(match) for match in _IMAGE.findall(page)}
+    items = [
+        Item(GROUP, name, Status.DIFFERENT, note="it is not the picture that index.html shows")
+        for key, name in figures.items()
+        if key not in shown
+    ]
+    strangers = len(shown - set(figures))
+    if strangers:
+        note = f"{strangers} of its pictures are none of the figures"
+        items.append(Item(GROUP, "index.html", Status.DIFFERENT, note=note))
+    return items or [
+        Item(GROUP, "pictures in index.html", Status.IDENTICAL, note="they are the figures")
+    ]
+
+
+def _figures(folder: Path) -> dict[str, str]:
+    """Names of the PNG files of a folder by their hashes."""
+    return {
+        sha256(path.read_bytes()): path.relative_to(folder).as_posix()
+        for path in sorted(folder.rglob("*.png"))
+    }
+
+
+def _hash(encoded: str) -> str:
+    return sha256(_decoded(encoded))
+
+
+def _decoded(encoded: str) -> bytes:
+    try:
+        return base64.b64decode(encoded, validate=True)
+    except binascii.Error:
+        return b""
+
+
+def own_pictures(content: str, folder: Path) -> list[bytes]:
+    """Return the pictures of a page that are none of the folder's figures, in their order."""
+    known = _figures(folder)
+    return [_decoded(text) for text in _IMAGE.findall(content) if _hash(text) not in known]
+
+
+def compare_page(
+    name: str,
+    recorded: Path,
+    written: Path,
+    judged: Callable[[str], tuple[str | None, bool]],
+) -> Item:
+    """Compare a page, or another text, with the one written again.
+
+    Parameters
+    ----------
+    name : str
+        Its path in the folder.
+    recorded, written : Path
+        The folders it is in.
+    judged : callable
+        Tells by the name of a section why its words cannot be judged (None where they can), and
+        whether its numbers can.
+    """
+    if (recorded / name).read_bytes() == (written / name).read_bytes():
+        return Item(GROUP, name, Status.IDENTICAL)
+    old, new = (_readable(folder, name) for folder in (recorded, written))
+    if old == new:
+        note = "the same but for its pictures, which are compared as figures, or its line ends"
+        return Item(GROUP, name, Status.WITHIN, note=note)
+    if _pictures(old) != _pictures(new):
+        note = "it shows other pictures, or in another order"
+        return Item(GROUP, name, Status.DIFFERENT, note=note)
+    parts, again = list(_sections(old)), list(_sections(new))
+    if [section for section, _ in parts] != [section for section, _ in again]:
+        return Item(GROUP, name, Status.DIFFERENT, note="it has other sections")
+    status, note = Status.WITHIN, "the same words; numbers are judged where they come from"
+    for (section, lines), (_, lines_again) in zip(parts, again, strict=True):
+        why, numbers = judged(section)
+        if _alike(lines, lines_again, numbers=numbers):
+            continue
+        said = differing_lines(lines, lines_again)
+        if why is None:
+            return Item(GROUP, name, Status.DIFFERENT, note=said)
+        status, note = Status.UNJUDGED, f"{why}: {said}"
+    return Item(GROUP, name, status, note=note)
+
+
+def _readable(folder: Path, name: str) -> list[str]:
+    """Lines of a text, with the names of the folder's figures in the place of the pictures."""
+    text = (folder / name).read_text(encoding="utf-8", errors="replace")
+    names = _figures(folder) if _IMAGE.search(text) else {}
+    return _IMAGE.sub(
+        lambda m: f"[picture {names.get(_hash(m[1]), 'of its own')}]", text
+    ).splitlines()
+
+
+def _pictures(lines: Sequence[str]) -> list[str]:
+    return [picture for line in lines for picture in _PICTURE.findall(line)]
+
+
+def _sections(lines: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
+    """Yield the lines of each section of a page, by what it is labelled by; first, its head."""
+    name, part = "", list[str]()
+    for line in lines:
+        begun = _SECTION.search(line)
+        if begun:
+            yield name, part
+            name, part = begun[1], []
+        part.append(line)
+    yield name, part
+
+
+def _alike(old: Sequence[str], new: Sequence[str], *, numbers: bool) -> bool:
+    """Whether texts have the same words in the same order and, if asked, the same numbers."""
+    return len(old) == len(new) and all(
+        a == b or (without_numbers(a) == without_numbers(b) and (not numbers or _near(a, b)))
+        for a, b in zip(old, new, strict=True)
+    )
+
+
+def _near(old: str, new: str) -> bool:
+    """Whether the numbers of two lines differ by one unit of their last digit at the most."""
+    numbers = (NUMBER.findall(_TAG.sub(" ", line)) for line in (old, new))
+    return all(a == b or _one_unit(a, b) for a, b in zip(*numbers, strict=False))
+
+
+def _one_unit(old: str, new: str) -> bool:
+    (a, unit_a), (b, unit_b) = _parsed(old), _parsed(new)
+    return abs(a - b) <= 1.001 * max(unit_a, unit_b)
+
+
+def _parsed(text: str) -> tuple[float, float]:
+    """Return a number as shown and one unit of its last digit."""
+    plain = text.translate(_PLAIN).replace("\u00d710", "e").replace(",", "")
+    mantissa, _, exponent = plain.lower().partition("e")
+    decimals = len(mantissa.partition(".")[2])
+    power = int(exponent or 0)
+    try:
+        return float(f"{mantissa}e{power}"), 10.0 ** (power - decimals)
+    except ValueError:  # such as 1.2.3 of a version
+        return float("nan"), 0.0
+
+
+def differing_lines(old: Sequence[str], new: Sequence[str]) -> str:
+    """Return how many lines two texts do not share, and the first of them."""
+    changed = [
+        line
+        for line in difflib.unified_diff(old, new, "recorded", "written again", n=0, lineterm="")
+        if line[0] in "+-" and not line.startswith(("---", "+++"))
+    ]
+    shown = "; ".join(f"{line[0]} {line[1:].strip()[:_WIDTH]}" for line in changed[: 2 * _SHOWN])
+    return f"{len(changed)} lines differ: {shown}"

@@ -1,0 +1,277 @@
+"""From the cells of a column to checked numbers, with every complaint at its line and column.
+
+Whole columns are converted at once; only when that fails, or a value lies outside its range,
+are single cells looked at, to say what is wrong with them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.data.headers import Column
+from calib.errors import CalibError
+
+__all__ = ["CellReader", "Decimals", "Problems", "check_values", "label_codes"]
+
+type Array = NDArray[np.float64]
+type Lines = Sequence[int] | NDArray[np.int64]
+
+MAX_SHOWN = 5
+_MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
+_MINUS = "\N{MINUS SIGN}"
+
+
+@dataclass(frozen=True, order=True)
+class _Problem:
+    line: int
+    column: str
+    found: str
+    allowed: str
+    mend: str
+
+
+@dataclass
+class Problems:
+    """What is wrong with a table, collected to be told at once.
+
+    Parameters
+    ----------
+    source : str
+        File, or label of the arrays.
+    place : str
+        What the rows are counted in: ``"line"`` of a file or ``"row"`` of arrays.
+    """
+
+    source: str
+    place: str = "line"
+    total: int = 0
+    _kept: dict[str, list[_Problem]] = field(default_factory=dict)
+
+    def add(self, line: int, column: str, found: str, allowed: str, mend: str) -> None:
+        """Note a problem; the first few of each column are kept, the rest counted."""
+        self.total += 1
+        kept = self._kept.setdefault(column, [])
+        if len(kept) < MAX_SHOWN:
+            kept.append(_Problem(line, column, found, allowed, mend))
+
+    def raise_any(self) -> None:
+        """Raise what was noted, in the order of the lines.
+
+        Raises
+        ------
+        CalibError
+            If there is any problem; it tells up to five of them.
+        """
+        if not self.total:
+            return
+        shown = sorted(p for kept in self._kept.values() for p in kept)[:MAX_SHOWN]
+        if self.total == 1:
+            only = shown[0]
+            raise CalibError(
+                only.found,
+                where=f"{self.source}, {self._at(only)}",
+                allowed=only.allowed,
+                mend=only.mend,
+            )
+        rows = [f"  {self._at(p)}: {p.found}; allowed: {p.allowed}" for p in shown]
+        if self.total > len(shown):
+            rows.append(f"  and {self.total - len(shown)} more")
+        raise CalibError(
+            "\n".join([f"{self.total} problems in the data", *rows]),
+            where=self.source,
+            mend="".join(f"\n    - {mend}" for mend in dict.fromkeys(p.mend for p in shown)),
+        )
+
+    def _at(self, problem: _Problem) -> str:
+        column = f", column {problem.column!r}" if problem.column else ""
+        return f"{self.place} {problem.line}{column}"
+
+
+@dataclass
+class Decimals:
+    """The first decimal comma and the first decimal point of a file, as (line, column, cell).
+
+    A file that has both could mean 1,234 either way, so it is refused.
+    """
+
+    comma: tuple[int, str, str] | None = None
+    point: tuple[int, str, str] | None = None
+
+    def complain(self, problems: Problems) -> None:
+        """Note a problem if the file has both."""
+        if self.comma and self.point:
+            line, column, cell = self.comma
+            other = f"{self.point[2]!r} in line {self.point[0]}, column {self.point[1]!r}"
+            problems.add(
+                line, column, f"{cell!r} has a decimal comma, but {other} has a decimal point",
+                "one decimal sign in the whole file",
+                "write every number with a decimal point, without thousands separators",
+            )  # fmt: skip
+
+
+@dataclass
+class CellReader:
+    """Read batches of cells of one numeric column.
+
+    Parameters
+    ----------
+    column : Column
+    problems : Problems
+        Where complaints go.
+    missing_ok : bool
+        Whether empty and NaN cells become NaN instead of complaints.
+    used : bool
+        Whether the column will be used, which a logarithmic output must be fit for.
+    decimals : Decimals or None
+        None where a comma separates the cells and so cannot be a decimal sign.
+    """
+
+    column: Column
+    problems: Problems
+    missing_ok: bool
+    used: bool
+    decimals: Decimals | None
+
+    def read(self, cells: Sequence[str], lines: Lines) -> Array:
+        """Return the values of cells in the canonical unit, shape (n,)."""
+        joined = "".join(cells)
+        self._note_point(joined, cells, lines)
+        unreadable: set[int] = set()
+        try:
+            # float() takes 1_000 for a number, a reader of the file would not.
+            if "_" in joined:
+                raise ValueError
+            values = np.fromiter(map(float, cells), dtype=np.float64, count=len(cells))
+        except ValueError:
+            values = self._read_one_by_one(cells, lines, unreadable)
+        return check_values(
+            self.column, values, lines, self.problems,
+            missing_ok=self.missing_ok, used=self.used, cells=cells, skip=unreadable,
+        )  # fmt: skip
+
+    def _note_point(self, joined: str, cells: Sequence[str], lines: Lines) -> None:
+        if self.decimals and self.decimals.point is None and "." in joined:
+            i = next(i for i, cell in enumerate(cells) if "." in cell)
+            self.decimals.point = (int(lines[i]), self.column.header, cells[i])
+
+    def _read_one_by_one(self, cells: Sequence[str], lines: Lines, unreadable: set[int]) -> Array:
+        values = np.full(len(cells), np.nan)
+        for i, cell in enumerate(cells):
+            try:
+                values[i] = self._parse(cell, int(lines[i]))
+            except ValueError as error:
+                unreadable.add(i)
+                found, mend = error.args
+                name = self.column.header
+                self.problems.add(int(lines[i]), name, found, self.column.allowed, mend)
+        return values
+
+    def _parse(self, cell: str, line: int) -> float:
+        text = cell.strip().replace(_MINUS, "-")
+        if text.lower() in _MISSING:
+            return math.nan
+        if "," in text:
+            if self.decimals is None or text.count(",") > 1 or "." in text:
+                raise ValueError(
+                    f"{cell!r} has a comma inside a number",
+                    "write numbers with a decimal point and no thousands separators, such as "
+                    "1234 or 0.5 (decimal commas are read where semicolons separate the cells)",
+                )
+            self.decimals.comma = self.decimals.comma or (line, self.column.header, cell)
+            text = text.replace(",", ".")
+        try:
+            if "_" in text:
+                raise ValueError
+            return float(text)
+        except ValueError:
+            raise ValueError(
+                f"{cell!r} is not a number",
+                "write one plain number, such as 0.05; the unit belongs in the column name",
+            ) from None
+
+
+def check_values(
+    column: Column, values: Array, lines: Lines, problems: Problems, *,
+    missing_ok: bool, used: bool, cells: Sequence[str] = (), skip: set[int] | None = None,
+) -> Array:  # fmt: skip
+    """Convert values to the canonical unit and note those that are not allowed.
+
+    Parameters
+    ----------
+    column : Column
+        The quantity and the unit of `values`.
+    values : ndarray, shape (n,)
+    lines : sequence of int, shape (n,)
+        Where the values are.
+    problems : Problems
+        Where complaints go.
+    missing_ok : bool
+        Whether NaN is allowed.
+    used : bool
+        Whether a logarithmic output must be positive.
+    cells : sequence of str
+        The values as written, for messages.
+    skip : set of int, optional
+        Positions already complained about.
+
+    Returns
+    -------
+    ndarray, shape (n,)
+    """
+    with np.errstate(over="ignore"):
+        canonical = column.to_canonical(values)
+    fine = np.isfinite(canonical)
+    if used or not column.quantity.log_scale:
+        fine &= column.quantity.range.holds(canonical)
+    if missing_ok:
+        fine |= np.isnan(canonical)
+    fine[list(skip or ())] = True
+    bad = np.flatnonzero(~fine)
+    for i in bad[:MAX_SHOWN].tolist():
+        cell = cells[i] if len(cells) else f"{values[i]:g}"
+        found, mend = _complaint(column, float(values[i]), cell)
+        problems.add(int(lines[i]), column.header, found, column.allowed, mend)
+    problems.total += max(0, bad.size - MAX_SHOWN)
+    return canonical
+
+
+def _complaint(column: Column, value: float, cell: str) -> tuple[str, str]:
+    """Say what is wrong with a value and how to mend it."""
+    if not math.isfinite(value):
+        what = f"{cell.strip()!r} is not a finite number" if cell.strip() else "an empty cell"
+        return what, "fill in the measured value, or delete the row"
+    quantity = column.quantity
+    what = f"{cell.strip()!r} is outside the range of {quantity.stem}"
+    in_percent = "percent" in quantity.units and column.unit == "dimensionless"
+    if in_percent and 1.0 < abs(value) <= 100.0:
+        return what, f"did you mean {quantity.stem}_percent? Then rename the column"
+    return what, quantity.mend
+
+
+def label_codes(
+    column: Column, cells: Sequence[str], lines: Lines, problems: Problems, *, missing_ok: bool
+) -> Array:
+    """Turn labels into numbers.
+
+    Whole numbers stay as they are; otherwise the codes count the sorted labels from 0, so that
+    the order of the rows does not matter. The codes of two tables are not comparable.
+    """
+    labels = [cell.strip() for cell in cells]
+    empty = np.array([not label for label in labels], dtype=np.bool_)
+    for i in [] if missing_ok else np.flatnonzero(empty).tolist():
+        problems.add(
+            int(lines[i]), column.header, "an empty cell", "any label", "fill in the label"
+        )
+    try:
+        codes = np.array([float(label or 0) for label in labels], dtype=np.float64)
+    except ValueError:
+        codes = np.full(len(labels), np.nan)
+    if not (np.isfinite(codes) & (codes == np.round(codes))).all():
+        codes = np.unique(labels, return_inverse=True)[1].astype(np.float64)
+    codes[empty] = np.nan
+    return codes

@@ -1,0 +1,213 @@
+"""How a column name says which quantity it holds, and in which unit.
+
+A column name is a quantity followed by a unit (``rut_depth_mm``). Upper and lower case, spaces
+and brackets make no difference (``Rut depth [mm]``).
+"""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib.data.quantities import QUANTITIES, UNITS, Quantity
+from calib.data.units import convert
+from calib.errors import CalibError
+
+__all__ = ["Column", "accepted_headers", "match_headers", "parse_header"]
+
+# A column such as drawbar_pull_sd or slip_angle_deg is about a quantity without being it.
+_QUALIFIERS = frozenset({
+    "sd", "std", "stdev", "se", "sem", "cv", "var", "variance", "err", "error", "uncertainty",
+    "min", "max", "mean", "median", "count", "note", "notes", "comment", "comments", "flag",
+    "id", "raw", "source", "before", "after", "lower", "upper", "angle", "setting", "target",
+    "level", "class", "method", "sensor", "channel", "time", "date",
+})  # fmt: skip
+
+_STEMS: tuple[tuple[str, Quantity], ...] = tuple(
+    sorted(
+        ((stem, q) for q in QUANTITIES.values() for stem in (q.stem, *q.synonyms)),
+        key=lambda pair: -len(pair[0]),
+    )
+)
+
+
+@dataclass(frozen=True)
+class Column:
+    """A header that was understood: its quantity and the pint unit its values are in."""
+
+    header: str
+    quantity: Quantity
+    unit: str
+    position: int = 0
+
+    def to_canonical(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Convert values in this column's unit to the canonical unit, any shape."""
+        return convert(values, self.unit, self.quantity.unit)
+
+    @property
+    def allowed(self) -> str:
+        """The allowed values, in this column's unit."""
+        return self.quantity.range.describe(self.quantity.unit, self.unit)
+
+
+def accepted_headers(quantity: Quantity) -> tuple[str, ...]:
+    """Return every header that names a quantity by its main stem, canonical first."""
+    names = [quantity.canonical]
+    names += [quantity.stem] if quantity.bare_unit else []
+    names += [f"{quantity.stem}_{suffix}" for suffix in quantity.units]
+    return tuple(dict.fromkeys(names))
+
+
+def _normal(header: str) -> str:
+    """Bring a header to lower case words joined by underscores."""
+    text = header.lower().replace("%", " percent ").replace("³", "3").replace("²", "2")
+    return re.sub(r"[\s_\-/()\[\]{},.:·]+", "_", re.sub(r"\^|\*\*", "", text)).strip("_")
+
+
+def parse_header(header: str, *, where: str = "", position: int = 0) -> Column | None:
+    """Read the quantity and the unit off a column name.
+
+    Parameters
+    ----------
+    header : str
+        The column name, such as ``"Rut_Depth_cm"``.
+    where : str
+        File and line to name in errors.
+    position : int
+        Index of the column, kept in the result.
+
+    Returns
+    -------
+    Column or None
+        None for a column that names none of the quantities.
+
+    Raises
+    ------
+    CalibError
+        If a quantity is named without its unit, or with an unknown or an unfitting one.
+    """
+    name = _normal(header)
+    for stem, quantity in _STEMS:
+        if name == stem:
+            if quantity.bare_unit is None:
+                raise _unit_error(header, quantity, "", where)
+            return Column(header, quantity, quantity.bare_unit, position)
+        if name.startswith(f"{stem}_") and quantity.units:
+            suffix = name[len(stem) + 1 :]
+            if suffix in quantity.units:
+                return Column(header, quantity, quantity.units[suffix], position)
+            if _is_about(suffix, quantity):
+                return None
+            raise _unit_error(header, quantity, suffix, where)
+    return None
+
+
+def _is_about(suffix: str, quantity: Quantity) -> bool:
+    """Tell a column derived from a quantity (``kn_lower``, ``sd_kn``) from a mistaken unit."""
+    derived = any(suffix.startswith(f"{unit}_") for unit in quantity.units)
+    return derived or not _QUALIFIERS.isdisjoint(suffix.split("_"))
+
+
+def _at(where: str, header: str) -> str:
+    return f"{where}, column {header!r}" if where else f"column {header!r}"
+
+
+def _unit_error(header: str, quantity: Quantity, suffix: str, where: str) -> CalibError:
+    kinds = [kind for kind, units in UNITS.items() if suffix in units]
+    if not suffix:
+        found = f"the column name {header!r} does not say the unit"
+    elif kinds:
+        found = f"{suffix!r} is a unit of {kinds[0]}, but {quantity.stem} is a {quantity.kind}"
+    else:
+        found = f"{suffix!r} is not a known unit of {quantity.stem}"
+    near = difflib.get_close_matches(suffix, quantity.units, n=1, cutoff=0.5)
+    name = f"{quantity.stem}_{near[0]}" if near else quantity.canonical
+    hint = "did you mean" if near else "rename the column, for example"
+    return CalibError(
+        found,
+        where=_at(where, header),
+        allowed=", ".join(accepted_headers(quantity)),
+        mend=f"{hint} {name}{'?' if near else ''}",
+    )
+
+
+def match_headers(
+    headers: Sequence[str], *, where: str, required: Sequence[str] = ()
+) -> tuple[tuple[Column, ...], tuple[str, ...]]:
+    """Read a whole header line.
+
+    Parameters
+    ----------
+    headers : sequence of str
+        Column names.
+    where : str
+        File and line to name in errors.
+    required : sequence of str
+        Canonical names that must be among them.
+
+    Returns
+    -------
+    columns : tuple of Column
+        Those that name a quantity, in the order of the file.
+    ignored : tuple of str
+        The other column names.
+
+    Raises
+    ------
+    CalibError
+        For a wrong or missing unit, a quantity given twice, or a required one that is missing.
+    """
+    found: dict[str, Column] = {}
+    ignored: list[str] = []
+    for position, header in enumerate(headers):
+        column = parse_header(header, where=where, position=position)
+        if column is None:
+            ignored.append(header)
+            continue
+        first = found.setdefault(column.quantity.canonical, column)
+        if first is not column:
+            raise CalibError(
+                f"columns {first.position + 1} ({first.header!r}) and {position + 1} "
+                f"({header!r}) both give {column.quantity.stem}",
+                where=_at(where, header),
+                allowed="one column per quantity",
+                mend="delete or rename one of the two",
+            )
+    for name in required:
+        if name not in found:
+            raise _missing_error(QUANTITIES[name], headers, ignored, where)
+    return tuple(found.values()), tuple(ignored)
+
+
+def _missing_error(
+    quantity: Quantity, headers: Sequence[str], ignored: Sequence[str], where: str
+) -> CalibError:
+    mend = f"add the column {quantity.canonical} ({quantity.description})"
+    guesses = [guess for header in ignored if (guess := _guess(header, quantity))]
+    if guesses:
+        mend = f"{'; '.join(guesses)} Rename it, or {mend}"
+    return CalibError(
+        f"there is no column for {quantity.stem}; found {', '.join(map(repr, headers))}",
+        where=_at(where, quantity.canonical),
+        allowed=", ".join(accepted_headers(quantity)),
+        mend=mend,
+    )
+
+
+def _guess(header: str, quantity: Quantity) -> str:
+    """Ask whether a header was meant to be a quantity; empty if it is nothing like it."""
+    name = _normal(header)
+    stems = (quantity.stem, *quantity.synonyms)
+    names = [f"{stem}_{unit}" for stem in stems for unit in quantity.units]
+    near = difflib.get_close_matches(name, [*accepted_headers(quantity), *names], n=1, cutoff=0.7)
+    if not near:
+        return ""
+    if any(near[0] == stem or name.endswith(near[0].removeprefix(stem)) for stem in stems):
+        return f"{header!r}: did you mean {near[0]}?"
+    # The header says nothing about the unit, so neither may the suggestion.
+    return f"{header!r}: did you mean {quantity.stem}, with its unit (as {quantity.canonical})?"

@@ -1,0 +1,249 @@
+"""Reading measurements: CSV or arrays in, a checked table in canonical units out."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Collection, Mapping, Sequence
+from itertools import batched
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from calib.data.cells import CellReader, Decimals, Problems, check_values, label_codes
+from calib.data.csvfile import CsvFile, open_csv, write_table
+from calib.data.headers import Column, match_headers
+from calib.data.quantities import QUANTITIES
+from calib.data.table import MAX_TEXT_ROWS, Table, check_enough, check_varies, hold_out
+from calib.errors import CalibError
+
+__all__ = [
+    "Table", "check_enough", "check_varies", "hold_out", "read_for_model", "read_table",
+    "table_from_arrays", "write_table",
+]  # fmt: skip
+
+_BATCH = 65_536
+
+
+def read_table(
+    path: str | os.PathLike[str],
+    *,
+    required: Sequence[str] = (),
+    allow_missing: Collection[str] = (),
+    label: str = "",
+) -> Table:
+    """Read a CSV file whose column names carry units.
+
+    Commas, semicolons or tabs separate the cells; a decimal comma is read where commas do not.
+
+    Parameters
+    ----------
+    path : path-like
+    required : sequence of str
+        Canonical names of the columns that will be used. If none are named, all count as used.
+    allow_missing : collection of str
+        Canonical names of the columns in which an empty cell or NaN is kept as NaN.
+    label : str
+        Kept in the table.
+
+    Returns
+    -------
+    Table
+
+    Raises
+    ------
+    CalibError
+        Naming file, line, column, what was found, what is allowed and how to mend it.
+    """
+    file = open_csv(path)
+    where = f"{file.source}, line {file.header_line}"
+    columns, ignored = match_headers(file.header, where=where, required=required)
+    problems = Problems(file.source)
+    parts = _Parts(columns, file, problems, _wants(required), allow_missing)
+    for batch in batched(file.rows, _BATCH):
+        parts.add(batch)
+    values = parts.finish()
+    problems.raise_any()
+    if not parts.lines:
+        raise CalibError(
+            "there are column names but no rows", where=file.source,
+            allowed="at least one row below the column names", mend="add the measurements",
+        )  # fmt: skip
+    return Table(
+        values, file.source, np.array(parts.lines), file.header, tuple(parts.text), file.sha256,
+        label, ignored,
+    )  # fmt: skip
+
+
+def _wants(required: Sequence[str]) -> frozenset[str]:
+    return frozenset(required or QUANTITIES)
+
+
+class _Parts:
+    """The columns of a file while it is read in batches, which keeps the memory bounded."""
+
+    def __init__(
+        self, columns: Sequence[Column], file: CsvFile, problems: Problems,
+        used: Collection[str], allow_missing: Collection[str],
+    ) -> None:  # fmt: skip
+        self._width = len(file.header)
+        self._problems = problems
+        self._delimiter = file.delimiter
+        self._decimals = None if file.delimiter == "," else Decimals()
+        self._missing = allow_missing
+        self._readers = {
+            c.quantity.canonical: CellReader(
+                c, problems, c.quantity.canonical in allow_missing,
+                c.quantity.canonical in used, self._decimals,
+            )
+            for c in columns if c.quantity.kind != "label"
+        }  # fmt: skip
+        self._columns = {c.quantity.canonical: c for c in columns}
+        self._numbers: dict[str, list[NDArray[np.float64]]] = {n: [] for n in self._readers}
+        self._labels: dict[str, list[str]] = {
+            n: [] for n in self._columns if n not in self._readers
+        }
+        self.lines: list[int] = []
+        self.text: list[tuple[str, ...]] = []
+
+    def add(self, batch: Sequence[tuple[int, list[str]]]) -> None:
+        whole = [pair for pair in batch if len(pair[1]) == self._width]
+        if len(whole) < len(batch):
+            self._complain_ragged(batch)
+        if not whole:
+            return
+        lines = [line for line, _ in whole]
+        cells = list(zip(*(row for _, row in whole), strict=True))
+        for name, reader in self._readers.items():
+            part = reader.read(cells[self._columns[name].position], lines)
+            self._numbers[name].append(part)
+        for name, labels in self._labels.items():
+            labels.extend(cells[self._columns[name].position])
+        self.lines += lines
+        small = len(self.lines) <= MAX_TEXT_ROWS
+        self.text = [*self.text, *(tuple(row) for _, row in whole)] if small else []
+
+    def _complain_ragged(self, batch: Sequence[tuple[int, list[str]]]) -> None:
+        mend = "complete the row, or delete the cells too many"
+        if self._delimiter == ",":
+            mend += " (a decimal comma splits a number in two: write a decimal point)"
+        for line, row in batch:
+            if len(row) != self._width:
+                found = f"the row has {len(row)} cells, the line of column names {self._width}"
+                self._problems.add(line, "", found, f"{self._width} cells", mend)
+
+    def finish(self) -> dict[str, NDArray[np.float64]]:
+        if self._decimals:
+            self._decimals.complain(self._problems)
+        done = {n: np.concatenate(p) if p else np.empty(0) for n, p in self._numbers.items()}
+        for name, labels in self._labels.items():
+            done[name] = label_codes(
+                self._columns[name], labels, self.lines, self._problems,
+                missing_ok=name in self._missing,
+            )  # fmt: skip
+        return {name: done[name] for name in self._columns}
+
+
+def read_for_model(path: str | os.PathLike[str], used: Sequence[str]) -> Table:
+    """Read a file of which only some columns will be used; the others may have empty cells.
+
+    Parameters
+    ----------
+    path : path-like
+    used : sequence of str
+        Canonical names of the columns that must be there, whole.
+
+    Raises
+    ------
+    CalibError
+        As `read_table` does.
+    """
+    unused = [name for name in QUANTITIES if name not in used]
+    return read_table(path, required=used, allow_missing=unused)
+
+
+def table_from_arrays(
+    columns: Mapping[str, ArrayLike],
+    *,
+    source: str = "arrays",
+    label: str = "",
+    required: Sequence[str] = (),
+    allow_missing: Collection[str] = (),
+) -> Table:
+    """Make a table of arrays, with the checks of a file.
+
+    Parameters
+    ----------
+    columns : mapping of str to array_like, shape (n,)
+        Column names with units, as in a file, to values.
+    source, label : str
+        Names for messages and for whoever shows the table.
+    required, allow_missing
+        As for `read_table`.
+
+    Returns
+    -------
+    Table
+        Its `text` holds the shortest decimals of the values as given.
+
+    Raises
+    ------
+    CalibError
+        As `read_table` does, with rows counted from 0; also for columns of unequal length.
+    """
+    arrays = {name: np.asarray(values) for name, values in columns.items()}
+    n = _common_length(arrays, source)
+    matched, ignored = match_headers(tuple(arrays), where=source, required=required)
+    problems, rows, used = Problems(source, place="row"), np.arange(n), _wants(required)
+    done: dict[str, NDArray[np.float64]] = {}
+    for column in matched:
+        name, array = column.quantity.canonical, arrays[column.header]
+        missing_ok = name in allow_missing
+        if column.quantity.kind == "label":
+            cells = [str(value) for value in array.tolist()]
+            done[name] = label_codes(column, cells, rows, problems, missing_ok=missing_ok)
+            continue
+        done[name] = check_values(
+            column, _as_floats(array, column, source), rows, problems,
+            missing_ok=missing_ok, used=name in used,
+        )  # fmt: skip
+    problems.raise_any()
+    text = _texts(arrays, n) if n <= MAX_TEXT_ROWS else ()
+    return Table(done, source, rows, tuple(arrays), text, _sha256(done), label, ignored)
+
+
+def _common_length(arrays: Mapping[str, NDArray[Any]], source: str) -> int:
+    shapes = {name: array.shape for name, array in arrays.items()}
+    lengths = set(shapes.values())
+    if len(lengths) != 1 or len(next(iter(lengths))) != 1 or lengths == {(0,)}:
+        raise CalibError(
+            f"the columns have the shapes {shapes}", where=source,
+            allowed="arrays of one shape (n,) with n of at least 1",
+            mend="flatten the arrays and give each column as many values",
+        )  # fmt: skip
+    return int(next(iter(lengths))[0])
+
+
+def _as_floats(array: NDArray[Any], column: Column, source: str) -> NDArray[np.float64]:
+    if array.dtype.kind not in "fiub":
+        raise CalibError(
+            f"the values are of type {array.dtype}, not numbers",
+            where=f"{source}, column {column.header!r}",
+            allowed=column.allowed,
+            mend="pass an array of numbers",
+        )
+    return array.astype(np.float64)
+
+
+def _texts(arrays: Mapping[str, NDArray[Any]], n: int) -> tuple[tuple[str, ...], ...]:
+    cells = ([str(value) for value in array.tolist()] for array in arrays.values())
+    return tuple(zip(*cells, strict=True)) if n else ()
+
+
+def _sha256(columns: Mapping[str, NDArray[np.float64]]) -> str:
+    digest = hashlib.sha256()
+    for name in sorted(columns):
+        digest.update(f"{name}\0".encode())
+        digest.update(columns[name].astype("<f8").tobytes())
+    return digest.hexdigest()

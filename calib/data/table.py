@@ -1,0 +1,212 @@
+"""The table of measurements: immutable columns in canonical units, subsets and checks of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.data.headers import parse_header
+from calib.errors import CalibError
+
+__all__ = ["MAX_TEXT_ROWS", "Table", "check_enough", "check_varies", "hold_out"]
+
+MAX_TEXT_ROWS = 10_000
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Rows of one data set; every quantity in its canonical unit.
+
+    Parameters
+    ----------
+    columns : mapping of str to ndarray, shape (n,)
+        Canonical name to values; copied and made read-only.
+    source : str
+        Path as given, or a label.
+    lines : ndarray of int, shape (n,)
+        Line of each row in the file, the header being line 1; rows from 0 for arrays.
+    header : tuple of str
+        Column names as in the file.
+    text : tuple of tuple of str
+        Cells as in the file, row by row; empty for more than 10,000 rows, to save memory.
+    sha256 : str
+        Of the bytes of the file, or of the canonical columns. A subset keeps that of the whole.
+    label : str
+        What to call the data wherever they are shown, such as ``"reconstructed"``.
+    ignored : tuple of str
+        Column names that name no known quantity.
+    """
+
+    columns: Mapping[str, NDArray[np.float64]]
+    source: str
+    lines: NDArray[np.int64]
+    header: tuple[str, ...]
+    text: tuple[tuple[str, ...], ...]
+    sha256: str
+    label: str = ""
+    ignored: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        frozen = {name: np.array(values, dtype=np.float64) for name, values in self.columns.items()}
+        lines = np.array(self.lines, dtype=np.int64)
+        for array in (*frozen.values(), lines):
+            array.setflags(write=False)
+        object.__setattr__(self, "columns", MappingProxyType(frozen))
+        object.__setattr__(self, "lines", lines)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        # A mapping proxy does not pickle, and worker processes are handed tables.
+        return Table, (
+            dict(self.columns), self.source, self.lines, self.header, self.text, self.sha256,
+            self.label, self.ignored,
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.columns
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        """Return the column of a canonical name, shape (n,)."""
+        if name not in self.columns:
+            raise CalibError(
+                f"there is no column {name!r}", where=self.source,
+                allowed=", ".join(self.columns), mend="add the column to the data",
+            )  # fmt: skip
+        return self.columns[name]
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.int64] | Sequence[int]) -> Table:
+        """Return some of the rows.
+
+        Parameters
+        ----------
+        rows : ndarray
+            Mask of shape (n,), or row indices from 0 in the order wanted.
+
+        Returns
+        -------
+        Table
+        """
+        index = np.arange(len(self))[np.asarray(rows, dtype=None if len(rows) else np.int64)]
+        return replace(
+            self,
+            columns={name: values[index] for name, values in self.columns.items()},
+            lines=self.lines[index],
+            text=tuple(self.text[i] for i in index) if self.text else (),
+        )
+
+
+def hold_out(
+    table: Table, quantity_header: str, value: float, rel_tol: float = 1e-3
+) -> tuple[Table, Table]:
+    """Set aside the rows at one value of a quantity.
+
+    Parameters
+    ----------
+    table : Table
+    quantity_header : str
+        A column name in any unit, such as ``"inflation_pressure_psi"``; the data may have it in
+        another one.
+    value : float
+        The value to hold out, in that unit.
+    rel_tol : float
+        Relative difference up to which a row counts as at that value. 30 psi written as
+        207 kPa differs by 7e-4.
+
+    Returns
+    -------
+    rest, held : Table
+
+    Raises
+    ------
+    CalibError
+        If no row has that value, listing those present, or if every row has it.
+    """
+    column = parse_header(quantity_header)
+    if column is None or column.quantity.canonical not in table:
+        raise CalibError(
+            f"there is no column to hold {quantity_header!r} out by", where=table.source,
+            allowed=", ".join(table), mend="name one of these quantities, with a unit",
+        )  # fmt: skip
+    values = table[column.quantity.canonical]
+    wanted = float(column.to_canonical(value))
+    scale = abs(wanted) or float(np.nanmax(np.abs(values)))
+    held = np.abs(values - wanted) <= rel_tol * scale
+    if held.any() and not held.all():
+        return table.take(~held), table.take(held)
+    present = ", ".join(_distinct(values / column.to_canonical(1.0)))
+    where = f"{table.source}, column {quantity_header!r}"
+    if held.any():
+        raise CalibError(
+            f"every row is at {value:g}, so nothing would be left to fit", where=where,
+            allowed="a value that only some of the rows have", mend="hold out something else",
+        )  # fmt: skip
+    raise CalibError(
+        f"no row is at {value:g}", where=where, allowed=f"one of the values present: {present}",
+        mend="hold out one of these, or check the unit",
+    )  # fmt: skip
+
+
+def _distinct(values: NDArray[np.float64], most: int = 12) -> list[str]:
+    names = list(dict.fromkeys(f"{v:.6g}" for v in np.unique(values[~np.isnan(values)])))
+    return names if len(names) <= most else [*names[:most], f"and {len(names) - most} more"]
+
+
+def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -> None:
+    """Check that there are more rows than parameters.
+
+    Parameters
+    ----------
+    table : Table
+    n_parameters : int
+        How many parameters are fitted, without the noise scale.
+    model : str
+        Name for the message.
+
+    Raises
+    ------
+    CalibError
+        If the rows cannot show any noise about a fit.
+    """
+    if len(table) > n_parameters:
+        return
+    rows = "1 row" if len(table) == 1 else f"{len(table)} rows"
+    raise CalibError(
+        f"{rows} cannot calibrate {model}, which has {n_parameters} parameters",
+        where=table.source,
+        allowed=f"at least {n_parameters + 1} rows",
+        mend="add measurements, or choose a model with fewer parameters",
+    )
+
+
+def check_varies(table: Table, column: str) -> None:
+    """Check that a column is not constant.
+
+    Parameters
+    ----------
+    table : Table
+    column : str
+        Canonical name.
+
+    Raises
+    ------
+    CalibError
+        If all its values are equal, up to rounding.
+    """
+    values = table[column][~np.isnan(table[column])]
+    if values.size and np.ptp(values) > 1e-12 * np.abs(values).max():
+        return
+    found = f"all {values.size} values are {values[0]:g}" if values.size else "there is no value"
+    raise CalibError(
+        found, where=f"{table.source}, column {column!r}",
+        allowed="at least two different values: a constant column tells a model nothing",
+        mend="check that the right column was written, or add measurements",
+    )  # fmt: skip

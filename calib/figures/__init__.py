@@ -1,9 +1,0 @@
-"""Figures of a result, each with one sentence on what it shows.
-
-`calib.figures.collect` draws those of a report. It is not imported here, since the figures of a
-diagnosis need neither a study nor a sampler.
-"""
-
-from calib.figures.plate import Plate
-
-__all__ = ["Plate"]

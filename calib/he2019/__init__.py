@@ -1,0 +1,1 @@
+"""He, Sandu & Osorio (2019, Part II): their data, tables, audit and gaps."""

@@ -1,0 +1,164 @@
+"""What an audit finds: a published claim, how it was tested, and a verdict with its evidence."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import StrEnum
+
+from calib.he2019.audit.intervals import Interval
+from calib.he2019.datasets.published import Figure
+
+__all__ = ["Basis", "Finding", "Quantity", "Verdict", "rounded"]
+
+
+class Verdict(StrEnum):
+    """What a test says of a published figure, as it is printed and read."""
+
+    CONTRADICTED = "contradicted"
+    CORRECTED = "corrected"
+    CONFIRMED = "confirmed"
+    CONSISTENT = "consistent"
+    UNTESTABLE = "cannot be tested"
+
+    @property
+    def meaning(self) -> str:
+        """One sentence."""
+        return _MEANINGS[self]
+
+
+_MEANINGS = {
+    Verdict.CONTRADICTED: "cannot hold together with what else is printed",
+    Verdict.CORRECTED: "does not say what it is taken to say; what should stand there is given",
+    Verdict.CONFIRMED: "the figure as read passes a test that its rivals fail",
+    Verdict.CONSISTENT: "passes a test it could have failed, which does not prove it",
+    Verdict.UNTESTABLE: "nothing printed decides; measured data would",
+}
+
+
+class Basis(StrEnum):
+    """What a verdict rests on."""
+
+    PRINTED = "printed figures alone"
+    SLIPS = "printed figures and the assumed slips"
+    PHYSICS = "printed figures and physical limits"
+    RECONSTRUCTED = "reconstructed data"
+
+    @property
+    def caveat(self) -> str:
+        """What a reader must not conclude; empty where there is nothing to warn of."""
+        return _CAVEATS.get(self, "")
+
+
+_CAVEATS = {
+    Basis.SLIPS: "The slips are assumed where the source does not print them.",
+    Basis.RECONSTRUCTED: (
+        "The data were reconstructed so that Tables 1, 4 and 6 are their exact optimum: this shows "
+        "what the method does with such data and proves nothing about the measured ones."
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A figure found, with the interval it lies in.
+
+    Parameters
+    ----------
+    name, unit : str
+    value : float
+        NaN where only the interval is meant.
+    lower, upper : float
+    interval : str
+        What the interval is: "rounding" (exact extremes over the printed digits), "95 % HDI", ...
+    published : str
+        The printed figure beside it; empty where there is none.
+    """
+
+    name: str
+    value: float
+    unit: str = "1"
+    lower: float = math.nan
+    upper: float = math.nan
+    interval: str = ""
+    published: str = ""
+
+    def __str__(self) -> str:
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        low, high = f"{self.lower:.4g}", f"{self.upper:.4g}"
+        span = ""
+        if not math.isnan(self.lower):
+            span = f"{low} to {high}" if low != high else low
+        if math.isnan(self.value):
+            return f"{self.name} {span}{unit} ({self.interval})"
+        around = f" ({span}, {self.interval})" if span else ""
+        return f"{self.name} {self.value:.4g}{unit}{around}"
+
+
+def rounded(
+    name: str,
+    interval: Interval,
+    unit: str = "1",
+    published: Figure | None = None,
+    *,
+    middle: bool = True,
+) -> Quantity:
+    """Return a quantity whose interval comes from the printed digits.
+
+    Parameters
+    ----------
+    name, unit : str
+    interval : Interval
+        Of one number, or of several: then from the least to the largest.
+    published : Figure, optional
+    middle : bool
+        Whether the midpoint is worth showing.
+    """
+    low, high = float(interval.lower.min()), float(interval.upper.max())
+    value = 0.5 * (low + high) if middle else math.nan
+    return Quantity(name, value, unit, low, high, "rounding", published.text if published else "")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding.
+
+    Parameters
+    ----------
+    key : str
+        Identifier, unique in an audit.
+    family : str
+        Heading under which it is shown.
+    where : str
+        Table or equation of the source. Pages are not known: the text reached us without them.
+    figures : tuple of str
+        The printed figures it judges, by the keys of `printed_figures`.
+    claim : str
+        What is claimed, or how the figure is read.
+    test : str
+        How it was tested.
+    found : tuple of Quantity
+    verdict : Verdict
+    evidence : str
+        One sentence.
+    stays_open : str
+        What the test leaves undecided; empty where nothing is.
+    basis : Basis
+    """
+
+    key: str
+    family: str
+    where: str
+    figures: tuple[str, ...]
+    claim: str
+    test: str
+    found: tuple[Quantity, ...]
+    verdict: Verdict
+    evidence: str
+    stays_open: str
+    basis: Basis
+
+    @property
+    def reconstructed(self) -> bool:
+        """Whether the verdict depends on the reconstruction."""
+        return self.basis is Basis.RECONSTRUCTED

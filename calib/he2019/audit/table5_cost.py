@@ -1,0 +1,232 @@
+"""The printed cost of Table 5: against the least that Eqs 12-15 can have, and its own digits'.
+
+Quadratics through three pressures are free at each of them, so Eqs 12-15 are the Magic Formula of
+each pressure with one C for all. Any such curves near Table 4's cost at most (|d| + r)^2 a pressure
+(`calib.he2019.audit.nearness`), whatever the data: that bounds the optimum from above. With the
+largest distance over all slips in the place of the tested ones the bound needs no slips at all.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import least_squares, minimize
+
+from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
+from calib.he2019.audit.nearness import (
+    ASSUMED_SLIPS,
+    Reference,
+    joint_bounds,
+    printed_coefficients,
+    references,
+)
+from calib.he2019.audit.pull import coefficients, pull
+from calib.he2019.audit.words import number
+from calib.he2019.datasets.published import FittedTable, Published
+from calib.models.base import Array
+from calib.models.magic_formula import magic_formula
+
+__all__ = [
+    "any_slips_bound", "assumed_slips_bound", "cost_as_printed", "cost_findings", "joint_cost",
+]  # fmt: skip
+
+_FAMILY = "Cost of Table 5"
+
+_BINS = 75
+_LARGEST_SLIP = float(_BINS)
+_COARSE = np.linspace(0.0, _LARGEST_SLIP, 4 * _BINS + 1)
+_FINE = np.linspace(0.0, _LARGEST_SLIP, 100 * _BINS + 1)
+_N_C = 9
+
+
+def _common_C(published: Published) -> Array:
+    values = [table.values["C"] for table in published.genetic.values()]
+    return np.linspace(min(values), max(values), _N_C)
+
+
+def _start(table: FittedTable, C: float, slips: Array) -> Array:
+    """Return B, D and E of the curve with another C nearest in the sum of squares."""
+    own = table.values
+    curve = magic_formula(slips, **own)
+
+    def apart(t: Array) -> Array:
+        return magic_formula(slips, t[0], C, t[1], t[2]) - curve
+
+    found = least_squares(apart, np.array([own["B"], own["D"], own["E"]]), x_scale="jac")
+    return np.asarray(found.x)
+
+
+def _worst_norm(apart: Array, levels: int) -> Array:
+    """Return the largest |d| of any slips of which no two are within 1 %: one in each bin."""
+    in_bins = apart[:-1].reshape(_BINS, -1)
+    largest = np.maximum(in_bins.max(axis=1), np.append(in_bins[1:, 0], apart[-1]))
+    return np.asarray(np.sqrt(np.sum(np.sort(largest)[-levels:] ** 2)))
+
+
+def _nearest_everywhere(table: FittedTable, C: float, levels: int) -> Array:
+    """Return B, D and E of the curve with another C that is nearest at the worst slips."""
+    curve = magic_formula(_COARSE, **table.values)
+
+    def norm(t: Array) -> float:
+        apart = np.abs(magic_formula(_COARSE, t[0], C, t[1], t[2]) - curve)
+        return float(_worst_norm(apart, levels)) if np.isfinite(apart).all() else 1e3
+
+    found = minimize(
+        norm, _start(table, C, _COARSE), method="Nelder-Mead",
+        options={"xatol": 1e-7, "fatol": 1e-7, "maxiter": 1000, "maxfev": 1000},
+    )  # fmt: skip
+    return np.asarray(found.x)
+
+
+def _largest_norm(table: FittedTable, C: float, levels: int) -> float:
+    """Return a |d| (kN) that some curve with another C exceeds at no slips.
+
+    It holds for all coefficients that print as Table 4, and between the points of the grid.
+    """
+    B, D, E = _nearest_everywhere(table, C, levels)
+    allowed = pull(_FINE, coefficients(table))
+    curve = magic_formula(_FINE, B, C, D, E)
+    apart = np.maximum(allowed.upper - curve, curve - allowed.lower)
+    between = 0.5 * np.abs(np.diff(curve - magic_formula(_FINE, **table.values))).max()
+    return float(_worst_norm(apart + between, levels))
+
+
+def any_slips_bound(published: Published) -> float:
+    """Return a cost (kN^2) that the joint optimum cannot exceed, whatever the slips.
+
+    They are up to 75 %, no two of them within 1 %.
+    """
+    levels = int(published.setup.slip_levels.value)
+
+    def total(C: float) -> float:
+        cost = 0.0
+        for table in published.genetic.values():
+            figure = table.quality["cost"]
+            r = np.sqrt(figure.value + figure.half_unit)
+            cost += float((r + _largest_norm(table, C, levels)) ** 2)
+        return cost
+
+    candidates = _common_C(published)
+    costs = [total(float(C)) for C in candidates]
+    best, step = int(np.argmin(costs)), float(candidates[1] - candidates[0])
+    finer = np.linspace(candidates[best] - step, candidates[best] + step, 7)[1:-1]
+    return min(*costs, *(total(float(C)) for C in finer))
+
+
+def assumed_slips_bound(published: Published, *, optimal: bool) -> float:
+    """Return a cost (kN^2) that the joint optimum cannot exceed at the assumed slips.
+
+    Parameters
+    ----------
+    published : Published
+    optimal : bool
+        Whether Table 4 is taken for the optimum of each pressure.
+    """
+    known = references(published)
+
+    def cost(reference: Reference, C: float) -> float:
+        t = _start(published.genetic[reference.psi], C, ASSUMED_SLIPS)
+        curve = magic_formula(ASSUMED_SLIPS, t[0], C, t[1], t[2])[None]
+        return float(reference.bounds(curve, optimal=optimal)[1][0])
+
+    return min(sum(cost(r, float(C)) for r in known) for C in _common_C(published))
+
+
+def cost_findings(published: Published, reconstructed_optimum: float) -> list[Finding]:
+    """Judge the printed cost: as a minimum, and as that of the printed digits."""
+    return [joint_cost(published, reconstructed_optimum), cost_as_printed(published)]
+
+
+def joint_cost(published: Published, reconstructed_optimum: float) -> Finding:
+    """Judge whether the printed cost can be a minimum of Eq 16.
+
+    Parameters
+    ----------
+    published : Published
+    reconstructed_optimum : float
+        The joint optimum on the reconstructed data, for comparison, kN^2.
+    """
+    figure = published.pressure.quality["cost"]
+    separate = [table.quality["cost"] for table in published.genetic.values()]
+    floor = sum(f.value - f.half_unit for f in separate)
+    anywhere = any_slips_bound(published)
+    assumed, optimal = (assumed_slips_bound(published, optimal=o) for o in (False, True))
+    low, high = figure.value - figure.half_unit, figure.value + figure.half_unit
+    if high < floor or low > anywhere:
+        verdict, basis = Verdict.CONTRADICTED, Basis.PRINTED
+    elif low > assumed:
+        verdict, basis = Verdict.CONTRADICTED, Basis.SLIPS
+    else:
+        verdict, basis = Verdict.CONSISTENT, Basis.SLIPS
+    if high < floor:
+        evidence = (
+            f"It is below {number(floor)} kN^2, the sum of Table 4's costs, which a joint fit "
+            "cannot undercut"
+        )
+    elif low > anywhere:
+        evidence = (
+            f"Whatever the measured pulls, and at any {published.setup.slip_levels.text} slips up "
+            f"to {_LARGEST_SLIP:g} % that are 1 % apart, some curves of Eqs 12-15 near Table 4 "
+            f"cost {number(anywhere, 4)} kN^2 at most: the printed {figure.text} is not a minimum"
+        )
+    else:
+        evidence = (
+            f"At the assumed slips the minimum lies between {number(floor)} and "
+            f"{number(assumed)} kN^2"
+        )
+    return Finding(
+        "table5_joint_cost", _FAMILY, "Table 5, Eq 16",
+        ("Table 5: cost", *(f"{t.source}: cost" for t in published.genetic.values())),
+        f"the least total cost of Eqs 12-15 over all pressures is {figure.text} kN^2",
+        "the cost of the best curves with one C on any data that have Table 4's costs (triangle "
+        "inequality), at any slips and at the assumed ones",
+        (
+            Quantity("minimum at any slips", float("nan"), "kN^2", floor, anywhere,
+                     "bounds for any data with Table 4's costs", figure.text),
+            Quantity("minimum at the assumed slips", float("nan"), "kN^2", floor, assumed,
+                     "bounds for any data with Table 4's costs", figure.text),
+            Quantity("and if Table 4 is optimal", float("nan"), "kN^2", floor, optimal,
+                     "bounds", figure.text),
+            Quantity("minimum on the reconstructed data", reconstructed_optimum, "kN^2",
+                     published=figure.text),
+        ),
+        verdict, evidence + ".",
+        "What stopped the search short of the minimum: the box, the coordinates or the "
+        "generations of the genetic algorithm.",
+        basis,
+    )  # fmt: skip
+
+
+def cost_as_printed(published: Published) -> Finding:
+    """Judge whether the coefficients as printed can have the printed cost."""
+    figure = published.pressure.quality["cost"]
+    known = references(published)
+    both = np.tile(printed_coefficients(published), (2, 1))
+    both[1, 8] *= -1.0  # the sign of c9 is open
+    least, largest = joint_bounds(both, known, ASSUMED_SLIPS, optimal=False)
+    strict, _ = joint_bounds(both, known, ASSUMED_SLIPS, optimal=True)
+    refused = [bool((bound > figure.value + figure.half_unit).all()) for bound in (least, strict)]
+    named = [f"c9 = {c9:+g}" for c9 in both[:, 8]]
+    found = [
+        Quantity(f"cost with {name}", float("nan"), "kN^2", low, high,
+                 "any data with Table 4's costs", figure.text)
+        for name, low, high in zip(named, least.tolist(), largest.tolist(), strict=True)
+    ]  # fmt: skip
+    found += [
+        Quantity(f"least with {name} if Table 4 is optimal", low, "kN^2", published=figure.text)
+        for name, low in zip(named, strict.tolist(), strict=True)
+    ]
+    at_least, anyway = (
+        " and ".join(number(float(b)) for b in bounds) for bounds in (strict, least)
+    )
+    return Finding(
+        "table5_cost_as_printed", _FAMILY, "Table 5, Eq 16", ("Table 5: cost",),
+        f"the coefficients as printed cost {figure.text} kN^2",
+        "the least and largest cost of the printed digits as they stand on any data that have "
+        "Table 4's costs (triangle inequality), and the least if Table 4 is their optimum",
+        tuple(found), Verdict.CONTRADICTED if any(refused) else Verdict.CONSISTENT,
+        f"As they stand the digits cost at least {at_least} kN^2 with {' and '.join(named)}, if "
+        f"Table 4 is the optimum of each pressure ({anyway} even if it is not); {figure.text} is "
+        "printed.",
+        "The cost belongs to coefficients with more digits than are printed.",
+        Basis.SLIPS,
+    )  # fmt: skip

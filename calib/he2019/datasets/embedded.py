@@ -1,0 +1,142 @@
+"""The data set reconstructed from He, Sandu & Osorio (2019): three outputs, one folder of CSVs.
+
+No raw data of the source are available. Conditions follow its description, with assumptions
+where it is silent; outputs are the published models plus noise, drawn with fixed seeds and moved
+as little as makes a fit return the published figures. It says what the source says and nothing
+more: never take it for a measurement, and show `LABEL` wherever it is shown.
+
+References
+----------
+doi:10.1016/j.jterra.2019.07.003; the published figures are in `calib.he2019.datasets.published`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from calib.data import Table, table_from_arrays
+from calib.errors import CalibError
+from calib.he2019.datasets import density, drawbar, rut
+from calib.he2019.datasets.reconstruct import Array
+
+__all__ = [
+    "LABEL",
+    "bulk_density",
+    "drawbar_pull",
+    "labelled",
+    "load_he2019",
+    "rut_depth",
+    "tables",
+    "write",
+]
+
+LABEL = "reconstructed"
+
+# Decimals of every column; they carry the printed digits through the files.
+_DECIMALS: Mapping[str, int] = MappingProxyType(
+    {
+        "cone_index_kpa": 1,
+        "gravimetric_water_content": 4,
+        "bulk_density_g_cm3": density.DECIMALS,
+        "inflation_pressure_psi": 0,
+        "nominal_slip_ratio": 3,
+        "slip_ratio": 3,
+        "drawbar_pull_kn": drawbar.DECIMALS,
+        "average_ground_pressure_kpa": 2,
+        "rut_depth_mm": rut.DECIMALS,
+    }
+)
+
+
+@cache
+def bulk_density() -> Mapping[str, Array]:
+    """Return cone index, water content and bulk density, 36 samples."""
+    return MappingProxyType(density.bulk_density())
+
+
+@cache
+def drawbar_pull() -> Mapping[str, Array]:
+    """Return drawbar pull at 3 inflation pressures and 14 slips."""
+    return MappingProxyType(drawbar.drawbar_pull())
+
+
+@cache
+def rut_depth() -> Mapping[str, Array]:
+    """Return rut depth at 3 inflation pressures and 9 slips."""
+    return MappingProxyType(rut.rut_depth())
+
+
+_TABLES: Mapping[str, Callable[[], Mapping[str, Array]]] = MappingProxyType(
+    {"bulk_density": bulk_density, "drawbar_pull": drawbar_pull, "rut_depth": rut_depth}
+)
+
+
+def tables() -> dict[str, Mapping[str, Array]]:
+    """Return all three outputs by name; columns are read-only arrays."""
+    return {name: table() for name, table in _TABLES.items()}
+
+
+def load_he2019(output: str) -> Table:
+    """Return one output's table, labelled reconstructed.
+
+    Parameters
+    ----------
+    output : {"bulk_density", "drawbar_pull", "rut_depth"}
+
+    Raises
+    ------
+    CalibError
+        If there is no such output.
+    """
+    if output not in tables():
+        raise CalibError(f"there is no output {output!r}", allowed=", ".join(tables()))
+    return table_from_arrays(tables()[output], source=f"he2019 {output}", label=LABEL)
+
+
+def _csv(columns: Mapping[str, Array]) -> str:
+    texts = [[f"{x:.{_DECIMALS[name]}f}" for x in column] for name, column in columns.items()]
+    rows = [list(columns), *zip(*texts, strict=True)]
+    return "".join(",".join(row) + "\n" for row in rows)
+
+
+def labelled(table: Table) -> Table:
+    """Return a table, labelled if all its rows are rows of the embedded data."""
+    known = any(_within(table, columns) for columns in tables().values())
+    return replace(table, label=LABEL) if known else table
+
+
+def _within(table: Table, columns: Mapping[str, Array]) -> bool:
+    names = list(columns)
+    if len(table) > len(columns[names[0]]) or any(name not in table for name in names):
+        return False
+    rows = np.column_stack([table[name] for name in names])
+    embedded = np.column_stack([columns[name] for name in names])
+    same = np.isclose(rows[:, None], embedded[None], rtol=1e-9, atol=1e-12).all(axis=2)
+    return bool(same.any(axis=1).all())
+
+
+def write(out_dir: Path) -> list[Path]:
+    """Write one CSV per output, and return their paths.
+
+    Parameters
+    ----------
+    out_dir : Path
+        Folder, made if it is missing; files of the same names are replaced.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be made or written to.
+    """
+    # All text is worked out first: a failure there leaves no files behind.
+    texts = {out_dir / f"{name}.csv": _csv(columns) for name, columns in tables().items()}
+    out_dir.mkdir(parents=True, exist_ok=True)
+    for path, text in texts.items():
+        path.write_text(text, encoding="ascii", newline="\n")
+    return list(texts)

@@ -1,0 +1,176 @@
+"""The report's section on the source's own gaps, and the page of each diagnosis below it."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from calib.batch.pool import HERE, Pool
+from calib.gap.files import write_diagnosis
+from calib.he2019.figures.gaps import gap_plate
+from calib.he2019.gaps.checks import checks, probability_of
+from calib.he2019.gaps.find import FoundGap
+from calib.he2019.page.checks import check_text
+from calib.models import get_model
+from calib.report.figures.export import pdf_bytes, png_size
+from calib.report.figures.gap import gap_plates
+from calib.report.figures.gap_rows import short_name
+from calib.report.figures.labels import short
+from calib.report.figures.plate import Plate
+from calib.report.page.diagnosis import gap_evidence, render_diagnosis
+from calib.report.page.gap_verdict import Tone, judge_gap, odds_text
+from calib.report.page.template import template
+
+__all__ = ["begin_gaps_section", "write_gaps"]
+
+_MARKS = {
+    Tone.FINE: "\N{HEAVY CHECK MARK}",
+    Tone.CARE: "\N{BLACK UP-POINTING TRIANGLE}",
+    Tone.NO: "?",
+}
+
+type Progress = Callable[[str, int, int], None]
+type ToPng = Callable[[Plate], bytes]
+
+
+def write_gaps(
+    results: Sequence[FoundGap],
+    folder: Path,
+    to_png: ToPng,
+    *,
+    manifest: Mapping[str, Any],
+    pdf: bool = False,
+    progress: Progress | None = None,
+) -> str:
+    """Write figures and pages of the gaps into a report folder, and return the section.
+
+    Parameters
+    ----------
+    results : sequence of FoundGap
+    folder : Path
+        Has ``figures/``; gets ``figures/gap_NAME.png`` and ``gaps/NAME/``, each what
+        `calib diagnose` writes, its figures inside the page only.
+    to_png : callable
+        Renders a figure.
+    manifest : mapping
+        Of the report, for the pages' versions.
+    pdf : bool
+        Whether each gap's figure also comes as PDF.
+    progress : callable, optional
+
+    Returns
+    -------
+    str
+        HTML for `calib.report.page.render.render_page`.
+    """
+    versions = manifest.get("versions", {})
+    section = begin_gaps_section(results, folder, to_png, versions=versions, pdf=pdf, pool=HERE)
+    return section(progress or (lambda what, done, planned: None))
+
+
+def begin_gaps_section(
+    results: Sequence[FoundGap],
+    folder: Path,
+    to_png: ToPng,
+    *,
+    versions: Mapping[str, str],
+    pdf: bool,
+    pool: Pool,
+) -> Callable[[Progress], str]:
+    """Ask for figures and pages as `write_gaps` does; return what waits for the section."""
+    pieces = [pool.submit(_write_gap, r, folder, to_png, versions, pdf) for r in results]
+
+    def finish(tell: Progress) -> str:
+        blocks = []
+        for i, piece in enumerate(pieces):
+            tell("the paper's own gaps: drawing", i, len(pieces))
+            blocks.append(piece.result())
+        tell("the paper's own gaps: drawing", len(pieces), len(pieces))
+        return template("gaps.html.j2", "calib.he2019.page").render(gaps=blocks)
+
+    return finish
+
+
+def _write_gap(
+    result: FoundGap, folder: Path, to_png: ToPng, versions: Mapping[str, str], pdf: bool
+) -> dict[str, Any]:
+    plate = gap_plate(result)
+    image = to_png(plate)
+    (folder / "figures" / f"gap_{plate.name}.png").write_bytes(image)
+    if pdf and plate.figure is not None:
+        file = folder / "figures" / f"gap_{plate.name}.pdf"
+        file.write_bytes(pdf_bytes(plate.figure))
+    inner = folder / "gaps" / result.gap.name
+    inner.mkdir(parents=True)
+    write_diagnosis(result.found, inner)
+    drawn = gap_plates(result.found)
+    images = {f"{p.name}.png": to_png(p) for p in drawn if p.figure is not None}
+    page = render_diagnosis(result.found, drawn, images, manifest={"versions": versions})
+    (inner / "index.html").write_text(page, encoding="utf-8")
+    return _block(result, plate, image)
+
+
+def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
+    gap, found = result.gap, result.found
+    verdict = judge_gap(gap_evidence(found))
+    ranking = found.ranking
+    case = found.data.case
+    return {
+        "name": gap.name,
+        "title": gap.title,
+        "question": gap.question,
+        "rows": [
+            ("Model", get_model(case.models[result.output]).title),
+            ("Calibration", f"{_upper(gap.lab_rows)}: {len(case.lab)} rows"),
+            ("Field", f"{_upper(gap.field_rows)}: {len(case.field)} rows"),
+        ],
+        "tone": verdict.tone.value,
+        "mark": _MARKS[verdict.tone],
+        "state": verdict.state,
+        "headline": verdict.headline,
+        "facts": [fact for fact in verdict.facts if fact[0] != "Next"],
+        "withheld": _withheld(result),
+        "best": f"{short_name(ranking.order[0])} ({odds_text(_best(result))})",
+        "shrink": _shrink(result),
+        "checks": [check_text(check) for check in checks(result)],
+        "limits": gap.limits,
+        "page": f"gaps/{gap.name}/index.html",
+        "caption": plate.caption,
+        "uri": f"data:image/png;base64,{base64.b64encode(image).decode()}",
+        "size": png_size(image),
+    }
+
+
+def _upper(text: str) -> str:
+    return text[0].upper() + text[1:]
+
+
+def _best(result: FoundGap) -> float:
+    ranking = result.found.ranking
+    return float(ranking.probability[ranking.order[0]])
+
+
+def _withheld(result: FoundGap) -> str:
+    """Say whether the effect that was withheld is the one that was found."""
+    effect = result.gap.withheld
+    if effect is None:
+        return ""
+    ranking = result.found.ranking
+    words = short_name(effect)
+    if ranking.order[0] == effect and result.found.verdict == "effect":
+        return f"The effect that was withheld, {words}, is the one that is named."
+    p = odds_text(probability_of(result.found, effect))
+    return (
+        f"The effect that was withheld, {words}, is not the one that is named: its probability, "
+        f"alone or with another, is {p}."
+    )
+
+
+def _shrink(result: FoundGap) -> str:
+    s = result.found.shrink.get(result.output)
+    if s is None:
+        return "no gap that could shrink"
+    low, high = (f"{100.0 * v:.0f}".replace("-", "\N{MINUS SIGN}") for v in s.interval)
+    return f"{short(100.0 * s.fraction)} % ({low} to {high} %)"

@@ -1,0 +1,1 @@
+"""Problem, likelihood, priors, estimators, sampling, convergence, and runs on disk."""

@@ -1,0 +1,219 @@
+"""Calibrate: a problem in, its posterior out, seeded by point estimates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from calib.inference.diagnostics import convergence, ess, hdi, hdi_error, median_error
+from calib.inference.estimators import PointEstimate
+from calib.inference.problem import Problem
+from calib.inference.random import stream
+from calib.inference.sampling.sampler import Draws, Progress, SamplerSettings, sample_posterior
+from calib.models.base import Array
+
+__all__ = ["Calibration", "ParameterSummary", "calibrate"]
+
+_HDI = 0.95
+# Parts of each ensemble's steps whose scatter gives Monte Carlo errors.
+_PARTS = 4
+
+
+@dataclass(frozen=True)
+class ParameterSummary:
+    """Posterior summary of one parameter; the interval is the 95 % highest-density one."""
+
+    name: str
+    unit: str
+    mean: float
+    sd: float
+    median: float
+    hdi_lower: float
+    hdi_upper: float
+    ess_bulk: float
+    ess_tail: float
+    rhat: float
+    mcse_mean: float
+    sd_ratio: float
+    """Posterior over prior standard deviation; near 1 the data say nothing. NaN if derived."""
+    mcse_median: float = float("nan")
+    mcse_hdi_lower: float = float("nan")
+    mcse_hdi_upper: float = float("nan")
+
+
+@dataclass(frozen=True, repr=False)
+class Calibration:
+    """A calibrated model.
+
+    Parameters
+    ----------
+    problem : Problem
+    draws : Draws
+    seed : int
+    label : str
+        Names the random streams that belong to it.
+    estimates : tuple of PointEstimate
+        That seeded the sampler.
+    settings : SamplerSettings
+        How it was sampled.
+    """
+
+    problem: Problem
+    draws: Draws
+    seed: int
+    label: str
+    estimates: tuple[PointEstimate, ...] = ()
+    settings: SamplerSettings = field(default_factory=SamplerSettings)
+    summary: Mapping[str, ParameterSummary] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "summary", _summarise(self))
+
+    def __repr__(self) -> str:
+        state = "converged" if self.converged else "NOT CONVERGED"
+        name, n = self.problem.bound.model.name, len(self.problem.table)
+        return f"<Calibration of {name} on {n} rows, {state}>"
+
+    @property
+    def converged(self) -> bool:
+        """Whether the gate was passed."""
+        return self.draws.report.passed
+
+    @cached_property
+    def natural(self) -> Array:
+        """Draws of all natural parameters, sigma last, shape (chains, draws, d_all)."""
+        return _by_walker(self.problem.theta(self.draws.flat), self.draws)
+
+    @cached_property
+    def reported(self) -> Mapping[str, Array]:
+        """Draws of the published parameters, each of shape (chains, draws)."""
+        flat = self.natural.reshape(-1, self.natural.shape[-1])[:, :-1]
+        values = self.problem.bound.report(flat)
+        return {name: v.reshape(self.natural.shape[:2]) for name, v in values.items()}
+
+    @cached_property
+    def parameters(self) -> Mapping[str, Array]:
+        """Draws of everything that varies, sampled and published, shape (chains, draws) each."""
+        sampled = {
+            p.name: self.natural[:, :, i]
+            for i, p in enumerate(self.problem.priors.entries)
+            if not p.fixed
+        }
+        derived = {
+            name: v for name, v in self.reported.items() if name not in sampled and np.ptp(v) > 0.0
+        }
+        return {**derived, **sampled}
+
+    def subset(self, size: int) -> Array:
+        """Evenly spaced draws in internal coordinates, shape (size, d)."""
+        flat = self.draws.flat
+        picked = np.linspace(0, flat.shape[0] - 1, min(size, flat.shape[0])).round().astype(int)
+        return np.asarray(flat[picked])
+
+
+def _by_walker(flat: Array, draws: Draws) -> Array:
+    ensembles, walkers, steps, _ = draws.t.shape
+    return flat.reshape(ensembles * walkers, steps, flat.shape[-1])
+
+
+def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
+    problem = calibration.problem
+    units = {**problem.bound.model.reported, **{p.name: p.unit for p in problem.priors.entries}}
+    names = tuple(calibration.parameters)
+    stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
+    ensembles, walkers, steps, _ = calibration.draws.t.shape
+    found = convergence(stacked.reshape(ensembles, walkers, steps, -1))
+    mean_ess = ess(stacked, "mean")
+    flat = stacked.reshape(-1, len(names))
+    interval = [hdi(flat[:, j], _HDI) for j in range(len(names))]
+    batches = _batches(stacked.reshape(ensembles, walkers, steps, -1))
+    interval_error = [hdi_error(batches[j], _HDI) for j in range(len(names))]
+    prior_sd = _prior_sds(calibration)
+    return {
+        name: ParameterSummary(
+            name=name,
+            unit=units[name],
+            mean=float(flat[:, j].mean()),
+            sd=float(flat[:, j].std(ddof=1)),
+            median=float(np.median(flat[:, j])),
+            hdi_lower=interval[j][0],
+            hdi_upper=interval[j][1],
+            ess_bulk=float(found.ess_bulk[j]),
+            ess_tail=float(found.ess_tail[j]),
+            rhat=float(found.rhat[j]),
+            mcse_mean=float(flat[:, j].std(ddof=1) / np.sqrt(mean_ess[j])),
+            sd_ratio=_internal_sd(calibration, name) / prior_sd.get(name, np.nan),
+            mcse_median=median_error(batches[j]),
+            mcse_hdi_lower=float(interval_error[j][0]),
+            mcse_hdi_upper=float(interval_error[j][1]),
+        )
+        for j, name in enumerate(names)
+    }
+
+
+def _batches(draws: Array) -> Array:
+    """Draws (ensembles, walkers, steps, d) in consecutive parts of every ensemble, (d, g, m)."""
+    ensembles, walkers, steps, d = draws.shape
+    parts = max(1, min(_PARTS, steps // 2))
+    kept = draws[:, :, : parts * (steps // parts)].reshape(ensembles, walkers, parts, -1, d)
+    return np.asarray(kept.transpose(4, 0, 2, 1, 3).reshape(d, ensembles * parts, -1))
+
+
+def _prior_sds(calibration: Calibration) -> dict[str, float]:
+    """Prior sd in internal coordinates, where a log-normal's is finite and meaningful."""
+    priors = calibration.problem.priors
+    drawn = priors.ppf(((np.arange(999) + 0.5) / 999.0)[:, None] * np.ones(len(priors.free)))
+    return {p.name: float(drawn[:, j].std()) for j, p in enumerate(priors.free)}
+
+
+def _internal_sd(calibration: Calibration, name: str) -> float:
+    names = calibration.problem.names
+    if name not in names:
+        return float("nan")
+    return float(calibration.draws.flat[:, names.index(name)].std())
+
+
+def calibrate(
+    problem: Problem,
+    seed: int,
+    *,
+    label: str = "",
+    estimates: tuple[PointEstimate, ...] = (),
+    settings: SamplerSettings | None = None,
+    progress: Progress | None = None,
+) -> Calibration:
+    """Sample a problem's posterior.
+
+    Parameters
+    ----------
+    problem : Problem
+    seed : int
+        Same seed, same numbers.
+    label : str
+        Names the random stream; the model's output by default.
+    estimates : tuple of PointEstimate
+        Seed the search for the mode; empty to search from prior draws alone.
+    settings : SamplerSettings, optional
+    progress : callable, optional
+        Called with steps done and steps planned.
+
+    Returns
+    -------
+    Calibration
+        Read ``converged`` before use.
+    """
+    label = label or problem.bound.model.output
+    starts = _starts(problem, estimates) if estimates else None
+    chosen = settings or SamplerSettings()
+    draws = sample_posterior(
+        problem, stream(seed, label, "sample"), starts=starts, settings=chosen, progress=progress
+    )
+    return Calibration(problem, draws, seed, label, estimates, chosen)
+
+
+def _starts(problem: Problem, estimates: tuple[PointEstimate, ...]) -> Array:
+    natural = [np.append(e.theta, max(e.rmse, 1e-12)) for e in estimates]
+    return problem.priors.to_internal(np.array(natural))

@@ -1,0 +1,71 @@
+"""SciPy's differential evolution, the yardstick of the genetic algorithm."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.optimize import differential_evolution
+
+from calib.inference.estimators.base import PointEstimate
+from calib.inference.estimators.search import Box, Found, SearchSpace, search_in_box
+from calib.inference.problem import Problem
+from calib.models.base import Array
+
+__all__ = ["estimate_differential_evolution"]
+
+# Instead of `inf`, with which the population's spread, SciPy's stopping rule, is undefined.
+_WORST = 1e100
+
+
+def estimate_differential_evolution(
+    problem: Problem,
+    rng: np.random.Generator,
+    *,
+    box: Box | None = None,
+    polish: bool = True,
+    tol: float = 0.01,
+    popsize: int = 15,
+    maxiter: int = 1000,
+) -> PointEstimate:
+    """Minimise the sum of squares by `scipy.optimize.differential_evolution`.
+
+    A generation is one batched model evaluation.
+
+    Parameters
+    ----------
+    problem : Problem
+    rng : Generator
+    box : mapping of str to (lower, upper), optional
+        As for `calib.inference.estimators.search.search_space`.
+    polish : bool
+        Whether L-BFGS-B follows.
+    tol, popsize, maxiter
+        As in SciPy, whose defaults they have.
+    """
+
+    def minimise(space: SearchSpace) -> Found:
+        evaluated = 0
+
+        def cost(x: Array) -> Array:
+            nonlocal evaluated
+            values = space.cost(np.atleast_2d(x.T))
+            evaluated += values.size
+            return np.minimum(values, _WORST)
+
+        # The stubs know the scalar signature only.
+        batched: Any = cost
+        result = differential_evolution(
+            batched,
+            list(zip(space.lower, space.upper, strict=True)),
+            vectorized=True,
+            updating="deferred",
+            rng=rng,
+            polish=polish,
+            tol=tol,
+            popsize=popsize,
+            maxiter=maxiter,
+        )
+        return Found(np.asarray(result.x), evaluated, bool(result.success))
+
+    return search_in_box(problem, "differential_evolution", box, minimise)

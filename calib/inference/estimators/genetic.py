@@ -1,0 +1,206 @@
+"""The genetic algorithm of the source (Eqs 10-11, Table 2), after Cabrera et al. (2004).
+
+One generation, and what the source leaves open of it, is in
+`calib.inference.estimators.generation`. The source runs 4000 generations at most; here a run ends
+once the whole population has converged.
+Its mutations do not lead out of a local optimum that all of it has converged on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from calib.inference.estimators.base import PointEstimate
+from calib.inference.estimators.generation import (
+    GeneticDraws,
+    GeneticSettings,
+    descendants,
+    draw_generations,
+)
+from calib.inference.estimators.search import Box, Found, SearchSpace, search_in_box
+from calib.inference.problem import Problem
+from calib.models.base import Array
+
+__all__ = [
+    "GeneticResult", "GeneticSettings", "estimate_genetic", "minimise_genetic",
+    "minimise_genetic_runs",
+]  # fmt: skip
+
+# Generations whose random numbers are drawn in one call: the calls would cost more than the
+# numbers. Part of what a seed means; changing it changes the numbers of a run.
+_BLOCK = 32
+
+
+class GeneticResult(NamedTuple):
+    """What `minimise_genetic` returns.
+
+    Parameters
+    ----------
+    x : ndarray, shape (d,)
+    cost : float
+    n_evaluations : int
+    history : ndarray, shape (generations + 1,)
+        Lowest cost of the first population and after each generation.
+    converged : bool
+        Whether the population converged before the last iteration.
+    """
+
+    x: Array
+    cost: float
+    n_evaluations: int
+    history: Array
+    converged: bool
+
+
+def minimise_genetic(
+    cost: Callable[[Array], Array],
+    lower: Array,
+    upper: Array,
+    rng: np.random.Generator,
+    settings: GeneticSettings | None = None,
+) -> GeneticResult:
+    """Minimise a cost over a box.
+
+    Parameters
+    ----------
+    cost : callable
+        ``(k, d) -> (k,)``, ``inf`` where it has no value; called once per generation.
+    lower, upper : ndarray, shape (d,)
+        The search box, in which the first population is drawn uniformly.
+    rng : Generator
+    settings : GeneticSettings, optional
+        Table 2 by default.
+
+    References
+    ----------
+    Cabrera, Ortiz, Carabias & Simon (2004), doi:10.1076/vesd.41.2.109.26496, as Eqs 10-11 and
+    Table 2 of He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003.
+    """
+    return minimise_genetic_runs(cost, lower, upper, [rng], settings)[0]
+
+
+def minimise_genetic_runs(
+    cost: Callable[[Array], Array],
+    lower: Array,
+    upper: Array,
+    rngs: Sequence[np.random.Generator],
+    settings: GeneticSettings | None = None,
+) -> list[GeneticResult]:
+    """Minimise a cost in several runs at once, each by its own random numbers.
+
+    The model costs little more for all populations than for one. The parameters are those of
+    `minimise_genetic`; a run's result does not depend on the others.
+    """
+    s = settings or GeneticSettings()
+    runs = [_Run(lower, upper, rng, s) for rng in rngs]
+    going = list(runs)
+    new = cost(np.concatenate([run.population for run in going]))
+    for run, costs in zip(going, new.reshape(len(going), s.NP), strict=True):
+        run.begin(costs)
+    for generation in range(s.max_iterations):
+        children = np.concatenate([run.descend(generation) for run in going])
+        new = cost(children).reshape(len(going), s.NP)
+        apart = children.reshape(len(going), s.NP, -1)
+        for run, mine, costs in zip(going, apart, new, strict=True):
+            run.select(mine, costs)
+        going = [run for run in going if run.calm < s.patience]
+        if not going:
+            break
+    return [run.result() for run in runs]
+
+
+class _Run:
+    """A population on its way."""
+
+    def __init__(
+        self, lower: Array, upper: Array, rng: np.random.Generator, settings: GeneticSettings
+    ) -> None:
+        self._lower, self._upper, self._rng, self._settings = lower, upper, rng, settings
+        self.population = lower + (upper - lower) * rng.random((settings.NP, lower.size))
+        self._costs: Array = np.empty(0)
+        self._history: list[float] = []
+        self._lead, self._floor, self.calm = 0, 0.0, 0
+
+    def begin(self, costs: Array) -> None:
+        """Take over the costs of the first population."""
+        self._costs = np.array(costs)
+        self._lead = int(costs.argmin())
+        self._history.append(float(costs[self._lead]))
+        # An exact fit has no lowest cost to compare with: the costs' rounding then ends the run.
+        finite = costs[np.isfinite(costs)]
+        self._floor = 1e-24 * float(np.median(finite)) if finite.size else 0.0
+
+    def descend(self, generation: int) -> Array:
+        """Make the descendants of a generation, shape (NP, d)."""
+        row = generation % _BLOCK
+        if row == 0:
+            self._block = draw_generations(self._rng, _BLOCK, self._lower.size, self._settings)
+        draws = GeneticDraws(*(part[row] for part in self._block))
+        best, F = self.population[self._lead], self._settings.F
+        return descendants(self.population, best, draws, F, self._lower, self._upper)
+
+    def select(self, children: Array, costs: Array) -> None:
+        """Let descendants replace their parents where they are fitter."""
+        fitter = costs < self._costs
+        self.population[fitter] = children[fitter]
+        self._costs[fitter] = costs[fitter]
+        self._lead = int(self._costs.argmin())
+        lowest = float(self._costs[self._lead])
+        self._history.append(lowest)
+        tolerated = lowest * (1.0 + self._settings.tolerance) + self._floor
+        self.calm = self.calm + 1 if self._costs.max() <= tolerated < np.inf else 0
+
+    def result(self) -> GeneticResult:
+        """Return where it ended."""
+        history = np.array(self._history)
+        return GeneticResult(
+            self.population[self._lead].copy(), self._history[-1],
+            self._settings.NP * history.size, history, self.calm == self._settings.patience,
+        )  # fmt: skip
+
+
+def estimate_genetic(
+    problem: Problem,
+    rng: np.random.Generator,
+    *,
+    settings: GeneticSettings | None = None,
+    box: Box | None = None,
+    restarts: int = 0,
+    polish: bool = False,
+) -> PointEstimate:
+    """Minimise the sum of squares by the genetic algorithm of the source.
+
+    Parameters
+    ----------
+    problem : Problem
+    rng : Generator
+    settings : GeneticSettings, optional
+        Table 2 by default.
+    box : mapping of str to (lower, upper), optional
+        As for `calib.inference.estimators.search.search_space`.
+    restarts : int
+        Further runs from fresh populations, the best of all being returned. Not in the source: a
+        population that has converged on a local optimum never leaves it, however long it runs.
+    polish : bool
+        Whether least squares from the result follows. Not in the source.
+    """
+
+    def minimise(space: SearchSpace) -> Found:
+        runs = [
+            minimise_genetic(space.cost, space.lower, space.upper, rng, settings)
+            for _ in range(restarts + 1)
+        ]
+        best = min(runs, key=lambda run: run.cost)
+        n_evaluations = sum(run.n_evaluations for run in runs)
+        note = f"{best.history.size - 1} generations"
+        if restarts:
+            note += f", the best of {len(runs)} runs"
+        if not polish:
+            return Found(best.x, n_evaluations, best.converged, note)
+        polished = space.polish(best.x)
+        return Found(polished.x, n_evaluations + polished.n_evaluations, True, f"{note}, polished")
+
+    return search_in_box(problem, "genetic", box, minimise)

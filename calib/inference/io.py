@@ -1,0 +1,334 @@
+"""Save and load calibrations: a run folder, and posteriors as ArviZ DataTrees.
+
+A run folder holds everything that is needed to predict from it and to compute it again:
+`posterior.nc`, `data.csv` (the fitted rows), `priors.toml` and `run.json`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from calib.batch.environment import Environment
+from calib.data import Table, read_for_model, write_table
+from calib.errors import CalibError
+from calib.inference.calibration import Calibration
+from calib.inference.estimators import PointEstimate
+from calib.inference.prior_files import parse_priors
+from calib.inference.priors import Priors
+from calib.inference.problem import Problem
+from calib.inference.random import generator
+from calib.inference.sampling.gate import GateReport
+from calib.inference.sampling.sampler import Draws
+from calib.models import BoundModel, get_model
+from calib.models.base import Array
+
+__all__ = [
+    "SCHEMA", "describe_estimates", "load_calibration", "run_problem", "save_calibration",
+    "to_datatree", "write_netcdf",
+]  # fmt: skip
+
+SCHEMA = "calib/run/1"
+_HASHED = ("posterior.nc", "priors.toml", "data.csv")
+N_PRIOR = 2000
+MAX_CELLS = 8_000_000
+
+
+def to_datatree(calibration: Calibration) -> xr.DataTree:
+    """Return a calibration as an ArviZ DataTree.
+
+    Chains are walkers (`sample_stats.ensemble` says of which ensemble), so that effective sample
+    sizes computed from the file are those of the gate. Groups: posterior, prior, log_prior,
+    posterior_predictive, log_likelihood, sample_stats, observed_data, constant_data.
+    """
+    import arviz as az
+
+    problem = calibration.problem
+    draws = calibration.draws
+    chains, steps = calibration.natural.shape[:2]
+    output = problem.bound.model.output
+    # Of long data the groups that hold a number for every draw and row hold fewer draws, or none.
+    kept = min(steps, MAX_CELLS // (chains * problem.response.size))
+    picked = np.linspace(0, steps - 1, kept).round().astype(int)
+    shape = (chains, kept, problem.response.size)
+    natural = calibration.natural[:, picked].reshape(-1, calibration.natural.shape[-1])
+    internal = draws.t.reshape(chains, steps, -1)[:, picked].reshape(-1, draws.t.shape[-1])
+    location = problem.bound.location(natural[:, :-1], problem.conditions)
+    rng = generator(calibration.seed, calibration.label, "posterior_predictive")
+    noisy = location + natural[:, -1:] * rng.standard_normal(location.shape)
+    prior = problem.theta(
+        problem.priors.sample(generator(calibration.seed, calibration.label, "prior"), N_PRIOR)
+    )
+    by_row = {
+        "posterior_predictive": {
+            output: problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
+        },
+        "log_likelihood": {output: problem.log_likelihood_rows(internal).reshape(shape)},
+    }
+    if kept == 0:
+        by_row = {}
+    ensembles = np.repeat(np.arange(draws.t.shape[0]), draws.t.shape[1])
+    with warnings.catch_warnings():
+        # Walkers are chains, of which there are more than draws in a short run.
+        warnings.filterwarnings("ignore", "Found chain dimension to be longer", UserWarning)
+        tree: xr.DataTree = az.from_dict(
+            {
+                "posterior": dict(calibration.parameters),
+                "prior": _prior_group(calibration, prior),
+                **by_row,
+                "log_prior": {"joint": problem.priors.log_prob(draws.flat).reshape(chains, steps)},
+                "sample_stats": {
+                    "lp": draws.log_prob.reshape(chains, steps),
+                    "ensemble": np.repeat(ensembles[:, None], steps, axis=1),
+                },
+                "observed_data": {output: problem.observed},
+                "constant_data": dict(problem.conditions),
+            },
+            dims={
+                output: ["row"],
+                **{name: ["row"] for name in problem.conditions},
+            },
+            # Without durations: equal results give equal files.
+            attrs={"/": {"run": json.dumps(_describe(calibration))}},
+        )
+    return tree
+
+
+def _prior_group(calibration: Calibration, natural: Array) -> dict[str, Array]:
+    problem = calibration.problem
+    named = {p.name: natural[:, i] for i, p in enumerate(problem.priors.entries) if not p.fixed}
+    with np.errstate(all="ignore"):
+        derived = problem.bound.report(natural[:, :-1])
+    both = {name: v for name, v in derived.items() if name in calibration.parameters} | named
+    return {name: both[name][None] for name in calibration.parameters}
+
+
+def _describe(calibration: Calibration) -> dict[str, Any]:
+    problem, report = calibration.problem, calibration.draws.report
+    return {
+        "schema": SCHEMA,
+        "model": problem.bound.model.name,
+        "output": problem.bound.model.output,
+        "references": dict(problem.bound.references),
+        "fixed": {p.name: p.loc for p in problem.priors.entries if p.fixed},
+        "prior_file": PurePath(problem.priors.source).name,
+        "prior_text": problem.priors.text,
+        "prior_references": _loads(problem.table),
+        "seed": calibration.seed,
+        "label": calibration.label,
+        "shape": list(calibration.draws.t.shape),
+        "mode": calibration.draws.mode.tolist(),
+        "log_evidence": calibration.draws.log_evidence,
+        "efficiency": calibration.draws.efficiency,
+        "acceptance": calibration.draws.acceptance,
+        "evaluations": calibration.draws.evaluations,
+        "walkers": calibration.draws.walkers,
+        "settings": asdict(calibration.settings),
+        "estimates": describe_estimates(calibration.estimates),
+        "data_source": problem.table.source,
+        "data_label": problem.table.label,
+        "gate": {
+            "passed": report.passed,
+            "reasons": list(report.reasons),
+            "steps": report.steps,
+            "names": list(report.names),
+            **{k: getattr(report, k).tolist() for k in ("rhat", "ess_bulk", "ess_tail", "tau")},
+        },
+    }
+
+
+def describe_estimates(estimates: Sequence[PointEstimate]) -> list[dict[str, Any]]:
+    """Return what a run folder keeps of the estimates that seeded the sampler."""
+    return [
+        {
+            "method": e.method,
+            "theta": e.theta.tolist(),
+            "reported": e.reported,
+            "cost": e.cost,
+            "rmse": e.rmse,
+        }
+        for e in estimates
+    ]
+
+
+def _loads(table: Table) -> dict[str, float]:
+    name = "normal_load_kn"
+    return {name: float(np.median(table[name]))} if name in table else {}
+
+
+def write_netcdf(tree: xr.DataTree, path: Path) -> None:
+    """Write a DataTree, compressed, without time stamps, so equal results give equal content."""
+    encoding = {
+        f"/{group}": {str(name): {"zlib": True, "complevel": 1} for name in node.data_vars}
+        for group, node in tree.children.items()
+    }
+    for node in tree.subtree:
+        node.attrs.pop("created_at", None)
+    tree.to_netcdf(path, engine="h5netcdf", encoding=encoding)
+
+
+def save_calibration(
+    calibration: Calibration, folder: Path, *, environment: Environment | None = None
+) -> None:
+    """Write a run folder into an existing, empty folder.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    folder : Path
+    environment : Environment, optional
+        Where it says that it was made: in that of this process by default.
+    """
+    problem = calibration.problem
+    write_netcdf(to_datatree(calibration), folder / "posterior.nc")
+    (folder / "priors.toml").write_text(problem.priors.text, encoding="utf-8")
+    write_table(folder / "data.csv", problem.table.columns)
+    hashes = {name: _sha256(folder / name) for name in _HASHED}
+    described = {
+        **_describe(calibration),
+        "seconds": calibration.draws.seconds,
+        **(environment or Environment.here()).document(),
+        "sha256": hashes,
+    }
+    (folder / "run.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _check_hashes(meta: dict[str, Any], folder: Path) -> None:
+    """A run is predicted from only as it was written."""
+    for name, expected in meta.get("sha256", {}).items():
+        with _damage(folder / name):
+            found = _sha256(folder / name)
+        if found != expected:
+            raise CalibError(
+                "the file has changed since the run was written",
+                where=str(folder / name),
+                allowed=f"SHA-256 {expected[:16]}..., found {found[:16]}...",
+                mend="restore it, or run `calib fit` again",
+            )
+
+
+def load_calibration(folder: Path) -> Calibration:
+    """Read a run folder.
+
+    Raises
+    ------
+    CalibError
+        If the folder is not one, or a file in it is damaged.
+    """
+    folder = Path(folder)
+    meta = _read_meta(folder)
+    _check_hashes(meta, folder)
+    with _damage(folder / "run.json"):
+        problem = run_problem(meta, folder / "data.csv")
+        shape = tuple(meta["shape"])
+        seed, label = meta["seed"], meta["label"]
+    with _damage(folder / "posterior.nc"):
+        t, log_prob = _read_posterior(folder / "posterior.nc", problem.priors, shape)
+    with _damage(folder / "run.json"):
+        return Calibration(problem, _draws(meta, t, log_prob), seed, label)
+
+
+@contextmanager
+def _damage(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CalibError(
+            f"the file cannot be read ({type(error).__name__})",
+            where=str(path),
+            allowed="the file as `calib fit` wrote it",
+            mend="the file is damaged or incomplete: run `calib fit` again",
+        ) from None
+
+
+def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
+    """Return the problem of a run folder.
+
+    Parameters
+    ----------
+    meta : mapping
+        The content of its ``run.json``.
+    data : Path
+        Its ``data.csv``.
+    """
+    model = get_model(meta["model"])
+    priors = parse_priors(
+        meta["prior_text"], meta["prior_file"], model.name,
+        (*model.parameters, "sigma"), meta["prior_references"],
+    )  # fmt: skip
+    if meta["fixed"]:
+        priors = priors.fix(meta["fixed"])
+    table = read_for_model(data, (*model.conditions, model.output))
+    # What is reconstructed stays labelled so.
+    table = replace(table, source=meta["data_source"], label=meta["data_label"])
+    return Problem(BoundModel(model, meta["references"]), table, priors)
+
+
+def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Return the internal coordinates, of a shape, and their log densities."""
+    import arviz as az
+
+    with az.from_netcdf(path, engine="h5netcdf") as tree:
+        posterior = tree["posterior"]
+        natural = np.stack(
+            [
+                np.full(shape[:-1], p.loc)
+                if p.fixed
+                else posterior[p.name].values.reshape(shape[:-1])
+                for p in priors.entries
+            ],
+            axis=-1,
+        )
+        log_prob = np.asarray(tree["sample_stats"]["lp"].values.reshape(shape[:-1]))
+    t = priors.to_internal(natural.reshape(-1, natural.shape[-1]), margin=0.0).reshape(shape)
+    return t, log_prob
+
+
+def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:
+    gate = meta["gate"]
+    figures = {k: np.array(gate[k]) for k in ("rhat", "ess_bulk", "ess_tail", "tau")}
+    report = GateReport(
+        names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
+        reasons=tuple(gate["reasons"]), **figures,
+    )  # fmt: skip
+    known = ("log_evidence", "efficiency", "acceptance", "evaluations", "seconds")
+    return Draws(
+        t=t,
+        log_prob=log_prob,
+        report=report,
+        mode=np.array(meta["mode"]),
+        # Earlier run folders had all walkers stored.
+        walkers=meta["walkers"] if "walkers" in meta else t.shape[1],
+        **{k: meta[k] for k in known},
+    )
+
+
+def _read_meta(folder: Path) -> dict[str, Any]:
+    path = folder / "run.json"
+    try:
+        meta: dict[str, Any] = json.loads(path.read_text())
+        known = meta.get("schema") == SCHEMA
+    except (OSError, ValueError, AttributeError):
+        known = False
+    if not known:
+        raise CalibError(
+            "this is not a run folder (no readable run.json in it)",
+            where=str(folder),
+            allowed="a folder written by `calib fit`",
+            mend="give the folder that `calib fit ... --out` named",
+        )
+    return meta

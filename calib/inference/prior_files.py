@@ -1,0 +1,270 @@
+"""Prior files: TOML read, checked against the model, and turned into priors."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from calib.errors import CalibError
+from calib.inference.priors import Prior, Priors
+
+__all__ = ["default_prior_path", "parse_priors", "prior_file_model", "read_priors"]
+
+
+class _Entry(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    unit: str
+    reason: str = Field(min_length=1)
+    source: str = Field(min_length=1)
+    relative_to: Literal["normal_load_kn"] | None = None
+    default_reference: float = Field(default=1.0, gt=0.0)
+
+
+class _Normal(_Entry):
+    dist: Literal["normal"]
+    mean: float
+    sd: float = Field(gt=0.0)
+    lower: float | None = None
+    upper: float | None = None
+
+
+class _LogNormal(_Entry):
+    dist: Literal["lognormal"]
+    median: float = Field(gt=0.0)
+    sd_log: float = Field(gt=0.0)
+    lower: float | None = Field(default=None, gt=0.0)
+    upper: float | None = Field(default=None, gt=0.0)
+
+
+class _HalfNormal(_Entry):
+    dist: Literal["half_normal"]
+    sd: float = Field(gt=0.0)
+
+
+class _Uniform(_Entry):
+    dist: Literal["uniform"]
+    lower: float
+    upper: float
+
+
+class _Fixed(_Entry):
+    dist: Literal["fixed"]
+    value: float
+
+
+type _AnyEntry = Annotated[
+    _Normal | _LogNormal | _HalfNormal | _Uniform | _Fixed, Field(discriminator="dist")
+]
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    model: str
+    parameters: dict[str, _AnyEntry]
+
+
+_FILE: TypeAdapter[_File] = TypeAdapter(_File)
+
+
+def default_prior_path(model_name: str) -> Path:
+    """Return the path of the shipped priors of a model."""
+    packaged = Path(str(resources.files("calib"))) / "_priors"
+    # An editable install has no packaged copy: the priors then lie beside the package.
+    folder = packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "priors"
+    return folder / f"{model_name}.toml"
+
+
+def prior_file_model(path: Path) -> str:
+    """Return the model that a prior file says it is for.
+
+    Raises
+    ------
+    CalibError
+        If the file cannot be read or names none.
+    """
+    try:
+        model = tomllib.loads(Path(path).read_text(encoding="utf-8")).get("model")
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise CalibError(
+            f"the prior file cannot be read ({error})", where=str(path), mend="correct it"
+        ) from None
+    if not isinstance(model, str):
+        raise CalibError(
+            "the prior file does not say which model it is for",
+            where=str(path),
+            allowed='model = "NAME"',
+            mend="add this line at its top",
+        )
+    return model
+
+
+def read_priors(
+    path: Path, model_name: str, parameters: Sequence[str], references: Mapping[str, float]
+) -> Priors:
+    """Read and check a prior file.
+
+    Parameters
+    ----------
+    path : Path
+        TOML file with ``model`` and a table ``parameters.NAME`` for each parameter.
+    model_name : str
+        The model it must be for.
+    parameters : sequence of str
+        The parameters it must give, in order; the noise scale ``sigma`` among them.
+    references : mapping of str to float
+        Values of the columns that priors may be relative to (a median normal load).
+
+    Raises
+    ------
+    CalibError
+        If the file is missing, is not TOML, or gives unknown, missing or impossible entries.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibError(
+            f"the prior file cannot be read ({error})",
+            where=str(path),
+            mend="give the path of a readable TOML file",
+        ) from None
+    return parse_priors(text, str(path), model_name, parameters, references)
+
+
+def parse_priors(
+    text: str,
+    source: str,
+    model_name: str,
+    parameters: Sequence[str],
+    references: Mapping[str, float],
+) -> Priors:
+    """Check the text of a prior file; see `read_priors`."""
+    try:
+        content = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise CalibError(
+            f"the prior file is not valid TOML: {error}", where=source, mend="correct that line"
+        ) from None
+    # A misspelt name is reported before its content: it is the likelier mistake.
+    _check_names(content, source, model_name, parameters)
+    try:
+        file = _FILE.validate_python(content)
+    except ValidationError as error:
+        raise _explain(error, source) from None
+    _check_units(file, source, model_name)
+    entries = tuple(_prior(name, file.parameters[name], source, references) for name in parameters)
+    return Priors(entries, text, source)
+
+
+def _check_names(
+    content: Mapping[str, Any], source: str, model_name: str, parameters: Sequence[str]
+) -> None:
+    if content.get("model") != model_name:
+        raise CalibError(
+            f"the priors are for model {content.get('model')!r}, not {model_name!r}",
+            where=source,
+            allowed=f'model = "{model_name}"',
+            mend="pass the prior file of this model",
+        )
+    given = content.get("parameters")
+    given = given if isinstance(given, Mapping) else {}
+    unknown = [name for name in given if name not in parameters]
+    missing = [name for name in parameters if name not in given]
+    if unknown or missing:
+        found = "; ".join(
+            f"{what} {', '.join(names)}"
+            for what, names in (("unknown parameter", unknown), ("missing parameter", missing))
+            if names
+        )
+        raise CalibError(
+            found,
+            where=f"{source}, [parameters]",
+            allowed=", ".join(parameters),
+            mend="give exactly these parameters; copy the shipped file and edit it",
+        )
+
+
+def _check_units(file: _File, source: str, model_name: str) -> None:
+    """A prior in another unit would silently be taken for one in the model's."""
+    shipped = default_prior_path(model_name)
+    if not shipped.is_file():
+        return
+    units = {
+        name: entry.get("unit")
+        for name, entry in tomllib.loads(shipped.read_text(encoding="utf-8"))["parameters"].items()
+    }
+    for name, entry in file.parameters.items():
+        if name in units and entry.unit != units[name]:
+            raise CalibError(
+                f"the unit is {entry.unit!r}",
+                where=f"{source}, parameters.{name}",
+                allowed=f"unit = {units[name]!r}",
+                mend="convert the numbers to this unit",
+            )
+
+
+def _explain(error: ValidationError, source: str) -> CalibError:
+    first = error.errors()[0]
+    place = ".".join(str(part) for part in first["loc"] if not str(part).startswith("_"))
+    return CalibError(
+        f"{first['msg']} (found {first.get('input')!r})",
+        where=f"{source}, {place}",
+        allowed="dist = normal (mean, sd > 0), lognormal (median > 0, sd_log > 0), half_normal "
+        "(sd > 0), uniform (lower < upper) or fixed (value); each with unit, reason, source",
+        mend="correct this entry",
+    )
+
+
+def _prior(name: str, entry: _AnyEntry, source: str, references: Mapping[str, float]) -> Prior:
+    reference = 1.0
+    suffix = ""
+    if entry.relative_to is not None:
+        reference = references.get(entry.relative_to, entry.default_reference)
+        suffix = f" x {reference:g} ({entry.relative_to})"
+    log, loc, scale, lower, upper, text = _internal(entry, reference)
+    if not lower < upper:
+        raise CalibError(
+            f"lower bound {lower:g} is not below upper bound {upper:g}",
+            where=f"{source}, parameters.{name}",
+            mend="give lower < upper",
+        )
+    return Prior(
+        name, entry.unit, entry.reason, entry.source, text + suffix, log, loc, scale, lower, upper
+    )
+
+
+def _internal(entry: _AnyEntry, reference: float) -> tuple[bool, float, float, float, float, str]:
+    """Return (log, loc, scale, lower, upper, text) of an entry in internal coordinates."""
+    inf = np.inf
+    match entry:
+        case _Normal(mean=mean, sd=sd, lower=lower, upper=upper):
+            low = -inf if lower is None else lower * reference
+            high = inf if upper is None else upper * reference
+            text = f"normal({mean:g}, {sd:g})" + _bounds_text(lower, upper)
+            return False, mean * reference, sd * reference, low, high, text
+        case _LogNormal(median=median, sd_log=sd_log, lower=lower, upper=upper):
+            low = -inf if lower is None else float(np.log(lower * reference))
+            high = inf if upper is None else float(np.log(upper * reference))
+            text = f"lognormal({median:g}, {sd_log:g})" + _bounds_text(lower, upper)
+            return True, float(np.log(median * reference)), sd_log, low, high, text
+        case _HalfNormal(sd=sd):
+            return False, 0.0, sd * reference, 0.0, inf, f"half_normal({sd:g})"
+        case _Uniform(lower=lower, upper=upper):
+            low, high = lower * reference, upper * reference
+            return False, 0.5 * (low + high), inf, low, high, f"uniform({lower:g}, {upper:g})"
+        case _Fixed(value=value):
+            fixed = value * reference
+            return False, fixed, 0.0, -inf, inf, f"fixed({value:g})"
+
+
+def _bounds_text(lower: float | None, upper: float | None) -> str:
+    if lower is None and upper is None:
+        return ""
+    low = "-inf" if lower is None else f"{lower:g}"
+    high = "inf" if upper is None else f"{upper:g}"
+    return f" on [{low}, {high}]"

@@ -1,0 +1,200 @@
+"""Priors of many parameters, evaluated for many parameter vectors at once.
+
+Every distribution on offer is a (truncated) normal or a uniform, on the parameter or on its
+logarithm. That is enough for physical priors, and it lets one array expression evaluate all
+parameters. Sampling happens in *internal* coordinates: the logarithm for log-normal parameters,
+the parameter itself otherwise. `calib.inference.prior_files` reads them from TOML.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, ndtr, ndtri
+
+from calib.errors import CalibError
+from calib.models.base import Array
+
+__all__ = ["Prior", "Priors"]
+
+type Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """One parameter's prior in internal coordinates.
+
+    Parameters
+    ----------
+    name, unit, reason, source, text : str
+        What it is, why, after whom, and the distribution in words.
+    log : bool
+        Whether the internal coordinate is the logarithm.
+    loc, scale : float
+        Of the normal; an infinite scale makes it uniform between the bounds, zero fixes it.
+    lower, upper : float
+        Bounds of the internal coordinate.
+    """
+
+    name: str
+    unit: str
+    reason: str
+    source: str
+    text: str
+    log: bool
+    loc: float
+    scale: float
+    lower: float = -np.inf
+    upper: float = np.inf
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the parameter is not sampled."""
+        return self.scale == 0.0
+
+
+@dataclass(frozen=True)
+class Priors:
+    """The joint prior of a problem, evaluated on the free parameters.
+
+    Parameters
+    ----------
+    entries : tuple of Prior
+        In the order of the model's parameters, the noise scale ``sigma`` last.
+    text : str
+        The TOML it was read from.
+    source : str
+        The file's name.
+    """
+
+    entries: tuple[Prior, ...]
+    text: str = ""
+    source: str = ""
+    free: tuple[Prior, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "free", tuple(p for p in self.entries if not p.fixed))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters."""
+        return tuple(p.name for p in self.free)
+
+    @cached_property
+    def _arrays(self) -> tuple[Array, ...]:
+        loc, scale, lower, upper = (
+            np.array([getattr(p, a) for p in self.free]) for a in ("loc", "scale", "lower", "upper")
+        )
+        normal = np.isfinite(scale)
+        precision = np.where(normal, 1.0 / scale, 0.0)
+        return loc, scale, lower, upper, precision
+
+    @cached_property
+    def _log_normaliser(self) -> float:
+        loc, scale, lower, upper, precision = self._arrays
+        normal = precision > 0.0
+        a, b = (lower - loc) * precision, (upper - loc) * precision
+        # The mass between the bounds, in the tail where it is accurate.
+        swap = a > 0.0
+        a, b = np.where(swap, -b, a), np.where(swap, -a, b)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            mass = log_ndtr(b) + np.log1p(-np.exp(log_ndtr(a) - log_ndtr(b)))
+            normals = -np.log(scale) - 0.5 * np.log(2.0 * np.pi) - mass
+            uniforms = -np.log(upper - lower)
+        return float(np.where(normal, normals, uniforms).sum())
+
+    def log_prob(self, t: Array) -> Array:
+        """Log prior density of internal coordinates.
+
+        Parameters
+        ----------
+        t : ndarray, shape (k, d)
+
+        Returns
+        -------
+        ndarray, shape (k,)
+            ``-inf`` outside the bounds.
+        """
+        loc, _, lower, upper, precision = self._arrays
+        z = (t - loc) * precision
+        inside = ((t >= lower) & (t <= upper)).all(axis=1)
+        value = -0.5 * np.einsum("kd,kd->k", z, z) + self._log_normaliser
+        return np.where(inside, value, -np.inf)
+
+    def ppf(self, u: Array) -> Array:
+        """Map the unit cube to internal coordinates, shape (k, d) to (k, d)."""
+        loc, scale, lower, upper, precision = self._arrays
+        normal = precision > 0.0
+        a, b = (lower - loc) * precision, (upper - loc) * precision
+        # In the tail where the normal's mass is accurate, as for the normaliser.
+        swap = a > 0.0
+        a, b = np.where(swap, -b, a), np.where(swap, -a, b)
+        below, above = ndtr(a), ndtr(b)
+        z = ndtri(below + np.where(swap, 1.0 - u, u) * (above - below))
+        with np.errstate(invalid="ignore"):
+            normals = loc + scale * np.where(swap, -z, z)
+            uniforms = lower + u * (upper - lower)
+        return np.asarray(np.clip(np.where(normal, normals, uniforms), lower, upper))
+
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw internal coordinates, shape (size, d)."""
+        return self.ppf(rng.uniform(size=(size, len(self.free))))
+
+    def to_natural(self, t: Array) -> Array:
+        """Return all parameters, fixed ones included, shape (k, d) to (k, d_all)."""
+        t = np.atleast_2d(t)
+        fixed, free, logs = self._layout
+        if free is None:
+            full = t.copy()
+        else:
+            full = np.tile(fixed, (t.shape[0], 1))
+            full[:, free] = t
+        if logs is not None:
+            np.exp(np.minimum(full, 700.0), out=full, where=logs)
+        return full
+
+    @cached_property
+    def _layout(self) -> tuple[Array, Mask | None, Mask | None]:
+        """Values of the fixed parameters, which are free (None: all), which on a log scale."""
+        fixed = np.array([p.loc for p in self.entries])
+        free = np.array([not p.fixed for p in self.entries])
+        logs = np.array([p.log and not p.fixed for p in self.entries])
+        return fixed, None if free.all() else free, logs if logs.any() else None
+
+    def to_internal(self, natural: Array, margin: float = 1e-9) -> Array:
+        """Map all natural parameters, shape (k, d_all), inside the bounds, shape (k, d)."""
+        natural = np.atleast_2d(natural)
+        picked = []
+        for i, prior in enumerate(self.entries):
+            if not prior.fixed:
+                x = natural[:, i]
+                t = np.log(np.maximum(x, 1e-300)) if prior.log else x
+                picked.append(np.clip(t, prior.lower + margin, prior.upper - margin))
+        return np.stack(picked, axis=1)
+
+    def fix(self, values: Mapping[str, float]) -> Priors:
+        """Return the same priors with some natural parameters held at values."""
+        unknown = set(values) - {p.name for p in self.entries}
+        if unknown:
+            raise CalibError(
+                f"cannot fix {', '.join(sorted(unknown))}",
+                where=self.source,
+                allowed=", ".join(p.name for p in self.entries),
+            )
+        return Priors(
+            tuple(
+                Prior(
+                    p.name, p.unit, "held fixed for this fit", "this call", f"fixed at "
+                    f"{values[p.name]:g}", False, float(values[p.name]), 0.0,
+                )
+                if p.name in values
+                else p
+                for p in self.entries
+            ),
+            self.text,
+            self.source,
+        )  # fmt: skip

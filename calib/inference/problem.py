@@ -1,0 +1,202 @@
+"""A problem: data, model, priors and likelihood as one log density over parameter vectors.
+
+The likelihood: rows are independent, and on the scale of the model's response (the output itself,
+or its logarithm for rut depth) each is normal about the prediction with one unknown standard
+deviation sigma,
+
+    ln L = -n ln sigma - SSE(theta)/(2 sigma^2) - (n/2) ln 2 pi  [- sum ln y for a log response],
+
+the bracket making it a density of the output itself, so that models can be compared.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from calib.data import Table, check_enough, check_varies
+from calib.errors import CalibError
+from calib.inference.likelihood import Squares
+from calib.inference.prior_files import default_prior_path, read_priors
+from calib.inference.priors import Priors
+from calib.models import Array, BoundModel, get_model
+
+__all__ = ["Problem", "build_problem"]
+
+_HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Calibration data, a bound model and priors.
+
+    Parameters
+    ----------
+    bound : BoundModel
+        The model at its reference conditions.
+    table : Table
+        The calibration data.
+    priors : Priors
+        Of the model's parameters and the noise scale ``sigma``, in this order.
+    notes : tuple of str
+        What a reader must know about how the problem was set up.
+    """
+
+    bound: BoundModel
+    table: Table
+    priors: Priors
+    notes: tuple[str, ...] = ()
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the free parameters, the internal coordinates' order."""
+        return self.priors.names
+
+    @property
+    def n_dim(self) -> int:
+        """Number of free parameters."""
+        return len(self.names)
+
+    @cached_property
+    def conditions(self) -> dict[str, Array]:
+        """The model's conditions, each of shape (n,)."""
+        return self.bound.model.select(self.table.columns)
+
+    @cached_property
+    def observed(self) -> Array:
+        """The measured output, shape (n,)."""
+        return self.table[self.bound.model.output]
+
+    @cached_property
+    def response(self) -> Array:
+        """The measured output on the scale of the response, shape (n,)."""
+        return self.bound.to_response(self.observed)
+
+    @cached_property
+    def _ln_jacobian(self) -> Array:
+        log = self.bound.model.response == "log"
+        return -self.response if log else np.zeros_like(self.response)
+
+    @cached_property
+    def _sum_ln_jacobian(self) -> float:
+        return float(self._ln_jacobian.sum())
+
+    @cached_property
+    def squares(self) -> Squares:
+        """Sums of squared residuals, on the scale of the response, of natural parameters."""
+        return Squares.of(self.bound, self.conditions, self.response)
+
+    def theta(self, t: Array) -> Array:
+        """Natural parameters, sigma last, of internal ones: (k, n_dim) to (k, d_all)."""
+        return self.priors.to_natural(t)
+
+    def residuals(self, natural: Array) -> Array:
+        """Observed minus predicted on the scale of the response, shape (k, n)."""
+        return self.response - self.bound.location(natural[:, :-1], self.conditions)
+
+    def log_likelihood(self, t: Array) -> Array:
+        """Log likelihood of internal coordinates, shape (k,); ``-inf`` where undefined."""
+        natural = self.theta(t)
+        n, sigma = self.response.size, natural[:, -1]
+        # A prior may admit sigma <= 0 or predictions beyond all bounds: they become -inf below.
+        with np.errstate(all="ignore"):
+            sse = self.squares(natural[:, :-1])
+            value = -n * (np.log(sigma) + _HALF_LN_2PI) - 0.5 * sse / sigma**2
+        value += self._sum_ln_jacobian
+        return np.where(np.isfinite(value), value, -np.inf)
+
+    def log_likelihood_rows(self, t: Array) -> Array:
+        """Log likelihood of every row, shape (k, n)."""
+        natural = self.theta(t)
+        sigma = natural[:, -1:]
+        z = self.residuals(natural) / sigma
+        return np.asarray(-0.5 * z * z - np.log(sigma) - _HALF_LN_2PI + self._ln_jacobian)
+
+    def log_prob(self, t: Array) -> Array:
+        """Log posterior density (unnormalised) of internal coordinates, shape (k,)."""
+        t = np.atleast_2d(t)
+        value = self.priors.log_prob(t)
+        inside = np.isfinite(value)
+        if inside.all():
+            return np.asarray(value + self.log_likelihood(t))
+        if inside.any():
+            value[inside] += self.log_likelihood(t[inside])
+        return value
+
+    def with_table(self, table: Table) -> Problem:
+        """Return the same problem, reference conditions included, with other rows."""
+        return Problem(self.bound, table, self.priors, self.notes)
+
+    def with_fixed(self, values: Mapping[str, float]) -> Problem:
+        """Return the problem with some natural parameters held fixed."""
+        return replace(self, priors=self.priors.fix(values))
+
+
+def build_problem(
+    model_name: str,
+    table: Table,
+    prior_path: Path | None = None,
+    *,
+    fixed: Mapping[str, float] | None = None,
+) -> Problem:
+    """Bind a model to data and read its priors.
+
+    Parameters
+    ----------
+    model_name : str
+        One of `calib.models.MODELS`.
+    table : Table
+        Calibration data with the model's conditions and its output.
+    prior_path : Path, optional
+        Prior file; the shipped one by default.
+    fixed : mapping of str to float, optional
+        Natural parameters to hold at a value.
+
+    Raises
+    ------
+    CalibError
+        If a column is missing, too few rows are there, the output is constant, or the priors do
+        not fit the model.
+    """
+    model = get_model(model_name)
+    model.select(table.columns)
+    if model.output not in table:
+        model_columns = (*model.conditions, model.output)
+        raise CalibError(
+            f"model {model.name} needs the measured output {model.output}",
+            where=table.source,
+            allowed=f"columns {', '.join(model_columns)} (in any known unit)",
+            mend=f"add the column, or see `calib template {model.name}` for an example",
+        )
+    check_enough(table, len(model.parameters), model=model.name)
+    check_varies(table, model.output)
+    loads = {}
+    if "normal_load_kn" in table:
+        loads["normal_load_kn"] = float(np.median(table["normal_load_kn"]))
+    priors = read_priors(
+        prior_path or default_prior_path(model.name),
+        model.name,
+        (*model.parameters, "sigma"),
+        loads,
+    )
+    try:
+        bound = model.bind(table.columns)
+    except CalibError as error:
+        raise CalibError(
+            error.message,
+            where=", ".join(filter(None, (table.source, error.where))),
+            allowed=error.allowed,
+            mend=error.mend,
+        ) from None
+    notes: tuple[str, ...] = ()
+    if not loads and 'relative_to = "normal_load_kn"' in priors.text:
+        notes = (
+            "the data have no normal_load column, so the priors of forces assume 5 kN; give the "
+            "load of your wheel if it differs",
+        )
+    problem = Problem(bound, table, priors, notes)
+    return problem.with_fixed(fixed) if fixed else problem

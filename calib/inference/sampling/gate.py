@@ -1,0 +1,94 @@
+"""The convergence gate that every posterior passes before it is shown as one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from calib.inference.diagnostics import convergence
+from calib.models.base import Array
+
+__all__ = ["Gate", "GateReport", "judge"]
+
+
+@dataclass(frozen=True)
+class Gate:
+    """What a set of ensembles must reach, for every parameter.
+
+    Parameters
+    ----------
+    rhat_max : float
+        Largest rank-normalised split R-hat between ensembles.
+    ess_min : float
+        Smallest bulk and tail effective sample size.
+    taus_min : float
+        Shortest chain in integrated autocorrelation times.
+
+    References
+    ----------
+    Vehtari et al. (2021), doi:10.1214/20-BA1221.
+    """
+
+    rhat_max: float = 1.01
+    ess_min: float = 400.0
+    taus_min: float = 50.0
+
+
+@dataclass(frozen=True)
+class GateReport:
+    """Convergence figures of each parameter, arrays of shape (d,), and the verdict."""
+
+    names: tuple[str, ...]
+    rhat: Array
+    ess_bulk: Array
+    ess_tail: Array
+    tau: Array
+    steps: int
+    passed: bool
+    reasons: tuple[str, ...]
+
+
+def judge(
+    draws: Array,
+    names: tuple[str, ...],
+    gate: Gate,
+    *,
+    tau: Array,
+    steps: int | None = None,
+    min_ensembles: int = 4,
+) -> GateReport:
+    """Judge draws of independently seeded ensembles.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (ensembles, walkers, steps, d)
+    names : tuple of str, length d
+    gate : Gate
+    tau : ndarray, shape (d,)
+        Integrated autocorrelation time in steps, the worst of the ensembles.
+    steps : int, optional
+        Length of the chain that was run; that of `draws` if it is not thinned.
+    min_ensembles : int
+        Fewer cannot be compared.
+
+    See Also
+    --------
+    calib.inference.diagnostics.convergence : How R-hat and effective sample sizes are taken.
+    """
+    ensembles = draws.shape[0]
+    steps = draws.shape[2] if steps is None else steps
+    found = convergence(draws)
+    r, bulk, tail = found.rhat, found.ess_bulk, found.ess_tail
+    reasons = []
+    if ensembles < min_ensembles:
+        reasons.append(f"{ensembles} ensembles, at least {min_ensembles} are needed")
+    # Written so that NaN fails.
+    for label, value, good, limit in (
+        ("R-hat", r, r <= gate.rhat_max, f"at most {gate.rhat_max}"),
+        ("bulk ESS", bulk, bulk >= gate.ess_min, f"at least {gate.ess_min:.0f}"),
+        ("tail ESS", tail, tail >= gate.ess_min, f"at least {gate.ess_min:.0f}"),
+        ("steps/tau", steps / tau, steps / tau >= gate.taus_min, f"at least {gate.taus_min:.0f}"),
+    ):
+        for name, v, ok in zip(names, value, good, strict=True):
+            if not ok:
+                reasons.append(f"{label} of {name} is {v:.4g}, {limit} is needed")
+    return GateReport(names, r, bulk, tail, tau, steps, not reasons, tuple(reasons))

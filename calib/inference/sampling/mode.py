@@ -1,0 +1,177 @@
+"""Find the modes of a posterior from point estimates and prior draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import minimize
+
+from calib.inference.priors import Priors
+from calib.inference.sampling.climb import climb
+from calib.inference.sampling.curvature import hessian_scale
+from calib.models.base import Array
+
+__all__ = ["Mode", "find_mode", "find_modes", "prior_widths"]
+
+_WORST = 1e12
+_MOST_POLISHED = 6
+# Modes so many nats below the highest hold no mass worth finding; squared standard distances up to
+# this are no distance.
+_NEGLIGIBLE, _NEAR = 15.0, 25.0
+
+
+def prior_widths(priors: Priors) -> Array:
+    """Prior standard deviation (uniform: a quarter of the range) of each free parameter, (d,)."""
+    return np.array(
+        [p.scale if np.isfinite(p.scale) else 0.25 * (p.upper - p.lower) for p in priors.free]
+    )
+
+
+def find_mode(
+    log_prob: Callable[[Array], Array],
+    priors: Priors,
+    rng: np.random.Generator,
+    *,
+    starts: Array | None = None,
+    n_screen: int = 400,
+    n_climb: int = 16,
+) -> Array:
+    """Return the highest mode of a posterior in internal coordinates, shape (d,).
+
+    Parameters
+    ----------
+    log_prob, priors, rng, starts, n_screen, n_climb
+        As for `find_modes`.
+    """
+    modes = find_modes(log_prob, priors, rng, starts=starts, n_screen=n_screen, n_climb=n_climb)
+    return modes[0].t
+
+
+@dataclass(frozen=True)
+class Mode:
+    """A mode of a posterior.
+
+    Parameters
+    ----------
+    t : ndarray, shape (d,)
+    log_prob : float
+    covariance : ndarray, shape (d, d)
+        Of the normal with the curvature there.
+    """
+
+    t: Array
+    log_prob: float
+    covariance: Array
+
+    def explains(self, t: Array, log_prob: float) -> bool:
+        """Whether a point may well belong here: no farther off than its density lets expect.
+
+        For a normal density the squared distance would be twice what the log density lacks.
+        """
+        apart = t - self.t
+        squared = float(apart @ np.linalg.solve(self.covariance, apart))
+        return squared < 4.0 * max(self.log_prob - log_prob, 0.0) + _NEAR
+
+
+def find_modes(
+    log_prob: Callable[[Array], Array],
+    priors: Priors,
+    rng: np.random.Generator,
+    *,
+    starts: Array | None = None,
+    n_screen: int = 400,
+    n_climb: int = 16,
+) -> list[Mode]:
+    """Return the modes of a posterior that were found, the highest first.
+
+    The given starts and the best of each group of prior draws climb together, a batch of
+    quasi-Newton ascents. The highest is polished by L-BFGS-B, with gradients by central
+    differences; so is each of the others that neither lies in its neighbourhood nor far below it.
+    A sampler that knows one mode only may miss another whatever its own diagnostics say.
+
+    Parameters
+    ----------
+    log_prob : callable
+        ``(k, d) -> (k,)``.
+    priors : Priors
+    rng : Generator
+    starts : ndarray, shape (m, d), optional
+        Point estimates, in internal coordinates.
+    n_screen, n_climb : int
+        Prior draws screened (if zero, only the given starts climb), and how many of them climb.
+    """
+    width = prior_widths(priors)
+    ends, values = climb(
+        log_prob, _starts(log_prob, priors, rng, starts, n_screen, n_climb), width, *_bounds(priors)
+    )
+    modes: list[Mode] = []
+    polished = 0
+    for i in np.argsort(-values):
+        t, value = ends[i], float(values[i])
+        if polished == _MOST_POLISHED or (
+            modes
+            and (
+                modes[0].log_prob - value > _NEGLIGIBLE or any(m.explains(t, value) for m in modes)
+            )
+        ):
+            continue
+        top, end = _polish(log_prob, t, priors)
+        polished += 1
+        if top <= -_WORST:
+            # Nowhere is the density positive: the caller will see.
+            modes.append(Mode(end, -np.inf, np.diag(width**2)))
+        elif not any(m.explains(end, top) for m in modes):
+            modes.append(Mode(end, top, hessian_scale(log_prob, end, width)))
+    return sorted(modes, key=lambda mode: -mode.log_prob)
+
+
+def _starts(
+    log_prob: Callable[[Array], Array],
+    priors: Priors,
+    rng: np.random.Generator,
+    starts: Array | None,
+    n_screen: int,
+    n_climb: int,
+) -> Array:
+    if starts is not None and n_screen == 0:
+        return np.atleast_2d(starts)
+    pool = priors.sample(rng, n_screen)
+    value = log_prob(pool)
+    # The best of each group rather than the best of all, which may share one basin.
+    groups = np.array_split(np.arange(n_screen), n_climb)
+    picked = pool[[group[value[group].argmax()] for group in groups]]
+    return picked if starts is None else np.concatenate([np.atleast_2d(starts), picked])
+
+
+def _bounds(priors: Priors) -> tuple[Array, Array]:
+    return np.array([p.lower for p in priors.free]), np.array([p.upper for p in priors.free])
+
+
+def _polish(
+    log_prob: Callable[[Array], Array], start: Array, priors: Priors
+) -> tuple[float, Array]:
+    d, width = start.size, prior_widths(priors)
+    step = 1e-5
+    directions = np.concatenate([np.zeros((1, d)), step * np.eye(d), -step * np.eye(d)])
+    low, high = ((bound - start) / width for bound in _bounds(priors))
+
+    def negative(z: Array) -> tuple[float, Array]:
+        # One-sided at a bound: the outer point is pulled back onto it.
+        points = np.clip(z + directions, low, high)
+        value = -log_prob(start + points * width)
+        value = np.where(np.isfinite(value), value, _WORST)
+        span = np.diagonal(points[1 : d + 1]) - np.diagonal(points[d + 1 :])
+        gradient = (value[1 : d + 1] - value[d + 1 :]) / np.maximum(span, 1e-12)
+        return float(value[0]), gradient
+
+    found = minimize(
+        negative,
+        np.zeros(d),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
+        options={"maxiter": 300},
+    )
+    return -float(found.fun), start + np.clip(found.x, low, high) * width

@@ -1,0 +1,1 @@
+"""The workflow of a report, its figures, page, tables and numbers."""

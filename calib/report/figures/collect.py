@@ -1,0 +1,55 @@
+"""All figures of one output, in reading order; one that cannot be drawn does not stop the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from calib.report.figures.bands import bands_plate
+from calib.report.figures.corner import corner_plate
+from calib.report.figures.density import density_plate
+from calib.report.figures.ensembles import ensembles_plate
+from calib.report.figures.estimates import by_pressure_plate, estimates_plate
+from calib.report.figures.learned import learned_plate
+from calib.report.figures.plate import Plate, draw_all
+from calib.report.figures.prior_predictive import prior_predictive_plate
+from calib.report.figures.residuals import residuals_plate
+from calib.report.figures.validation import validation_plate
+from calib.report.study import OutputResult
+
+__all__ = ["plates"]
+
+type _Draw = Callable[[], Plate | None]
+
+
+def plates(result: OutputResult, published: bool = False) -> list[Plate]:
+    """Draw the figures of an output.
+
+    Parameters
+    ----------
+    result : OutputResult
+    published : bool
+        Whether the data are the embedded ones, so that the published figures belong beside them.
+
+    Returns
+    -------
+    list of Plate
+        In reading order. A figure that failed has ``figure=None`` and a caption saying why.
+    """
+    model = result.calibration.problem.bound.model
+    density = model.output == "bulk_density_g_cm3"
+    drawings: dict[str, _Draw] = {
+        "bands": (
+            (lambda: density_plate(result))
+            if density
+            else (lambda: bands_plate(result, published=published))
+        ),
+        "validation": lambda: validation_plate(result, published=published),
+        "prior_predictive": lambda: prior_predictive_plate(result),
+        "learned": lambda: learned_plate(result, published=published),
+        "corner": lambda: corner_plate(result, published=published),
+        "ensembles": lambda: ensembles_plate(result),
+        "residuals": lambda: residuals_plate(result),
+        "estimates": lambda: estimates_plate(result, published=published),
+        "by_pressure": lambda: by_pressure_plate(result, published=published),
+    }
+    return draw_all(drawings)

@@ -1,0 +1,273 @@
+"""Point estimates of every method beside the posterior and the published figures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.figures.reference import published_parameters, published_source
+from calib.inference.diagnostics import hdi
+from calib.inference.estimators import PointEstimate
+from calib.models.base import Array
+from calib.models.magic_formula_pressure import coefficients_at
+from calib.report.figures.labels import NO_UNIT, joined, parameter_label, plain, short, symbol
+from calib.report.figures.plate import Plate
+from calib.report.figures.style import (
+    BLACK,
+    CYCLE,
+    GREY,
+    MARKERS,
+    MIDDLE_MM,
+    ORANGE,
+    SMALLEST_PT,
+    SYMBOL_PT,
+    legend_below,
+    panels,
+)
+from calib.report.study import OutputResult
+
+__all__ = ["METHOD_NAMES", "by_pressure_plate", "distances", "estimates_plate"]
+
+METHOD_NAMES: Mapping[str, str] = {
+    "geometric": "geometric (Eqs 6-9)",
+    "genetic": "genetic algorithm",
+    "differential_evolution": "differential evolution",
+    "least_squares": "least squares",
+    "published_regression": "regression as published (Eq 22)",
+}
+_LOOKS = {name: (MARKERS[i], CYCLE[i]) for i, name in enumerate(METHOD_NAMES)}
+# Estimates farther off than this many posterior sds are drawn at the edge.
+_EDGE = 5.0
+_WIDE = 4.0
+# Calibrated pressures that a legend lists one by one, at most.
+_LISTED = 5
+
+
+def distances(draws: Array, values: Array) -> tuple[Array, Array, bool]:
+    """Express values as distances from the posterior mean in posterior sds.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (m,)
+        Of the posterior.
+    values : ndarray, shape (k,)
+
+    Returns
+    -------
+    distance : ndarray, shape (k,)
+        NaN where a logarithm does not exist.
+    interval : ndarray, shape (2,)
+        The 95 % HDI of the posterior, in the same unit.
+    log : bool
+        Whether logarithms were taken, as they are of positive parameters that span decades.
+    """
+    low, high = hdi(np.asarray(draws), 0.95)
+    log = bool(low > 0.0 and high > _WIDE * low)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        to = np.log if log else np.asarray
+        t, x = to(draws[draws > 0.0] if log else draws), to(np.asarray(values, dtype=float))
+    mean, sd = t.mean(), t.std()
+    return (x - mean) / sd, (to(np.array([low, high])) - mean) / sd, log
+
+
+def estimates_plate(result: OutputResult, *, published: bool) -> Plate:
+    """Draw every method's estimate of every published parameter, in posterior sds.
+
+    Parameters
+    ----------
+    result : OutputResult
+    published : bool
+        Whether to add the published figures.
+    """
+    calibration = result.calibration
+    reported = {k: v for k, v in calibration.reported.items() if np.ptp(v) > 0.0}
+    model = calibration.problem.bound.model
+    printed = published_parameters(model.name) if published else {}
+    fig, axes = panels(
+        1,
+        1,
+        height=max(34.0, 8.0 * len(reported)),
+        width=MIDDLE_MM,
+        left=18.0,
+        bottom=22.0,
+        top=3.0,
+    )
+    ax: Axes = axes[0, 0]
+    handles: dict[str, Any] = {}
+    names, reach = [], 2.5
+    for i, (name, draws) in enumerate(reported.items()):
+        values = [e.reported[name] for e in result.estimates]
+        values.append(printed[name].value if name in printed else np.nan)
+        distance, interval, log = distances(draws.ravel(), np.array(values))
+        reach = max(reach, *np.abs(interval), np.nanmax(np.abs(distance), initial=0.0))
+        (handles["posterior, 95 % HDI"],) = ax.plot(
+            interval, [i, i], color="#c4c4c4", lw=4.0, solid_capstyle="butt"
+        )
+        (handles["posterior mean"],) = ax.plot(0.0, i, "|", color=BLACK, ms=9.0, mew=1.3, zorder=3)
+        handles |= _row(ax, i, distance, result.estimates, published_source(model.name))
+        names.append(f"ln {symbol(name)}" if log else symbol(name))
+    reach = 1.08 * min(_EDGE, reach)
+    ax.set_xlim(-reach, reach)
+    ax.set_yticks(range(len(names)), names, fontsize=SYMBOL_PT)
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    ax.axvline(0.0, color=GREY, lw=0.5, zorder=0)
+    ax.set_xlabel("Distance from the posterior mean (posterior sds)")
+    ax.set_ylabel(f"Parameter ({NO_UNIT})")
+    legend_below(fig, list(handles.values()), list(handles), 3)
+    return Plate(fig, "estimates", _caption(result, reported, published), "Point estimates")
+
+
+def _row(
+    ax: Axes, i: int, distance: Array, estimates: tuple[PointEstimate, ...], source: str
+) -> dict[str, Any]:
+    handles: dict[str, Any] = {}
+    spread = np.linspace(-0.33, 0.33, max(2, len(estimates)))
+    for k, (estimate, d) in enumerate(zip(estimates, distance[:-1], strict=True)):
+        if np.isfinite(d):
+            name = METHOD_NAMES.get(estimate.method, estimate.method)
+            marker, colour = _LOOKS.get(estimate.method, ("P", GREY))
+            handles[name] = _dot(ax, float(d), i + float(spread[k]), marker, colour)
+    if np.isfinite(distance[-1]):
+        handles[f"published ({source})"] = _dot(ax, float(distance[-1]), i, "D", ORANGE, ring=True)
+    return handles
+
+
+def _dot(ax: Axes, d: float, y: float, marker: str, colour: str, *, ring: bool = False) -> Any:
+    """A dot; at the edge, with its distance written, where it is far off."""
+    x = float(np.clip(d, -_EDGE, _EDGE))
+    face = "none" if ring else colour
+    edge, width, size = (colour, 1.3, 7.0) if ring else ("white", 0.4, 4.6)
+    (dot,) = ax.plot(x, y, marker, mfc=face, mec=edge, mew=width, ms=size, zorder=4 + ring)
+    if abs(d) > _EDGE:
+        ax.annotate(
+            f"{short(d)} ►" if d > 0 else f"◄ {short(d)}", (x, y),
+            (-6.0 if d > 0 else 6.0, 0.0), textcoords="offset points", fontsize=SMALLEST_PT,
+            va="center", ha="right" if d > 0 else "left",
+        )  # fmt: skip
+    return dot
+
+
+def _caption(result: OutputResult, reported: Mapping[str, Array], published: bool) -> str:
+    lowest = min((e.cost for e in result.estimates), default=0.0)
+    # Of costs that are equal but for their rounding, that of the most exact method: it comes last.
+    best = next((e for e in reversed(result.estimates) if e.cost <= lowest * (1.0 + 1e-9)), None)
+    if best is None:
+        return "No method gave an estimate."
+    names = list(reported)
+    off = {
+        n: float(distances(reported[n].ravel(), np.array([best.reported[n]]))[0][0]) for n in names
+    }
+    far = max(names, key=lambda n: abs(off[n]))
+    distance = abs(off[far])
+    how = f"within {short(distance)}" if distance < 100.0 else "up to more than 100"
+    text = (
+        f"The lowest cost, {short(best.cost, 3)}, was found by "
+        f"{METHOD_NAMES.get(best.method, best.method)}; its estimates lie "
+        f"{how} posterior sds of the posterior mean ({plain(far)} is farthest)."
+    )
+    printed = published_parameters(result.calibration.problem.bound.model.name)
+    if published and printed:
+        outside = [
+            plain(n) for n in names if n in printed and _outside(result, n, printed[n].value)
+        ]
+        source = published_source(result.calibration.problem.bound.model.name)
+        text += (
+            f" Of the published figures ({source}), {joined(outside)} "
+            f"{'lies' if len(outside) == 1 else 'lie'} outside the posterior's 95 % HDI."
+            if outside
+            else f" All published figures ({source}) lie inside the posterior's 95 % HDI."
+        )
+    return text
+
+
+def _outside(result: OutputResult, name: str, value: float) -> bool:
+    s = result.calibration.summary[name]
+    return not s.hdi_lower <= value <= s.hdi_upper
+
+
+def by_pressure_plate(result: OutputResult, *, published: bool) -> Plate | None:
+    """Draw B, C, D and E of each pressure by method; None where pressures were not fitted alone.
+
+    Parameters
+    ----------
+    result : OutputResult
+    published : bool
+        Whether to ring Tables 3 and 4.
+    """
+    pressures = list(result.by_pressure)
+    if not pressures:
+        return None
+    calibration = result.calibration
+    joint = coefficients_at(
+        calibration.problem.theta(calibration.subset(1000))[:, :-1], np.array(pressures),
+        calibration.problem.bound.references,
+    )  # fmt: skip
+    fig, axes = panels(1, 4, height=46.0, left=14.0, bottom=24.0, gap_x=15.0, top=4.0)
+    handles: dict[str, Any] = {}
+    units = {"B": "1/%", "C": "1", "D": "kN", "E": "1"}
+    for ax, name in zip(axes[0], "BCDE", strict=True):
+        handles |= _coefficient(ax, result, name, joint[name], published)
+        ax.set_xticks(range(len(pressures)), [f"{p:g}" for p in pressures])
+        ax.tick_params(axis="x", labelsize=SMALLEST_PT)
+        ax.set_xlim(-0.65, len(pressures) - 0.35)
+        ax.set_xlabel("Pressure (psi)")
+        ax.set_ylabel(parameter_label(name, units[name]))
+    legend_below(fig, list(handles.values()), list(handles), 3)
+    return Plate(
+        fig, "by_pressure", _pressure_caption(result, published), "Each pressure on its own"
+    )
+
+
+def _coefficient(
+    ax: Axes, result: OutputResult, name: str, joint: Array, published: bool
+) -> dict[str, Any]:
+    handles: dict[str, Any] = {}
+    low, middle, high = np.nanquantile(joint, [0.05, 0.5, 0.95], axis=0)
+    fitted = np.unique(result.calibration.problem.table["inflation_pressure_psi"])
+    jointly = f"{joined([f'{p:g}' for p in fitted])} psi"
+    if set(result.by_pressure) <= set(fitted.tolist()):
+        jointly = "all pressures"
+    elif fitted.size > _LISTED:
+        jointly = f"{fitted.size} pressures"
+    for i, (psi, estimates) in enumerate(result.by_pressure.items()):
+        handles[f"{jointly} calibrated jointly, 90 %"] = ax.errorbar(
+            i - 0.4, middle[i], yerr=[[middle[i] - low[i]], [high[i] - middle[i]]], fmt="_",
+            color=BLACK, ms=6.0, elinewidth=1.0,
+        )  # fmt: skip
+        for k, e in enumerate(estimates):
+            marker, colour = _LOOKS.get(e.method, ("P", GREY))
+            (handles[METHOD_NAMES.get(e.method, e.method)],) = ax.plot(
+                i - 0.2 + 0.2 * k, e.reported[name], marker, color=colour, ms=4.6,
+                mec="white", mew=0.4,
+            )  # fmt: skip
+        for table, at, shape in ((PUBLISHED.geometric, -0.2, "o"), (PUBLISHED.genetic, 0.0, "s")):
+            if published and psi in table:
+                label = f"published ({table[round(psi)].source.partition(',')[0]})"
+                (handles[label],) = ax.plot(
+                    i + at, table[round(psi)].values[name], shape, mfc="none", mec=ORANGE,
+                    mew=1.2, ms=8.0,
+                )  # fmt: skip
+    spread = [e.reported[name] for group in result.by_pressure.values() for e in group]
+    pad = 0.25 * max(float(np.ptp(spread)), 1e-9)
+    everything = np.concatenate([low, high, spread])
+    bottom, top = (
+        max(everything.min(), min(spread) - 4 * pad),
+        min(everything.max(), max(spread) + 4 * pad),
+    )
+    ax.set_ylim(bottom - 0.4 * pad, top + 0.4 * pad)
+    return handles
+
+
+def _pressure_caption(result: OutputResult, published: bool) -> str:
+    parts = []
+    for psi, estimates in result.by_pressure.items():
+        best = min(estimates, key=lambda e: e.cost)
+        cost = f"{psi:g} psi {short(best.cost, 3)} kN²"
+        if published and psi in PUBLISHED.genetic:
+            cost += f" (Table 4: {PUBLISHED.genetic[round(psi)].quality['cost'].text})"
+        parts.append(cost)
+    return f"Lowest cost of a pressure fitted alone: {'; '.join(parts)}."

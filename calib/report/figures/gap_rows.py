@@ -1,0 +1,208 @@
+"""What the pictures of a diagnosis share: field rows with their gaps, groups, names in words."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from matplotlib.colors import LinearSegmentedColormap
+from numpy.typing import NDArray
+
+from calib.data.outputs import OUTPUTS
+from calib.gap.diagnose import Diagnosis
+from calib.gap.effects import EFFECTS
+from calib.gap.fit import Fit
+from calib.gap.where import Region
+from calib.models.base import Array
+from calib.report.figures.labels import MINUS, Axis, axis_of
+
+__all__ = [
+    "EVERYWHERE", "PROBABLE", "OutputRows", "axis_name", "best_fit", "best_of", "output_axis",
+    "output_rows", "output_word", "panel_groups", "region_text", "short_name", "title_of",
+    "unit_after",
+]  # fmt: skip
+
+# The words for a region that covers all rows.
+EVERYWHERE = "all conditions"
+# White to dark: how probable it is that a gap exceeds the noise. It survives greyscale.
+PROBABLE = LinearSegmentedColormap.from_list("probable", ["#ffffff", "#f6c9a5", "#D55E00"])
+
+_WORDS = {
+    "none": "no gap beyond the noise",
+    "unknown": "a real gap that nothing listed explains",
+    "parameter_shift": "the same model with other parameter values",
+}
+_SHORT = {"none": "none (noise)", "unknown": "unknown effect", "parameter_shift": "parameter shift"}
+_AXES = {
+    "speed_m_s": Axis("Speed", "m/s"),
+    "normal_load_kn": Axis("Normal load", "kN"),
+    "pass_number": Axis("Pass", "number"),
+    "run_order": Axis("Run order", "number"),
+}
+_MOST_PANELS = 4
+# Pulls below this (kN) are those of a single small wheel, written in newtons.
+_SMALL_PULL = 0.1
+
+
+def short_name(name: str) -> str:
+    """Return a hypothesis's name in words."""
+    if name in _SHORT:
+        return _SHORT[name]
+    return " + ".join(part.replace("_", " ") for part in name.split("+"))
+
+
+def title_of(found: Diagnosis, name: str) -> str:
+    """Say what a hypothesis claims, in plain words."""
+    if name in _WORDS:
+        return _WORDS[name]
+    titles = {e.name: e.title for e in EFFECTS.values()}
+    for fit in found.ranking.fits.get(name, ()):
+        titles |= {e.name: e.title for e in fit.forward.hypothesis.effects}
+    return ", and ".join(titles.get(part) or part.replace("_", " ") for part in name.split("+"))
+
+
+def axis_name(column: str) -> Axis:
+    """Return how a condition of a field campaign is drawn."""
+    return _AXES.get(column) or axis_of(column)
+
+
+def unit_after(axis: Axis) -> str:
+    """Return a unit to be put after a number; nothing for counts."""
+    return "" if axis.unit == "number" else f" {axis.unit}"
+
+
+def region_text(found: Diagnosis, region: Region) -> str:
+    """Say over which stretch of which condition a region lies, or that it is everywhere."""
+    column, ends = next(iter(region.conditions.items()))
+    rows = next(o.rows for o in found.data.outputs if o.name == region.output)
+    values = found.data.view.conditions[column][rows]
+    if ends[0] <= values.min() and ends[1] >= values.max():
+        return EVERYWHERE
+    axis = axis_name(column)
+    low, high = (_stretch_end(column, axis.scale(np.array(v)).item()) for v in ends)
+    span = low if low == high else f"{low} to {high}"
+    return f"{axis.name.lower()} {span}{unit_after(axis)}"
+
+
+def _stretch_end(column: str, value: float) -> str:
+    text = f"{value:.0f}" if column in ("slip_ratio", "run_order") else f"{value:.3g}"
+    if abs(value) < 10.0 and column not in ("slip_ratio", "run_order"):
+        text = f"{value:.2g}"
+    return text.replace("-", MINUS)
+
+
+def output_word(output: str) -> str:
+    """Return an output's name in a sentence."""
+    return output.replace("_", " ")
+
+
+def best_fit(found: Diagnosis, name: str) -> Fit:
+    """Return the most probable variant of a hypothesis."""
+    return found.ranking.best(name)
+
+
+def best_of(found: Diagnosis) -> str:
+    """Return the most probable hypothesis."""
+    return found.ranking.order[0]
+
+
+@dataclass(frozen=True)
+class OutputRows:
+    """Field rows of one output, as they are drawn.
+
+    Parameters
+    ----------
+    name : str
+    axis : Axis
+    rows : ndarray of int, shape (n,)
+    measured, before, after : ndarray, shape (n,)
+        On the scale of the axis: the reading; the calibrated simulator; the corrected one.
+    noise : ndarray, shape (n,)
+        Sd of a reading.
+    gap, sd, probability : ndarray, shape (n,)
+        Truth minus simulator, and that it exceeds the noise.
+    """
+
+    name: str
+    axis: Axis
+    rows: NDArray[np.int64]
+    measured: Array
+    before: Array
+    after: Array
+    noise: Array
+    gap: Array
+    sd: Array
+    probability: Array
+
+
+def output_rows(found: Diagnosis) -> list[OutputRows]:
+    """Gather the field rows of every output."""
+    gathered = []
+    view, truth = found.data.view, found.truth
+    for o, gap in zip(found.data.outputs, found.gaps, strict=True):
+        theta = o.priors.to_natural(found.ranking.lab_mode[o.name][None])
+        before = o.problem.bound.predict(theta, o.problem.bound.model.select(view.conditions))[0]
+        gathered.append(
+            OutputRows(
+                o.name,
+                output_axis(found, o.name),
+                o.rows,
+                found.data.case.field[OUTPUTS[o.name]][o.rows],
+                np.asarray(before)[o.rows],
+                truth.mean(truth.truth[o.name])[o.rows],
+                truth.mean(truth.noise[o.name])[o.rows],
+                gap.gap,
+                gap.sd,
+                gap.probability,
+            )
+        )
+    return [_rescaled(own) for own in gathered]
+
+
+def output_axis(found: Diagnosis, output: str) -> Axis:
+    """Return how an output is written: drawbar pulls of a small wheel in newtons."""
+    axis = axis_of(OUTPUTS[output])
+    if (
+        axis.unit == "kN"
+        and np.nanmax(np.abs(found.data.case.field[OUTPUTS[output]])) < _SMALL_PULL
+    ):
+        return Axis(axis.name, "N", 1000.0)
+    return axis
+
+
+def _rescaled(own: OutputRows) -> OutputRows:
+    """Put the values on the scale of the axis."""
+    if own.axis.factor == 1.0:
+        return own
+    scale = own.axis.scale
+    return replace(
+        own,
+        measured=scale(own.measured),
+        before=scale(own.before),
+        after=scale(own.after),
+        noise=scale(own.noise),
+        gap=scale(own.gap),
+        sd=scale(own.sd),
+    )
+
+
+def panel_groups(
+    found: Diagnosis, rows: NDArray[np.int64]
+) -> list[tuple[str, NDArray[np.bool_]]]:  # fmt: skip
+    """Split rows by inflation pressure into a few panels: titles and masks."""
+    pressure = found.data.view.conditions.get("inflation_pressure_psi")
+    everything = np.ones(rows.size, dtype=np.bool_)
+    if pressure is None or np.ptp(pressure) == 0.0:
+        return [("", everything)]
+    distinct = np.unique(pressure)
+    if distinct.size <= _MOST_PANELS:
+        return [(f"{float(p):.3g} psi", pressure[rows] == p) for p in distinct]
+    edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
+    groups = []
+    for low, high in pairwise(edges):
+        inside = (pressure[rows] >= low) & (pressure[rows] <= high)
+        if low > edges[0]:
+            inside &= pressure[rows] > low
+        groups.append((f"{low:.3g} to {high:.3g} psi", inside))
+    return groups

@@ -1,0 +1,235 @@
+"""Where a simulator misses: the gap at every field row, over slip and over every condition."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
+
+from calib.gap.diagnose import Diagnosis
+from calib.gap.where import Region
+from calib.models.base import Array
+from calib.report.figures.gap_rows import (
+    PROBABLE,
+    OutputRows,
+    axis_name,
+    output_axis,
+    output_rows,
+    output_word,
+    panel_groups,
+    region_text,
+)
+from calib.report.figures.labels import MINUS, NO_UNIT, Axis, percent, short
+from calib.report.figures.plate import Plate
+from calib.report.figures.style import BLACK, GREY, ORANGE, VERMILION, panels
+
+__all__ = ["conditions_plate", "where_plate"]
+
+_BAND = "#e6e6e6"
+_CONDITIONS = (
+    "slip_ratio", "inflation_pressure_psi", "speed_m_s", "pass_number",
+    "gravimetric_water_content", "volumetric_water_content", "cone_index_kpa", "normal_load_kn",
+    "average_ground_pressure_kpa", "run_order",
+)  # fmt: skip
+_MOST_CONDITIONS = 6
+_NORM = Normalize(0.0, 1.0)
+# Gaps that do not reach this part of the noise are none.
+_TINY = 0.02
+
+
+def where_plate(found: Diagnosis) -> Plate:
+    """Draw the gap over slip, a panel for each inflation pressure."""
+    outputs = output_rows(found)
+    columns = max(len(panel_groups(found, o.rows)) for o in outputs)
+    fig, axes = panels(
+        len(outputs), columns, height=44.0, left=16.0, right=4.0, top=6.0, bottom=25.0, gap_x=5.0,
+        gap_y=7.0, sharex=True, sharey="row",
+    )  # fmt: skip
+    x, x_axis = _abscissa(found)
+    for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
+        limits = _limits(own)
+        for j, (ax, (title, mask)) in enumerate(
+            zip(row, panel_groups(found, own.rows), strict=True)
+        ):
+            _noise_band(ax, x[own.rows][mask], own.noise[mask])
+            for region in found.regions:
+                if region.output == own.name and "slip_ratio" in region.conditions:
+                    _span(ax, region, x_axis, found.data.view.conditions["slip_ratio"])
+                    break
+            _points(ax, x[own.rows][mask], own, mask)
+            ax.set_ylim(*limits)
+            if limits[1] > 0.01:
+                ax.ticklabel_format(axis="y", style="plain")
+            if i == 0:
+                ax.set_title(title, loc="left", fontweight="bold")
+            if i == len(outputs) - 1:
+                ax.set_xlabel(x_axis.label)
+            if j == 0:
+                ax.set_ylabel(f"Gap in {output_word(own.name)} ({own.axis.unit})")
+    _key(fig, regions=any("slip_ratio" in r.conditions for r in found.regions))
+    return Plate(fig, "where", _caption(outputs), "Where: the gap over slip")
+
+
+def conditions_plate(found: Diagnosis) -> Plate | None:
+    """Draw the gap in noise sds over every condition that varies, with regions marked."""
+    conditions = found.data.view.conditions
+    names = [n for n in _CONDITIONS if n in conditions and np.ptp(conditions[n]) > 0.0]
+    if "inflation_pressure_psi" in names and "average_ground_pressure_kpa" in names:
+        names.remove("average_ground_pressure_kpa")
+    # A condition with a region in it must not be left out.
+    marked = {key for r in found.regions for key in r.conditions}
+    names = sorted(names, key=lambda n: n not in marked)[:_MOST_CONDITIONS]
+    names.sort(key=_CONDITIONS.index)
+    if not names:
+        return None
+    outputs = output_rows(found)
+    fig, axes = panels(
+        len(outputs), len(names), height=34.0, left=19.0, right=4.0, top=4.0, bottom=28.0,
+        gap_x=3.0, gap_y=5.0, sharex="col", sharey="row",
+    )  # fmt: skip
+    for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
+        scaled = _in_noise(own)
+        for ax, name in zip(row, names, strict=True):
+            axis = axis_name(name)
+            ax.axhspan(-1.0, 1.0, color=_BAND, lw=0.0, zorder=0)
+            for region in found.regions:
+                if region.output == own.name and name in region.conditions:
+                    _span(ax, region, axis, conditions[name])
+            _points(ax, axis.scale(conditions[name][own.rows]), scaled, np.ones(own.rows.size, "?"))
+            ax.set_ylim(*_limits(scaled))
+            if i == len(outputs) - 1:
+                ax.set_xlabel(f"{axis.name}\n({axis.unit})")
+                ax.xaxis.set_major_locator(MaxNLocator(3))
+                ax.ticklabel_format(axis="x", style="plain", useOffset=False)
+        row[0].set_ylabel(f"Gap in {output_word(own.name)}\n(noise sd)")
+    _key(fig, regions=bool(found.regions))
+    return Plate(fig, "where_conditions", _region_caption(found), "Where: the gap over conditions")
+
+
+def _abscissa(found: Diagnosis) -> tuple[Array, Any]:
+    conditions = found.data.view.conditions
+    name = next((n for n in ("slip_ratio", "run_order") if n in conditions), next(iter(conditions)))
+    axis = axis_name(name)
+    return axis.scale(conditions[name]), axis
+
+
+def _in_noise(own: OutputRows) -> OutputRows:
+    return OutputRows(
+        own.name, own.axis, own.rows, own.measured, own.before, own.after,
+        np.ones_like(own.noise), own.gap / own.noise, own.sd / own.noise, own.probability,
+    )  # fmt: skip
+
+
+def _limits(own: OutputRows) -> tuple[float, float]:
+    """Room for all bars, and for two noise sds to either side."""
+    least = 2.0 * float(own.noise.mean())
+    low = min(float((own.gap - 1.64 * own.sd).min()), -least)
+    high = max(float((own.gap + 1.64 * own.sd).max()), least)
+    return low - 0.06 * (high - low), high + 0.08 * (high - low)
+
+
+def _noise_band(ax: Axes, x: Array, noise: Array) -> None:
+    """Shade one noise sd about zero; a straight line through the rows' own, as noise may grow."""
+    if not x.size:
+        return
+    ends = np.array([x.min(), x.max()])
+    level = np.full(2, noise.mean())
+    if np.ptp(x) > 0.0 and x.size > 2:
+        level = np.polyval(np.polyfit(x, noise, 1), ends)
+    ax.fill_between(ends, -level, level, color=_BAND, lw=0.0, zorder=0)
+    ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
+
+
+def _span(ax: Axes, region: Region, axis: Axis, values: Array) -> None:
+    low, high = (float(v) for v in axis.scale(np.array(next(iter(region.conditions.values())))))
+    # A region at a single value still needs a width.
+    least = 0.03 * float(np.ptp(axis.scale(values)))
+    if high - low < least:
+        low, high = low - 0.5 * least, high + 0.5 * least
+    ax.axvspan(low, high, facecolor=ORANGE, alpha=0.13, lw=0.0, zorder=0)
+    ax.plot(
+        [low, high], [0.985, 0.985], transform=ax.get_xaxis_transform(), color=VERMILION, lw=2.2,
+        solid_capstyle="butt", clip_on=False,
+    )  # fmt: skip
+
+
+def _points(ax: Axes, x: Array, own: OutputRows, mask: np.ndarray) -> None:
+    ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
+    ax.errorbar(
+        x, own.gap[mask], 1.64 * own.sd[mask], fmt="none", ecolor=BLACK, elinewidth=0.6,
+        capsize=0.0, zorder=2,
+    )  # fmt: skip
+    ax.scatter(
+        x, own.gap[mask], c=own.probability[mask], cmap=PROBABLE, norm=_NORM, s=20.0,
+        edgecolors=BLACK, linewidths=0.6, zorder=3,
+    )  # fmt: skip
+
+
+def _key(fig: Figure, *, regions: bool) -> None:
+    """Put the colour scale and the meaning of the shades at the foot, below the axis labels."""
+    height = fig.get_figheight() * 25.4
+    bar = fig.add_axes((0.56, 7.0 / height, 0.28, 2.4 / height))
+    scale = fig.colorbar(ScalarMappable(_NORM, PROBABLE), cax=bar, orientation="horizontal")
+    scale.set_ticks([0.0, 0.5, 1.0])
+    scale.outline.set_linewidth(0.5)
+    bar.set_title(f"Probability that the gap exceeds the noise ({NO_UNIT})", fontsize=7.0, pad=2.5)
+    bar.set_xlabel("")
+    handles: list[Any] = [Patch(color=_BAND)]
+    labels = ["±1 noise sd of a single reading"]
+    if regions:
+        handles.append(Patch(facecolor="#fdf3dc", edgecolor=VERMILION, lw=0.8))
+        labels.append("region with a probable gap")
+    fig.legend(
+        handles, labels, loc="lower left", ncols=1, bbox_to_anchor=(0.09, 2.5 / height),
+        borderaxespad=0.0, labelspacing=0.4,
+    )  # fmt: skip
+
+
+def _caption(outputs: list[OutputRows]) -> str:
+    parts = []
+    for o in outputs:
+        likely = int((o.probability > 0.5).sum())
+        parts.append(
+            f"{output_word(o.name)}: {likely} of {o.rows.size} rows have a gap that probably "
+            f"exceeds the noise of {short(float(np.median(o.noise)))} {o.axis.unit} (median "
+            f"over the rows, from both campaigns); {_largest(o)}"
+        )
+    text = ". ".join(p[0].upper() + p[1:] for p in parts)
+    return (
+        f"{text}. A point is the posterior mean of what truly happens minus what the calibrated "
+        "simulator says, its bar 1.64 sd to either side (90 %); above zero the field gives more "
+        "than the simulator."
+    )
+
+
+def _largest(o: OutputRows) -> str:
+    """Say how large the largest gap is, with its 90 % interval."""
+    row = int(np.abs(o.gap).argmax())
+    gap, half = float(o.gap[row]), 1.64 * float(o.sd[row])
+    if abs(gap) + half < _TINY * float(np.median(o.noise)):
+        return "none of them shows any"
+    interval = f"{short(gap)} (90 % {short(gap - half)} to {short(gap + half)})"
+    return f"the largest is {interval} {o.axis.unit}".replace("-", MINUS)
+
+
+def _region_caption(found: Diagnosis) -> str:
+    if not found.regions:
+        return "Over no stretch of any condition does the gap probably exceed the noise."
+    parts = []
+    for r in found.regions:
+        axis = output_axis(found, r.output)
+        p = percent(r.probability) if r.probability < 0.995 else "above 99 %"
+        low, high = (short(axis.factor * end) for end in r.interval)
+        gap = f"{short(r.gap * axis.factor)} (90 % {low} to {high}) {axis.unit}"
+        gap = gap.replace("-", MINUS)
+        parts.append(f"{output_word(r.output)} at {region_text(found, r)}: {gap} (probability {p})")
+    return (
+        "Each row once in every panel of its output, in units of the noise. Marked regions, with "
+        f"their mean gap: {'; '.join(parts)}."
+    )

@@ -1,0 +1,222 @@
+"""Which effect: probabilities of the hypotheses, and what wrong ones would have reached."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.gap.diagnose import Diagnosis
+from calib.gap.noise import noise_at
+from calib.models.base import Array
+from calib.report.figures.gap_rows import best_fit, best_of, short_name
+from calib.report.figures.labels import MINUS, NO_UNIT, joined, percent, short
+from calib.report.figures.plate import Plate
+from calib.report.figures.style import (
+    BLACK,
+    BLUE,
+    EMBER,
+    GREY,
+    ORANGE,
+    SKY,
+    VERMILION,
+    note,
+    panels,
+)
+
+__all__ = ["IN_PLAY", "Placebo", "in_play", "placebos", "probability_text", "which_plate"]
+
+# A hypothesis this many times less probable than the best is not worth naming beside it.
+IN_PLAY = 0.2
+_MOST = 8
+_SPECIAL = ("none", "unknown", "parameter_shift")
+
+
+def in_play(found: Diagnosis) -> list[str]:
+    """Return hypotheses whose probability is not far below the best one's, best first."""
+    p, order = found.ranking.probability, found.ranking.order
+    return [name for name in order if p[name] >= IN_PLAY * p[order[0]]][:_MOST]
+
+
+def probability_text(p: float) -> str:
+    """Write a probability as a percentage without claiming certainty."""
+    if p > 0.995:
+        return "> 99 %"
+    return "< 1 %" if p < 0.01 else f"{100.0 * p:.0f} %"
+
+
+def which_plate(found: Diagnosis) -> Plate:
+    """Draw probabilities beside the misfit that each hypothesis leaves."""
+    p = found.ranking.probability
+    order = found.ranking.order
+    names = order[:_MOST]
+    names += [n for n in _SPECIAL if n in p and n not in names]
+    tied = in_play(found)
+    fig, axes = panels(
+        1, 1, height=5.2 * len(names) + 3.0, left=62.0, right=16.0, top=3.0, bottom=10.0
+    )
+    ax = axes[0, 0]
+    y = np.arange(len(names))[::-1]
+    for yi, name in zip(y, names, strict=True):
+        leading = name in tied
+        colour = (BLUE if name == order[0] else SKY) if leading else "#c9c9c9"
+        ax.barh(
+            yi, p[name], color=colour, height=0.66, edgecolor=BLACK if leading else "none", lw=0.5,
+            hatch="///" if leading and len(tied) > 1 else None,
+        )  # fmt: skip
+        ax.text(
+            p[name] + 0.01, yi, probability_text(p[name]), va="center", fontsize=7.0,
+            fontweight="bold" if leading else "normal",
+        )  # fmt: skip
+    ax.set_yticks(y, [short_name(n) for n in names])
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    ax.set_xlim(0.0, 1.0)
+    ax.axvline(0.5, color=GREY, lw=0.7, ls=(0, (4, 2)), zorder=0)
+    ax.tick_params(axis="y", length=0.0)
+    ax.set_xlabel(f"Probability ({NO_UNIT})")
+    if len(tied) > 1:
+        note(ax, "hatched: not far apart,\nread them as a tie", x=0.98, y=0.05, color=BLACK)
+    return Plate(fig, "which", _which_caption(found, tied), "Which: the hypotheses")
+
+
+def _which_caption(found: Diagnosis, tied: list[str]) -> str:
+    p, order = found.ranking.probability, found.ranking.order
+    listed = joined([f"{short_name(n)} ({probability_text(p[n])})" for n in tied])
+    text = (
+        f"Most probable: {listed}."
+        if len(tied) == 1
+        else f"No data here separate {listed} by more than a factor of {1.0 / IN_PLAY:.0f}."
+    )
+    rest = sum(p[n] for n in order[_MOST:] if n not in _SPECIAL)
+    others = len(order) - min(len(order), _MOST)
+    if others:
+        text += f" {others} more hypotheses share {probability_text(rest)}."
+    return text + " Beyond the dashed line a hypothesis is named in the verdict."
+
+
+@dataclass(frozen=True)
+class Placebo:
+    """What each single hypothesis leaves of the gap on the field rows.
+
+    Parameters
+    ----------
+    left : mapping of str to float
+        Root-mean-square residual over the noise of the best hypothesis, all outputs.
+    before : float
+        The same for the simulator as it was calibrated.
+    """
+
+    left: dict[str, float]
+    before: float
+
+    def shrink(self, name: str) -> float:
+        """Part of the misfit that a hypothesis removes."""
+        return 1.0 - self.left[name] / self.before
+
+
+def placebos(found: Diagnosis) -> Placebo:
+    """Work out what every single hypothesis leaves on the rows it was fitted to.
+
+    A fit's own residuals are standardised by its own noise, which a wrong hypothesis inflates:
+    they are put on the noise of the best hypothesis first.
+    """
+    at = noise_at(found.data.view)
+    best = best_fit(found, best_of(found))
+    rows = {o.name: o.rows for o in found.data.outputs}
+    reference = {o: n.sd(at.rows(rows[o])) for o, n in best.noise.items()}
+    left = {}
+    for name in found.ranking.fits:
+        if "+" in name and name != best_of(found):
+            continue
+        fit = best_fit(found, name)
+        left[name] = _rms(
+            [
+                r * fit.noise[o].sd(at.rows(rows[o])) / reference[o]
+                for o, r in fit.field_residuals.items()
+            ]
+        )
+    before = found.corrected.calibrated(found.data.view.conditions)
+    response = [
+        (o.field - o.problem.bound.to_response(before[o.name][o.rows])) / reference[o.name]
+        for o in found.data.outputs
+    ]
+    return Placebo(left, _rms(response))
+
+
+def _rms(parts: list[Array]) -> float:
+    values = np.concatenate(parts)
+    return float(np.sqrt(np.nanmean(np.square(values))))
+
+
+def placebo_plate(found: Diagnosis) -> Plate:
+    """Draw what wrong hypotheses would have left of the gap."""
+    placebo = placebos(found)
+    order = sorted(placebo.left, key=lambda n: placebo.left[n])
+    named = best_of(found)
+    fig, axes = panels(
+        1, 1, height=4.2 * len(order) + 3.0, left=62.0, right=16.0, top=7.0, bottom=10.0
+    )
+    ax = axes[0, 0]
+    y = np.arange(len(order))[::-1]
+    for yi, name in zip(y, order, strict=True):
+        best = name == named
+        colour = BLUE if best else ORANGE if name in ("unknown", "parameter_shift") else GREY
+        ax.plot([placebo.left[name], placebo.before], [yi, yi], color="#d4d4d4", lw=1.0, zorder=1)
+        ax.plot(
+            placebo.left[name], yi, "D" if best else "o", color=colour, ms=5.5 if best else 4.0,
+            zorder=3,
+        )  # fmt: skip
+        ax.text(
+            1.015, yi, f"{100.0 * placebo.shrink(name):.0f} %".replace("-", MINUS),
+            transform=ax.get_yaxis_transform(), va="center", fontsize=7.0,
+            fontweight="bold" if best else "normal",
+        )  # fmt: skip
+    ax.axvline(1.0, color=BLACK, lw=0.8, ls=(0, (1, 1)), zorder=0)
+    ax.axvline(placebo.before, color=VERMILION, lw=1.0, zorder=0)
+    high = max(placebo.before, *placebo.left.values())
+    low = min(1.0, *placebo.left.values())
+    pad = 0.06 * max(high - low, 0.3)
+    ax.set_xlim(low - pad, high + pad)
+    top = len(order) - 0.3
+    ax.text(1.0, top, "noise", ha="center", va="bottom", fontsize=7.0)
+    if placebo.before - 1.0 > 0.12 * (high - low + 2.0 * pad):
+        ax.text(placebo.before, top, "simulator", ha="center", va="bottom", fontsize=7.0,
+                color=EMBER)  # fmt: skip
+    ax.text(1.015, 1.0, "removed", transform=ax.transAxes, va="bottom", fontsize=7.0, color=GREY)
+    ax.set_yticks(y, [short_name(n) for n in order])
+    ax.set_ylim(-0.6, len(order) - 0.4)
+    ax.tick_params(axis="y", length=0.0)
+    ax.set_xlabel("Residual on the field rows, rms over the noise (noise sd)")
+    return Plate(fig, "placebo", _placebo_caption(placebo, named), "Placebo: the wrong hypotheses")
+
+
+def _placebo_caption(placebo: Placebo, named: str) -> str:
+    wrong = {
+        n: v
+        for n, v in placebo.left.items()
+        if n not in ("none", "unknown", "parameter_shift", named)
+    }
+    text = (
+        f"On the rows they were fitted to, {short_name(named)} removes "
+        f"{percent(max(placebo.shrink(named), 0.0))} of the misfit"
+    )
+    if wrong:
+        runner = min(wrong, key=lambda n: wrong[n])
+        text += (
+            f", and the best of the other single effects, {short_name(runner)}, "
+            f"{percent(max(placebo.shrink(runner), 0.0))}"
+        )
+    if "none" in placebo.left:
+        text += (
+            f". Without any effect, {short_name('none')}, "
+            f'{percent(max(placebo.shrink("none"), 0.0))} go: the line "simulator" is the model '
+            "as the laboratory alone calibrated it, and every hypothesis, that of no gap too, "
+            "estimates the model's parameters anew from both campaigns, which lets those that the "
+            "laboratory left uncertain follow the field. What an effect adds to that is its own"
+        )
+    return (
+        f"{text}. Any hypothesis with free parameters removes something, a wrong one too, so the "
+        "distance between the diamond and the rest is what counts, not the percentage; "
+        "noise alone would leave "
+        f"{short(1.0)}."
+    )

@@ -1,0 +1,162 @@
+"""Names and units as a reader writes them, for axes (mathtext) and sentences (plain text)."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from calib.data.quantities import QUANTITIES
+from calib.models.base import Array
+from calib.report.numbers import NOTHING, format_number
+
+__all__ = [
+    "MINUS", "NO_UNIT", "Axis", "axis_of", "joined", "parameter_label", "percent", "plain",
+    "short", "symbol", "unbroken", "unit_plain", "unit_text",
+]  # fmt: skip
+
+NO_UNIT = NOTHING
+MINUS = "\N{MINUS SIGN}"
+
+_GREEK = {"sigma": r"\sigma", "gamma": r"\gamma", "theta": r"\theta"}
+
+
+_GREEK_PLAIN = {
+    "sigma": "\N{GREEK SMALL LETTER SIGMA}",
+    "gamma": "\N{GREEK SMALL LETTER GAMMA}",
+    "theta": "\N{GREEK SMALL LETTER THETA}",
+}
+
+
+@dataclass(frozen=True)
+class Axis:
+    """How a canonical column is drawn.
+
+    Parameters
+    ----------
+    name, unit : str
+        In words.
+    factor : float
+        From the canonical unit to the drawn one.
+    """
+
+    name: str
+    unit: str
+    factor: float = 1.0
+
+    @property
+    def label(self) -> str:
+        """For an axis."""
+        return f"{self.name} ({self.unit})"
+
+    def scale(self, values: Array) -> Array:
+        """Convert from the canonical unit."""
+        return np.asarray(values) * self.factor
+
+    def range_text(self, values: Array) -> str:
+        """Say from where to where values go."""
+        low, high = (self.value_text(float(f(values))) for f in (np.min, np.max))
+        return f"{low} to {high} {self.unit}"
+
+    def value_text(self, value: float) -> str:
+        """Write one value, without the unit: whole numbers whole."""
+        scaled = self.factor * value
+        text = f"{scaled:.0f}" if abs(scaled) >= 1000.0 else f"{scaled:.3g}"
+        return text.replace("-", MINUS)
+
+
+_AXES: Mapping[str, Axis] = MappingProxyType(
+    {
+        "slip_ratio": Axis("Slip", "%", 100.0),
+        "nominal_slip_ratio": Axis("Nominal slip", "%", 100.0),
+        "inflation_pressure_psi": Axis("Inflation pressure", "psi"),
+        "average_ground_pressure_kpa": Axis("Ground pressure", "kPa"),
+        "cone_index_kpa": Axis("Cone index", "kPa"),
+        "gravimetric_water_content": Axis("Water content", "% of dry mass", 100.0),
+        "volumetric_water_content": Axis("Water content", "% of volume", 100.0),
+        "drawbar_pull_kn": Axis("Drawbar pull", "kN"),
+        "rut_depth_mm": Axis("Rut depth", "mm"),
+        "bulk_density_g_cm3": Axis("Dry bulk density", "g/cm³"),
+    }
+)
+
+
+def axis_of(column: str) -> Axis:
+    """Return how a canonical column is drawn."""
+    if column in _AXES:
+        return _AXES[column]
+    quantity = QUANTITIES.get(column)
+    if quantity is None:
+        return Axis(column.replace("_", " ").capitalize(), NO_UNIT)
+    unit = quantity.unit.replace("**", "^").replace("dimensionless", NO_UNIT)
+    return Axis(quantity.stem.replace("_", " ").capitalize(), unit)
+
+
+def stem_and_subscript(name: str) -> tuple[str, str]:
+    """Split a parameter's name: ``K_lo`` into K and lo, ``C3`` into C and 3."""
+    stem, _, below = name.partition("_")
+    digits = re.fullmatch(r"([A-Za-z]+)(\d+)", stem)
+    if digits and not below:
+        stem, below = digits.groups()
+    if not below and len(stem) == 2 and stem[0].isupper() and stem[1].islower():
+        stem, below = stem[0], stem[1]
+    return stem, below
+
+
+def symbol(name: str) -> str:
+    """Return a parameter's symbol in mathtext: ``K_lo`` as K with a subscript."""
+    stem, below = stem_and_subscript(name)
+    stem = _GREEK.get(stem, stem)
+    return f"${stem}_\\mathrm{{{below}}}$" if below else f"${stem}$"
+
+
+def plain(name: str) -> str:
+    """Return a parameter's symbol for a sentence."""
+    stem, _, below = name.partition("_")
+    stem = _GREEK_PLAIN.get(stem, stem)
+    return f"{stem}_{below}" if below else stem
+
+
+def unit_text(unit: str) -> str:
+    """Return a unit in mathtext: powers raised; an en dash where there is none."""
+    if unit in ("1", "", "dimensionless"):
+        return NO_UNIT
+    return re.sub(r"\^(-?\w+)", r"$^{\1}$", unit)
+
+
+def unit_plain(unit: str) -> str:
+    """Return a unit for a sentence: small powers as superscripts, nothing where there is none."""
+    if unit in ("1", "", "dimensionless"):
+        return ""
+    return unit.replace("^2", "²").replace("^3", "³")
+
+
+def parameter_label(name: str, unit: str, *, log: bool = False) -> str:
+    """Return symbol and unit of a parameter for an axis."""
+    inside = symbol(name)
+    if log:
+        inside = f"log$_{{10}}$ {inside}"
+    return f"{inside} ({unit_text(unit)})"
+
+
+def short(value: float, digits: int = 2) -> str:
+    """Write a number with few significant digits."""
+    return format_number(value, digits)
+
+
+def percent(fraction: float) -> str:
+    """Write a fraction as a percentage with two significant digits."""
+    return f"{short(100.0 * fraction)} %"
+
+
+def joined(words: list[str]) -> str:
+    """Join words as a sentence does."""
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def unbroken(text: str) -> str:
+    """Keep numbers and their units on one line."""
+    return re.sub(r"(\d) (%|kN|mm|psi|kPa|g/cm³|rows?\b)", "\\1\N{NO-BREAK SPACE}\\2", text)

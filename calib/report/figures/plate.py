@@ -1,0 +1,50 @@
+"""A plate: a figure, the name of its file, and one sentence on what it shows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from calib.report.figures.style import style
+
+__all__ = ["Plate", "draw_all"]
+
+
+@dataclass(frozen=True, eq=False)
+class Plate:
+    """A figure to be shown.
+
+    Parameters
+    ----------
+    figure : Figure or None
+        None if it could not be drawn; the caption then says why.
+    name : str
+        Stem of its file.
+    caption : str
+        What it shows, in words and numbers.
+    heading : str
+        What it is, in a few words.
+    """
+
+    figure: Figure | None
+    name: str
+    caption: str
+    heading: str = ""
+
+
+def draw_all(drawings: Mapping[str, Callable[[], Plate | None]]) -> list[Plate]:
+    """Draw figures by name, in order; one that fails has no figure and a caption saying why."""
+    with style():
+        drawn = [_attempt(name, draw) for name, draw in drawings.items()]
+    return [plate for plate in drawn if plate is not None]
+
+
+def _attempt(name: str, draw: Callable[[], Plate | None]) -> Plate | None:
+    try:
+        return draw()
+    except Exception as error:
+        # Any failure: a page without one figure is worth more than no page.
+        why = f"{type(error).__name__}: {error}"
+        return Plate(None, name, f"This figure could not be drawn ({why}).")

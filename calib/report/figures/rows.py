@@ -1,0 +1,187 @@
+"""The rows of a result as figures show them: fitted and held-out points, grouped into panels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtri
+
+from calib.data.table import Table
+from calib.inference.calibration import Calibration
+from calib.inference.random import generator
+from calib.models.base import Array
+from calib.report.figures.labels import Axis, axis_of
+from calib.report.study import OutputResult
+from calib.validation.prediction import Bands, bands
+
+__all__ = ["Group", "data_word", "grid", "group_column", "groups", "held_table", "smooth_bands",
+           "x_column"]  # fmt: skip
+
+MAX_PANELS = 6
+_N_DRAWS = 1000
+_GRID = 100
+
+
+@dataclass(frozen=True)
+class Group:
+    """Rows that share a panel.
+
+    Parameters
+    ----------
+    title : str
+    held : bool
+        Whether its rows were held out.
+    column : str or None
+        The condition that the panel stands for.
+    value : float
+        Its value there; NaN where there is none.
+    fitted, held_out : ndarray of bool
+        Rows of the calibration table, and of the held-out one.
+    """
+
+    title: str
+    held: bool
+    column: str | None
+    value: float
+    fitted: NDArray[np.bool_]
+    held_out: NDArray[np.bool_]
+
+    @property
+    def size(self) -> int:
+        """How many rows it has."""
+        return int(self.fitted.sum() + self.held_out.sum())
+
+
+def held_table(result: OutputResult) -> Table | None:
+    """Return the rows that were held out, if any were."""
+    return result.validation.table if result.validation.method == "held_out" else None
+
+
+def data_word(result: OutputResult) -> str:
+    """What to call the data: their label where they have one."""
+    label = result.task.table.label
+    return f"{label} data" if label else "data"
+
+
+def x_column(result: OutputResult) -> str:
+    """The condition along which predictions are drawn."""
+    conditions = result.calibration.problem.bound.model.conditions
+    return "slip_ratio" if "slip_ratio" in conditions else conditions[0]
+
+
+def group_column(result: OutputResult) -> str | None:
+    """The column that tells panels apart: inflation pressure where the data have it."""
+    conditions = result.calibration.problem.bound.model.conditions
+    table = result.task.table
+    pressure = "inflation_pressure_psi"
+    if pressure in table and np.unique(table[pressure]).size > 1 and len(conditions) > 1:
+        return pressure
+    second = [name for name in conditions if name != x_column(result)]
+    return second[0] if second else None
+
+
+def groups(result: OutputResult, *, most: bool = True) -> list[Group]:
+    """Split the rows into at most six panels: those held out and the most populated others.
+
+    More distinct values than twice that are pooled into thirds of the rows.
+
+    Parameters
+    ----------
+    result : OutputResult
+    most : bool
+        Whether to stop at six; otherwise every row is in a group.
+    """
+    column = group_column(result)
+    fitted, held = result.calibration.problem.table, held_table(result)
+    none = np.zeros(0, dtype=bool)
+    if column is None:
+        rows = np.ones(len(fitted), dtype=bool)
+        rest = none if held is None else np.ones(len(held), dtype=bool)
+        return [Group("", False, None, float("nan"), rows, rest)]
+    axis = axis_of(column)
+    inside, outside = fitted[column], np.empty(0) if held is None else held[column]
+    everything = np.concatenate([inside, outside])
+    found = []
+    for low, high, value in _bins(everything):
+        mine, theirs = ((v >= low) & (v <= high) for v in (inside, outside))
+        only_held = bool(theirs.any() and not mine.any())
+        found.append(
+            Group(_title(axis, low, high, only_held), only_held, column, value, mine, theirs)
+        )
+    return _kept(found) if most else found
+
+
+def _kept(found: list[Group]) -> list[Group]:
+    """At most six: those held out first, then the most populated; of equals, spread out."""
+    if len(found) <= MAX_PANELS:
+        return found
+    held = [g for g in found if g.held][:MAX_PANELS]
+    others = [g for g in found if not g.held]
+    room = MAX_PANELS - len(held)
+    if len({g.size for g in others}) == 1:
+        picked = np.linspace(0, len(others) - 1, room).round().astype(int).tolist()
+        others = [others[i] for i in picked]
+    else:
+        others = sorted(others, key=lambda g: -g.size)[:room]
+    return sorted([*held, *others], key=lambda g: g.value)
+
+
+def _title(axis: Axis, low: float, high: float, held: bool) -> str:
+    a, b = axis.value_text(low), axis.value_text(high)
+    name = "water " if axis.name == "Water content" else ""
+    value = a if a == b else f"{a} to {b}"
+    return f"{name}{value} {axis.unit}{', held out' if held else ''}"
+
+
+def _bins(values: Array) -> list[tuple[float, float, float]]:
+    distinct, counts = np.unique(values, return_counts=True)
+    if distinct.size <= 2 * MAX_PANELS and counts.max() > 1:
+        return [(float(v), float(v), float(v)) for v in distinct]
+    if distinct.size <= 3:
+        return [(float(v), float(v), float(v)) for v in distinct]
+    parts = np.array_split(np.sort(values), 3)
+    return [(float(p[0]), float(p[-1]), float(np.median(p))) for p in parts]
+
+
+def grid(result: OutputResult, group: Group) -> dict[str, Array]:
+    """Conditions along the x axis of a panel, the others at the panel's middle."""
+    problem = result.calibration.problem
+    held = held_table(result)
+    x = x_column(result)
+    everywhere = problem.table[x] if held is None else np.append(problem.table[x], held[x])
+    ends = min(0.0, float(everywhere.min())) if x == "slip_ratio" else float(everywhere.min())
+    conditions: dict[str, Array] = {x: np.linspace(ends, float(everywhere.max()), _GRID)}
+    for name in problem.bound.model.conditions:
+        if name != x:
+            inside = problem.table[name][group.fitted]
+            outside = np.empty(0) if held is None else held[name][group.held_out]
+            conditions[name] = np.full(_GRID, np.median(np.append(inside, outside)))
+    return conditions
+
+
+def smooth_bands(
+    calibration: Calibration, conditions: Mapping[str, Array], *, prior: bool = False
+) -> tuple[Bands, Bands]:
+    """Bands of the mean output and of a measurement along a curve.
+
+    Each draw has one noise value for the whole curve, so that its quantiles are smooth in x.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    conditions : mapping of str to ndarray
+    prior : bool
+        Of the prior instead of the posterior.
+    """
+    problem = calibration.problem
+    rng = generator(calibration.seed, calibration.label, "figures")
+    t = problem.priors.sample(rng, _N_DRAWS) if prior else calibration.subset(_N_DRAWS)
+    natural = problem.theta(t)
+    size = natural.shape[0]
+    z = ndtri((rng.permutation(size) + 0.5) / size)[:, None]
+    location = problem.bound.location(natural[:, :-1], conditions)
+    back = problem.bound.from_response
+    return bands(back(location)), bands(back(location + natural[:, -1:] * z))

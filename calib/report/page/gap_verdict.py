@@ -1,0 +1,303 @@
+"""The verdict on a gap, by explicit rules, from a few facts.
+
+The first rule that applies decides:
+
+1. none: no gap, at a probability of 90 % or more;
+2. not shown: no hypothesis of a gap is named, and none is not certain either;
+3. unknown: there is a gap, and nothing that is listed explains it;
+4. tie: there is a gap, and several explanations are about as probable;
+5. recalibrate: the same model with other parameter values closes the gap;
+6. named: one effect, or pair, at a probability of 90 % or more;
+7. likely: one effect, or pair, that is more probable than all others together.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+from calib.report.figures.labels import joined
+
+__all__ = [
+    "Candidate", "GapEvidence", "GapVerdict", "NextFact", "ShrinkFact", "Tone", "WhereFact",
+    "judge_gap", "odds_text", "repeats_needed",
+]  # fmt: skip
+
+SURE = 0.9
+# Hypotheses within this factor of the best are read as a tie with it.
+TIE = 0.2
+_MOST_TIED = 4
+# ln 20: the evidence that makes odds of twenty to one.
+_ENOUGH_NATS = math.log(20.0)
+
+
+class Tone(StrEnum):
+    """How the card looks."""
+
+    FINE = "fine"
+    CARE = "care"
+    NO = "no"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A hypothesis: its name, its name in words, its claim, its probability."""
+
+    name: str
+    words: str
+    title: str
+    probability: float
+
+
+@dataclass(frozen=True)
+class WhereFact:
+    """A region: "drawbar pull, at slips from 30 to 60 %", "0.09 kN lower", its probability."""
+
+    place: str
+    gap: str
+    probability: float
+
+
+@dataclass(frozen=True)
+class ShrinkFact:
+    """Errors in words with units; fraction and interval as ratios."""
+
+    output: str
+    before: str
+    after: str
+    floor: str
+    fraction: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class NextFact:
+    """A measurement: the two hypotheses in words, where, and what it is expected to tell."""
+
+    separates: tuple[str, str]
+    conditions: str
+    gain_nats: float
+
+
+@dataclass(frozen=True)
+class GapEvidence:
+    """What a verdict is made from.
+
+    Parameters
+    ----------
+    verdict : {"effect", "none", "unknown", "ambiguous"}
+    ranked : sequence of Candidate
+        Most probable first.
+    sizes : sequence of str
+        What the best hypothesis amounts to.
+    where : sequence of WhereFact
+        One of each output that has any.
+    shrink : sequence of ShrinkFact
+    unfitted : bool
+        Whether the shrink was judged at conditions other than the fitted ones.
+    next_facts : sequence of NextFact
+    alike : sequence of str
+        Effects that look like the best one on this design, in words.
+    smallest : float
+        Smallest size that this design can name, in noise sds of the laboratory.
+    look : str
+        What to measure where nothing that is listed explains the gap.
+    """
+
+    verdict: str
+    ranked: Sequence[Candidate]
+    sizes: Sequence[str]
+    where: Sequence[WhereFact]
+    shrink: Sequence[ShrinkFact]
+    unfitted: bool
+    next_facts: Sequence[NextFact]
+    alike: Sequence[str] = ()
+    smallest: float = float("nan")
+    look: str = ""
+
+
+@dataclass(frozen=True)
+class GapVerdict:
+    """What a busy reader needs.
+
+    Parameters
+    ----------
+    tone : Tone
+    rule : str
+        Which rule decided.
+    state : str
+        Two or three words.
+    headline : str
+        One sentence.
+    facts : sequence of (str, str)
+        Which, how large, where, how far, what next.
+    """
+
+    tone: Tone
+    rule: str
+    state: str
+    headline: str
+    facts: Sequence[tuple[str, str]]
+
+
+def judge_gap(e: GapEvidence) -> GapVerdict:
+    """Apply the rules."""
+    found = _judge(e)
+    headline = found.headline[0].upper() + found.headline[1:]
+    return replace(
+        found, headline=headline, facts=[(k, v[0].upper() + v[1:]) for k, v in found.facts]
+    )
+
+
+def _judge(e: GapEvidence) -> GapVerdict:
+    best = e.ranked[0]
+    if e.verdict == "none":
+        return _no_gap(e, best)
+    facts = _facts(e)
+    if e.verdict == "unknown":
+        return GapVerdict(
+            Tone.NO, "unknown", "Cause unknown",
+            "There is a real gap, and no effect on the list explains it", facts,
+        )  # fmt: skip
+    if e.verdict == "ambiguous":
+        tied = _tied(e)
+        words = [c.words for c in tied]
+        there_is = "There may be" if any(c.name == "none" for c in tied) else "There is"
+        headline = f"{there_is} a gap, but the data cannot tell {joined(words)} apart"
+        if len(words) == 1:
+            headline = f"There may be a gap; {words[0]} is the likeliest of many explanations"
+        return GapVerdict(Tone.CARE, "tie", "Not told apart", headline, facts)
+    sure = best.probability >= SURE
+    tone = Tone.FINE if sure else Tone.CARE
+    if best.name == "parameter_shift":
+        return GapVerdict(
+            tone, "recalibrate", "Recalibrate",
+            f"{_hedge(sure)}the same model with other parameter values closes the gap", facts,
+        )  # fmt: skip
+    two = "two effects at once: " if "+" in best.name else ""
+    return GapVerdict(
+        tone, "named" if sure else "likely", "Cause named" if sure else "Likely cause",
+        f"{_hedge(sure)}{two}{best.title}", facts,
+    )  # fmt: skip
+
+
+def _no_gap(e: GapEvidence, best: Candidate) -> GapVerdict:
+    sure = best.probability >= SURE
+    size = "" if not math.isfinite(e.smallest) else (
+        f"; an effect of {e.smallest:.1f} noise sd (rms in the output where it is largest; the "
+        "laboratory's noise) would have shown in four of five campaigns like this one"
+    )  # fmt: skip
+    facts = [("Which", f"No gap, probability {odds_text(best.probability)}{size}")]
+    others = [c for c in e.ranked[1:4] if c.probability >= 0.05]
+    if others:
+        listed = joined([f"{c.words} ({odds_text(c.probability)})" for c in others])
+        facts.append(("Not excluded", listed))
+        facts += _next(e)
+    if sure:
+        return GapVerdict(
+            Tone.FINE, "none", "No gap",
+            "The calibrated simulator holds: what is left is measurement noise", facts,
+        )  # fmt: skip
+    return GapVerdict(
+        Tone.CARE, "not shown", "No gap shown",
+        "The data show no gap, but they do not exclude one either", facts,
+    )  # fmt: skip
+
+
+def _facts(e: GapEvidence) -> list[tuple[str, str]]:
+    facts = [("Which", _which(e))]
+    if e.sizes:
+        facts.append(("How large", f"{'; '.join(e.sizes)}"))
+    facts += [("Where", _where(e)), ("How far", _how_far(e)), *_next(e)]
+    return facts
+
+
+def _which(e: GapEvidence) -> str:
+    best = e.ranked[0]
+    text = f"{best.words}, probability {odds_text(best.probability)}"
+    rivals = [c for c in e.ranked[1:_MOST_TIED] if c.probability >= 0.05]
+    if rivals:
+        listed = joined([f"{c.words} ({odds_text(c.probability)})" for c in rivals])
+        text += f"; also possible: {listed}"
+    else:
+        text += "; nothing else reaches 5 %"
+    if e.alike:
+        text += f". On these conditions it looks like {joined(list(e.alike))}"
+    return text
+
+
+def _where(e: GapEvidence) -> str:
+    if not e.where:
+        return "In no stretch of the conditions does the gap probably exceed the noise"
+    return "; ".join(f"{w.place}: {w.gap} ({odds_text(w.probability)})" for w in e.where)
+
+
+def _how_far(e: GapEvidence) -> str:
+    if not e.shrink:
+        return "No output has a gap that could shrink"
+    parts = []
+    for s in e.shrink:
+        low, high = (_per_cent(v) for v in s.interval)
+        shrinks = "it shrinks by" if s.fraction > 0.0 else "it does not shrink:"
+        part = (
+            f"{s.output} error from {s.before} to {s.after} rms (noise {s.floor}): {shrinks} "
+            f"{_per_cent(s.fraction)} % (90 % interval {low} to {high} %)"
+        )
+        if s.interval[0] <= 0.0 < s.fraction:
+            part += ", so it may not shrink at all"
+        parts.append(part)
+    where = "" if e.unfitted else ", at the field's own conditions"
+    return "; ".join(parts) + where
+
+
+def _next(e: GapEvidence) -> list[tuple[str, str]]:
+    """Say what would show the unknown, or separate the first two unless the first is certain."""
+    if e.look and e.verdict == "unknown":
+        return [("Next", e.look)]
+    if not e.next_facts or e.ranked[0].probability >= SURE:
+        return []
+    n = max(e.next_facts, key=lambda fact: (_leading(e, fact), fact.gain_nats))
+    repeats = repeats_needed(n.gain_nats)
+    a, b = n.separates
+    if repeats is None:
+        return [
+            ("Next", f"No single condition in the range of the data separates {a} from {b}; "
+             "vary another condition, or measure another output"),
+        ]  # fmt: skip
+    many = "one measurement" if repeats == 1 else f"about {repeats} measurements"
+    return [("Next", f"To separate {a} from {b}: {many} at {n.conditions}")]
+
+
+def _leading(e: GapEvidence, fact: NextFact) -> int:
+    leaders = {c.words for c in e.ranked[:2]}
+    return sum(word in leaders for word in fact.separates)
+
+
+def repeats_needed(gain_nats: float) -> int | None:
+    """Measurements for expected odds of twenty to one; None where that is out of reach (50)."""
+    if not gain_nats > 0.0:
+        return None
+    repeats = math.ceil(_ENOUGH_NATS / gain_nats)
+    return repeats if repeats <= 50 else None
+
+
+def odds_text(p: float) -> str:
+    """Write a probability as a percentage without claiming certainty."""
+    if p > 0.995:
+        return "above 99 %"
+    return "below 1 %" if p < 0.01 else f"{100.0 * p:.0f} %"
+
+
+def _tied(e: GapEvidence) -> list[Candidate]:
+    best = e.ranked[0].probability
+    return [c for c in e.ranked if c.probability >= TIE * best][:_MOST_TIED]
+
+
+def _hedge(sure: bool) -> str:
+    return "" if sure else "probably "
+
+
+def _per_cent(ratio: float) -> str:
+    return f"{100.0 * ratio:.0f}".replace("-", "\N{MINUS SIGN}")

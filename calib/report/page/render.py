@@ -1,0 +1,76 @@
+"""Render a study as one self-contained page."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from markupsafe import Markup
+
+from calib.report.figures import Plate
+from calib.report.page.content import failed_section, section
+from calib.report.page.template import template
+from calib.report.publish import Publication
+from calib.report.study import OutputResult, Study
+
+__all__ = ["render_page"]
+
+
+def render_page(
+    study: Study,
+    plates: Mapping[str, Sequence[Plate]],
+    images: Mapping[str, bytes],
+    *,
+    manifest: Mapping[str, Any],
+    title: str,
+    reconstructed: bool,
+    gaps_html: str | None = None,
+    audit_html: str | None = None,
+    paper: Publication | None = None,
+) -> str:
+    """Render the report.
+
+    Parameters
+    ----------
+    study : Study
+    plates : mapping of str to sequence of Plate
+        Figures of every output that was worked out.
+    images : mapping of str to bytes
+        PNG files by name, ``{output}_{plate.name}.png``.
+    manifest : mapping
+        As `calib.report.manifest.build_manifest` returns it.
+    title : str
+    reconstructed : bool
+        Whether any data were reconstructed from published results.
+    gaps_html : str, optional
+        A section on the source's own gaps, from `calib.he2019.page.gaps.write_gaps`.
+    audit_html : str, optional
+        A section to be placed before the appendix, as trusted HTML.
+    paper : Publication, optional
+        Tables and methods beside the page.
+
+    Returns
+    -------
+    str
+        HTML that makes no request: style and images are inside.
+    """
+    sections = [
+        section(key, result, plates.get(key, ()), images)
+        if isinstance(result, OutputResult)
+        else failed_section(key, result)
+        for key, result in study.results.items()
+    ]
+    return template("report.html.j2").render(
+        title=title,
+        sections=sections,
+        reconstructed=reconstructed,
+        gaps=Markup(gaps_html) if gaps_html else None,
+        audit=Markup(audit_html) if audit_html else None,
+        paper=paper if paper is not None and paper.files else None,
+        seed=study.seed,
+        command=shlex.join(str(part) for part in manifest.get("command", ())),
+        versions=manifest.get("versions", {}),
+        settings=manifest.get("settings", {}),
+        tasks=manifest.get("tasks", {}),
+    )

@@ -1,0 +1,96 @@
+"""What a run leaves: `sbc.json` with every rank's transform, figures and a page."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from calib.report.figures.export import png_bytes
+from calib.report.figures.sbc import coverage_figure, ranks_figure
+from calib.report.page.sbc import render
+from calib.validation.sbc.designs import design_of
+from calib.validation.sbc.score import ModelScore, SbcScore
+
+__all__ = ["SCHEMA", "document", "write_sbc"]
+
+SCHEMA = "calib/sbc/1"
+
+
+def document(score: SbcScore, settings: dict[str, Any]) -> dict[str, Any]:
+    """Return every number of a run as plain dictionaries."""
+    adjusted = score.adjusted
+    return {
+        "schema": SCHEMA,
+        "seed": score.seed,
+        "simulations": score.simulations,
+        "settings": settings,
+        "alarms": [f"{model}: {name}" for model, name in score.alarms],
+        "models": {m.model: _model(m, adjusted) for m in score.models},
+    }
+
+
+def _model(m: ModelScore, adjusted: dict[tuple[str, str], float]) -> dict[str, Any]:
+    return {
+        "design": design_of(m.model).text,
+        "replicates": m.replicates,
+        "failed": dict(m.failed),
+        "not_converged": m.unconverged,
+        "extended": m.extended,
+        "prior_draws": m.attempts,
+        "held_out_without_band": m.no_band,
+        "coverage": {
+            f"{100 * c.level:g}": {
+                "proportion": _finite(c.proportion),
+                "standard_error": _finite(c.se),
+                "interval": [_finite(x) for x in c.interval],
+                "measurements": c.rows,
+                "campaigns": c.replicates,
+                "p": c.p,
+                "p_adjusted": adjusted[m.model, f"{100 * c.level:g} % band"],
+            }
+            for c in m.coverage
+        },
+        "quantities": {
+            q.name: {
+                "p": q.p,
+                "p_adjusted": adjusted[m.model, q.name],
+                "p_with_not_converged": q.p_all,
+                "pit": [round(float(v), 5) for v in q.pit],
+            }
+            for q in m.quantities
+        },
+    }
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def write_sbc(score: SbcScore, out: Path, settings: dict[str, Any], command: Sequence[str]) -> Path:
+    """Write numbers, figures and page into the folder of a run, and return the page's path.
+
+    Parameters
+    ----------
+    score : SbcScore
+    out : Path
+        That of `calib.validation.sbc.run.run_sbc`; files of an earlier end of the run are replaced.
+    settings : dict
+        Of the sampler.
+    command : sequence of str
+        The command line, for the page.
+    """
+    text = json.dumps(document(score, settings), allow_nan=False) + "\n"
+    images = {m.model: png_bytes(ranks_figure(m, score.adjusted)) for m in score.models}
+    images["coverage"] = png_bytes(coverage_figure(score))
+    uris = {k: f"data:image/png;base64,{base64.b64encode(v).decode()}" for k, v in images.items()}
+    page = render(score, uris, command)
+    (out / "figures").mkdir(exist_ok=True)
+    for name, image in images.items():
+        (out / "figures" / f"{name}.png").write_bytes(image)
+    (out / "sbc.json").write_text(text, encoding="utf-8")
+    (out / "index.html").write_text(page, encoding="utf-8")
+    return out / "index.html"

@@ -1,0 +1,287 @@
+"""The main job: calibrate each output, predict it with bands, validate it, compare estimates.
+
+A study is what a report shows. Each output is worked out on its own: one that fails is kept as a
+`Failure`, and the others still come.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calib.batch.pool import HERE, Pool
+from calib.batch.threads import one_thread
+from calib.errors import CalibError
+from calib.inference.calibration import Calibration, calibrate
+from calib.inference.estimators import PointEstimate, estimate, methods_for
+from calib.inference.prior_files import default_prior_path
+from calib.inference.problem import Problem, build_problem
+from calib.inference.random import generator
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.models.base import Array
+from calib.report.study_tasks import Task, fitted_rows
+from calib.validation.prediction import predictive_draws
+from calib.validation.sensitivity import Sensitivity, prior_sensitivity
+from calib.validation.validate import Validation, leave_one_out, validate_held_out
+
+__all__ = [
+    "Failure", "OutputResult", "Study", "begin_study", "estimate_task", "run_study",
+]  # fmt: skip
+
+N_PRIOR_PREDICTIVE = 1000
+
+type Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class OutputResult:
+    """What a study found for one output.
+
+    Parameters
+    ----------
+    task : Task
+    calibration : Calibration
+        On the rows that are not held out.
+    validation : Validation
+    estimates : tuple of PointEstimate
+        Every applicable method, on all rows the source fitted.
+    by_pressure : mapping of float to tuple of PointEstimate
+        The Magic Formula at each inflation pressure (psi) on its own; empty for other models.
+    prior_predictive : ndarray, shape (draws, n)
+        Measurements the prior alone expects, at the calibration conditions.
+    posterior_predictive : ndarray, shape (draws, n)
+    seconds : mapping of str to float
+        Of each stage.
+    sensitivity : mapping of str to Sensitivity
+        Of each parameter to prior and data.
+    """
+
+    task: Task
+    calibration: Calibration
+    validation: Validation
+    estimates: tuple[PointEstimate, ...]
+    by_pressure: Mapping[float, tuple[PointEstimate, ...]]
+    prior_predictive: Array
+    posterior_predictive: Array
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    sensitivity: Mapping[str, Sensitivity] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Failure:
+    """An output that could not be worked out, and why."""
+
+    task: Task
+    error: str
+
+
+@dataclass(frozen=True)
+class Study:
+    """Results of all outputs, by the keys of `OUTPUTS`."""
+
+    results: Mapping[str, OutputResult | Failure]
+    seed: int
+    seconds: float
+
+    @property
+    def successes(self) -> dict[str, OutputResult]:
+        """The outputs that were worked out."""
+        return {k: r for k, r in self.results.items() if isinstance(r, OutputResult)}
+
+    @property
+    def failures(self) -> dict[str, Failure]:
+        """The outputs that were not."""
+        return {k: r for k, r in self.results.items() if isinstance(r, Failure)}
+
+
+def run_study(
+    tasks: Sequence[Task],
+    seed: int,
+    *,
+    settings: SamplerSettings | None = None,
+    progress: Progress | None = None,
+    workers: int = 1,
+    pool: Pool = HERE,
+) -> Study:
+    """Work every task out.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+    seed : int
+    settings : SamplerSettings, optional
+    progress : callable, optional
+        Called with what is being done, steps done and steps planned.
+    workers : int
+        Processes for leaving rows out; the numbers do not depend on it.
+    pool : Pool, optional
+        Where outputs are worked out; here, one after the other, by default.
+    """
+    asked = begin_study(tasks, seed, pool, settings=settings, progress=progress, workers=workers)
+    return asked(progress or _silent)
+
+
+def begin_study(
+    tasks: Sequence[Task],
+    seed: int,
+    pool: Pool,
+    *,
+    settings: SamplerSettings | None = None,
+    progress: Progress | None = None,
+    workers: int = 1,
+) -> Callable[[Progress], Study]:
+    """Ask for every output, the parameters as for `run_study`; return what waits for them."""
+    began = time.perf_counter()
+    inner = progress if pool.here else None
+    pieces = {
+        t.output: pool.submit(_attempt, t, seed, settings, inner or _silent, workers) for t in tasks
+    }
+
+    def finish(tell: Progress) -> Study:
+        results = {}
+        for i, (key, piece) in enumerate(pieces.items()):
+            results[key] = piece.result()
+            if not pool.here:
+                tell("outputs", i + 1, len(pieces))
+        return Study(results, seed, time.perf_counter() - began)
+
+    return finish
+
+
+@one_thread()
+def _attempt(
+    task: Task,
+    seed: int,
+    settings: SamplerSettings | None,
+    progress: Progress,
+    workers: int,
+) -> OutputResult | Failure:
+    try:
+        return _work_out(task, seed, settings, progress, workers)
+    except Exception as error:  # whatever fails, the other outputs still come
+        return Failure(task, _without_folder(task, error))
+
+
+def _silent(what: str, done: int, planned: int) -> None:
+    pass
+
+
+def _without_folder(task: Task, error: Exception) -> str:
+    """Return what failed; where the priors lie on this computer is nobody's business."""
+    text = f"{type(error).__name__}: {error}"
+    path = task.prior_path or default_prior_path(task.model)
+    return text.replace(str(path), path.name)
+
+
+def _work_out(
+    task: Task, seed: int, settings: SamplerSettings | None, progress: Progress, workers: int
+) -> OutputResult:
+    seconds: dict[str, float] = {}
+    fitted, held = fitted_rows(task)
+    problem = build_problem(task.model, fitted, task.prior_path)
+    clock = time.perf_counter()
+    seeding = (estimate(problem, "least_squares", generator(seed, task.output, "seeding")),)
+    estimates, by_pressure = estimate_task(task, seed, progress=progress)
+    seconds["estimate"] = time.perf_counter() - clock
+    clock = time.perf_counter()
+    calibration = calibrate(
+        problem,
+        seed,
+        label=task.output,
+        estimates=seeding,
+        settings=settings,
+        progress=lambda done, planned: progress(f"{task.output}: sampling", done, planned),
+    )
+    seconds["sample"] = time.perf_counter() - clock
+    clock = time.perf_counter()
+    if held is not None:
+        validation = validate_held_out(calibration, held)
+    else:
+        validation = leave_one_out(
+            calibration,
+            settings=settings,
+            progress=lambda done, n: progress(f"{task.output}: leaving rows out", done, n),
+            workers=workers,
+        )
+    seconds["validate"] = time.perf_counter() - clock
+    _, replicated = predictive_draws(
+        calibration, problem.conditions, generator(seed, task.output, "replicate")
+    )
+    return OutputResult(
+        task,
+        calibration,
+        validation,
+        estimates,
+        by_pressure,
+        _prior_predictive(problem, generator(seed, task.output, "prior")),
+        replicated,
+        seconds,
+        prior_sensitivity(calibration),
+    )
+
+
+def estimate_task(
+    task: Task, seed: int, *, progress: Progress | None = None
+) -> tuple[tuple[PointEstimate, ...], dict[float, tuple[PointEstimate, ...]]]:
+    """Return the point estimates of a task, and those at each inflation pressure on its own.
+
+    Parameters
+    ----------
+    task : Task
+    seed : int
+    progress : callable, optional
+
+    Raises
+    ------
+    CalibError
+        If the data or the priors do not fit the model.
+    """
+    tell = progress or _silent
+    # The paper fitted drawbar pull at all pressures, rut depth at the two outer ones.
+    everything = task.held_out is None or task.model.startswith("magic_formula")
+    rows = task.table if everything else fitted_rows(task)[0]
+    problem = build_problem(task.model, rows, task.prior_path)
+    estimates = _all_methods(
+        problem, seed, (task.output,), lambda done, n: tell(f"{task.output}: estimating", done, n)
+    )
+    pressures = _by_pressure(task, seed) if task.model == "magic_formula_pressure" else {}
+    return estimates, pressures
+
+
+def _all_methods(
+    problem: Problem,
+    seed: int,
+    labels: tuple[str, ...],
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[PointEstimate, ...]:
+    """Estimate by every method; one that cannot read these data is left out of the table."""
+    methods = methods_for(problem.bound.model.name)
+    found = []
+    for i, method in enumerate(methods):
+        with suppress(CalibError):
+            found.append(estimate(problem, method, generator(seed, *labels, method)))
+        if progress is not None:
+            progress(i + 1, len(methods))
+    return tuple(found)
+
+
+def _by_pressure(task: Task, seed: int) -> dict[float, tuple[PointEstimate, ...]]:
+    found = {}
+    for psi in np.unique(task.table["inflation_pressure_psi"]):
+        rows = task.table.take(np.isclose(task.table["inflation_pressure_psi"], psi))
+        # Too few rows, or a pull that is constant: nothing is estimated at this pressure.
+        with suppress(CalibError):
+            problem = build_problem("magic_formula", rows, fixed={"Sh": 0.0, "Sv": 0.0})
+            found[float(psi)] = _all_methods(problem, seed, (task.output, f"{psi:g}"))
+    return found
+
+
+def _prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
+    natural = problem.theta(problem.priors.sample(rng, N_PRIOR_PREDICTIVE))
+    location = problem.bound.location(natural[:, :-1], problem.conditions)
+    noise = natural[:, -1:] * rng.standard_normal(location.shape)
+    return problem.bound.from_response(location + noise)

@@ -1,0 +1,196 @@
+"""What a study is of: outputs, the model and the rows of each, and those held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from calib.data import Table, hold_out
+from calib.data.headers import parse_header
+from calib.data.outputs import OUTPUTS
+from calib.errors import CalibError
+from calib.inference.prior_files import prior_file_model
+from calib.models import get_model
+
+__all__ = ["HoldOut", "Task", "choose_model", "fitted_rows", "he2019_tasks", "plan_tasks"]
+
+# A report's figures and leave-one-out hold a number for every draw and row.
+MAX_ROWS = 5000
+
+
+@dataclass(frozen=True)
+class HoldOut:
+    """Rows kept for validation: a column as a header would name it, and its value."""
+
+    column: str
+    value: float
+
+    def __str__(self) -> str:
+        return f"{self.column} = {self.value:g}"
+
+    @classmethod
+    def parse(cls, text: str) -> HoldOut:
+        """Read ``COLUMN=VALUE``.
+
+        Raises
+        ------
+        CalibError
+            If it is not of this form.
+        """
+        column, equals, value = text.partition("=")
+        try:
+            if not equals:
+                raise ValueError
+            return cls(column.strip(), float(value))
+        except ValueError:
+            raise CalibError(
+                f"cannot read --hold-out {text!r}",
+                allowed="COLUMN=VALUE, for instance inflation_pressure_psi=30",
+                mend="name a column with its unit, an equals sign and one number",
+            ) from None
+
+    def applies_to(self, table: Table) -> bool:
+        """Whether a table has the column at all."""
+        column = parse_header(self.column)
+        return column is not None and column.quantity.canonical in table
+
+
+@dataclass(frozen=True)
+class Task:
+    """One output to calibrate.
+
+    Parameters
+    ----------
+    output : str
+        Key of `OUTPUTS`.
+    model : str
+    table : Table
+        All rows.
+    held_out : HoldOut, optional
+        Validation by held-out rows; by leave-one-out where there is none.
+    prior_path : Path, optional
+    """
+
+    output: str
+    model: str
+    table: Table
+    held_out: HoldOut | None = None
+    prior_path: Path | None = None
+
+
+def choose_model(output: str, table: Table) -> str:
+    """Pick the model that a table's columns allow for an output (a key of `OUTPUTS`)."""
+    if output == "bulk_density":
+        gravimetric = "gravimetric_water_content" in table
+        return "ayers_perumpral" if gravimetric else "ayers_perumpral_volumetric"
+    if output == "drawbar_pull":
+        pressure = "inflation_pressure_psi"
+        several = pressure in table and np.unique(table[pressure]).size > 1
+        return "magic_formula_pressure" if several else "magic_formula"
+    slips = "slip_ratio" in table and np.unique(table["slip_ratio"]).size > 1
+    return "modified_bekker" if slips else "bekker"
+
+
+def plan_tasks(
+    tables: Sequence[Table],
+    held_out: HoldOut | None = None,
+    *,
+    models: Sequence[str] = (),
+    prior_paths: Sequence[Path] = (),
+    only: Sequence[str] = (),
+) -> tuple[Task, ...]:
+    """Find the outputs in some tables and choose a model for each.
+
+    Parameters
+    ----------
+    tables : sequence of Table
+    held_out : HoldOut, optional
+    models : sequence of str
+        Models to use for their outputs, in the place of the ones the columns suggest.
+    prior_paths : sequence of Path
+        Prior files; each names the model it is for.
+    only : sequence of str
+        Outputs to work out (keys of `OUTPUTS`); all by default.
+
+    Raises
+    ------
+    CalibError
+        If no table has an output, two have the same, none has the rows to hold out, a table is
+        too long for a report, or a name is unknown.
+    """
+    wanted = {get_model(name).output: name for name in models}
+    priors = {prior_file_model(path): path for path in prior_paths}
+    for name in only:
+        if name not in OUTPUTS:
+            raise CalibError(f"there is no output {name!r}", allowed=", ".join(OUTPUTS))
+    tasks: dict[str, Task] = {}
+    for table in tables:
+        if len(table) > MAX_ROWS:
+            raise CalibError(
+                f"{len(table)} rows are too many for a report",
+                where=table.source,
+                allowed=f"up to {MAX_ROWS} rows",
+                mend="use `calib fit` and `calib predict`, or thin the rows",
+            )
+        found = [key for key, column in OUTPUTS.items() if column in table]
+        found = [key for key in found if not only or key in only]
+        if not found:
+            raise CalibError(
+                "there is no output to calibrate",
+                where=table.source,
+                allowed=", ".join(OUTPUTS.values()) + " (in any known unit)",
+                mend="add a column with the measured output",
+            )
+        for key in found:
+            if key in tasks:
+                raise CalibError(
+                    f"two files give the output {key}",
+                    where=f"{tasks[key].table.source}, {table.source}",
+                    mend="report one of them, or join them into one file",
+                )
+            rows = table.take(np.isfinite(table[OUTPUTS[key]]))
+            usable = held_out if held_out is not None and held_out.applies_to(rows) else None
+            model = wanted.get(OUTPUTS[key]) or choose_model(key, rows)
+            tasks[key] = Task(key, model, rows, usable, priors.get(model))
+    planned = tuple(tasks[key] for key in OUTPUTS if key in tasks)
+    if held_out is not None:
+        _check_held_out(planned, held_out)
+    return planned
+
+
+def _check_held_out(tasks: Sequence[Task], held_out: HoldOut) -> None:
+    """Check that the rows to hold out are there for one output at least."""
+    refusals = []
+    for task in tasks:
+        try:
+            hold_out(task.table, held_out.column, held_out.value)
+        except CalibError as error:
+            refusals.append(error)
+    if len(refusals) == len(tasks):
+        raise refusals[0]
+
+
+def he2019_tasks() -> tuple[Task, ...]:
+    """Return the paper's three calibrations on the embedded, reconstructed data.
+
+    The 30 psi rows of drawbar pull and rut depth are held out.
+    """
+    from calib.he2019.datasets.embedded import load_he2019
+
+    held = HoldOut("inflation_pressure_psi", 30.0)
+    models = {
+        "bulk_density": ("ayers_perumpral", None),
+        "drawbar_pull": ("magic_formula_pressure", held),
+        "rut_depth": ("modified_bekker", held),
+    }
+    return tuple(Task(key, model, load_he2019(key), rows) for key, (model, rows) in models.items())
+
+
+def fitted_rows(task: Task) -> tuple[Table, Table | None]:
+    """Return the rows that are fitted, and those held out."""
+    if task.held_out is None:
+        return task.table, None
+    return hold_out(task.table, task.held_out.column, task.held_out.value)

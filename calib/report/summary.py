@@ -1,0 +1,223 @@
+"""`summary.json`: every number of a study, with its uncertainty, for machines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from calib.inference.calibration import Calibration
+from calib.inference.estimators import PointEstimate
+from calib.models.base import Array
+from calib.report.study import OutputResult, Study
+from calib.validation.scores import Scores
+from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
+
+__all__ = ["SCHEMA", "summarise", "summarise_estimates"]
+
+SCHEMA = "calib/summary/1"
+
+
+def summarise(study: Study) -> dict[str, Any]:
+    """Return a study's numbers as plain dictionaries.
+
+    Keys under ``models.<output>``: ``estimates.<method>.<parameter>``, ``fit.<method>``,
+    ``posterior.<parameter>``, ``prior_sensitivity``, ``validation``, ``sampling``; a failed output
+    has ``error`` alone.
+    """
+    models: dict[str, Any] = {k: _output(r) for k, r in study.successes.items()}
+    models |= {k: {"model": f.task.model, "error": f.error} for k, f in study.failures.items()}
+    document = {
+        "schema": SCHEMA,
+        "seed": study.seed,
+        "models": {key: models[key] for key in study.results},
+    }
+    plain: dict[str, Any] = _finite(document)
+    return plain
+
+
+def _output(result: OutputResult) -> dict[str, Any]:
+    problem = result.calibration.problem
+    return {
+        "model": problem.bound.model.name,
+        "output": problem.bound.model.output,
+        "data": {
+            "source": problem.table.source,
+            "label": problem.table.label,
+            "n": len(problem.table),
+            "n_all": len(result.task.table),
+            "ranges": {
+                name: _range(problem.table[name])
+                for name in (*problem.bound.model.conditions, problem.bound.model.output)
+            },
+            "held_out": None if result.task.held_out is None else str(result.task.held_out),
+        },
+        "references": dict(problem.bound.references),
+        **summarise_estimates(result.estimates, result.by_pressure),
+        "priors": {
+            p.name: {
+                "unit": p.unit,
+                "distribution": p.text,
+                "reason": p.reason,
+                "source": p.source,
+            }
+            for p in problem.priors.entries
+        },
+        "posterior": _posterior(result.calibration),
+        "prior_sensitivity": _sensitivity(result),
+        "validation": _validation(result),
+        "sampling": _sampling(result.calibration),
+    }
+
+
+def summarise_estimates(
+    estimates: Sequence[PointEstimate], by_pressure: Mapping[float, Sequence[PointEstimate]]
+) -> dict[str, Any]:
+    """Return an output's point estimates as they stand in the summary."""
+    plain: dict[str, Any] = _finite(
+        {
+            "estimates": {e.method: dict(e.reported) for e in estimates},
+            "fit": {e.method: _fit(e) for e in estimates},
+            "by_pressure": {
+                f"{psi:g} psi": {e.method: {**e.reported, "cost": e.cost} for e in alone}
+                for psi, alone in by_pressure.items()
+            },
+        }
+    )
+    return plain
+
+
+def _range(values: Array) -> dict[str, float]:
+    return {
+        "lower": float(values.min()),
+        "upper": float(values.max()),
+        "distinct": int(np.unique(values).size),
+    }
+
+
+def _fit(e: PointEstimate) -> dict[str, Any]:
+    return {
+        "cost": e.cost,
+        "cost_unit": e.cost_unit,
+        "rmse": e.rmse,
+        "rmse_unit": e.rmse_unit,
+        "r_squared": e.r_squared,
+        "evaluations": e.n_evaluations,
+        "converged": e.converged,
+        "note": e.note,
+    }
+
+
+def _posterior(calibration: Calibration) -> dict[str, Any]:
+    return {
+        name: {
+            "unit": s.unit,
+            "mean": s.mean,
+            "sd": s.sd,
+            "median": s.median,
+            "hdi_lower": s.hdi_lower,
+            "hdi_upper": s.hdi_upper,
+            "ess_bulk": s.ess_bulk,
+            "ess_tail": s.ess_tail,
+            "rhat": s.rhat,
+            "mcse_mean": s.mcse_mean,
+            "mcse_median": s.mcse_median,
+            "mcse_hdi_lower": s.mcse_hdi_lower,
+            "mcse_hdi_upper": s.mcse_hdi_upper,
+            "posterior_to_prior_sd": s.sd_ratio,
+        }
+        for name, s in calibration.summary.items()
+    }
+
+
+def _sensitivity(result: OutputResult) -> dict[str, Any]:
+    return {
+        "criteria": {
+            "contraction_at_least": CONTRACTION_MIN,
+            "power_scaling_threshold": SENSITIVITY_MIN,
+        },
+        "parameters": {
+            name: {
+                "contraction": s.contraction,
+                "prior": s.prior,
+                "likelihood": s.likelihood,
+                "identified": s.identified,
+                "reading": s.reading,
+            }
+            for name, s in result.sensitivity.items()
+        },
+    }
+
+
+def _validation(result: OutputResult) -> dict[str, Any]:
+    v = result.validation
+    return {"method": v.method, **_scores(v.scores)} | (
+        {
+            "elpd": v.elpd,
+            "elpd_se": v.elpd_se,
+            "largest_pareto_k": None if v.pareto_k is None else float(v.pareto_k.max()),
+            "refitted": list(v.refitted),
+            "refits_not_converged": list(v.unconverged),
+        }
+        if v.method == "leave_one_out"
+        else {}
+    )
+
+
+def _scores(s: Scores) -> dict[str, Any]:
+    return {
+        "n": s.n,
+        "rmse": s.rmse,
+        "crps": s.crps,
+        "max_relative_error": s.max_relative_error,
+        "n_relative_error_above_6_percent": int((abs(s.relative_error) > 0.06).sum()),
+        "coverage": {f"{100 * level:g}": c.proportion for level, c in s.coverage.items()},
+        "coverage_interval": {
+            f"{100 * level:g}": [c.lower, c.upper] for level, c in s.coverage.items()
+        },
+        "pit": s.pit.tolist(),
+    }
+
+
+def _sampling(calibration: Calibration) -> dict[str, Any]:
+    d, problem = calibration.draws, calibration.problem
+    r = d.report
+    mode = problem.theta(d.mode[None])[0].tolist()
+    return {
+        "converged": r.passed,
+        "reasons": list(r.reasons),
+        "gate": {
+            "largest_rhat": float(r.rhat.max()),
+            "smallest_ess_bulk": float(r.ess_bulk.min()),
+            "smallest_ess_tail": float(r.ess_tail.min()),
+            "smallest_steps_over_tau": float((r.steps / r.tau).min()),
+        },
+        "ensembles": d.t.shape[0],
+        "walkers": d.walkers,
+        "steps": r.steps,
+        "tau": float(max(r.tau)),
+        "acceptance": d.acceptance,
+        "evaluations": d.evaluations,
+        "log_evidence": d.log_evidence,
+        "mode": {
+            p.name: value
+            for p, value in zip(problem.priors.entries, mode, strict=True)
+            if not p.fixed
+        },
+        "log_posterior_at_mode": float(problem.log_prob(d.mode[None])[0]),
+    }
+
+
+def _finite(value: Any) -> Any:
+    """JSON has no NaN: what is undefined is null."""
+    if isinstance(value, dict):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "item"):
+        return _finite(value.item())
+    return value

@@ -1,0 +1,199 @@
+"""Write a study as one folder: page, figures, numbers, posteriors, manifest. It only formats."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+from calib.batch.environment import Environment, sha256
+from calib.batch.folders import fresh_folder
+from calib.batch.pool import HERE, Pool
+from calib.data import write_table
+from calib.he2019.audit import Audit
+from calib.he2019.gaps.find import FoundGap
+from calib.he2019.gaps.summary import summarise_gaps
+from calib.he2019.page.audit import write_audit
+from calib.he2019.page.gaps import begin_gaps_section
+from calib.inference.io import to_datatree, write_netcdf
+from calib.inference.prior_files import default_prior_path
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.report.figures import Plate
+from calib.report.figures.collect import plates
+from calib.report.figures.export import pdf_bytes, png
+from calib.report.manifest import build_manifest, file_hashes
+from calib.report.page.render import render_page
+from calib.report.publish import publication
+from calib.report.study import OutputResult, Study
+from calib.report.summary import summarise
+
+__all__ = ["write_report"]
+
+type Progress = Callable[[str, int, int], None]
+
+
+def write_report(
+    study: Study,
+    out: Path,
+    *,
+    settings: SamplerSettings,
+    command: Sequence[str],
+    title: str,
+    gaps: Sequence[FoundGap] = (),
+    overwrite: bool = False,
+    posteriors: bool = True,
+    environment: Environment | None = None,
+    audit: Audit | None = None,
+    pdf: bool = False,
+    progress: Progress | None = None,
+    pool: Pool = HERE,
+) -> Path:
+    """Write a report folder.
+
+    Parameters
+    ----------
+    study : Study
+    out : Path
+        Appears whole or not at all.
+    settings : SamplerSettings
+        Of the study, for the manifest.
+    command : sequence of str
+        The command line, for the manifest.
+    title : str
+    gaps : sequence of FoundGap
+        Of the source's own models, diagnosed: a section of their own.
+    overwrite : bool
+        Replace an earlier report.
+    posteriors : bool
+        Whether to keep the netCDF files, which are megabytes. Where they are left out, the
+        manifest says so and has their hashes.
+    environment : Environment, optional
+        Where the manifest says the report was made: that of this process by default.
+    audit : Audit, optional
+        Of the published tables, shown before the appendix.
+    pdf : bool
+        Whether every figure also comes as PDF, for print.
+    progress : callable, optional
+    pool : Pool, optional
+        Where figures are drawn.
+
+    Returns
+    -------
+    Path
+        Of ``index.html``.
+
+    Raises
+    ------
+    CalibError
+        If the folder exists or cannot be written.
+    """
+    tell = progress or (lambda what, done, planned: None)
+    successes = study.successes
+    with fresh_folder(out, overwrite=overwrite) as folder:
+        inputs = _copy_inputs(study, folder)
+        (folder / "figures").mkdir()
+        pieces = {
+            key: pool.submit(_write_output, key, result, folder, _embedded(study, key), pdf)
+            for key, result in successes.items()
+        }
+        versions = (environment or Environment.here()).versions
+        section = begin_gaps_section(gaps, folder, png, versions=versions, pdf=pdf, pool=pool)
+        summary = summarise(study)
+        if gaps:
+            summary["paper_gaps"] = summarise_gaps(gaps)
+        (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
+        manifest = build_manifest(
+            study, settings, command, inputs, title=title, environment=environment
+        )
+        manifest["pdf"] = pdf
+        paper = publication(manifest, summary)
+        for path, text in paper.files.items():
+            (folder / path).parent.mkdir(exist_ok=True)
+            (folder / path).write_text(text, encoding="utf-8")
+        if gaps:
+            manifest["paper_gaps"] = {r.gap.name: {"seed": r.found.seed} for r in gaps}
+        if audit is not None:
+            manifest["audit"] = {"seed": audit.seed, "seeds": asdict(audit.seeds)}
+        audit_html = write_audit(audit, folder) if audit is not None else None
+        drawn: dict[str, list[Plate]] = {}
+        images: dict[str, bytes] = {}
+        for i, (key, piece) in enumerate(pieces.items()):
+            tell("drawing figures", i, len(pieces))
+            drawn[key], shown = piece.result()
+            images |= shown
+        tell("drawing figures", len(pieces), len(pieces))
+        page = render_page(
+            study,
+            drawn,
+            images,
+            manifest=manifest,
+            title=title,
+            gaps_html=section(tell) if gaps else None,
+            reconstructed=any(r.task.table.label for r in study.results.values()),
+            audit_html=audit_html,
+            paper=paper,
+        )
+        (folder / "index.html").write_text(page, encoding="utf-8")
+        files = file_hashes(folder)
+        left_out = [] if posteriors else [f"{key}.nc" for key in successes]
+        manifest["left_out"] = {name: files.pop(name) for name in left_out}
+        for name in left_out:
+            (folder / name).unlink()
+        manifest["files"] = files
+        (folder / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
+    return Path(out) / "index.html"
+
+
+def _write_output(
+    key: str, result: OutputResult, folder: Path, published: bool, pdf: bool
+) -> tuple[list[Plate], dict[str, bytes]]:
+    """Write posterior and figures of an output; return what the page shows of the figures."""
+    write_netcdf(to_datatree(result.calibration), folder / f"{key}.nc")
+    drawn, images = [], {}
+    for plate in plates(result, published=published):
+        drawn.append(replace(plate, figure=None))
+        if plate.figure is None:
+            continue
+        name = f"{key}_{plate.name}.png"
+        images[name] = png(plate)
+        (folder / "figures" / name).write_bytes(images[name])
+        if pdf:
+            file = folder / "figures" / f"{key}_{plate.name}.pdf"
+            file.write_bytes(pdf_bytes(plate.figure))
+    return drawn, images
+
+
+def _embedded(study: Study, key: str) -> bool:
+    return study.results[key].task.table.label != ""
+
+
+def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
+    """Copy data and priors into the report, so that it can be computed again from itself."""
+    (folder / "data").mkdir()
+    (folder / "priors").mkdir()
+    inputs = {}
+    for key, result in study.results.items():
+        task = result.task
+        prior_path = task.prior_path or default_prior_path(task.model)
+        write_table(folder / "data" / f"{key}.csv", task.table.columns)
+        data = (folder / "data" / f"{key}.csv").read_bytes()
+        priors = prior_path.read_bytes()
+        (folder / "priors" / f"{key}.toml").write_bytes(priors)
+        inputs[key] = {
+            "data": {
+                "file": f"data/{key}.csv",
+                "sha256": sha256(data),
+                "source": task.table.source,
+                "source_sha256": task.table.sha256,
+                "ignored": list(task.table.ignored),
+            },
+            "priors": {
+                "file": f"priors/{key}.toml",
+                "sha256": sha256(priors),
+                "source": prior_path.name,
+                "shipped": task.prior_path is None,
+            },
+        }
+    return inputs

@@ -1,0 +1,1 @@
+"""Predictions, scores, held-out rows, sensitivity, simulation-based calibration."""

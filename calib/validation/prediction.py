@@ -1,0 +1,222 @@
+"""Predict outputs at new conditions, with bands, from a calibration."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.special import ndtri
+
+from calib.batch.threads import one_thread
+from calib.data import Table
+from calib.data.headers import parse_header
+from calib.errors import CalibError
+from calib.inference.random import generator
+from calib.models.base import Array
+from calib.validation.scores import LEVELS
+
+if TYPE_CHECKING:
+    from calib.inference.calibration import Calibration
+
+__all__ = [
+    "Bands", "Prediction", "bands", "outside", "predict", "prediction_columns", "predictive_draws",
+]  # fmt: skip
+
+N_DRAWS = 4000
+MIN_DEFINED = 0.95
+_ROWS_AT_ONCE = 2000
+_NOISE_REPEATS = 4
+
+
+@dataclass(frozen=True)
+class Bands:
+    """Median and central bands, arrays of shape (n,) by level."""
+
+    median: Array
+    lower: Mapping[float, Array]
+    upper: Mapping[float, Array]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A prediction at n conditions.
+
+    Parameters
+    ----------
+    output : str
+        Canonical column, with its unit.
+    conditions : mapping of str to ndarray
+    parameter : Bands
+        Uncertainty of the parameters alone: where the mean curve lies.
+    predictive : Bands
+        With the noise: where a measurement would lie.
+    outside : tuple of tuple of str
+        For every row, the conditions that leave the calibrated range.
+    defined : ndarray, shape (n,)
+        Part of the posterior for which the equation has a value there; below `MIN_DEFINED`
+        median and bands are NaN.
+    """
+
+    output: str
+    conditions: Mapping[str, Array]
+    parameter: Bands
+    predictive: Bands
+    outside: tuple[tuple[str, ...], ...]
+    defined: Array
+
+
+@one_thread()
+def predictive_draws(
+    calibration: Calibration, conditions: Mapping[str, Array], rng: np.random.Generator,
+    size: int = N_DRAWS,
+) -> tuple[Array, Array]:  # fmt: skip
+    """Draw the mean output and a measurement, both of shape (size, n)."""
+    problem = calibration.problem
+    natural = problem.theta(calibration.subset(size))
+    location = problem.bound.location(natural[:, :-1], conditions)
+    noise = natural[:, -1:] * rng.standard_normal(location.shape)
+    from_response = problem.bound.from_response
+    return from_response(location), from_response(location + noise)
+
+
+def predict(calibration: Calibration, table: Table) -> Prediction:
+    """Predict at the conditions of a table.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    table : Table
+        With the model's conditions.
+
+    Returns
+    -------
+    Prediction
+
+    Raises
+    ------
+    CalibError
+        If a condition is missing.
+    """
+    model = calibration.problem.bound.model
+    conditions = model.select(table.columns)
+    problem = calibration.problem
+    natural = problem.theta(calibration.subset(N_DRAWS))
+    # The same noise draws for every row: its bands do not depend on the other rows.
+    rng = generator(calibration.seed, calibration.label, "predict")
+    noises = [natural[:, -1:] * z for z in _stratified_normals(rng, natural.shape[0])]
+    parts = []
+    for start in range(0, len(table), _ROWS_AT_ONCE):
+        rows = {name: v[start : start + _ROWS_AT_ONCE] for name, v in conditions.items()}
+        location = problem.bound.location(natural[:, :-1], rows)
+        share = np.isfinite(location).mean(axis=0)
+        # Where many plausible parameters give the equation no value (a quadratic in pressure
+        # extrapolated below zero), the rest are no sample of anything: no value is better.
+        location = np.where(share >= MIN_DEFINED, location, np.nan)
+        back = problem.bound.from_response
+        measured = np.concatenate([back(location + noise) for noise in noises])
+        parts.append((bands(back(location)), bands(measured), share))
+    return Prediction(
+        model.output,
+        conditions,
+        _join([p[0] for p in parts]),
+        _join([p[1] for p in parts]),
+        outside(problem.conditions, conditions),
+        np.concatenate([p[2] for p in parts]),
+    )
+
+
+def _stratified_normals(rng: np.random.Generator, size: int) -> Iterator[Array]:
+    """Standard normals, evenly spread over their quantiles, in random order, (size, 1) each."""
+    for _ in range(_NOISE_REPEATS):
+        yield ndtri((rng.permutation(size) + rng.uniform(size=size)) / size)[:, None]
+
+
+def _join(parts: Sequence[Bands]) -> Bands:
+    return Bands(
+        np.concatenate([b.median for b in parts]),
+        {level: np.concatenate([b.lower[level] for b in parts]) for level in LEVELS},
+        {level: np.concatenate([b.upper[level] for b in parts]) for level in LEVELS},
+    )
+
+
+def bands(draws: Array) -> Bands:
+    """Median and central bands of draws, shape (size, n)."""
+    edges = [
+        0.5,
+        *(0.5 - level / 2.0 for level in LEVELS),
+        *(0.5 + level / 2.0 for level in LEVELS),
+    ]
+    # A parameter vector for which the equation has no value there is left out, not spread; where
+    # none has a value, neither have the bands.
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
+        quantiles = np.nanquantile(draws, edges, axis=0)
+    k = len(LEVELS)
+    return Bands(
+        quantiles[0],
+        dict(zip(LEVELS, quantiles[1 : 1 + k], strict=True)),
+        dict(zip(LEVELS, quantiles[1 + k :], strict=True)),
+    )
+
+
+def prediction_columns(prediction: Prediction, table: Table) -> dict[str, Array | list[str]]:
+    """Lay a prediction out as columns of a CSV: the conditions first, as they were given.
+
+    Parameters
+    ----------
+    prediction : Prediction
+    table : Table
+        The conditions.
+    """
+    output = prediction.output
+    columns: dict[str, Array | list[str]] = echoed(table, output)
+    columns[f"{output}_median"] = prediction.predictive.median
+    for kind, banded in (
+        ("parameter", prediction.parameter),
+        ("predictive", prediction.predictive),
+    ):
+        for level in LEVELS:
+            columns[f"{output}_{kind}_{100 * level:g}_lower"] = banded.lower[level]
+            columns[f"{output}_{kind}_{100 * level:g}_upper"] = banded.upper[level]
+    columns["outside_calibrated_range"] = [
+        "+".join(flags)
+        + ("" if defined >= MIN_DEFINED else f" (no value: defined for {defined:.0%})")
+        for flags, defined in zip(prediction.outside, prediction.defined, strict=True)
+    ]
+    return columns
+
+
+def echoed(table: Table, output: str) -> dict[str, Array | list[str]]:
+    """Return the columns of a table as they were given, but for a measured output.
+
+    Long tables, whose text is not kept, come back in canonical columns.
+    """
+    if table.text:
+        given = {h: [row[j] for row in table.text] for j, h in enumerate(table.header)}
+        return {h: v for h, v in given.items() if not _names(h, output)}
+    return {name: v for name, v in table.columns.items() if name != output}
+
+
+def _names(header: str, output: str) -> bool:
+    try:
+        column = parse_header(header)
+    except CalibError:
+        return False
+    return column is not None and column.quantity.canonical == output
+
+
+def outside(
+    calibrated: Mapping[str, Array], conditions: Mapping[str, Array]
+) -> tuple[tuple[str, ...], ...]:
+    """Name, for each row of conditions, those beyond the range of the calibrated ones."""
+    n = next(iter(conditions.values())).size
+    flags: list[list[str]] = [[] for _ in range(n)]
+    for name, values in conditions.items():
+        low, high = calibrated[name].min(), calibrated[name].max()
+        slack = 1e-9 * max(abs(low), abs(high))
+        for i in np.flatnonzero((values < low - slack) | (values > high + slack)):
+            flags[i].append(name)
+    return tuple(tuple(row) for row in flags)

@@ -1,0 +1,181 @@
+"""One replicate: simulate, calibrate as a user would, rank the truth among the posterior's draws.
+
+A replicate is a pure function of its item, so it can run anywhere and in any order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from calib.data import table_from_arrays
+from calib.inference.calibration import Calibration, calibrate
+from calib.inference.estimators import estimate
+from calib.inference.problem import build_problem
+from calib.inference.random import generator
+from calib.inference.sampling.sampler import Draws, SamplerSettings
+from calib.models.base import Array
+from calib.validation.prediction import predict
+from calib.validation.sbc.designs import Design, design_of
+from calib.validation.sbc.simulate import Simulated, simulate
+from calib.validation.scores import LEVELS
+
+__all__ = ["DERIVED", "Item", "calibrated", "measure", "ranks", "replicate", "simulated"]
+
+# Quantities that are followed beside the parameters.
+DERIVED = ("log_likelihood", "prediction", "measurement")
+# Steps of each walker that are kept for ranks. The gate asks for 50 autocorrelation times, so five
+# steps are at least ten of them apart: as good as independent.
+_KEPT_STEPS = 5
+
+
+@dataclass(frozen=True)
+class Item:
+    """What a replicate needs.
+
+    Parameters
+    ----------
+    model : str
+    index : int
+        Number of the replicate.
+    seed : int
+        Of the whole run.
+    settings : SamplerSettings
+    """
+
+    model: str
+    index: int
+    seed: int
+    settings: SamplerSettings = field(default_factory=SamplerSettings)
+
+
+def replicate(item: Item) -> dict[str, Any]:
+    """Run one replicate.
+
+    Returns
+    -------
+    dict
+        Plain numbers: convergence, ranks by quantity as ``[rank, draws]``, and how many held-out
+        measurements each band covered.
+    """
+    case = simulated(item)
+    calibration = calibrated(case, item)
+    report = calibration.draws.report
+    return {
+        "model": item.model,
+        "index": item.index,
+        "seed": item.seed,
+        "attempts": case.attempts,
+        "converged": report.passed,
+        "reasons": list(report.reasons),
+        "steps": report.steps,
+        "extended": report.steps > item.settings.steps,
+        **measure(case, calibration, design_of(item.model)),
+    }
+
+
+def simulated(item: Item) -> Simulated:
+    """Return the campaign of an item."""
+    design = design_of(item.model)
+    template = build_problem(item.model, design.table)
+    return simulate(template, design, generator(item.seed, "sbc", item.model, item.index))
+
+
+def calibrated(case: Simulated, item: Item) -> Calibration:
+    """Return the posterior of a campaign, by the same steps as `calib fit`."""
+    label = f"sbc {item.model} {item.index}"
+    point = estimate(case.problem, "least_squares", generator(item.seed, label, "least_squares"))
+    return calibrate(
+        case.problem, item.seed, label=label, estimates=(point,), settings=item.settings
+    )
+
+
+def measure(case: Simulated, calibration: Calibration, design: Design) -> dict[str, Any]:
+    """Rank the truth and count what the bands covered."""
+    return {
+        "ranks": ranks(case, calibration, design.watched),
+        **_coverage(case, calibration),
+    }
+
+
+def ranks(case: Simulated, calibration: Calibration, watched: int) -> dict[str, list[int]]:
+    """Rank the truth of every quantity among nearly independent posterior draws.
+
+    Parameters
+    ----------
+    case : Simulated
+    calibration : Calibration
+    watched : int
+        Held-out row at which a prediction is ranked.
+
+    Returns
+    -------
+    dict of str to [int, int]
+        Draws below the truth, and draws. Where the truth has no value the quantity is left out.
+    """
+    drawn = _quantities(calibration, _thinned(calibration.draws), case, watched)
+    true = _quantities(calibration, case.truth[None], case, watched)
+    rng = generator(calibration.seed, calibration.label, "measurement")
+    sigma = calibration.problem.theta(_thinned(calibration.draws))[:, -1]
+    response = calibration.problem.bound.to_response
+    with np.errstate(all="ignore"):
+        noisy = response(drawn["prediction"]) + sigma * rng.standard_normal(sigma.size)
+        drawn["measurement"] = calibration.problem.bound.from_response(noisy)
+    true["measurement"] = case.measured[watched : watched + 1]
+    found = {}
+    for name, values in drawn.items():
+        finite = values[np.isfinite(values)]
+        if np.isfinite(true[name][0]):
+            found[name] = [int((finite < true[name][0]).sum()), int(finite.size)]
+    return found
+
+
+def _thinned(draws: Draws) -> Array:
+    """All walkers at a few steps far apart, shape (ensembles * walkers * steps, d).
+
+    Walkers of an ensemble are independent of each other at any one step of a stationary chain.
+    """
+    steps = np.linspace(0, draws.t.shape[2] - 1, min(_KEPT_STEPS, draws.t.shape[2]))
+    kept = draws.t[:, :, steps.round().astype(int)]
+    return np.asarray(kept.reshape(-1, draws.t.shape[-1]))
+
+
+def _quantities(
+    calibration: Calibration, t: Array, case: Simulated, watched: int
+) -> dict[str, Array]:
+    """Everything that is ranked but the measurement, of internal coordinates (k, d): (k,) each."""
+    problem = calibration.problem
+    natural = problem.theta(t)
+    reported: Mapping[str, Array] = problem.bound.report(natural[:, :-1])
+    entries = {p.name: natural[:, i] for i, p in enumerate(problem.priors.entries)}
+    known = {**reported, **entries}
+    row = {name: v[watched : watched + 1] for name, v in case.held.items()}
+    return {
+        **{name: known[name] for name in calibration.parameters},
+        "log_likelihood": problem.log_likelihood(t),
+        "prediction": problem.bound.predict(natural[:, :-1], row)[:, 0],
+    }
+
+
+def _coverage(case: Simulated, calibration: Calibration) -> dict[str, Any]:
+    """Held-out measurements inside each predictive band, of those that have one."""
+    defined = np.isfinite(case.measured)
+    if not defined.any():
+        return {"covered": {}, "rows": 0, "no_band": 0}
+    rows = {name: v[defined] for name, v in case.held.items()}
+    bands = predict(calibration, table_from_arrays(rows, source="held out")).predictive
+    given = np.isfinite(bands.median)
+    measured = case.measured[defined]
+    return {
+        "covered": {
+            f"{100 * level:g}": int(
+                ((measured >= bands.lower[level]) & (measured <= bands.upper[level]))[given].sum()
+            )
+            for level in LEVELS
+        },
+        "rows": int(given.sum()),
+        "no_band": int((~given).sum()),
+    }

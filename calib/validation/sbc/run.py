@@ -1,0 +1,104 @@
+"""Run the replicates of all models, resumable, on this machine or a cluster."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from calib.batch.tasks import run_tasks
+from calib.errors import CalibError
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.models import MODELS, get_model
+from calib.validation.sbc.replicate import Item, replicate
+from calib.validation.sbc.score import SbcScore, score
+
+__all__ = ["SETTINGS", "read_records", "run_sbc"]
+
+# As for a report, but a chain is extended to 3200 steps, not 25,600, before it counts as one that
+# did not converge: simulated campaigns are many, and some tell next to nothing.
+SETTINGS = SamplerSettings(max_steps=3200)
+_RUN = "run.json"
+REPLICATES = "replicates"
+
+
+def run_sbc(
+    out: Path,
+    *,
+    models: Sequence[str] = (),
+    simulations: int = 300,
+    seed: int,
+    settings: SamplerSettings = SETTINGS,
+    workers: int = 1,
+    scheduler: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    announce: Callable[[str], None] | None = None,
+) -> SbcScore:
+    """Simulate, calibrate and rank; what is there already is not done again.
+
+    Parameters
+    ----------
+    out : Path
+        Its folder ``replicates`` gets one JSON file for each replicate.
+    models : sequence of str
+        All by default.
+    simulations : int
+        Of each model.
+    seed : int
+    settings : SamplerSettings
+    workers, scheduler, progress, announce
+        As for `calib.batch.tasks.run_tasks`.
+
+    Raises
+    ------
+    CalibError
+        If there is no such model, or the folder holds a run of another seed or other settings.
+    """
+    names = [get_model(name).name for name in models] or list(MODELS)
+    _claim(out, {"seed": seed, "settings": asdict(settings)})
+    items = {
+        f"{model}-{i:04d}": Item(model, i, seed, settings)
+        for model in names
+        for i in range(simulations)
+    }
+    outcome = run_tasks(
+        replicate, items, out / REPLICATES, workers=workers, scheduler=scheduler,
+        progress=progress, announce=announce,
+    )  # fmt: skip
+    return score(read_records(out, outcome.done), seed, simulations, outcome.failed)
+
+
+def read_records(out: Path, names: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the records of some replicates of a run."""
+    return [json.loads((out / REPLICATES / f"{name}.json").read_text()) for name in names]
+
+
+def _claim(out: Path, run: dict[str, Any]) -> None:
+    """Write what is run into the folder, or check that it is the same that is there."""
+    path = Path(out) / _RUN
+    text = json.dumps(run, indent=1) + "\n"
+    try:
+        if path.exists():
+            if path.read_text(encoding="utf-8") != text:
+                raise CalibError(
+                    "the folder holds replicates of another seed or of other sampler settings",
+                    where=str(path),
+                    mend="choose another --out, or the seed that is there",
+                )
+            return
+        if Path(out).exists() and any(Path(out).iterdir()):
+            raise CalibError(
+                "the output folder exists, is not empty and holds no simulation-based calibration",
+                where=str(out),
+                mend="choose another --out",
+            )
+        Path(out).mkdir(parents=True, exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CalibError(
+            f"the output folder cannot be written ({error.strerror})",
+            where=str(out),
+            mend="choose another --out, or change its permissions",
+        ) from None

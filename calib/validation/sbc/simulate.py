@@ -1,0 +1,101 @@
+"""One simulated campaign: parameters from the prior, measurements from the parameters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calib.data import Table
+from calib.errors import CalibError
+from calib.inference.problem import Problem
+from calib.models.base import Array
+from calib.validation.sbc.designs import Design
+
+__all__ = ["Simulated", "simulate"]
+
+_MOST_ATTEMPTS = 10_000
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A campaign whose truth is known.
+
+    Parameters
+    ----------
+    truth : ndarray, shape (d,)
+        Internal coordinates.
+    problem : Problem
+        Of the simulated calibration data.
+    held : mapping of str to ndarray, shape (m,)
+        Conditions of the held-out rows.
+    location, measured : ndarray, shape (m,)
+        At the held-out rows: the model's output at the truth, and a measurement of it; NaN where
+        the model has no value.
+    attempts : int
+        Draws from the prior until the model had a value at every row.
+    """
+
+    truth: Array
+    problem: Problem
+    held: dict[str, Array]
+    location: Array
+    measured: Array
+    attempts: int
+
+
+def simulate(template: Problem, design: Design, rng: np.random.Generator) -> Simulated:
+    """Simulate a campaign.
+
+    Parameters
+    ----------
+    template : Problem
+        Of the design's conditions; its outputs are not used.
+    design : Design
+    rng : Generator
+
+    Raises
+    ------
+    CalibError
+        If the model has no value at the design, however often the prior is asked.
+
+    Notes
+    -----
+    Parameters for which the equation has no value at some row have no likelihood: the posterior
+    excludes them, so the prior that the truths come from does too. Data that a float cannot hold
+    are drawn again with new parameters; a choice made by looking at data alone keeps ranks
+    uniform (Modrak et al. 2023, doi:10.1214/23-BA1404).
+    """
+    bound = template.bound
+    for attempt in range(1, _MOST_ATTEMPTS + 1):
+        truth = template.priors.sample(rng, 1)
+        natural = template.theta(truth)
+        noisy = _noisy(template, natural, dict(template.conditions), rng)[1]
+        location, measured = _noisy(template, natural, design.held, rng)
+        if np.isfinite(noisy).all() and (bound.model.response != "log" or (noisy > 0.0).all()):
+            return Simulated(
+                truth[0], template.with_table(_measured(template, noisy)), design.held, location,
+                measured, attempt,
+            )  # fmt: skip
+    raise CalibError(
+        f"the prior of {bound.model.name} gave no data in {_MOST_ATTEMPTS} draws",
+        where=template.priors.source,
+        mend="look for conditions at which the model has no value",
+    )
+
+
+def _noisy(
+    problem: Problem, natural: Array, conditions: dict[str, Array], rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Output at some conditions and a measurement of it, each of shape (n,)."""
+    location = problem.bound.location(natural[:, :-1], conditions)[0]
+    noise = natural[0, -1] * rng.standard_normal(location.size)
+    with np.errstate(over="ignore"):
+        back = problem.bound.from_response
+        return back(location), back(location + noise)
+
+
+def _measured(template: Problem, output: Array) -> Table:
+    # Not checked as a file is: a prior may expect values that no instrument reads.
+    columns = {**template.table.columns, template.bound.model.output: output}
+    return replace(template.table, columns=columns, source="simulated", label="simulated", text=())

@@ -1,0 +1,148 @@
+"""Plans: which tasks they stand for, and what is said of those that will not do."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from calib.batch.campaign import read_plan
+from calib.batch.campaign.kinds import KINDS
+from calib.errors import CalibError
+from calib.inference.prior_files import default_prior_path
+from tests.batch.campaign.sites import EFFECT, NAMES, WIND, make_site
+
+README = Path(__file__).resolve().parents[3] / "README.md"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    plan = make_site(tmp_path_factory.mktemp("plans"))
+    plan.unlink()
+    return plan.parent
+
+
+def planned(folder: Path, text: str) -> list[str]:
+    (folder / "plan.toml").write_text(text)
+    return list(read_plan(folder / "plan.toml").tasks)
+
+
+def test_a_plan_is_its_tasks_by_name(site):
+    plan = read_plan(site)
+    assert tuple(plan.tasks) == NAMES
+    task = plan.tasks["sites.cases-case-3"]
+    assert (task.name, task.kind) == ("sites.cases-case-3", "diagnose")
+    assert sorted(task.inputs) == ["calibration", "case.toml", "field", "predict"]
+    assert len({t.seed for t in plan.tasks.values()}) == len(NAMES)
+
+
+def test_a_tasks_seed_is_its_own(folder):
+    one = '[[challenge]]\nname = "{}"\ncases = 2\ndraw_seed = 5\n'
+    seeds = {}
+    for text in ("", "seed = 8\n"):
+        planned(folder, text + one.format("a") + one.format("b"))
+        for name, task in read_plan(folder / "plan.toml").tasks.items():
+            seeds[text, name] = task.seed
+    assert len(set(seeds.values())) == 8
+    planned(folder, one.format("b") + "seed = 8\n" + one.format("a"))
+    again = read_plan(folder / "plan.toml").tasks
+    assert again["b.case-000"].seed == seeds["seed = 8\n", "b.case-000"]
+    assert again["a.case-001"].seed == seeds["", "a.case-001"]
+
+
+def test_fits_are_files_by_models_by_priors_by_hold_outs(folder):
+    shipped = default_prior_path("bekker").read_text()
+    (folder / "wide.toml").write_text(shipped)
+    found = planned(
+        folder,
+        """
+        [[fit]]
+        name = "all"
+        data = ["data/*.csv", "data/rut.csv"]
+        models = ["bekker", "modified_bekker"]
+        priors = ["shipped", "wide.toml"]
+        hold_out = ["nothing", "inflation_pressure_psi = 30"]
+        """,
+    )
+    assert found == [
+        "all.data-rut.bekker.shipped.nothing",
+        "all.data-rut.bekker.shipped.inflation_pressure_psi_=_30",
+        "all.data-rut.bekker.wide.toml.nothing",
+        "all.data-rut.bekker.wide.toml.inflation_pressure_psi_=_30",
+        "all.data-rut.modified_bekker.shipped.nothing",
+        "all.data-rut.modified_bekker.shipped.inflation_pressure_psi_=_30",
+    ]
+
+
+def test_the_readmes_plan_is_one(tmp_path):
+    blocks = re.findall(r"```toml\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.S)
+    text = next(block for block in blocks if "[[fit]]" in block)
+    plan = make_site(tmp_path / "site", text)
+    (plan.parent / "my_priors.toml").write_text(default_prior_path("bekker").read_text())
+    (plan.parent / "my_effects.py").write_text(EFFECT)
+    (plan.parent / "wind.toml").write_text(WIND)
+    tasks = read_plan(plan).tasks.values()
+    assert {t.kind for t in tasks} == {"fit", "diagnose", "challenge", "sbc"} == set(KINDS)
+
+
+FIT = '[[fit]]\nname = "a"\ndata = ["data/*.csv"]\nmodels = ["bekker"]\n'
+CASES = '[[challenge]]\nname = "a"\ndraw_seed = 1\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", ["the plan has no tasks", "[[fit]]", "add a table"]),
+        ("seed = 1", ["the plan has no tasks"]),
+        ("[[fits]]", ["unknown table fits", "[[fit]]"]),
+        ("fit = 3", ["fit is not a list of tables"]),
+        ("[fit]\nname = 'a'", ["fit is not a list of tables", "two brackets"]),
+        ("seed = -1\n" + FIT, ["the seed is -1", "0 or a positive whole number"]),
+        ("seed = true\n" + FIT, ["the seed is True"]),
+        ("[[fit\n", ["not valid TOML", "line 1"]),
+        (FIT + "colour = 1", ["[[fit]]", "unknown key colour", "max_steps"]),
+        (FIT + "max_steps = '9'", ["[[fit]], max_steps", "'9' will not do", "100 or more"]),
+        (FIT + "seed = 1.5", ["[[fit]], seed", "1.5 will not do"]),
+        ('[[fit]]\nname = "a"\ndata = ["data/*.csv"]', ["models is missing", "calib models"]),
+        ('[[fit]]\nname = "a"\ndata = []\nmodels = ["bekker"]', ["[] will not do", "CSV files"]),
+        (FIT.replace("data/*.csv", "other/*.csv"), ["no file", "'other/*.csv'", "[[fit]], data"]),
+        (FIT.replace("bekker", "becker"), ["[[fit]], models", "becker", "bekker"]),
+        (FIT.replace('"a"', '"a b"'), ["[[fit]], name", "'a b' will not do", "a word of"]),
+        (FIT + FIT, ["[[fit]] number 2", "the name 'a' is that of"]),
+        (FIT + CASES + "cases = 1", ["[[challenge]]", "the name 'a' is that of"]),
+        (FIT + 'priors = ["none.toml"]', ["[[fit]], priors", "no file 'none.toml'"]),
+        (FIT + 'priors = ["soft.toml"]', ["soft.toml holds priors of magic_formula", "bekker"]),
+        (FIT.replace("[\"bekker", "[\"magic_formula\", \"bekker") + 'priors = ["soft.toml"]',
+         ["no prior file is for bekker", "'shipped'"]),
+        (FIT + 'hold_out = ["30 psi"]', ["[[fit]], hold_out", "'30 psi'", "COLUMN=VALUE"]),
+        ('[[diagnose]]\nname = "a"\ncases = ["data"]', ["no folder with a case.toml", "'data'"]),
+        ('[[diagnose]]\nname = "a"\ncases = ["cases/*"]\neffects = "e.py"', ["no file 'e.py'"]),
+        (CASES, ["cases is missing", "how many"]),
+        (CASES + "cases = 0", ["[[challenge]], cases", "0 will not do", "1 or more"]),
+        (CASES + "cases = 1\ntier = 'middling'", ["'middling' will not do", "'easy'"]),
+        (CASES + "cases = 1\nnull_fraction = 0.9", ["0.9 will not do", "0 to 0.7"]),
+    ],
+)  # fmt: skip
+def test_a_plan_that_will_not_do_says_where_and_what_would(folder, text, said):
+    (folder / "soft.toml").write_text(default_prior_path("magic_formula").read_text())
+    with pytest.raises(CalibError) as caught:
+        planned(folder, text)
+    for part in ("plan.toml", *said):
+        assert part in str(caught.value)
+
+
+def test_two_tasks_of_one_name_are_refused(folder):
+    (folder / "twins").mkdir(exist_ok=True)
+    for name in ("a b.csv", "a_b.csv"):
+        (folder / "twins" / name).write_text("")
+    with pytest.raises(CalibError, match=r"two tasks would be called a\.twins-a_b"):
+        planned(folder, FIT.replace("data/*", "twins/*"))
+
+
+def test_a_plan_that_is_not_there(tmp_path):
+    with pytest.raises(CalibError, match="the plan cannot be read"):
+        read_plan(tmp_path / "plan.toml")
+    (tmp_path / "plan.toml").write_bytes(b"\xff")
+    with pytest.raises(CalibError, match="not valid TOML"):
+        read_plan(tmp_path / "plan.toml")

@@ -1,0 +1,202 @@
+"""Campaigns: the same on any number of workers, through kills, and never of mixed inputs."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import signal
+import time
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+import pytest
+
+from calib.batch.campaign import read_plan, run_campaign
+from calib.batch.campaign import run as run_module
+from calib.errors import CalibError
+from tests.batch.campaign.sites import N_CASES, NAMES, content, make_site, results, start
+
+CASES_ONLY = '[[diagnose]]\nname = "sites"\ncases = ["cases/*"]\n'
+
+
+def test_every_task_has_its_result(serial):
+    assert results(serial) == sorted(NAMES)
+    summary = json.loads((serial / "summary.json").read_text())
+    assert summary["counts"] == {"done": len(NAMES), "failed": 0, "missing": 0}
+    assert list(summary["tasks"]) == list(NAMES)
+    found = summary["tasks"]["sites.cases-case-0"]
+    assert (found["state"], found["numbers"]["first"]) == ("done", "force_offset")
+    record = json.loads((serial / "results" / NAMES[1] / "task.json").read_text())
+    assert set(record["inputs"]) == {"case.toml", "calibration", "field", "predict"}
+    assert all(len(digest) == 64 for digest in record["inputs"].values())
+    with (serial / "results" / "seconds.csv").open() as file:
+        assert sorted(row[0] for row in csv.reader(file)) == sorted(NAMES)
+
+
+def test_each_kind_has_a_table(serial):
+    rows = {}
+    for kind in ("fit", "diagnose", "challenge", "sbc"):
+        with (serial / f"{kind}.csv").open(newline="") as file:
+            rows[kind] = list(csv.DictReader(file))
+    assert [row["task"] for row in rows["diagnose"]] == list(NAMES[1 : N_CASES + 1])
+    assert {row["state"] for kind in rows.values() for row in kind} == {"done"}
+    fit = rows["fit"][0]
+    assert fit["converged"] == "True"
+    assert float(fit["posterior.n.hdi_lower"]) < float(fit["posterior.n.mean"])
+    summary = json.loads((serial / "summary.json").read_text())
+    numbers = summary["tasks"]["sites.cases-case-0"]["numbers"]
+    assert float(rows["diagnose"][0]["probability"]) == numbers["probability"]
+
+
+@pytest.mark.slow  # with workers that are killed the bytes are compared in every run
+def test_two_workers_write_the_same_bytes(site, serial, tmp_path):
+    run_campaign(read_plan(site), tmp_path / "two", workers=2)
+    assert content(tmp_path / "two") == content(serial)
+
+
+def test_a_killed_worker_and_a_killed_client_lose_nothing(site, serial, tmp_path):
+    out = tmp_path / "out"
+    client = start(site, out, "--workers", "2")
+    kill_a_worker(client.pid, until=lambda: (out / "results").exists())
+    wait_for(lambda: len(results(out)) >= 2, client)
+    os.kill(client.pid, signal.SIGKILL)
+    client.communicate()
+    there = {n: (out / "results" / n).stat().st_mtime_ns for n in results(out)}
+    assert 2 <= len(there) < len(NAMES)
+    again = start(site, out, "--workers", "2")
+    kill_a_worker(again.pid, after_seconds=0.0)  # as it starts, before it has met the scheduler
+    said = again.communicate(timeout=120)
+    assert again.returncode == 0, said
+    assert {n: (out / "results" / n).stat().st_mtime_ns for n in there} == there
+    assert content(out) == content(serial)
+
+
+def wait_for(condition, process) -> None:
+    while not condition():
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.005)
+
+
+def kill_a_worker(client: int, until=lambda: True, after_seconds: float = 0.5) -> None:
+    """Kill the first worker of a client that has computed for so long."""
+    deadline = time.monotonic() + 60.0
+    while time.monotonic() < deadline:
+        for child in psutil.Process(client).children():
+            # One that ends just now cannot be asked any more.
+            with suppress(psutil.NoSuchProcess):
+                busy = "spawn_main" in " ".join(child.cmdline()) and (
+                    child.cpu_times().user >= after_seconds
+                )
+                if busy and until():
+                    child.kill()
+                    return
+        time.sleep(0.005)
+    raise AssertionError("no worker was seen")
+
+
+def test_nothing_is_done_twice(site, serial, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    shutil.copytree(serial, out)
+
+    def refuse(item):
+        raise AssertionError("done again")
+
+    monkeypatch.setattr(run_module, "_work", refuse)
+    seen = []
+    run_campaign(read_plan(site), out, progress=lambda *p: seen.append(p))
+    assert seen == [(len(NAMES), len(NAMES))]
+    assert content(out) == content(serial)
+
+
+@pytest.fixture
+def own(tmp_path) -> tuple[Path, Path]:
+    """Plan of cases alone, which a test may change, and the folder of its campaign."""
+    return make_site(tmp_path / "site", CASES_ONLY), tmp_path / "out"
+
+
+def test_a_task_that_fails_is_listed_and_the_others_go_on(own):
+    plan, out = own
+    good = plan.parent / "cases" / "case-1" / "lab.csv"
+    text = good.read_text()
+    good.unlink()
+    (plan.parent / "cases" / "case-2" / "case.toml").write_text("[")
+    with (plan.parent / "cases" / "case-3" / "case.toml").open("a") as file:
+        file.write('rut_depth = "modified_bekker"\n')
+    summary = run_campaign(read_plan(plan), out)
+    assert list(summary.failed) == [f"sites.cases-case-{i}" for i in (1, 2, 3)]
+    assert "lab.csv" in summary.failed["sites.cases-case-1"]
+    assert "not valid TOML" in summary.failed["sites.cases-case-2"]
+    assert "no values of rut_depth_mm" in summary.failed["sites.cases-case-3"]
+    document = json.loads((out / "summary.json").read_text())
+    assert document["counts"] == {"done": 1, "failed": 3, "missing": 0}
+    assert "lab.csv" in document["tasks"]["sites.cases-case-1"]["error"]
+    with (out / "diagnose.csv").open(newline="") as file:
+        assert [row["state"] for row in csv.DictReader(file)].count("failed") == 3
+    good.write_text(text)
+    again = run_campaign(read_plan(plan), out)
+    assert list(again.failed) == [f"sites.cases-case-{i}" for i in (2, 3)]
+
+
+def test_an_interrupted_campaign_has_a_summary(own):
+    plan, out = own
+
+    def interrupt(done: int, planned: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="2 of 4 results are kept"):
+        run_campaign(read_plan(plan), out, progress=interrupt)
+    counts = json.loads((out / "summary.json").read_text())["counts"]
+    assert counts == {"done": 2, "failed": 0, "missing": 2}
+
+
+def test_results_of_other_inputs_are_not_mixed_in(own):
+    plan, out = own
+    plan.write_text(CASES_ONLY.replace("*", "case-[01]"))
+    run_campaign(read_plan(plan), out)
+    field = plan.parent / "cases" / "case-1" / "field.csv"
+    lines = field.read_text().splitlines()
+    field.write_text("\n".join(lines[:-1]) + "\n")
+    with pytest.raises(CalibError, match=r"sites\.cases-case-1 differs in field \(inputs\)"):
+        run_campaign(read_plan(plan), out)
+    before = {n: (out / "results" / n).stat().st_mtime_ns for n in results(out)}
+    run_campaign(read_plan(plan), out, overwrite=True)
+    after = {n: (out / "results" / n).stat().st_mtime_ns for n in results(out)}
+    assert {n for n in after if after[n] != before[n]} == {"sites.cases-case-1"}
+    run_campaign(read_plan(plan), out)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda text: "seed = 8\n" + text, "seed"),
+        (lambda text: text + "pages = true\n", r"pages \(settings\)"),
+    ],
+)
+def test_results_of_another_plan_are_not_mixed_in(site, serial, tmp_path, change, said):
+    plan = site.with_name(f"{tmp_path.name}.toml")
+    text = 'seed = 7\n[[diagnose]]\nname = "sites"\ncases = ["cases/*"]\n'
+    plan.write_text(change(text) if "seed" not in said else text.replace("7", "8"))
+    shutil.copytree(serial, tmp_path / "out")
+    with pytest.raises(CalibError, match=said):
+        run_campaign(read_plan(plan), tmp_path / "out")
+
+
+def test_results_of_other_versions_are_not_mixed_in(site, serial, tmp_path, monkeypatch):
+    from calib.batch.campaign import record
+
+    shutil.copytree(serial, tmp_path / "out")
+    monkeypatch.setattr(record, "versions", lambda: {"numpy": "0"})
+    with pytest.raises(CalibError, match=r"differs in .*versions"):
+        run_campaign(read_plan(site), tmp_path / "out")
+
+
+def test_a_folder_of_something_else_is_left_alone(site, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "thesis.txt").write_text("x")
+    with pytest.raises(CalibError, match="exists and is not empty"):
+        run_campaign(read_plan(site), tmp_path / "mine")
+    assert [p.name for p in (tmp_path / "mine").iterdir()] == ["thesis.txt"]

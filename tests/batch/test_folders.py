@@ -1,0 +1,177 @@
+"""Output folders appear whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from calib.batch.folders import check_folder, fresh_folder
+from calib.errors import CalibError
+
+
+def contents(folder: Path) -> set[str]:
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*")}
+
+
+def refusal(out: Path, *, overwrite: bool = False) -> str:
+    """Both the check and the folder itself must refuse, with the same message."""
+    with pytest.raises(CalibError) as early:
+        check_folder(out, overwrite=overwrite)
+    with pytest.raises(CalibError) as late:
+        fresh_folder(out, overwrite=overwrite).__enter__()
+    assert str(early.value) == str(late.value)
+    assert str(out) in str(early.value)
+    assert "to mend:" in str(early.value)
+    return str(early.value)
+
+
+def test_a_folder_appears_once_the_block_succeeds(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "run"
+    with fresh_folder(out) as folder:
+        (folder / "run.json").write_text("{}")
+        assert not out.exists()
+    assert contents(tmp_path) == {"new", "new/run", "new/run/run.json"}
+    mask = os.umask(0)
+    os.umask(mask)
+    assert out.stat().st_mode & 0o777 == 0o777 & ~mask
+
+
+@pytest.mark.parametrize("existing", [False, True])
+def test_a_block_that_fails_leaves_things_as_they_were(tmp_path: Path, existing: bool) -> None:
+    out = tmp_path / "run"
+    if existing:
+        out.mkdir()
+        (out / "run.json").write_text("old")
+    before = contents(tmp_path)
+
+    def fail() -> None:
+        with fresh_folder(out, overwrite=True) as folder:
+            (folder / "half").write_text("x")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
+    assert contents(tmp_path) == before
+
+
+def test_an_empty_folder_is_used(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    with fresh_folder(tmp_path / "run") as folder:
+        (folder / "a").write_text("x")
+    assert contents(tmp_path) == {"run", "run/a"}
+
+
+def test_an_earlier_result_is_replaced_only_on_request(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    out.mkdir()
+    (out / "manifest.json").write_text("old")
+    assert "pass --overwrite" in refusal(out)
+    with fresh_folder(out, overwrite=True) as folder:
+        (folder / "new").write_text("x")
+    assert contents(tmp_path) == {"run", "run/new"}
+
+
+def test_a_folder_of_something_else_is_never_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "thesis"
+    out.mkdir()
+    (out / "chapter1.tex").write_text("years of work")
+    assert "was not written by calib" in refusal(out, overwrite=True)
+    assert (out / "chapter1.tex").read_text() == "years of work"
+
+
+def test_a_file_is_no_folder(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    assert "is an existing file" in refusal(tmp_path / "file", overwrite=True)
+
+
+def test_a_path_below_a_file_is_refused_before_the_work(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("x")
+    message = refusal(tmp_path / "file" / "deeper" / "run")
+    assert "cannot be written" in message
+    assert f"{tmp_path / 'file'} is a file" in message
+    assert contents(tmp_path) == {"file"}
+
+
+def test_a_name_that_is_too_long_is_refused(tmp_path: Path) -> None:
+    assert "cannot be written" in refusal(tmp_path / ("x" * 300))
+
+
+def test_a_folder_without_permission_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The superuser may write anywhere, so the answer is put in the system's mouth.
+    monkeypatch.setattr(os, "access", lambda path, mode: False)
+    assert "no permission to write" in refusal(tmp_path / "run")
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from calib.batch.folders import fresh_folder
+with fresh_folder(Path(sys.argv[1]), overwrite=True) as folder:
+    (folder / "half").write_text("x")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def aged(folder: Path) -> Path:
+    earlier = time.time() - 3600.0
+    os.utime(folder, (earlier, earlier))
+    return folder
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    subprocess.run([sys.executable, "-c", KILLED, str(out)], check=False)
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(".run-")
+    with fresh_folder(out) as folder:
+        (folder / "a").write_text("x")
+    # It might have been a run that had only just begun.
+    assert contents(tmp_path) == {"run", "run/a", left.name, f"{left.name}/half"}
+    aged(left)
+    with fresh_folder(tmp_path / "other") as folder:
+        (folder / "a").write_text("x")
+    assert left.exists()
+    (out / "a").unlink()
+    with fresh_folder(out) as folder:
+        (folder / "a").write_text("x")
+    assert contents(tmp_path) == {"run", "run/a", "other", "other/a"}
+
+
+def test_what_a_living_run_writes_is_left_alone(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with fresh_folder(out) as first:
+        aged(first)
+        with fresh_folder(out) as second:
+            (second / "b").write_text("x")
+        assert first.exists()
+        (out / "b").unlink()
+        (first / "a").write_text("x")
+
+
+def test_the_only_copy_of_an_earlier_result_is_not_removed(tmp_path: Path) -> None:
+    earlier = tmp_path / ".run-old-abcdef12"
+    (earlier / "old").mkdir(parents=True)
+    mine = tmp_path / ".run-notes"
+    mine.mkdir()
+    aged(earlier), aged(mine)
+    with fresh_folder(tmp_path / "run") as folder:
+        (folder / "run.json").write_text("{}")
+    assert earlier.exists()
+    with fresh_folder(tmp_path / "run", overwrite=True):
+        pass
+    assert not earlier.exists()
+    assert mine.exists()
+
+
+def test_the_current_folder_cannot_be_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert "is the current folder" in refusal(Path())

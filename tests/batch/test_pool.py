@@ -1,0 +1,60 @@
+"""Pieces of one result: the same wherever they are worked out, and clear errors."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from calib.batch.pool import HERE, pool
+from calib.errors import CalibError
+
+
+def square(x: int) -> tuple[int, int]:
+    return x * x, os.getpid()
+
+
+def fail(words: str) -> None:
+    raise CalibError(words, mend="do")
+
+
+def die() -> None:
+    os._exit(9)
+
+
+def leave(path: Path) -> None:
+    path.write_text("there")
+
+
+def test_pieces_come_from_other_processes_in_the_order_they_are_asked_for() -> None:
+    with pool(2) as side:
+        assert not side.here
+        pieces = [side.submit(square, x) for x in range(5)]
+        results = [piece.result() for piece in pieces]
+    assert [value for value, _ in results] == [0, 1, 4, 9, 16]
+    assert os.getpid() not in {pid for _, pid in results}
+
+
+def test_one_worker_is_this_process_and_works_when_the_piece_is_wanted(tmp_path: Path) -> None:
+    with pool(1) as side:
+        assert side is HERE
+        piece = side.submit(leave, tmp_path / "file")
+        assert not (tmp_path / "file").exists()
+        piece.result()
+        assert (tmp_path / "file").exists()
+        assert side.submit(square, 3).result() == (9, os.getpid())
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_what_goes_wrong_with_a_piece_is_raised_where_it_is_wanted(workers: int) -> None:
+    with pool(workers) as side:
+        wrong, fine = side.submit(fail, "mine"), side.submit(square, 2)
+        with pytest.raises(CalibError, match="mine"):
+            wrong.result()
+        assert fine.result()[0] == 4
+
+
+def test_a_process_that_dies_is_a_clear_error() -> None:
+    with pool(2) as side, pytest.raises(CalibError, match="a process died"):
+        side.submit(die).result()

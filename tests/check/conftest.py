@@ -1,0 +1,169 @@
+"""A small report, a whole one and a run, and copies of them to tamper with.
+
+They are made in processes that round as another processor would; what is tampered with is to be
+found there as here. ``CALIB_MADE_UNDER`` names another setting (`kernels.Setting`).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import pytest
+
+import calib.check.check_report as check_report_module
+from calib.batch.environment import sha256
+from calib.check.check import check
+from calib.check.items import Status
+from calib.check.outcome import Outcome
+from calib.check.recompute import recompute_report
+from calib.report.manifest import file_hashes
+from calib.report.publish import publication
+from calib.report.study import Study
+from tests.check.kernels import ALL, FEW, Setting
+
+from . import made
+
+
+def made_under() -> Setting | None:
+    """The processor that the originals are made on; None for this one."""
+    named = os.environ.get("CALIB_MADE_UNDER")
+    if named:
+        return next(setting for setting in ALL if str(setting) == named)
+    return FEW[0] if FEW else None
+
+
+def original_of(kind: str, factory: pytest.TempPathFactory) -> Path:
+    setting, out = made_under(), factory.mktemp("original") / kind
+    return getattr(made, kind)(out) if setting is None else made.elsewhere(kind, out, setting)
+
+
+@pytest.fixture(scope="package")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report of rut depth, posterior included."""
+    return original_of("report", tmp_path_factory)
+
+
+@pytest.fixture(scope="package")
+def original_whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report with one of the source's gaps, the audit and figures for print."""
+    return original_of("whole", tmp_path_factory)
+
+
+@pytest.fixture(scope="package")
+def original_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run as `calib fit` makes it."""
+    return original_of("run", tmp_path_factory)
+
+
+@pytest.fixture(autouse=True)
+def _few_figures() -> Any:
+    with patch("calib.report.writer.plates", made.two_plates):
+        yield
+
+
+@pytest.fixture
+def report(original: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original, tmp_path / "report"))
+
+
+@pytest.fixture(scope="package")
+def original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The report as this processor makes it."""
+    return made.report(tmp_path_factory.mktemp("original") / "here")
+
+
+@pytest.fixture
+def report_here(original_here: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original_here, tmp_path / "here"))
+
+
+@pytest.fixture
+def whole(original_whole: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original_whole, tmp_path / "whole"))
+
+
+@pytest.fixture
+def run(original_run: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original_run, tmp_path / "run"))
+
+
+@pytest.fixture(scope="package")
+def _made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[Any, tuple[Study, Path]], Path]:
+    return {}, tmp_path_factory.mktemp("made")
+
+
+@pytest.fixture
+def computed_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do the work of equal inputs once: most tampering leaves them as they are."""
+    cache, folder = _made
+
+    def again(manifest, tasks, out, progress, pool):
+        key = (
+            manifest.model_dump_json(exclude={"files", "left_out"}),
+            *(t.table[c].tobytes() for t in tasks for c in t.table),
+            *(t.prior_path.read_bytes() for t in tasks),
+        )
+        if key not in cache:
+            kept = folder / str(len(cache))
+            cache[key] = recompute_report(manifest, tasks, kept, progress), kept
+        study, kept = cache[key]
+        shutil.copytree(kept, out)
+        return study
+
+    monkeypatch.setattr(check_report_module, "recompute_report", again)
+
+
+def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content, indent=1) + "\n")
+
+
+def seal(folder: Path, *, rewrite: bool = True) -> None:
+    """Make a manifest agree with the files as they are now, as a thorough forger would.
+
+    Tables and methods are written again from the numbers as they are now, unless told otherwise.
+    """
+    if rewrite:
+        with suppress(ValueError, KeyError, TypeError, AttributeError):
+            manifest = json.loads((folder / "manifest.json").read_text())
+            summary = json.loads((folder / "summary.json").read_text())
+            for name, entry in manifest["tasks"].items():
+                for kind in ("data", "priors"):
+                    path = folder / entry[kind]["file"]
+                    manifest["tasks"][name][kind]["sha256"] = sha256(path.read_bytes())
+            for name, text in publication(manifest, summary).files.items():
+                (folder / name).write_text(text, encoding="utf-8")
+
+    def change(manifest: dict[str, Any]) -> None:
+        manifest["files"] = file_hashes(folder)
+        for entry in manifest["tasks"].values():
+            for kind in ("data", "priors"):
+                path = folder / entry[kind]["file"]
+                entry[kind]["sha256"] = sha256(path.read_bytes())
+
+    edit_json(folder / "manifest.json", change)
+
+
+def seal_run(folder: Path) -> None:
+    def change(record: dict[str, Any]) -> None:
+        record["sha256"] = {n: sha256((folder / n).read_bytes()) for n in record["sha256"]}
+
+    edit_json(folder / "run.json", change)
+
+
+def different(outcome: Outcome) -> dict[str, str]:
+    """What a check calls different, and why."""
+    # The first remark of several on the same thing.
+    return {item.name: item.note for item in reversed(outcome.of(Status.DIFFERENT))}
+
+
+def findings(folder: Path, *, quick: bool = False) -> dict[str, str]:
+    return different(check(folder, quick=quick))

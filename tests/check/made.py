@@ -1,0 +1,102 @@
+"""A small report, a whole one and a run, made in a process of its own as another processor would.
+
+As a program: python -m tests.check.made KIND FOLDER.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+from calib.he2019.audit import Seeds
+from calib.he2019.datasets.embedded import load_he2019
+from calib.he2019.gaps.cases import paper_gaps
+from calib.inference.calibration import Calibration, calibrate
+from calib.inference.estimators import estimate
+from calib.inference.io import save_calibration
+from calib.inference.problem import Problem, build_problem
+from calib.inference.random import generator
+from calib.inference.sampling.gate import Gate
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.report.contents import work_out
+from calib.report.figures import Plate
+from calib.report.figures.bands import bands_plate
+from calib.report.figures.learned import learned_plate
+from calib.report.figures.style import style
+from calib.report.study import OutputResult, Study, run_study
+from calib.report.study_tasks import Task, he2019_tasks
+from calib.report.writer import write_report
+from tests.check.kernels import Setting, skip_what_crashes
+
+ROOT = Path(__file__).resolve().parents[2]
+# Short chains, and a gate that lets them pass.
+SETTINGS = SamplerSettings(steps=100, gate=Gate(taus_min=20.0))
+
+
+def two_plates(result: OutputResult, published: bool = False) -> list[Plate]:
+    """Drawing takes most of the time of a report: two figures do for these tests."""
+    with style():
+        return [
+            bands_plate(result, published=published),
+            learned_plate(result, published=published),
+        ]
+
+
+def rut_tasks() -> list[Task]:
+    return [task for task in he2019_tasks() if task.output == "rut_depth"]
+
+
+def rut_study(seed: int = 2019) -> Study:
+    return run_study(rut_tasks(), seed, settings=SETTINGS)
+
+
+def write(study: Study, out: Path, **kwargs: Any) -> Path:
+    with patch("calib.report.writer.plates", two_plates):
+        write_report(
+            study, out, settings=SETTINGS, command=["calib", "report"], title="A report", **kwargs
+        )
+    return out
+
+
+def report(out: Path) -> Path:
+    """A report of rut depth, posterior included."""
+    return write(rut_study(), out)
+
+
+def whole(out: Path) -> Path:
+    """A report with one of the source's gaps, the audit and figures for print."""
+    gaps = [gap for gap in paper_gaps() if gap.name == "plain_bekker"]
+    found = work_out(rut_tasks(), 2019, settings=SETTINGS, gaps=gaps, audit=Seeds(1, 1, 1))
+    return write(found.study, out, gaps=found.gaps, audit=found.audit, pdf=True)
+
+
+def run(out: Path) -> Path:
+    """A run as `calib fit` makes it."""
+    table = load_he2019("rut_depth")
+    fitted = table.take(table["inflation_pressure_psi"] != 30.0)
+    out.mkdir()
+    save_calibration(fitted_run(build_problem("modified_bekker", fitted), 2019), out)
+    return out
+
+
+def fitted_run(problem: Problem, seed: int) -> Calibration:
+    rng = generator(seed, problem.bound.model.name, "least_squares")
+    point = estimate(problem, "least_squares", rng)
+    return calibrate(problem, seed, estimates=(point,), settings=SETTINGS)
+
+
+def elsewhere(kind: str, out: Path, setting: Setting) -> Path:
+    """Make one of them as another processor would."""
+    skip_what_crashes(setting)
+    subprocess.run(
+        [sys.executable, "-m", "tests.check.made", kind, str(out)],
+        env=setting.environment(), cwd=ROOT, check=True, capture_output=True,
+    )  # fmt: skip
+    return out
+
+
+if __name__ == "__main__":
+    {"report": report, "whole": whole, "run": run}[sys.argv[1]](Path(sys.argv[2]))

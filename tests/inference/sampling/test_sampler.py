@@ -1,0 +1,322 @@
+"""The whole sampler against posteriors in closed form.
+
+A random number generator and a seed fix every run; tolerances are five Monte Carlo standard errors.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calib.data import Table
+from calib.errors import CalibError
+from calib.inference.diagnostics import ess
+from calib.inference.problem import build_problem
+from calib.inference.sampling import ensemble as ensemble_module
+from calib.inference.sampling import sampler as sampler_module
+from calib.inference.sampling.adapt import Guess
+from calib.inference.sampling.gate import Gate, judge
+from calib.inference.sampling.mixture import Mixture, StudentT
+from calib.inference.sampling.mode import find_modes
+from calib.inference.sampling.sampler import (
+    Draws,
+    SamplerSettings,
+    sample_density,
+    sample_posterior,
+)
+from tests.custom_problems import fixed, normal, problem_of
+from tests.inference.sampling.closed_form import (
+    SIGMAS,
+    assert_distributed,
+    evidence_error,
+    linear,
+    run,
+)
+from tests.inference.sampling.test_mode import box
+
+QUICK = SamplerSettings(steps=100, max_steps=100, keep=50)
+
+
+def slow(*case: float):
+    """One more case of the same, for `make test-slow`."""
+    return pytest.param(*case, marks=pytest.mark.slow)
+
+
+def test_a_normal_posterior_with_known_noise() -> None:
+    model = linear()
+    draws = run(model.log_prob_known, np.zeros(3), np.eye(3))
+    assert draws.report.passed
+    for i in range(3):
+        assert_distributed(draws, lambda t, i=i: t[:, i], model.marginal_known(i))
+    exact = np.linalg.inv(model.precision)
+    size = draws.report.ess_bulk.min()
+    scale = np.sqrt(np.outer(np.diag(exact), np.diag(exact)))
+    # The sd of a sample covariance of normals is at most sqrt(2/size) of the product of sds.
+    error = np.abs(np.cov(draws.flat.T) - exact) / scale
+    assert error.max() < 5.0 * np.sqrt(2.0 / size)
+    assert abs(draws.log_evidence - model.log_evidence_known()) < 5.0 * evidence_error(draws)
+
+
+def test_an_unknown_noise_scale() -> None:
+    model = linear()
+    draws = run(model.log_prob_unknown, np.zeros(4), np.eye(4))
+    assert draws.report.passed
+    for i in range(3):
+        assert_distributed(draws, lambda t, i=i: t[:, i], model.marginal_unknown(i))
+    assert_distributed(draws, lambda t: np.exp(2.0 * t[:, 3]), model.sigma2())
+    assert abs(draws.log_evidence - model.log_evidence_unknown()) < 5.0 * evidence_error(draws)
+
+
+def test_a_banana() -> None:
+    def log_prob(t):
+        bent = t[:, 1] - t[:, 0] ** 2
+        return stats.norm.logpdf(t[:, 0]) + stats.norm.logpdf(bent, 0.0, 0.4)
+
+    draws = run(log_prob, np.zeros(2), np.eye(2))
+    assert draws.report.passed
+    assert_distributed(draws, lambda t: t[:, 0], stats.norm())
+    assert_distributed(draws, lambda t: t[:, 1] - t[:, 0] ** 2, stats.norm(0.0, 0.4))
+
+
+def test_heavy_tails() -> None:
+    target = stats.multivariate_t([1.0, -1.0], [[1.0, 0.6], [0.6, 2.0]], df=3)
+    draws = run(target.logpdf, np.zeros(2), np.eye(2))
+    assert draws.report.passed
+    assert_distributed(draws, lambda t: t[:, 0], stats.t(3, 1.0))
+    assert_distributed(draws, lambda t: t[:, 1], stats.t(3, -1.0, np.sqrt(2.0)))
+
+
+def two_modes(distance: float):
+    def log_prob(t):
+        one, other = (stats.norm.logpdf(t[:, 0] - sign * distance).clip(-1e300) for sign in (-1, 1))
+        rest = stats.norm.logpdf(t[:, 1])
+        return np.logaddexp(np.log(0.3) + one, np.log(0.7) + other) + rest
+
+    return log_prob
+
+
+def test_two_overlapping_modes_come_out_in_their_proportions() -> None:
+    draws = run(two_modes(2.5), np.array([-2.5, 0.0]), np.eye(2))
+    assert draws.report.passed
+    left = (draws.t[..., 0] < 0.0).mean(axis=(1, 2))  # of each ensemble
+    # Phi(-2.5) of either mode lies on the other side.
+    expected = 0.3 * stats.norm.cdf(2.5) + 0.7 * stats.norm.cdf(-2.5)
+    assert abs(left.mean() - expected) < 5.0 * np.sqrt(0.25 / draws.report.ess_bulk.min())
+
+
+@pytest.mark.parametrize("distance", [4.0, 6.0])
+@pytest.mark.parametrize("seed", [0, slow(1)])
+def test_a_mode_that_is_hard_to_reach_comes_out_right_or_is_refused(
+    distance: float, seed: int
+) -> None:
+    """Started in the lesser of two modes up to 12 sd apart, told nothing of the other.
+
+    Farther off (16 sd) nothing that the sampler sees tells of the other mode, and the gate passes:
+    there it is the search for modes that finds both.
+    """
+    short = SamplerSettings(max_steps=800)
+    guess = np.array([-distance, 0.0])
+    draws = run(two_modes(distance), guess, np.eye(2), seed=seed, settings=short)
+    left = (draws.t[..., 0] < 0.0).mean()
+    right = abs(left - 0.3) < 5.0 * np.sqrt(0.25 / draws.report.ess_bulk.min())
+    assert right or not draws.report.passed
+
+
+def test_walkers_in_a_mode_the_proposal_does_not_know_are_refused() -> None:
+    """One walker in a hundred sits 40 sd away, where the proposal never goes."""
+    rng = np.random.default_rng(1)
+    t = rng.standard_normal((4, 100, 200, 2))
+    t[0, :4, :, 0] += 40.0
+    log_prob = two_modes(20.0)(t.reshape(-1, 2) - [20.0, 0.0]).reshape(t.shape[:3])
+    report = judge(t, ("x0", "x1"), Gate(rhat_max=1.1), tau=np.ones(2))
+    known = Mixture(np.ones(1), (StudentT(np.zeros(2), np.eye(2), 6.0),))
+    assert report.passed
+    refused = sampler_module._refuse_neglect(report, known, t, log_prob, steps=200)
+    assert not refused.passed
+    assert "1.0% of the draws lie where hardly any was proposed" in refused.reasons[0]
+    both = Mixture(
+        np.array([0.9, 0.1]), (*known.components, StudentT(np.array([40.0, 0.0]), np.eye(2), 6.0))
+    )
+    assert sampler_module._refuse_neglect(report, both, t, log_prob, steps=200) is report
+
+
+def test_modes_far_apart_are_found_by_the_search() -> None:
+    """Two modes 60 sd apart, both seen from the prior: the ensembles visit them in proportion."""
+    priors = box((-60.0, 60.0), (-60.0, 60.0))
+
+    def log_prob(t):
+        return np.where(np.isfinite(priors.log_prob(t)), two_modes(30.0)(t), -np.inf)
+
+    rng = np.random.default_rng(5)
+    modes = find_modes(log_prob, priors, rng)
+    assert sorted(round(float(m.t[0])) for m in modes) == [-30, 30]
+    draws = sample_density(
+        log_prob, [Guess(m.t, np.linalg.cholesky(m.covariance)) for m in modes],
+        np.random.SeedSequence(5).spawn(5), ("x0", "x1"), SamplerSettings(), rng=rng,
+    )  # fmt: skip
+    assert draws.report.passed
+    left = (draws.t[..., 0] < 0.0).mean()
+    assert abs(left - 0.3) < 5.0 * np.sqrt(0.25 / draws.report.ess_bulk.min())
+
+
+def ridge(thinness: float):
+    """The first coordinate standard normal, each of the others near half its square."""
+
+    def log_prob(t):
+        bent = (t[:, 1:] - 0.5 * t[:, :1] ** 2) / thinness
+        return -0.5 * (t[:, 0] ** 2 + np.square(bent).sum(axis=1))
+
+    return log_prob
+
+
+def on_ridge(d: int, thinness: float, max_steps: int) -> Draws:
+    covariance = np.diag([1.0, *np.full(d - 1, thinness**2)])
+    settings = SamplerSettings(max_steps=max_steps)
+    return run(ridge(thinness), np.zeros(d), covariance, settings=settings)
+
+
+def test_an_attempt_that_fails_teaches_the_next() -> None:
+    first, whole = (on_ridge(4, 0.3, steps) for steps in (200, 1600))
+    assert not first.report.passed
+    assert whole.report.passed
+    assert whole.efficiency > first.efficiency
+    assert_distributed(whole, lambda t: t[:, 0], stats.norm())
+    assert_distributed(whole, lambda t: t[:, 3] - 0.5 * t[:, 0] ** 2, stats.norm(0.0, 0.3))
+
+
+@pytest.mark.parametrize(("d", "thinness"), [(2, 0.05), slow(4, 0.1), slow(7, 0.3)])
+def test_thin_bent_ridges_come_out_right_or_are_refused(d: int, thinness: float) -> None:
+    draws = on_ridge(d, thinness, 800)
+    if draws.report.passed:
+        assert_distributed(draws, lambda t: t[:, 0], stats.norm())
+
+
+@pytest.mark.parametrize("seed", [0, *(slow(seed) for seed in range(1, 5))])
+def test_distant_modes_come_out_in_their_proportions(seed: int) -> None:
+    """A square tells no sign: modes 80 sd apart, which no local move ever crosses."""
+    slip = np.linspace(0.0, 0.2, 12)
+    pull = 4.0 + 0.05 * np.random.default_rng(3).standard_normal(12)
+    priors = (normal("a", 0.4, 2.0), fixed("sigma", 0.05))
+    problem = problem_of(lambda a, x: a * a + 0.0 * x, priors, slip, pull)
+    draws = sample_posterior(problem, seed)
+    assert draws.report.passed
+    grid = np.concatenate([np.linspace(-2.1, -1.9, 4001), np.linspace(1.9, 2.1, 4001)])[:, None]
+    density = np.exp(problem.log_prob(grid) - problem.log_prob(grid).max())
+    exact = density[4001:].sum() / density.sum()
+    right = (draws.flat[:, 0] > 0.0).astype(float)
+    ensembles, walkers, steps, _ = draws.t.shape
+    size = float(ess(right.reshape(ensembles * walkers, steps, 1), "mean")[0])
+    assert abs(right.mean() - exact) < SIGMAS * np.sqrt(exact * (1.0 - exact) / size)
+    ln_evidence = np.log(density.sum() * 5e-5) + problem.log_prob(grid).max()
+    assert abs(draws.log_evidence - ln_evidence) < SIGMAS * evidence_error(draws)
+
+
+def test_the_numbers_follow_from_the_seed(rut_tables: tuple[Table, Table]) -> None:
+    problem = build_problem("modified_bekker", rut_tables[0])
+    first, again, other = (
+        sample_posterior(problem, seed, settings=QUICK) for seed in (3, 3, 4)
+    )  # fmt: skip
+    np.testing.assert_array_equal(first.t, again.t)
+    np.testing.assert_array_equal(first.log_prob, again.log_prob)
+    assert (first.log_evidence, first.efficiency) == (again.log_evidence, again.efficiency)
+    assert not (first.t == other.t).any()
+
+
+def test_ensembles_are_seeded_independently(rut_calibration) -> None:
+    t = rut_calibration.draws.t
+    for i in range(t.shape[0]):
+        for j in range(i):
+            assert not (t[i] == t[j]).any()
+
+
+def test_log_densities_belong_to_the_draws(rut_calibration) -> None:
+    draws: Draws = rut_calibration.draws
+    picked = draws.t[:, ::10, ::20]
+    expected = rut_calibration.problem.log_prob(picked.reshape(-1, picked.shape[-1]))
+    np.testing.assert_allclose(draws.log_prob[:, ::10, ::20].ravel(), expected, rtol=1e-10)
+
+
+def test_a_run_extends_itself_until_the_gate_passes() -> None:
+    model = linear()
+    short = SamplerSettings(steps=10, max_steps=10_000)
+    draws = run(model.log_prob_known, np.zeros(3), np.eye(3), settings=short)
+    assert draws.report.passed
+    assert draws.report.steps > 10
+    assert draws.t.shape == (4, 128, min(32, draws.report.steps), 3)
+    assert draws.walkers == 320
+
+
+@pytest.mark.parametrize(("steps", "most", "done"), [(10, 39, 20), (200, 30, 30)])
+def test_extension_stops_where_it_is_told_to(steps: int, most: int, done: int) -> None:
+    settings = SamplerSettings(steps=steps, max_steps=most)
+    draws = run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=settings)
+    assert draws.report.steps == done
+    assert not draws.report.passed
+    assert any("steps/tau" in reason for reason in draws.report.reasons)
+
+
+def test_progress_counts_up_to_what_is_planned(rut_tables: tuple[Table, Table]) -> None:
+    seen: list[tuple[int, int]] = []
+    problem = build_problem("modified_bekker", rut_tables[0])
+    told = sample_posterior(
+        problem, 3, settings=QUICK, progress=lambda done, planned: seen.append((done, planned))
+    )
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+    assert seen[-1][0] == seen[-1][1]
+    untold = sample_posterior(problem, 3, settings=QUICK)
+    np.testing.assert_array_equal(told.t, untold.t)
+
+
+@pytest.mark.parametrize(("steps", "discarded"), [(120, 10), (480, 16)])
+def test_what_is_discarded_of_a_good_proposals_chain_is_bounded(
+    rut_tables: tuple[Table, Table], steps: int, discarded: int
+) -> None:
+    seen: list[int] = []
+    settings = SamplerSettings(steps=steps, walkers=64)
+    draws = sample_posterior(
+        build_problem("modified_bekker", rut_tables[0]), 3, settings=settings,
+        progress=lambda done, planned: seen.append(planned),
+    )  # fmt: skip
+    assert draws.efficiency > ensemble_module.GOOD
+    assert seen[0] == 4 * (steps + discarded)
+
+
+def test_emcee_takes_the_random_state(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Moves and splits must come from the numbers that were given, or runs do not repeat."""
+
+    class Deaf(ensemble_module._Sampler):
+        def begin(self, state):
+            super().begin(state)
+            self.given, self._random = self._random, np.random.RandomState()
+
+        def end(self):
+            return self.given.get_state()
+
+    monkeypatch.setattr(ensemble_module, "_Sampler", Deaf)
+    with pytest.raises(RuntimeError, match="did not take the random state"):
+        run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=QUICK)
+
+
+def test_no_parameters_of_positive_probability(rut_tables: tuple[Table, Table]) -> None:
+    problem = build_problem("modified_bekker", rut_tables[0], fixed={"sigma": -1.0})
+    with pytest.raises(CalibError, match="no parameter values of positive probability") as caught:
+        sample_posterior(problem, 1)
+    assert "he2019 rut_depth" in str(caught.value)
+    assert "to mend:" in str(caught.value)
+
+
+def test_a_density_that_is_almost_nowhere_positive_cannot_be_started() -> None:
+    def log_prob(t):
+        return np.where((t == 0.0).all(axis=1), 0.0, -np.inf)
+
+    with pytest.raises(CalibError, match="could not be started"):
+        run(log_prob, np.zeros(2), np.eye(2), settings=QUICK)
+
+
+def test_flat_draws_keep_their_vectors(rut_calibration) -> None:
+    draws: Draws = rut_calibration.draws
+    np.testing.assert_array_equal(draws.flat[0], draws.t[0, 0, 0])
+    np.testing.assert_array_equal(draws.flat[-1], draws.t[-1, -1, -1])
+    assert 0.0 < draws.acceptance < 1.0
+    assert draws.evaluations > draws.t[..., 0].size

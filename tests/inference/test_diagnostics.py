@@ -1,0 +1,57 @@
+"""Our one pass over the ranks, and emcee's autocorrelation time, against the libraries."""
+
+from __future__ import annotations
+
+import emcee
+import numpy as np
+import pytest
+from arviz_stats.base import array_stats
+
+from calib.inference.diagnostics import autocorrelation_time, convergence, ess
+
+
+def sticky(seed: int, shape: tuple[int, ...], share: float) -> np.ndarray:
+    """Chains that repeat their last value, as Metropolis chains do: ties among the ranks."""
+    rng = np.random.default_rng(seed)
+    fresh = rng.standard_normal(shape)
+    fresh[0] += 0.3
+    draws = fresh.copy()
+    for s in range(1, shape[2]):
+        moved = rng.random(shape[:2]) < share
+        draws[:, :, s] = np.where(moved[..., None], fresh[:, :, s], draws[:, :, s - 1])
+    return draws
+
+
+@pytest.mark.parametrize("shape", [(4, 20, 60, 3), (4, 6, 200, 2), (5, 1, 40, 1)])
+@pytest.mark.parametrize("share", [1.0, 0.3])
+def test_convergence_is_arviz_own(shape: tuple[int, ...], share: float) -> None:
+    draws = sticky(1, shape, share)
+    ensembles, walkers, steps, d = shape
+    found = convergence(draws)
+    by_ensemble = draws.transpose(0, 2, 1, 3).reshape(ensembles, steps * walkers, d)
+    by_walker = draws.reshape(ensembles * walkers, steps, d)
+    expected = array_stats.rhat(by_ensemble, chain_axis=0, draw_axis=1, method="rank")
+    np.testing.assert_allclose(found.rhat, expected, rtol=1e-12)
+    np.testing.assert_allclose(found.ess_bulk, ess(by_walker, "bulk"), rtol=1e-12)
+    np.testing.assert_allclose(found.ess_tail, ess(by_walker, "tail"), rtol=1e-12)
+
+
+def test_the_first_of_an_odd_number_of_steps_is_left_out() -> None:
+    draws = sticky(2, (4, 5, 41, 2), 0.5)
+    odd, even = convergence(draws), convergence(draws[:, :, 1:])
+    np.testing.assert_array_equal(odd.rhat, even.rhat)
+    np.testing.assert_array_equal(odd.ess_bulk, even.ess_bulk)
+
+
+@pytest.mark.parametrize("steps", [50, 201])
+def test_autocorrelation_times_are_emcees(steps: int) -> None:
+    chain = sticky(3, (1, 12, steps, 3), 0.3)[0]
+    expected = emcee.autocorr.integrated_time(chain.transpose(1, 0, 2), tol=0)
+    np.testing.assert_allclose(autocorrelation_time(chain), expected, rtol=1e-10)
+
+
+def test_a_walker_that_never_moved_has_no_autocorrelation_time() -> None:
+    chain = sticky(4, (1, 12, 80, 2), 0.3)[0]
+    chain[3, :, 1] = 0.7
+    assert np.isfinite(autocorrelation_time(chain)[0])
+    assert np.isnan(autocorrelation_time(chain)[1])

@@ -1,0 +1,100 @@
+"""Sums of squares against the plain sum over rows, and what they must not depend on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import calib.inference.likelihood as module
+from calib.inference.likelihood import Squares
+from calib.models import MODELS, BoundModel
+from tests.models.ranges import draw
+
+SEEDS = st.integers(0, 2**32 - 1)
+LENGTHS = (2, 40, 256, 257, 3000)
+
+
+def data(name: str, seed: int, n: int, *, levels: int | None = None):
+    """A bound model, vectors, and n rows with conditions all distinct or of some levels each."""
+    bound, theta, conditions = draw(seed, name, k=7, n=n)
+    rng = np.random.default_rng(seed)
+    if levels is not None:
+        conditions = {c: rng.choice(v[:levels], n) for c, v in conditions.items()}
+    location = bound.location(theta[:1], conditions)[0]
+    return bound, theta, conditions, location + 0.1 * rng.standard_normal(n)
+
+
+def plain(bound: BoundModel, theta, conditions, response) -> np.ndarray:
+    return np.square(response - bound.location(theta, conditions)).sum(axis=1)
+
+
+@pytest.mark.parametrize("name", MODELS)
+@settings(max_examples=10, deadline=None)
+@given(seed=SEEDS, n=st.sampled_from(LENGTHS), levels=st.sampled_from([None, 1, 3]))
+def test_sums_are_those_over_all_rows(name: str, seed: int, n: int, levels: int | None) -> None:
+    bound, theta, conditions, response = data(name, seed, n, levels=levels)
+    found = Squares.of(bound, conditions, response)
+    # Of 3000 terms, each with a relative rounding error of some 1e-13 (Newton's tolerance).
+    np.testing.assert_allclose(
+        found(theta), plain(bound, theta, conditions, response), rtol=1e-9, equal_nan=True
+    )
+
+
+def test_a_condition_is_evaluated_once_however_often_it_was_measured() -> None:
+    bound, _, conditions, response = data("magic_formula_pressure", 1, 5000, levels=6)
+    squares = Squares.of(bound, conditions, response)
+    assert squares.n_distinct == len(set(zip(*conditions.values(), strict=True)))
+    assert sum(tile.response.size for tile in squares.tiles) == squares.n_distinct <= 36
+    assert sum(float(tile.repeats.sum()) for tile in squares.tiles) == 5000
+
+
+def test_repeats_that_agree_leave_nothing_within() -> None:
+    bound, theta, conditions, _ = data("modified_bekker", 2, 300, levels=4)
+    exact = bound.location(theta[:1], conditions)[0]
+    squares = Squares.of(bound, conditions, exact)
+    assert squares.within < 1e-24 * exact.size
+    assert squares(theta[:1])[0] < 1e-24 * exact.size
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("n", LENGTHS)
+def test_a_sum_does_not_depend_on_what_it_is_evaluated_with(
+    name: str, n: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bound, theta, conditions, response = data(name, 3, n)
+    many = np.tile(theta, (40 if n > 1000 else 300, 1))
+    monkeypatch.setattr(module, "_TILE_CELLS", max(4096, n))
+    squares = Squares.of(bound, conditions, response)
+    together = squares(many)
+    # Other vectors may change the order of a sum, or Newton's last step of the implicit model.
+    for i in (0, 3, 6):
+        np.testing.assert_allclose(squares(theta[i : i + 1])[0], together[i::7], rtol=1e-9)
+
+
+def test_threads_make_no_difference(monkeypatch: pytest.MonkeyPatch) -> None:
+    bound, theta, conditions, response = data("magic_formula_pressure", 4, 200_000)
+    one, two = (Squares.of(bound, conditions, response, threads=t) for t in (1, 2))
+    assert len(one.tiles) > 2
+    monkeypatch.setattr(module, "_PARALLEL_CELLS", 1)
+    np.testing.assert_array_equal(one(theta), two(theta))
+
+
+def test_memory_is_bounded_by_the_tile() -> None:
+    """Cells a tile holds, times its work arrays: whatever the rows and vectors."""
+    bound, theta, conditions, response = data("magic_formula_pressure", 5, 100_000)
+    squares = Squares.of(bound, conditions, response, threads=1)
+    squares(np.tile(theta, (10, 1)))
+    assert [space.size for space in squares._spare] == [module.N_WORK * module._TILE_CELLS]
+    assert max(tile.response.size for tile in squares.tiles) <= module._TILE_CELLS
+
+
+def test_a_vector_without_a_value_does_not_touch_the_others() -> None:
+    bound, theta, conditions, response = data("magic_formula_pressure", 6, 42)
+    squares = Squares.of(bound, conditions, response)
+    before = squares(theta)
+    theta[2] = -1.0
+    after = squares(theta)
+    assert np.isnan(after[2])
+    np.testing.assert_array_equal(np.delete(after, 2), np.delete(before, 2))

@@ -1,0 +1,318 @@
+"""Priors against scipy's distributions, and every mistake in a prior file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.integrate import quad
+
+from calib.errors import CalibError
+from calib.inference.prior_files import default_prior_path, parse_priors, read_priors
+from calib.inference.priors import Prior, Priors
+from calib.models import MODELS
+
+ENTRY = '[parameters.{name}]\nunit = "1"\nreason = "a test"\nsource = "nobody"\n'
+# Of single parameters; how parameters move together is of another form (tests/gap/test_shifts.py).
+PRIOR_FILES = sorted(
+    p
+    for p in Path(__file__).resolve().parents[2].joinpath("priors").rglob("*.toml")
+    if p.parent.name != "shifts"
+)
+
+
+def one(body: str, references: dict[str, float] | None = None, name: str = "x") -> Priors:
+    text = f'model = "m"\n{ENTRY.format(name=name)}{body}'
+    return parse_priors(text, "my.toml", "m", (name,), references or {})
+
+
+# TOML, and the same distribution by scipy, in internal coordinates (the log for a log-normal).
+CASES: dict[str, tuple[str, stats.rv_continuous]] = {
+    "normal": ('dist = "normal"\nmean = 1.5\nsd = 0.4', stats.norm(1.5, 0.4)),
+    "normal, both sides cut": (
+        'dist = "normal"\nmean = 1.5\nsd = 0.4\nlower = 1.0\nupper = 1.6',
+        stats.truncnorm(-0.5 / 0.4, 0.1 / 0.4, 1.5, 0.4),
+    ),
+    "normal, cut below": (
+        'dist = "normal"\nmean = 0.0\nsd = 2.0\nlower = 1.0',
+        stats.truncnorm(0.5, np.inf, 0.0, 2.0),
+    ),
+    "normal, upper tail alone": (
+        'dist = "normal"\nmean = 0.0\nsd = 1.0\nlower = 9.5',
+        stats.truncnorm(9.5, np.inf, 0.0, 1.0),
+    ),
+    "normal, lower tail alone": (
+        'dist = "normal"\nmean = 0.0\nsd = 1.0\nupper = -9.5',
+        stats.truncnorm(-np.inf, -9.5, 0.0, 1.0),
+    ),
+    "lognormal": ('dist = "lognormal"\nmedian = 4.0\nsd_log = 0.7', stats.norm(np.log(4), 0.7)),
+    "lognormal, cut": (
+        'dist = "lognormal"\nmedian = 4.0\nsd_log = 0.7\nlower = 2.0\nupper = 5.0',
+        stats.truncnorm(np.log(0.5) / 0.7, np.log(1.25) / 0.7, np.log(4), 0.7),
+    ),
+    "half normal": ('dist = "half_normal"\nsd = 0.3', stats.halfnorm(0.0, 0.3)),
+    "uniform": ('dist = "uniform"\nlower = -2.0\nupper = 3.0', stats.uniform(-2.0, 5.0)),
+}
+BY_CASE = pytest.mark.parametrize(("body", "expected"), CASES.values(), ids=CASES)
+
+
+@BY_CASE
+def test_density_quantiles_and_draws_are_scipys(body: str, expected) -> None:
+    priors = one(body)
+    u = np.array([0.001, 0.1, 0.5, 0.9, 0.999])
+    t = expected.ppf(u)
+    np.testing.assert_allclose(priors.log_prob(t[:, None]), expected.logpdf(t), rtol=1e-8)
+    np.testing.assert_allclose(priors.ppf(u[:, None])[:, 0], t, rtol=1e-8, atol=1e-12)
+    drawn = priors.sample(np.random.default_rng(5), 4000)[:, 0]
+    # At a fixed seed this either holds or not; p would be below 1e-4 by chance in 1 of 1e4 seeds.
+    assert stats.kstest(drawn, expected.cdf).pvalue > 1e-4
+
+
+@BY_CASE
+def test_densities_integrate_to_one(body: str, expected) -> None:
+    priors = one(body)
+    low, high = (float(x) for x in expected.ppf([1e-12, 1.0 - 1e-12]))
+    mass, _ = quad(lambda t: float(np.exp(priors.log_prob(np.array([[t]]))[0])), low, high)
+    assert mass == pytest.approx(1.0, abs=1e-6)
+
+
+@BY_CASE
+def test_no_draw_leaves_the_bounds_and_nothing_lies_outside(body: str, expected) -> None:
+    priors = one(body)
+    (prior,) = priors.free
+    corners = np.array([[0.0], [5e-324], [1.0 - 1e-16], [1.0]])
+    drawn = np.concatenate([priors.ppf(corners), priors.sample(np.random.default_rng(6), 2000)])
+    assert np.all(drawn >= prior.lower)
+    assert np.all(drawn <= prior.upper)
+    finite = [b + s for b, s in ((prior.lower, -1e-6), (prior.upper, 1e-6)) if np.isfinite(b)]
+    assert np.all(priors.log_prob(np.array(finite)[:, None]) == -np.inf)
+
+
+def test_a_joint_density_is_the_sum_over_parameters() -> None:
+    bodies = {"a": CASES["normal, both sides cut"], "b": CASES["lognormal"], "c": CASES["uniform"]}
+    text = 'model = "m"\n' + "\n".join(ENTRY.format(name=n) + b for n, (b, _) in bodies.items())
+    priors = parse_priors(text, "my.toml", "m", tuple(bodies), {})
+    t = priors.sample(np.random.default_rng(1), 50)
+    expected = sum(e.logpdf(t[:, j]) for j, (_, e) in enumerate(bodies.values()))
+    np.testing.assert_allclose(priors.log_prob(t), expected, rtol=1e-10)
+    outside = t.copy()
+    outside[:, 2] = 3.5
+    assert np.all(priors.log_prob(outside) == -np.inf)
+
+
+def mixed() -> Priors:
+    text = 'model = "m"\n' + "\n".join(
+        ENTRY.format(name=n) + body
+        for n, body in {
+            "a": 'dist = "lognormal"\nmedian = 4.0\nsd_log = 0.7',
+            "b": 'dist = "fixed"\nvalue = -3.0',
+            "c": 'dist = "uniform"\nlower = 0.0\nupper = 1.0',
+        }.items()
+    )
+    return parse_priors(text, "my.toml", "m", ("a", "b", "c"), {})
+
+
+def test_fixed_parameters_are_carried_but_not_sampled() -> None:
+    priors = mixed()
+    assert priors.names == ("a", "c")
+    natural = priors.to_natural(np.array([[np.log(2.0), 0.25]]))
+    np.testing.assert_allclose(natural, [[2.0, -3.0, 0.25]])
+    np.testing.assert_allclose(priors.to_internal(natural), [[np.log(2.0), 0.25]])
+
+
+def test_internal_coordinates_are_pulled_inside_the_bounds() -> None:
+    t = mixed().to_internal(np.array([[-1.0, -3.0, 7.0]]))
+    assert np.isfinite(mixed().log_prob(t)).all()
+    assert t[0, 1] == pytest.approx(1.0, abs=1e-8)
+
+
+def test_fixing_a_parameter_removes_it_and_keeps_the_others() -> None:
+    held = mixed().fix({"a": 5.0})
+    assert held.names == ("c",)
+    np.testing.assert_allclose(held.to_natural(np.array([[0.5]])), [[5.0, -3.0, 0.5]])
+    with pytest.raises(CalibError, match="cannot fix z") as caught:
+        mixed().fix({"z": 1.0})
+    assert "a, b, c" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("body", "t"),
+    [
+        ('dist = "normal"\nmean = 0.2\nsd = 0.1\nlower = 0.1\nupper = 0.4', [0.4, 1.2, 2.0]),
+        ('dist = "uniform"\nlower = 0.1\nupper = 0.4', [0.4, 1.0, 1.6]),
+        ('dist = "half_normal"\nsd = 0.1', [0.01, 0.4, 2.0]),
+    ],
+)
+def test_relative_priors_scale_with_the_load(body: str, t: list[float]) -> None:
+    relative = one(f'{body}\nrelative_to = "normal_load_kn"', {"normal_load_kn": 4.0})
+    plain = one(body)
+    scaled = np.array(t)[:, None]
+    np.testing.assert_allclose(
+        relative.log_prob(scaled), plain.log_prob(scaled / 4.0) - np.log(4.0), rtol=1e-9
+    )
+
+
+def test_relative_log_normals_shift_and_fall_back_on_the_default() -> None:
+    body = (
+        'dist = "lognormal"\nmedian = 0.2\nsd_log = 0.5\nlower = 0.1\n'
+        'relative_to = "normal_load_kn"\ndefault_reference = 5.0'
+    )
+    for references, load in (({"normal_load_kn": 2.0}, 2.0), ({}, 5.0)):
+        (prior,) = one(body, references).entries
+        assert prior.loc == pytest.approx(np.log(0.2 * load))
+        assert prior.lower == pytest.approx(np.log(0.1 * load))
+        assert prior.scale == 0.5
+        assert f"x {load:g} (normal_load_kn)" in prior.text
+
+
+def test_a_fixed_relative_value_scales() -> None:
+    body = 'dist = "fixed"\nvalue = 0.1\nrelative_to = "normal_load_kn"'
+    assert one(body, {"normal_load_kn": 3.0}).entries[0].loc == pytest.approx(0.3)
+
+
+# Mistakes
+
+
+def refusal(call: Callable[[], object]) -> str:
+    with pytest.raises(CalibError) as caught:
+        call()
+    message = str(caught.value)
+    assert "to mend:" in message
+    return message
+
+
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ('dist = "normal"\nmean = 0.0\nsd = 0.0', ["normal.sd", "greater than 0", "0.0"]),
+        ('dist = "normal"\nmean = 0.0\nsd = -1.0', ["normal.sd", "greater than 0", "-1.0"]),
+        ('dist = "half_normal"\nsd = 0.0', ["half_normal.sd", "greater than 0"]),
+        ('dist = "lognormal"\nmedian = 1.0\nsd_log = 0', ["sd_log", "greater than 0"]),
+        ('dist = "lognormal"\nmedian = -1.0\nsd_log = 1', ["median", "greater than 0"]),
+        ('dist = "normal"\nmean = nan\nsd = 1.0', ["mean", "finite", "nan"]),
+        ('dist = "normal"\nmean = 0.0\nsd = inf', ["sd", "finite", "inf"]),
+        ('dist = "normal"\nmean = "wide"\nsd = 1.0', ["mean", "number", "wide"]),
+        ('dist = "normal"\nmean = 0.0', ["normal.sd", "Field required"]),
+        ('dist = "normal"\nmean = 0.0\nsd = 1.0\nsigma = 2', ["sigma", "not permitted"]),
+        ('dist = "cauchy"\nmean = 0.0', ["cauchy", "normal", "uniform"]),
+        ("mean = 0.0\nsd = 1.0", ["parameters.x", "dist"]),
+        ('dist = "fixed"', ["value", "Field required"]),
+        ('dist = "normal"\nmean = 0.0\nsd = 1.0\nrelative_to = "load"', ["relative_to",
+         "normal_load_kn", "'load'"]),
+    ],
+)  # fmt: skip
+def test_an_impossible_entry_names_its_place(body: str, words: list[str]) -> None:
+    message = refusal(lambda: one(body))
+    for word in ["my.toml", "parameters.x", "allowed:", *words]:
+        assert word in message
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        'dist = "uniform"\nlower = 3.0\nupper = 1.0',
+        'dist = "uniform"\nlower = 3.0\nupper = 3.0',
+        'dist = "normal"\nmean = 0.0\nsd = 1.0\nlower = 3.0\nupper = 1.0',
+    ],
+)
+def test_swapped_bounds_are_told(body: str) -> None:
+    message = refusal(lambda: one(body))
+    assert "my.toml, parameters.x: lower bound 3 is not below upper bound" in message
+
+
+@pytest.mark.parametrize("part", ["reason", "source", "unit"])
+def test_a_prior_without_a_justification_is_refused(part: str) -> None:
+    entry = "\n".join(
+        line for line in ENTRY.format(name="x").splitlines() if not line.startswith(part)
+    )
+    text = f'model = "m"\n{entry}\ndist = "half_normal"\nsd = 1.0'
+    message = refusal(lambda: parse_priors(text, "my.toml", "m", ("x",), {}))
+    assert f"half_normal.{part}" in message
+    assert "Field required" in message
+
+
+@pytest.mark.parametrize("part", ["reason", "source"])
+def test_an_empty_justification_is_refused(part: str) -> None:
+    entry = ENTRY.format(name="x").replace({"reason": "a test", "source": "nobody"}[part], "")
+    text = f'model = "m"\n{entry}\ndist = "half_normal"\nsd = 1.0'
+    assert part in refusal(lambda: parse_priors(text, "my.toml", "m", ("x",), {}))
+
+
+def test_unknown_and_missing_parameters_come_in_one_message() -> None:
+    text = f'model = "m"\n{ENTRY.format(name="kk")}dist = "half_normal"\nsd = 1.0'
+    message = refusal(lambda: parse_priors(text, "my.toml", "m", ("k", "sigma"), {}))
+    for word in ("my.toml, [parameters]", "unknown parameter kk", "missing parameter k, sigma",
+                 "allowed: k, sigma"):  # fmt: skip
+        assert word in message
+
+
+@pytest.mark.parametrize("text", ['model = "other"\n', "", "parameters = 3\n"])
+def test_priors_of_another_model_are_refused(text: str) -> None:
+    message = refusal(lambda: parse_priors(text, "my.toml", "m", ("x",), {}))
+    assert "not 'm'" in message
+    assert 'allowed: model = "m"' in message
+
+
+def test_no_parameters_at_all() -> None:
+    for text in ('model = "m"\n', 'model = "m"\nparameters = 3\n'):
+        message = refusal(lambda t=text: parse_priors(t, "my.toml", "m", ("x",), {}))
+        assert "missing parameter x" in message
+
+
+def test_an_entry_that_is_no_table() -> None:
+    text = 'model = "m"\n[parameters]\nx = 3\n'
+    assert "parameters.x" in refusal(lambda: parse_priors(text, "my.toml", "m", ("x",), {}))
+
+
+def test_bad_toml_names_the_line() -> None:
+    message = refusal(lambda: parse_priors('model = "m"\nx = = 3\n', "my.toml", "m", ("x",), {}))
+    assert "my.toml: the prior file is not valid TOML" in message
+    assert "line 2" in message
+
+
+def test_unreadable_files_are_told(tmp_path: Path) -> None:
+    latin = tmp_path / "latin.toml"
+    latin.write_bytes(b'model = "\xe9"\n')
+    for path in (tmp_path / "absent.toml", tmp_path, latin):
+        message = refusal(lambda p=path: read_priors(p, "m", ("x",), {}))
+        assert f"{path}: the prior file cannot be read" in message
+
+
+# What is shipped
+
+
+@pytest.mark.parametrize("path", PRIOR_FILES, ids=lambda p: p.stem)
+def test_shipped_priors_parse_with_reasons_and_sources(path: Path) -> None:
+    import tomllib
+
+    content = tomllib.loads(path.read_text(encoding="utf-8"))
+    assert content["model"] == path.stem
+    names = tuple(content["parameters"])
+    priors = read_priors(path, path.stem, names, {})
+    for entry in priors.entries:
+        assert len(entry.reason) > 5
+        assert len(entry.source) > 5
+        assert entry.unit
+    t = priors.sample(np.random.default_rng(3), 200)
+    assert np.isfinite(priors.log_prob(t)).all()
+
+
+def test_there_are_priors_for_every_model_and_they_give_its_parameters() -> None:
+    for name, model in MODELS.items():
+        priors = read_priors(default_prior_path(name), name, (*model.parameters, "sigma"), {})
+        assert tuple(p.name for p in priors.entries) == (*model.parameters, "sigma")
+        assert priors.entries[-1].lower >= 0.0 or priors.entries[-1].log
+
+
+def test_there_are_priors_of_effects() -> None:
+    assert sum(path.parent.name == "effects" for path in PRIOR_FILES) >= 10
+
+
+def test_a_prior_says_what_it_is() -> None:
+    (prior,) = one('dist = "normal"\nmean = 1\nsd = 2\nlower = 0').entries
+    assert prior.text == "normal(1, 2) on [0, inf]"
+    assert isinstance(prior, Prior)
+    assert not prior.fixed

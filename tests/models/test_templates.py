@@ -1,0 +1,31 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.data import check_enough, check_varies, read_table
+from calib.errors import CalibError
+from calib.models import MODELS
+from calib.models.templates import template_csv
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_template_loads_and_can_be_fitted(name: str, tmp_path: Path) -> None:
+    model = MODELS[name]
+    path = tmp_path / "my.csv"
+    path.write_text(template_csv(name))
+    table = read_table(path, required=[*model.conditions, model.output])
+    assert table.ignored == ()
+    # Forces come with the load that gives the priors their scale; it is the same in every row.
+    extra = {"normal_load_kn"} if model.output == "drawbar_pull_kn" else set()
+    assert set(table) == {*model.conditions, model.output} | extra
+    check_enough(table, len(model.parameters), model=name)
+    for column in set(table) - extra:
+        check_varies(table, column)
+    assert np.isfinite(model.bind_references(table.columns).get("p_half_psi", 1.0))
+
+
+def test_an_unknown_template_lists_the_models() -> None:
+    with pytest.raises(CalibError, match="no template for a model 'magic'") as caught:
+        template_csv("magic")
+    assert all(name in str(caught.value) for name in MODELS)

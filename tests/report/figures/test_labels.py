@@ -1,0 +1,70 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.report.figures.labels import (
+    axis_of,
+    joined,
+    parameter_label,
+    percent,
+    plain,
+    short,
+    symbol,
+    unit_text,
+)
+from calib.report.figures.learned import _log_ticks
+
+MINUS = "\N{MINUS SIGN}"
+TIMES = "\N{MULTIPLICATION SIGN}"
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(0.0, "0"), (0.0996, "0.10"), (1234.0, "1200"), (-0.5, f"{MINUS}0.50"),
+     (4.3e8, f"4.3{TIMES}10⁸"), (1.9e-6, f"1.9{TIMES}10⁻⁶"),
+     (float("nan"), "\N{EN DASH}"), (99.6, "100")],
+)  # fmt: skip
+def test_short(value, text):
+    assert short(value) == text
+
+
+def test_percent_and_joined():
+    assert percent(0.0294) == "2.9 %"
+    assert joined(["a"]) == "a"
+    assert joined(["a", "b", "c"]) == "a, b and c"
+
+
+def test_symbols():
+    assert symbol("K_lo") == r"$K_\mathrm{lo}$"
+    assert symbol("C2") == r"$C_\mathrm{2}$"
+    assert symbol("Sh") == r"$S_\mathrm{h}$"
+    assert symbol("sigma") == r"$\sigma$"
+    assert plain("gamma_ref") == "\N{GREEK SMALL LETTER GAMMA}_ref"
+
+
+def test_units():
+    assert unit_text("g/cm^3") == "g/cm$^{3}$"
+    assert unit_text("kPa (g/cm^3)^-C4") == "kPa (g/cm$^{3}$)$^{-C4}$"
+    assert parameter_label("n0", "1").endswith("(\N{EN DASH})")
+    assert parameter_label("C2", "1", log=True).startswith("log$_{10}$")
+
+
+def test_slip_is_drawn_in_percent():
+    axis = axis_of("slip_ratio")
+    assert axis.label == "Slip (%)"
+    assert axis.scale(np.array([0.2]))[0] == pytest.approx(20.0)
+    assert axis.range_text(np.array([-0.00141, 0.9])) == f"{MINUS}0.141 to 90 %"
+    assert axis_of("cone_index_kpa").value_text(1893.4) == "1893"
+
+
+def test_a_column_without_an_entry_still_has_a_unit():
+    assert axis_of("speed_m_s").label == "Speed (m/s)"
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.02, 1.5), (1e-5, 0.3), (8.0, 12.0), (1e-9, 1e3)])
+def test_log_ticks_lie_inside_and_are_few(low, high):
+    ticks = _log_ticks(low, high)
+    assert len(ticks) <= 4
+    assert all(low <= v <= high for v in ticks)
+    assert ticks

@@ -1,0 +1,341 @@
+"""What is drawn, and what the captions say of it, checked against the numbers."""
+
+from __future__ import annotations
+
+import io
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from matplotlib import rcParams
+from matplotlib.collections import LineCollection
+
+from calib.data import table_from_arrays
+from calib.he2019.figures.reference import published_curve, published_sampled
+from calib.report.figures import collect
+from calib.report.figures.bands import bands_plate
+from calib.report.figures.collect import plates
+from calib.report.figures.corner import corner_plate
+from calib.report.figures.ensembles import ensembles_plate, rank_histograms
+from calib.report.figures.estimates import distances, estimates_plate
+from calib.report.figures.learned import learned_plate
+from calib.report.figures.plate import Plate
+from calib.report.figures.prior_predictive import prior_predictive_plate
+from calib.report.figures.residuals import residuals_plate, sign_changes, standardise
+from calib.report.figures.roles import BOTH, DATA, MOVED, PRIOR, role_of
+from calib.report.figures.rows import groups, smooth_bands
+from calib.report.figures.style import style
+from calib.report.figures.validation import validation_plate
+
+UNIT = re.compile(r"\(.+\)$")
+NAMES = ("bands", "validation", "prior_predictive", "learned", "corner", "ensembles", "residuals",
+         "estimates")  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def drawn(all_plates) -> dict[str, list[Plate]]:
+    return all_plates
+
+
+def test_every_output_has_its_figures(drawn):
+    for key, found in drawn.items():
+        assert [p.caption for p in found if p.figure is None] == []
+        expected = (*NAMES, "by_pressure") if key == "drawbar" else NAMES
+        assert tuple(p.name for p in found) == expected
+
+
+def test_every_axis_has_a_label_with_a_unit(drawn):
+    for found in drawn.values():
+        for p in found:
+            if p.name == "corner":
+                continue
+            for ax in p.figure.axes:
+                if not ax.get_visible() or not ax.axison:
+                    continue
+                shared_x = p.name in ("bands", "prior_predictive", "ensembles")
+                hidden_y = not ax.spines["left"].get_visible() or shared_x
+                label = ax.get_xlabel()
+                assert UNIT.search(label) or (shared_x and not label), (p.name, label)
+                assert UNIT.search(ax.get_ylabel()) or hidden_y, (p.name, ax.get_ylabel())
+
+
+def test_shared_axes_are_labelled_at_the_edge(drawn):
+    bands = drawn["drawbar"][0].figure
+    assert [ax.get_ylabel() for ax in bands.axes] == ["Drawbar pull (kN)", "", ""]
+    assert {ax.get_xlabel() for ax in bands.axes} == {"Slip (%)"}
+
+
+def test_corner_labels_every_parameter_with_its_unit(drawbar):
+    texts = [t.get_text() for t in corner_plate(drawbar, published=True).figure.axes[0].texts]
+    for symbol in ("$K_\\mathrm{lo}$\n(kN/%)", "$D_\\mathrm{hi}$\n(kN)", "$\\sigma$\n(kN)"):
+        assert symbol in texts
+    assert any("dashed: published" in t for t in texts)
+
+
+def test_saved_without_a_warning(plate):
+    for draw in (bands_plate, validation_plate):
+        draw(plate, published=False).figure.savefig(io.BytesIO(), format="png", dpi=40)
+
+
+def test_nothing_is_cut_off(drawn):
+    # The most parameters and panels, and the longest tick labels.
+    for found in (drawn["drawbar"], drawn["density"][:1]):
+        for p in found:
+            inside = p.figure.bbox.padded(2.0)
+            for ax in p.figure.axes:
+                box = ax.get_tightbbox()
+                if ax.get_visible() and ax.axison and box is not None:
+                    assert inside.x0 <= box.x0, (p.name, box)
+                    assert box.x1 <= inside.x1, (p.name, box)
+                    assert inside.y0 <= box.y0, (p.name, box)
+                    assert box.y1 <= inside.y1, (p.name, box)
+
+
+def test_bands_caption_counts_what_the_bands_cover(drawbar):
+    caption = bands_plate(drawbar, published=True).caption
+    low, high = np.nanquantile(drawbar.posterior_predictive, [0.05, 0.95], axis=0)
+    observed = drawbar.calibration.problem.observed
+    inside = ((low <= observed) & (observed <= high)).sum()
+    c = drawbar.validation.scores.coverage[0.9]
+    assert f"covers {inside} of 28 calibrated points and {c.hits} of 14 held-out" in caption
+
+
+def test_bands_say_what_was_held_out_and_show_each_point_once(drawbar):
+    fig = bands_plate(drawbar, published=True).figure
+    assert [ax.get_title() for ax in fig.axes] == ["18 psi", "30 psi, held out", "42 psi"]
+    points = [sum(len(li.get_xdata()) for li in ax.lines if li.get_marker() == "o")
+              for ax in fig.axes]  # fmt: skip
+    assert points == [14, 14, 14]
+    labels = [t.get_text() for t in fig.legends[0].get_texts()]
+    assert "reconstructed data, held out" in labels
+
+
+def test_published_curves_only_where_wanted(rut):
+    def legend(published):
+        fig = bands_plate(rut, published=published).figure
+        return [t.get_text() for t in fig.legends[0].get_texts()]
+
+    assert "published fit (Table 6)" in legend(True)
+    assert not any("published" in t for t in legend(False))
+
+
+def test_published_curve_of_the_rut_is_equation_21(rut):
+    conditions = {"average_ground_pressure_kpa": np.array([150.0]), "slip_ratio": np.array([0.1])}
+    depth, source = published_curve("modified_bekker", conditions)
+    assert depth[0] == pytest.approx(1000 * (150 / 3.306e5) ** (1 / (1.996 + 0.1266)))
+    assert source == "Table 6"
+
+
+def test_published_figures_on_the_sampled_scale(drawbar):
+    marks = published_sampled(drawbar.calibration.problem.bound)
+    assert marks["D_lo"] == pytest.approx(1.6480)
+    assert marks["K_hi"] == pytest.approx(0.1265 * 1.4802 * 0.5954)
+    mean = 0.5 * (1.6480 + 0.5954)
+    assert marks["D_bend"] == pytest.approx(1.0 - 1.0071 / mean)
+    assert set(marks) <= set(drawbar.calibration.problem.names)
+
+
+def test_smooth_bands_nest_and_match_the_draws(rut):
+    conditions = {"average_ground_pressure_kpa": np.full(5, 140.0),
+                  "slip_ratio": np.linspace(0, 0.2, 5)}  # fmt: skip
+    mean, measured = smooth_bands(rut.calibration, conditions)
+    for outer, inner in ((0.95, 0.9), (0.9, 0.5)):
+        assert (measured.lower[outer] < measured.lower[inner]).all()
+        assert (measured.upper[outer] > measured.upper[inner]).all()
+    assert (mean.upper[0.9] < measured.upper[0.9]).all()
+    assert (np.diff(mean.median) > 0).all()
+    natural = rut.calibration.problem.theta(rut.calibration.draws.flat)
+    exact = rut.calibration.problem.bound.predict(natural[:, :-1], conditions)
+    assert mean.median == pytest.approx(np.median(exact, axis=0), rel=0.01)
+
+
+def test_validation_caption_has_the_scores(rut):
+    s = rut.validation.scores
+    caption = validation_plate(rut, published=True).caption
+    assert "9 held-out rows (reconstructed data)" in caption
+    assert f"{100 * s.max_relative_error:.1f} % at most" in caption
+    assert f"90 % band {s.coverage[0.9].hits} of 9" in caption
+
+
+def test_validation_shows_the_limits_of_the_source(rut):
+    labels = [t.get_text() for t in validation_plate(rut, published=True).figure.legends[0]
+              .get_texts()]  # fmt: skip
+    assert any("held out: 9.7 %" in t for t in labels)
+    assert any("fitted: 13 %" in t for t in labels)
+
+
+def test_leave_one_out_shows_pareto_k(density):
+    plate = validation_plate(density, published=True)
+    assert plate.figure.axes[0].get_ylabel().startswith("Pareto k")
+    assert plate.caption.endswith(f"{len(density.validation.refitted)} of 36 rows needed a refit "
+                                  "(Pareto k above 0.7).")  # fmt: skip
+
+
+def test_rank_histograms_see_an_ensemble_that_is_off():
+    rng = np.random.default_rng(1)
+    values = rng.standard_normal((4, 2000))
+    even = rank_histograms(values)
+    assert even.mean() == pytest.approx(1.0)
+    assert np.abs(even - 1.0).max() < 0.5
+    values[0] += 1.0
+    assert rank_histograms(values)[0, -1] > 2.0
+
+
+def test_ensembles_caption_says_when_the_gate_is_not_passed(rut, unconverged):
+    assert "agree" in ensembles_plate(rut).caption
+    assert "do NOT pass" in ensembles_plate(unconverged).caption
+
+
+def test_distances_are_in_posterior_sds():
+    draws = np.random.default_rng(0).normal(10.0, 2.0, 20_000)
+    distance, interval, log = distances(draws, np.array([14.0, np.nan]))
+    assert distance[0] == pytest.approx(2.0, abs=0.05)
+    assert np.isnan(distance[1])
+    assert interval == pytest.approx([-1.96, 1.96], abs=0.06)
+    assert not log
+
+
+def test_distances_of_a_wide_positive_parameter_are_logarithmic():
+    draws = np.exp(np.random.default_rng(0).normal(0.0, 2.0, 20_000))
+    distance, _, log = distances(draws, np.array([np.exp(2.0), -1.0]))
+    assert log
+    assert distance[0] == pytest.approx(1.0, abs=0.05)
+    assert np.isnan(distance[1])
+
+
+def test_estimates_caption_names_the_published_figures_outside(rut):
+    caption = estimates_plate(rut, published=True).caption
+    outside = [
+        name
+        for name, figure in (("n0", 1.996), ("n1", 1.266), ("k", 3.306e5))
+        if not rut.calibration.summary[name].hdi_lower
+        <= figure
+        <= rut.calibration.summary[name].hdi_upper
+    ]
+    assert ("All published" in caption) == (not outside)
+    for name in outside:
+        assert name in caption
+
+
+@pytest.mark.parametrize(
+    ("ratio", "moved", "role"),
+    [(0.99, 0.1, PRIOR), (0.99, 0.8, MOVED), (0.7, 0.0, BOTH), (0.2, 3.0, DATA), (0.9, 0.0, BOTH),
+     (float("nan"), 0.0, "")],
+)  # fmt: skip
+def test_roles(ratio, moved, role):
+    assert role_of(ratio, moved) == role
+
+
+def test_two_pressures_leave_the_curvature_to_the_prior(drawbar):
+    caption = learned_plate(drawbar, published=True).caption
+    part = next(p for p in caption.split(";") if "set by the prior" in p)
+    assert "K_bend" in part
+    assert "D_bend" in part
+
+
+def test_prior_predictive_caption_compares_widths(rut):
+    caption = prior_predictive_plate(rut).caption
+    ratio = float(re.search(r"is (\d[\d.]*) times as wide", caption).group(1))
+    assert ratio > 2.0
+
+
+def test_residuals_are_in_noise_sds(rut):
+    residual = standardise(rut, rut.calibration.problem).residual
+    assert residual.std() == pytest.approx(1.0, abs=0.25)
+    changes, pairs = sign_changes(rut, residual)
+    assert pairs == 18 - 2
+    assert 0 <= changes <= pairs
+    assert sign_changes(rut, np.ones(18)) == (0, 16)
+
+
+def with_residuals(drawbar, high, low):
+    """Give the two calibrated pressures residuals of a known spread."""
+    problem = drawbar.calibration.problem
+    table = problem.table
+    rng = np.random.default_rng(5)
+    noise = np.where(table["inflation_pressure_psi"] < 30.0, high, low)
+    predicted = standardise(drawbar, problem).predicted
+    columns = dict(table.columns) | {
+        "drawbar_pull_kn": predicted + noise * rng.standard_normal(len(table))
+    }
+    told = problem.with_table(replace(table, columns=columns))
+    return replace(drawbar, calibration=replace(drawbar.calibration, problem=told))
+
+
+def test_residuals_say_where_one_sigma_does_not_fit(drawbar):
+    caption = residuals_plate(with_residuals(drawbar, 0.2, 0.02)).caption
+    sds = re.search(r"([\d.]+) kN at 18 psi and ([\d.]+) kN at 42 psi", caption).groups()
+    assert float(sds[0]) == pytest.approx(0.2, rel=0.5)
+    assert float(sds[1]) == pytest.approx(0.02, rel=0.5)
+    assert "too narrow at 18 psi and too wide at 42 psi" in caption
+    same = residuals_plate(with_residuals(drawbar, 0.05, 0.05)).caption
+    assert "does not tell the pressures apart" in same
+    assert "too narrow" not in same
+
+
+def test_spread_is_compared_between_pressures_only(plate, density):
+    for result in (plate, density):
+        assert "Levene" not in residuals_plate(result).caption
+
+
+def test_by_pressure_says_which_pressures_were_calibrated(drawn):
+    figure = next(p for p in drawn["drawbar"] if p.name == "by_pressure").figure
+    labels = [t.get_text() for t in figure.legends[0].get_texts()]
+    assert "18 and 42 psi calibrated jointly, 90 %" in labels
+    assert not any("all pressures" in label for label in labels)
+
+
+def test_residuals_show_every_row(drawbar):
+    fig = residuals_plate(drawbar).figure
+    shown = sum(len(line.get_xdata()) for line in fig.axes[1].lines if line.get_marker() != "None")
+    assert shown == 42
+
+
+def test_many_pressures_are_cut_to_six_spread_out(drawbar):
+    psi = np.repeat(np.arange(10.0, 42.0, 4.0), 5)
+    whole = table_from_arrays(
+        {"inflation_pressure_psi": psi, "slip_ratio": np.tile(np.linspace(0.05, 0.6, 5), 8),
+         "drawbar_pull_kn": np.ones(40)},
+    )  # fmt: skip
+    calibration = replace(
+        drawbar.calibration, problem=drawbar.calibration.problem.with_table(whole)
+    )
+    validation = replace(drawbar.validation, method="leave_one_out")
+    result = replace(drawbar, calibration=calibration, validation=validation,
+                     task=replace(drawbar.task, table=whole))  # fmt: skip
+    shown = [g.value for g in groups(result)]
+    assert len(shown) == 6
+    assert (shown[0], shown[-1]) == (10.0, 38.0)
+    assert sum(g.size for g in groups(result, most=False)) == 40
+
+
+def test_a_figure_that_fails_does_not_stop_the_rest(rut, monkeypatch):
+    def broken(*args, **kwargs):
+        raise RuntimeError("no luck")
+
+    monkeypatch.setattr(collect, "learned_plate", broken)
+    found = {p.name: p for p in plates(rut, published=True)}
+    assert found["learned"].figure is None
+    assert "no luck" in found["learned"].caption
+    assert found["corner"].figure is not None
+
+
+def test_the_users_style_neither_leaks_in_nor_is_changed():
+    rcParams["font.size"] = 33.0
+    try:
+        with style():
+            assert rcParams["font.size"] == 8.0
+        assert rcParams["font.size"] == 33.0
+    finally:
+        rcParams["font.size"] = 10.0
+
+
+def test_corner_marks_lie_inside_their_panels(drawbar):
+    ax = corner_plate(drawbar, published=True).figure.axes[0]
+    dashed = [c for c in ax.collections if isinstance(c, LineCollection)
+              and c.get_linestyle()[0][1] is not None]  # fmt: skip
+    ends = np.concatenate([np.array(s) for c in dashed for s in c.get_segments()])
+    assert ends.size
+    assert ends.min() >= 0.0
+    assert ends.max() <= 11.0

@@ -1,0 +1,194 @@
+"""The rules of the verdict, one by one and in their order."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.report.page.verdict import Evidence, Level, Where, binomial_p, gather, judge_evidence
+
+FINE = Evidence(
+    converged=True,
+    reasons=(),
+    held_out=True,
+    hits=13,
+    n=14,
+    low_coverage_p=0.4,
+    effective=9.0,
+    rmse=0.04,
+    unit="kN",
+    max_relative_error=0.08,
+    prior_set=(),
+    two_pressures=False,
+    skill=0.9,
+    sign_changes=12,
+    neighbours=26,
+    along="slip",
+    inside="slip 0 to 70 %",
+)
+
+RULES = {
+    "not converged": {
+        "converged": False,
+        "reasons": ("R-hat of C is 1.2, at most 1.01 is needed",),
+    },
+    "not scored": {"rmse": float("nan")},
+    "miscovered": {"hits": 6, "low_coverage_p": 0.001},
+    "misfit": {"sign_changes": 4},
+    "unexpected": {"prior_hits": 2, "prior_n": 20},
+    "extrapolated": {"two_pressures": True, "prior_set": ("K_bend", "D_bend")},
+    "weak": {"skill": 0.1},
+}
+
+
+def test_fine():
+    verdict = judge_evidence(FINE)
+    assert (verdict.rule, verdict.level) == ("fine", Level.FINE)
+    assert "slip 0 to 70 %" in verdict.trust
+    assert "outside" in verdict.doubt
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_each_rule_decides_alone(rule):
+    verdict = judge_evidence(replace(FINE, **RULES[rule]))
+    assert verdict.rule == rule
+    assert verdict.level != Level.FINE
+
+
+@pytest.mark.parametrize("first", range(len(RULES)))
+def test_the_graver_rule_decides(first):
+    rules = list(RULES)
+    evidence = FINE
+    for rule in reversed(rules[first:]):
+        evidence = replace(evidence, **RULES[rule])
+    assert judge_evidence(evidence).rule == rules[first]
+
+
+def test_not_converged_says_why_and_what_to_do():
+    doubt = judge_evidence(replace(FINE, **RULES["not converged"])).doubt
+    assert "R-hat of C is 1.2" in doubt
+    assert "more steps" in doubt
+
+
+def test_two_pressures_name_what_the_prior_sets():
+    doubt = judge_evidence(replace(FINE, **RULES["extrapolated"])).doubt
+    assert "two pressures do not determine a quadratic" in doubt
+    assert "K_bend and D_bend" in doubt
+
+
+def test_no_error_is_claimed_between_two_pressures_where_nothing_was_measured():
+    verdict = judge_evidence(replace(FINE, **RULES["extrapolated"], held_out=False))
+    assert "nothing was measured between them" in verdict.doubt
+    assert "0.040" not in verdict.doubt
+    assert "to 0.040 kN rms" in verdict.trust
+    assert "width" not in verdict.trust
+
+
+def test_an_error_beyond_two_pressures_is_said_to_be_there():
+    verdict = judge_evidence(replace(FINE, **RULES["extrapolated"], unseen_at=Where.BEYOND))
+    assert "nothing was measured between them" in verdict.doubt
+    assert "Beyond them the median is off by 0.040 kN rms" in verdict.doubt
+    assert "0.040" not in verdict.trust
+
+
+def test_one_held_out_curve_does_not_confirm_the_width():
+    verdict = judge_evidence(
+        replace(FINE, **RULES["extrapolated"], unseen_at=Where.BETWEEN, effective=1.8)
+    )
+    assert "off by 0.040 kN rms" in verdict.doubt
+    assert "14 rows worth 1.8 independent rows, cannot confirm it" in verdict.doubt
+    assert "width" not in verdict.trust
+
+
+@pytest.mark.parametrize(("hits", "rule"), [(9, "unexpected"), (10, "fine"), (20, "fine")])
+def test_priors_expect_at_least_half_of_the_points(hits, rule):
+    assert judge_evidence(replace(FINE, prior_hits=hits, prior_n=20)).rule == rule
+
+
+def test_data_that_the_priors_did_not_expect():
+    doubt = judge_evidence(
+        replace(FINE, **RULES["unexpected"], suspects="the load", notes=("5 kN is assumed",))
+    ).doubt
+    assert "did not expect these data (2 of 20 points" in doubt
+    assert "check the load; 5 kN is assumed" in doubt
+
+
+def test_units_off_by_a_thousand_conflict_with_the_priors(drawbar):
+    problem = replace(drawbar.calibration.problem, notes=("5 kN is assumed",))
+    calibration = replace(drawbar.calibration, problem=problem)
+    evidence = gather(
+        replace(
+            drawbar, calibration=calibration, prior_predictive=1000.0 + drawbar.prior_predictive
+        )
+    )
+    assert (evidence.prior_hits, evidence.prior_n) == (0, 28)
+    assert evidence.notes == ("5 kN is assumed",)
+    assert "normal load" in judge_evidence(evidence).doubt
+
+
+def test_parameters_set_by_the_prior_are_named_even_where_all_is_fine():
+    assert "C2" in judge_evidence(replace(FINE, prior_set=("C2",))).doubt
+
+
+def test_an_error_that_cannot_be_judged_is_not_printed():
+    evidence = replace(FINE, hits=6, low_coverage_p=0.001, max_relative_error=float("nan"))
+    assert "at most" not in judge_evidence(evidence).trust
+
+
+def test_binomial_p():
+    assert binomial_p(14, 14) == pytest.approx(1.0)
+    assert binomial_p(9, 14) == pytest.approx(0.0092, abs=0.0005)
+    assert np.isnan(binomial_p(0, 0))
+
+
+def test_evidence_of_the_held_out_pressure(drawbar):
+    evidence = gather(drawbar)
+    assert evidence.two_pressures
+    assert {"K_bend", "D_bend"} <= set(evidence.prior_set)
+    assert (evidence.held_out, evidence.n) == (True, 14)
+    assert evidence.effective < 7
+    assert evidence.neighbours == 26
+    assert evidence.inside == "slip 2 to 72 % and inflation pressure 18 to 42 psi"
+    assert evidence.unseen_at is Where.BETWEEN
+    assert evidence.prior_hits >= 14
+    verdict = judge_evidence(evidence)
+    assert verdict.rule == "extrapolated"
+    assert verdict.trust == "the curves at 18 and 42 psi for slip 2 to 72 %"
+
+
+@pytest.mark.parametrize(
+    ("psi", "where"), [(30.0, Where.BETWEEN), (18.0, Where.AT), (50.0, Where.BEYOND)]
+)
+def test_where_the_held_out_rows_lie(drawbar, psi, where):
+    table = drawbar.validation.table
+    columns = dict(table.columns) | {"inflation_pressure_psi": np.full(len(table), psi)}
+    held = replace(drawbar.validation, table=replace(table, columns=columns))
+    assert gather(replace(drawbar, validation=held)).unseen_at is where
+
+
+def test_leaving_rows_out_measures_nothing_between_two_pressures(drawbar):
+    left_out = replace(drawbar.validation, method="leave_one_out")
+    evidence = gather(replace(drawbar, validation=left_out))
+    assert evidence.unseen_at is Where.AT
+
+
+def test_evidence_of_leave_one_out(density):
+    evidence = gather(density)
+    scores = density.validation.scores
+    assert not evidence.held_out
+    assert evidence.low_coverage_p == pytest.approx(binomial_p(scores.coverage[0.9].hits, 36))
+    expected = 1 - scores.rmse**2 / np.var(density.validation.observed)
+    assert evidence.skill == pytest.approx(expected)
+
+
+def test_draws_without_values_are_not_scored(rut):
+    scores = replace(rut.validation.scores, rmse=float("nan"))
+    draws = np.full_like(rut.validation.draws, np.nan)
+    broken = replace(rut, validation=replace(rut.validation, scores=scores, draws=draws))
+    assert judge_evidence(gather(broken)).rule == "not scored"
+
+
+def test_a_run_that_did_not_converge(unconverged):
+    assert judge_evidence(gather(unconverged)).headline == "NOT CONVERGED"

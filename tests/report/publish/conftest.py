@@ -1,0 +1,48 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.report.manifest import build_manifest
+from calib.report.publish import Publication, publication
+from calib.report.study import Failure, Study
+from calib.report.summary import summarise
+
+
+def records(results: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Manifest and summary of some results, as they are read back from a report."""
+    study = Study(results, 42, 3.2)
+    inputs = {
+        key: {
+            "data": {"file": f"data/{key}.csv", "sha256": f"{i:02x}da7a" * 8},
+            "priors": {"sha256": f"{i:02x}b0b1" * 8, "source": f"{r.task.model}.toml"},
+        }
+        for i, (key, r) in enumerate(results.items())
+    }
+    command = ["calib", "report", "--out", "a folder"]
+    documents = build_manifest(study, SamplerSettings(), command, inputs), summarise(study)
+    return tuple(json.loads(json.dumps(d)) for d in documents)  # type: ignore[return-value]
+
+
+@pytest.fixture(scope="session")
+def he2019(density, drawbar, rut) -> tuple[dict[str, Any], dict[str, Any]]:
+    # The genetic algorithm takes seconds: what least squares found stands for what it would find.
+    searched = replace(density.estimates[0], method="genetic")
+    density = replace(density, estimates=(*density.estimates, searched))
+    return records({"bulk_density": density, "drawbar_pull": drawbar, "rut_depth": rut})
+
+
+@pytest.fixture(scope="session")
+def users(plate, unconverged) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A user's own data, one output not converged, one that failed."""
+    failed = Failure(replace(plate.task, output="bulk_density"), "CalibError: no rows")
+    return records({"rut_depth": plate, "drawbar_pull": unconverged, "bulk_density": failed})
+
+
+@pytest.fixture(scope="session")
+def published(he2019) -> Publication:
+    return publication(*he2019)

@@ -1,0 +1,43 @@
+"""A report is the same wherever its pieces are worked out and drawn."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calib.batch.pool import pool
+from calib.he2019.audit import Seeds
+from calib.he2019.gaps.cases import paper_gaps
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.report.contents import work_out
+from calib.report.manifest import file_hashes
+from calib.report.study_tasks import he2019_tasks
+from calib.report.writer import write_report
+
+SHORT = SamplerSettings(steps=60, max_steps=60)
+
+
+def test_processes_make_the_same_report_as_one(tmp_path: Path) -> None:
+    """Outputs, a gap, the audit and all figures, to the byte."""
+    tasks = [task for task in he2019_tasks() if task.output == "rut_depth"]
+    gaps = [gap for gap in paper_gaps() if gap.name == "plain_bekker"]
+    told: dict[int, set[str]] = {}
+    for workers in (1, 2):
+        told[workers] = set()
+
+        def tell(what: str, done: int, planned: int, seen: set[str] = told[workers]) -> None:
+            assert 0 <= done <= planned
+            seen.add(what)
+
+        with pool(workers) as side:
+            found = work_out(
+                tasks, 7, settings=SHORT, gaps=gaps, audit=Seeds(1, 1, 2), progress=tell, pool=side
+            )
+            write_report(
+                found.study, tmp_path / f"{workers}", settings=SHORT, command=["calib"], title="R",
+                gaps=found.gaps, audit=found.audit, progress=tell, pool=side,
+            )  # fmt: skip
+    one, two = (file_hashes(tmp_path / f"{workers}") for workers in (1, 2))
+    assert one == two
+    assert "gaps/plain_bekker/index.html" in one
+    assert "outputs" in told[2]
+    assert {"drawing figures", "genetic algorithm over seeds"} <= told[1] & told[2]

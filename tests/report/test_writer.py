@@ -1,0 +1,116 @@
+"""The report folder: whole, consistent, and the same bytes when it is made again."""
+
+from __future__ import annotations
+
+import json
+import re
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.report.figures.collect import plates
+from calib.report.manifest import file_hashes
+from calib.report.publish import publication
+from calib.report.study import Study
+from calib.report.writer import write_report
+
+
+class Links(HTMLParser):
+    """Addresses and anchors of a page."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.ids: set[str] = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        found = dict(attrs)
+        self.ids |= {found["id"]} if "id" in found else set()
+        if tag == "a":
+            self.found.append(str(found["href"]))
+
+
+def write(result, out: Path, **kwargs) -> Path:
+    return write_report(
+        Study({"rut_depth": result}, 2019, 1.0), out, settings=SamplerSettings(),
+        command=["calib", "report"], title="Report", **kwargs,
+    ).parent  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def report(rut, tmp_path_factory) -> Path:
+    return write(rut, tmp_path_factory.mktemp("report") / "rep", pdf=True)
+
+
+def test_every_file_is_in_the_manifest(report):
+    manifest = json.loads((report / "manifest.json").read_text())
+    assert manifest["files"] == file_hashes(report)
+    assert {"methods.txt", "methods.tex", "references.bib", "tables/posterior.csv",
+            "tables/posterior_rut_depth.tex"} <= set(manifest["files"])  # fmt: skip
+
+
+def test_tables_and_methods_follow_from_the_files_beside_them(report):
+    manifest, summary = (
+        json.loads((report / f"{name}.json").read_text()) for name in ("manifest", "summary")
+    )
+    for path, text in publication(manifest, summary).files.items():
+        assert (report / path).read_text(encoding="utf-8") == text, path
+
+
+def test_every_link_of_the_page_leads_somewhere(report):
+    links = Links((report / "index.html").read_text(encoding="utf-8"))
+    local = [link for link in links.found if not link.startswith("#")]
+    assert {"tables/posterior.csv", "methods.txt", "references.bib", "summary.json"} <= set(local)
+    for link in local:
+        assert (report / link).is_file(), link
+    assert {link[1:] for link in links.found if link.startswith("#")} <= links.ids
+    tables = {p.relative_to(report).as_posix() for p in (report / "tables").iterdir()}
+    assert tables <= set(local)
+
+
+def test_the_page_quotes_the_methods(report):
+    page = (report / "index.html").read_text(encoding="utf-8").replace("\u00a0", " ")
+    text = (report / "methods.txt").read_text(encoding="utf-8")
+    sentence = re.search(r"Sampling by .*? autocorrelation\s+times\.", text, re.DOTALL)
+    assert sentence is not None
+    assert " ".join(sentence[0].split()) in page
+    assert 'class="copy"' in page
+    assert "user-select: all" in page
+
+
+def test_every_figure_has_its_pdf_and_its_size_in_print(report):
+    images = sorted((report / "figures").glob("*.png"))
+    assert images
+    for image in images:
+        assert image.with_suffix(".pdf").read_bytes().startswith(b"%PDF")
+        with Image.open(image) as opened:
+            assert opened.info["dpi"] == pytest.approx((150, 150), abs=0.1)
+            width = opened.size[0] / 150 * 25.4
+            assert min(abs(width - w) for w in (90, 140, 190)) < 0.3
+
+
+def test_pdfs_come_on_request_only(plate, tmp_path, monkeypatch):
+    monkeypatch.setattr("calib.report.writer.plates", lambda *a, **k: plates(*a, **k)[:1])
+    report = write(plate, tmp_path / "rep")
+    assert list(report.rglob("*.png"))
+    assert not list(report.rglob("*.pdf"))
+    assert json.loads((report / "manifest.json").read_text())["pdf"] is False
+
+
+def test_made_again_it_is_the_same_to_the_last_byte(rut, report, tmp_path):
+    again = write(rut, tmp_path / "rep", pdf=True)
+    first, second = file_hashes(report), file_hashes(again)
+    assert set(first) == set(second)
+    assert first == second
+
+
+def test_it_may_be_replaced(rut, tmp_path, monkeypatch):
+    monkeypatch.setattr("calib.report.writer.plates", lambda result, published: [])
+    out = write(rut, tmp_path / "rep", pdf=True)
+    (out / "methods.txt").write_text("old")
+    assert write(rut, out, overwrite=True) == out
+    assert (out / "methods.txt").read_text(encoding="utf-8").startswith("Methods")

@@ -1,0 +1,158 @@
+"""Bands against quantiles formed anew from the draws."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calib.data import Table, table_from_arrays
+from calib.errors import CalibError
+from calib.inference.calibration import Calibration
+from calib.validation.prediction import bands, predict, prediction_columns, predictive_draws
+from calib.validation.scores import LEVELS
+
+
+def conditions(slip, psi=30.0, **more) -> Table:
+    slip = np.atleast_1d(np.asarray(slip, dtype=float))
+    columns = {"slip_ratio": slip, "inflation_pressure_psi": np.full(slip.size, psi)}
+    return table_from_arrays(columns | more, source="at.csv")
+
+
+def test_bands_are_quantiles() -> None:
+    draws = np.random.default_rng(1).standard_normal((501, 4))
+    found = bands(draws)
+    np.testing.assert_allclose(found.median, np.median(draws, axis=0))
+    for level in LEVELS:
+        np.testing.assert_allclose(found.lower[level], np.quantile(draws, 0.5 - level / 2, axis=0))
+        np.testing.assert_allclose(found.upper[level], np.quantile(draws, 0.5 + level / 2, axis=0))
+
+
+def test_vectors_without_a_value_are_left_out_of_the_bands() -> None:
+    draws = np.random.default_rng(1).standard_normal((500, 2))
+    holed = np.vstack([draws, np.full((100, 2), np.nan)])
+    np.testing.assert_allclose(bands(holed).upper[0.9], bands(draws).upper[0.9])
+
+
+def test_parameter_bands_are_those_of_the_model_over_the_draws(
+    pull_calibration: Calibration,
+) -> None:
+    table = conditions([0.02, 0.1, 0.3])
+    found = predict(pull_calibration, table)
+    problem = pull_calibration.problem
+    natural = problem.theta(pull_calibration.subset(4000))
+    curve = problem.bound.predict(natural[:, :-1], table.columns)
+    np.testing.assert_allclose(found.parameter.median, np.median(curve, axis=0))
+    np.testing.assert_allclose(found.parameter.upper[0.95], np.quantile(curve, 0.975, axis=0))
+    assert found.output == "drawbar_pull_kn"
+
+
+def test_predictive_bands_add_the_noise(pull_calibration: Calibration) -> None:
+    """Where a measurement lies is a normal of each draw's sigma about each draw's curve."""
+    table = conditions(np.linspace(0.0, 0.6, 12))
+    found = predict(pull_calibration, table)
+    natural = pull_calibration.problem.theta(pull_calibration.subset(4000))
+    curve = pull_calibration.problem.bound.predict(natural[:, :-1], table.columns)
+    sigma = natural[:, -1:]
+    for level in LEVELS:
+        # The part of each draw's normal below the band's edge, averaged, is the band's level.
+        below = stats.norm.cdf(found.predictive.upper[level], curve, sigma).mean(axis=0)
+        # 4000 draws: the level of an empirical quantile varies by sqrt(p(1-p)/4000).
+        p = 0.5 + level / 2
+        assert np.all(np.abs(below - p) < 5.0 * np.sqrt(p * (1 - p) / 4000))
+        assert np.all(found.predictive.upper[level] > found.parameter.upper[level])
+        assert np.all(found.predictive.lower[level] < found.parameter.lower[level])
+
+
+def test_ruts_are_predicted_in_millimetres(rut_calibration: Calibration) -> None:
+    table = table_from_arrays(
+        {"average_ground_pressure_kpa": np.array([140.0]), "slip_ratio": np.array([0.1])}
+    )
+    found = predict(rut_calibration, table)
+    assert 10.0 < found.predictive.lower[0.95][0] < found.parameter.median[0] < 60.0
+    assert found.parameter.median[0] < found.predictive.upper[0.95][0] < 100.0
+
+
+def test_the_same_prediction_twice(pull_calibration: Calibration) -> None:
+    table = conditions([0.1, 0.2])
+    one, other = predict(pull_calibration, table), predict(pull_calibration, table)
+    np.testing.assert_array_equal(one.predictive.upper[0.9], other.predictive.upper[0.9])
+
+
+def test_draws_come_in_the_order_of_mean_and_measurement(rut_calibration: Calibration) -> None:
+    at = rut_calibration.problem.conditions
+    mean, measured = predictive_draws(rut_calibration, at, np.random.default_rng(1), size=1000)
+    assert mean.shape == measured.shape == (1000, 18)
+    sigma = rut_calibration.problem.theta(rut_calibration.subset(1000))[:, -1:]
+    z = (np.log(measured) - np.log(mean)) / sigma
+    # 18,000 standard normals, on the logarithm's scale.
+    assert stats.kstest(z.ravel(), "norm").pvalue > 1e-4
+
+
+def test_leaving_the_calibrated_range_is_flagged(pull_calibration: Calibration) -> None:
+    calibrated = pull_calibration.problem.conditions["slip_ratio"]
+    top = float(calibrated.max())
+    inside = conditions([calibrated.min(), 0.1, top, top * (1 + 1e-12)])
+    assert predict(pull_calibration, inside).outside == ((), (), (), ())
+    slips = conditions([-0.3, top + 0.01])
+    assert predict(pull_calibration, slips).outside == (("slip_ratio",),) * 2
+    assert predict(pull_calibration, conditions([0.1], psi=45.0)).outside == (
+        ("inflation_pressure_psi",),
+    )
+    both = predict(pull_calibration, conditions([0.95], psi=10.0))
+    assert both.outside == (("slip_ratio", "inflation_pressure_psi"),)
+
+
+def test_where_no_vector_has_a_value_neither_have_the_bands(
+    pull_calibration: Calibration,
+) -> None:
+    """Two columns of NaN say nothing; they must not warn either."""
+    found = bands(np.full((10, 2), np.nan))
+    assert np.isnan(found.median).all()
+    far = predict(pull_calibration, conditions([0.1], psi=400.0))
+    assert far.outside == (("inflation_pressure_psi",),)
+
+
+def test_a_missing_condition_is_told(pull_calibration: Calibration) -> None:
+    table = table_from_arrays({"slip_ratio": np.array([0.1])})
+    with pytest.raises(CalibError, match="needs inflation_pressure_psi"):
+        predict(pull_calibration, table)
+
+
+def test_a_prediction_as_columns(pull_calibration: Calibration) -> None:
+    table = conditions([0.1, 0.95], drawbar_pull_kn=np.array([1.0, 2.0]), run=np.array([1, 2]))
+    found = predict(pull_calibration, table)
+    columns = prediction_columns(found, table)
+    assert list(columns)[:4] == [
+        "slip_ratio", "inflation_pressure_psi", "run", "drawbar_pull_kn_median",
+    ]  # fmt: skip
+    assert len(columns) == 3 + 1 + 2 * 2 * len(LEVELS) + 1
+    np.testing.assert_array_equal(
+        columns["drawbar_pull_kn_predictive_95_upper"], found.predictive.upper[0.95]
+    )
+    np.testing.assert_array_equal(
+        columns["drawbar_pull_kn_parameter_50_lower"], found.parameter.lower[0.5]
+    )
+    assert columns["outside_calibrated_range"] == ["", "slip_ratio"]
+
+
+def test_bands_of_a_row_do_not_depend_on_the_other_rows(pull_calibration: Calibration) -> None:
+    many = predict(pull_calibration, conditions(np.array([0.05, 0.2, 0.5])))
+    one = predict(pull_calibration, conditions(np.array([0.2])))
+    assert one.predictive.lower[0.9][0] == many.predictive.lower[0.9][1]
+    assert one.predictive.upper[0.95][0] == many.predictive.upper[0.95][1]
+
+
+def test_no_band_where_the_model_has_no_value_for_much_of_the_posterior(
+    pull_calibration: Calibration,
+) -> None:
+    far = table_from_arrays(
+        {"slip_ratio": np.array([0.2, 0.2]), "inflation_pressure_psi": np.array([30.0, 120.0])}
+    )
+    found = predict(pull_calibration, far)
+    assert found.defined[0] == 1.0
+    assert np.isfinite(found.predictive.median[0])
+    assert found.defined[1] < 0.95
+    assert np.isnan(found.predictive.median[1])
+    assert np.isnan(found.parameter.upper[0.9][1])
+    assert "no value" in prediction_columns(found, far)["outside_calibrated_range"][1]
