@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from calib.data import Table, table_from_arrays
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 
 
 def table(source: str = "my.csv", **columns) -> Table:

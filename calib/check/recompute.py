@@ -15,7 +15,7 @@ from calib.check.inputs import GROUP as INPUTS
 from calib.check.items import Item, Status
 from calib.check.schema import Manifest, RunRecord, TaskRecord
 from calib.data import read_table
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.he2019.audit import Seeds
 from calib.he2019.gaps.cases import paper_gaps

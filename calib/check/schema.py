@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from calib.batch.environment import Environment
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.he2019.gaps.cases import paper_gaps
 from calib.inference.io import SCHEMA as RUN_SCHEMA

@@ -60,7 +60,7 @@ def report(
     from calib.batch.pool import pool
     from calib.cli.display import progress_bars
     from calib.data import read_table
-    from calib.data.outputs import OUTPUTS
+    from calib.data.quantities import OUTPUTS
     from calib.he2019.audit import Seeds
     from calib.he2019.datasets.embedded import labelled
     from calib.he2019.gaps.cases import paper_gaps

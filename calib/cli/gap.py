@@ -42,8 +42,7 @@ def diagnose(
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
     from calib.batch.folders import check_folder, fresh_folder
     from calib.batch.pool import pool
-    from calib.data.outputs import OUTPUTS
-    from calib.data.quantities import QUANTITIES
+    from calib.data.quantities import OUTPUTS, QUANTITIES
     from calib.gap.case import case_from_run, read_case
     from calib.gap.diagnose import diagnose as find
     from calib.gap.effects import EFFECTS

@@ -28,12 +28,11 @@ _QUALIFIERS = frozenset({
     "level", "class", "method", "sensor", "channel", "time", "date",
 })  # fmt: skip
 
-_STEMS: tuple[tuple[str, Quantity], ...] = tuple(
-    sorted(
-        ((stem, q) for q in QUANTITIES.values() for stem in (q.stem, *q.synonyms)),
-        key=lambda pair: -len(pair[0]),
-    )
-)
+
+def _stems() -> list[tuple[str, Quantity]]:
+    """Every stem and the quantity it names, the longest first."""
+    pairs = [(stem, q) for q in QUANTITIES.values() for stem in (q.stem, *q.synonyms)]
+    return sorted(pairs, key=lambda pair: -len(pair[0]))
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,7 @@ def parse_header(header: str, *, where: str = "", position: int = 0) -> Column |
         If a quantity is named without its unit, or with an unknown or an unfitting one.
     """
     name = _normal(header)
-    for stem, quantity in _STEMS:
+    for stem, quantity in _stems():
         if name == stem:
             if quantity.bare_unit is None:
                 raise _unit_error(header, quantity, "", where)

@@ -1,12 +1,15 @@
-"""The dictionary of quantities: their names, units and the values they can have.
+"""The dictionary of quantities: names, units, what they physically are, and how they are shown.
 
-Inside the package every quantity has one canonical column in one unit.
+It is the only vocabulary: inside the package every quantity has one canonical column in one unit,
+outputs are known by their stems, and effects know quantities by their physical roles. A new one is
+one declaration, made known by `calib.register`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from math import inf
 from types import MappingProxyType
 from typing import Literal
@@ -14,9 +17,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.data.registry import Registry
 from calib.data.units import convert
+from calib.errors import CalibError
 
-__all__ = ["QUANTITIES", "UNITS", "Quantity", "Range"]
+__all__ = [
+    "OUTPUTS", "QUANTITIES", "UNITS", "Quantity", "Range", "columns_of", "output_of",
+    "physical_role", "role_of",
+]  # fmt: skip
 
 _RATIO = {"ratio": "dimensionless", "fraction": "dimensionless", "percent": "percent",
           "pct": "percent"}  # fmt: skip
@@ -83,11 +91,11 @@ class Quantity:
     Parameters
     ----------
     stem : str
-        Its name in a header, without the unit.
+        Its name in a header, without the unit; of an output, its name in results.
     canonical : str
         The column it becomes.
     kind : str
-        Key of `UNITS`; also the dimension as messages call it.
+        Its dimension as messages call it: a key of `UNITS`, unless it has `suffixes` of its own.
     unit : str
         The canonical unit, in pint's spelling.
     role : {"output", "condition", "bookkeeping"}
@@ -103,6 +111,19 @@ class Quantity:
         Whether the models compare its logarithm, so that it must be positive when used.
     mend : str
         What to do about a value outside the range.
+    title : str
+        Its name on an axis and as a heading; the stem in words by default.
+    shown : tuple of (str, float), optional
+        Unit in which it is drawn, and the factor from the canonical one to it.
+    physical : str
+        The role by which effects refer to it (``"pull"``, ``"slip"``): the stem by default.
+        Several quantities may have the same one.
+    of_factors : bool
+        Whether factors of it count, not differences, so that what depends on it is even on its
+        logarithm.
+    suffixes : mapping of str to str, optional
+        Accepted unit suffixes of a header and the pint units they mean, for a dimension that is
+        not in `UNITS`.
     """
 
     stem: str
@@ -116,11 +137,50 @@ class Quantity:
     bare_unit: str | None = None
     log_scale: bool = False
     mend: str = "correct the value, its unit in the column name, or delete the row"
+    title: str = ""
+    shown: tuple[str, float] | None = None
+    physical: str = ""
+    of_factors: bool = False
+    suffixes: Mapping[str, str] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "title", self.title or self.stem.replace("_", " ").capitalize())
+        object.__setattr__(self, "physical", self.physical or self.stem)
 
     @property
     def units(self) -> Mapping[str, str]:
         """Accepted suffixes and the pint units they mean."""
-        return UNITS[self.kind]
+        return UNITS.get(self.kind, {}) if self.suffixes is None else self.suffixes
+
+    @property
+    def word(self) -> str:
+        """Its name in a sentence."""
+        return self.stem.replace("_", " ")
+
+    def register(self) -> None:
+        """Make it known.
+
+        Raises
+        ------
+        CalibError
+            If its canonical column does not read as itself, or its name is taken.
+        """
+        if self.unit not in (*self.units.values(), self.bare_unit):
+            raise CalibError(
+                f"the quantity {self.stem} has no suffix for its own unit {self.unit!r}",
+                allowed=", ".join(sorted({*self.units.values()})) or "suffixes={suffix: unit}",
+                mend="declare it with suffixes={...} that have the canonical unit among them",
+            )
+        ending = self.canonical.removeprefix(f"{self.stem}_")
+        if self.units.get(ending) != self.unit and not (
+            self.canonical == self.stem and self.bare_unit == self.unit
+        ):
+            raise CalibError(
+                f"the column {self.canonical!r} does not name {self.stem} in {self.unit}",
+                allowed=f"{self.stem} and a suffix of the unit: {', '.join(self.units)}",
+                mend="correct the canonical column",
+            )
+        QUANTITIES.add(self)
 
 
 _POSITIVE = Range(low=0.0, low_open=True)
@@ -128,50 +188,97 @@ _SLIP = Range(low=-1.0, high=1.0)
 _ONE = "dimensionless"
 
 
-def _dictionary() -> Mapping[str, Quantity]:
-    entries = (
-        Quantity("slip", "slip_ratio", "slip", _ONE, "condition",
-                 "wheel slip; 0.2 means 20 %", _SLIP),
-        Quantity("nominal_slip", "nominal_slip_ratio", "slip", _ONE, "bookkeeping",
-                 "slip before its zero was redefined", _SLIP),
-        Quantity("inflation_pressure", "inflation_pressure_psi", "pressure", "psi", "condition",
-                 "tyre inflation (gauge) pressure", _POSITIVE),
-        Quantity("average_ground_pressure", "average_ground_pressure_kpa", "pressure", "kPa",
-                 "condition", "load over contact area", _POSITIVE),
-        Quantity("normal_load", "normal_load_kn", "force", "kN", "condition",
-                 "vertical load on the wheel", _POSITIVE,
-                 synonyms=("load", "wheel_load", "vertical_load")),
-        Quantity("speed", "speed_m_s", "speed", "m/s", "condition",
-                 "travel speed", Range(low=0.0)),
-        Quantity("pass_number", "pass_number", "number", _ONE, "condition",
-                 "how often a wheel has run in this rut, the first time being 1",
-                 Range(low=1.0, integer=True), bare_unit=_ONE),
-        Quantity("run_order", "run_order", "number", _ONE, "bookkeeping",
-                 "order in which the rows were measured", bare_unit=_ONE),
-        Quantity("repeat", "repeat", "label", _ONE, "bookkeeping",
-                 "label of a repetition", synonyms=("replicate",), bare_unit=_ONE),
-        Quantity("run", "run", "label", _ONE, "bookkeeping",
-                 "label of a test run", synonyms=("run_id",), bare_unit=_ONE),
-        Quantity("gravimetric_water_content", "gravimetric_water_content", "mass ratio", _ONE,
-                 "condition", "mass of water over mass of dry soil", Range(low=0.0, high=3.0),
-                 synonyms=("water_content_grav",), bare_unit=_ONE),
-        Quantity("volumetric_water_content", "volumetric_water_content", "volume ratio", _ONE,
-                 "condition", "volume of water over volume of soil", Range(low=0.0, high=1.0),
-                 synonyms=("water_content_vol",), bare_unit=_ONE),
-        Quantity("cone_index", "cone_index_kpa", "pressure", "kPa", "condition",
-                 "penetration resistance of a cone", _POSITIVE,
-                 synonyms=("penetration_resistance",)),
-        Quantity("drawbar_pull", "drawbar_pull_kn", "force", "kN", "output",
-                 "net pull of the wheel; negative when it must be pushed"),
-        Quantity("rut_depth", "rut_depth_mm", "length", "mm", "output",
-                 "depth of the rut, or sinkage", _POSITIVE, synonyms=("sinkage",),
-                 log_scale=True,
-                 mend="the models compare the logarithm of the rut depth, which zero and negative "
-                 "depths do not have: correct the zero of the gauge, or delete the row"),
-        Quantity("bulk_density", "bulk_density_g_cm3", "density", "g/cm**3", "output",
-                 "dry mass of soil over its volume", Range(low=0.3, high=3.5)),
-    )  # fmt: skip
-    return MappingProxyType({quantity.canonical: quantity for quantity in entries})
+QUANTITIES: Registry[Quantity] = Registry(
+    "quantity",
+    lambda quantity: quantity.canonical,
+    Quantity("bulk_density", "bulk_density_g_cm3", "density", "g/cm**3", "output",
+             "dry mass of soil over its volume", Range(low=0.3, high=3.5),
+             title="Dry bulk density", shown=("g/cm³", 1.0), physical="density"),
+    Quantity("drawbar_pull", "drawbar_pull_kn", "force", "kN", "output",
+             "net pull of the wheel; negative when it must be pushed", physical="pull"),
+    Quantity("rut_depth", "rut_depth_mm", "length", "mm", "output",
+             "depth of the rut, or sinkage", _POSITIVE, synonyms=("sinkage",),
+             log_scale=True, physical="sinkage",
+             mend="the models compare the logarithm of the rut depth, which zero and negative "
+             "depths do not have: correct the zero of the gauge, or delete the row"),
+    Quantity("slip", "slip_ratio", "slip", _ONE, "condition",
+             "wheel slip; 0.2 means 20 %", _SLIP, shown=("%", 100.0)),
+    Quantity("nominal_slip", "nominal_slip_ratio", "slip", _ONE, "bookkeeping",
+             "slip before its zero was redefined", _SLIP, shown=("%", 100.0)),
+    Quantity("inflation_pressure", "inflation_pressure_psi", "pressure", "psi", "condition",
+             "tyre inflation (gauge) pressure", _POSITIVE, physical="pressure"),
+    Quantity("average_ground_pressure", "average_ground_pressure_kpa", "pressure", "kPa",
+             "condition", "load over contact area", _POSITIVE, title="Ground pressure",
+             physical="ground_pressure"),
+    Quantity("normal_load", "normal_load_kn", "force", "kN", "condition",
+             "vertical load on the wheel", _POSITIVE, physical="load", of_factors=True,
+             synonyms=("load", "wheel_load", "vertical_load")),
+    Quantity("speed", "speed_m_s", "speed", "m/s", "condition",
+             "travel speed", Range(low=0.0), of_factors=True),
+    Quantity("pass_number", "pass_number", "number", _ONE, "condition",
+             "how often a wheel has run in this rut, the first time being 1",
+             Range(low=1.0, integer=True), bare_unit=_ONE, title="Pass", shown=("number", 1.0),
+             physical="passes", of_factors=True),
+    Quantity("run_order", "run_order", "number", _ONE, "bookkeeping",
+             "order in which the rows were measured", bare_unit=_ONE, shown=("number", 1.0),
+             physical="order"),
+    Quantity("repeat", "repeat", "label", _ONE, "bookkeeping",
+             "label of a repetition", synonyms=("replicate",), bare_unit=_ONE),
+    Quantity("run", "run", "label", _ONE, "bookkeeping",
+             "label of a test run", synonyms=("run_id",), bare_unit=_ONE),
+    Quantity("gravimetric_water_content", "gravimetric_water_content", "mass ratio", _ONE,
+             "condition", "mass of water over mass of dry soil", Range(low=0.0, high=3.0),
+             synonyms=("water_content_grav",), bare_unit=_ONE, title="Water content",
+             shown=("% of dry mass", 100.0), physical="water"),
+    Quantity("volumetric_water_content", "volumetric_water_content", "volume ratio", _ONE,
+             "condition", "volume of water over volume of soil", Range(low=0.0, high=1.0),
+             synonyms=("water_content_vol",), bare_unit=_ONE, title="Water content",
+             shown=("% of volume", 100.0), physical="water_by_volume"),
+    Quantity("cone_index", "cone_index_kpa", "pressure", "kPa", "condition",
+             "penetration resistance of a cone", _POSITIVE, physical="cone", of_factors=True,
+             synonyms=("penetration_resistance",)),
+)  # fmt: skip
 
 
-QUANTITIES: Mapping[str, Quantity] = _dictionary()
+class _Outputs(Mapping[str, str]):
+    """The outputs that can be calibrated: name in results to canonical column."""
+
+    def __getitem__(self, name: str) -> str:
+        for quantity in QUANTITIES.values():
+            if quantity.role == "output" and quantity.stem == name:
+                return quantity.canonical
+        raise KeyError(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return (q.stem for q in QUANTITIES.values() if q.role == "output")
+
+    def __len__(self) -> int:
+        return sum(q.role == "output" for q in QUANTITIES.values())
+
+
+OUTPUTS: Mapping[str, str] = _Outputs()
+
+
+@cache
+def _columns_of(physical: str, _version: int) -> tuple[str, ...]:
+    return tuple(c for c, q in QUANTITIES.items() if physical in (q.physical, c))
+
+
+def columns_of(physical: str) -> tuple[str, ...]:
+    """Return the canonical columns that have a physical role, or are named so themselves."""
+    return _columns_of(physical, QUANTITIES.version)
+
+
+def role_of(column: str) -> str:
+    """Return the physical role of a canonical column."""
+    return QUANTITIES[column].physical if column in QUANTITIES else column
+
+
+def output_of(column: str) -> str:
+    """Return the name in results of an output's canonical column."""
+    return QUANTITIES[column].stem
+
+
+def physical_role(output: str) -> str:
+    """Return the role by which effects know an output."""
+    return QUANTITIES[OUTPUTS[output]].physical

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table, read_table
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS, columns_of, output_of, physical_role
 from calib.errors import CalibError
 from calib.gap.covariates import Covariates
 from calib.gap.effects import View
 from calib.gap.noise import At, noise_at, noise_at_lab
 from calib.gap.oddities import oddities
-from calib.gap.simulated import PRESSURE, Simulated
+from calib.gap.simulated import Simulated
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS, get_model
@@ -48,7 +48,7 @@ class Case:
     lab, field : Table
         The campaign of the calibration, and the one the simulator is used for.
     models : mapping of str to str
-        Output (`calib.data.outputs.OUTPUTS`) to model.
+        Output (`calib.data.quantities.OUTPUTS`) to model.
     fresh : Table, optional
         Conditions to predict.
     warnings : tuple of str
@@ -70,7 +70,7 @@ class OutputData:
     Parameters
     ----------
     name : str
-        Key of `calib.data.outputs.OUTPUTS`.
+        Key of `calib.data.quantities.OUTPUTS`.
     problem : Problem
         On the lab rows that have the output.
     priors : Priors
@@ -87,6 +87,11 @@ class OutputData:
     rows: NDArray[np.int64]
     field: Array
 
+    @property
+    def role(self) -> str:
+        """The physical role by which effects know the output."""
+        return physical_role(self.name)
+
 
 @dataclass(frozen=True)
 class Campaigns:
@@ -102,11 +107,21 @@ class Campaigns:
         """Outputs in order."""
         return tuple(o.name for o in self.outputs)
 
+    @property
+    def roles(self) -> tuple[str, ...]:
+        """Physical roles of the outputs, in order."""
+        return tuple(o.role for o in self.outputs)
+
+    def with_role(self, role: str) -> tuple[str, ...]:
+        """Return the outputs that have a physical role."""
+        return tuple(o.name for o in self.outputs if o.role == role)
+
     @cached_property
     def simulated(self) -> dict[str, Simulated]:
         """Every output's simulator at the rows of both campaigns."""
         tables = (self.case.lab, self.case.field)
-        recorded = np.concatenate([t[PRESSURE] for t in tables if PRESSURE in t] or [np.zeros(1)])
+        parts = [_recorded(t, "pressure", np.empty(0)) for t in tables]
+        recorded = np.concatenate(parts) if any(p.size for p in parts) else np.zeros(1)
         pressures = float(recorded.min()), float(recorded.max())
         return {o.name: Simulated(o, self.view, pressures) for o in self.outputs}
 
@@ -236,7 +251,7 @@ def case_from_run(run: Path, field: Path) -> Case:
     # Needs what writes and reads run folders, and that a sampler: no other case does.
     problem = import_module("calib.inference.io").load_calibration(run).problem
     model = problem.bound.model
-    output = next(key for key, column in OUTPUTS.items() if column == model.output)
+    output = output_of(model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))
     models = {output: model.name}
     warnings = oddities(problem.table, table, models)
@@ -253,8 +268,8 @@ def campaigns(case: Case) -> Campaigns:
     """
     outputs = tuple(_output(case, name, model) for name, model in case.models.items())
     lab, field = case.lab, case.field
-    load = lab.columns.get("normal_load_kn", field.columns.get("normal_load_kn", np.array([5.0])))
-    order = field.columns.get("run_order", np.array([0.0, 1.0]))
+    load = _recorded(lab, "load", _recorded(field, "load", np.array([5.0])))
+    order = _recorded(field, "order", np.array([0.0, 1.0]))
     view = View(
         conditions=dict(field.columns),
         lab={name: float(np.nanmedian(values)) for name, values in lab.columns.items()},
@@ -323,12 +338,18 @@ def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) ->
         )
 
 
+def _recorded(table: Table, role: str, otherwise: Array) -> Array:
+    """Return a column by its physical role."""
+    column = next((c for c in columns_of(role) if c in table), None)
+    return otherwise if column is None else table[column]
+
+
 def _ground_exponent(lab: Table, field: Table) -> float:
     """D ln(ground pressure)/d ln(inflation pressure), 0.5 where the data cannot tell."""
-    names = ("inflation_pressure_psi", "average_ground_pressure_kpa")
     for table in (lab, field):
-        if all(name in table for name in names):
-            x, y = (np.log(table[name]) for name in names)
+        x, y = (_recorded(table, role, np.ones(1)) for role in ("pressure", "ground_pressure"))
+        if x.size == y.size:
+            x, y = np.log(x), np.log(y)
             if np.ptp(x) > 1e-6:
                 return float(np.clip(np.polyfit(x, y, 1)[0], 0.0, 1.5))
     return 0.5

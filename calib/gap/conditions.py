@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS, role_of
 from calib.errors import CalibError
 from calib.gap.case import MAX_RATIO, Case
 from calib.models import get_model
@@ -17,7 +17,7 @@ from calib.models.base import Array
 __all__ = ["check_units", "without_far_conditions"]
 
 # Runs may come in any order and number.
-_ANY = ("run_order", *OUTPUTS.values())
+_ANY = "order"
 # A value is far from all others if it lies this part of their range beyond them, and by no less
 # than a factor of `_LEAST_FACTOR`; of quantities that may be negative, than half their size.
 _FAR = 1.5
@@ -56,7 +56,7 @@ def without_far_conditions(case: Case) -> Case:
     """
     lab, field, said = case.lab, case.field, list(case.warnings)
     for name in case.field:
-        if name in _ANY or name not in case.lab:
+        if role_of(name) == _ANY or name in OUTPUTS.values() or name not in case.lab:
             continue
         far = _far(np.concatenate([lab[name], field[name]]))
         in_lab, in_field = (np.flatnonzero(part) for part in (far[: len(lab)], far[len(lab) :]))

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from calib.data import Table, write_table
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import Campaigns, campaigns, read_case
 from calib.gap.effects import EFFECTS, Effect
@@ -264,16 +264,17 @@ def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array]:
         If a condition is missing.
     """
     needed = corrected.data.view.conditions
-    missing = [n for n in needed if n not in table and n not in (*OUTPUTS.values(), "run_order")]
+    order = corrected.data.view.column("order")
+    missing = [n for n in needed if n not in table and n not in (*OUTPUTS.values(), order)]
     if missing:
         raise CalibError(
             f"the corrected model needs {', '.join(missing)}", where=table.source,
             allowed="the conditions and covariates of the field campaign", mend="add the columns",
         )  # fmt: skip
     conditions = dict(table.columns)
-    if "run_order" in needed and "run_order" not in conditions:
+    if order is not None and order not in conditions:
         # A drift is predicted as it stood at the end of the campaign.
-        conditions["run_order"] = np.full(len(table), corrected.data.view.order_range[1])
+        conditions[order] = np.full(len(table), corrected.data.view.order_range[1])
     truth = corrected.mixture.at(corrected.data.at_conditions(conditions))
     columns: dict[str, Array] = {
         n: v for n, v in table.columns.items() if n not in OUTPUTS.values()

@@ -7,24 +7,36 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib.data.quantities import QUANTITIES, columns_of
 from calib.gap.effects import View
 from calib.models.base import Array
 
 if TYPE_CHECKING:
     from calib.gap.case import Campaigns
 
-__all__ = ["OVER", "Covariates"]
+__all__ = ["Covariates", "columns_over", "other_conditions"]
 
-# What something may vary with by itself: the first of the columns that is recorded and varies.
-OVER = {
-    "slip": ("slip_ratio",), "order": ("run_order",), "speed": ("speed_m_s",),
-    "passes": ("pass_number",), "load": ("normal_load_kn",), "cone": ("cone_index_kpa",),
-    "water": ("gravimetric_water_content", "volumetric_water_content"),
-    "pressure": ("inflation_pressure_psi", "average_ground_pressure_kpa"),
-    "low_pressure": ("inflation_pressure_psi",),
+# What something may vary with by itself, where it is not just one physical role: the first of them
+# that is recorded and varies.
+_OVER = {
+    "water": ("water", "water_by_volume"), "pressure": ("pressure", "ground_pressure"),
+    "low_pressure": ("pressure",),
 }  # fmt: skip
-# Conditions of which factors count, not differences.
-_LOGS = frozenset({"speed_m_s", "pass_number", "normal_load_kn", "cone_index_kpa"})
+# Roles of which a discrepancy knows what they may do.
+_KNOWN = ("slip", "order", "speed", "passes", "load", "cone", "ground_pressure",
+          "water_by_volume", *_OVER)  # fmt: skip
+
+
+def columns_over(what: str) -> tuple[str, ...]:
+    """Return the columns of what something may vary with, the one to be preferred first."""
+    return tuple(c for role in _OVER.get(what, (what,)) for c in columns_of(role))
+
+
+def other_conditions(view: View) -> tuple[str, ...]:
+    """Return the roles of recorded conditions of which nothing more is known."""
+    recorded = [QUANTITIES[c] for c in view.conditions if c in QUANTITIES]
+    roles = [q.physical for q in recorded if q.role == "condition" and q.physical not in _KNOWN]
+    return tuple(dict.fromkeys(roles))
 
 
 class Covariates:
@@ -48,8 +60,8 @@ class Covariates:
         }
 
     def over(self, view: View, what: str) -> Array | None:
-        """What something varies with, a key of `OVER`, scaled, shape (n,); None if nothing does."""
-        columns = (self.scaled(view, name) for name in OVER[what])
+        """What something varies with (see `columns_over`), scaled, shape (n,); None if nothing."""
+        columns = (self.scaled(view, name) for name in columns_over(what))
         return next((u for u in columns if u is not None), None)
 
     def scaled(self, view: View, name: str) -> Array | None:
@@ -65,7 +77,7 @@ class Covariates:
         if name not in view.conditions:
             return None
         values, reference = view.conditions[name], self._ranges[name]
-        if name in _LOGS:
+        if name in QUANTITIES and QUANTITIES[name].of_factors:
             values, reference = (
                 np.log(np.maximum(values, 1e-6)),
                 np.log(np.maximum(reference, 1e-6)),

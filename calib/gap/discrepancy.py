@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.special import expit
 
-from calib.gap.case import Campaigns
+from calib.gap.case import Campaigns, OutputData
+from calib.gap.covariates import other_conditions
 from calib.gap.effects import View
-from calib.gap.effects.base import DRAWBAR, RUT
 from calib.gap.hypothesis import Hypothesis, Setting
 from calib.models.base import Array
 
@@ -92,7 +92,7 @@ class Discrepancy:
         """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
         over = self.hypothesis.onset_over or ""
         if over in ("level", "sinkage"):
-            return self._known(self._level(view, output if over == "level" else RUT))
+            return self._known(self._level(view, self._level_of(over, output)))
         u = self._known(self.covariates.over(view, over))
         return -u if over == "low_pressure" else u
 
@@ -111,12 +111,12 @@ class Discrepancy:
             change = self._from_the_run_before(view, output)
             return change[:, None], np.ones(1)
         if over in ("level", "sinkage"):
-            terms = self._cosines(self._level(view, output if over == "level" else RUT), 8, 0.8)
+            terms = self._cosines(self._level(view, self._level_of(over, output)), 8, 0.8)
         elif over == "order":
             terms = self._cosines(self.covariates.over(view, "order"), 12, 0.7)
         elif over == "ripple":
             terms = self._ripples(view)
-        elif over in SETTINGS:
+        elif over in SETTINGS or over in other_conditions(self.data.view):
             terms = self._setting_terms(view, output, over)
         else:
             terms = self._condition_terms(view, everything=over == "all")
@@ -134,7 +134,7 @@ class Discrepancy:
         for u, sd in self._cosines(*self._settings(view, "pressure", bends), 0.5):
             terms.append((u, sd))
             terms += [(u * b, sd * w) for b, w in slips[:4]]
-        for name in ("speed", "passes", "water", "load", "cone"):
+        for name in ("speed", "passes", "water", "load", "cone", *other_conditions(view)):
             values = self.covariates.over(view, name)
             if values is not None and everything:
                 terms += self._cosines(values, 3, 0.4)
@@ -145,7 +145,8 @@ class Discrepancy:
     def _setting_terms(self, view: View, output: str, over: str) -> list[tuple[Array, float]]:
         """Of one condition by itself: added to an output, or a part of its level."""
         terms = self._cosines(*self._settings(view, over, 6), 0.8)
-        if output == DRAWBAR:  # ruts are on a logarithmic scale, where adding is to be a part of
+        log = self._of(output).problem.bound.model.response == "log"
+        if not log:  # on a logarithmic scale adding is to be a part of it
             level = self._known(self._level(view, output))
             terms += [(level, 0.5), *((level * b, 0.6 * w) for b, w in terms)]
         return terms
@@ -184,9 +185,16 @@ class Discrepancy:
         level = np.nan_to_num(self._predicted(view, output), nan=low)
         return np.clip((level - low) / max(high - low, 1e-12) * 2.0 - 1.0, -1.5, 1.5)
 
+    def _level_of(self, over: str, output: str) -> str:
+        """The output whose level something varies with: its own, or the sinkage."""
+        return output if over == "level" else self.data.with_role("sinkage")[0]
+
+    def _of(self, output: str) -> OutputData:
+        return next(o for o in self.data.outputs if o.name == output)
+
     def _predicted(self, view: View, output: str) -> Array:
         """Prediction of an output as the lab calibrated it, on the response's scale."""
-        o = next(o for o in self.data.outputs if o.name == output)
+        o = self._of(output)
         theta = o.priors.to_natural(self.lab_mode[output][None])
         selected = o.problem.bound.model.select(view.conditions)
         return np.asarray(o.problem.bound.location(theta, selected)[0])
@@ -196,7 +204,7 @@ class Discrepancy:
 
         def change(view: View) -> Array:
             level = np.nan_to_num(self._predicted(view, output))
-            run = view.conditions["run_order"]
+            run = view.of("order")
             if not np.ptp(run):
                 return np.zeros(level.size)  # nobody knows what went before
             order = np.argsort(run, kind="stable")

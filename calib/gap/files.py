@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from calib.data import write_table
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.gap.corrected import save_corrected
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit

@@ -17,6 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from calib.data.quantities import columns_of, physical_role, role_of
 from calib.gap.case import Campaigns
 from calib.gap.discrepancy import THRESHOLDS, Bases, Discrepancy
 from calib.gap.effects import Effect, View
@@ -234,14 +235,14 @@ class Forward:
     def _shifted(self, shift: Array, conditions: dict[str, Array]) -> dict[str, Array]:
         """Conditions as they truly are: with a shift the zero of slip is another."""
         radius_error = np.zeros(0) if self.shift is None else self.shift.radius_error
-        if not radius_error.any() or "slip_ratio" not in conditions:
+        column = next((c for c in columns_of("slip") if c in conditions), None)
+        if not radius_error.any() or column is None:
             return conditions
         error = shift @ radius_error
-        slip = 1.0 - (1.0 - conditions["slip_ratio"]) * (1.0 - error[:, None])
-        return {**conditions, "slip_ratio": slip}
+        return {**conditions, column: 1.0 - (1.0 - conditions[column]) * (1.0 - error[:, None])}
 
     def _with_effects(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
-        base = {o.name: o.problem.bound.from_response(plain[o.name]) for o in self.data.outputs}
+        base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in self.data.outputs}
         view = replace(view, base=base)
         acting = [
             (effect, p.to_natural(psi[:, s]))
@@ -258,19 +259,23 @@ class Forward:
         plain: Array, form: Array,
     ) -> Array:  # fmt: skip
         """One output with the effects in it; effects with their natural parameters."""
-        acting = [(effect, phi) for effect, phi in effects if name in effect.outputs]
+        role = physical_role(name)
+        acting = [(effect, phi) for effect, phi in effects if role in effect.outputs]
         if not acting:
             return plain
         simulated = self._simulated[name]
-        conditions = original = simulated.conditions(view)
+        recorded = simulated.conditions(view)
+        columns = {role_of(column): column for column in recorded}
+        conditions = original = {known: recorded[column] for known, column in columns.items()}
         for effect, phi in acting:
-            conditions = effect.on_conditions(phi, name, conditions, view)
+            conditions = effect.on_conditions(phi, role, conditions, view)
         location = plain
         if conditions is not original:
             t, misfit = psi[:, self.theta_slices[name]], psi[:, self.misfit_slices[name]]
-            location = simulated.predict_beyond(t, misfit, conditions)
+            true = {columns[known]: values for known, values in conditions.items()}
+            location = simulated.predict_beyond(t, misfit, true)
         for effect, phi in acting:
-            location = effect.on_output(phi, name, location, view)
+            location = effect.on_output(phi, role, location, view)
         if form.shape[1]:
             factor = 1.0 + psi[:, self.form_slices[name]] @ form.T
             location = plain + (location - plain) * factor

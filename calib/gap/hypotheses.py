@@ -9,10 +9,9 @@ from typing import Literal
 import numpy as np
 
 from calib.gap.case import Campaigns
-from calib.gap.covariates import OVER
+from calib.gap.covariates import columns_over, other_conditions
 from calib.gap.discrepancy import SETTINGS
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.base import DENSITY, DRAWBAR, RUT
 from calib.gap.hypothesis import Hypothesis, OnsetOver, SmoothOver
 from calib.gap.shifts import ShiftAs
 from calib.inference.prior_files import default_prior_path, read_priors
@@ -57,11 +56,12 @@ REMAINDER = 0.2
 
 
 type _Over = Literal["slip", "level", "sinkage", "order"]
+type _Touched = tuple[str, ...]
 
 # One output that changes beyond some slip or run is what listed effects are: post-peak softening,
 # slip sinkage, rebound and drift may set in anywhere. Nobody could tell the unlisted from them.
-_LISTED_ONSETS: tuple[tuple[_Over, tuple[str, ...]], ...] = (
-    ("slip", (DRAWBAR,)), ("slip", (RUT,)), ("order", (DRAWBAR,)),
+_LISTED_ONSETS: tuple[tuple[_Over, str], ...] = (
+    ("slip", "pull"), ("slip", "sinkage"), ("order", "pull"),
 )  # fmt: skip
 
 
@@ -71,7 +71,7 @@ def split_testable(
     """Split the effects into those the data can show and those they cannot, with the reason."""
     able, unable = {}, {}
     for name, effect in effects.items():
-        reason = effect.not_testable(data.view, data.names)
+        reason = effect.not_testable(data.view, data.roles)
         if reason is None:
             able[name] = effect
         else:
@@ -93,30 +93,28 @@ def singles(data: Campaigns, effects: Mapping[str, Effect]) -> list[Hypothesis]:
 
 def unknowns(data: Campaigns) -> list[Hypothesis]:
     """Free discrepancies: of one output or all, smooth over slip, level, … or setting in there."""
-    names = data.names
-    each = [(name,) for name in names]
+    names, density, ruts = data.names, data.with_role("density"), data.with_role("sinkage")
+    each: list[_Touched] = [(name,) for name in names]
     touched = each + ([names] if len(names) > 1 else [])
-    recorded = data.view.conditions
-    choices: list[tuple[_Over, tuple[str, ...]]] = [("level", t) for t in each]
-    if "slip_ratio" in recorded:
+    of_wheel = [t for t in touched if not set(density) & set(t)]
+    slipping = data.view.column("slip") is not None
+    choices: list[tuple[_Over, _Touched]] = [("level", t) for t in each]
+    if slipping:
         choices += [("slip", t) for t in touched]
-    if RUT in names:
-        choices += [("sinkage", t) for t in touched if t != (RUT,)]
-    remembered: list[tuple[str, ...]] = []
-    if "run_order" in recorded and np.ptp(recorded["run_order"]) > 0:
+    if ruts:
+        choices += [("sinkage", t) for t in touched if t != ruts]
+    remembered: list[_Touched] = []
+    if _varies(data, "order"):
         choices += [("order", t) for t in touched]
-        remembered = [t for t in touched if DENSITY not in t]
-    rippled = [t for t in touched if "slip_ratio" in recorded and DENSITY not in t]
-    everywhere: list[tuple[SmoothOver, tuple[str, ...]]] = [
+        remembered = of_wheel
+    rippled = of_wheel if slipping else []
+    others = [role for role in other_conditions(data.view) if _varies(data, role)]
+    everywhere: list[tuple[SmoothOver, _Touched]] = [
         *choices,
         *(("ripple", t) for t in rippled),
         *(("before", t) for t in remembered),
-        *(
-            (over, t)
-            for over in SETTINGS
-            for t in touched
-            if _varies(data, over) and DENSITY not in t
-        ),
+        *((over, t) for over in SETTINGS for t in of_wheel if _varies(data, over)),
+        *((role, t) for role in others for t in touched),
         *(("all", t) for t in touched),
     ]
     smooth = [
@@ -124,10 +122,11 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
         for over, t in everywhere
         for size in SMOOTHS
     ]
-    probes: tuple[OnsetOver, ...] = ("water", "cone") if DENSITY in names else ()
-    setting_in: list[tuple[OnsetOver, tuple[str, ...]]] = [
-        *(choice for choice in choices if choice not in _LISTED_ONSETS),
-        *((over, (DENSITY,)) for over in probes if _varies(data, over)),
+    probes: tuple[OnsetOver, ...] = ("water", "cone") if density else ()
+    listed = [(over, data.with_role(role)) for over, role in _LISTED_ONSETS]
+    setting_in: list[tuple[OnsetOver, _Touched]] = [
+        *(choice for choice in choices if choice not in listed),
+        *((over, density) for over in probes if _varies(data, over)),
     ]
     sudden = [
         Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over=over)
@@ -138,8 +137,7 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
     if _varies(data, "low_pressure"):
         limp = [
             Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over="low_pressure")
-            for t in touched
-            if DENSITY not in t
+            for t in of_wheel
         ]
     half = (1.0 - REMAINDER) / 2.0
     onsets = half - LIMP if limp else half
@@ -152,7 +150,7 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
 
 def _varies(data: Campaigns, over: str) -> bool:
     recorded = data.view.conditions
-    return any(np.ptp(recorded[c]) > 0 for c in OVER[over] if c in recorded)
+    return any(np.ptp(recorded[c]) > 0 for c in columns_over(over) if c in recorded)
 
 
 def remainders(data: Campaigns, best: Sequence[Hypothesis], n_single: int) -> list[Hypothesis]:
@@ -161,7 +159,7 @@ def remainders(data: Campaigns, best: Sequence[Hypothesis], n_single: int) -> li
     The best of them stand for all: the others' evidence is negligible beside theirs.
     """
     overs: tuple[SmoothOver, ...] = ("all", "level")
-    if "slip_ratio" in data.view.conditions:
+    if data.view.column("slip") is not None:
         overs = ("all", "level", "slip")
     share = REMAINDER / ((n_single + 1) * len(overs))
     return [
@@ -181,7 +179,7 @@ def remainders(data: Campaigns, best: Sequence[Hypothesis], n_single: int) -> li
 def shifts(data: Campaigns) -> list[Hypothesis]:
     """Other parameter values in the field, by a little or a lot, each by itself or as soils do."""
     kinds: dict[ShiftAs, float] = {"alone": 1.0 - SOIL, "soil": SOIL}
-    if set(data.names) == {DENSITY}:
+    if set(data.roles) == {"density"}:
         kinds = {"alone": 1.0}
     return [
         Hypothesis("parameter_shift", shift=size, shift_as=kind, share=share / len(SHIFTS))

@@ -12,7 +12,10 @@ from calib.inference.priors import Priors
 __all__ = ["Hypothesis", "OnsetOver", "Setting", "SmoothOver"]
 
 type Setting = Literal["pressure", "speed", "passes", "water"]
-type SmoothOver = Setting | Literal["slip", "level", "sinkage", "order", "before", "ripple", "all"]
+# Or the physical role of another condition that is recorded.
+type SmoothOver = (
+    Setting | Literal["slip", "level", "sinkage", "order", "before", "ripple", "all"] | str
+)
 type OnsetOver = Literal["slip", "level", "sinkage", "order", "water", "cone", "low_pressure"]
 
 
@@ -40,7 +43,8 @@ class Hypothesis:
         (as weather or another stretch of ground would), how far the output is from that of the run
         before (as a recorder that lags would), slip in waves too short for the first (as lugs that
         pass would), one of inflation pressure, speed, passes and water content alone (as a wheel
-        that hops at some pressure would), or every condition.
+        that hops at some pressure would), another recorded condition by its physical role, or
+        every condition.
     smooth_decay : float
         Number of half waves from which the discrepancy's coefficients fall off.
     onset_over : OnsetOver, optional

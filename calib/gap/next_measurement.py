@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import QUANTITIES, role_of
 from calib.gap.case import Campaigns
 from calib.gap.effects import View
 from calib.gap.fit import Fit
@@ -19,7 +19,6 @@ from calib.models.base import Array
 
 __all__ = ["NextMeasurement", "next_measurements"]
 
-_LABELS = ("nominal_slip_ratio", "repeat", "run")
 _IN_PLAY = 0.03
 _MOST = 3
 _N_CANDIDATES = 400
@@ -77,16 +76,17 @@ def _candidates(data: Campaigns, rng: np.random.Generator) -> dict[str, Array]:
     candidates = {}
     lab = data.case.lab.columns
     for name, values in data.view.conditions.items():
-        if name in OUTPUTS.values() or name in _LABELS:
+        role = role_of(name)
+        if name in QUANTITIES and QUANTITIES[name].role != "condition" and role != "order":
             continue
         both = np.concatenate([values, lab.get(name, values)])
-        if name == "slip_ratio":
+        if role == "slip":
             candidates[name] = rng.uniform(both.min(), both.max(), _N_CANDIDATES)
-        elif name == "run_order":
+        elif role == "order":
             candidates[name] = np.full(_N_CANDIDATES, data.view.order_range[1])
         else:
             candidates[name] = rng.choice(np.unique(both), _N_CANDIDATES)
-    pressures = ("inflation_pressure_psi", "average_ground_pressure_kpa")
+    pressures = [data.view.column(role) or "" for role in ("pressure", "ground_pressure")]
     if all(p in candidates for p in pressures):
         # The two go together: pick rows, not values.
         row = rng.integers(len(data.case.field), size=_N_CANDIDATES)

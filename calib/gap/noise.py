@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
+from calib.data.quantities import columns_of
 from calib.gap.effects import View
 from calib.models.base import Array
 
@@ -84,10 +85,13 @@ def noise_at_lab(lab: Table, view: View) -> At:
 
 def _at(conditions: Mapping[str, Array], lab: Mapping[str, float], size: int) -> At:
     softness = np.zeros(size)
-    pressure, reference = (c.get("inflation_pressure_psi") for c in (conditions, lab))
+    slip, recorded = (
+        next((c for c in columns_of(role) if c in conditions), "") for role in ("slip", "pressure")
+    )
+    pressure, reference = conditions.get(recorded), lab.get(recorded)
     if pressure is not None and reference is not None:
         softness = -np.log(np.maximum(pressure, 1e-6) / max(reference, 1e-6))
-    return At(conditions.get("slip_ratio", np.zeros(size)), softness)
+    return At(conditions.get(slip, np.zeros(size)), softness)
 
 
 def _growth(at: At, rho: float, kappa: float) -> Array:

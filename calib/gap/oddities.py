@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from calib.data import Table
-from calib.data.outputs import OUTPUTS
-from calib.gap.effects.base import DRAWBAR
+from calib.data.quantities import OUTPUTS, columns_of, role_of
 from calib.models import get_model
 from calib.models.base import Array
 
@@ -62,7 +61,7 @@ def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, 
             f"{', '.join(sorted(held))}: held constant in the calibration and varied in the field; "
             "what it does to the simulator rests on the priors alone"
         )
-    states = ("speed_m_s", "pass_number", "gravimetric_water_content")
+    states = [c for role in ("speed", "passes", "water") for c in columns_of(role)]
     both = [n for n in states if n in lab and n in field]
     varied = [n for n in both if np.ptp(lab[n]) > 0.0 and np.ptp(field[n]) == 0.0]
     if varied:
@@ -109,9 +108,11 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
                     f"{name}: {_times(lab[name], field[name])}; if the field's is in another unit, "
                     "or is another column's, the diagnosis means nothing"
                 )
+    pull = next((name for name in outputs if role_of(name) == "pull"), None)
     for table in (lab, field):
-        if OUTPUTS[DRAWBAR] in outputs and {OUTPUTS[DRAWBAR], "normal_load_kn"} <= set(table):
-            pulls = np.abs(table[OUTPUTS[DRAWBAR]]) / table["normal_load_kn"]
+        load = next((c for c in columns_of("load") if c in table), None)
+        if pull is not None and load is not None and pull in table:
+            pulls = np.abs(table[pull]) / table[load]
             if np.nanmedian(pulls) > 1.0:
                 said.append(
                     f"{table.source}: the drawbar pull is typically {np.nanmedian(pulls):.2g} "

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.gap.case import Campaigns, Case, OutputData, campaigns
 from calib.gap.conditions import check_units, without_far_conditions
 from calib.gap.effects import Effect

@@ -13,7 +13,6 @@ from scipy.linalg import block_diag
 
 from calib.errors import CalibError
 from calib.gap.case import OutputData
-from calib.gap.effects.base import DRAWBAR
 from calib.inference.prior_files import default_prior_path
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
@@ -118,7 +117,7 @@ def coordinates(outputs: Sequence[OutputData]) -> list[tuple[str, str]]:
     found = []
     for o in outputs:
         kinds = quantities(o.priors.names)
-        if o.name == DRAWBAR:
+        if o.role == "pull":
             kinds.append(ZERO_OF_SLIP)
         found += [(o.name, kind) for kind in kinds]
     return found
@@ -159,7 +158,7 @@ def shift_map(outputs: Sequence[OutputData], shift_as: ShiftAs) -> tuple[ShiftMa
     for o in outputs:
         names = [kind for name, kind in at if name == o.name and kind != ZERO_OF_SLIP]
         blocks.append(prior_widths(o.priors)[:, None] * _unfold(names))
-        if o.name == DRAWBAR:
+        if o.role == "pull":
             blocks.append(np.full((1, 1), RADIUS_ERROR))
     matrix = block_diag(*blocks)
     sds = np.array([alone_sd(kind) for kind in kinds])

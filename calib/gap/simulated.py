@@ -11,16 +11,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib.data.quantities import QUANTITIES
 from calib.gap.effects import View
 from calib.models.base import Array
 
 if TYPE_CHECKING:
     from calib.gap.case import OutputData
 
-__all__ = ["PRESSURE", "Simulated"]
+__all__ = ["Simulated"]
 
-MISFIT_OUTPUTS = ("bulk_density",)
-PRESSURE = "inflation_pressure_psi"
+# Physical roles of the outputs whose simulators may be bent over their conditions.
+_BENT = ("density",)
 
 
 class Simulated:
@@ -89,9 +90,10 @@ class Simulated:
         33 true gauge errors (four seeds of the challenge) the rms error is 0.95 noise sds so, 1.5
         along the parabolas.
         """
-        pressure = conditions.get(PRESSURE)
+        column = self._view.column("pressure") or ""
+        pressure = conditions.get(column)
         low, high = self._pressures
-        if pressure is None or low == high or pressure is self._view.conditions.get(PRESSURE):
+        if pressure is None or low == high or pressure is self._view.conditions[column]:
             return self.predict(t, misfit, conditions)
         inside = np.clip(pressure, low, high)
         beyond = (pressure - inside) / (high - low)
@@ -100,14 +102,14 @@ class Simulated:
         # Inside and at either end in one call.
         ends = [np.full_like(inside, end) for end in (low, high)]
         thrice = {name: np.concatenate([v, v, v], axis=-1) for name, v in conditions.items()}
-        thrice[PRESSURE] = np.concatenate([inside, *ends], axis=-1)
+        thrice[column] = np.concatenate([inside, *ends], axis=-1)
         location, at_low, at_high = np.split(self.predict(t, misfit, thrice), 3, axis=1)
         return np.asarray(location + (at_high - at_low) * beyond)
 
     def _bends(self, conditions: Mapping[str, Array]) -> list[Array]:
         """What the coefficients of the inadequacy multiply, (n,) or (k, n) each."""
         scaled = [
-            np.clip((_LOGS.get(name, _same)(conditions[name]) - mid) / half, -2.5, 2.5)
+            np.clip((_even(name, conditions[name]) - mid) / half, -2.5, 2.5)
             for name, mid, half in self._ranges
         ]
         return [
@@ -117,25 +119,20 @@ class Simulated:
         ]
 
 
-def _same(values: Array) -> Array:
+def _even(column: str, values: Array) -> Array:
+    """A condition on the scale on which what depends on it is even."""
+    if column in QUANTITIES and QUANTITIES[column].of_factors:
+        return np.asarray(np.log(np.maximum(values, 1e-6)))
     return values
-
-
-def _ln(values: Array) -> Array:
-    return np.asarray(np.log(np.maximum(values, 1e-6)))
-
-
-# Conditions whose effect is even on the logarithm.
-_LOGS = {"cone_index_kpa": _ln, "average_ground_pressure_kpa": _ln}
 
 
 def _misfit_ranges(o: OutputData) -> tuple[tuple[str, float, float], ...]:
     """Conditions over which a simulator may be bent, with middle and half range in the lab."""
-    if o.name not in MISFIT_OUTPUTS:
+    if o.role not in _BENT:
         return ()
     found = []
     for name, values in o.problem.conditions.items():
-        values = _LOGS.get(name, _same)(values)
+        values = _even(name, values)
         half = 0.5 * float(np.ptp(values))
         if half > 1e-9 * max(1.0, float(np.abs(values).max())):
             found.append((name, 0.5 * float(values.max() + values.min()), half))

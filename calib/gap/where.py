@@ -9,16 +9,19 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.data.quantities import columns_of
 from calib.gap.case import Campaigns
+from calib.gap.covariates import other_conditions
+from calib.gap.effects import View
 from calib.gap.mixture import Truth
 from calib.models.base import Array
 
-__all__ = ["Region", "RowGap", "regions", "row_gaps"]
+__all__ = ["Region", "RowGap", "conditions_to_search", "regions", "row_gaps"]
 
-_REGION_CONDITIONS = (
-    "slip_ratio", "inflation_pressure_psi", "average_ground_pressure_kpa", "speed_m_s",
-    "pass_number", "gravimetric_water_content", "volumetric_water_content", "cone_index_kpa",
-    "normal_load_kn", "run_order",
+# Physical roles of the conditions, in the order in which a reader looks for a cause; others follow.
+_ROLES = (
+    "slip", "pressure", "ground_pressure", "speed", "passes", "water", "water_by_volume", "cone",
+    "load", "order",
 )  # fmt: skip
 # The fewest rows of a region: this part of an output's rows, and two.
 _FEWEST_PART, _FEWEST = 1 / 12, 2
@@ -70,6 +73,12 @@ class Region:
     probability: float
 
 
+def conditions_to_search(view: View) -> list[str]:
+    """Return the recorded conditions along which a gap may lie somewhere, in a reader's order."""
+    roles = (*_ROLES, *other_conditions(view))
+    return [c for role in roles for c in columns_of(role) if c in view.conditions]
+
+
 def row_gaps(data: Campaigns, truth: Truth) -> tuple[RowGap, ...]:
     """Gap at every field row that has the output."""
     found = []
@@ -96,9 +105,9 @@ def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Re
         left = np.ones(o.rows.size, dtype=bool)
         for _ in range(_MOST):
             best: tuple[float, Region, NDArray[np.bool_]] | None = None
-            for name in _REGION_CONDITIONS:
-                column = data.view.conditions.get(name)
-                if column is None or np.ptp(column[o.rows]) == 0.0:
+            for name in conditions_to_search(data.view):
+                column = data.view.conditions[name]
+                if np.ptp(column[o.rows]) == 0.0:
                     continue
                 values = column[o.rows]
                 for low, high in _stretches(values, row_gap, left):

@@ -10,7 +10,7 @@ import numpy as np
 
 from calib.data import Table, hold_out
 from calib.data.headers import parse_header
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.inference.prior_files import prior_file_model
 from calib.models import get_model

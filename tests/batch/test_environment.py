@@ -71,7 +71,8 @@ def test_another_line_of_code_or_another_prior_is_another_code(
         effects = package.parent / folder / "effects"
         effects.mkdir(parents=True, exist_ok=True)
         (effects / "one.toml").write_bytes(prior)
-        monkeypatch.setattr(environment_module, "__file__", str(package / "batch" / "environment.py"))
+        module = package / "batch" / "environment.py"
+        monkeypatch.setattr(environment_module, "__file__", str(module))
         return environment_module.code_sha256.__wrapped__()
 
     one = code(b"x = 1\ny = 2\n")

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data import Table, table_from_arrays, write_table
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.gap.case import Campaigns, Case, campaigns
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from calib.cli import app
 from calib.data import table_from_arrays, write_table
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.corrected import (

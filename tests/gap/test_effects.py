@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calib.data.quantities import role_of
 from calib.gap.effects import EFFECTS, View
 from calib.gap.effects.base import saturating
 from calib.inference.prior_files import default_prior_path, read_priors
 from tests.gap.cases import make_case, parameters, simulate
 
-OUTPUTS = ("drawbar_pull", "rut_depth", "bulk_density")
+OUTPUTS = ("pull", "sinkage", "density")
 # Parameters that make an effect vanish when they are zero; those of its shape keep some value.
 SIZES = {
     "slip_zero_shift": ("radius_error",),
@@ -61,9 +62,9 @@ def view() -> View:
     n = 20
     slip = np.linspace(0.05, 0.6, n)
     base = {
-        "drawbar_pull": np.tile(1.4 * (1.0 - np.exp(-slip / 0.1)), (K, 1)),
-        "rut_depth": np.tile(30.0 * (1.0 + slip), (K, 1)),
-        "bulk_density": np.full((K, n), 1.5),
+        "pull": np.tile(1.4 * (1.0 - np.exp(-slip / 0.1)), (K, 1)),
+        "sinkage": np.tile(30.0 * (1.0 + slip), (K, 1)),
+        "density": np.full((K, n), 1.5),
     }
     return View(
         conditions={
@@ -85,22 +86,27 @@ def view() -> View:
     )  # fmt: skip
 
 
+def by_role(view: View) -> dict[str, np.ndarray]:
+    """Return a view's conditions as effects are given them."""
+    return {role_of(column): values for column, values in view.conditions.items()}
+
+
 def predict(output: str, conditions: dict[str, np.ndarray]) -> np.ndarray:
     """Predict by simple laws: pull rises with slip and falls with pressure, the rut grows."""
-    slip, psi = conditions["slip_ratio"], conditions["inflation_pressure_psi"]
-    if output == "drawbar_pull":
+    slip, psi = conditions["slip"], conditions["pressure"]
+    if output == "pull":
         return 1.4 * (1.0 - np.exp(-slip / 0.1)) - 0.01 * psi
-    if output == "rut_depth":
-        return np.log(30.0 * (1.0 + slip) * (conditions["average_ground_pressure_kpa"] / 140.0))
-    return 1.2 + 1e-4 * conditions["cone_index_kpa"] + conditions["gravimetric_water_content"]
+    if output == "sinkage":
+        return np.log(30.0 * (1.0 + slip) * (conditions["ground_pressure"] / 140.0))
+    return 1.2 + 1e-4 * conditions["cone"] + conditions["water"]
 
 
 def apply(name: str, size: Mapping[str, float], output: str, view: View) -> np.ndarray:
     """Return the change that an effect makes, shape (k, n)."""
     effect = EFFECTS[name]
     phi = np.tile(parameters(name, size), (K, 1))
-    plain = np.tile(predict(output, dict(view.conditions)), (K, 1))
-    conditions = effect.on_conditions(phi, output, dict(view.conditions), view)
+    plain = np.tile(predict(output, by_role(view)), (K, 1))
+    conditions = effect.on_conditions(phi, output, by_role(view), view)
     location = predict(output, conditions) * np.ones((K, 1))
     changed = effect.on_output(phi, output, location, view)
     assert changed.shape == (K, 20)
@@ -124,14 +130,14 @@ def test_nothing_happens_at_zero_size(name, output, view):
 @pytest.mark.parametrize("name", SOME)
 def test_it_acts_in_its_direction_on_its_outputs(name, view):
     size, *signs = SOME[name]
-    for output, sign in zip(("drawbar_pull", "rut_depth"), signs, strict=True):
+    for output, sign in zip(("pull", "sinkage"), signs, strict=True):
         change = apply(name, size, output, view)
         if sign is None:
             np.testing.assert_allclose(change, 0.0, atol=1e-12)
         else:
             assert (sign * change >= -1e-12).all()
             assert (sign * change).max() > 0.01
-    np.testing.assert_allclose(apply(name, size, "bulk_density", view), 0.0, atol=1e-12)
+    np.testing.assert_allclose(apply(name, size, "density", view), 0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("name", SOME)
@@ -140,93 +146,92 @@ def test_outputs_that_it_changes_are_the_ones_it_states(name, view):
     changed = {o for o, size in largest.items() if size > 1e-9}
     stated = set(EFFECTS[name].outputs)
     # Digging deeper costs pull, but pull alone could not show slip sinkage: it states the rut.
-    allowed = {"drawbar_pull"} if name == "slip_sinkage" else set()
+    allowed = {"pull"} if name == "slip_sinkage" else set()
     assert stated <= changed <= stated | allowed
 
 
 def test_amounts(view):
-    np.testing.assert_allclose(apply("force_offset", {"offset": 0.2}, "drawbar_pull", view), 0.2)
+    np.testing.assert_allclose(apply("force_offset", {"offset": 0.2}, "pull", view), 0.2)
     drift = apply(
         "sensor_drift",
         {"drift": 0.2, "curvature": 1.0, "half_way": 1e9, "zero_at": 0.25},
-        "drawbar_pull",
+        "pull",
         view,
     )[0]
     # Linear from the first run to the last, about its zero; the first run is taken at u = 0.001.
     np.testing.assert_allclose(drift, 0.2 * (np.arange(20) / 19.0 - 0.25), atol=3e-4)
-    rate = apply("rate_effect", {"rut": 0.5}, "rut_depth", view)[0]
+    rate = apply("rate_effect", {"rut": 0.5}, "sinkage", view)[0]
     np.testing.assert_allclose(rate, 0.5 * np.log(view.conditions["speed_m_s"] / 0.3))
     rut = apply(
         "rut_rebound",
         {"towed": 0.1, "growth": 0.5, "slip_exponent": 1.0, "half_way": 1e9},
-        "rut_depth",
+        "sinkage",
         view,
     )[0]
     np.testing.assert_allclose(rut, -0.1 - 0.5 * view.slip())
-    lug = apply("lug_thrust", {"thrust": 0.1, "slip_scale": 0.2}, "drawbar_pull", view)[0]
+    lug = apply("lug_thrust", {"thrust": 0.1, "slip_scale": 0.2}, "pull", view)[0]
     np.testing.assert_allclose(lug, 0.5 * -np.expm1(-view.slip() / 0.2))
 
 
 def test_true_slip_from_a_wrong_rolling_radius(view):
     phi = parameters("slip_zero_shift", {"radius_error": 0.1})
     changed = EFFECTS["slip_zero_shift"].on_conditions(
-        phi, "drawbar_pull", dict(view.conditions), view
+        phi, "pull", by_role(view), view
     )
-    np.testing.assert_allclose(1.0 - changed["slip_ratio"][0], 0.9 * (1.0 - view.slip()))
+    np.testing.assert_allclose(1.0 - changed["slip"][0], 0.9 * (1.0 - view.slip()))
 
 
 def test_pressure_drags_ground_pressure_along(view):
     phi = parameters("pressure_gauge_bias", {"gain": np.log(1.21), "offset": 0.0, "ground": 1.0})
     changed = EFFECTS["pressure_gauge_bias"].on_conditions(
-        phi, "rut_depth", dict(view.conditions), view
+        phi, "sinkage", by_role(view), view
     )
     # Twenty-one per cent, to the power of a half.
-    ratio = changed["average_ground_pressure_kpa"] / view.conditions["average_ground_pressure_kpa"]
+    ratio = changed["ground_pressure"] / view.conditions["average_ground_pressure_kpa"]
     np.testing.assert_allclose(ratio, 1.1)
-    np.testing.assert_allclose(changed["slip_ratio"][0], view.slip(), rtol=1e-12)
+    np.testing.assert_allclose(changed["slip"][0], view.slip(), rtol=1e-12)
 
 
 def test_at_another_pressure_the_wheel_rolls_on_another_radius(view):
     gain = {"gain": np.log(1.21), "offset": 0.0, "ground": 1.0, "rolling_radius": 0.05}
     changed = EFFECTS["pressure_gauge_bias"].on_conditions(
-        parameters("pressure_gauge_bias", gain), "drawbar_pull", dict(view.conditions), view
+        parameters("pressure_gauge_bias", gain), "pull", by_role(view), view
     )
     larger = 0.05 * np.log(1.21)
-    np.testing.assert_allclose(1.0 - changed["slip_ratio"][0], (1.0 - larger) * (1.0 - view.slip()))
+    np.testing.assert_allclose(1.0 - changed["slip"][0], (1.0 - larger) * (1.0 - view.slip()))
 
 
 @pytest.mark.parametrize(
-    ("name", "column"),
-    [("cone_index_bias", "cone_index_kpa"),
-     ("water_content_bias", "gravimetric_water_content")],
+    ("name", "role"),
+    [("cone_index_bias", "cone"), ("water_content_bias", "water")],
 )  # fmt: skip
-def test_probes_change_what_they_read(name, column, view):
+def test_probes_change_what_they_read(name, role, view):
     up = EFFECTS[name].on_conditions(
-        parameters(name, {"gain": 0.2, "offset": 0.0}), "bulk_density", dict(view.conditions), view
+        parameters(name, {"gain": 0.2, "offset": 0.0}), "density", by_role(view), view
     )
-    np.testing.assert_allclose(up[column][0], np.exp(0.2) * view.conditions[column])
-    others = {k: v for k, v in up.items() if k != column}
-    assert all(v is view.conditions[k] for k, v in others.items())
+    np.testing.assert_allclose(up[role][0], np.exp(0.2) * view.of(role))
+    others = {k: v for k, v in up.items() if k != role}
+    assert all(v is view.of(k) for k, v in others.items())
 
 
 def test_softening_begins_past_the_peak(view):
     change = apply(
         "post_peak_softening",
         {"loss": 0.4, "peak_slip": 0.3, "slip_scale": 0.2},
-        "drawbar_pull",
+        "pull",
         view,
     )[0]
     np.testing.assert_allclose(change[view.slip() <= 0.3], 0.0, atol=1e-12)
-    lost = change / predict("drawbar_pull", dict(view.conditions))
+    lost = change / predict("pull", by_role(view))
     assert (np.diff(lost[view.slip() > 0.3]) < 0.0).all()
 
 
 def test_bulldozing_grows_with_sinkage_and_slip(view):
     size = {"resistance": 0.05, "sinkage_exponent": 1.0, "slip_growth": 1.0}
-    change = apply("bulldozing_resistance", size, "drawbar_pull", view)[0]
+    change = apply("bulldozing_resistance", size, "pull", view)[0]
     assert (np.diff(change) < 0.0).all()
-    shallow = replace(view, base={**view.base, "rut_depth": 0.5 * view.base["rut_depth"]})
-    halved = apply("bulldozing_resistance", size, "drawbar_pull", shallow)[0]
+    shallow = replace(view, base={**view.base, "sinkage": 0.5 * view.base["sinkage"]})
+    halved = apply("bulldozing_resistance", size, "pull", shallow)[0]
     np.testing.assert_allclose(halved, 0.5 * change)
 
 
@@ -236,7 +241,7 @@ def test_soil_effects_vanish_at_the_laboratorys_covariate(view):
         view, conditions={**view.conditions, **{k: np.full(20, v) for k, v in at_lab.items()}}
     )
     for name in ("multipass_compaction", "rate_effect", "moisture_softening"):
-        for output in ("drawbar_pull", "rut_depth"):
+        for output in ("pull", "sinkage"):
             change = apply(name, dict.fromkeys(SIZES[name], 0.2), output, same)
             np.testing.assert_allclose(change, 0.0, atol=1e-12)
 
@@ -254,7 +259,7 @@ def test_every_effect_has_priors_with_units_and_reasons(name):
 
 
 def test_reasons_why_an_effect_cannot_be_tested(view):
-    both = ("drawbar_pull", "rut_depth")
+    both = ("pull", "sinkage")
     reason = EFFECTS["cone_index_bias"].not_testable(view, both)
     assert reason == "no bulk_density output"
     slow = {k: v for k, v in view.conditions.items() if k != "speed_m_s"}
@@ -267,7 +272,7 @@ def test_reasons_why_an_effect_cannot_be_tested(view):
     # Constant in the field, but not what it was in the laboratory: that can be seen.
     fast = {**view.conditions, "speed_m_s": np.full(20, 2.0)}
     assert EFFECTS["rate_effect"].not_testable(replace(view, conditions=fast), both) is None
-    assert EFFECTS["load_transfer"].not_testable(view, ("rut_depth",)) == "no drawbar_pull output"
+    assert EFFECTS["load_transfer"].not_testable(view, ("sinkage",)) == "no drawbar_pull output"
     for effect in EFFECTS.values():
         assert effect.not_testable(view, OUTPUTS) is None
 
@@ -301,8 +306,8 @@ def test_growth_that_levels_off():
 
 @pytest.mark.parametrize("name", ["lug_thrust", "load_transfer"])
 def test_the_rut_alone_does_not_show_what_acts_on_the_pull(name: str, view: View) -> None:
-    assert EFFECTS[name].not_testable(view, ("rut_depth",)) == "no drawbar_pull output"
-    assert EFFECTS[name].not_testable(view, ("drawbar_pull", "rut_depth")) is None
+    assert EFFECTS[name].not_testable(view, ("sinkage",)) == "no drawbar_pull output"
+    assert EFFECTS[name].not_testable(view, ("pull", "sinkage")) is None
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -310,6 +315,6 @@ def test_an_effect_names_every_output_that_it_changes(name, view):
     effect = EFFECTS[name]
     rng = np.random.default_rng(1)
     phi = rng.uniform(0.05, 0.3, (1, len(effect.parameters)))
-    for output in {"drawbar_pull", "rut_depth", "bulk_density"} - set(effect.outputs):
+    for output in {"pull", "sinkage", "density"} - set(effect.outputs):
         location = np.ones((1, view.slip().size))
         np.testing.assert_array_equal(effect.on_output(phi, output, location, view), location)

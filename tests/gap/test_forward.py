@@ -162,7 +162,7 @@ def test_an_effect_acts_on_the_outputs_it_names_alone(data):
     class Wind(Effect):
         name = "wind"
         parameters = ("force",)
-        outputs = ("drawbar_pull",)
+        outputs = ("pull",)
 
         def on_conditions(self, phi, output, conditions, view):
             raised = {k: 1.01 * v for k, v in conditions.items()}

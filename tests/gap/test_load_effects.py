@@ -19,7 +19,7 @@ class CrossWind(Effect):
     name = "cross_wind"
     title = "wind on the rig adds to the pull"
     parameters = ("force",)
-    outputs = ("drawbar_pull",)
+    outputs = ("pull",)
 
     def on_output(self, phi, output, location, view):
         return location + phi[:, :1]
@@ -79,15 +79,16 @@ RETURN = "        return location + phi[:, :1]\n"
     ("old", "new", "words"),
     [
         ('name = "cross_wind"', 'name = "rate_effect"', "an effect of calib's own"),
-        ('outputs = ("drawbar_pull",)', 'outputs = ("drawbar_pul",)', "was drawbar_pull meant?"),
-        ('outputs = ("drawbar_pull",)', 'outputs = "drawbar_pull"', "with the comma"),
+        ('outputs = ("pull",)', 'outputs = ("pul",)', "was pull meant?"),
+        ('outputs = ("pull",)', 'outputs = ("drawbar_pull",)', "by its physical role, 'pull'"),
+        ('outputs = ("pull",)', 'outputs = "pull"', "with the comma"),
         (
-            'outputs = ("drawbar_pull",)',
-            'outputs = ("drawbar_pull",); needs = ("drawbar",)',
+            'outputs = ("pull",)',
+            'outputs = ("pull",); needs = ("drawbar",)',
             "in needs",
         ),
-        ('    outputs', '    covariates = ("sped_m_s",)\n    outputs', "was speed_m_s meant?"),
-        ('    outputs', '    covariate = ("speed_m_s",)\n    outputs', "was covariates meant?"),
+        ('    outputs', '    covariates = ("sped",)\n    outputs', "was speed meant?"),
+        ('    outputs', '    covariate = ("speed",)\n    outputs', "was covariates meant?"),
         ('    outputs', '    form = ("slope",)\n    outputs', "unknown name 'slope' in form"),
         ("def on_output", "def on_outputs", "was on_output meant?"),
     ],

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.data import table_from_arrays
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.data import read_table, table_from_arrays
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.he2019.datasets.embedded import load_he2019
 from calib.inference.prior_files import default_prior_path

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.mode import find_mode
 from calib.report.study_tasks import he2019_tasks

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
-
+from calib.data.registry import Registry
 from calib.gap.effects.base import Effect, View
 from calib.gap.effects.instruments import (
     ConeIndexBias,
@@ -26,25 +24,22 @@ from calib.gap.effects.wheel import (
 
 __all__ = ["EFFECTS", "Effect", "View"]
 
-EFFECTS: Mapping[str, Effect] = MappingProxyType(
-    {
-        effect.name: effect
-        for effect in (
-            SlipZeroShift(),
-            ForceOffset(),
-            SensorDrift(),
-            PressureGaugeBias(),
-            MultipassCompaction(),
-            RateEffect(),
-            MoistureSoftening(),
-            BulldozingResistance(),
-            LugThrust(),
-            SlipSinkage(),
-            RutRebound(),
-            PostPeakSoftening(),
-            LoadTransfer(),
-            ConeIndexBias(),
-            WaterContentBias(),
-        )
-    }
+EFFECTS: Registry[Effect] = Registry(
+    "effect",
+    lambda effect: effect.name,
+    SlipZeroShift(),
+    ForceOffset(),
+    SensorDrift(),
+    PressureGaugeBias(),
+    MultipassCompaction(),
+    RateEffect(),
+    MoistureSoftening(),
+    BulldozingResistance(),
+    LugThrust(),
+    SlipSinkage(),
+    RutRebound(),
+    PostPeakSoftening(),
+    LoadTransfer(),
+    ConeIndexBias(),
+    WaterContentBias(),
 )

@@ -1,8 +1,10 @@
 """What an effect is: something the simulator does not model, acting in the field only.
 
 An effect may act on the conditions a model is given (a wrong gauge), on the prediction itself (a
-force that is added), or both, for every output it physically touches. To add one, write a class
-like those in this folder and a prior file of its name; see `docs` in the README.
+force that is added), or both, for every output it physically touches. It knows outputs and
+conditions by their physical roles (`calib.data.quantities.Quantity.physical`), not by columns, so
+that it acts on whatever has the role. To add one, write a class like those in this folder and a
+prior file of its name.
 """
 
 from __future__ import annotations
@@ -13,11 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.data.quantities import QUANTITIES, columns_of
 from calib.models.base import Array
 
 __all__ = ["Effect", "View", "saturating"]
-
-DRAWBAR, RUT, DENSITY = "drawbar_pull", "rut_depth", "bulk_density"
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class View:
     order_range : tuple of float
         First and last run order of the field campaign.
     base : mapping of str to ndarray, shape (k, n)
-        The simulator's prediction of each modelled output (kN, mm, g/cm^3) before any effect.
+        The simulator's prediction of each modelled output, by role, in its canonical unit and
+        before any effect.
     """
 
     conditions: Mapping[str, Array]
@@ -47,15 +49,29 @@ class View:
     order_range: tuple[float, float]
     base: Mapping[str, Array] = field(default_factory=dict)
 
+    def column(self, role: str) -> str | None:
+        """Return the recorded column of a physical role; None if there is none."""
+        return next((c for c in columns_of(role) if c in self.conditions), None)
+
+    def of(self, role: str) -> Array:
+        """Return recorded values by their physical role, shape (n,)."""
+        return self.conditions[self.column(role) or role]
+
+    def lab_of(self, role: str, otherwise: float) -> float:
+        """Return the median in the calibration data by its physical role."""
+        return self.lab.get(self.column(role) or role, otherwise)
+
     def slip(self) -> Array:
         """Recorded slip (fraction), zero where it is not recorded, shape (n,)."""
-        n = next(iter(self.conditions.values())).size
-        return self.conditions.get("slip_ratio", np.zeros(n))
+        column = self.column("slip")
+        if column is not None:
+            return self.conditions[column]
+        return np.zeros(next(iter(self.conditions.values())).size)
 
     def sinkage(self) -> Array:
         """Sinkage over 30 mm: the simulator's where rut depth is modelled, else 1 + slip."""
-        if RUT in self.base:
-            return self.base[RUT] / 30.0
+        if "sinkage" in self.base:
+            return self.base["sinkage"] / 30.0
         return (1.0 + np.maximum(self.slip(), 0.0))[None, :]
 
 
@@ -90,11 +106,11 @@ class Effect:
     parameters : tuple of str
         In the order of the columns of `phi`.
     outputs : tuple of str
-        Outputs it touches.
+        Physical roles of the outputs it touches: ``"pull"``, ``"sinkage"``, ``"density"``, ...
     needs : tuple of str
         Those of them without which its trace in the others would be another effect's as well.
     covariates : tuple of str
-        Columns it needs.
+        Physical roles of what it needs recorded.
     varies : bool
         Whether the (first) covariate must vary in the field, or differ from the laboratory's.
     form : tuple of {"size", "slip", "pressure", "cone", "water", "shape", "extrapolation"}
@@ -128,9 +144,9 @@ class Effect:
         ----------
         phi : ndarray, shape (k, n_parameters)
         output : str
-            The output about to be predicted.
+            Physical role of the output about to be predicted.
         conditions : dict
-            Conditions of the output's model, possibly changed by other effects.
+            Conditions of the output's model by physical role, possibly changed by other effects.
         view : View
         """
         return conditions
@@ -142,6 +158,7 @@ class Effect:
         ----------
         phi : ndarray, shape (k, n_parameters)
         output : str
+            Its physical role.
         location : ndarray, shape (k, n)
             On the scale of the response: kN, ln mm, g/cm^3.
         view : View
@@ -159,19 +176,40 @@ class Effect:
         ----------
         view : View
         outputs : tuple of str
-            Outputs that the case models.
+            Physical roles of the outputs that the case models.
         """
         if not set(self.outputs) & set(outputs):
-            return f"no {' or '.join(self.outputs)} output"
+            return f"no {' or '.join(map(_named, self.outputs))} output"
         unseen = [o for o in self.needs if o not in outputs]
         if unseen:
-            return f"no {' and '.join(unseen)} output"
-        missing = [c for c in self.covariates if c not in view.conditions]
+            return f"no {' and '.join(map(_named, unseen))} output"
+        missing = [c for c in self.covariates if view.column(c) is None]
         if missing:
-            return f"the data lack {', '.join(missing)}"
+            return f"the data lack {', '.join((*columns_of(c), c)[0] for c in missing)}"
         if self.varies and self.covariates:
-            values = view.conditions[self.covariates[0]]
-            reference = view.lab.get(self.covariates[0], float(values[0]))
+            values = view.of(self.covariates[0])
+            reference = view.lab_of(self.covariates[0], float(values[0]))
             if np.allclose(values, reference, rtol=1e-6, atol=1e-12):
-                return f"{self.covariates[0]} is the same in every row, as in the calibration"
+                return (
+                    f"{view.column(self.covariates[0])} is the same in every row, as in the "
+                    "calibration"
+                )
         return None
+
+    def register(self) -> None:
+        """Make the effect known to every diagnosis.
+
+        Raises
+        ------
+        CalibError
+            If there is another one of its name.
+        """
+        from calib.gap.effects import EFFECTS
+
+        EFFECTS.add(self)
+
+
+def _named(role: str) -> str:
+    """Name the outputs that have a role as results do."""
+    names = [QUANTITIES[c].stem for c in columns_of(role) if QUANTITIES[c].role == "output"]
+    return " or ".join(names) or role

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.outputs import OUTPUTS
-from calib.data.quantities import QUANTITIES
+from calib.data.quantities import QUANTITIES, role_of
 from calib.errors import CalibError
 from calib.gap.case import Campaigns, Case, OutputData, campaigns
 from calib.gap.effects import EFFECTS, Effect, View
@@ -57,8 +56,10 @@ def check_declared(effect: Effect, path: Path) -> None:
             "the name is that of an effect of calib's own", where=where,
             allowed=f"any name but {', '.join(EFFECTS)}", mend="give it another name",
         )  # fmt: skip
+    outputs = {q.physical: q.stem for q in QUANTITIES.values() if q.role == "output"}
+    conditions = {q.physical: c for c, q in QUANTITIES.items() if q.role != "output"}
     for attribute, known in (
-        ("outputs", OUTPUTS), ("needs", OUTPUTS), ("covariates", QUANTITIES), ("form", _FORMS),
+        ("outputs", outputs), ("needs", outputs), ("covariates", conditions), ("form", _FORMS),
     ):  # fmt: skip
         given = getattr(effect, attribute)
         if isinstance(given, str):
@@ -70,7 +71,7 @@ def check_declared(effect: Effect, path: Path) -> None:
             if name not in known:
                 raise CalibError(
                     f"unknown name {name!r} in {attribute}", where=where,
-                    allowed=", ".join(known), mend=_meant(name, known),
+                    allowed=", ".join(known), mend=_role_of_column(name) or _meant(name, known),
                 )  # fmt: skip
     for kind in type(effect).__mro__[:-2]:
         for name, value in vars(kind).items():
@@ -112,7 +113,7 @@ def check_on_case(effects: Mapping[str, Effect], case: Case, path: Path) -> None
     data = campaigns(case)
     for effect in effects.values():
         where = _place(path, effect)
-        if _call(effect.not_testable, path, where, data.view, data.names) is None:
+        if _call(effect.not_testable, path, where, data.view, data.roles) is None:
             _check_testable(effect, data, path, where)
 
 
@@ -124,11 +125,11 @@ def _check_testable(effect: Effect, data: Campaigns, path: Path, where: str) -> 
     phi = hypothesis.effect_priors[0].to_natural(psi[:, forward.phi_slices[0]])
     with np.errstate(all="ignore"):
         plain = forward.simulator(psi, data.view)
-        base = {o.name: o.problem.bound.from_response(plain[o.name]) for o in data.outputs}
+        base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in data.outputs}
         view = replace(data.view, base=base)
         changed = [
             _changes_conditions(effect, phi, o, view, path, where)
-            | _changes_output(effect, phi, o.name, plain[o.name], view, path, where)
+            | _changes_output(effect, phi, o, plain[o.name], view, path, where)
             for o in data.outputs
         ]
     if not any(changed):
@@ -142,8 +143,9 @@ def _check_testable(effect: Effect, data: Campaigns, path: Path, where: str) -> 
 def _changes_conditions(
     effect: Effect, phi: Array, o: OutputData, view: View, path: Path, where: str
 ) -> bool:
-    given = o.problem.bound.model.select(view.conditions)
-    found = _call(effect.on_conditions, path, where, phi, o.name, dict(given), view)
+    selected = o.problem.bound.model.select(view.conditions)
+    given = {role_of(column): values for column, values in selected.items()}
+    found = _call(effect.on_conditions, path, where, phi, o.role, dict(given), view)
     if not isinstance(found, dict) or set(found) != set(given):
         raise _wrong(f"on_conditions returned {_described(found)} for {o.name}", where,
                      f"a dict with {', '.join(given)}")  # fmt: skip
@@ -154,18 +156,18 @@ def _changes_conditions(
 
 
 def _changes_output(
-    effect: Effect, phi: Array, output: str, plain: Array, view: View, path: Path, where: str
+    effect: Effect, phi: Array, o: OutputData, plain: Array, view: View, path: Path, where: str
 ) -> bool:
     handed = plain.copy()
-    found = _call(effect.on_output, path, where, phi, output, handed, view)
+    found = _call(effect.on_output, path, where, phi, o.role, handed, view)
     if not np.array_equal(handed, plain, equal_nan=True):
         raise CalibError(
             "on_output changes the location it is given", where=where, allowed="a new array",
             mend="write location = location + ... instead of location += ...",
         )  # fmt: skip
-    _check_numbers(found, (plain.shape,), f"on_output for {output}", where)
+    _check_numbers(found, (plain.shape,), f"on_output for {o.name}", where)
     if not np.isfinite(found[np.isfinite(plain)]).any():
-        raise _wrong(f"on_output returned no finite number for {output}", where,
+        raise _wrong(f"on_output returned no finite number for {o.name}", where,
                      "numbers wherever the location is one")  # fmt: skip
     return not np.array_equal(found, plain, equal_nan=True)
 
@@ -208,13 +210,19 @@ def _call[R](function: Callable[..., R], path: Path, where: str, *args: Any) -> 
         at = where if line is None else f"{where}, line {line}"
         raise CalibError(
             f"it does not run: {type(error).__name__}: {error}", where=at,
-            mend="correct it; view.conditions holds the columns of the data",
+            mend="correct it; view.of(role) gives what the data record, such as view.of(\"slip\")",
         ) from error  # fmt: skip
 
 
 def _meant(name: str, known: Collection[str]) -> str:
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     return f"was {near[0]} meant?" if near else "correct the name"
+
+
+def _role_of_column(name: str) -> str:
+    """Name the physical role that goes by a column's or an output's name."""
+    roles = [q.physical for c, q in QUANTITIES.items() if name in (c, q.stem)]
+    return f"effects know {name} by its physical role, {roles[0]!r}" if roles else ""
 
 
 def _place(path: Path, effect: Effect) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import DENSITY, DRAWBAR, RUT, Effect, View, saturating
+from calib.gap.effects.base import Effect, View, saturating
 from calib.models.base import Array
 
 __all__ = [
@@ -20,18 +20,18 @@ class SlipZeroShift(Effect):
     form = ("pressure",)  # a tyre rolls on a smaller radius at less inflation
     title = "the rolling radius behind the recorded slip is wrong"
     parameters = ("radius_error",)
-    outputs = (DRAWBAR, RUT)
-    covariates = ("slip_ratio",)
+    outputs = ("pull", "sinkage")
+    covariates = ("slip",)
     varies = False
 
     def on_conditions(
         self, phi: Array, output: str, conditions: dict[str, Array], view: View
     ) -> dict[str, Array]:
         """Shift the slip."""
-        if "slip_ratio" not in conditions:
+        if "slip" not in conditions:
             return conditions
-        slip = conditions["slip_ratio"]
-        return {**conditions, "slip_ratio": 1.0 - (1.0 - slip) * (1.0 - phi[:, :1])}
+        slip = conditions["slip"]
+        return {**conditions, "slip": 1.0 - (1.0 - slip) * (1.0 - phi[:, :1])}
 
 
 class ForceOffset(Effect):
@@ -40,12 +40,12 @@ class ForceOffset(Effect):
     name = "force_offset"
     title = "the drawbar reading is off by a constant"
     parameters = ("offset",)
-    outputs = (DRAWBAR,)
+    outputs = ("pull",)
     varies = False
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Add the offset (kN)."""
-        return location + phi[:, :1] if output == DRAWBAR else location
+        return location + phi[:, :1] if output == "pull" else location
 
 
 class SensorDrift(Effect):
@@ -55,17 +55,17 @@ class SensorDrift(Effect):
     title = "the drawbar reading drifts with run order"
     parameters = ("drift", "curvature", "half_way", "zero_at")
     form = ("shape",)
-    outputs = (DRAWBAR,)
-    covariates = ("run_order",)
+    outputs = ("pull",)
+    covariates = ("order",)
 
     def _progress(self, view: View) -> Array:
         first, last = view.order_range
         span = max(last - first, 1.0)
-        return np.clip((view.conditions["run_order"] - first) / span, 0.0, 1.2)
+        return np.clip((view.of("order") - first) / span, 0.0, 1.2)
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Add the drift (kN from the first run to the last)."""
-        if output != DRAWBAR:
+        if output != "pull":
             return location
         drift, curvature, half_way, zero_at = (phi[:, i : i + 1] for i in range(4))
         u = np.maximum(self._progress(view), 1e-3)
@@ -87,27 +87,25 @@ class PressureGaugeBias(Effect):
     form = ("extrapolation",)  # the simulator is used at pressures it was not fitted at
     title = "true inflation pressure differs from the recorded one"
     parameters = ("gain", "offset", "ground_response", "rolling_radius")
-    outputs = (DRAWBAR, RUT)
-    covariates = ("inflation_pressure_psi",)
+    outputs = ("pull", "sinkage")
+    covariates = ("pressure",)
     varies = False
 
     def on_conditions(
         self, phi: Array, output: str, conditions: dict[str, Array], view: View
     ) -> dict[str, Array]:
         """Correct the inflation pressure, and the ground pressure and slip that go with it."""
-        recorded = view.conditions["inflation_pressure_psi"]
+        recorded = view.of("pressure")
         true = np.maximum(recorded * np.exp(phi[:, :1]) + phi[:, 1:2], 0.2 * recorded)
         changed = dict(conditions)
-        if "inflation_pressure_psi" in conditions:
-            changed["inflation_pressure_psi"] = true
-        if "average_ground_pressure_kpa" in conditions:
+        if "pressure" in conditions:
+            changed["pressure"] = true
+        if "ground_pressure" in conditions:
             ratio = (true / recorded) ** (view.ground_exponent * phi[:, 2:3])
-            changed["average_ground_pressure_kpa"] = (
-                conditions["average_ground_pressure_kpa"] * ratio
-            )
-        if "slip_ratio" in conditions:
+            changed["ground_pressure"] = conditions["ground_pressure"] * ratio
+        if "slip" in conditions:
             larger = phi[:, 3:4] * np.log(true / recorded)
-            changed["slip_ratio"] = 1.0 - (1.0 - conditions["slip_ratio"]) * (1.0 - larger)
+            changed["slip"] = 1.0 - (1.0 - conditions["slip"]) * (1.0 - larger)
         return changed
 
 
@@ -118,19 +116,20 @@ class ConeIndexBias(Effect):
     title = "the cone penetrometer reads wrong"
     parameters = ("gain", "offset")
     form = ("size", "cone", "water")
-    outputs = (DENSITY,)
-    covariates = ("cone_index_kpa",)
+    outputs = ("density",)
+    covariates = ("cone",)
     varies = False
 
     def on_conditions(
         self, phi: Array, output: str, conditions: dict[str, Array], view: View
     ) -> dict[str, Array]:
         """Correct the cone index."""
-        if "cone_index_kpa" not in conditions:
+        if "cone" not in conditions:
             return conditions
-        recorded = conditions["cone_index_kpa"]
-        true = recorded * np.exp(phi[:, :1]) + phi[:, 1:2] * view.lab["cone_index_kpa"]
-        return {**conditions, "cone_index_kpa": np.maximum(true, 0.02 * recorded)}
+        recorded = conditions["cone"]
+        typical = view.lab_of("cone", float(np.median(view.of("cone"))))
+        true = recorded * np.exp(phi[:, :1]) + phi[:, 1:2] * typical
+        return {**conditions, "cone": np.maximum(true, 0.02 * recorded)}
 
 
 class WaterContentBias(Effect):
@@ -140,7 +139,7 @@ class WaterContentBias(Effect):
     title = "the moisture probe reads wrong"
     parameters = ("gain", "offset")
     form = ("size", "cone", "water")
-    outputs = (DENSITY,)
+    outputs = ("density",)
     varies = False
 
     def on_conditions(
@@ -148,7 +147,7 @@ class WaterContentBias(Effect):
     ) -> dict[str, Array]:
         """Correct the water content."""
         changed = dict(conditions)
-        for name in ("gravimetric_water_content", "volumetric_water_content"):
+        for name in ("water", "water_by_volume"):
             if name in conditions:
                 true = conditions[name] * np.exp(phi[:, :1]) + phi[:, 1:2]
                 changed[name] = np.maximum(true, 0.0)

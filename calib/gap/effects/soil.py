@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import DRAWBAR, RUT, Effect, View
+from calib.gap.effects.base import Effect, View
 from calib.models.base import Array
 
 __all__ = ["MoistureSoftening", "MultipassCompaction", "RateEffect"]
@@ -23,7 +23,7 @@ class _SoilStrength(Effect):
 
     parameters = ("pull", "slope", "resistance", "rut", "rut_slip")
     form = ("slip", "pressure", "shape")
-    outputs = (DRAWBAR, RUT)
+    outputs = ("pull", "sinkage")
 
     def covariate(self, view: View) -> Array:
         """Covariate h, zero at the laboratory's value, shape (n,)."""
@@ -33,18 +33,18 @@ class _SoilStrength(Effect):
         self, phi: Array, output: str, conditions: dict[str, Array], view: View
     ) -> dict[str, Array]:
         """Stretch the slip axis of the traction curve."""
-        if output != DRAWBAR or "slip_ratio" not in conditions:
+        if output != "pull" or "slip" not in conditions:
             return conditions
         stretch = np.exp(np.clip(phi[:, 1:2] * self.covariate(view), -2.0, 2.0))
-        return {**conditions, "slip_ratio": conditions["slip_ratio"] * stretch}
+        return {**conditions, "slip": conditions["slip"] * stretch}
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Scale the pull and shift the resistance; shift the logarithm of the rut."""
         h = self.covariate(view)
-        if output == DRAWBAR:
+        if output == "pull":
             factor = np.exp(np.clip(phi[:, :1] * h, -2.0, 2.0))
             return np.asarray(location * factor + phi[:, 2:3] * h * view.load_kn)
-        if output == RUT:
+        if output == "sinkage":
             slip = np.maximum(view.slip(), 0.0)
             return np.asarray(location + (phi[:, 3:4] + phi[:, 4:5] * slip) * h)
         return location
@@ -59,11 +59,11 @@ class MultipassCompaction(_SoilStrength):
 
     name = "multipass_compaction"
     title = "earlier passes in the same rut have compacted the soil"
-    covariates = ("pass_number",)
+    covariates = ("passes",)
 
     def covariate(self, view: View) -> Array:
         """Logarithm of the pass number over the laboratory's."""
-        return np.log(view.conditions["pass_number"] / view.lab.get("pass_number", 1.0))
+        return np.log(view.of("passes") / view.lab_of("passes", 1.0))
 
 
 class RateEffect(_SoilStrength):
@@ -71,12 +71,12 @@ class RateEffect(_SoilStrength):
 
     name = "rate_effect"
     title = "soil strength changes with speed"
-    covariates = ("speed_m_s",)
+    covariates = ("speed",)
 
     def covariate(self, view: View) -> Array:
         """Logarithm of the speed over the laboratory's."""
-        speed = view.conditions["speed_m_s"]
-        lab = max(view.lab.get("speed_m_s", float(np.median(speed))), 1e-3)
+        speed = view.of("speed")
+        lab = max(view.lab_of("speed", float(np.median(speed))), 1e-3)
         return np.log(np.maximum(speed, 1e-3) / lab)
 
 
@@ -85,10 +85,10 @@ class MoistureSoftening(_SoilStrength):
 
     name = "moisture_softening"
     title = "soil strength changes with water content"
-    covariates = ("gravimetric_water_content",)
+    covariates = ("water",)
 
     def covariate(self, view: View) -> Array:
         """Water content above the laboratory's, in steps of 0.02 g/g."""
-        water = view.conditions["gravimetric_water_content"]
-        lab = view.lab.get("gravimetric_water_content", float(np.median(water)))
+        water = view.of("water")
+        lab = view.lab_of("water", float(np.median(water)))
         return (water - lab) / 0.02

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import DRAWBAR, RUT, Effect, View, saturating
+from calib.gap.effects.base import Effect, View, saturating
 from calib.models.base import Array
 
 __all__ = [
@@ -20,12 +20,12 @@ class BulldozingResistance(Effect):
     title = "the wheel pushes soil ahead of it, more as it sinks and slips"
     parameters = ("resistance", "sinkage_exponent", "slip_growth")
     form = ("slip", "pressure")
-    outputs = (DRAWBAR,)
+    outputs = ("pull",)
     varies = False
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Subtract the resistance from the pull."""
-        if output != DRAWBAR:
+        if output != "pull":
             return location
         resistance, exponent, growth = phi[:, :1], phi[:, 1:2], phi[:, 2:3]
         slip = np.maximum(view.slip(), 0.0)
@@ -44,17 +44,17 @@ class LugThrust(Effect):
     title = "tread lugs or grousers add thrust as slip grows"
     parameters = ("thrust", "slip_scale", "digging")
     form = ("slip", "pressure")
-    outputs = (DRAWBAR, RUT)
-    needs = (DRAWBAR,)  # a rut alone does not tell lugs that dig from slip sinkage
-    covariates = ("slip_ratio",)
+    outputs = ("pull", "sinkage")
+    needs = ("pull",)  # a rut alone does not tell lugs that dig from slip sinkage
+    covariates = ("slip",)
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Add the thrust to the pull, the digging to the logarithm of the rut."""
         slip = np.maximum(view.slip(), 0.0)
-        if output == DRAWBAR:
+        if output == "pull":
             grown = 1.0 - np.exp(-slip / phi[:, 1:2])
             return np.asarray(location + view.load_kn * phi[:, :1] * grown)
-        if output == RUT:
+        if output == "sinkage":
             return np.asarray(location + phi[:, 2:3] * slip)
         return location
 
@@ -70,9 +70,9 @@ class SlipSinkage(Effect):
     title = "sinkage grows with slip beyond what the model has"
     parameters = ("growth", "slip_exponent", "pull_loss")
     form = ("slip", "pressure")
-    outputs = (DRAWBAR, RUT)
-    needs = (RUT,)  # a pull alone does not tell the sinkage that costs it
-    covariates = ("slip_ratio",)
+    outputs = ("pull", "sinkage")
+    needs = ("sinkage",)  # a pull alone does not tell the sinkage that costs it
+    covariates = ("slip",)
 
     def _deepening(self, phi: Array, view: View) -> Array:
         slip = np.maximum(view.slip(), 1e-4)
@@ -81,9 +81,9 @@ class SlipSinkage(Effect):
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Deepen the rut; take the extra compaction resistance from the pull."""
         deeper = self._deepening(phi, view)
-        if output == RUT:
+        if output == "sinkage":
             return location + deeper
-        if output == DRAWBAR:
+        if output == "pull":
             extra = view.sinkage() * np.expm1(np.minimum(deeper, 3.0))
             return np.asarray(location - view.load_kn * phi[:, 2:3] * extra)
         return location
@@ -100,12 +100,12 @@ class RutRebound(Effect):
     title = "part of the sinkage springs back, more at high slip"
     parameters = ("towed", "growth", "slip_exponent", "half_way")
     form = ("slip", "pressure")
-    outputs = (RUT,)
-    covariates = ("slip_ratio",)
+    outputs = ("sinkage",)
+    covariates = ("slip",)
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Make the rut shallower."""
-        if output != RUT:
+        if output != "sinkage":
             return location
         slip = np.maximum(view.slip(), 1e-4)
         grown = saturating(slip, phi[:, 2:3], phi[:, 3:4])
@@ -123,12 +123,12 @@ class PostPeakSoftening(Effect):
     title = "shear strength falls past its peak"
     parameters = ("loss", "peak_slip", "slip_scale")
     form = ("slip", "pressure")
-    outputs = (DRAWBAR,)
-    covariates = ("slip_ratio",)
+    outputs = ("pull",)
+    covariates = ("slip",)
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Lower the pull past the peak."""
-        if output != DRAWBAR:
+        if output != "pull":
             return location
         beyond = np.maximum(view.slip() - phi[:, 1:2], 0.0) / phi[:, 2:3]
         return np.asarray(location * (1.0 - phi[:, :1] * -np.expm1(-beyond)))
@@ -145,26 +145,26 @@ class LoadTransfer(Effect):
     title = "drawbar pull changes the normal load"
     parameters = ("transfer", "pull_exponent", "pressure_exponent")
     form = ("slip",)
-    outputs = (DRAWBAR, RUT)
-    needs = (DRAWBAR,)
+    outputs = ("pull", "sinkage")
+    needs = ("pull",)
     varies = False
 
     def _ln_load(self, phi: Array, view: View) -> Array:
-        ratio = 1.0 + phi[:, :1] * view.base[DRAWBAR] / view.load_kn
+        ratio = 1.0 + phi[:, :1] * view.base["pull"] / view.load_kn
         return np.log(np.clip(ratio, 0.2, 5.0))
 
     def on_conditions(
         self, phi: Array, output: str, conditions: dict[str, Array], view: View
     ) -> dict[str, Array]:
         """Raise the ground pressure with the load."""
-        if output != RUT or "average_ground_pressure_kpa" not in conditions:
+        if output != "sinkage" or "ground_pressure" not in conditions:
             return conditions
         factor = np.exp(phi[:, 2:3] * self._ln_load(phi, view))
-        pressure = conditions["average_ground_pressure_kpa"] * factor
-        return {**conditions, "average_ground_pressure_kpa": pressure}
+        pressure = conditions["ground_pressure"] * factor
+        return {**conditions, "ground_pressure": pressure}
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Scale the pull with the load."""
-        if output != DRAWBAR:
+        if output != "pull":
             return location
         return np.asarray(location * np.exp(phi[:, 1:2] * self._ln_load(phi, view)))

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.he2019.gaps.find import FoundGap
 from calib.models.base import Array
 from calib.report.figures.gap_rows import (

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table, table_from_arrays
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.gap.case import Case
 from calib.he2019.datasets.embedded import LABEL, load_he2019
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import f as f_distribution
 
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.gap.diagnose import Diagnosis
 from calib.gap.files import document
 from calib.he2019.datasets.drawbar import SLIP_SHIFT

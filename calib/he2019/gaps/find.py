@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 
 from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.gap.case import Case
 from calib.gap.diagnose import Diagnosis, diagnose_once, with_unseen_rows
 from calib.he2019.gaps.cases import PaperGap, paper_gaps

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.gap.covariates import OVER
+from calib.gap.covariates import columns_over
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit
@@ -153,7 +153,7 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
         name, unit = f"a predicted {output_word(output).lower()} of", f" {axis.unit}"
     else:
         over = h.onset_over or ""
-        column = next(c for c in OVER[over] if c in view.conditions)
+        column = next(c for c in columns_over(over) if c in view.conditions)
         name = {
             "slip": "a slip of", "order": "run", "water": "a water content of",
             "cone": "a cone index of", "low_pressure": "an inflation pressure of",

@@ -54,11 +54,11 @@ class Wind(Effect):
     name = "wind"
     title = "wind on the rig adds to the pull"
     parameters = ("force",)
-    outputs = ("drawbar_pull",)
-    covariates = ("run_order",)
+    outputs = ("pull",)
+    covariates = ("order",)
 
     def on_output(self, phi, output, location, view):
-        return location + phi[:, :1] * (view.conditions["run_order"] % 2)
+        return location + phi[:, :1] * (view.of("order") % 2)
 """
 WIND = """
 model = "wind"

@@ -13,10 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from tests.batch.tasks import work
 
 from calib.batch.tasks import cluster, run_folder_tasks, run_tasks
 from calib.errors import CalibError
+from tests.batch.tasks import work
 
 ROOT = Path(__file__).parents[3]
 # Started processes import the functions of `work`, and calib from where this process has it.

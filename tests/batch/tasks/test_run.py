@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
-from tests.batch.tasks import work
 
 from calib.batch.tasks import run_folder_tasks, run_tasks
 from calib.errors import CalibError
+from tests.batch.tasks import work
 
 ITEMS = {f"task-{i}": i for i in range(4)}
 

@@ -11,7 +11,7 @@ import pytest
 
 from calib.data import table_from_arrays
 from calib.data.csvfile import write_table
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.diagnose import diagnose

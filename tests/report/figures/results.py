@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data import Table
-from calib.data.outputs import OUTPUTS
+from calib.data.quantities import OUTPUTS
 from calib.inference.calibration import Calibration
 from calib.inference.estimators import PointEstimate, estimate
 from calib.inference.problem import Problem, build_problem

@@ -19,10 +19,10 @@ def _figure(title: str) -> Figure:
 
 def test_a_picture_is_the_same_whatever_was_drawn_before() -> None:
     code = (
-        "import sys; from figures.test_export import _figure, png_bytes\n"
+        "import sys; from tests.report.figures.test_export import _figure, png_bytes\n"
         "sys.stdout.buffer.write(png_bytes(_figure('$k_\\\\phi$')))"
     )
-    here = Path(__file__).parents[2]
+    here = Path(__file__).parents[3]
     alone = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, cwd=here)
     png_bytes(_figure(r"$\sigma^2$"))
     assert png_bytes(_figure(r"$k_\phi$")) == alone.stdout

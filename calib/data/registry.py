@@ -1,0 +1,93 @@
+"""What is known by name: quantities, models, effects; shipped ones, and those a user adds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Protocol
+
+from calib.errors import CalibError
+
+__all__ = ["Registry", "register"]
+
+
+class _Declared(Protocol):
+    def register(self) -> None: ...
+
+
+class Registry[T](Mapping[str, T]):
+    """Declarations by name, in the order in which they came.
+
+    Parameters
+    ----------
+    what : str
+        What they are, for messages.
+    key : callable
+        Returns the name of one.
+    *declared
+        Those that are shipped.
+
+    Attributes
+    ----------
+    version : int
+        Another one whenever what is known has changed.
+    """
+
+    def __init__(self, what: str, key: Callable[[T], str], *declared: T) -> None:
+        self._what, self._key = what, key
+        self._known: dict[str, T] = {}
+        self.version = 0
+        for one in declared:
+            self.add(one)
+
+    def add(self, declared: T) -> None:
+        """Add a declaration.
+
+        Raises
+        ------
+        CalibError
+            If another one has its name.
+        """
+        name = self._key(declared)
+        self.version += 1
+        if self._known.setdefault(name, declared) is not declared:
+            raise CalibError(
+                f"there is a {self._what} {name!r} already",
+                allowed=f"a name other than {', '.join(self._known)}",
+                mend=f"give the new {self._what} another name",
+            )
+
+    def discard(self, name: str) -> None:
+        """Forget a declaration, if there is one of this name."""
+        self.version += 1
+        self._known.pop(name, None)
+
+    def __getitem__(self, name: str) -> T:
+        return self._known[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._known)
+
+    def __len__(self) -> int:
+        return len(self._known)
+
+
+def register(*declared: _Declared) -> None:
+    """Make quantities, models or effects known by their names.
+
+    Parameters
+    ----------
+    *declared : Quantity, Model or Effect
+
+    Raises
+    ------
+    CalibError
+        If one is not what it must be, or something else has its name.
+    """
+    for one in declared:
+        if not hasattr(one, "register"):
+            raise CalibError(
+                f"{one!r} cannot be registered",
+                allowed="a Quantity, a Model or an Effect",
+                mend="make one of these of it",
+            )
+        one.register()
