@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data import Table, table_from_arrays, write_table
-from calib.data.quantities import OUTPUTS
+from calib.data.quantities import OUTPUTS, physical_role, role_of
 from calib.gap.case import Campaigns, Case, campaigns
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
@@ -142,11 +142,15 @@ def simulate(
         return lab, field
     acting = EFFECTS[effect]
     phi = parameters(effect, LARGE[effect] if size is None else size)
-    view = replace(view, base={o: bounds[o].from_response(v[None]) for o, v in field.items()})
+    roles = {o: physical_role(o) for o in bounds}
+    base = {roles[o]: bounds[o].from_response(v[None]) for o, v in field.items()}
+    view = replace(view, base=base)
     for o, bound in bounds.items():
-        plain = dict(bound.model.select(view.conditions))
-        location = bound.location(thetas[o], acting.on_conditions(phi, o, plain, view))
-        field[o] = acting.on_output(phi, o, location, view)[0]
+        columns = {role_of(c): c for c in bound.model.conditions}
+        plain = {role: view.conditions[c] for role, c in columns.items()}
+        true = acting.on_conditions(phi, roles[o], plain, view)
+        location = bound.location(thetas[o], {columns[role]: v for role, v in true.items()})
+        field[o] = acting.on_output(phi, roles[o], location, view)[0]
     return lab, field
 
 

@@ -175,17 +175,13 @@ def test_amounts(view):
 
 def test_true_slip_from_a_wrong_rolling_radius(view):
     phi = parameters("slip_zero_shift", {"radius_error": 0.1})
-    changed = EFFECTS["slip_zero_shift"].on_conditions(
-        phi, "pull", by_role(view), view
-    )
+    changed = EFFECTS["slip_zero_shift"].on_conditions(phi, "pull", by_role(view), view)
     np.testing.assert_allclose(1.0 - changed["slip"][0], 0.9 * (1.0 - view.slip()))
 
 
 def test_pressure_drags_ground_pressure_along(view):
     phi = parameters("pressure_gauge_bias", {"gain": np.log(1.21), "offset": 0.0, "ground": 1.0})
-    changed = EFFECTS["pressure_gauge_bias"].on_conditions(
-        phi, "sinkage", by_role(view), view
-    )
+    changed = EFFECTS["pressure_gauge_bias"].on_conditions(phi, "sinkage", by_role(view), view)
     # Twenty-one per cent, to the power of a half.
     ratio = changed["ground_pressure"] / view.conditions["average_ground_pressure_kpa"]
     np.testing.assert_allclose(ratio, 1.1)

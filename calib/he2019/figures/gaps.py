@@ -14,7 +14,6 @@ from calib.he2019.gaps.find import FoundGap
 from calib.models.base import Array
 from calib.report.figures.gap_rows import (
     OutputRows,
-    axis_name,
     output_rows,
     output_word,
     short_name,
@@ -67,7 +66,7 @@ def _plate(result: FoundGap) -> Plate:
         result.found.data.view.conditions[name][own.rows]
         for name in ("slip_ratio", "inflation_pressure_psi")
     )
-    x_axis = axis_name("slip_ratio")
+    x_axis = axis_of("slip_ratio")
     x = x_axis.scale(slip)
     for ax in (before, after):
         _noise_band(ax, x, own)
@@ -123,7 +122,7 @@ def _kept_out(before: Axes, after: Axes, result: FoundGap) -> bool:
     if rows is None:
         return False
     predicted = result.found.fresh[result.output]
-    x = axis_name("slip_ratio").scale(rows["slip_ratio"])
+    x = axis_of("slip_ratio").scale(rows["slip_ratio"])
     measured = rows[OUTPUTS[result.output]]
     psi = float(rows["inflation_pressure_psi"][0])
     factor = axis_of(OUTPUTS[result.output]).factor

@@ -9,8 +9,8 @@ from scipy.spatial.distance import squareform
 
 from calib.gap.diagnose import Diagnosis
 from calib.gap.isolate import ALIKE, Isolability
-from calib.report.figures.gap_rows import axis_name, best_fit, best_of, output_word, short_name
-from calib.report.figures.labels import NO_UNIT, joined, percent, short
+from calib.report.figures.gap_rows import best_fit, best_of, output_word, short_name
+from calib.report.figures.labels import NO_UNIT, axis_of, joined, percent, short
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -153,7 +153,8 @@ def left_over_plate(found: Diagnosis) -> Plate:
     name = best_of(found)
     fit = best_fit(found, name)
     conditions = found.data.view.conditions
-    columns = [c for c in ("slip_ratio", "run_order") if c in conditions]
+    known = (found.data.view.column(role) for role in ("slip", "order"))
+    columns = [c for c in known if c]
     columns = columns or [next(iter(conditions))]
     fig, axes = panels(
         1, len(columns), height=44.0, left=13.0, right=4.0, top=6.0, bottom=16.0, gap_x=6.0,
@@ -163,7 +164,7 @@ def left_over_plate(found: Diagnosis) -> Plate:
     beyond = total = 0
     top = 2.6
     for ax, column in zip(axes[0], columns, strict=True):
-        axis = axis_name(column)
+        axis = axis_of(column)
         ax.axhspan(-2.0, 2.0, color="#eeeeee", lw=0.0, zorder=0)
         ax.axhline(0.0, color=GREY, lw=0.6)
         for k, o in enumerate(found.data.outputs):

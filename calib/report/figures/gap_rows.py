@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
-from calib.data.quantities import OUTPUTS
+from calib.data.quantities import OUTPUTS, role_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
@@ -18,7 +18,7 @@ from calib.models.base import Array
 from calib.report.figures.labels import MINUS, Axis, axis_of
 
 __all__ = [
-    "EVERYWHERE", "PROBABLE", "OutputRows", "axis_name", "best_fit", "best_of", "output_axis",
+    "EVERYWHERE", "PROBABLE", "OutputRows", "best_fit", "best_of", "output_axis",
     "output_rows", "output_word", "panel_groups", "region_text", "short_name", "title_of",
     "unit_after",
 ]  # fmt: skip
@@ -34,12 +34,6 @@ _WORDS = {
     "parameter_shift": "the same model with other parameter values",
 }
 _SHORT = {"none": "none (noise)", "unknown": "unknown effect", "parameter_shift": "parameter shift"}
-_AXES = {
-    "speed_m_s": Axis("Speed", "m/s"),
-    "normal_load_kn": Axis("Normal load", "kN"),
-    "pass_number": Axis("Pass", "number"),
-    "run_order": Axis("Run order", "number"),
-}
 _MOST_PANELS = 4
 # Pulls below this (kN) are those of a single small wheel, written in newtons.
 _SMALL_PULL = 0.1
@@ -62,11 +56,6 @@ def title_of(found: Diagnosis, name: str) -> str:
     return ", and ".join(titles.get(part) or part.replace("_", " ") for part in name.split("+"))
 
 
-def axis_name(column: str) -> Axis:
-    """Return how a condition of a field campaign is drawn."""
-    return _AXES.get(column) or axis_of(column)
-
-
 def unit_after(axis: Axis) -> str:
     """Return a unit to be put after a number; nothing for counts."""
     return "" if axis.unit == "number" else f" {axis.unit}"
@@ -79,16 +68,16 @@ def region_text(found: Diagnosis, region: Region) -> str:
     values = found.data.view.conditions[column][rows]
     if ends[0] <= values.min() and ends[1] >= values.max():
         return EVERYWHERE
-    axis = axis_name(column)
+    axis = axis_of(column)
     low, high = (_stretch_end(column, axis.scale(np.array(v)).item()) for v in ends)
     span = low if low == high else f"{low} to {high}"
     return f"{axis.name.lower()} {span}{unit_after(axis)}"
 
 
 def _stretch_end(column: str, value: float) -> str:
-    text = f"{value:.0f}" if column in ("slip_ratio", "run_order") else f"{value:.3g}"
-    if abs(value) < 10.0 and column not in ("slip_ratio", "run_order"):
-        text = f"{value:.2g}"
+    text = f"{value:.2g}" if abs(value) < 10.0 else f"{value:.3g}"
+    if role_of(column) in ("slip", "order"):
+        text = f"{value:.0f}"
     return text.replace("-", MINUS)
 
 
@@ -191,18 +180,19 @@ def panel_groups(
     found: Diagnosis, rows: NDArray[np.int64]
 ) -> list[tuple[str, NDArray[np.bool_]]]:  # fmt: skip
     """Split rows by inflation pressure into a few panels: titles and masks."""
-    pressure = found.data.view.conditions.get("inflation_pressure_psi")
+    column = found.data.view.column("pressure") or ""
+    pressure = found.data.view.conditions.get(column)
     everything = np.ones(rows.size, dtype=np.bool_)
     if pressure is None or np.ptp(pressure) == 0.0:
         return [("", everything)]
-    distinct = np.unique(pressure)
+    distinct, unit = np.unique(pressure), axis_of(column).unit
     if distinct.size <= _MOST_PANELS:
-        return [(f"{float(p):.3g} psi", pressure[rows] == p) for p in distinct]
+        return [(f"{float(p):.3g} {unit}", pressure[rows] == p) for p in distinct]
     edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
     groups = []
     for low, high in pairwise(edges):
         inside = (pressure[rows] >= low) & (pressure[rows] <= high)
         if low > edges[0]:
             inside &= pressure[rows] > low
-        groups.append((f"{low:.3g} to {high:.3g} psi", inside))
+        groups.append((f"{low:.3g} to {high:.3g} {unit}", inside))
     return groups

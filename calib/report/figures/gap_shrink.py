@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from calib.gap.diagnose import Diagnosis
 from calib.gap.shrink import Shrink
 from calib.models.base import Array
-from calib.report.figures.gap_rows import OutputRows, axis_name, output_rows, output_word
-from calib.report.figures.labels import MINUS, percent, short
+from calib.report.figures.gap_rows import OutputRows, output_rows, output_word
+from calib.report.figures.labels import MINUS, axis_of, percent, short
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -35,8 +35,8 @@ def how_far_plate(found: Diagnosis) -> Plate:
         gap_y=14.0,
     )  # fmt: skip
     conditions = found.data.view.conditions
-    name = "slip_ratio" if "slip_ratio" in conditions else next(iter(conditions))
-    x_axis = axis_name(name)
+    name = found.data.view.column("slip") or next(iter(conditions))
+    x_axis = axis_of(name)
     handles: dict[str, Any] = {}
     for row, own in zip(axes, outputs, strict=True):
         handles |= _against(row[0], own)

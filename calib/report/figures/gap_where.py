@@ -12,31 +12,26 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 
+from calib.data.quantities import role_of
 from calib.gap.diagnose import Diagnosis
-from calib.gap.where import Region
+from calib.gap.where import Region, conditions_to_search
 from calib.models.base import Array
 from calib.report.figures.gap_rows import (
     PROBABLE,
     OutputRows,
-    axis_name,
     output_axis,
     output_rows,
     output_word,
     panel_groups,
     region_text,
 )
-from calib.report.figures.labels import MINUS, NO_UNIT, Axis, percent, short
+from calib.report.figures.labels import MINUS, NO_UNIT, Axis, axis_of, percent, short
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import BLACK, GREY, ORANGE, VERMILION, panels
 
 __all__ = ["conditions_plate", "where_plate"]
 
 _BAND = "#e6e6e6"
-_CONDITIONS = (
-    "slip_ratio", "inflation_pressure_psi", "speed_m_s", "pass_number",
-    "gravimetric_water_content", "volumetric_water_content", "cone_index_kpa", "normal_load_kn",
-    "average_ground_pressure_kpa", "run_order",
-)  # fmt: skip
 _MOST_CONDITIONS = 6
 _NORM = Normalize(0.0, 1.0)
 # Gaps that do not reach this part of the noise are none.
@@ -52,6 +47,7 @@ def where_plate(found: Diagnosis) -> Plate:
         gap_y=7.0, sharex=True, sharey="row",
     )  # fmt: skip
     x, x_axis = _abscissa(found)
+    slip = found.data.view.column("slip") or ""
     for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
         limits = _limits(own)
         for j, (ax, (title, mask)) in enumerate(
@@ -59,8 +55,8 @@ def where_plate(found: Diagnosis) -> Plate:
         ):
             _noise_band(ax, x[own.rows][mask], own.noise[mask])
             for region in found.regions:
-                if region.output == own.name and "slip_ratio" in region.conditions:
-                    _span(ax, region, x_axis, found.data.view.conditions["slip_ratio"])
+                if region.output == own.name and slip in region.conditions:
+                    _span(ax, region, x_axis, found.data.view.conditions[slip])
                     break
             _points(ax, x[own.rows][mask], own, mask)
             ax.set_ylim(*limits)
@@ -72,20 +68,21 @@ def where_plate(found: Diagnosis) -> Plate:
                 ax.set_xlabel(x_axis.label)
             if j == 0:
                 ax.set_ylabel(f"Gap in {output_word(own.name)} ({own.axis.unit})")
-    _key(fig, regions=any("slip_ratio" in r.conditions for r in found.regions))
+    _key(fig, regions=any(slip in r.conditions for r in found.regions))
     return Plate(fig, "where", _caption(outputs), "Where: the gap over slip")
 
 
 def conditions_plate(found: Diagnosis) -> Plate | None:
     """Draw the gap in noise sds over every condition that varies, with regions marked."""
     conditions = found.data.view.conditions
-    names = [n for n in _CONDITIONS if n in conditions and np.ptp(conditions[n]) > 0.0]
-    if "inflation_pressure_psi" in names and "average_ground_pressure_kpa" in names:
-        names.remove("average_ground_pressure_kpa")
+    order = conditions_to_search(found.data.view)
+    names = [n for n in order if np.ptp(conditions[n]) > 0.0]
+    if {"pressure", "ground_pressure"} <= {role_of(n) for n in names}:
+        names = [n for n in names if role_of(n) != "ground_pressure"]
     # A condition with a region in it must not be left out.
     marked = {key for r in found.regions for key in r.conditions}
     names = sorted(names, key=lambda n: n not in marked)[:_MOST_CONDITIONS]
-    names.sort(key=_CONDITIONS.index)
+    names.sort(key=order.index)
     if not names:
         return None
     outputs = output_rows(found)
@@ -96,7 +93,7 @@ def conditions_plate(found: Diagnosis) -> Plate | None:
     for i, (row, own) in enumerate(zip(axes, outputs, strict=True)):
         scaled = _in_noise(own)
         for ax, name in zip(row, names, strict=True):
-            axis = axis_name(name)
+            axis = axis_of(name)
             ax.axhspan(-1.0, 1.0, color=_BAND, lw=0.0, zorder=0)
             for region in found.regions:
                 if region.output == own.name and name in region.conditions:
@@ -114,8 +111,9 @@ def conditions_plate(found: Diagnosis) -> Plate | None:
 
 def _abscissa(found: Diagnosis) -> tuple[Array, Any]:
     conditions = found.data.view.conditions
-    name = next((n for n in ("slip_ratio", "run_order") if n in conditions), next(iter(conditions)))
-    axis = axis_name(name)
+    known = (found.data.view.column(role) for role in ("slip", "order"))
+    name = next((n for n in known if n), next(iter(conditions)))
+    axis = axis_of(name)
     return axis.scale(conditions[name]), axis
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 
 import numpy as np
 
@@ -68,31 +66,13 @@ class Axis:
         return text.replace("-", MINUS)
 
 
-_AXES: Mapping[str, Axis] = MappingProxyType(
-    {
-        "slip_ratio": Axis("Slip", "%", 100.0),
-        "nominal_slip_ratio": Axis("Nominal slip", "%", 100.0),
-        "inflation_pressure_psi": Axis("Inflation pressure", "psi"),
-        "average_ground_pressure_kpa": Axis("Ground pressure", "kPa"),
-        "cone_index_kpa": Axis("Cone index", "kPa"),
-        "gravimetric_water_content": Axis("Water content", "% of dry mass", 100.0),
-        "volumetric_water_content": Axis("Water content", "% of volume", 100.0),
-        "drawbar_pull_kn": Axis("Drawbar pull", "kN"),
-        "rut_depth_mm": Axis("Rut depth", "mm"),
-        "bulk_density_g_cm3": Axis("Dry bulk density", "g/cm³"),
-    }
-)
-
-
 def axis_of(column: str) -> Axis:
     """Return how a canonical column is drawn."""
-    if column in _AXES:
-        return _AXES[column]
     quantity = QUANTITIES.get(column)
     if quantity is None:
         return Axis(column.replace("_", " ").capitalize(), NO_UNIT)
-    unit = quantity.unit.replace("**", "^").replace("dimensionless", NO_UNIT)
-    return Axis(quantity.stem.replace("_", " ").capitalize(), unit)
+    unit = quantity.unit.replace("**", "^").replace("*", " ").replace("dimensionless", NO_UNIT)
+    return Axis(quantity.title, *(quantity.shown or (unit, 1.0)))
 
 
 def stem_and_subscript(name: str) -> tuple[str, str]:

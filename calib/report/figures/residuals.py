@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.stats import beta, levene, norm, shapiro
 
+from calib.data.quantities import role_of
 from calib.inference.problem import Problem
 from calib.models.base import Array
 from calib.report.figures.labels import NO_UNIT, axis_of, joined, plain, short, unit_plain
@@ -195,7 +196,7 @@ def _caption(result: OutputResult, fitted: Standardised, held: Standardised | No
 
 def _spread_words(result: OutputResult, fitted: Standardised) -> str:
     """Say whether the noise differs between pressures; empty where too few rows would tell."""
-    if group_column(result) != "inflation_pressure_psi":
+    if role_of(group_column(result) or "") != "pressure":
         return ""
     problem = result.calibration.problem
     log = problem.bound.model.response == "log"

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from calib.data.quantities import columns_of, role_of
 from calib.data.table import Table
 from calib.inference.calibration import Calibration
 from calib.inference.random import generator
@@ -69,15 +70,15 @@ def data_word(result: OutputResult) -> str:
 def x_column(result: OutputResult) -> str:
     """The condition along which predictions are drawn."""
     conditions = result.calibration.problem.bound.model.conditions
-    return "slip_ratio" if "slip_ratio" in conditions else conditions[0]
+    return next((name for name in conditions if role_of(name) == "slip"), conditions[0])
 
 
 def group_column(result: OutputResult) -> str | None:
     """The column that tells panels apart: inflation pressure where the data have it."""
     conditions = result.calibration.problem.bound.model.conditions
     table = result.task.table
-    pressure = "inflation_pressure_psi"
-    if pressure in table and np.unique(table[pressure]).size > 1 and len(conditions) > 1:
+    pressure = next((name for name in columns_of("pressure") if name in table), None)
+    if pressure and np.unique(table[pressure]).size > 1 and len(conditions) > 1:
         return pressure
     second = [name for name in conditions if name != x_column(result)]
     return second[0] if second else None
@@ -152,7 +153,7 @@ def grid(result: OutputResult, group: Group) -> dict[str, Array]:
     held = held_table(result)
     x = x_column(result)
     everywhere = problem.table[x] if held is None else np.append(problem.table[x], held[x])
-    ends = min(0.0, float(everywhere.min())) if x == "slip_ratio" else float(everywhere.min())
+    ends = min(0.0, float(everywhere.min())) if role_of(x) == "slip" else float(everywhere.min())
     conditions: dict[str, Array] = {x: np.linspace(ends, float(everywhere.max()), _GRID)}
     for name in problem.bound.model.conditions:
         if name != x:

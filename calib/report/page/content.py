@@ -40,16 +40,10 @@ MARKS: Mapping[str, str] = {
 # Which exception carried a message is the programmer's business.
 _CLASS_NAME = re.compile(r"^(?:[A-Za-z_][\w.]*(?:Error|Exception): )+")
 
-_NAMES = {
-    "bulk_density": "Bulk density",
-    "drawbar_pull": "Drawbar pull",
-    "rut_depth": "Rut depth",
-}
-
 
 def output_name(key: str) -> str:
     """Return the heading of an output."""
-    return _NAMES.get(key, key.replace("_", " ").capitalize())
+    return key.replace("_", " ").capitalize()
 
 
 def failed_section(key: str, failure: Failure) -> dict[str, Any]:

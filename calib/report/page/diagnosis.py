@@ -194,7 +194,7 @@ def _region_words(found: Diagnosis, region: Region) -> tuple[str, str]:
 def _leading_regions(found: Diagnosis) -> list[Region]:
     """One region of each output, along a condition of the best hypothesis if there is one."""
     effects = best_fit(found, best_of(found)).forward.hypothesis.effects
-    wanted = {c for e in effects for c in e.covariates}
+    wanted = {found.data.view.column(role) for e in effects for role in e.covariates}
     leading = []
     for o in found.data.outputs:
         own = [r for r in found.regions if r.output == o.name]

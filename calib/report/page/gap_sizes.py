@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.data.quantities import physical_role, role_of
 from calib.gap.covariates import columns_over
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
@@ -18,14 +19,13 @@ from calib.models import get_model
 from calib.models.base import Array
 from calib.report.figures.gap_rows import (
     EVERYWHERE,
-    axis_name,
     best_fit,
     output_axis,
     output_word,
     region_text,
     unit_after,
 )
-from calib.report.figures.labels import joined
+from calib.report.figures.labels import axis_of, joined
 from calib.report.numbers import format_value
 
 __all__ = ["size_sentences", "where_to_look"]
@@ -80,7 +80,7 @@ def where_to_look(found: Diagnosis) -> str:
     h = fit.forward.hypothesis
     # Runs cannot be repeated at their place in the order, and waves have their largest gaps apart.
     places = [] if h.smooth_over == "ripple" else found.regions
-    places = [r for r in places if "run_order" not in r.conditions]
+    places = [r for r in places if not any(role_of(c) == "order" for c in r.conditions)]
     stretches = [region_text(found, r) for r in places]
     narrow = [text for text in stretches if text != EVERYWHERE]
     place = f" where the gap is surest ({narrow[0]})" if narrow else ""
@@ -133,16 +133,19 @@ def _by_pressure(found: Diagnosis, fit: Fit) -> str:
     """Say so where a predicted rut depth is nothing but pressure by another name."""
     h = fit.forward.hypothesis
     over = h.onset_over or h.smooth_over
-    of_rut = over == "sinkage" or (over == "level" and h.smooth_outputs == ("rut_depth",))
-    conditions = get_model(found.data.case.models["rut_depth"]).conditions if of_rut else ()
-    alone = len(conditions) == 1 and "pressure" in conditions[0]
+    ruts = found.data.with_role("sinkage")
+    of_rut = over == "sinkage" or (over == "level" and h.smooth_outputs == ruts)
+    conditions = get_model(found.data.case.models[ruts[0]]).conditions if of_rut else ()
+    alone = len(conditions) == 1 and role_of(conditions[0]) in ("pressure", "ground_pressure")
     return ", which here is a matter of pressure alone" if alone else ""
 
 
 def _threshold(found: Diagnosis, fit: Fit) -> str:
     forward, view = fit.forward, found.data.view
     h = forward.hypothesis
-    output = h.smooth_outputs[0] if h.onset_over == "level" else "rut_depth"
+    output = h.smooth_outputs[0]
+    if h.onset_over == "sinkage":
+        output = found.data.with_role("sinkage")[0]
     u = forward.discrepancy.onset_covariate(view, output)
     if h.onset_over in ("level", "sinkage"):
         o = next(o for o in found.data.outputs if o.name == output)
@@ -158,7 +161,7 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
             "slip": "a slip of", "order": "run", "water": "a water content of",
             "cone": "a cone index of", "low_pressure": "an inflation pressure of",
         }[over]  # fmt: skip
-        shown = axis_name(column)
+        shown = axis_of(column)
         values, unit = shown.scale(view.conditions[column]), unit_after(shown)
     order = np.argsort(u)
     good = order[np.isfinite(values[order])]
@@ -212,25 +215,26 @@ def _instrument_sentences(found: Diagnosis, effect: Effect, phi: Array) -> list[
     sentences: dict[str, str] = {}
     view = found.data.view
     for o in found.data.outputs:
-        recorded = dict(o.problem.bound.model.select(view.conditions))
-        true = effect.on_conditions(phi, o.name, recorded, view)
-        for column, values in recorded.items():
-            if true[column] is values or column in sentences:
+        columns = {role_of(c): c for c in o.problem.bound.model.conditions}
+        recorded = {role: view.conditions[c] for role, c in columns.items()}
+        true = effect.on_conditions(phi, o.role, recorded, view)
+        for role, values in recorded.items():
+            if true[role] is values or role in sentences:
                 continue
-            axis = axis_name(column)
-            shift = axis.scale((true[column] - values).mean(axis=1))
-            own = not effect.covariates or column in effect.covariates
+            axis = axis_of(columns[role])
+            shift = axis.scale((true[role] - values).mean(axis=1))
+            own = not effect.covariates or role in effect.covariates
             if not own and abs(shift.mean()) < 2.0 * shift.std():
                 continue  # it may follow, but nothing says that it does
-            unit = "percentage points" if column == "slip_ratio" else axis.unit
+            unit = "percentage points" if axis.unit == "%" else axis.unit
             way = "above" if shift.mean() > 0.0 else "below"
             amount = format_value(abs(float(shift.mean())), float(shift.std()))
-            sentences[column] = (
+            sentences[role] = (
                 f"true {axis.name.lower()} is {amount} {unit} {way} the recorded one on average"
             )
     # Ground pressure only follows from inflation pressure.
-    if "inflation_pressure_psi" in sentences:
-        sentences.pop("average_ground_pressure_kpa", None)
+    if "pressure" in sentences:
+        sentences.pop("ground_pressure", None)
     return list(sentences.values())
 
 
@@ -238,9 +242,10 @@ def _end_sentences(
     found: Diagnosis, effect: Effect, changes: Mapping[str, _Change]
 ) -> list[str]:  # fmt: skip
     """Say what the effect does at the end of its condition where it does most."""
-    column = next((c for c in effect.covariates if c in found.data.view.conditions), None)
-    if column is None and effect.form and "slip_ratio" in found.data.view.conditions:
-        column = "slip_ratio"
+    view = found.data.view
+    column = next((c for c in map(view.column, effect.covariates) if c), None)
+    if column is None and effect.form:
+        column = view.column("slip")
     sentences = []
     for output, change in changes.items():
         rows = next(o.rows for o in found.data.outputs if o.name == output)
@@ -265,7 +270,7 @@ def _end_sentences(
 
 
 def _way(output: str, up: bool) -> str:
-    if output == "rut_depth":
+    if physical_role(output) == "sinkage":
         return "deeper" if up else "shallower"
     return "higher" if up else "lower"
 
@@ -283,9 +288,9 @@ def _end(
     size = [abs(float(change.draws[:, m].mean())) / float(change.noise[m].mean()) for m in ends]
     last = int(size[1] >= size[0])
     inside = ends[last]
-    if column == "run_order":
+    if role_of(column) == "order":
         return ("at the start of the campaign", "by the end of the campaign")[last], inside
-    axis = axis_name(column)
+    axis = axis_of(column)
     low, high = (axis.value_text(float(f(values[inside]))) for f in (np.min, np.max))
     span = low if low == high else f"{low} to {high}"
     return f"at {axis.name.lower()} {span}{unit_after(axis)}", inside
