@@ -295,10 +295,9 @@ def template(
     out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
 ) -> None:
     """Write an example CSV of a model to fill in."""
-    from calib.models import get_model
-    from calib.models.templates import template_csv
+    from calib.models import example_csv, get_model
 
-    _emit(template_csv(get_model(model).name), out)
+    _emit(example_csv(get_model(model).name), out)
 
 
 def priors(

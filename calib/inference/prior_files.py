@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from calib.errors import CalibError
 from calib.inference.priors import Prior, Priors
+from calib.models import MODELS
 
 __all__ = ["default_prior_path", "parse_priors", "prior_file_model", "read_priors"]
 
@@ -73,7 +74,10 @@ _FILE: TypeAdapter[_File] = TypeAdapter(_File)
 
 
 def default_prior_path(model_name: str) -> Path:
-    """Return the path of the shipped priors of a model."""
+    """Return the path of a model's priors: those it declares, else those that are shipped."""
+    known = MODELS.get(model_name)
+    if known is not None and known.prior_file is not None:
+        return known.prior_file
     packaged = Path(str(resources.files("calib"))) / "_priors"
     # An editable install has no packaged copy: the priors then lie beside the package.
     folder = packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "priors"

@@ -1,10 +1,8 @@
-"""The six models, one equation set per file, by name in `MODELS`."""
+"""The models, one equation set per file, by name in `MODELS`."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from types import MappingProxyType
-
+from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.models.ayers_perumpral import AYERS_PERUMPRAL, AYERS_PERUMPRAL_VOLUMETRIC
 from calib.models.base import Array, BoundModel, Conditions, Model, References
@@ -13,22 +11,49 @@ from calib.models.magic_formula import MAGIC_FORMULA
 from calib.models.magic_formula_pressure import MAGIC_FORMULA_PRESSURE
 
 __all__ = [
-    "MODELS", "Array", "BoundModel", "Conditions", "Model", "References", "get_model",
+    "MODELS", "Array", "BoundModel", "Conditions", "Model", "References", "example_csv",
+    "get_model",
 ]  # fmt: skip
 
-MODELS: Mapping[str, Model] = MappingProxyType(
-    {
-        model.name: model
-        for model in (
-            AYERS_PERUMPRAL,
-            AYERS_PERUMPRAL_VOLUMETRIC,
-            MAGIC_FORMULA,
-            MAGIC_FORMULA_PRESSURE,
-            BEKKER,
-            MODIFIED_BEKKER,
-        )
-    }
+MODELS: Registry[Model] = Registry(
+    "model",
+    lambda model: model.name,
+    AYERS_PERUMPRAL,
+    AYERS_PERUMPRAL_VOLUMETRIC,
+    MAGIC_FORMULA,
+    MAGIC_FORMULA_PRESSURE,
+    BEKKER,
+    MODIFIED_BEKKER,
 )
+
+
+def example_csv(model_name: str) -> str:
+    """Return an example of the data a model is calibrated on.
+
+    Parameters
+    ----------
+    model_name : str
+        Name of the model, such as ``"magic_formula_pressure"``.
+
+    Returns
+    -------
+    str
+        A CSV with the units in the column names; any other unit in `calib.data.quantities` may
+        stand in their place.
+
+    Raises
+    ------
+    CalibError
+        If there is no model of that name, or it has no example.
+    """
+    model = get_model(model_name)
+    if not model.example:
+        raise CalibError(
+            f"the model {model_name!r} has no example of its data",
+            allowed=f"columns {', '.join((*model.conditions, model.output))}",
+            mend='declare the model with example="..."',
+        )
+    return model.example
 
 
 def get_model(name: str) -> Model:

@@ -171,7 +171,6 @@ def _from_reported_volumetric(reported: Mapping[str, float], references: Referen
 AYERS_PERUMPRAL = Model(
     name="ayers_perumpral",
     title="Bulk density from cone index and gravimetric water content",
-    equation="gamma_d = {(CI/C1)[C2 + (theta_g - C3)^2]}^(1/C4)  (Eq 1)",
     output="bulk_density_g_cm3",
     conditions=("cone_index_kpa", "gravimetric_water_content"),
     parameters=("gamma_ref", "C2", "C3", "C4"),
@@ -182,12 +181,41 @@ AYERS_PERUMPRAL = Model(
     theta_from_reported=_from_reported,
     bind_references=_references,
     prepare=_prepare,
+    latex=(
+        (
+            r"$\gamma_\mathrm{d} = \{(\mathrm{CI}/C_1)[C_2 + (\theta_\mathrm{g} - "
+            r"C_3)^2]\}^{1/C_4}$"
+        ),
+    ),
+    numbers="Eq 1",
+    cited="He_2019",
+    source="He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003",
+    letters=(
+        "[$gamma_d] the dry bulk density (g/cm³), CI the cone index (kPa), [$theta_g] "
+        "the gravimetric water content (g/g)"
+    ),
+    parametrisation=(
+        "The density gamma_ref at a cone index of {ci_ref_kpa:.4g} kPa and a water "
+        "content of {water_ref:.3g} (means of the data) is sampled in the place of "
+        "C1, with which the other coefficients are almost collinear; C1 follows from "
+        "it."
+    ),
+    example="""\
+cone_index_kpa,gravimetric_water_content,bulk_density_g_cm3
+350,0.030,1.809
+520,0.045,1.853
+680,0.050,1.870
+900,0.040,1.866
+1150,0.060,1.865
+1400,0.070,1.888
+1750,0.055,1.899
+2100,0.085,1.925
+""",
 )
 
 AYERS_PERUMPRAL_VOLUMETRIC = Model(
     name="ayers_perumpral_volumetric",
     title="Bulk density from cone index and volumetric water content",
-    equation="CI = A1 gamma_d^A2/(A3 + (theta_v/gamma_d - A4)^2), solved for gamma_d  (Eq 2)",
     output="bulk_density_g_cm3",
     conditions=("cone_index_kpa", "volumetric_water_content"),
     parameters=("gamma_ref", "A2", "A3", "A4"),
@@ -198,4 +226,35 @@ AYERS_PERUMPRAL_VOLUMETRIC = Model(
     theta_from_reported=_from_reported_volumetric,
     bind_references=_references_volumetric,
     prepare=_prepare_volumetric,
+    latex=(
+        (
+            r"$\mathrm{CI} = A_1 \gamma_\mathrm{d}^{A_2} / [A_3 + "
+            r"(\theta_\mathrm{v}/\gamma_\mathrm{d} - A_4)^2]$"
+        ),
+        r"solved for $\gamma_\mathrm{d}$",
+    ),
+    numbers="Eq 2",
+    cited="He_2019",
+    source="He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003",
+    letters=(
+        "[$gamma_d] the dry bulk density (g/cm³), CI the cone index (kPa), [$theta_v] "
+        "the volumetric water content (cm³/cm³)"
+    ),
+    parametrisation=(
+        "The density gamma_ref at a cone index of {ci_ref_kpa:.4g} kPa and a water "
+        "content of {water_ref:.3g} (means of the data) is sampled in the place of "
+        "A1, with which the other coefficients are almost collinear; A1 follows from "
+        "it."
+    ),
+    example="""\
+cone_index_kpa,volumetric_water_content,bulk_density_g_cm3
+350,0.054,1.809
+520,0.083,1.853
+680,0.094,1.870
+900,0.075,1.866
+1150,0.112,1.865
+1400,0.132,1.888
+1750,0.104,1.899
+2100,0.164,1.925
+""",
 )

@@ -9,20 +9,24 @@ published coefficients, which are reported beside them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
+from calib.models.latex import text
 
 __all__ = [
-    "N_WORK", "Array", "BoundModel", "Columns", "Conditions", "Model", "References", "Rows",
-    "columns",
+    "N_WORK", "Alone", "Array", "BoundModel", "Columns", "Conditions", "Model", "References",
+    "Rows", "Searched", "columns",
 ]  # fmt: skip
 
 N_WORK = 3
+# Vectors that are evaluated one by one before all are at once.
+_TRIED = 3
 
 type Array = NDArray[np.float64]
 type References = Mapping[str, float]
@@ -50,34 +54,180 @@ def _no_references(conditions: Conditions) -> dict[str, float]:
     return {}
 
 
+def _not_given(*_: Any) -> Any:
+    raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class _Plain:
+    """Evaluates `Model.predict` in the layouts in which a location is asked for."""
+
+    model: Model
+
+    def __call__(self, columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+        theta = np.stack([np.ravel(c) for c in columns], axis=-1)
+        first = next(iter(rows.values()))
+        if first.ndim == 2 and first.shape[1] == 1 and columns[0].shape[0] == 1:
+            # Rows by vectors.
+            return self._of_each(theta, {name: v[:, 0] for name, v in rows.items()}).T.copy()
+        if any(v.ndim == 2 for v in rows.values()):
+            return self._of_own(theta, rows)
+        return self._of_each(theta, rows)
+
+    def _of_own(self, theta: Array, rows: Rows) -> Array:
+        """Evaluate where every vector has conditions of its own, shape (k, n)."""
+        k = max(len(theta), *(len(v) for v in rows.values() if v.ndim == 2))
+        theta = np.broadcast_to(theta, (k, theta.shape[1]))
+
+        def one(i: int) -> Array:
+            own = {name: v[i] if v.ndim == 2 else v for name, v in rows.items()}
+            return self._of_each(theta[i : i + 1], own)
+
+        first = np.concatenate([one(i) for i in range(min(k, _TRIED))])
+        # A function written with NumPy's broadcasting takes them all at once.
+        n = first.shape[1]
+        try:
+            wide = {name: np.broadcast_to(v, (k, n)) for name, v in rows.items()}
+            found = self._of_each(theta, wide, n)
+        except (CalibError, ValueError, IndexError, TypeError):
+            found = np.empty((0, n))
+        if len(found) == k and np.allclose(found[: len(first)], first, 1e-12, 0.0, equal_nan=True):
+            return found
+        return np.concatenate([first, *(one(i) for i in range(len(first), k))])
+
+    def _of_each(self, theta: Array, rows: Rows, n: int = 0) -> Array:
+        if self.model.predict is None:
+            raise CalibError(
+                f"the model {self.model.name} has no predict",
+                allowed="predict(theta (k, d), conditions) -> (k, n)",
+                mend="declare it with a function that predicts its output",
+            )
+        found = np.asarray(self.model.predict(theta, rows), dtype=np.float64)
+        n = n or next(iter(rows.values())).size
+        if found.shape != (theta.shape[0], n):
+            raise CalibError(
+                f"predict of the model {self.model.name} returned the shape {found.shape}",
+                allowed=f"(vectors, rows) = ({theta.shape[0]}, {n})",
+                mend="theta[:, :1] is the first parameter as a column, (vectors, 1)",
+            )
+        return np.log(found) if self.model.response == "log" else found.copy()
+
+
+@dataclass(frozen=True)
+class _Named:
+    """Reports the sampled parameters as they are."""
+
+    names: tuple[str, ...]
+
+    def __call__(self, theta: Array, references: References) -> dict[str, Array]:
+        return dict(zip(self.names, theta.T, strict=True))
+
+
+@dataclass(frozen=True)
+class _Vector:
+    """The inverse of `_Named`, for one vector."""
+
+    names: tuple[str, ...]
+
+    def __call__(self, reported: Mapping[str, float], references: References) -> Array:
+        return np.array([reported[name] for name in self.names])
+
+
 def _as_they_are(conditions: Conditions, references: References) -> Rows:
     return conditions
 
 
 @dataclass(frozen=True)
-class Model:
-    """A published tyre-soil equation and its well-conditioned parametrisation.
+class Searched:
+    """Coordinates in which population methods search a model, in the place of its prior's.
 
     Parameters
     ----------
-    name, title, equation : str
-        Identifier, heading and equation as printed, with its number in the source.
+    names : mapping of str to str
+        Sampled parameter to the published one that is searched for it.
+    box : callable
+        ``largest response -> {name: (lower, upper)}``.
+    sampled : callable
+        ``values -> values``: sampled parameters of searched ones, by name.
+    """
+
+    names: Mapping[str, str]
+    box: Callable[[float], dict[str, tuple[float, float]]]
+    sampled: Callable[[dict[str, Any]], dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class Alone:
+    """A simpler model, for each value of a condition by itself, to be seen beside a joint one.
+
+    Parameters
+    ----------
+    column : str
+        The condition.
+    model : str
+        Name of the simpler model.
+    fixed : mapping of str to float
+        Parameters of it that are held.
+    """
+
+    column: str
+    model: str
+    fixed: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Model:
+    """An equation that predicts an output from conditions: the only place for what is known of it.
+
+    A model of one's own needs `name`, `title`, `output`, `conditions`, `parameters` and `predict`;
+    a prior file ``NAME.toml`` lies beside the file that declares it.
+
+    Parameters
+    ----------
+    name, title : str
+        Identifier and heading.
     output : str
         Canonical column that the model predicts.
     conditions : tuple of str
         Canonical columns that it needs.
     parameters : tuple of str
         The sampled parameters, in the order of `theta`.
+    predict : callable, optional
+        ``(theta (k, d), conditions) -> (k, n)``: the output in its canonical unit, from parameters
+        and conditions of shape (n,) each; NaN where the equation has no value.
     reported : mapping of str to str
-        The published parameters and their units.
+        The published parameters and their units; the sampled ones by default, without units.
     response : {"identity", "log"}
         Scale on which the noise is additive.
-    location : callable
-        ``(columns, rows, references, work) -> prediction`` on the scale of the response; NaN where
-        the equation has no value. Columns of shape (k, 1) with rows of shape (n,) give (k, n);
-        columns of shape (1, k) with rows of shape (n, 1) give (n, k), for short data much faster.
-        `work`, shape (`N_WORK`, k, n) or (`N_WORK`, n, k), is memory for temporaries and the
-        result: fresh memory would cost more than the arithmetic.
+    latex : tuple of str
+        The equation, in the mathematics of `calib.models.latex`, and where it helps its parts.
+    letters : str
+        What its letters mean that are not parameters, with marks of `calib.report.publish.markup`.
+    numbers : str
+        Where its source prints it: ``"Eqs 12-15"``.
+    source : str
+        Whom it is after, with a DOI.
+    cited : str
+        Key of the source in `references.bib`, where it is there.
+    parametrisation : str
+        Which parameters are sampled and why these, with the reference conditions in braces.
+    example : str
+        A CSV of the data it is calibrated on; without one, `calib.models.example_csv` makes it.
+    prior_file : Path, optional
+        Where its priors are, if not among the shipped ones.
+    parabolic_in : str
+        A condition in which its coefficients are parabolas, not to be trusted beyond the data.
+    alone : Alone, optional
+    searched : Searched, optional
+    estimates_all_rows : bool
+        Whether point estimates are from all rows, those held out among them, as published.
+    location : callable, optional
+        What is evaluated in the place of `predict`, in place and on the scale of the response:
+        ``(columns, rows, references, work) -> prediction``; NaN where the equation has no value.
+        Columns of shape (k, 1) with rows of shape (n,) give (k, n); columns of shape (1, k) with
+        rows of shape (n, 1) give (n, k), for short data much faster. `work`, shape (`N_WORK`, k, n)
+        or (`N_WORK`, n, k), is memory for temporaries and the result: fresh memory would cost more
+        than the arithmetic.
     report_theta : callable
         ``(theta, references) -> {name: (k,)}``: published parameters from sampled ones.
     theta_from_reported : callable
@@ -91,17 +241,63 @@ class Model:
 
     name: str
     title: str
-    equation: str
     output: str
     conditions: tuple[str, ...]
     parameters: tuple[str, ...]
-    reported: Mapping[str, str]
-    response: Literal["identity", "log"]
-    location: Callable[[Columns, Rows, References, Array], Array]
-    report_theta: Callable[[Array, References], dict[str, Array]]
-    theta_from_reported: Callable[[Mapping[str, float], References], Array]
+    predict: Callable[[Array, Conditions], Array] | None = None
+    reported: Mapping[str, str] = field(default_factory=dict)
+    response: Literal["identity", "log"] = "identity"
+    latex: tuple[str, ...] = ()
+    letters: str = ""
+    numbers: str = ""
+    source: str = ""
+    cited: str = ""
+    parametrisation: str = "The parameters of the equation are sampled."
+    example: str = ""
+    prior_file: Path | None = None
+    parabolic_in: str = ""
+    alone: Alone | None = None
+    searched: Searched | None = None
+    estimates_all_rows: bool = False
+    location: Callable[[Columns, Rows, References, Array], Array] = _not_given
+    report_theta: Callable[[Array, References], dict[str, Array]] = _not_given
+    theta_from_reported: Callable[[Mapping[str, float], References], Array] = _not_given
     bind_references: Callable[[Conditions], dict[str, float]] = _no_references
     prepare: Callable[[Conditions, References], Rows] = _as_they_are
+
+    def __post_init__(self) -> None:
+        if not self.reported:
+            object.__setattr__(self, "reported", dict.fromkeys(self.parameters, "1"))
+        if self.location is _not_given:
+            object.__setattr__(self, "location", _Plain(self))
+        if self.report_theta is _not_given:
+            object.__setattr__(self, "report_theta", _Named(self.parameters))
+            object.__setattr__(self, "theta_from_reported", _Vector(self.parameters))
+
+    @property
+    def equation(self) -> str:
+        """The equation as plain text, with its number in the source."""
+        written = ", ".join(text(part) for part in self.latex)
+        return f"{written}  ({self.numbers})" if self.numbers else written
+
+    @property
+    def by_sampled(self) -> bool:
+        """Whether the sampled parameters are those that are reported."""
+        return tuple(self.reported) == self.parameters
+
+    def register(self) -> None:
+        """Make it known by its name.
+
+        Raises
+        ------
+        CalibError
+            If its declaration does not hold together, or the name is taken.
+        """
+        from calib.models import MODELS
+        from calib.models.declared import check_model
+
+        check_model(self)
+        MODELS.add(self)
 
     def bind(self, conditions: Conditions) -> BoundModel:
         """Fix the reference conditions to those of calibration data."""

@@ -107,7 +107,6 @@ def _theta_modified(reported: Mapping[str, float], references: References) -> Ar
 BEKKER = Model(
     name="bekker",
     title="Bekker pressure-sinkage",
-    equation="z0 = (pgr/k)^(1/n), k = kc/b + kphi  (Eqs 17, 19, 20)",
     output="rut_depth_mm",
     conditions=("average_ground_pressure_kpa",),
     parameters=("z_ref", "n"),
@@ -118,12 +117,33 @@ BEKKER = Model(
     theta_from_reported=_theta_bekker,
     bind_references=_references,
     prepare=_prepare,
+    latex=(
+        r"$z_0 = (p_\mathrm{gr}/k)^{1/n}$",
+        r"$k = k_\mathrm{c}/b + k_\phi$",
+    ),
+    numbers="Eqs 17, 19, 20",
+    cited="He_2019",
+    source="He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003",
+    letters="[$z_0] the rut depth (m), [$p_gr] the ground pressure (kPa)",
+    parametrisation=(
+        "The rut z_ref of a towed wheel at {p_ref_kpa:.4g} kPa (mean of the data) is "
+        "sampled in the place of k, which is almost collinear with n; k follows from "
+        "it."
+    ),
+    example="""\
+average_ground_pressure_kpa,rut_depth_mm
+60,13.6
+85,15.9
+107,18.2
+141,19.8
+178,23.0
+220,24.9
+""",
 )
 
 MODIFIED_BEKKER = Model(
     name="modified_bekker",
     title="Bekker with slip sinkage",
-    equation="zt = (pgr/k)^(1/(n0 + n1 s)), k = kc/b + kphi  (Eqs 18, 20, 21)",
     output="rut_depth_mm",
     conditions=("average_ground_pressure_kpa", "slip_ratio"),
     parameters=("z_ref", "n0", "n1"),
@@ -134,4 +154,31 @@ MODIFIED_BEKKER = Model(
     theta_from_reported=_theta_modified,
     bind_references=_references,
     prepare=_prepare,
+    latex=(
+        r"$z_\mathrm{t} = (p_\mathrm{gr}/k)^{1/(n_0 + n_1 s)}$",
+        r"$k = k_\mathrm{c}/b + k_\phi$",
+    ),
+    numbers="Eqs 18, 20, 21",
+    cited="He_2019",
+    source="He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003",
+    letters=(
+        "[$z_t] the rut depth (m), [$p_gr] the ground pressure (kPa), [$s] the slip (as a fraction)"
+    ),
+    parametrisation=(
+        "The rut z_ref of a towed wheel at {p_ref_kpa:.4g} kPa (mean of the data) is "
+        "sampled in the place of k, which is almost collinear with n0; k follows from "
+        "it."
+    ),
+    example="""\
+slip_ratio,average_ground_pressure_kpa,rut_depth_mm
+0.00,107,17.7
+0.10,107,23.2
+0.20,107,30.3
+0.00,141,20.3
+0.10,141,25.6
+0.20,141,33.0
+0.00,178,22.2
+0.10,178,28.5
+0.20,178,36.5
+""",
 )

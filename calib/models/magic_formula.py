@@ -12,10 +12,11 @@ effect is felt through the size of 1 - E; so G = 1 - E > 0 is sampled and E repo
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from calib.models.base import Array, Columns, Conditions, Model, References, Rows
+from calib.models.base import Array, Columns, Conditions, Model, References, Rows, Searched
 
 __all__ = ["MAGIC_FORMULA", "half_sine_in_place", "magic_formula"]
 
@@ -107,10 +108,25 @@ def _from_reported(reported: Mapping[str, float], references: References) -> Arr
     return np.array([B * C * D, C, D, 1.0 - E, reported.get("Sh", 0.0), reported.get("Sv", 0.0)])
 
 
+def _box(largest: float) -> dict[str, tuple[float, float]]:
+    return {"B": (0.001, 0.5), "C": (1.0, 2.0), "D": (0.0, 2.0 * largest), "E": (-30.0, 1.0)}
+
+
+def _sampled(value: dict[str, Any]) -> dict[str, Any]:
+    found = dict(value)
+    if "B" in value:
+        found["K"] = value["B"] * value["C"] * value["D"]
+    if "E" in value:
+        found["G"] = 1.0 - value["E"]
+    return found
+
+
+# As the source searches it (Table 3).
+_SEARCHED = Searched({"K": "B", "G": "E"}, _box, _sampled)
+
 MAGIC_FORMULA = Model(
     name="magic_formula",
     title="Magic Formula, one inflation pressure",
-    equation="Y = Sv + D sin(C arctan(BX - E(BX - arctan BX))), X = x - Sh  (Eqs 3-5)",
     output="drawbar_pull_kn",
     conditions=("slip_ratio",),
     parameters=("K", "C", "D", "G", "Sh", "Sv"),
@@ -120,4 +136,29 @@ MAGIC_FORMULA = Model(
     report_theta=_report,
     theta_from_reported=_from_reported,
     prepare=_prepare,
+    latex=(
+        r"$Y = S_\mathrm{v} + D \sin\{C \arctan[B X - E (B X - \arctan B X)]\}$",
+        r"$X = x - S_\mathrm{h}$",
+    ),
+    numbers="Eqs 3-5",
+    cited="He_2019",
+    source="He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003",
+    letters="[$Y] the drawbar pull (kN), [$x] the slip (%)",
+    parametrisation=(
+        "The initial slope K = BCD is sampled in the place of B, and G = 1 - E in "
+        "that of E; B and E follow."
+    ),
+    example="""\
+slip_ratio,normal_load_kn,drawbar_pull_kn
+0.00,5.0,0.02
+0.05,5.0,0.55
+0.10,5.0,0.94
+0.15,5.0,0.98
+0.20,5.0,0.90
+0.30,5.0,0.78
+0.45,5.0,0.67
+0.60,5.0,0.66
+""",
+    searched=_SEARCHED,
+    estimates_all_rows=True,
 )

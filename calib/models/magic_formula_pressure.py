@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
-from calib.models.base import Array, Columns, Conditions, Model, References, Rows, columns
+from calib.models.base import Alone, Array, Columns, Conditions, Model, References, Rows, columns
 from calib.models.magic_formula import half_sine_in_place
 
 __all__ = ["MAGIC_FORMULA_PRESSURE", "coefficients_at"]
@@ -151,10 +151,6 @@ def _references(conditions: Conditions) -> dict[str, float]:
 MAGIC_FORMULA_PRESSURE = Model(
     name="magic_formula_pressure",
     title="Magic Formula with inflation pressure",
-    equation=(
-        "Y = D sin(C arctan(Bx - E(Bx - arctan Bx))), BCD = c4 + c5 p + c6 p^2, C = b0, "
-        "D = c1 + c2 p + c3 p^2, E = c7 + c8 p + c9 p^2  (Eqs 12-15)"
-    ),
     output="drawbar_pull_kn",
     conditions=("slip_ratio", "inflation_pressure_psi"),
     parameters=(
@@ -187,4 +183,51 @@ MAGIC_FORMULA_PRESSURE = Model(
     theta_from_reported=_from_reported,
     bind_references=_references,
     prepare=_prepare,
+    latex=(
+        r"$Y = D \sin\{C \arctan[B x - E (B x - \arctan B x)]\}$",
+        "$B C D = c_4 + c_5 p + c_6 p^2$",
+        "$C = b_0$",
+        "$D = c_1 + c_2 p + c_3 p^2$",
+        "$E = c_7 + c_8 p + c_9 p^2$",
+    ),
+    numbers="Eqs 12-15",
+    cited="He_2019",
+    source="He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003",
+    letters=("[$Y] the drawbar pull (kN), [$x] the slip (%), [$p] the inflation pressure (psi)"),
+    parametrisation=(
+        "Each quadratic in pressure is sampled through its values at the lowest (_lo) "
+        "and highest (_hi) calibrated pressure, {p_low_psi:.4g} and {p_high_psi:.4g} "
+        "psi, and its relative curvature between them (_bend): K = BCD, D and G = 1 - "
+        "E. All three quadratics must stay positive between these pressures, which "
+        "truncates the priors (bends below about 1). The coefficients c1 to c9 of the "
+        "source follow."
+    ),
+    example="""\
+slip_ratio,inflation_pressure_psi,normal_load_kn,drawbar_pull_kn
+0.00,18,5.0,-0.03
+0.05,18,5.0,1.02
+0.10,18,5.0,1.44
+0.15,18,5.0,1.61
+0.20,18,5.0,1.64
+0.30,18,5.0,1.56
+0.45,18,5.0,1.43
+0.60,18,5.0,1.37
+0.00,30,5.0,0.02
+0.05,30,5.0,0.61
+0.10,30,5.0,0.98
+0.20,30,5.0,0.90
+0.40,30,5.0,0.74
+0.60,30,5.0,0.69
+0.00,42,5.0,0.01
+0.05,42,5.0,0.57
+0.10,42,5.0,0.57
+0.15,42,5.0,0.52
+0.20,42,5.0,0.50
+0.30,42,5.0,0.47
+0.45,42,5.0,0.46
+0.60,42,5.0,0.43
+""",
+    alone=Alone("inflation_pressure_psi", "magic_formula", {"Sh": 0.0, "Sv": 0.0}),
+    parabolic_in="inflation_pressure_psi",
+    estimates_all_rows=True,
 )

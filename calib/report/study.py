@@ -22,6 +22,7 @@ from calib.inference.prior_files import default_prior_path
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
+from calib.models import get_model
 from calib.models.base import Array
 from calib.report.study_tasks import Task, fitted_rows
 from calib.validation.prediction import predictive_draws
@@ -242,13 +243,13 @@ def estimate_task(
     """
     tell = progress or _silent
     # The paper fitted drawbar pull at all pressures, rut depth at the two outer ones.
-    everything = task.held_out is None or task.model.startswith("magic_formula")
+    everything = task.held_out is None or get_model(task.model).estimates_all_rows
     rows = task.table if everything else fitted_rows(task)[0]
     problem = build_problem(task.model, rows, task.prior_path)
     estimates = _all_methods(
         problem, seed, (task.output,), lambda done, n: tell(f"{task.output}: estimating", done, n)
     )
-    pressures = _by_pressure(task, seed) if task.model == "magic_formula_pressure" else {}
+    pressures = _each_alone(task, seed)
     return estimates, pressures
 
 
@@ -269,14 +270,18 @@ def _all_methods(
     return tuple(found)
 
 
-def _by_pressure(task: Task, seed: int) -> dict[float, tuple[PointEstimate, ...]]:
+def _each_alone(task: Task, seed: int) -> dict[float, tuple[PointEstimate, ...]]:
+    """Estimate by the simpler model at each value of its condition, where a model has one."""
+    alone = get_model(task.model).alone
+    if alone is None:
+        return {}
     found = {}
-    for psi in np.unique(task.table["inflation_pressure_psi"]):
-        rows = task.table.take(np.isclose(task.table["inflation_pressure_psi"], psi))
-        # Too few rows, or a pull that is constant: nothing is estimated at this pressure.
+    for value in np.unique(task.table[alone.column]):
+        rows = task.table.take(np.isclose(task.table[alone.column], value))
+        # Too few rows, or an output that is constant: nothing is estimated there.
         with suppress(CalibError):
-            problem = build_problem("magic_formula", rows, fixed={"Sh": 0.0, "Sv": 0.0})
-            found[float(psi)] = _all_methods(problem, seed, (task.output, f"{psi:g}"))
+            problem = build_problem(alone.model, rows, fixed=alone.fixed)
+            found[float(value)] = _all_methods(problem, seed, (task.output, f"{value:g}"))
     return found
 
 

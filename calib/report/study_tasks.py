@@ -13,7 +13,7 @@ from calib.data.headers import parse_header
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.inference.prior_files import prior_file_model
-from calib.models import get_model
+from calib.models import MODELS, get_model
 
 __all__ = ["HoldOut", "Task", "choose_model", "fitted_rows", "he2019_tasks", "plan_tasks"]
 
@@ -82,16 +82,30 @@ class Task:
 
 
 def choose_model(output: str, table: Table) -> str:
-    """Pick the model that a table's columns allow for an output (a key of `OUTPUTS`)."""
-    if output == "bulk_density":
-        gravimetric = "gravimetric_water_content" in table
-        return "ayers_perumpral" if gravimetric else "ayers_perumpral_volumetric"
-    if output == "drawbar_pull":
-        pressure = "inflation_pressure_psi"
-        several = pressure in table and np.unique(table[pressure]).size > 1
-        return "magic_formula_pressure" if several else "magic_formula"
-    slips = "slip_ratio" in table and np.unique(table["slip_ratio"]).size > 1
-    return "modified_bekker" if slips else "bekker"
+    """Pick the model of an output (a key of `OUTPUTS`) that suits a table.
+
+    Of the models whose conditions are all there it is the one that makes use of most of those that
+    vary; of several such, the simplest.
+
+    Raises
+    ------
+    CalibError
+        If no model of the output suits the table, with what those there are would need.
+    """
+    known = [m for m in MODELS.values() if m.output == OUTPUTS[output]]
+    suited = [m for m in known if all(c in table for c in m.conditions)]
+    if suited:
+        varied = {c for m in suited for c in m.conditions if np.unique(table[c]).size > 1}
+        uses = [len(varied & set(m.conditions)) - 0.01 * len(m.conditions) for m in suited]
+        return suited[int(np.argmax(uses))].name
+    raise CalibError(
+        f"no model of {output} suits the columns",
+        where=table.source,
+        allowed="; ".join(f"{m.name}: {', '.join(m.conditions)}" for m in known)
+        or "a model that is registered for this output",
+        mend="add the columns of one of these models, declare a model of your own (--models), or "
+        "report the other outputs (--only)",
+    )
 
 
 def plan_tasks(

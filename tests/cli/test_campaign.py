@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from calib.cli import main
-from calib.models.templates import template_csv
+from calib.models import example_csv
 from tests.batch.campaign.sites import refuse_all, results
 
 # Tests that run in the background of a shell inherit that Ctrl-C is ignored.
@@ -32,7 +32,7 @@ FIT = '[[fit]]\nname = "a"\ndata = ["*.csv"]\nmodels = ["bekker"]\nposteriors = 
 def calib(monkeypatch, capsys, tmp_path):
     """Run the verb as the shell would, in a folder with a data file."""
     monkeypatch.chdir(tmp_path)
-    Path("rut.csv").write_text(template_csv("bekker"))
+    Path("rut.csv").write_text(example_csv("bekker"))
 
     def run(plan: str, *options: str) -> tuple[int, str, str]:
         Path("plan.toml").write_text(plan)

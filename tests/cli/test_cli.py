@@ -15,12 +15,11 @@ import pytest
 
 from calib.cli import main
 from calib.inference.prior_files import default_prior_path
-from calib.models import MODELS
-from calib.models.templates import template_csv
+from calib.models import MODELS, example_csv
 from calib.report.manifest import file_hashes
 
-RUT = template_csv("modified_bekker")
-PRESSURES = template_csv("magic_formula_pressure")
+RUT = example_csv("modified_bekker")
+PRESSURES = example_csv("magic_formula_pressure")
 
 
 @dataclass(frozen=True)
@@ -205,7 +204,7 @@ def test_own_priors_are_used(calib: Calib) -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_templates_and_priors_are_printed_and_written(calib: Calib, model: str) -> None:
-    assert calib("template", model).out == template_csv(model)
+    assert calib("template", model).out == example_csv(model)
     printed = calib("priors", model).out
     assert tomllib.loads(printed)["model"] == model
     assert printed == default_prior_path(model).read_text(encoding="utf-8")
@@ -469,7 +468,7 @@ def test_an_interruption_is_no_traceback(calib: Calib, monkeypatch: pytest.Monke
     def interrupt(name: str) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("calib.models.templates.template_csv", interrupt)
+    monkeypatch.setattr("calib.models.example_csv", interrupt)
     ran = calib("template", "bekker")
     assert ran.code == 130
     assert "Traceback" not in ran.err

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from calib.batch.environment import sha256
-from calib.models.templates import template_csv
+from calib.models import example_csv
 from tests.cli.test_cli import Calib, assert_refused, calib, contents  # noqa: F401
 
 
@@ -87,7 +87,7 @@ def test_the_report_of_own_data_has_no_such_section(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("calib.report.writer.plates", lambda result, published: [])
-    Path("my.csv").write_text(template_csv("modified_bekker"))
+    Path("my.csv").write_text(example_csv("modified_bekker"))
     ran = calib("report", "my.csv", "--out", "rep")
     assert ran.code == 0, ran.err
     assert "paper_gaps" not in json.loads(Path("rep/summary.json").read_text())

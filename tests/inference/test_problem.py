@@ -9,7 +9,7 @@ from scipy import stats
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
 from calib.inference.problem import Problem, build_problem
-from calib.models.templates import template_csv
+from calib.models import example_csv
 
 
 @pytest.fixture
@@ -127,7 +127,7 @@ def table_of(model: str, tmp_path, **changed: np.ndarray | None) -> Table:
     from calib.data import read_table
 
     path = tmp_path / "my.csv"
-    path.write_text(template_csv(model))
+    path.write_text(example_csv(model))
     columns = dict(read_table(path).columns) | changed
     return table_from_arrays({k: v for k, v in columns.items() if v is not None}, source="my.csv")
 

@@ -18,23 +18,37 @@ from tests.user_tables import pulls, table
 HELD = HoldOut("inflation_pressure_psi", 30.0)
 
 
+PSI, GROUND, CONE = "inflation_pressure_psi", "average_ground_pressure_kpa", "cone_index_kpa"
+MASS, VOLUME = "gravimetric_water_content", "volumetric_water_content"
+
+
 @pytest.mark.parametrize(
     ("output", "columns", "model"),
     [
         ("drawbar_pull", {"slip_ratio": [0.1, 0.2]}, "magic_formula"),
-        ("drawbar_pull", {"inflation_pressure_psi": [30, 30]}, "magic_formula"),
-        ("drawbar_pull", {"inflation_pressure_psi": [18, 30]}, "magic_formula_pressure"),
-        ("rut_depth", {"average_ground_pressure_kpa": [100, 120]}, "bekker"),
-        ("rut_depth", {"slip_ratio": [0.1, 0.1]}, "bekker"),
-        ("rut_depth", {"slip_ratio": [0.1, 0.2]}, "modified_bekker"),
-        ("bulk_density", {"gravimetric_water_content": [0.1, 0.2]}, "ayers_perumpral"),
-        ("bulk_density", {"volumetric_water_content": [0.1, 0.2]}, "ayers_perumpral_volumetric"),
+        ("drawbar_pull", {"slip_ratio": [0.1, 0.2], PSI: [30, 30]}, "magic_formula"),
+        ("drawbar_pull", {"slip_ratio": [0.1, 0.2], PSI: [18, 30]}, "magic_formula_pressure"),
+        ("rut_depth", {GROUND: [100, 120]}, "bekker"),
+        ("rut_depth", {"slip_ratio": [0.1, 0.1], GROUND: [100, 120]}, "bekker"),
+        ("rut_depth", {"slip_ratio": [0.1, 0.2], GROUND: [100, 120]}, "modified_bekker"),
+        ("rut_depth", {"slip_ratio": [0.1, 0.2], GROUND: [100, 100]}, "modified_bekker"),
+        ("bulk_density", {CONE: [300, 400], MASS: [0.1, 0.2]}, "ayers_perumpral"),
+        ("bulk_density", {CONE: [300, 400], VOLUME: [0.1, 0.2]}, "ayers_perumpral_volumetric"),
+        ("bulk_density", {CONE: [3, 4], MASS: [0.1, 0.2], VOLUME: [0.1, 0.2]}, "ayers_perumpral"),
     ],
 )
 def test_the_columns_choose_the_model(output: str, columns, model: str) -> None:
     assert (
         choose_model(output, table(**{k: np.array(v, float) for k, v in columns.items()})) == model
     )
+
+
+def test_a_table_that_suits_no_model_is_refused_with_those_that_would() -> None:
+    rut = table(slip_ratio=np.linspace(0, 0.3, 6), rut_depth_mm=np.linspace(20, 30, 6))
+    with pytest.raises(CalibError) as caught:
+        plan_tasks([rut])
+    for word in ("no model of rut_depth", "bekker: average_ground_pressure_kpa", "--only"):
+        assert word in str(caught.value)
 
 
 def test_the_embedded_tasks_hold_30_psi_out() -> None:
@@ -92,7 +106,10 @@ def test_what_cannot_be_planned_is_told_before_the_work(tables, held, words: lis
 
 def test_read_files_are_planned_as_arrays_are(tmp_path: Path) -> None:
     path = tmp_path / "my.csv"
-    path.write_text("slip_percent,drawbar_pull_n,rut_depth_mm\n0,1,\n10,300,\n20,,\n")
+    path.write_text(
+        "slip_percent,average_ground_pressure_kpa,drawbar_pull_n,rut_depth_mm\n"
+        "0,100,1,\n10,110,300,\n20,120,,\n"
+    )
     read = read_table(path, allow_missing=tuple(OUTPUTS.values()))
     tasks = plan_tasks([read])
     assert [(t.output, len(t.table)) for t in tasks] == [("drawbar_pull", 2), ("rut_depth", 0)]

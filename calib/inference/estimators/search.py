@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +21,6 @@ __all__ = [
 ]  # fmt: skip
 
 # Sampled parameters of the Magic Formula at one pressure, and what the source searches instead.
-_SEARCHED = MappingProxyType({"K": "B", "G": "E"})
 
 type Box = Mapping[str, tuple[float, float]]
 
@@ -60,15 +58,15 @@ class SearchSpace:
     def natural(self, x: Array) -> Array:
         """Natural parameters, the noise scale last, of coordinates (k, d)."""
         priors = self.problem.priors
-        if self.problem.bound.model.name != "magic_formula":
+        other = self.problem.bound.model.searched
+        if other is None:
             return priors.to_natural(x)
         searched = dict(zip(self.names, x.T, strict=True))
         value: dict[str, Any] = {p.name: searched.get(p.name, p.loc) for p in priors.entries}
-        if "B" in searched:
-            value["K"] = searched["B"] * value["C"] * value["D"]
-        if "E" in searched:
-            value["G"] = 1.0 - searched["E"]
-        return np.stack(np.broadcast_arrays(x[:, 0], *value.values())[1:], axis=1)
+        value |= {name: searched[name] for name in other.names.values() if name in searched}
+        found = other.sampled(value)
+        columns = [found[p.name] for p in priors.entries]
+        return np.stack(np.broadcast_arrays(x[:, 0], *columns)[1:], axis=1)
 
     def cost(self, x: Array) -> Array:
         """Sum of squared residuals (Eq 10), (k, d) to (k,); ``inf`` where there is no value."""
@@ -94,11 +92,6 @@ class SearchSpace:
         return Found(np.asarray(result.x) if better else x, n_evaluations, bool(result.success))
 
 
-def _magic_formula_box(problem: Problem) -> dict[str, tuple[float, float]]:
-    largest = float(np.abs(problem.response).max())
-    return {"B": (0.001, 0.5), "C": (1.0, 2.0), "D": (0.0, 2.0 * largest), "E": (-30.0, 1.0)}
-
-
 def search_space(problem: Problem, box: Box | None = None) -> SearchSpace:
     """Return the space in which a population method searches.
 
@@ -117,12 +110,13 @@ def search_space(problem: Problem, box: Box | None = None) -> SearchSpace:
     CalibError
         If the box names no coordinate or has a lower bound that is not below its upper bound.
     """
-    one_pressure = problem.bound.model.name == "magic_formula"
-    names = tuple(_SEARCHED.get(n, n) if one_pressure else n for n in problem.names)
+    other = problem.bound.model.searched
+    names = tuple(other.names.get(n, n) if other else n for n in problem.names)
     low, high = central_interval(problem)
-    logs = [p.log and not one_pressure for p in problem.priors.free]
+    logs = [p.log and other is None for p in problem.priors.free]
     _check_box(box or {}, names)
-    given = (_magic_formula_box(problem) if one_pressure else {}) | dict(box or {})
+    largest = float(np.abs(problem.response).max())
+    given = (other.box(largest) if other else {}) | dict(box or {})
     for j, name in enumerate(names):
         if name in given:
             ends = np.array(given[name], dtype=np.float64)
@@ -133,7 +127,7 @@ def search_space(problem: Problem, box: Box | None = None) -> SearchSpace:
                     mend="raise the lower bound",
                 )
             low[j], high[j] = np.log(ends) if logs[j] else ends
-        elif one_pressure and problem.priors.free[j].log:  # a user's prior may be log-normal
+        elif other and problem.priors.free[j].log:  # a user's prior may be log-normal
             low[j], high[j] = np.exp([low[j], high[j]])
     return SearchSpace(problem, names, low, high)
 

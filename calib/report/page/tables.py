@@ -129,7 +129,7 @@ def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
     ]
     fitted, shown = len(result.calibration.problem.table), len(result.task.table)
     caption = ""
-    if fitted < shown and model.name.startswith("magic_formula"):
+    if fitted < shown and model.estimates_all_rows:
         caption = (
             f"Not the same rows: the estimates are of all {shown} rows"
             f"{', as in the source' if table else ''}; the posterior is of the {fitted} that were "

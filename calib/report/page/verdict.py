@@ -22,6 +22,7 @@ from enum import StrEnum
 import numpy as np
 from scipy.stats import binomtest
 
+from calib.data.quantities import role_of
 from calib.report.figures.joint import coverage_probability, effective_rows
 from calib.report.figures.labels import axis_of, joined, percent, plain, short
 from calib.report.figures.prior_predictive import prior_hits
@@ -35,7 +36,6 @@ __all__ = ["Evidence", "Level", "Verdict", "Where", "gather", "judge_evidence"]
 _SIGNIFICANT = 0.05
 _WEAK_SKILL = 0.5
 _EXPECTED = 0.5
-_PRESSURE = "inflation_pressure_psi"
 
 
 class Where(StrEnum):
@@ -238,7 +238,8 @@ def gather(result: OutputResult) -> Evidence:
     covered = v.scores.coverage[0.9]
     held = held_table(result) is not None
     complete = bool(np.isfinite(v.draws).all(axis=1).any())
-    quadratic = problem.bound.model.name == "magic_formula_pressure"
+    parabolic = problem.bound.model.parabolic_in
+    quadratic = bool(parabolic)
     changes, neighbours = sign_changes(result, standardise(result, problem).residual)
     scatter = float(np.mean(np.square(v.observed - problem.observed.mean())))
     return Evidence(
@@ -258,7 +259,7 @@ def gather(result: OutputResult) -> Evidence:
         unit=axis_of(problem.bound.model.output).unit,
         max_relative_error=_largest(v.scores.relative_error),
         prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
-        two_pressures=quadratic and np.unique(problem.table[_PRESSURE]).size == 2,
+        two_pressures=quadratic and np.unique(problem.table[parabolic]).size == 2,
         skill=1.0 - v.scores.rmse**2 / scatter if scatter > 0.0 else float("nan"),
         sign_changes=changes,
         neighbours=neighbours,
@@ -271,7 +272,7 @@ def gather(result: OutputResult) -> Evidence:
         prior_n=problem.observed.size,
         suspects=(
             "the units and the normal load"
-            if problem.bound.model.output == "drawbar_pull_kn"
+            if role_of(problem.bound.model.output) == "pull"
             else "the units"
         ),
         notes=tuple(getattr(problem, "notes", ())),
@@ -279,8 +280,9 @@ def gather(result: OutputResult) -> Evidence:
 
 
 def _unseen_at(result: OutputResult) -> Where:
-    fitted = result.calibration.problem.table[_PRESSURE]
-    unseen = result.validation.table[_PRESSURE]
+    column = result.calibration.problem.bound.model.parabolic_in
+    fitted = result.calibration.problem.table[column]
+    unseen = result.validation.table[column]
     if bool(((unseen < fitted.min()) | (unseen > fitted.max())).any()):
         return Where.BEYOND
     return Where.AT if bool(np.isin(unseen, fitted).any()) else Where.BETWEEN
@@ -288,9 +290,10 @@ def _unseen_at(result: OutputResult) -> Where:
 
 def _at_pressures(result: OutputResult) -> str:
     problem = result.calibration.problem
-    psi, slip = axis_of(_PRESSURE), axis_of("slip_ratio")
-    words = joined([psi.value_text(float(p)) for p in np.unique(problem.table[_PRESSURE])])
-    return f"{words} {psi.unit} for slip {slip.range_text(problem.table['slip_ratio'])}"
+    column, along = problem.bound.model.parabolic_in, x_column(result)
+    axis, x = axis_of(column), axis_of(along)
+    words = joined([axis.value_text(float(p)) for p in np.unique(problem.table[column])])
+    return f"{words} {axis.unit} for {x.name.lower()} {x.range_text(problem.table[along])}"
 
 
 def _largest(relative: np.ndarray) -> float:

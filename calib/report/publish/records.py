@@ -72,7 +72,7 @@ class Output:
     def estimates_use_all_rows(self) -> bool:
         """Whether point estimates are of more rows than the posterior: the source's were."""
         data = self.found["data"]
-        return self.model.startswith("magic_formula") and bool(data["n_all"] > data["n"])
+        return get_model(self.model).estimates_all_rows and bool(data["n_all"] > data["n"])
 
     @property
     def posterior(self) -> tuple[ParameterSummary, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.inference.sampling import sampler
 from calib.inference.sampling.gate import judge
-from calib.models.templates import template_csv
+from calib.models import example_csv
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 N_CASES = 4
@@ -76,7 +76,7 @@ source = "test"
 def make_site(folder: Path, plan: str = PLAN) -> Path:
     """Write data, cases and a plan; return the plan's path."""
     (folder / "data").mkdir(parents=True)
-    (folder / "data" / "rut.csv").write_text(template_csv("bekker"))
+    (folder / "data" / "rut.csv").write_text(example_csv("bekker"))
     for i in range(N_CASES):
         effect = ("force_offset", None)[i % 2]
         case = make_case(effect, models=PULL_ONLY, n_lab=15, n_field=12, n_fresh=4, seed=i)

@@ -20,7 +20,7 @@ from calib.inference.estimators import estimate
 from calib.inference.io import load_calibration
 from calib.inference.problem import build_problem
 from calib.inference.random import generator
-from calib.models.templates import template_csv
+from calib.models import example_csv
 from calib.validation.sbc.run import run_sbc
 from calib.validation.validate import validate_held_out
 from tests.batch.campaign.sites import EFFECT, NAMES, WIND, content, refuse_all
@@ -90,7 +90,7 @@ def test_a_fit_is_that_of_the_verb(site, serial):
 
 @pytest.fixture
 def folder(tmp_path) -> Path:
-    (tmp_path / "rut.csv").write_text(template_csv("bekker"))
+    (tmp_path / "rut.csv").write_text(example_csv("bekker"))
     return tmp_path
 
 

@@ -5,15 +5,14 @@ import pytest
 
 from calib.data import check_enough, check_varies, read_table
 from calib.errors import CalibError
-from calib.models import MODELS
-from calib.models.templates import template_csv
+from calib.models import MODELS, example_csv
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_a_template_loads_and_can_be_fitted(name: str, tmp_path: Path) -> None:
     model = MODELS[name]
     path = tmp_path / "my.csv"
-    path.write_text(template_csv(name))
+    path.write_text(example_csv(name))
     table = read_table(path, required=[*model.conditions, model.output])
     assert table.ignored == ()
     # Forces come with the load that gives the priors their scale; it is the same in every row.
@@ -26,6 +25,6 @@ def test_a_template_loads_and_can_be_fitted(name: str, tmp_path: Path) -> None:
 
 
 def test_an_unknown_template_lists_the_models() -> None:
-    with pytest.raises(CalibError, match="no template for a model 'magic'") as caught:
-        template_csv("magic")
+    with pytest.raises(CalibError, match="there is no model 'magic'") as caught:
+        example_csv("magic")
     assert all(name in str(caught.value) for name in MODELS)
