@@ -13,9 +13,12 @@ if TYPE_CHECKING:
     from calib.batch.campaign import read_plan, run_campaign
     from calib.check.check import check
     from calib.data import Table, hold_out, read_table, table_from_arrays
+    from calib.data.quantities import Quantity, Range
+    from calib.data.registry import register
     from calib.errors import CalibError
     from calib.gap.case import Case, read_case
     from calib.gap.diagnose import Diagnosis, diagnose
+    from calib.gap.effects import Effect
     from calib.he2019.audit import Audit, run_audit
     from calib.he2019.datasets.embedded import load_he2019
     from calib.inference.calibration import Calibration, calibrate
@@ -23,7 +26,7 @@ if TYPE_CHECKING:
     from calib.inference.io import load_calibration, save_calibration, to_datatree
     from calib.inference.problem import Problem, build_problem
     from calib.inference.sampling.sampler import SamplerSettings
-    from calib.models import MODELS
+    from calib.models import MODELS, Model
     from calib.validation.prediction import Prediction, predict
     from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
@@ -35,6 +38,9 @@ _HOME = {
     "read_plan": "calib.batch.campaign",
     "run_campaign": "calib.batch.campaign",
     "Table": "calib.data",
+    "Quantity": "calib.data.quantities",
+    "Range": "calib.data.quantities",
+    "register": "calib.data.registry",
     "hold_out": "calib.data",
     "read_table": "calib.data",
     "table_from_arrays": "calib.data",
@@ -47,6 +53,8 @@ _HOME = {
     "Diagnosis": "calib.gap.diagnose",
     "diagnose": "calib.gap.diagnose",
     "MODELS": "calib.models",
+    "Model": "calib.models",
+    "Effect": "calib.gap.effects",
     "Prediction": "calib.validation.prediction",
     "predict": "calib.validation.prediction",
     "Problem": "calib.inference.problem",
@@ -68,9 +76,13 @@ __all__ = [
     "Calibration",
     "Case",
     "Diagnosis",
+    "Effect",
+    "Model",
     "PointEstimate",
     "Prediction",
     "Problem",
+    "Quantity",
+    "Range",
     "SamplerSettings",
     "Table",
     "Validation",
@@ -87,6 +99,7 @@ __all__ = [
     "read_case",
     "read_plan",
     "read_table",
+    "register",
     "run_audit",
     "run_campaign",
     "save_calibration",

@@ -15,6 +15,7 @@ from multiprocessing import get_all_start_methods, get_context
 from threading import Thread
 from typing import Protocol
 
+from calib.batch.plugins import inherit
 from calib.errors import CalibError
 
 __all__ = ["HERE", "Later", "Pool", "pool"]
@@ -107,15 +108,20 @@ def pool(workers: int, modules: Sequence[str] = _REPORT) -> Iterator[Pool]:
     context = get_context("forkserver" if forked else "spawn")
     if forked:
         context.set_forkserver_preload(list(modules))
-    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_quiet)
+    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
     # A first process starts now, not when there is work for it; it starts where it can wait.
-    Thread(target=executor.submit, args=(_quiet,), daemon=True).start()
+    Thread(target=executor.submit, args=(_begun,), daemon=True).start()
     try:
         yield Pool(executor)
     finally:
         executor.shutdown(wait=False, cancel_futures=True)
 
 
-def _quiet() -> None:
-    """Leave an interruption to the process that waits for the pieces."""
+def _begin() -> None:
+    """Leave an interruption to the process that waits for the pieces; know what it knows."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    inherit()
+
+
+def _begun() -> None:
+    """Do nothing, in a process that has begun."""

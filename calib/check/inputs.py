@@ -11,7 +11,7 @@ from calib.check.items import Item, Status
 from calib.check.schema import TaskRecord
 from calib.data import Table
 from calib.he2019.datasets import embedded
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 
 __all__ = ["GROUP", "verify_files", "verify_hashes", "verify_label", "verify_priors"]
 
@@ -96,7 +96,7 @@ def verify_priors(key: str, entry: TaskRecord, folder: Path, *, same_code: bool)
     file = entry.priors.file
     if not entry.priors.shipped:
         return Item(GROUP, file, Status.IDENTICAL, note=f"priors of the user for {key}")
-    shipped = default_prior_path(entry.model)
+    shipped = default_priors(entry.model)
     if (folder / file).read_bytes() == shipped.read_bytes():
         return Item(GROUP, file, Status.IDENTICAL, note=f"the shipped {shipped.name}")
     status = Status.DIFFERENT if same_code else Status.UNJUDGED

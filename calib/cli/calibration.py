@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.parallel import CORES, Workers
+from calib.cli.parallel import CORES, Models, Workers
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
@@ -54,6 +54,7 @@ def report(
         bool, typer.Option(help="Keep the posteriors, megabytes of netCDF, in the folder.")
     ] = True,
     workers: Workers = CORES,
+    plugins: Models = None,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from calib.batch.folders import check_folder
@@ -120,6 +121,7 @@ def fit(
     hold_out: _HoldOut = None,
     overwrite: _Overwrite = False,
     max_steps: _MaxSteps = 25_600,
+    plugins: Models = None,
 ) -> None:
     """Calibrate one model on one file and save the posterior."""
     from calib.batch.folders import check_folder, fresh_folder
@@ -176,6 +178,7 @@ def predict(
         Path | None, typer.Option(help="Python file with the effects of your own it was made with.")
     ] = None,
     overwrite: _Overwrite = False,
+    plugins: Models = None,
 ) -> None:
     """Predict at new conditions: with 50, 90 and 95 % bands; a diagnosis with 90 % bands."""
     if out is not None and out.exists() and not overwrite:
@@ -293,6 +296,7 @@ def _write_he2019_gaps(out: Path, overwrite: bool) -> list[Path]:
 def template(
     model: Annotated[str, typer.Argument(help="See `calib models`.")],
     out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
+    plugins: Models = None,
 ) -> None:
     """Write an example CSV of a model to fill in."""
     from calib.models import example_csv, get_model
@@ -303,15 +307,16 @@ def template(
 def priors(
     model: Annotated[str, typer.Argument(help="See `calib models`.")],
     out: Annotated[Path | None, typer.Option(help="TOML to write; printed if none.")] = None,
+    plugins: Models = None,
 ) -> None:
     """Write the shipped priors of a model, to copy and edit."""
-    from calib.inference.prior_files import default_prior_path
+    from calib.inference.prior_files import default_priors
     from calib.models import get_model
 
-    _emit(default_prior_path(get_model(model).name).read_text(encoding="utf-8"), out)
+    _emit(default_priors(get_model(model).name).read_text(encoding="utf-8"), out)
 
 
-def models() -> None:
+def models(plugins: Models = None) -> None:
     """List the models with their equations and columns."""
     from calib.models import MODELS
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import CORES, Workers
+from calib.cli.parallel import CORES, Models, Workers
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -31,6 +31,7 @@ def check(
         Path | None, typer.Option("--json", help="File for machines to read; - prints it.")
     ] = None,
     workers: Workers = CORES,
+    plugins: Models = None,
 ) -> None:
     """Compute a report or a run again from its own folder and compare everything.
 

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from calib.cli.parallel import CORES, Scheduler, Workers, announce, resumable
+from calib.cli.parallel import CORES, Models, Scheduler, Workers, announce, resumable
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -38,6 +38,7 @@ def diagnose(
     effects: Annotated[Path | None, typer.Option(help="Python file with your effects.")] = None,
     overwrite: _Overwrite = False,
     workers: Workers = CORES,
+    plugins: Models = None,
 ) -> None:
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
     from calib.batch.folders import check_folder, fresh_folder
@@ -88,7 +89,7 @@ def diagnose(
         print(f"  {text:>6}  {name}")
     for output, s in found.shrink.items():
         low, high = s.interval
-        unit = QUANTITIES[OUTPUTS[output]].unit.replace("**", "")
+        unit = QUANTITIES[OUTPUTS[output]].unit.replace("**", "").replace("*", " ")
         print(
             f"{output}: error {format_number(s.rmse_before)} -> {format_number(s.rmse_after)} "
             f"{unit} rms, shrink {100 * s.fraction:.0f} % (90 % interval {100 * low:.0f} to "
@@ -125,6 +126,7 @@ def run(
     seed: _Seed = 1,
     workers: Workers = 2,
     scheduler: Scheduler = None,
+    plugins: Models = None,
 ) -> None:
     """Diagnose every case of a folder; run again to resume."""
     from calib.cli.display import progress_bars

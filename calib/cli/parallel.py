@@ -6,11 +6,12 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated
 
 import typer
 
-__all__ = ["CORES", "Scheduler", "Workers", "announce", "resumable"]
+__all__ = ["CORES", "Models", "Scheduler", "Workers", "announce", "resumable"]
 
 # As many processes as there are cores, of which two bring most of what there is to gain.
 CORES = min(2, os.cpu_count() or 1)
@@ -18,6 +19,26 @@ Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1)]
 Scheduler = Annotated[
     str | None,
     typer.Option(help="A Dask scheduler in the place of --workers, e.g. tcp://host:8786."),
+]
+
+
+def _load(paths: list[Path] | None) -> list[Path] | None:
+    """Register what the files declare, before names are looked up."""
+    from calib.batch.plugins import load_files, load_installed
+
+    load_installed()
+    load_files(paths or ())
+    return paths
+
+
+Models = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--models",
+        help="Python file that registers quantities, models or effects of your own; repeatable.",
+        callback=_load,
+        is_eager=True,
+    ),
 ]
 
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import Scheduler, Workers, announce
+from calib.cli.parallel import Models, Scheduler, Workers, announce
 
 __all__ = ["register"]
 
@@ -20,13 +20,14 @@ def register(app: typer.Typer) -> None:
 
 def sbc(
     out: Annotated[Path, typer.Option(help="Folder to write; a run there is resumed.")],
-    models: Annotated[
+    model: Annotated[
         list[str] | None, typer.Option(help="Model to test, all by default; repeatable.")
     ] = None,
     simulations: Annotated[int, typer.Option(help="Campaigns per model.", min=10)] = 300,
     seed: Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)] = 2019,
     workers: Workers = 2,
     scheduler: Scheduler = None,
+    plugins: Models = None,
 ) -> None:
     """Prove posteriors and bands calibrated on simulated data whose truth is known."""
     from dataclasses import asdict
@@ -38,14 +39,14 @@ def sbc(
 
     with progress_bars() as tell:
         score = run_sbc(
-            out, models=models or (), simulations=simulations, seed=seed, workers=workers,
+            out, models=model or (), simulations=simulations, seed=seed, workers=workers,
             scheduler=scheduler, announce=announce,
             progress=lambda done, n: tell("simulating and calibrating", done, n),
         )  # fmt: skip
     page = write_sbc(score, out, asdict(SETTINGS), ["calib", *sys.argv[1:]])
     print(text_table(score))
-    for model in score.models:
-        for name, error in model.failed.items():
+    for of_model in score.models:
+        for name, error in of_model.failed.items():
             print(f"calib: {name} failed: {error}", file=sys.stderr)
     print(page)
     if score.alarms or any(m.failed for m in score.models):

@@ -14,7 +14,12 @@ from calib.gap.discrepancy import SETTINGS
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.hypothesis import Hypothesis, OnsetOver, SmoothOver
 from calib.gap.shifts import ShiftAs
-from calib.inference.prior_files import default_prior_path, read_priors
+from calib.inference.prior_files import (
+    DeclaredPriors,
+    PriorFile,
+    default_priors,
+    read_priors,
+)  # fmt: skip
 from calib.inference.priors import Priors
 
 __all__ = [
@@ -81,9 +86,11 @@ def split_testable(
 
 def effect_priors(data: Campaigns, effect: Effect) -> Priors:
     """Read an effect's priors, forces relative to the case's load."""
-    path = effect.prior_file or default_prior_path(f"effects/{effect.name}")
+    file: PriorFile = effect.prior_file or default_priors(f"effects/{effect.name}")
+    if effect.priors:
+        file = DeclaredPriors(f"{effect.name}.toml", effect.priors)
     loads = {"normal_load_kn": data.view.load_kn}
-    return read_priors(path, effect.name, effect.parameters, loads)
+    return read_priors(file, effect.name, effect.parameters, loads)
 
 
 def singles(data: Campaigns, effects: Mapping[str, Effect]) -> list[Hypothesis]:

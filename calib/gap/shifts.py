@@ -13,7 +13,7 @@ from scipy.linalg import block_diag
 
 from calib.errors import CalibError
 from calib.gap.case import OutputData
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 
@@ -80,7 +80,7 @@ def another_soil() -> dict[str, tuple[Array, float]]:
     CalibError
         If the prior file cannot be read or is not complete.
     """
-    path = default_prior_path("shifts/another_soil")
+    path = default_priors("shifts/another_soil")
     try:
         file = _File.model_validate(tomllib.loads(path.read_text(encoding="utf-8")))
     except (OSError, tomllib.TOMLDecodeError, ValidationError) as error:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
@@ -15,7 +16,14 @@ from calib.errors import CalibError
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
 
-__all__ = ["default_prior_path", "parse_priors", "prior_file_model", "read_priors"]
+__all__ = [
+    "DeclaredPriors",
+    "PriorFile",
+    "default_priors",
+    "parse_priors",
+    "prior_file_model",
+    "read_priors",
+]
 
 
 class _Entry(BaseModel):
@@ -73,11 +81,51 @@ class _File(BaseModel):
 _FILE: TypeAdapter[_File] = TypeAdapter(_File)
 
 
-def default_prior_path(model_name: str) -> Path:
-    """Return the path of a model's priors: those it declares, else those that are shipped."""
+@dataclass(frozen=True)
+class DeclaredPriors:
+    """Priors that a model or an effect declares as text, read as a file is."""
+
+    name: str
+    text: str
+
+    def read_text(self, encoding: str | None = None) -> str:
+        """Return the text."""
+        return self.text
+
+    def read_bytes(self) -> bytes:
+        """Return the text as bytes."""
+        return self.text.encode()
+
+    def is_file(self) -> bool:
+        """Whether it can be read: always."""
+        return True
+
+    def __str__(self) -> str:
+        return self.name
+
+
+class PriorFile(Protocol):
+    """A prior file on disk, or priors that are read like one."""
+
+    @property
+    def name(self) -> str:
+        """Of the file."""
+
+    def read_text(self, encoding: str | None = None) -> str:
+        """Return its text."""
+
+    def read_bytes(self) -> bytes:
+        """Return its bytes."""
+
+    def is_file(self) -> bool:
+        """Whether it is there."""
+
+
+def default_priors(model_name: str) -> PriorFile:
+    """Return a model's priors: those it declares, else the file that is shipped."""
     known = MODELS.get(model_name)
-    if known is not None and known.prior_file is not None:
-        return known.prior_file
+    if known is not None and known.priors:
+        return DeclaredPriors(f"{model_name}.toml", known.priors)
     packaged = Path(str(resources.files("calib"))) / "_priors"
     # An editable install has no packaged copy: the priors then lie beside the package.
     folder = packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "priors"
@@ -109,13 +157,13 @@ def prior_file_model(path: Path) -> str:
 
 
 def read_priors(
-    path: Path, model_name: str, parameters: Sequence[str], references: Mapping[str, float]
+    path: PriorFile, model_name: str, parameters: Sequence[str], references: Mapping[str, float]
 ) -> Priors:
     """Read and check a prior file.
 
     Parameters
     ----------
-    path : Path
+    path : Path or PriorFile
         TOML file with ``model`` and a table ``parameters.NAME`` for each parameter.
     model_name : str
         The model it must be for.
@@ -130,7 +178,7 @@ def read_priors(
         If the file is missing, is not TOML, or gives unknown, missing or impossible entries.
     """
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise CalibError(
             f"the prior file cannot be read ({error})",
@@ -195,7 +243,7 @@ def _check_names(
 
 def _check_units(file: _File, source: str, model_name: str) -> None:
     """A prior in another unit would silently be taken for one in the model's."""
-    shipped = default_prior_path(model_name)
+    shipped = default_priors(model_name)
     if not shipped.is_file():
         return
     units = {

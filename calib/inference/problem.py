@@ -21,7 +21,7 @@ import numpy as np
 from calib.data import Table, check_enough, check_varies
 from calib.errors import CalibError
 from calib.inference.likelihood import Squares
-from calib.inference.prior_files import default_prior_path, read_priors
+from calib.inference.prior_files import default_priors, read_priors
 from calib.inference.priors import Priors
 from calib.models import Array, BoundModel, get_model
 
@@ -178,7 +178,7 @@ def build_problem(
     if "normal_load_kn" in table:
         loads["normal_load_kn"] = float(np.median(table["normal_load_kn"]))
     priors = read_priors(
-        prior_path or default_prior_path(model.name),
+        prior_path or default_priors(model.name),
         model.name,
         (*model.parameters, "sigma"),
         loads,

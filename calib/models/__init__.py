@@ -68,6 +68,6 @@ def get_model(name: str) -> Model:
         raise CalibError(
             f"there is no model {name!r}",
             allowed=", ".join(MODELS),
-            mend="use one of these names",
+            mend="use one of these names, or name the file of your own models (--models FILE)",
         )
     return MODELS[name]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -179,8 +178,8 @@ class Alone:
 class Model:
     """An equation that predicts an output from conditions: the only place for what is known of it.
 
-    A model of one's own needs `name`, `title`, `output`, `conditions`, `parameters` and `predict`;
-    a prior file ``NAME.toml`` lies beside the file that declares it.
+    A model of one's own needs `name`, `title`, `output`, `conditions`, `parameters`, `predict`,
+    `priors` and, for a template and simulation-based calibration, an `example`.
 
     Parameters
     ----------
@@ -213,8 +212,8 @@ class Model:
         Which parameters are sampled and why these, with the reference conditions in braces.
     example : str
         A CSV of the data it is calibrated on; without one, `calib.models.example_csv` makes it.
-    prior_file : Path, optional
-        Where its priors are, if not among the shipped ones.
+    priors : str
+        Its priors as the TOML text of a prior file, if they are not among the shipped ones.
     parabolic_in : str
         A condition in which its coefficients are parabolas, not to be trusted beyond the data.
     alone : Alone, optional
@@ -254,7 +253,7 @@ class Model:
     cited: str = ""
     parametrisation: str = "The parameters of the equation are sampled."
     example: str = ""
-    prior_file: Path | None = None
+    priors: str = ""
     parabolic_in: str = ""
     alone: Alone | None = None
     searched: Searched | None = None

@@ -52,16 +52,21 @@ def check_model(model: Model) -> None:
             f"the parameter {twice[0]} is there twice", where=where,
             allowed="each name once; sigma is the noise's", mend="rename one of them",
         )  # fmt: skip
-    if model.prior_file is None:
+    if not model.priors:
         raise CalibError(
             "the model has no priors", where=where,
-            allowed=f"prior_file=Path(__file__).with_name('{model.name}.toml')",
-            mend="write a prior file after the example that `calib priors` shows, and name it",
+            allowed="priors=... with the text of a prior file",
+            mend="write it after the example that `calib priors magic_formula` shows",
         )  # fmt: skip
     try:
-        tomllib.loads(model.prior_file.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        given = tomllib.loads(model.priors).get("parameters", {})
+    except tomllib.TOMLDecodeError as error:
         raise CalibError(
-            f"the priors of the model cannot be read ({error})", where=str(model.prior_file),
-            mend="write this file after the example that `calib priors` shows",
-        ) from None  # fmt: skip
+            f"its priors are not valid TOML: {error}", where=where, mend="correct that line"
+        ) from None
+    apart = sorted(set(names) ^ set(given))
+    if apart:
+        raise CalibError(
+            f"its priors and its parameters differ by {', '.join(apart)}", where=where,
+            allowed=", ".join(names), mend="give a prior for each of these, and for nothing else",
+        )  # fmt: skip

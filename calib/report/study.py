@@ -18,7 +18,7 @@ from calib.batch.threads import one_thread
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import PointEstimate, estimate, methods_for
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
@@ -174,7 +174,7 @@ def _silent(what: str, done: int, planned: int) -> None:
 def _without_folder(task: Task, error: Exception) -> str:
     """Return what failed; where the priors lie on this computer is nobody's business."""
     text = f"{type(error).__name__}: {error}"
-    path = task.prior_path or default_prior_path(task.model)
+    path = task.prior_path or default_priors(task.model)
     return text.replace(str(path), path.name)
 
 

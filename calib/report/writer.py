@@ -18,7 +18,7 @@ from calib.he2019.gaps.summary import summarise_gaps
 from calib.he2019.page.audit import write_audit
 from calib.he2019.page.gaps import begin_gaps_section
 from calib.inference.io import to_datatree, write_netcdf
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.figures import Plate
 from calib.report.figures.collect import plates
@@ -176,7 +176,7 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
     inputs = {}
     for key, result in study.results.items():
         task = result.task
-        prior_path = task.prior_path or default_prior_path(task.model)
+        prior_path = task.prior_path or default_priors(task.model)
         write_table(folder / "data" / f"{key}.csv", task.table.columns)
         data = (folder / "data" / f"{key}.csv").read_bytes()
         priors = prior_path.read_bytes()

@@ -16,7 +16,7 @@ from calib.batch.environment import sha256
 from calib.check.check import check
 from calib.check.items import Status
 from calib.errors import CalibError
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.study import run_study
 from calib.report.study_tasks import he2019_tasks
@@ -542,7 +542,7 @@ def test_another_version_explains_another_page_and_does_not_hide_it(report_here:
 
 
 def test_priors_of_another_version_are_not_called_wrong(report: Path) -> None:
-    shipped = default_prior_path("modified_bekker").read_bytes()
+    shipped = default_priors("modified_bekker").read_bytes()
     assert (report / "priors/rut_depth.toml").read_bytes() == shipped
     (report / "priors/rut_depth.toml").write_bytes(shipped + b"# of an earlier version\n")
     edit_json(report / "manifest.json", lambda m: m.update(code=sha256(b"")))

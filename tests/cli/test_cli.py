@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from calib.cli import main
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 from calib.models import MODELS, example_csv
 from calib.report.manifest import file_hashes
 
@@ -207,7 +207,7 @@ def test_templates_and_priors_are_printed_and_written(calib: Calib, model: str) 
     assert calib("template", model).out == example_csv(model)
     printed = calib("priors", model).out
     assert tomllib.loads(printed)["model"] == model
-    assert printed == default_prior_path(model).read_text(encoding="utf-8")
+    assert printed == default_priors(model).read_text(encoding="utf-8")
     for verb in ("template", "priors"):
         assert calib(verb, model, "--out", f"{verb}.txt").code == 0
         again = calib(verb, model, "--out", f"{verb}.txt")
@@ -363,7 +363,7 @@ def test_bad_data_of_a_report_and_a_prediction(
 
 
 def prior_text(old: str, new: str) -> str:
-    text = default_prior_path("modified_bekker").read_text(encoding="utf-8")
+    text = default_priors("modified_bekker").read_text(encoding="utf-8")
     assert old in text
     return text.replace(old, new, 1)
 

@@ -15,7 +15,7 @@ from calib.gap.case import Campaigns, Case, campaigns
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.which import Ranking, rank
-from calib.inference.prior_files import default_prior_path, read_priors
+from calib.inference.prior_files import default_priors, read_priors
 from calib.inference.problem import build_problem
 
 SHARED = Path(__file__).resolve().parents[3] / "shared" / "cases"
@@ -118,7 +118,7 @@ def parameters(effect: str, size: Mapping[str, float]) -> np.ndarray:
     Parameters that may be zero, because their prior is centred there, are zero.
     """
     names = EFFECTS[effect].parameters
-    path = default_prior_path(f"effects/{effect}")
+    path = default_priors(f"effects/{effect}")
     priors = read_priors(path, effect, names, {"normal_load_kn": 5.0})
     middle = priors.to_natural(np.array([[p.loc for p in priors.free]]))[0]
     return np.array([[size.get(n, float(m)) for n, m in zip(names, middle, strict=True)]])

@@ -11,7 +11,7 @@ import pytest
 from calib.data.quantities import role_of
 from calib.gap.effects import EFFECTS, View
 from calib.gap.effects.base import saturating
-from calib.inference.prior_files import default_prior_path, read_priors
+from calib.inference.prior_files import default_priors, read_priors
 from tests.gap.cases import make_case, parameters, simulate
 
 OUTPUTS = ("pull", "sinkage", "density")
@@ -245,7 +245,7 @@ def test_soil_effects_vanish_at_the_laboratorys_covariate(view):
 @pytest.mark.parametrize("name", EFFECTS)
 def test_every_effect_has_priors_with_units_and_reasons(name):
     priors = read_priors(
-        default_prior_path(f"effects/{name}"), name, EFFECTS[name].parameters, {"normal_load_kn": 5}
+        default_priors(f"effects/{name}"), name, EFFECTS[name].parameters, {"normal_load_kn": 5}
     )
     assert [p.name for p in priors.entries] == list(EFFECTS[name].parameters)
     for p in priors.entries:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import calib
 import calib.gap
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 GAP = Path(calib.gap.__file__).parent
@@ -71,7 +71,7 @@ def test_only_the_case_and_the_priors_are_opened(tmp_path):
     # The hook sees what is opened: the case's own files are there, and nothing else of its root.
     assert {p.name for p in inside} == {"case.toml", "lab.csv", "field.csv", "fresh.csv"}
     assert all(p.parent == case for p in inside)
-    priors = default_prior_path("magic_formula").parent
+    priors = default_priors("magic_formula").parent
     package = Path(calib.__file__).parent
     allowed = (case, out.parent, scratch, priors, package, Path(sys.prefix), Path(sys.base_prefix))
     strange = [

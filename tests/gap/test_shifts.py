@@ -26,7 +26,7 @@ from calib.gap.shifts import (
     another_soil,
     quantities,
 )
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 from calib.inference.sampling.mode import prior_widths
 from calib.models import MODELS as KNOWN
 from calib.report.page.gap_tables import shift_sizes
@@ -75,7 +75,7 @@ def test_alone_all_pressures_change_alike_and_shapes_less(data):
 
 
 def test_with_another_soil_they_covary_as_the_prior_file_says(data):
-    file = tomllib.loads(default_prior_path("shifts/another_soil").read_text())["parameters"]
+    file = tomllib.loads(default_priors("shifts/another_soil").read_text())["parameters"]
     ways = {name: np.array(row["ways"]) for name, row in file.items()}
     drawn = drawn_shifts(data, "soil")
     shared = {
@@ -110,7 +110,7 @@ def test_what_the_file_does_not_know_shifts_by_itself():
 def test_the_prior_names_quantities_of_the_models_and_says_where_it_comes_from():
     known = {q for m in KNOWN.values() for q in quantities(m.parameters)}
     assert set(another_soil()) <= known | {ZERO_OF_SLIP}
-    content = tomllib.loads(default_prior_path("shifts/another_soil").read_text())
+    content = tomllib.loads(default_priors("shifts/another_soil").read_text())
     for key in ("unit", "reason", "source"):
         assert len(content[key]) > 5
     assert len(content["ways"]) == len(next(iter(another_soil().values()))[0])
@@ -130,7 +130,7 @@ def test_the_prior_names_quantities_of_the_models_and_says_where_it_comes_from()
 )
 def test_a_damaged_prior_is_refused(tmp_path, monkeypatch, text, said):
     (tmp_path / "another_soil.toml").write_text(text)
-    monkeypatch.setattr(module, "default_prior_path", lambda _: tmp_path / "another_soil.toml")
+    monkeypatch.setattr(module, "default_priors", lambda _: tmp_path / "another_soil.toml")
     with pytest.raises(CalibError, match=said):
         another_soil()
 

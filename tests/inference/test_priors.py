@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.integrate import quad
 
 from calib.errors import CalibError
-from calib.inference.prior_files import default_prior_path, parse_priors, read_priors
+from calib.inference.prior_files import default_priors, parse_priors, read_priors
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
 
@@ -302,7 +302,7 @@ def test_shipped_priors_parse_with_reasons_and_sources(path: Path) -> None:
 
 def test_there_are_priors_for_every_model_and_they_give_its_parameters() -> None:
     for name, model in MODELS.items():
-        priors = read_priors(default_prior_path(name), name, (*model.parameters, "sigma"), {})
+        priors = read_priors(default_priors(name), name, (*model.parameters, "sigma"), {})
         assert tuple(p.name for p in priors.entries) == (*model.parameters, "sigma")
         assert priors.entries[-1].lower >= 0.0 or priors.entries[-1].log
 

@@ -17,7 +17,7 @@ from calib.data.quantities import OUTPUTS
 from calib.he2019.datasets import embedded
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import PUBLISHED
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.manifest import build_manifest, file_hashes
 from calib.report.study import Failure, OutputResult, Study, run_study
@@ -250,7 +250,7 @@ def test_the_mode_is_stated_with_its_density(study: Study) -> None:
 
 def test_a_failure_does_not_say_where_the_priors_lie(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(default_prior_path("bekker").read_text().replace("sd_log = ", "sd_log = -"))
+    path.write_text(default_priors("bekker").read_text().replace("sd_log = ", "sd_log = -"))
     (task,) = plan_tasks([load_he2019("rut_depth")], models=["bekker"], prior_paths=[path])
     error = run_study([task], 1).failures["rut_depth"].error
     assert "mine.toml, parameters." in error

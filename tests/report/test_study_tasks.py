@@ -11,7 +11,7 @@ from calib.data import read_table, table_from_arrays
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.he2019.datasets.embedded import load_he2019
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 from calib.report.study_tasks import HoldOut, choose_model, he2019_tasks, plan_tasks
 from tests.user_tables import pulls, table
 
@@ -123,7 +123,7 @@ def test_a_model_can_be_chosen_for_its_output() -> None:
 
 def test_a_prior_file_goes_to_the_model_it_names(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text(default_prior_path("bekker").read_text())
+    path.write_text(default_priors("bekker").read_text())
     table = load_he2019("rut_depth")
     assert plan_tasks([table], models=["bekker"], prior_paths=[path])[0].prior_path == path
     assert plan_tasks([table], prior_paths=[path])[0].prior_path is None

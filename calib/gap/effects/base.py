@@ -117,6 +117,8 @@ class Effect:
         Along what its size may depart from its formula, by the form error of the diagnosis
         (extrapolation: along inflation pressure, to values the simulator was not fitted at);
         empty where the formula is exact.
+    priors : str
+        Its priors as the text of a prior file, if they are in no file.
     prior_file : Path, optional
         Where its priors are, if not among the shipped ones.
     """
@@ -129,6 +131,7 @@ class Effect:
     covariates: tuple[str, ...] = ()
     varies: bool = True
     form: tuple[str, ...] = ()
+    priors: str = ""
     prior_file: Path | None = None
 
     def on_conditions(

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import importlib.util
 import inspect
 from pathlib import Path
 
+from calib.batch.plugins import run_file
 from calib.errors import CalibError
 from calib.gap.effects.base import Effect
 from calib.gap.effects.check import check_declared
@@ -29,30 +29,17 @@ def load_effects(path: Path) -> dict[str, Effect]:
         what it must be.
     """
     path = Path(path)
-    spec = importlib.util.spec_from_file_location(f"calib_user_{path.stem}", path)
-    if not path.is_file() or spec is None or spec.loader is None:
-        raise CalibError(
-            "the effects cannot be read", where=str(path), allowed="a Python file ending in .py",
-            mend="give the path of such a file",
-        )  # fmt: skip
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise CalibError(
-            f"the file does not run: {type(error).__name__}: {error}",
-            where=str(path),
-            mend="correct it",
-        ) from error
+    module = run_file(path, "effects")
     found: dict[str, Effect] = {}
     for _, kind in inspect.getmembers(module, inspect.isclass):
         if issubclass(kind, Effect) and kind.__module__ == module.__name__ and kind.name:
             effect = kind()
             check_declared(effect, path)
-            effect.prior_file = path.with_name(f"{effect.name}.toml")
-            if not effect.prior_file.is_file():
+            beside = path.with_name(f"{effect.name}.toml")
+            effect.prior_file = None if effect.priors else beside
+            if not effect.priors and not beside.is_file():
                 raise CalibError(
-                    f"the effect {effect.name} has no priors", where=str(effect.prior_file),
+                    f"the effect {effect.name} has no priors", where=str(beside),
                     mend="write this file after the example of priors/effects/rate_effect.toml",
                 )  # fmt: skip
             found[effect.name] = effect

@@ -10,7 +10,6 @@ from typing import Any
 from calib.models import get_model
 from calib.report.figures.labels import axis_of, joined
 from calib.report.numbers import format_number, format_value
-from calib.report.publish.equations import equation_numbers, letters
 from calib.report.publish.markup import joined_symbols
 from calib.report.publish.records import Output
 
@@ -54,10 +53,7 @@ def _everything(manifest: Mapping[str, Any], outputs: Sequence[Output]) -> list[
     """What holds for all outputs."""
     v, s = manifest["versions"], manifest["settings"]
     gate = s["gate"]
-    sentences = [
-        f"Published tyre-soil models [@He_2019] were calibrated with calib {v['terracalib']} "
-        "[@calib]."
-    ]
+    sentences = [f"Tyre-soil models were calibrated with calib {v['terracalib']} [@calib]."]
     labels = sorted({o.label for o in outputs if o.label})
     if labels:
         sentences.append(
@@ -92,7 +88,7 @@ def _everything(manifest: Mapping[str, Any], outputs: Sequence[Output]) -> list[
 
 def _genetic(settings: Mapping[str, Any]) -> str:
     return (
-        "The genetic algorithm of the source [@Cabrera_2004] weighted "
+        "The genetic algorithm [@Cabrera_2004] weighted "
         f"differences by {settings['F']:g}, had probabilities of crossover {settings['CP']:g} and "
         f"of mutation {settings['MP']:g}, a population of {settings['NP']} and at most "
         f"{settings['max_iterations']} generations."
@@ -104,10 +100,10 @@ def _output(o: Output) -> list[str]:
 
 
 def _model(o: Output) -> list[str]:
-    return [
-        f"The model is {equation_numbers(o.model)} of the source, [={o.model}], with "
-        f"{letters(o.model)}."
-    ]
+    model = get_model(o.model)
+    equation = f": [={o.model}]" if model.latex else ""
+    letters = f", with {model.letters}" if model.letters else ""
+    return [f"The model is {o.model_words}{equation}{letters}."]
 
 
 def _data(o: Output) -> list[str]:

@@ -41,8 +41,11 @@ class Output:
     @property
     def model_words(self) -> str:
         """The model by its title and its place in the source, with marks."""
-        title = get_model(self.model).title
-        return f"\u201c{title}\u201d ({equation_numbers(self.model)} of the source [@He_2019])"
+        model = get_model(self.model)
+        source = f"the source [@{model.cited}]" if model.cited else model.source
+        numbers = equation_numbers(self.model)
+        origin = f"{numbers} of {source}" if numbers and source else source
+        return f"\u201c{model.title}\u201d" + (f" ({origin})" if origin else "")
 
     @property
     def label(self) -> str:

@@ -8,12 +8,14 @@ are held out between the conditions that they are calibrated at.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from calib.data import Table, hold_out, table_from_arrays
+from calib.data import Table, hold_out, read_for_model, table_from_arrays
 from calib.he2019.datasets.embedded import load_he2019
-from calib.models import get_model
+from calib.models import Model, example_csv, get_model
 from calib.models.base import Array
 
 __all__ = ["Design", "design_of"]
@@ -58,6 +60,8 @@ def design_of(model_name: str) -> Design:
         If there is no such model.
     """
     model = get_model(model_name)
+    if model.priors:
+        return _of_example(model)
     if model.output == "bulk_density_g_cm3":
         return _density(model.name)
     if model.name == "magic_formula":
@@ -66,6 +70,18 @@ def design_of(model_name: str) -> Design:
     fitted, held = hold_out(load_he2019(key), _PSI, 30.0)
     text = f"{len(fitted)} embedded conditions of 18 and 42 psi; held out: {len(held)} of 30 psi"
     return Design(model.name, fitted, model.select(held.columns), text)
+
+
+def _of_example(model: Model) -> Design:
+    """The conditions of a model's own example."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / f"{model.name}.csv"
+        path.write_text(example_csv(model.name), encoding="utf-8")
+        table = read_for_model(path, (*model.conditions, model.output))
+    held = {name: 0.5 * (v[1:] + v[:-1]) for name, v in model.select(table.columns).items()}
+    n = len(table)
+    text = f"{n} conditions of the model's example; held out: {n - 1} midway between them"
+    return Design(model.name, table, held, text)
 
 
 def _density(name: str) -> Design:

@@ -10,7 +10,7 @@ import pytest
 from calib.batch.campaign import read_plan
 from calib.batch.campaign.kinds import KINDS
 from calib.errors import CalibError
-from calib.inference.prior_files import default_prior_path
+from calib.inference.prior_files import default_priors
 from tests.batch.campaign.sites import EFFECT, NAMES, WIND, make_site
 
 README = Path(__file__).resolve().parents[3] / "README.md"
@@ -52,7 +52,7 @@ def test_a_tasks_seed_is_its_own(folder):
 
 
 def test_fits_are_files_by_models_by_priors_by_hold_outs(folder):
-    shipped = default_prior_path("bekker").read_text()
+    shipped = default_priors("bekker").read_text()
     (folder / "wide.toml").write_text(shipped)
     found = planned(
         folder,
@@ -79,7 +79,7 @@ def test_the_readmes_plan_is_one(tmp_path):
     blocks = re.findall(r"```toml\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.S)
     text = next(block for block in blocks if "[[fit]]" in block)
     plan = make_site(tmp_path / "site", text)
-    (plan.parent / "my_priors.toml").write_text(default_prior_path("bekker").read_text())
+    (plan.parent / "my_priors.toml").write_text(default_priors("bekker").read_text())
     (plan.parent / "my_effects.py").write_text(EFFECT)
     (plan.parent / "wind.toml").write_text(WIND)
     tasks = read_plan(plan).tasks.values()
@@ -125,7 +125,7 @@ CASES = '[[challenge]]\nname = "a"\ndraw_seed = 1\n'
     ],
 )  # fmt: skip
 def test_a_plan_that_will_not_do_says_where_and_what_would(folder, text, said):
-    (folder / "soft.toml").write_text(default_prior_path("magic_formula").read_text())
+    (folder / "soft.toml").write_text(default_priors("magic_formula").read_text())
     with pytest.raises(CalibError) as caught:
         planned(folder, text)
     for part in ("plan.toml", *said):

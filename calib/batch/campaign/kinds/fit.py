@@ -20,7 +20,7 @@ from calib.he2019.datasets.embedded import labelled
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
-from calib.inference.prior_files import default_prior_path, prior_file_model
+from calib.inference.prior_files import default_priors, prior_file_model
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
@@ -95,7 +95,7 @@ class Fit(Kind[FitSection, FitItem]):
                         "hold_out": out, "max_steps": section.max_steps,
                         "posteriors": section.posteriors,
                     },
-                    {"data": path, "priors": prior_path},
+                    {"data": path} | ({"priors": prior_path} if prior_path else {}),
                 )  # fmt: skip
 
     def load(self, task: Task) -> FitItem:
@@ -104,7 +104,7 @@ class Fit(Kind[FitSection, FitItem]):
         table = labelled(read_for_model(task.inputs["data"], (*model.conditions, model.output)))
         kept = _held(task.settings["hold_out"])
         fitted, held = hold_out(table, kept.column, kept.value) if kept else (table, None)
-        problem = build_problem(model.name, fitted, task.inputs["priors"])
+        problem = build_problem(model.name, fitted, task.inputs.get("priors"))
         settings = SamplerSettings(max_steps=task.settings["max_steps"])
         return FitItem(problem, held, settings, task.settings["posteriors"])
 
@@ -123,14 +123,18 @@ class Fit(Kind[FitSection, FitItem]):
         return Work(numbers, _run_folder(calibration) if item.posterior else {})
 
 
-def _priors(section: FitSection, place: Place) -> dict[str, list[tuple[str, Path]]]:
+def _priors(section: FitSection, place: Place) -> dict[str, list[tuple[str, Path | None]]]:
     """Return names and paths of the prior files of each model."""
     with place.telling("models"):
-        found: dict[str, list[tuple[str, Path]]] = {get_model(m).name: [] for m in section.models}
+        found: dict[str, list[tuple[str, Path | None]]] = {
+            get_model(m).name: [] for m in section.models
+        }
     for name in section.priors:
         if name == SHIPPED:
             for model, files in found.items():
-                files.append((SHIPPED, default_prior_path(model)))
+                own = default_priors(model)
+                # A model's own are in its file, of which the plan knows nothing more.
+                files.append((SHIPPED, own if isinstance(own, Path) else None))
             continue
         path = place.file("priors", name)
         model = prior_file_model(path)

@@ -1,0 +1,112 @@
+"""Python files of a user's own, run once in every process: they register what they declare."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from importlib.metadata import entry_points
+from pathlib import Path
+from types import ModuleType
+
+from calib.errors import CalibError
+
+__all__ = ["ENTRY_POINTS", "inherit", "load_files", "load_installed", "run_file"]
+
+# Packages that declare one of these have it loaded; what it names registers itself.
+ENTRY_POINTS = ("terracalib.quantities", "terracalib.models", "terracalib.effects")
+# Worker processes find here what this one has loaded.
+_VARIABLE = "CALIB_MODELS"
+
+
+def run_file(path: Path, what: str) -> ModuleType:
+    """Run a Python file as a module of its own; one that has been run is not run again.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What it holds, for messages: ``"effects"``.
+
+    Raises
+    ------
+    CalibError
+        If it cannot be read or does not run, with the line.
+    """
+    path = Path(path).resolve()
+    name = f"calib_user_{path.stem}"
+    known = sys.modules.get(name)
+    if known is not None and known.__file__ == str(path):
+        return known
+    spec = importlib.util.spec_from_file_location(name, path)
+    if not path.is_file() or spec is None or spec.loader is None:
+        raise CalibError(
+            f"the {what} cannot be read", where=str(path), allowed="a Python file ending in .py",
+            mend="give the path of such a file",
+        )  # fmt: skip
+    module = importlib.util.module_from_spec(spec)
+    # Known by its name, so that what it defines can be handed to other processes.
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except CalibError:
+        sys.modules.pop(name)
+        raise
+    except Exception as error:
+        sys.modules.pop(name)
+        frames = traceback.extract_tb(error.__traceback__)
+        lines = [f.lineno for f in frames if Path(f.filename).resolve() == path]
+        at = f"{path}, line {lines[-1]}" if lines else str(path)
+        raise CalibError(
+            f"the file does not run: {type(error).__name__}: {error}", where=at, mend="correct it"
+        ) from error
+    return module
+
+
+def load_files(paths: Sequence[Path]) -> None:
+    """Run files that register quantities, models or effects, here and in processes to come.
+
+    Raises
+    ------
+    CalibError
+        If one cannot be run, or what it declares does not hold together.
+    """
+    for path in paths:
+        run_file(path, "models")
+    known = [p for p in os.environ.get(_VARIABLE, "").split(os.pathsep) if p]
+    new = [str(Path(p).resolve()) for p in paths]
+    if new:
+        os.environ[_VARIABLE] = os.pathsep.join(dict.fromkeys([*known, *new]))
+
+
+def inherit() -> None:
+    """Load what the process that started this one had loaded."""
+    load_installed()
+    for path in os.environ.get(_VARIABLE, "").split(os.pathsep):
+        if path:
+            run_file(Path(path), "models")
+
+
+def load_installed() -> None:
+    """Load what installed packages declare as entry points.
+
+    Raises
+    ------
+    CalibError
+        If one cannot be loaded, naming the package.
+    """
+    for group in ENTRY_POINTS:
+        for point in entry_points(group=group):
+            try:
+                found = point.load()
+            except Exception as error:
+                package = point.dist.name if point.dist else "an installed package"
+                raise CalibError(
+                    f"{point.name} of {package} cannot be loaded: {type(error).__name__}: {error}",
+                    where=f"entry point {group}",
+                    mend="update or remove the package",
+                ) from error
+            if hasattr(found, "register") and not isinstance(found, ModuleType):
+                found.register()

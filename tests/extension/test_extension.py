@@ -1,0 +1,258 @@
+"""Models, quantities and effects of a user's own go through every verb, from one file each."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calib
+from calib.data.quantities import QUANTITIES
+from calib.errors import CalibError
+from calib.gap.effects import EFFECTS
+from calib.models import MODELS
+from calib.models.base import BoundModel
+from calib.report.page.equations import equation
+from tests.cli.test_cli import Calib
+
+HERE = Path(__file__).parent
+FEW = ["--max-steps", 400]
+
+
+@pytest.fixture(autouse=True)
+def as_before() -> Iterator[None]:
+    """Forget what a test registers."""
+    before = [(r, set(r)) for r in (QUANTITIES, MODELS, EFFECTS)]
+    environment = os.environ.pop("CALIB_MODELS", None)
+    yield
+    for registry, names in before:
+        for name in set(registry) - names:
+            registry.discard(name)
+    for name in [m for m in sys.modules if m.startswith("calib_user_")]:
+        del sys.modules[name]
+    os.environ.pop("CALIB_MODELS", None)
+    if environment is not None:
+        os.environ["CALIB_MODELS"] = environment
+
+
+def field_of(example: str, rng: np.random.Generator) -> str:
+    """Return field rows of the torque's example at larger loads, a loss in them."""
+    lines = example.splitlines()
+    rows = [tuple(map(float, line.split(","))) for line in lines[1:]]
+    written = [lines[0]]
+    for slip, load, _ in rows:
+        for heavier in (1.25, 1.5):
+            mobilised = 1.0 - np.exp(-slip / 8.0)
+            loss = 0.25 * (heavier * load / 4.0 - 1.0)
+            torque = 0.4 * heavier * load * 0.6 * mobilised - loss + 0.02 * rng.standard_normal()
+            written.append(f"{slip:g},{heavier * load:g},{1000.0 * torque:.1f}")
+    return "\n".join(written) + "\n"
+
+
+def test_a_new_output_its_model_and_its_effect_go_through_every_verb(run: Calib) -> None:
+    own = ["--models", HERE / "wheel_torque.py"]
+    assert "janosi_torque: Wheel torque" in run("models", *own).out
+    assert 'model = "janosi_torque"' in run("priors", "janosi_torque", *own).out
+    example = run("template", "janosi_torque", *own).out
+    Path("torque.csv").write_text(example)
+    fitted = run("fit", "torque.csv", "--model", "janosi_torque", *own, "--out", "run", *FEW,
+                 "--hold-out", "normal_load_kn=4")  # fmt: skip
+    assert fitted.code == 0, fitted.err
+    predicted = run("predict", "run", "--at", "torque.csv", *own, "--out", "bands.csv")
+    assert "18 rows written" in predicted.out
+    assert "wheel_torque_knm_predictive_90_lower" in Path("bands.csv").read_text()
+    # A report chooses the model by the columns, as for any output.
+    made = run("report", "torque.csv", *own, "--out", "report", "--workers", 1, *FEW)
+    assert made.code == 0, made.err
+    assert "wheel_torque: converged" in made.out
+    summary = json.loads(Path("report/summary.json").read_text())
+    assert summary["models"]["wheel_torque"]["model"] == "janosi_torque"
+    methods = " ".join(Path("report/methods.txt").read_text().split())
+    assert "Janosi & Hanamoto (1961)" in methods
+    assert "He et al." not in methods
+    page = Path("report/index.html").read_text()
+    assert "could not be drawn" not in page
+    assert "Wheel torque" in page
+    checked = run("check", "report", *own, "--workers", 1)
+    assert checked.code == 0, checked.out
+    assert checked.out.startswith("SAME")
+    # Without the file nobody knows the model; the message says how to name it.
+    Path("field.csv").write_text(field_of(example, np.random.default_rng(1)))
+    found = run("diagnose", "--run", "run", "--field", "field.csv", *own, "--out", "gap",
+                "--workers", 1)  # fmt: skip
+    assert found.code == 0, found.err
+    assert found.out.startswith("verdict: effect (The gearbox takes more torque")
+    assert "could not be drawn" not in Path("gap/index.html").read_text()
+
+
+def test_without_its_file_a_model_is_unknown(
+    run: Calib,
+) -> None:
+    refused = run("template", "wismer_luth")
+    assert refused.code == 2
+    assert "--models FILE" in refused.err
+
+
+def test_a_traction_model_of_ones_own_is_simulated_and_reported(run: Calib) -> None:
+    own = ["--models", HERE / "wismer_luth.py"]
+    Path("pull.csv").write_text(run("template", "wismer_luth", *own).out)
+    proved = run("sbc", "--model", "wismer_luth", *own, "--simulations", 10, "--out", "sbc",
+                 "--workers", 1)  # fmt: skip
+    assert proved.code in (0, 1), proved.err
+    assert "wismer_luth  10" in proved.out
+    made = run("report", "pull.csv", *own, "--out", "report", "--workers", 1, *FEW)
+    assert made.code == 0, made.err
+    # It makes use of more of the columns than the Magic Formula.
+    summary = json.loads(Path("report/summary.json").read_text())
+    assert summary["models"]["drawbar_pull"]["model"] == "wismer_luth"
+    assert "Wismer &amp; Luth" in Path("report/index.html").read_text()
+
+
+def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause(run: Calib) -> None:
+    rng = np.random.default_rng(4)
+    slip = np.linspace(0.02, 0.6, 20)
+
+    def rows(load: np.ndarray) -> str:
+        pull = 1.5 * (1.0 - np.exp(-slip / 0.1)) * (load / 5.0) ** 0.7
+        pull = pull + 0.02 * rng.standard_normal(slip.size)
+        lines = [f"{s:.3f},{w:g},{p:.4f}" for s, w, p in zip(slip, load, pull, strict=True)]
+        return "slip_ratio,normal_load_kn,drawbar_pull_kn\n" + "\n".join(lines) + "\n"
+
+    Path("case").mkdir()
+    Path("case/lab.csv").write_text(rows(np.full(20, 5.0)))
+    Path("case/field.csv").write_text(rows(np.resize([3.0, 5.0, 8.0], 20)))
+    Path("case/case.toml").write_text(
+        'calibration = "lab.csv"\nfield = "field.csv"\n[models]\ndrawbar_pull = "magic_formula"\n'
+    )
+    own = ["--models", HERE / "load_sensitivity.py"]
+    found = run("diagnose", "case", *own, "--out", "gap", "--workers", 1)
+    assert found.code == 0, found.err
+    assert "load_sensitivity" in found.out.splitlines()[1]
+
+
+def test_a_plain_function_is_a_model() -> None:
+    def straight(theta: np.ndarray, conditions) -> np.ndarray:
+        return theta[:, :1] + theta[:, 1:2] * conditions["slip_ratio"]
+
+    prior = """
+[parameters.{name}]
+dist = "normal"
+mean = 0.0
+sd = 10.0
+unit = "kN"
+reason = "Wide"
+source = "Assumed"
+"""
+    priors = 'model = "straight"\n' + "".join(prior.format(name=n) for n in ("a", "b"))
+    priors += (
+        prior.format(name="sigma").replace("normal", "half_normal").replace("mean = 0.0\n", "")
+    )
+    model = calib.Model(
+        name="straight", title="A straight line", output="drawbar_pull_kn",
+        conditions=("slip_ratio",), parameters=("a", "b"), predict=straight, priors=priors,
+    )  # fmt: skip
+    calib.register(model)
+    rng = np.random.default_rng(1)
+    slip = np.linspace(0.0, 0.5, 30)
+    pull = 0.2 + 3.0 * slip + 0.05 * rng.standard_normal(30)
+    table = calib.table_from_arrays({"slip_ratio": slip, "drawbar_pull_kn": pull})
+    problem = calib.build_problem("straight", table)
+    found = calib.calibrate(problem, seed=1)
+    assert found.converged
+    design = np.column_stack([np.ones(30), slip])
+    exact = np.linalg.lstsq(design, pull, rcond=None)[0]
+    for name, value in zip(("a", "b"), exact, strict=True):
+        draws = found.parameters[name]
+        assert abs(draws.mean() - value) < 0.1 * draws.std()
+    # In every layout in which a likelihood or an effect asks for it.
+    bound = BoundModel(model, {})
+    theta = np.array([[0.2, 3.0], [0.1, 2.0], [0.0, 1.0], [1.0, 0.0], [2.0, 0.5]])
+    each = np.stack([straight(t[None], {"slip_ratio": slip})[0] for t in theta])
+    np.testing.assert_allclose(bound.location(theta, {"slip_ratio": slip}), each)
+    own = np.tile(slip, (5, 1)) * np.arange(1.0, 6.0)[:, None]
+    apart = np.stack(
+        [straight(t[None], {"slip_ratio": s})[0] for t, s in zip(theta, own, strict=True)]
+    )
+    np.testing.assert_allclose(bound.location(theta, {"slip_ratio": own}), apart)
+    sse = np.square(pull - each).sum(axis=1)
+    np.testing.assert_allclose(problem.squares(theta), sse)
+
+
+def test_a_function_that_does_not_broadcast_is_evaluated_vector_by_vector() -> None:
+    def looped(theta, conditions):
+        slip = conditions["slip_ratio"]
+        return np.array([[t[0] * s for s in slip] for t in theta])
+
+    model = calib.Model(
+        name="looped", title="", output="drawbar_pull_kn", conditions=("slip_ratio",),
+        parameters=("a",), predict=looped,
+    )  # fmt: skip
+    theta, slip = np.arange(1.0, 6.0)[:, None], np.arange(20.0).reshape(5, 4)
+    found = BoundModel(model, {}).location(theta, {"slip_ratio": slip})
+    np.testing.assert_allclose(found, theta * slip)
+
+
+def declared(**changes: object) -> calib.Model:
+    fields = {
+        "name": "mine", "title": "", "output": "drawbar_pull_kn", "conditions": ("slip_ratio",),
+        "parameters": ("a",), "predict": lambda theta, conditions: theta,
+        "priors": '[parameters.a]\n[parameters.sigma]\n',
+    } | changes  # fmt: skip
+    return calib.Model(**fields)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"name": "my model"}, ["must be a word"]),
+        ({"name": "bekker"}, ["there is a model 'bekker' already"]),
+        ({"conditions": ("slip",)}, ["no quantity 'slip'", "slip_ratio"]),
+        ({"output": "slip_ratio"}, ["slip_ratio is no output", "drawbar_pull_kn"]),
+        ({"parameters": ("a", "a")}, ["the parameter a is there twice"]),
+        ({"priors": ""}, ["has no priors", "calib priors"]),
+        ({"priors": "x ="}, ["not valid TOML"]),
+        ({"priors": "[parameters.a]\n[parameters.b]\n"}, ["differ by b, sigma"]),
+    ],
+)
+def test_what_is_declared_wrongly_is_named(changes: dict[str, object], words: list[str]) -> None:
+    with pytest.raises(CalibError) as caught:
+        calib.register(declared(**changes))
+    for word in [*words, "to mend:"]:
+        assert word in str(caught.value)
+
+
+def test_a_quantity_must_read_as_itself() -> None:
+    torque = {
+        "stem": "hub_torque", "canonical": "hub_torque_knm", "kind": "torque", "unit": "kN*m",
+        "role": "output", "description": "torque", "suffixes": {"knm": "kN*m"},
+    }  # fmt: skip
+    calib.register(calib.Quantity(**torque))
+    assert calib.table_from_arrays({"hub_torque_knm": np.ones(3)})["hub_torque_knm"].size == 3
+    with pytest.raises(CalibError, match="does not name hub_torque"):
+        calib.register(calib.Quantity(**torque | {"canonical": "torque"}))
+    with pytest.raises(CalibError, match="no suffix for its own unit"):
+        calib.register(calib.Quantity(**torque | {"suffixes": {}}))
+    with pytest.raises(CalibError, match="a quantity 'hub_torque_knm' already"):
+        calib.register(calib.Quantity(**torque))
+    with pytest.raises(CalibError, match="cannot be registered"):
+        calib.register("hub_torque")  # type: ignore[arg-type]
+
+
+def test_a_file_that_does_not_run_is_named_with_its_line(run: Calib) -> None:
+    Path("mine.py").write_text("import calib\n\nx = 1 / 0\n")
+    refused = run("models", "--models", "mine.py")
+    assert refused.code == 2
+    assert "mine.py, line 3" in refused.err
+    assert "ZeroDivisionError" in refused.err
+    assert "cannot be read" in run("models", "--models", "nothing.py").err
+
+
+def test_equations_are_read_from_their_latex() -> None:
+    model = declared(latex=(r"$\frac{a}{b} \sqrt{x_1} - \mathrm{CI}^{2n}$",), numbers="Eq 3")
+    assert model.equation == "(a)/(b) \u221a(x_1) - CI^(2n)  (Eq 3)"
+    assert "<i>x</i><sub>1</sub>" in equation(BoundModel(model, {}))
