@@ -28,7 +28,7 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings, sample_posterior
 from calib.models.base import Array
-from calib.report.study_tasks import he2019_tasks
+from calib.he2019.tasks import he2019_tasks
 
 # Draws of each sampler: its defaults, and so many that what comes before them is of no account.
 OURS = {"default": {}, "long": {"walkers": 1024, "steps": 640}}

@@ -67,7 +67,8 @@ def report(
     from calib.he2019.gaps.cases import paper_gaps
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.report.contents import work_out
-    from calib.report.study_tasks import he2019_tasks, plan_tasks
+    from calib.report.study_tasks import plan_tasks
+    from calib.he2019.tasks import he2019_tasks
     from calib.report.writer import write_report
     from calib.validation.outliers import outlying_notes
 

@@ -15,7 +15,7 @@ from calib.errors import CalibError
 from calib.inference.prior_files import prior_file_model
 from calib.models import MODELS, get_model
 
-__all__ = ["HoldOut", "Task", "choose_model", "fitted_rows", "he2019_tasks", "plan_tasks"]
+__all__ = ["HoldOut", "Task", "choose_model", "fitted_rows", "plan_tasks"]
 
 # A report's figures and leave-one-out hold a number for every draw and row.
 MAX_ROWS = 5000
@@ -185,22 +185,6 @@ def _check_held_out(tasks: Sequence[Task], held_out: HoldOut) -> None:
             refusals.append(error)
     if len(refusals) == len(tasks):
         raise refusals[0]
-
-
-def he2019_tasks() -> tuple[Task, ...]:
-    """Return the paper's three calibrations on the embedded, reconstructed data.
-
-    The 30 psi rows of drawbar pull and rut depth are held out.
-    """
-    from calib.he2019.datasets.embedded import load_he2019
-
-    held = HoldOut("inflation_pressure_psi", 30.0)
-    models = {
-        "bulk_density": ("ayers_perumpral", None),
-        "drawbar_pull": ("magic_formula_pressure", held),
-        "rut_depth": ("modified_bekker", held),
-    }
-    return tuple(Task(key, model, load_he2019(key), rows) for key, (model, rows) in models.items())
 
 
 def fitted_rows(task: Task) -> tuple[Table, Table | None]:

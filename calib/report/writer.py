@@ -26,6 +26,7 @@ from calib.report.figures.export import pdf_bytes, png
 from calib.report.manifest import build_manifest, file_hashes
 from calib.report.page.render import render_page
 from calib.report.publish import publication
+from calib.report.reference import reference_of
 from calib.report.study import OutputResult, Study
 from calib.report.summary import summarise
 
@@ -95,7 +96,7 @@ def write_report(
         inputs = _copy_inputs(study, folder)
         (folder / "figures").mkdir()
         pieces = {
-            key: pool.submit(_write_output, key, result, folder, _embedded(study, key), pdf)
+            key: pool.submit(_write_output, key, result, folder, pdf)
             for key, result in successes.items()
         }
         versions = (environment or Environment.here()).versions
@@ -147,12 +148,12 @@ def write_report(
 
 
 def _write_output(
-    key: str, result: OutputResult, folder: Path, published: bool, pdf: bool
+    key: str, result: OutputResult, folder: Path, pdf: bool
 ) -> tuple[list[Plate], dict[str, bytes]]:
     """Write posterior and figures of an output; return what the page shows of the figures."""
     write_netcdf(to_datatree(result.calibration), folder / f"{key}.nc")
     drawn, images = [], {}
-    for plate in plates(result, published=published):
+    for plate in plates(result, reference_of(result.task.table.label)):
         drawn.append(replace(plate, figure=None))
         if plate.figure is None:
             continue
@@ -163,10 +164,6 @@ def _write_output(
             file = folder / "figures" / f"{key}_{plate.name}.pdf"
             file.write_bytes(pdf_bytes(plate.figure))
     return drawn, images
-
-
-def _embedded(study: Study, key: str) -> bool:
-    return study.results[key].task.table.label != ""
 
 
 def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:

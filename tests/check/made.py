@@ -14,6 +14,7 @@ from unittest.mock import patch
 from calib.he2019.audit import Seeds
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.gaps.cases import paper_gaps
+from calib.he2019.tasks import he2019_tasks
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
@@ -27,7 +28,7 @@ from calib.report.figures.bands import bands_plate
 from calib.report.figures.learned import learned_plate
 from calib.report.figures.style import style
 from calib.report.study import OutputResult, Study, run_study
-from calib.report.study_tasks import Task, he2019_tasks
+from calib.report.study_tasks import Task
 from calib.report.writer import write_report
 from tests.check.kernels import Setting, skip_what_crashes
 

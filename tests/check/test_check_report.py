@@ -16,10 +16,10 @@ from calib.batch.environment import sha256
 from calib.check.check import check
 from calib.check.items import Status
 from calib.errors import CalibError
+from calib.he2019.tasks import he2019_tasks
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.study import run_study
-from calib.report.study_tasks import he2019_tasks
 from calib.report.writer import write_report
 from tests.check.conftest import different, edit_json, findings, seal
 from tests.check.made import rut_study, write

@@ -17,12 +17,12 @@ from calib.check.montecarlo import (
 )
 from calib.check.numbers import compare_entries, flatten
 from calib.data import hold_out
+from calib.he2019.tasks import he2019_tasks
 from calib.inference.calibration import calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
 from calib.inference.random import generator
 from calib.report.study import run_study
-from calib.report.study_tasks import he2019_tasks
 from calib.report.summary import summarise
 from calib.validation.scores import score
 from calib.validation.validate import Validation, leave_one_out, validate_held_out

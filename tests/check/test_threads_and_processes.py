@@ -22,11 +22,12 @@ import pytest
 from calib.he2019.audit import Seeds, audit_json
 from calib.he2019.gaps.cases import paper_gaps
 from calib.he2019.gaps.summary import summarise_gaps
+from calib.he2019.tasks import he2019_tasks
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.contents import work_out
 from calib.report.manifest import file_hashes
 from calib.report.study import run_study
-from calib.report.study_tasks import Task, he2019_tasks
+from calib.report.study_tasks import Task
 from calib.report.summary import summarise
 from calib.report.writer import write_report
 from calib.validation.sbc.run import run_sbc

@@ -71,7 +71,7 @@ def test_the_report_of_the_embedded_data_has_the_section(
         asked.append(seed)
         return lambda tell: (found_gaps["plain_bekker"],)
 
-    monkeypatch.setattr("calib.report.study_tasks.he2019_tasks", lambda: ())
+    monkeypatch.setattr("calib.he2019.tasks.he2019_tasks", lambda: ())
     monkeypatch.setattr("calib.report.contents.begin_gaps", begin)
     monkeypatch.setattr("calib.report.contents.begin_convergence", lambda *_: None)
     monkeypatch.setattr("calib.report.contents.run_audit", lambda *_, **__: audit)

@@ -7,10 +7,10 @@ from pathlib import Path
 from calib.batch.pool import pool
 from calib.he2019.audit import Seeds
 from calib.he2019.gaps.cases import paper_gaps
+from calib.he2019.tasks import he2019_tasks
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.contents import work_out
 from calib.report.manifest import file_hashes
-from calib.report.study_tasks import he2019_tasks
 from calib.report.writer import write_report
 
 SHORT = SamplerSettings(steps=60, max_steps=60)

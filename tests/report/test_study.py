@@ -17,11 +17,12 @@ from calib.data.quantities import OUTPUTS
 from calib.he2019.datasets import embedded
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.tasks import he2019_tasks
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.manifest import build_manifest, file_hashes
 from calib.report.study import Failure, OutputResult, Study, run_study
-from calib.report.study_tasks import Task, he2019_tasks, plan_tasks
+from calib.report.study_tasks import Task, plan_tasks
 from calib.report.summary import summarise
 from tests.user_tables import pulls, table
 

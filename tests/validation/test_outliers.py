@@ -9,9 +9,9 @@ import pytest
 from scipy import stats
 
 from calib.data.quantities import OUTPUTS
+from calib.he2019.tasks import he2019_tasks
 from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.mode import find_mode
-from calib.report.study_tasks import he2019_tasks
 from calib.validation.outliers import LEVEL, outlying_notes, outlying_rows
 from tests.custom_problems import normal, problem_of
 

@@ -15,75 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from decimal import Decimal
 from types import MappingProxyType
+
+from calib.report.reference import Figure, FittedTable
 
 __all__ = ["DOI", "PUBLISHED", "Figure", "FittedTable", "Published", "Setup", "printed_figures"]
 
 DOI = "10.1016/j.jterra.2019.07.003"
-
-
-@dataclass(frozen=True)
-class Figure:
-    """One printed figure.
-
-    Parameters
-    ----------
-    text : str
-        The figure as printed, in the stated unit; percentages as fractions.
-    unit : str
-        "1" where there is none.
-    note : str
-        What was inferred, and from what; empty where nothing was.
-    """
-
-    text: str
-    unit: str = "1"
-    note: str = ""
-
-    @property
-    def value(self) -> float:
-        """The figure as a number."""
-        return float(self.text)
-
-    @property
-    def half_unit(self) -> float:
-        """Half a unit of the last printed digit."""
-        exponent = Decimal(self.text).as_tuple().exponent
-        return 0.5 * 10.0 ** int(exponent)
-
-    def agrees(self, value: float) -> bool:
-        """Whether a value, rounded to the printed digits, is this figure."""
-        return abs(value - self.value) <= self.half_unit
-
-
-@dataclass(frozen=True)
-class FittedTable:
-    """Estimates of one model, and the goodness of fit printed with them.
-
-    Parameters
-    ----------
-    source : str
-        Where they are printed.
-    model : str
-        The equations fitted.
-    estimates, quality : mapping of str to Figure
-        Parameters, and what is said of the fit.
-    note : str
-        How to read them.
-    """
-
-    source: str
-    model: str
-    estimates: Mapping[str, Figure]
-    quality: Mapping[str, Figure]
-    note: str = ""
-    doi: str = DOI
-
-    @property
-    def values(self) -> dict[str, float]:
-        """The estimates as numbers."""
-        return {name: figure.value for name, figure in self.estimates.items()}
 
 
 @dataclass(frozen=True)
@@ -183,6 +121,7 @@ def _magic(table: int, psi: int, *printed: str) -> FittedTable:
     B, C, D, E, cost = printed
     note = _SIGN_OF_E_18 if psi == 18 else _SIGN_OF_E
     return FittedTable(
+        doi=DOI,
         source=f"Table {table}, {psi} psi",
         model="Eqs 3-5 with Sh = Sv = 0, slip in percent, drawbar pull in kN",
         estimates=_frozen(
@@ -194,6 +133,7 @@ def _magic(table: int, psi: int, *printed: str) -> FittedTable:
 
 
 _BULK_DENSITY = FittedTable(
+    doi=DOI,
     source="Table 1",
     model="Eq 1, density in g/cm^3, cone index in kPa, gravimetric water content in g/g",
     estimates=_frozen(
@@ -213,6 +153,7 @@ _BULK_DENSITY = FittedTable(
 )  # fmt: skip
 
 _PRESSURE = FittedTable(
+    doi=DOI,
     source="Table 5",
     model="Eqs 12-15 in inflation pressure in psi, least squares of Eq 16 over 42 points",
     estimates=_frozen(
@@ -239,6 +180,7 @@ _PRESSURE = FittedTable(
 )
 
 _RUT_DEPTH = FittedTable(
+    doi=DOI,
     source="Table 6",
     model="Eq 22, ln pgr = ln k + (n0 + n1 s) ln zt, fitted to 18 and 42 psi, slips to 20 %",
     estimates=_frozen(

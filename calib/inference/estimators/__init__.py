@@ -2,55 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from calib.batch.threads import one_thread
 from calib.errors import CalibError
-from calib.he2019.estimators.geometric import estimate_geometric
-from calib.he2019.estimators.rut_regression import (
-    RutRegression,
-    estimate_published_regression,
-    rut_regression,
-)  # fmt: skip
 from calib.inference.estimators.base import PointEstimate
-from calib.inference.estimators.differential_evolution import estimate_differential_evolution
-from calib.inference.estimators.genetic import GeneticSettings, estimate_genetic, minimise_genetic
-from calib.inference.estimators.least_squares import estimate_least_squares
+from calib.inference.estimators.genetic import GeneticSettings, minimise_genetic
+from calib.inference.estimators.methods import METHODS, Method, method_name
 from calib.inference.problem import Problem
-from calib.models import MODELS, get_model
+from calib.models import get_model
 
 __all__ = [
-    "METHODS", "GeneticSettings", "PointEstimate", "RutRegression", "compare", "estimate",
-    "methods_for", "minimise_genetic", "rut_regression",
+    "METHODS", "GeneticSettings", "Method", "PointEstimate", "compare", "estimate", "method_name",
+    "methods_for", "minimise_genetic",
 ]  # fmt: skip
-
-METHODS = (
-    "geometric", "genetic", "differential_evolution", "least_squares", "published_regression",
-)  # fmt: skip
-
-_ESTIMATORS: Mapping[str, Callable[..., PointEstimate]] = MappingProxyType(
-    {
-        "geometric": estimate_geometric,
-        "genetic": estimate_genetic,
-        "differential_evolution": estimate_differential_evolution,
-        "least_squares": estimate_least_squares,
-        "published_regression": estimate_published_regression,
-    }
-)
-_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "geometric": ("magic_formula", "magic_formula_pressure"),
-        "published_regression": ("bekker", "modified_bekker"),
-    }
-)
 
 
 def methods_for(model_name: str) -> tuple[str, ...]:
-    """Return the methods that apply to a model, in the order of `METHODS`.
+    """Return the methods that apply to a model, in their order.
 
     Raises
     ------
@@ -58,7 +30,8 @@ def methods_for(model_name: str) -> tuple[str, ...]:
         If there is no model of that name.
     """
     name = get_model(model_name).name
-    return tuple(method for method in METHODS if name in _MODELS.get(method, MODELS))
+    known = sorted(METHODS.values(), key=lambda method: method.place)
+    return tuple(m.name for m in known if not m.models or name in m.models)
 
 
 @one_thread()
@@ -91,7 +64,7 @@ def estimate(
             allowed=", ".join(methods_for(model)),
             mend="use one of these methods",
         )
-    return _ESTIMATORS[method](problem, rng, **settings)
+    return METHODS[method].estimate(problem, rng, **settings)
 
 
 def compare(

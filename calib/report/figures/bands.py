@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from calib.he2019.figures.reference import published_curve
 from calib.models.base import Array
 from calib.report.figures.labels import axis_of, joined, short
 from calib.report.figures.plate import Plate
@@ -33,6 +32,7 @@ from calib.report.figures.style import (
     legend_below,
     panels,
 )
+from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 from calib.validation.prediction import Bands
 
@@ -64,14 +64,14 @@ def scatter_points(ax: Axes, x: Array, y: Array, *, held: bool) -> Any:
     return ax.plot(x, y, "o", ms=3.6, color=BLACK, mec="white", mew=0.4, ls="none", zorder=4)[0]
 
 
-def bands_plate(result: OutputResult, *, published: bool) -> Plate:
+def bands_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
     """Draw the predictive bands of an output along slip or pressure.
 
     Parameters
     ----------
     result : OutputResult
-    published : bool
-        Whether to add the published fit.
+    reference : Reference, optional
+        Whose fit is added.
     """
     problem = result.calibration.problem
     x_axis, y_axis = axis_of(x_column(result)), axis_of(problem.bound.model.output)
@@ -85,7 +85,7 @@ def bands_plate(result: OutputResult, *, published: bool) -> Plate:
     )  # fmt: skip
     handles: dict[str, Any] = {}
     for ax, group in zip(axes.flat, shown, strict=False):
-        handles |= _panel(ax, result, group, published)
+        handles |= _panel(ax, result, group, reference)
         ax.set_title(group.title, color=EMBER if group.held else BLACK,
                      weight="bold" if group.held else "normal")  # fmt: skip
         ax.set_xlabel(x_axis.label)
@@ -100,13 +100,13 @@ def bands_plate(result: OutputResult, *, published: bool) -> Plate:
     return Plate(fig, "bands", _caption(result, len(shown)), "Prediction and data")
 
 
-def _panel(ax: Axes, result: OutputResult, group: Group, published: bool) -> dict[str, Any]:
+def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -> dict[str, Any]:
     problem, held = result.calibration.problem, held_table(result)
     x, y = x_column(result), problem.bound.model.output
     conditions = grid(result, group)
     scale = axis_of(x).scale
     handles = fill_bands(ax, scale(conditions[x]), *smooth_bands(result.calibration, conditions))
-    curve = published_curve(problem.bound.model.name, conditions) if published else None
+    curve = reference.curve(problem.bound.model.name, conditions)
     if curve is not None:
         (handles[f"published fit ({curve[1]})"],) = ax.plot(
             scale(conditions[x]), curve[0], color=ORANGE, lw=1.4, ls=DASHES[3], zorder=3

@@ -14,6 +14,7 @@ from calib.report.figures.plate import Plate, draw_all
 from calib.report.figures.prior_predictive import prior_predictive_plate
 from calib.report.figures.residuals import residuals_plate
 from calib.report.figures.validation import validation_plate
+from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 
 __all__ = ["plates"]
@@ -21,14 +22,14 @@ __all__ = ["plates"]
 type _Draw = Callable[[], Plate | None]
 
 
-def plates(result: OutputResult, published: bool = False) -> list[Plate]:
+def plates(result: OutputResult, reference: Reference = NOTHING) -> list[Plate]:
     """Draw the figures of an output.
 
     Parameters
     ----------
     result : OutputResult
-    published : bool
-        Whether the data are the embedded ones, so that the published figures belong beside them.
+    reference : Reference, optional
+        What the source of the data printed, to be shown beside them.
 
     Returns
     -------
@@ -41,15 +42,15 @@ def plates(result: OutputResult, published: bool = False) -> list[Plate]:
         "bands": (
             (lambda: density_plate(result))
             if density
-            else (lambda: bands_plate(result, published=published))
+            else (lambda: bands_plate(result, reference=reference))
         ),
-        "validation": lambda: validation_plate(result, published=published),
+        "validation": lambda: validation_plate(result, reference=reference),
         "prior_predictive": lambda: prior_predictive_plate(result),
-        "learned": lambda: learned_plate(result, published=published),
-        "corner": lambda: corner_plate(result, published=published),
+        "learned": lambda: learned_plate(result, reference=reference),
+        "corner": lambda: corner_plate(result, reference=reference),
         "ensembles": lambda: ensembles_plate(result),
         "residuals": lambda: residuals_plate(result),
-        "estimates": lambda: estimates_plate(result, published=published),
-        "by_pressure": lambda: by_pressure_plate(result, published=published),
+        "estimates": lambda: estimates_plate(result, reference=reference),
+        "by_pressure": lambda: by_pressure_plate(result, reference=reference),
     }
     return draw_all(drawings)

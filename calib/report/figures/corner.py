@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
-from calib.he2019.figures.reference import published_sampled
 from calib.inference.calibration import Calibration
 from calib.inference.priors import Prior
 from calib.models.base import Array
@@ -29,6 +28,7 @@ from calib.report.figures.style import (
     SYMBOL_PT,
     WIDE,
 )
+from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 
 __all__ = ["corner_plate"]
@@ -77,17 +77,17 @@ class _Cells:
         return np.asarray(found[:: -(-found.size // most)])
 
 
-def corner_plate(result: OutputResult, *, published: bool) -> Plate:
+def corner_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
     """Draw every pair of sampled parameters.
 
     Parameters
     ----------
     result : OutputResult
-    published : bool
-        Whether to mark what the published figures amount to.
+    reference : Reference, optional
+        Whose figures are marked.
     """
     draws, priors, wide = _sampled(result.calibration)
-    marks = published_sampled(result.calibration.problem.bound) if published else {}
+    marks = reference.sampled(result.calibration.problem.bound)
     at = [
         np.log10(marks[p.name]) if w and p.name in marks else marks.get(p.name)
         for p, w in zip(priors, wide, strict=True)

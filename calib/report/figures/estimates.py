@@ -8,10 +8,8 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from calib.he2019.datasets.published import PUBLISHED
-from calib.he2019.figures.reference import published_parameters, published_source
 from calib.inference.diagnostics import hdi
-from calib.inference.estimators import PointEstimate
+from calib.inference.estimators import PointEstimate, method_name
 from calib.models.base import Array
 from calib.models.magic_formula_pressure import coefficients_at
 from calib.report.figures.labels import NO_UNIT, joined, parameter_label, plain, short, symbol
@@ -28,18 +26,15 @@ from calib.report.figures.style import (
     legend_below,
     panels,
 )
+from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 
-__all__ = ["METHOD_NAMES", "by_pressure_plate", "distances", "estimates_plate"]
+__all__ = ["by_pressure_plate", "distances", "estimates_plate"]
 
-METHOD_NAMES: Mapping[str, str] = {
-    "geometric": "geometric (Eqs 6-9)",
-    "genetic": "genetic algorithm",
-    "differential_evolution": "differential evolution",
-    "least_squares": "least squares",
-    "published_regression": "regression as published (Eq 22)",
-}
-_LOOKS = {name: (MARKERS[i], CYCLE[i]) for i, name in enumerate(METHOD_NAMES)}
+_KNOWN = (
+    "geometric", "genetic", "differential_evolution", "least_squares", "published_regression",
+)  # fmt: skip
+_LOOKS = {name: (MARKERS[i], CYCLE[i]) for i, name in enumerate(_KNOWN)}
 # Estimates farther off than this many posterior sds are drawn at the edge.
 _EDGE = 5.0
 _WIDE = 4.0
@@ -74,19 +69,19 @@ def distances(draws: Array, values: Array) -> tuple[Array, Array, bool]:
     return (x - mean) / sd, (to(np.array([low, high])) - mean) / sd, log
 
 
-def estimates_plate(result: OutputResult, *, published: bool) -> Plate:
+def estimates_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
     """Draw every method's estimate of every published parameter, in posterior sds.
 
     Parameters
     ----------
     result : OutputResult
-    published : bool
-        Whether to add the published figures.
+    reference : Reference, optional
+        Whose figures are added.
     """
     calibration = result.calibration
     reported = {k: v for k, v in calibration.reported.items() if np.ptp(v) > 0.0}
     model = calibration.problem.bound.model
-    printed = published_parameters(model.name) if published else {}
+    printed = reference.parameters(model.name)
     fig, axes = panels(
         1,
         1,
@@ -108,7 +103,7 @@ def estimates_plate(result: OutputResult, *, published: bool) -> Plate:
             interval, [i, i], color="#c4c4c4", lw=4.0, solid_capstyle="butt"
         )
         (handles["posterior mean"],) = ax.plot(0.0, i, "|", color=BLACK, ms=9.0, mew=1.3, zorder=3)
-        handles |= _row(ax, i, distance, result.estimates, published_source(model.name))
+        handles |= _row(ax, i, distance, result.estimates, reference.source(model.name))
         names.append(f"ln {symbol(name)}" if log else symbol(name))
     reach = 1.08 * min(_EDGE, reach)
     ax.set_xlim(-reach, reach)
@@ -118,7 +113,7 @@ def estimates_plate(result: OutputResult, *, published: bool) -> Plate:
     ax.set_xlabel("Distance from the posterior mean (posterior sds)")
     ax.set_ylabel(f"Parameter ({NO_UNIT})")
     legend_below(fig, list(handles.values()), list(handles), 3)
-    return Plate(fig, "estimates", _caption(result, reported, published), "Point estimates")
+    return Plate(fig, "estimates", _caption(result, reported, reference), "Point estimates")
 
 
 def _row(
@@ -128,7 +123,7 @@ def _row(
     spread = np.linspace(-0.33, 0.33, max(2, len(estimates)))
     for k, (estimate, d) in enumerate(zip(estimates, distance[:-1], strict=True)):
         if np.isfinite(d):
-            name = METHOD_NAMES.get(estimate.method, estimate.method)
+            name = method_name(estimate.method)
             marker, colour = _LOOKS.get(estimate.method, ("P", GREY))
             handles[name] = _dot(ax, float(d), i + float(spread[k]), marker, colour)
     if np.isfinite(distance[-1]):
@@ -151,7 +146,7 @@ def _dot(ax: Axes, d: float, y: float, marker: str, colour: str, *, ring: bool =
     return dot
 
 
-def _caption(result: OutputResult, reported: Mapping[str, Array], published: bool) -> str:
+def _caption(result: OutputResult, reported: Mapping[str, Array], reference: Reference) -> str:
     lowest = min((e.cost for e in result.estimates), default=0.0)
     # Of costs that are equal but for their rounding, that of the most exact method: it comes last.
     best = next((e for e in reversed(result.estimates) if e.cost <= lowest * (1.0 + 1e-9)), None)
@@ -166,15 +161,16 @@ def _caption(result: OutputResult, reported: Mapping[str, Array], published: boo
     how = f"within {short(distance)}" if distance < 100.0 else "up to more than 100"
     text = (
         f"The lowest cost, {short(best.cost, 3)}, was found by "
-        f"{METHOD_NAMES.get(best.method, best.method)}; its estimates lie "
+        f"{method_name(best.method)}; its estimates lie "
         f"{how} posterior sds of the posterior mean ({plain(far)} is farthest)."
     )
-    printed = published_parameters(result.calibration.problem.bound.model.name)
-    if published and printed:
+    name = result.calibration.problem.bound.model.name
+    printed = reference.parameters(name)
+    if printed:
         outside = [
             plain(n) for n in names if n in printed and _outside(result, n, printed[n].value)
         ]
-        source = published_source(result.calibration.problem.bound.model.name)
+        source = reference.source(name)
         text += (
             f" Of the published figures ({source}), {joined(outside)} "
             f"{'lies' if len(outside) == 1 else 'lie'} outside the posterior's 95 % HDI."
@@ -189,7 +185,7 @@ def _outside(result: OutputResult, name: str, value: float) -> bool:
     return not s.hdi_lower <= value <= s.hdi_upper
 
 
-def by_pressure_plate(result: OutputResult, *, published: bool) -> Plate | None:
+def by_pressure_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate | None:
     """Draw B, C, D and E of each pressure by method; None where pressures were not fitted alone.
 
     Parameters
@@ -210,7 +206,7 @@ def by_pressure_plate(result: OutputResult, *, published: bool) -> Plate | None:
     handles: dict[str, Any] = {}
     units = {"B": "1/%", "C": "1", "D": "kN", "E": "1"}
     for ax, name in zip(axes[0], "BCDE", strict=True):
-        handles |= _coefficient(ax, result, name, joint[name], published)
+        handles |= _coefficient(ax, result, name, joint[name], reference)
         ax.set_xticks(range(len(pressures)), [f"{p:g}" for p in pressures])
         ax.tick_params(axis="x", labelsize=SMALLEST_PT)
         ax.set_xlim(-0.65, len(pressures) - 0.35)
@@ -218,12 +214,12 @@ def by_pressure_plate(result: OutputResult, *, published: bool) -> Plate | None:
         ax.set_ylabel(parameter_label(name, units[name]))
     legend_below(fig, list(handles.values()), list(handles), 3)
     return Plate(
-        fig, "by_pressure", _pressure_caption(result, published), "Each pressure on its own"
+        fig, "by_pressure", _pressure_caption(result, reference), "Each pressure on its own"
     )
 
 
 def _coefficient(
-    ax: Axes, result: OutputResult, name: str, joint: Array, published: bool
+    ax: Axes, result: OutputResult, name: str, joint: Array, reference: Reference
 ) -> dict[str, Any]:
     handles: dict[str, Any] = {}
     low, middle, high = np.nanquantile(joint, [0.05, 0.5, 0.95], axis=0)
@@ -240,12 +236,13 @@ def _coefficient(
         )  # fmt: skip
         for k, e in enumerate(estimates):
             marker, colour = _LOOKS.get(e.method, ("P", GREY))
-            (handles[METHOD_NAMES.get(e.method, e.method)],) = ax.plot(
+            (handles[method_name(e.method)],) = ax.plot(
                 i - 0.2 + 0.2 * k, e.reported[name], marker, color=colour, ms=4.6,
                 mec="white", mew=0.4,
             )  # fmt: skip
-        for table, at, shape in ((PUBLISHED.geometric, -0.2, "o"), (PUBLISHED.genetic, 0.0, "s")):
-            if published and psi in table:
+        printed = zip(reference.alone.values(), (-0.2, 0.0), "os", strict=False)
+        for table, at, shape in printed:
+            if psi in table:
                 label = f"published ({table[round(psi)].source.partition(',')[0]})"
                 (handles[label],) = ax.plot(
                     i + at, table[round(psi)].values[name], shape, mfc="none", mec=ORANGE,
@@ -262,12 +259,14 @@ def _coefficient(
     return handles
 
 
-def _pressure_caption(result: OutputResult, published: bool) -> str:
+def _pressure_caption(result: OutputResult, reference: Reference) -> str:
     parts = []
     for psi, estimates in result.by_pressure.items():
         best = min(estimates, key=lambda e: e.cost)
         cost = f"{psi:g} psi {short(best.cost, 3)} kN²"
-        if published and psi in PUBLISHED.genetic:
-            cost += f" (Table 4: {PUBLISHED.genetic[round(psi)].quality['cost'].text})"
+        beside = reference.beside("genetic", psi)
+        if beside is not None:
+            source = beside.source.partition(",")[0]
+            cost += f" ({source}: {beside.quality['cost'].text})"
         parts.append(cost)
     return f"Lowest cost of a pressure fitted alone: {'; '.join(parts)}."

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator, NullLocator
 from scipy.stats import gaussian_kde
 
-from calib.he2019.figures.reference import published_sampled
 from calib.inference.calibration import Calibration
 from calib.inference.priors import Prior
 from calib.models.base import Array
@@ -27,6 +26,7 @@ from calib.report.figures.style import (
     panels,
 )
 from calib.report.numbers import TIMES
+from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 
 __all__ = ["learned_plate"]
@@ -34,18 +34,18 @@ __all__ = ["learned_plate"]
 _KDE_DRAWS = 3000
 
 
-def learned_plate(result: OutputResult, *, published: bool) -> Plate:
+def learned_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
     """Draw prior and posterior densities of every sampled parameter.
 
     Parameters
     ----------
     result : OutputResult
-    published : bool
-        Whether to mark what the published figures amount to.
+    reference : Reference, optional
+        Whose figures are marked.
     """
     calibration = result.calibration
     free = calibration.problem.priors.free
-    marks = published_sampled(calibration.problem.bound) if published else {}
+    marks = reference.sampled(calibration.problem.bound)
     cols = min(4, len(free)) if len(free) != 5 else 3
     rows = -(-len(free) // cols)
     fig, axes = panels(

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from calib.he2019.figures.reference import limits, published_curve
 from calib.report.figures.density import draw_predicted_observed
 from calib.report.figures.joint import effective_rows, ks_distance, pit_half_width
 from calib.report.figures.labels import MINUS, NO_UNIT, axis_of, percent, short
@@ -24,20 +23,21 @@ from calib.report.figures.style import (
     note,
     panels,
 )
+from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 from calib.validation.validate import PARETO_K_MAX
 
 __all__ = ["validation_plate"]
 
 
-def validation_plate(result: OutputResult, *, published: bool) -> Plate:
+def validation_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
     """Draw how predictions of unseen rows fared, in four panels.
 
     Parameters
     ----------
     result : OutputResult
-    published : bool
-        Whether to add the published fit's errors and the limits that the source states.
+    reference : Reference, optional
+        Whose errors and stated limits are added.
     """
     fig, axes = panels(2, 2, height=52.0, left=15.0, bottom=22.0, gap_x=17.0, gap_y=15.0, top=10.0)
     density = result.calibration.problem.bound.model.output == "bulk_density_g_cm3"
@@ -46,7 +46,7 @@ def validation_plate(result: OutputResult, *, published: bool) -> Plate:
         first, handles = "Can rows be left out by reweighting?", _pareto(axes[0, 0], result)
     else:
         first, handles = "Predicted against observed", draw_predicted_observed(axes[0, 0], result)
-    handles |= _relative_errors(axes[0, 1], result, published)
+    handles |= _relative_errors(axes[0, 1], result, reference)
     _pit(axes[1, 0], result)
     handles |= _coverage(axes[1, 1], result)
     for ax, title in zip(
@@ -72,7 +72,7 @@ def _pareto(ax: Axes, result: OutputResult) -> dict[str, Any]:
     return {f"Pareto k ({data_word(result)})": points, "above: fitted again": line}
 
 
-def _relative_errors(ax: Axes, result: OutputResult, published: bool) -> dict[str, Any]:
+def _relative_errors(ax: Axes, result: OutputResult, reference: Reference) -> dict[str, Any]:
     v, x = result.validation, x_column(result)
     axis = axis_of(x)
     handles: dict[str, Any] = {}
@@ -81,19 +81,18 @@ def _relative_errors(ax: Axes, result: OutputResult, published: bool) -> dict[st
         axis.scale(v.table[x]), 100.0 * v.scores.relative_error, "o", ms=4.2, color=BLUE,
         mec="white", mew=0.4, zorder=3,
     )[0]  # fmt: skip
-    if published:
-        model = result.calibration.problem.bound.model
-        curve = published_curve(model.name, model.select(v.table.columns))
-        if curve is not None:
-            judged = np.isfinite(v.scores.relative_error)
-            error = np.where(judged, 100.0 * (curve[0] - v.observed) / v.observed, np.nan)
-            handles[f"error of the published fit ({curve[1]})"] = ax.plot(
-                axis.scale(v.table[x]), error, "x", ms=4.5, mew=1.1, color=ORANGE, zorder=2
-            )[0]
-        for (value, name), dashes in zip(limits(model.name), DASHES[1:], strict=False):
-            for sign in (-1.0, 1.0):
-                line = ax.axhline(sign * 100.0 * value, color=GREY, lw=0.9, ls=dashes)
-            handles[f"largest error, {name}: {percent(value)}"] = line
+    model = result.calibration.problem.bound.model
+    curve = reference.curve(model.name, model.select(v.table.columns))
+    if curve is not None:
+        judged = np.isfinite(v.scores.relative_error)
+        error = np.where(judged, 100.0 * (curve[0] - v.observed) / v.observed, np.nan)
+        handles[f"error of the published fit ({curve[1]})"] = ax.plot(
+            axis.scale(v.table[x]), error, "x", ms=4.5, mew=1.1, color=ORANGE, zorder=2
+        )[0]
+    for (value, name), dashes in zip(reference.limits(model.name), DASHES[1:], strict=False):
+        for sign in (-1.0, 1.0):
+            line = ax.axhline(sign * 100.0 * value, color=GREY, lw=0.9, ls=dashes)
+        handles[f"largest error, {name}: {percent(value)}"] = line
     ax.set_xlabel(axis.label)
     ax.set_ylabel("Relative error (%)")
     ax.margins(y=0.1)

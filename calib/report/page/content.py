@@ -24,6 +24,7 @@ from calib.report.page.tables import (
     sensitivity_grid,
 )
 from calib.report.page.verdict import Evidence, Level, gather, judge_evidence
+from calib.report.reference import reference_of
 from calib.report.study import Failure, OutputResult
 from calib.validation.outliers import outlying_notes
 
@@ -80,7 +81,7 @@ def section(
     problem = calibration.problem
     evidence = gather(result)
     verdict = judge_evidence(evidence)
-    published = bool(problem.table.label)
+    reference = reference_of(problem.table.label)
     names = [*problem.bound.model.reported, *(p.name for p in problem.priors.entries)]
     bound = problem.bound
     return {
@@ -103,8 +104,8 @@ def section(
         "outlying": [prose(n, names) for n in outlying_notes(problem, calibration.draws.mode)],
         "priors": prior_rows(result),
         "prior_source": PurePath(problem.priors.source).name,
-        "estimates": estimates_grid(result, published=published),
-        "by_pressure": pressure_grids(result, published=published),
+        "estimates": estimates_grid(result, reference=reference),
+        "by_pressure": pressure_grids(result, reference=reference),
         "posterior": posterior_rows(result),
         "sensitivity": sensitivity_grid(result) if result.sensitivity else None,
         "sampling": sampling_facts(result),

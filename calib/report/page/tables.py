@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from calib.he2019.datasets.published import PUBLISHED, Figure, FittedTable
-from calib.he2019.figures.reference import published_quality, published_table
-from calib.inference.estimators import PointEstimate
-from calib.report.figures.estimates import METHOD_NAMES
+from calib.inference.estimators import PointEstimate, method_name
 from calib.report.figures.roles import role
 from calib.report.numbers import NOTHING, format_as_printed, format_like, format_number
 from calib.report.page.equations import symbol_html, unit_html
 from calib.report.posterior_text import centre_text, interval_text, skewed
+from calib.report.reference import NOTHING as NONE
+from calib.report.reference import Figure, FittedTable, Reference
 from calib.report.study import OutputResult
 from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 
@@ -110,23 +109,21 @@ def sensitivity_grid(result: OutputResult) -> Grid:
     return Grid(said, head, rows, [], notes)
 
 
-def estimates_grid(result: OutputResult, *, published: bool) -> Grid | None:
+def estimates_grid(result: OutputResult, *, reference: Reference = NONE) -> Grid | None:
     """Point estimates by method, beside the published figures and the posterior."""
     if not result.estimates:
         return None
     model = result.calibration.problem.bound.model
-    table = published_table(model.name) if published else None
-    quality = published_quality(model.name) if table else None
+    table = reference.table(model.name)
+    quality = reference.quality(model.name) if table else None
     head: list[Any] = ["Parameter", "Unit"]
     head += [table.source] if table else []
-    head += [METHOD_NAMES.get(e.method, e.method) for e in result.estimates]
+    head += [method_name(e.method) for e in result.estimates]
     head += ["Posterior mean ± sd, or median and 95 % HDI"]
     varying = [name for name, v in result.calibration.reported.items() if np.ptp(v) > 0.0]
     rows = [_estimate_row(result, name, unit, table) for name, unit in model.reported.items()
             if name in varying]  # fmt: skip
-    notes = [
-        f"{METHOD_NAMES.get(e.method, e.method)}: {e.note}" for e in result.estimates if e.note
-    ]
+    notes = [f"{method_name(e.method)}: {e.note}" for e in result.estimates if e.note]
     fitted, shown = len(result.calibration.problem.table), len(result.task.table)
     caption = ""
     if fitted < shown and model.estimates_all_rows:
@@ -189,20 +186,15 @@ def _quality_rows(
     ]  # fmt: skip
 
 
-def pressure_grids(result: OutputResult, *, published: bool) -> list[Grid]:
+def pressure_grids(result: OutputResult, *, reference: Reference = NONE) -> list[Grid]:
     """The Magic Formula at each pressure on its own."""
     grids = []
     for psi, estimates in result.by_pressure.items():
-        geometric, genetic = (
-            (PUBLISHED.geometric.get(round(psi)), PUBLISHED.genetic.get(round(psi)))
-            if published
-            else (None, None)
-        )
         rows = []
         for e in estimates:
-            beside = geometric if e.method == "geometric" else genetic
-            rows.append(_pressure_row(METHOD_NAMES.get(e.method, e.method), e, beside))
-            if beside is not None and e.method in ("geometric", "genetic"):
+            beside = reference.beside(e.method, psi)
+            rows.append(_pressure_row(method_name(e.method), e, beside))
+            if beside is not None and e.method in reference.alone:
                 shown = {**beside.estimates, **beside.quality}
                 printed = [shown[k] for k in (*"BCDE", "cost")]
                 cells = [_ticked(format_like(f.value, f.text), False) for f in printed]

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 
-from calib.he2019.datasets.published import PUBLISHED, Figure, FittedTable
-from calib.he2019.figures.reference import published_quality, published_table
 from calib.inference.calibration import ParameterSummary
+from calib.inference.estimators import METHODS, method_name
 from calib.models import get_model
-from calib.report.figures.estimates import METHOD_NAMES
 from calib.report.numbers import NOTHING, ascii_text, format_as_printed, format_like, format_number
 from calib.report.posterior_text import centre_text, interval_text, skewed
 from calib.report.publish.grid import CsvTable, LatexTable
 from calib.report.publish.markup import in_brackets
 from calib.report.publish.records import Output
+from calib.report.reference import Figure, FittedTable, reference_of
 
 __all__ = ["estimates_csv", "estimates_latex", "pressure_latex"]
 
@@ -21,21 +20,16 @@ _HEAD = (
     "output", "model", "rows", "n_rows", "quantity", "unit", "method", "value", "published",
     "published_in", "same_printed_digits",
 )  # fmt: skip
-# Printed beside each method at a single pressure.
-_BESIDE: Mapping[str, Mapping[int, FittedTable]] = {
-    "geometric": PUBLISHED.geometric, "genetic": PUBLISHED.genetic,
-    "least_squares": PUBLISHED.genetic, "differential_evolution": PUBLISHED.genetic,
-}  # fmt: skip
-_SHORT = {
-    "geometric": "Geom.", "genetic": "GA", "differential_evolution": "DE", "least_squares": "LS",
-    "published_regression": "Regr.",
-}  # fmt: skip
 _ALONE = {"B": "1/%", "C": "1", "D": "kN", "E": "1", "cost": "kN^2"}
 _QUALITY = {"cost": "Sum of squares", "rmse": "RMSE", "r_squared": "R²"}
 
 
+def _short(method: str) -> str:
+    return METHODS[method].short if method in METHODS else method
+
+
 def _printed(o: Output) -> FittedTable | None:
-    return published_table(o.model) if o.label else None
+    return reference_of(o.label).table(o.model)
 
 
 def _varying(o: Output) -> dict[str, str]:
@@ -56,7 +50,7 @@ def _digits(value: float | None, printed: Figure | None) -> str:
 def _rows_of(o: Output) -> Iterator[tuple[str, str, str, float | None, Figure | None, str]]:
     """Yield (quantity, unit, method, value, printed figure, its table) of all rows together."""
     table = _printed(o)
-    source, quality = (table.source, published_quality(o.model)) if table else ("", {})
+    source, quality = (table.source, reference_of(o.label).quality(o.model)) if table else ("", {})
     for method, values in o.found["estimates"].items():
         fit = o.found["fit"][method]
         units = {"cost": fit["cost_unit"], "rmse": fit["rmse_unit"], "r_squared": "1"}
@@ -121,7 +115,7 @@ def estimates_latex(o: Output) -> LatexTable | None:
         columns=f"l{'r' * (len(methods) + 1 + bool(table))}",
         head=(
             "Parameter", *([table.source] if table else []),
-            *(_SHORT.get(m, m) for m in methods), "Posterior",
+            *(_short(m) for m in methods), "Posterior",
         ),
         groups=(
             tuple(tuple(row) for name, row in cells.items() if name not in _QUALITY),
@@ -132,7 +126,7 @@ def estimates_latex(o: Output) -> LatexTable | None:
 
 
 def _explained(methods: Sequence[str]) -> str:
-    words = [f"{_SHORT[m]}: {METHOD_NAMES[m]}" for m in methods if m in _SHORT]
+    words = [f"{METHODS[m].short}: {METHODS[m].title}" for m in methods if m in METHODS]
     return f"{'; '.join(words)}." if words else ""
 
 
@@ -150,10 +144,7 @@ def _ticked(value: float | None, printed: Figure | None) -> str:
 
 
 def _beside(o: Output, pressure: str, method: str) -> FittedTable | None:
-    number = float(pressure.partition(" ")[0])
-    if not o.label or not number.is_integer():
-        return None
-    return _BESIDE.get(method, {}).get(int(number))
+    return reference_of(o.label).beside(method, float(pressure.partition(" ")[0]))
 
 
 def pressure_latex(o: Output) -> LatexTable | None:
@@ -164,9 +155,9 @@ def pressure_latex(o: Output) -> LatexTable | None:
         for method, values in by_method.items():
             beside = _beside(o, pressure, method)
             shown = {**beside.estimates, **beside.quality} if beside else {}
-            group.append((pressure, METHOD_NAMES.get(method, method),
+            group.append((pressure, method_name(method),
                           *(_ticked(values[k], shown.get(k)) for k in _ALONE)))  # fmt: skip
-        for tables in (PUBLISHED.geometric, PUBLISHED.genetic) if o.label else ():
+        for tables in reference_of(o.label).alone.values():
             table = tables.get(round(float(pressure.partition(" ")[0])))
             if table is not None:
                 figures = {**table.estimates, **table.quality}

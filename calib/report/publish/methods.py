@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from calib.inference.estimators import METHODS
 from calib.models import get_model
 from calib.report.figures.labels import axis_of, joined
 from calib.report.numbers import format_number, format_value
@@ -17,13 +18,6 @@ __all__ = ["Paragraph", "methods"]
 
 # Digits of a hash that tell two files apart; the manifest has all of them.
 _HASH = 12
-_METHODS: Mapping[str, str] = {
-    "geometric": "the geometric method (Eqs 6\N{EN DASH}9 of the source)",
-    "genetic": "the genetic algorithm",
-    "least_squares": "multi-start least squares",
-    "differential_evolution": "differential evolution",
-    "published_regression": "the regression as published (Eq 22 of the source)",
-}
 
 
 @dataclass(frozen=True)
@@ -141,7 +135,7 @@ def _inference(o: Output) -> list[str]:
         f"The sampled parameters are {joined_symbols(sampled)}; their priors, with reasons and "
         f"sources, are those of `{priors['source']}` (SHA-256 `{priors['sha256'][:_HASH]}`).",
     ]
-    methods = [_METHODS.get(method, method) for method in o.found["estimates"]]
+    methods = [METHODS[m].words if m in METHODS else m for m in o.found["estimates"]]
     if methods:
         rows = f" from all {o.found['data']['n_all']} rows" if o.estimates_use_all_rows else ""
         sentences.append(

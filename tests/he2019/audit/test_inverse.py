@@ -18,7 +18,7 @@ from calib.he2019.audit.inverse_findings import (
 from calib.he2019.audit.inverse_regression import attenuation, simulate_inverse, study_inverse
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import PUBLISHED
-from calib.inference.estimators import rut_regression
+from calib.he2019.estimators.rut_regression import rut_regression
 from tests.he2019.audit.altered import altered
 
 

@@ -12,7 +12,7 @@ from matplotlib import rcParams
 from matplotlib.collections import LineCollection
 
 from calib.data import table_from_arrays
-from calib.he2019.figures.reference import published_curve, published_sampled
+from calib.he2019.figures.reference import HE2019, published_curve, published_sampled
 from calib.report.figures import collect
 from calib.report.figures.bands import bands_plate
 from calib.report.figures.collect import plates
@@ -67,7 +67,7 @@ def test_shared_axes_are_labelled_at_the_edge(drawn):
 
 
 def test_corner_labels_every_parameter_with_its_unit(drawbar):
-    texts = [t.get_text() for t in corner_plate(drawbar, published=True).figure.axes[0].texts]
+    texts = [t.get_text() for t in corner_plate(drawbar, reference=HE2019).figure.axes[0].texts]
     for symbol in ("$K_\\mathrm{lo}$\n(kN/%)", "$D_\\mathrm{hi}$\n(kN)", "$\\sigma$\n(kN)"):
         assert symbol in texts
     assert any("dashed: published" in t for t in texts)
@@ -75,7 +75,7 @@ def test_corner_labels_every_parameter_with_its_unit(drawbar):
 
 def test_saved_without_a_warning(plate):
     for draw in (bands_plate, validation_plate):
-        draw(plate, published=False).figure.savefig(io.BytesIO(), format="png", dpi=40)
+        draw(plate).figure.savefig(io.BytesIO(), format="png", dpi=40)
 
 
 def test_nothing_is_cut_off(drawn):
@@ -93,7 +93,7 @@ def test_nothing_is_cut_off(drawn):
 
 
 def test_bands_caption_counts_what_the_bands_cover(drawbar):
-    caption = bands_plate(drawbar, published=True).caption
+    caption = bands_plate(drawbar, reference=HE2019).caption
     low, high = np.nanquantile(drawbar.posterior_predictive, [0.05, 0.95], axis=0)
     observed = drawbar.calibration.problem.observed
     inside = ((low <= observed) & (observed <= high)).sum()
@@ -102,7 +102,7 @@ def test_bands_caption_counts_what_the_bands_cover(drawbar):
 
 
 def test_bands_say_what_was_held_out_and_show_each_point_once(drawbar):
-    fig = bands_plate(drawbar, published=True).figure
+    fig = bands_plate(drawbar, reference=HE2019).figure
     assert [ax.get_title() for ax in fig.axes] == ["18 psi", "30 psi, held out", "42 psi"]
     points = [sum(len(li.get_xdata()) for li in ax.lines if li.get_marker() == "o")
               for ax in fig.axes]  # fmt: skip
@@ -152,21 +152,21 @@ def test_smooth_bands_nest_and_match_the_draws(rut):
 
 def test_validation_caption_has_the_scores(rut):
     s = rut.validation.scores
-    caption = validation_plate(rut, published=True).caption
+    caption = validation_plate(rut, reference=HE2019).caption
     assert "9 held-out rows (reconstructed data)" in caption
     assert f"{100 * s.max_relative_error:.1f} % at most" in caption
     assert f"90 % band {s.coverage[0.9].hits} of 9" in caption
 
 
 def test_validation_shows_the_limits_of_the_source(rut):
-    labels = [t.get_text() for t in validation_plate(rut, published=True).figure.legends[0]
+    labels = [t.get_text() for t in validation_plate(rut, reference=HE2019).figure.legends[0]
               .get_texts()]  # fmt: skip
     assert any("held out: 9.7 %" in t for t in labels)
     assert any("fitted: 13 %" in t for t in labels)
 
 
 def test_leave_one_out_shows_pareto_k(density):
-    plate = validation_plate(density, published=True)
+    plate = validation_plate(density, reference=HE2019)
     assert plate.figure.axes[0].get_ylabel().startswith("Pareto k")
     assert plate.caption.endswith(f"{len(density.validation.refitted)} of 36 rows needed a refit "
                                   "(Pareto k above 0.7).")  # fmt: skip
@@ -205,7 +205,7 @@ def test_distances_of_a_wide_positive_parameter_are_logarithmic():
 
 
 def test_estimates_caption_names_the_published_figures_outside(rut):
-    caption = estimates_plate(rut, published=True).caption
+    caption = estimates_plate(rut, reference=HE2019).caption
     outside = [
         name
         for name, figure in (("n0", 1.996), ("n1", 1.266), ("k", 3.306e5))
@@ -228,7 +228,7 @@ def test_roles(ratio, moved, role):
 
 
 def test_two_pressures_leave_the_curvature_to_the_prior(drawbar):
-    caption = learned_plate(drawbar, published=True).caption
+    caption = learned_plate(drawbar, reference=HE2019).caption
     part = next(p for p in caption.split(";") if "set by the prior" in p)
     assert "K_bend" in part
     assert "D_bend" in part
@@ -315,7 +315,7 @@ def test_a_figure_that_fails_does_not_stop_the_rest(rut, monkeypatch):
         raise RuntimeError("no luck")
 
     monkeypatch.setattr(collect, "learned_plate", broken)
-    found = {p.name: p for p in plates(rut, published=True)}
+    found = {p.name: p for p in plates(rut, reference=HE2019)}
     assert found["learned"].figure is None
     assert "no luck" in found["learned"].caption
     assert found["corner"].figure is not None
@@ -332,7 +332,7 @@ def test_the_users_style_neither_leaks_in_nor_is_changed():
 
 
 def test_corner_marks_lie_inside_their_panels(drawbar):
-    ax = corner_plate(drawbar, published=True).figure.axes[0]
+    ax = corner_plate(drawbar, reference=HE2019).figure.axes[0]
     dashed = [c for c in ax.collections if isinstance(c, LineCollection)
               and c.get_linestyle()[0][1] is not None]  # fmt: skip
     ends = np.concatenate([np.array(s) for c in dashed for s in c.get_segments()])

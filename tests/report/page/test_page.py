@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from calib.he2019.figures.reference import HE2019
 from calib.models import MODELS
 from calib.models.base import BoundModel
 from calib.report.figures import Plate
@@ -234,7 +235,7 @@ def test_posterior_table_marks_what_the_prior_sets(drawbar):
 
 
 def test_estimates_tick_what_equals_the_source(rut):
-    grid = estimates_grid(rut, published=True)
+    grid = estimates_grid(rut, reference=HE2019)
     regression = grid.head.index("regression as published (Eq 22)")
     for row in grid.rows:
         assert "\N{CHECK MARK}" in row[regression]
@@ -242,7 +243,7 @@ def test_estimates_tick_what_equals_the_source(rut):
 
 
 def test_estimates_of_a_users_data_have_no_published_column(plate):
-    grid = estimates_grid(plate, published=False)
+    grid = estimates_grid(plate)
     assert not any("Table" in str(cell) for cell in grid.head)
     assert all(len(row) == len(grid.head) for row in (*grid.rows, *grid.foot))
 
@@ -258,20 +259,20 @@ def test_a_skewed_parameter_has_a_median_and_no_sd(rut):
     told = replace(rut, calibration=calibration)
     row = next(r for r in posterior_rows(told) if str(r["symbol"]) == "<i>k</i>")
     assert row["value"] == "median 2.0"
-    cells = [r for r in estimates_grid(told, published=True).rows if str(r[0]) == "<i>k</i>"]
+    cells = [r for r in estimates_grid(told, reference=HE2019).rows if str(r[0]) == "<i>k</i>"]
     assert str(cells[0][-1]) == "median 2.0<br>HDI 0 to 90"
 
 
 def test_the_table_says_that_its_estimates_are_of_more_rows(drawbar, rut):
-    caption = estimates_grid(drawbar, published=True).caption
+    caption = estimates_grid(drawbar, reference=HE2019).caption
     assert "all 42 rows" in caption
     assert "the 28 that were not held out" in caption
     assert caption in page({"drawbar_pull": drawbar})[1].text
-    assert estimates_grid(rut, published=True).caption == ""
+    assert estimates_grid(rut, reference=HE2019).caption == ""
 
 
 def test_each_pressure_stands_beside_tables_3_and_4(drawbar):
-    grids = pressure_grids(drawbar, published=True)
+    grids = pressure_grids(drawbar, reference=HE2019)
     assert [g.caption for g in grids] == ["18 psi alone", "30 psi alone", "42 psi alone"]
     least = next(row for row in grids[0].rows if row[0] == "least squares")
     assert all("\N{CHECK MARK}" in cell for cell in least[1:])
@@ -318,7 +319,7 @@ def test_symbols_and_units_are_escaped():
 
 
 def test_the_cost_has_its_unit(density):
-    cost = estimates_grid(density, published=True).foot[0]
+    cost = estimates_grid(density, reference=HE2019).foot[0]
     assert str(cost[1]) == "(g/cm<sup>3</sup>)<sup>2</sup>"
 
 
