@@ -13,10 +13,11 @@ from types import ModuleType
 
 from calib.errors import CalibError
 
-__all__ = ["ENTRY_POINTS", "inherit", "load_files", "load_installed", "run_file"]
+__all__ = ["PLUGINS", "inherit", "load_files", "load_installed", "run_file"]
 
-# Packages that declare one of these have it loaded; what it names registers itself.
-ENTRY_POINTS = ("terracalib.quantities", "terracalib.models", "terracalib.effects")
+# Entry points of packages that register several things.
+PLUGINS = "terracalib.plugins"
+_LOADED: set[str] = set()
 # Worker processes find here what this one has loaded.
 _VARIABLE = "CALIB_MODELS"
 
@@ -83,30 +84,31 @@ def load_files(paths: Sequence[Path]) -> None:
 
 def inherit() -> None:
     """Load what the process that started this one had loaded."""
-    load_installed()
     for path in os.environ.get(_VARIABLE, "").split(os.pathsep):
         if path:
             run_file(Path(path), "models")
 
 
-def load_installed() -> None:
-    """Load what installed packages declare as entry points.
+def load_installed(group: str) -> None:
+    """Load what installed packages declare as entry points of a group, once.
 
     Raises
     ------
     CalibError
         If one cannot be loaded, naming the package.
     """
-    for group in ENTRY_POINTS:
-        for point in entry_points(group=group):
-            try:
-                found = point.load()
-            except Exception as error:
-                package = point.dist.name if point.dist else "an installed package"
-                raise CalibError(
-                    f"{point.name} of {package} cannot be loaded: {type(error).__name__}: {error}",
-                    where=f"entry point {group}",
-                    mend="update or remove the package",
-                ) from error
-            if hasattr(found, "register") and not isinstance(found, ModuleType):
-                found.register()
+    if group in _LOADED:
+        return
+    _LOADED.add(group)
+    for point in entry_points(group=group):
+        try:
+            found = point.load()
+        except Exception as error:
+            package = point.dist.name if point.dist else "an installed package"
+            raise CalibError(
+                f"{point.name} of {package} cannot be loaded: {type(error).__name__}: {error}",
+                where=f"entry point {group}",
+                mend="update or remove the package",
+            ) from error
+        if hasattr(found, "register") and not isinstance(found, ModuleType):
+            found.register()

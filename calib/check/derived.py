@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +23,8 @@ from calib.check.text import differing_lines
 from calib.errors import CalibError
 from calib.gap.corrected import load_corrected
 from calib.gap.where import row_gaps
-from calib.he2019.audit import audit_csv
-from calib.he2019.audit.files import read_findings
 from calib.report.publish import publication
+from calib.report.sections import SECTIONS
 
 __all__ = [
     "AUDIT_CSV", "AUDIT_JSON", "derived_files", "verify_derived", "verify_form", "verify_gaps",
@@ -67,7 +67,7 @@ def verify_derived(
     failed = []
     writers: dict[str, Callable[[], Mapping[str, str]]] = {
         _SOURCES: lambda: publication(manifest, summary).files,
-        AUDIT_JSON: lambda: _audit_csv(folder, files),
+        **{kind.name: partial(kind.derived, folder, files) for kind in SECTIONS.values()},
     }
     for source, write in writers.items():
         try:
@@ -85,12 +85,6 @@ def verify_derived(
             note = "it follows from nothing here"
             items.append(_different(name, note, same_code=same_code))
     return failed + items
-
-
-def _audit_csv(folder: Path, files: Mapping[str, str]) -> dict[str, str]:
-    if AUDIT_JSON not in files or not (folder / AUDIT_JSON).is_file():
-        return {}
-    return {AUDIT_CSV: audit_csv(read_findings(read_json(folder / AUDIT_JSON)))}
 
 
 def _written(folder: Path, name: str, text: str, *, same_code: bool) -> Item:

@@ -126,7 +126,7 @@ def _about(again: Again, name: str, section: str) -> set[str]:
     if name.startswith("gaps/"):
         return {f"gap: {name.split('/')[1]}"}
     tasks = set(again.manifest.tasks)
-    gaps = {f"gap: {gap}" for gap in again.manifest.paper_gaps}
+    gaps = {f"gap: {gap}" for gap in _names(again.manifest.sections.get("paper_gaps"))}
     parts: Mapping[str, set[str]] = {"paper-gaps": gaps, "audit": {"audit"}}
     return parts.get(section, {section} & tasks or tasks)
 
@@ -137,3 +137,7 @@ def _left_out(recorded: str, again: Again, name: str) -> Item:
         return Item(POSTERIORS, name, Status.IDENTICAL, note=note)
     note = "left out on purpose; its summary is compared"
     return Item(POSTERIORS, name, Status.UNJUDGED, note=note)
+
+
+def _names(record: object) -> list[str]:
+    return list(record) if isinstance(record, dict) else []

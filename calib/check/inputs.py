@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 from calib.batch.environment import sha256
 from calib.check.items import Item, Status
 from calib.check.schema import TaskRecord
 from calib.data import Table
-from calib.he2019.datasets import embedded
+from calib.data.labels import KNOWN_DATA, label_of
 from calib.inference.prior_files import default_priors
 
 __all__ = ["GROUP", "verify_files", "verify_hashes", "verify_label", "verify_priors"]
@@ -70,7 +69,7 @@ def verify_hashes(key: str, entry: TaskRecord, folder: Path) -> list[Item]:
 
 
 def verify_label(file: str, table: Table, label: str) -> Item:
-    """Check that the embedded, reconstructed data are called so, and nothing else is.
+    """Check that data which are known are called what they are, and nothing else is.
 
     Parameters
     ----------
@@ -80,15 +79,14 @@ def verify_label(file: str, table: Table, label: str) -> Item:
     label : str
         What they are said to be.
     """
-    known = embedded.labelled(replace(table, label="")).label == embedded.LABEL
-    if label == embedded.LABEL and not known:
-        note = "called reconstructed, but not the embedded data"
-        return Item(GROUP, file, Status.DIFFERENT, note=note)
-    if label != embedded.LABEL and known:
-        note = "these are the embedded data, reconstructed and not measured, but not called so"
-        return Item(GROUP, file, Status.DIFFERENT, note=note)
-    note = "the embedded data" if embedded else "data of the user"
-    return Item(GROUP, file, Status.IDENTICAL, note=note)
+    known = label_of(table)
+    if label == known:
+        note = KNOWN_DATA[known].words if known else "data of the user"
+        return Item(GROUP, file, Status.IDENTICAL, note=note)
+    note = f"called {label}, but not {KNOWN_DATA[label].words if label in KNOWN_DATA else 'that'}"
+    if known:
+        note = f"these are {KNOWN_DATA[known].words}, {known} and not measured, but not called so"
+    return Item(GROUP, file, Status.DIFFERENT, note=note)
 
 
 def verify_priors(key: str, entry: TaskRecord, folder: Path, *, same_code: bool) -> Item:

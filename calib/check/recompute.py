@@ -17,14 +17,13 @@ from calib.check.schema import Manifest, RunRecord, TaskRecord
 from calib.data import read_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.he2019.audit import Seeds
-from calib.he2019.gaps.cases import paper_gaps
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import PointEstimate, estimate
 from calib.inference.io import save_calibration
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.report.contents import work_out
+from calib.report.sections import SECTIONS
 from calib.report.study import Progress, Study
 from calib.report.study_tasks import HoldOut, Task
 from calib.report.writer import write_report
@@ -95,21 +94,18 @@ def recompute_report(
     pool: Pool = HERE,
 ) -> Study:
     """Work a report out again and write it into a new folder."""
-    repeats = manifest.audit and manifest.audit.seeds
     contents = work_out(
         tasks,
         manifest.seed,
         settings=manifest.settings,
-        gaps=[gap for gap in paper_gaps() if gap.name in manifest.paper_gaps],
-        audit=Seeds(**repeats.model_dump()) if repeats else None,
+        sections=[SECTIONS[name].again(record) for name, record in manifest.sections.items()],
         progress=progress,
         pool=pool,
     )
     write_report(
         contents.study,
         out,
-        gaps=contents.gaps,
-        audit=contents.audit,
+        sections=contents.found,
         pdf=manifest.pdf,
         settings=manifest.settings,
         command=manifest.command,

@@ -20,11 +20,11 @@ from pydantic import (
 from calib.batch.environment import Environment
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.he2019.gaps.cases import paper_gaps
 from calib.inference.io import SCHEMA as RUN_SCHEMA
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS
 from calib.report.manifest import SCHEMA as REPORT_SCHEMA
+from calib.report.sections import SECTIONS
 
 __all__ = ["Manifest", "RunRecord", "TaskRecord", "read_folder"]
 
@@ -49,20 +49,11 @@ def _known_model(name: str) -> str:
     return name
 
 
-def _known_gap(name: str) -> str:
-    known = [gap.name for gap in paper_gaps()]
-    if name not in known:
-        raise ValueError(f"not one of {', '.join(known)}")
-    return name
-
-
 type _Hash = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 type _File = Annotated[str, AfterValidator(_inside)]
 type _Name = Annotated[str, AfterValidator(_name)]
 type _Model = Annotated[str, AfterValidator(_known_model)]
 type _Seed = Annotated[int, Field(ge=0)]
-type _Repeat = Annotated[int, Field(ge=1, le=1000)]
-type _Gap = Annotated[str, AfterValidator(_known_gap)]
 
 
 class _Record(BaseModel):
@@ -111,20 +102,6 @@ class _Made(_Record):
         return Environment(self.versions, self.machine, self.code)
 
 
-class _Seeded(_Record):
-    seed: _Seed
-
-
-class _Repeats(_Record):
-    by_pressure: _Repeat
-    joint: _Repeat
-    printed_coordinates: _Repeat
-
-
-class _Audit(_Seeded):
-    seeds: _Repeats
-
-
 class Manifest(_Made):
     """`manifest.json` of a report folder."""
 
@@ -135,8 +112,7 @@ class Manifest(_Made):
     settings: SamplerSettings
     tasks: dict[str, TaskRecord]
     pdf: bool = False
-    paper_gaps: dict[_Gap, _Seeded] = {}
-    audit: _Audit | None = None
+    sections: dict[str, JsonValue] = {}
     files: dict[_File, _Hash]
     left_out: dict[_File, _Hash]
 
@@ -197,9 +173,15 @@ def read_folder(folder: Path) -> Manifest | RunRecord:
 def _manifest(content: Any, path: Path) -> Manifest:
     _check_schema(content, REPORT_SCHEMA, path)
     try:
-        manifest = Manifest.model_validate(content)
+        sections = {name: content[name] for name in SECTIONS if name in content}
+        manifest = Manifest.model_validate({**content, "sections": sections})
     except ValidationError as error:
         raise _damaged(path, _first(error)) from None
+    for name, record in sections.items():
+        try:
+            SECTIONS[name].again(record)
+        except ValueError as error:
+            raise _damaged(path, f"{name}: {error}") from None
     unknown = [key for key in manifest.tasks if key not in OUTPUTS]
     if unknown or not manifest.tasks:
         raise _damaged(path, f"tasks: there is no output {', '.join(unknown) or 'at all'}")

@@ -12,6 +12,9 @@ from calib.cli.parallel import CORES, Models, Workers
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from calib.report.sections import Section
     from calib.report.study_tasks import HoldOut
 
 __all__ = ["register"]
@@ -61,14 +64,11 @@ def report(
     from calib.batch.pool import pool
     from calib.cli.display import progress_bars
     from calib.data import read_table
+    from calib.data.labels import labelled
     from calib.data.quantities import OUTPUTS
-    from calib.he2019.audit import Seeds
-    from calib.he2019.datasets.embedded import labelled
-    from calib.he2019.gaps.cases import paper_gaps
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.report.contents import work_out
     from calib.report.study_tasks import plan_tasks
-    from calib.he2019.tasks import he2019_tasks
     from calib.report.writer import write_report
     from calib.validation.outliers import outlying_notes
 
@@ -82,21 +82,25 @@ def report(
             only=only or (),
         )
         title = "Calibration report"
+        sections: Sequence[Section] = ()
     else:
+        from calib.he2019.sections import AuditSection, GapsSection
+        from calib.he2019.tasks import he2019_tasks
+
         tasks = he2019_tasks()
+        # Beside the user's own data, the source's gaps and tables have no place.
+        sections = (GapsSection(), AuditSection())
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
     with pool(workers) as side, progress_bars() as tell:
-        # Beside the user's own data, the source's gaps and tables have no place.
         found = work_out(
-            tasks, seed, settings=settings, gaps=() if files else paper_gaps(),
-            audit=None if files else Seeds(), progress=tell, workers=workers, pool=side,
+            tasks, seed, settings=settings, sections=sections, progress=tell, workers=workers,
+            pool=side,
         )  # fmt: skip
         study = found.study
         page = write_report(
-            study, out, settings=settings, command=_command(), title=title, gaps=found.gaps,
-            overwrite=overwrite, posteriors=posteriors, audit=found.audit, pdf=pdf, progress=tell,
-            pool=side,
+            study, out, settings=settings, command=_command(), title=title, sections=found.found,
+            overwrite=overwrite, posteriors=posteriors, pdf=pdf, progress=tell, pool=side,
         )  # fmt: skip
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]
@@ -129,7 +133,7 @@ def fit(
     from calib.cli.display import posterior_table, progress_bars, verdict_line
     from calib.data import hold_out as split
     from calib.data import read_for_model
-    from calib.he2019.datasets.embedded import labelled
+    from calib.data.labels import labelled
     from calib.inference.calibration import calibrate
     from calib.inference.estimators import estimate
     from calib.inference.io import save_calibration

@@ -24,9 +24,8 @@ Scheduler = Annotated[
 
 def _load(paths: list[Path] | None) -> list[Path] | None:
     """Register what the files declare, before names are looked up."""
-    from calib.batch.plugins import load_files, load_installed
+    from calib.batch.plugins import load_files
 
-    load_installed()
     load_files(paths or ())
     return paths
 

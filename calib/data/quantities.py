@@ -237,6 +237,7 @@ QUANTITIES: Registry[Quantity] = Registry(
     Quantity("cone_index", "cone_index_kpa", "pressure", "kPa", "condition",
              "penetration resistance of a cone", _POSITIVE, physical="cone", of_factors=True,
              synonyms=("penetration_resistance",)),
+    group="terracalib.quantities",
 )  # fmt: skip
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
 
+from calib.batch.plugins import PLUGINS, load_installed
 from calib.errors import CalibError
 
 __all__ = ["Registry", "register"]
@@ -25,6 +26,8 @@ class Registry[T](Mapping[str, T]):
         Returns the name of one.
     *declared
         Those that are shipped.
+    group : str, optional
+        Entry points of installed packages that are loaded before any is looked up.
 
     Attributes
     ----------
@@ -32,8 +35,10 @@ class Registry[T](Mapping[str, T]):
         Another one whenever what is known has changed.
     """
 
-    def __init__(self, what: str, key: Callable[[T], str], *declared: T) -> None:
-        self._what, self._key = what, key
+    def __init__(
+        self, what: str, key: Callable[[T], str], *declared: T, group: str = PLUGINS
+    ) -> None:
+        self._what, self._key, self._group = what, key, group
         self._known: dict[str, T] = {}
         self.version = 0
         for one in declared:
@@ -61,14 +66,18 @@ class Registry[T](Mapping[str, T]):
         self.version += 1
         self._known.pop(name, None)
 
+    def _all(self) -> dict[str, T]:
+        load_installed(self._group)
+        return self._known
+
     def __getitem__(self, name: str) -> T:
-        return self._known[name]
+        return self._all()[name]
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._known)
+        return iter(self._all())
 
     def __len__(self) -> int:
-        return len(self._known)
+        return len(self._all())
 
 
 def register(*declared: _Declared) -> None:

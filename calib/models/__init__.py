@@ -24,6 +24,7 @@ MODELS: Registry[Model] = Registry(
     MAGIC_FORMULA_PRESSURE,
     BEKKER,
     MODIFIED_BEKKER,
+    group="terracalib.models",
 )
 
 

@@ -1,4 +1,4 @@
-"""What a report shows: the study, and for the embedded data the source's gaps and its audit."""
+"""What a report shows: the study, and the sections that were asked for."""
 
 from __future__ import annotations
 
@@ -6,12 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from calib.batch.pool import HERE, Pool
-from calib.he2019.audit import Audit, Seeds, run_audit
-from calib.he2019.audit.convergence import begin_convergence
-from calib.he2019.datasets.published import PUBLISHED
-from calib.he2019.gaps.cases import PaperGap
-from calib.he2019.gaps.find import FoundGap, begin_gaps
 from calib.inference.sampling.sampler import SamplerSettings
+from calib.report.sections import Found, Section
 from calib.report.study import Progress, Study, begin_study
 from calib.report.study_tasks import Task
 
@@ -25,14 +21,12 @@ class Contents:
     Parameters
     ----------
     study : Study
-    gaps : tuple of FoundGap
-        Empty where none were asked for.
-    audit : Audit, optional
+    found : tuple of Found
+        What the sections found, in their order on the page.
     """
 
     study: Study
-    gaps: tuple[FoundGap, ...]
-    audit: Audit | None
+    found: tuple[Found, ...]
 
 
 def work_out(
@@ -40,8 +34,7 @@ def work_out(
     seed: int,
     *,
     settings: SamplerSettings | None = None,
-    gaps: Sequence[PaperGap] = (),
-    audit: Seeds | None = None,
+    sections: Sequence[Section] = (),
     progress: Progress | None = None,
     workers: int = 1,
     pool: Pool = HERE,
@@ -54,34 +47,21 @@ def work_out(
     seed : int
         Same seed, same numbers.
     settings : SamplerSettings, optional
-    gaps : sequence of PaperGap
-        The source's gaps to diagnose.
-    audit : Seeds, optional
-        How often the audit of the source's tables repeats each search; none, no audit.
+    sections : sequence of Section
+        What the report has beside its outputs.
     progress : callable, optional
         Called with what is being done, steps done and steps planned.
     workers : int
         Processes for leaving rows out, where outputs are worked out here.
     pool : Pool, optional
-        Where outputs, gaps and searches are worked out, in any order. The numbers depend neither
-        on it nor on `workers`.
+        Where outputs and sections are worked out, in any order. The numbers depend neither on it
+        nor on `workers`.
     """
     tell = progress or (lambda what, done, planned: None)
     study = begin_study(
         tasks, seed, pool, settings=settings, progress=progress,
         workers=workers if pool.here else 1,
     )  # fmt: skip
-    searches = begin_convergence(PUBLISHED, seed, audit, pool) if audit is not None else None
-    diagnoses = begin_gaps(seed, gaps, pool)
+    begun = [section.begin(seed, pool) for section in sections]
     studied = study(tell)
-    if audit is None:
-        return Contents(studied, diagnoses(tell), None)
-    rut = studied.successes.get("rut_depth")
-    audited = run_audit(
-        seed,
-        seeds=audit,
-        rut_calibration=None if rut is None else rut.calibration,
-        progress=progress,
-        genetic=searches,
-    )
-    return Contents(studied, diagnoses(tell), audited)
+    return Contents(studied, tuple(finish(studied, tell) for finish in begun))

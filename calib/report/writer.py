@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +12,6 @@ from calib.batch.environment import Environment, sha256
 from calib.batch.folders import fresh_folder
 from calib.batch.pool import HERE, Pool
 from calib.data import write_table
-from calib.he2019.audit import Audit
-from calib.he2019.gaps.find import FoundGap
-from calib.he2019.gaps.summary import summarise_gaps
-from calib.he2019.page.audit import write_audit
-from calib.he2019.page.gaps import begin_gaps_section
 from calib.inference.io import to_datatree, write_netcdf
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
@@ -27,6 +22,7 @@ from calib.report.manifest import build_manifest, file_hashes
 from calib.report.page.render import render_page
 from calib.report.publish import publication
 from calib.report.reference import reference_of
+from calib.report.sections import Found
 from calib.report.study import OutputResult, Study
 from calib.report.summary import summarise
 
@@ -42,11 +38,10 @@ def write_report(
     settings: SamplerSettings,
     command: Sequence[str],
     title: str,
-    gaps: Sequence[FoundGap] = (),
+    sections: Sequence[Found] = (),
     overwrite: bool = False,
     posteriors: bool = True,
     environment: Environment | None = None,
-    audit: Audit | None = None,
     pdf: bool = False,
     progress: Progress | None = None,
     pool: Pool = HERE,
@@ -63,8 +58,8 @@ def write_report(
     command : sequence of str
         The command line, for the manifest.
     title : str
-    gaps : sequence of FoundGap
-        Of the source's own models, diagnosed: a section of their own.
+    sections : sequence of Found
+        What it shows beside its outputs, in their order on the page.
     overwrite : bool
         Replace an earlier report.
     posteriors : bool
@@ -72,8 +67,6 @@ def write_report(
         manifest says so and has their hashes.
     environment : Environment, optional
         Where the manifest says the report was made: that of this process by default.
-    audit : Audit, optional
-        Of the published tables, shown before the appendix.
     pdf : bool
         Whether every figure also comes as PDF, for print.
     progress : callable, optional
@@ -100,10 +93,12 @@ def write_report(
             for key, result in successes.items()
         }
         versions = (environment or Environment.here()).versions
-        section = begin_gaps_section(gaps, folder, png, versions=versions, pdf=pdf, pool=pool)
+        begun = [s.begin(folder, versions=versions, pdf=pdf, pool=pool) for s in sections]
         summary = summarise(study)
-        if gaps:
-            summary["paper_gaps"] = summarise_gaps(gaps)
+        for section in sections:
+            numbers = section.summary()
+            if numbers is not None:
+                summary[section.name] = numbers
         (folder / "summary.json").write_text(json.dumps(summary, indent=1) + "\n")
         manifest = build_manifest(
             study, settings, command, inputs, title=title, environment=environment
@@ -113,11 +108,7 @@ def write_report(
         for path, text in paper.files.items():
             (folder / path).parent.mkdir(exist_ok=True)
             (folder / path).write_text(text, encoding="utf-8")
-        if gaps:
-            manifest["paper_gaps"] = {r.gap.name: {"seed": r.found.seed} for r in gaps}
-        if audit is not None:
-            manifest["audit"] = {"seed": audit.seed, "seeds": asdict(audit.seeds)}
-        audit_html = write_audit(audit, folder) if audit is not None else None
+        manifest |= {section.name: section.record() for section in sections}
         drawn: dict[str, list[Plate]] = {}
         images: dict[str, bytes] = {}
         for i, (key, piece) in enumerate(pieces.items()):
@@ -131,9 +122,8 @@ def write_report(
             images,
             manifest=manifest,
             title=title,
-            gaps_html=section(tell) if gaps else None,
+            more=[finish(tell) for finish in begun],
             reconstructed=any(r.task.table.label for r in study.results.values()),
-            audit_html=audit_html,
             paper=paper,
         )
         (folder / "index.html").write_text(page, encoding="utf-8")

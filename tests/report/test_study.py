@@ -13,6 +13,7 @@ import pytest
 import calib.report.study as study_module
 from calib.batch.environment import sha256
 from calib.data import read_table
+from calib.data.labels import labelled
 from calib.data.quantities import OUTPUTS
 from calib.he2019.datasets import embedded
 from calib.he2019.datasets.embedded import load_he2019
@@ -276,7 +277,7 @@ def test_failures_and_tasks_are_plain_records() -> None:
 def test_the_embedded_data_are_recognised_in_a_file(tmp_path: Path) -> None:
     for path in embedded.write(tmp_path):
         read = read_table(path)
-        assert embedded.labelled(read).label == "reconstructed"
-        assert embedded.labelled(read.take([3, 1])).label == "reconstructed"
+        assert labelled(read).label == "reconstructed"
+        assert labelled(read.take([3, 1])).label == "reconstructed"
         path.write_text(path.read_text().replace("0.0", "0.1", 1))
-        assert embedded.labelled(read_table(path)).label == ""
+        assert labelled(read_table(path)).label == ""

@@ -42,4 +42,5 @@ EFFECTS: Registry[Effect] = Registry(
     LoadTransfer(),
     ConeIndexBias(),
     WaterContentBias(),
+    group="terracalib.effects",
 )

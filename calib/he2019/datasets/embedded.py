@@ -13,7 +13,6 @@ doi:10.1016/j.jterra.2019.07.003; the published figures are in `calib.he2019.dat
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -29,7 +28,7 @@ __all__ = [
     "LABEL",
     "bulk_density",
     "drawbar_pull",
-    "labelled",
+    "holds",
     "load_he2019",
     "rut_depth",
     "tables",
@@ -105,10 +104,9 @@ def _csv(columns: Mapping[str, Array]) -> str:
     return "".join(",".join(row) + "\n" for row in rows)
 
 
-def labelled(table: Table) -> Table:
-    """Return a table, labelled if all its rows are rows of the embedded data."""
-    known = any(_within(table, columns) for columns in tables().values())
-    return replace(table, label=LABEL) if known else table
+def holds(table: Table) -> bool:
+    """Whether all rows of a table are rows of the embedded data."""
+    return any(_within(table, columns) for columns in tables().values())
 
 
 def _within(table: Table, columns: Mapping[str, Array]) -> bool:

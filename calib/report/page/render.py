@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 from markupsafe import Markup
@@ -12,6 +13,7 @@ from calib.report.figures import Plate
 from calib.report.page.content import failed_section, section
 from calib.report.page.template import template
 from calib.report.publish import Publication
+from calib.report.sections import Written
 from calib.report.study import OutputResult, Study
 
 __all__ = ["render_page"]
@@ -25,8 +27,7 @@ def render_page(
     manifest: Mapping[str, Any],
     title: str,
     reconstructed: bool,
-    gaps_html: str | None = None,
-    audit_html: str | None = None,
+    more: Sequence[Written] = (),
     paper: Publication | None = None,
 ) -> str:
     """Render the report.
@@ -43,10 +44,8 @@ def render_page(
     title : str
     reconstructed : bool
         Whether any data were reconstructed from published results.
-    gaps_html : str, optional
-        A section on the source's own gaps, from `calib.he2019.page.gaps.write_gaps`.
-    audit_html : str, optional
-        A section to be placed before the appendix, as trusted HTML.
+    more : sequence of Written
+        Sections after the outputs, as trusted HTML.
     paper : Publication, optional
         Tables and methods beside the page.
 
@@ -65,8 +64,7 @@ def render_page(
         title=title,
         sections=sections,
         reconstructed=reconstructed,
-        gaps=Markup(gaps_html) if gaps_html else None,
-        audit=Markup(audit_html) if audit_html else None,
+        more=[{**asdict(s), "html": Markup(s.html)} for s in more],
         paper=paper if paper is not None and paper.files else None,
         seed=study.seed,
         command=shlex.join(str(part) for part in manifest.get("command", ())),

@@ -15,8 +15,8 @@ from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
 from calib.batch.campaign.place import Place, word
 from calib.batch.folders import read_folder
 from calib.data import Table, hold_out, read_for_model
+from calib.data.labels import labelled
 from calib.errors import CalibError
-from calib.he2019.datasets.embedded import labelled
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
