@@ -36,7 +36,7 @@ def problem_of(
 
     names = tuple(p.name for p in priors)[:-1]
     model = Model(
-        name="custom", title="a test", equation="", output="drawbar_pull_kn",
+        name="custom", title="a test", output="drawbar_pull_kn",
         conditions=("slip_ratio",), parameters=names, reported={}, response="identity",
         location=location, report_theta=lambda theta, references: {},
         theta_from_reported=lambda reported, references: np.empty(0),

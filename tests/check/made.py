@@ -14,6 +14,7 @@ from unittest.mock import patch
 from calib.he2019.audit import Seeds
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.gaps.cases import paper_gaps
+from calib.he2019.sections import AuditSection, GapsSection
 from calib.he2019.tasks import he2019_tasks
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
@@ -27,6 +28,7 @@ from calib.report.figures import Plate
 from calib.report.figures.bands import bands_plate
 from calib.report.figures.learned import learned_plate
 from calib.report.figures.style import style
+from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult, Study, run_study
 from calib.report.study_tasks import Task
 from calib.report.writer import write_report
@@ -37,12 +39,12 @@ ROOT = Path(__file__).resolve().parents[2]
 SETTINGS = SamplerSettings(steps=100, gate=Gate(taus_min=20.0))
 
 
-def two_plates(result: OutputResult, published: bool = False) -> list[Plate]:
+def two_plates(result: OutputResult, reference: Reference = NOTHING) -> list[Plate]:
     """Drawing takes most of the time of a report: two figures do for these tests."""
     with style():
         return [
-            bands_plate(result, published=published),
-            learned_plate(result, published=published),
+            bands_plate(result, reference=reference),
+            learned_plate(result, reference=reference),
         ]
 
 
@@ -70,8 +72,9 @@ def report(out: Path) -> Path:
 def whole(out: Path) -> Path:
     """A report with one of the source's gaps, the audit and figures for print."""
     gaps = [gap for gap in paper_gaps() if gap.name == "plain_bekker"]
-    found = work_out(rut_tasks(), 2019, settings=SETTINGS, gaps=gaps, audit=Seeds(1, 1, 1))
-    return write(found.study, out, gaps=found.gaps, audit=found.audit, pdf=True)
+    sections = [GapsSection(gaps), AuditSection(Seeds(1, 1, 1))]
+    found = work_out(rut_tasks(), 2019, settings=SETTINGS, sections=sections)
+    return write(found.study, out, sections=found.found, pdf=True)
 
 
 def run(out: Path) -> Path:

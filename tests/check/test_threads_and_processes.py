@@ -21,7 +21,7 @@ import pytest
 
 from calib.he2019.audit import Seeds, audit_json
 from calib.he2019.gaps.cases import paper_gaps
-from calib.he2019.gaps.summary import summarise_gaps
+from calib.he2019.sections import AuditSection, GapsSection
 from calib.he2019.tasks import he2019_tasks
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.contents import work_out
@@ -48,13 +48,14 @@ def all_numbers() -> dict:
     """Those of a report: of outputs, a gap and the audit."""
     tasks = [task for task in he2019_tasks() if task.output in OUTPUTS]
     found = work_out(
-        tasks, 2019, settings=SHORT, gaps=paper_gaps()[:1], audit=Seeds(1, 1, 1)
+        tasks, 2019, settings=SHORT,
+        sections=[GapsSection(paper_gaps()[:1]), AuditSection(Seeds(1, 1, 1))],
     )  # fmt: skip
-    assert found.audit is not None
+    gaps, audit = found.found
     return {
         "models": summarise(found.study)["models"],
-        "gaps": summarise_gaps(found.gaps),
-        "audit": json.loads(audit_json(found.audit)),
+        "gaps": gaps.summary(),
+        "audit": json.loads(audit_json(audit.audit)),
     }
 
 

@@ -35,7 +35,7 @@ def test_a_users_effect_that_does_not_run_is_named(calib: Calib) -> None:  # noq
     assert calib("data", "he2019-gaps", "--out", "gaps").code == 0
     Path("mine.py").write_text(
         "from calib.gap.effects import Effect\n\n\nclass Wind(Effect):\n    name = 'wind'\n"
-        "    parameters = ('deeper',)\n    outputs = ('rut_depth',)\n\n"
+        "    parameters = ('deeper',)\n    outputs = ('sinkage',)\n\n"
         "    def on_output(self, phi, output, location, view):\n        return location + gust\n"
     )
     Path("wind.toml").write_text(
@@ -72,9 +72,9 @@ def test_the_report_of_the_embedded_data_has_the_section(
         return lambda tell: (found_gaps["plain_bekker"],)
 
     monkeypatch.setattr("calib.he2019.tasks.he2019_tasks", lambda: ())
-    monkeypatch.setattr("calib.report.contents.begin_gaps", begin)
-    monkeypatch.setattr("calib.report.contents.begin_convergence", lambda *_: None)
-    monkeypatch.setattr("calib.report.contents.run_audit", lambda *_, **__: audit)
+    monkeypatch.setattr("calib.he2019.sections.begin_gaps", begin)
+    monkeypatch.setattr("calib.he2019.sections.begin_convergence", lambda *_: None)
+    monkeypatch.setattr("calib.he2019.sections.run_audit", lambda *_, **__: audit)
     ran = calib("report", "--out", "rep", "--seed", 5)
     assert ran.code == 0, ran.err
     assert asked == [5]
@@ -86,7 +86,7 @@ def test_the_report_of_own_data_has_no_such_section(
     calib: Calib,  # noqa: F811
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("calib.report.writer.plates", lambda result, published: [])
+    monkeypatch.setattr("calib.report.writer.plates", lambda result, reference: [])
     Path("my.csv").write_text(example_csv("modified_bekker"))
     ran = calib("report", "my.csv", "--out", "rep")
     assert ran.code == 0, ran.err

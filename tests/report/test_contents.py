@@ -7,6 +7,7 @@ from pathlib import Path
 from calib.batch.pool import pool
 from calib.he2019.audit import Seeds
 from calib.he2019.gaps.cases import paper_gaps
+from calib.he2019.sections import AuditSection, GapsSection
 from calib.he2019.tasks import he2019_tasks
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.contents import work_out
@@ -30,11 +31,16 @@ def test_processes_make_the_same_report_as_one(tmp_path: Path) -> None:
 
         with pool(workers) as side:
             found = work_out(
-                tasks, 7, settings=SHORT, gaps=gaps, audit=Seeds(1, 1, 2), progress=tell, pool=side
+                tasks,
+                7,
+                settings=SHORT,
+                progress=tell,
+                pool=side,
+                sections=[GapsSection(gaps), AuditSection(Seeds(1, 1, 2))],
             )
             write_report(
                 found.study, tmp_path / f"{workers}", settings=SHORT, command=["calib"], title="R",
-                gaps=found.gaps, audit=found.audit, progress=tell, pool=side,
+                sections=found.found, progress=tell, pool=side,
             )  # fmt: skip
     one, two = (file_hashes(tmp_path / f"{workers}") for workers in (1, 2))
     assert one == two

@@ -125,7 +125,7 @@ def test_pressures_that_cannot_be_fitted_alone_are_left_out() -> None:
     tasks = plan_tasks([table(**columns).take(keep)])
     (task,) = tasks
     assert task.model == "magic_formula_pressure"
-    found = study_module._by_pressure(task, 1)
+    found = study_module._each_alone(task, 1)
     assert set(found) == {18.0}
     assert {e.method for e in found[18.0]} >= {"least_squares", "genetic"}
 

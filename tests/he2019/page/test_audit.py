@@ -10,6 +10,7 @@ import pytest
 from calib.he2019.audit import Verdict
 from calib.he2019.page.audit import AUDIT_MARKS, audit_section, write_audit_page
 from calib.report.figures.plate import Plate
+from calib.report.sections import Written
 from tests.report.page.test_page import PNG, Reader, page
 
 
@@ -92,7 +93,9 @@ def test_the_page_stands_alone(audit, written):
 
 
 def test_the_section_fits_into_the_report(rut, section):
-    html, reader = page({"rut_depth": rut}, audit_html=section)
+    html, reader = page(
+        {"rut_depth": rut}, more=[Written("audit", "Audit of the published tables", "", section)]
+    )
     assert reader.open == []
     assert len(reader.ids) == len(set(reader.ids))
     assert "#audit" in reader.addresses

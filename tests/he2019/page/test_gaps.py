@@ -11,6 +11,7 @@ import pytest
 from calib.he2019.gaps.checks import Check, checks
 from calib.he2019.page.checks import check_text
 from calib.he2019.page.gaps import _withheld
+from calib.he2019.sections import FoundGaps
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.figures.gap_rows import short_name
 from calib.report.figures.labels import short
@@ -27,7 +28,7 @@ def written(folder: Path, gaps) -> Path:
     """Write a report of nothing but gaps."""
     write_report(
         NOTHING, folder, settings=SamplerSettings(), command=["calib", "report"],
-        title="Report", gaps=gaps,
+        title="Report", sections=[FoundGaps(tuple(gaps))] if gaps else (),
     )  # fmt: skip
     return folder
 

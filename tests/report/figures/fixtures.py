@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from calib.data import Table, table_from_arrays
+from calib.he2019.figures.reference import HE2019
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.problem import build_problem
 from calib.report.figures import Plate
 from calib.report.figures.collect import plates
 from calib.report.figures.style import style
+from calib.report.reference import NOTHING
 from calib.report.study import OutputResult
 from tests.report.figures.results import build
 
@@ -60,7 +62,7 @@ def all_plates(
 ) -> dict[str, list[Plate]]:
     """The figures of each output, laid out."""
     results = {"drawbar": drawbar, "density": density, "rut": rut, "plate": plate}
-    found = {k: plates(r, published=k != "plate") for k, r in results.items()}
+    found = {k: plates(r, NOTHING if k == "plate" else HE2019) for k, r in results.items()}
     with style():
         for p in (p for drawn in found.values() for p in drawn):
             assert p.figure is not None, p.caption

@@ -12,7 +12,7 @@ from matplotlib import rcParams
 from matplotlib.collections import LineCollection
 
 from calib.data import table_from_arrays
-from calib.he2019.figures.reference import HE2019, published_curve, published_sampled
+from calib.he2019.figures.reference import HE2019
 from calib.report.figures import collect
 from calib.report.figures.bands import bands_plate
 from calib.report.figures.collect import plates
@@ -27,6 +27,7 @@ from calib.report.figures.roles import BOTH, DATA, MOVED, PRIOR, role_of
 from calib.report.figures.rows import groups, smooth_bands
 from calib.report.figures.style import style
 from calib.report.figures.validation import validation_plate
+from calib.report.reference import NOTHING
 
 UNIT = re.compile(r"\(.+\)$")
 NAMES = ("bands", "validation", "prior_predictive", "learned", "corner", "ensembles", "residuals",
@@ -112,23 +113,23 @@ def test_bands_say_what_was_held_out_and_show_each_point_once(drawbar):
 
 
 def test_published_curves_only_where_wanted(rut):
-    def legend(published):
-        fig = bands_plate(rut, published=published).figure
+    def legend(reference):
+        fig = bands_plate(rut, reference=reference).figure
         return [t.get_text() for t in fig.legends[0].get_texts()]
 
-    assert "published fit (Table 6)" in legend(True)
-    assert not any("published" in t for t in legend(False))
+    assert "published fit (Table 6)" in legend(HE2019)
+    assert not any("published" in t for t in legend(NOTHING))
 
 
 def test_published_curve_of_the_rut_is_equation_21(rut):
     conditions = {"average_ground_pressure_kpa": np.array([150.0]), "slip_ratio": np.array([0.1])}
-    depth, source = published_curve("modified_bekker", conditions)
+    depth, source = HE2019.curve("modified_bekker", conditions)
     assert depth[0] == pytest.approx(1000 * (150 / 3.306e5) ** (1 / (1.996 + 0.1266)))
     assert source == "Table 6"
 
 
 def test_published_figures_on_the_sampled_scale(drawbar):
-    marks = published_sampled(drawbar.calibration.problem.bound)
+    marks = HE2019.sampled(drawbar.calibration.problem.bound)
     assert marks["D_lo"] == pytest.approx(1.6480)
     assert marks["K_hi"] == pytest.approx(0.1265 * 1.4802 * 0.5954)
     mean = 0.5 * (1.6480 + 0.5954)

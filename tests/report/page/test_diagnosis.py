@@ -489,8 +489,8 @@ def test_what_comes_and_goes_is_not_told_by_its_end(tmp_path):
     from tests.gap.test_load_effects import CODE, write
 
     # Wind on every other run: over the last runs its mean is half of what it is in a gust.
-    code = CODE.replace("phi[:, :1]", 'phi[:, :1] * (view.conditions["run_order"] % 2.0)')
-    code = code.replace("    outputs =", '    covariates = ("run_order",)\n    outputs =')
+    code = CODE.replace("phi[:, :1]", 'phi[:, :1] * (view.of("order") % 2.0)')
+    code = code.replace("    outputs =", '    covariates = ("order",)\n    outputs =')
     effects = load_effects(write(tmp_path, code))
     case = make_case(None, models=PULL_ONLY, n_field=36, n_fresh=3)
     columns = {name: np.array(v) for name, v in case.field.columns.items()}

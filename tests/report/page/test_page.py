@@ -25,6 +25,7 @@ from calib.report.page.tables import (
     pressure_grids,
     sensitivity_grid,
 )
+from calib.report.sections import Written
 from calib.report.study import Failure, Study
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\x00\x02\x00\x00\x00\x03\x08\x06\x00\x00\x00rest"
@@ -220,8 +221,10 @@ def test_the_footer_says_how_to_get_the_same_numbers(whole):
         assert words in reader.text
 
 
-def test_an_audit_is_placed_as_given(rut):
-    html, reader = page({"rut_depth": rut}, audit_html="<p>All <b>agree</b>.</p>")
+def test_a_section_is_placed_as_given(rut):
+    html, reader = page(
+        {"rut_depth": rut}, more=[Written("audit", "Audit", "new", "<p>All <b>agree</b>.</p>")]
+    )
     assert "<p>All <b>agree</b>.</p>" in html
     assert "audit" in reader.ids
 

@@ -24,7 +24,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("sbc") / "run"
     result = CliRunner().invoke(
         app,
-        ["sbc", "--out", str(folder), "--models", "bekker", "--simulations", "10", "--seed", "3",
+        ["sbc", "--out", str(folder), "--model", "bekker", "--simulations", "10", "--seed", "3",
          "--workers", "1"],
     )  # fmt: skip
     assert result.exit_code == 0, result.output
