@@ -19,8 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from calib.challenge.design import Tier
-from calib.challenge.make import make_case
 from calib.gap.case import OutputData, campaigns, read_case
 from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
@@ -30,6 +28,8 @@ from calib.gap.shifts import alone_sd, coordinates
 from calib.gap.which import calibrate_lab
 from calib.tasks import completed
 from calib.threads import one_thread
+from challenge.design import Tier
+from challenge.make import make_case
 
 type Array = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from challenge.blind import blind_test  # noqa: F401
+from blind import blind_test  # noqa: F401
 from figures.fixtures import (  # noqa: F401
     all_plates,
     density,

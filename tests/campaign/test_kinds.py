@@ -10,7 +10,6 @@ import pytest
 
 from calib.calibration import calibrate
 from calib.campaign import read_plan, run_campaign
-from calib.challenge.make import make
 from calib.data import hold_out, read_table
 from calib.datasets import he2019
 from calib.errors import CalibError
@@ -24,6 +23,7 @@ from calib.streams import generator
 from calib.templates import template_csv
 from calib.validate import validate_held_out
 from campaign.sites import EFFECT, NAMES, WIND, content, refuse_all
+from challenge.make import make
 
 
 def test_a_diagnosis_is_that_of_the_verb(site, serial, tmp_path):

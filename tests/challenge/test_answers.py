@@ -7,10 +7,9 @@ from typing import Any
 
 import pytest
 from scipy.stats import norm
+from test_score import entry
 
-from calib.challenge.answers import read_answer
-
-from .test_score import entry
+from challenge.answers import read_answer
 
 
 def told_apart(tmp_path: Path, truth: str, **rival: Any) -> float | None:

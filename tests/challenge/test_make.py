@@ -11,15 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from blind import BlindTest
 
-from calib.challenge.build import try_case
-from calib.challenge.effects import LISTED
-from calib.challenge.files import OUTPUT_COLUMNS
-from calib.challenge.make import make, make_case, plan
-from calib.challenge.seal import open_key, sha256
 from calib.errors import CalibError
-
-from .blind import BlindTest
+from challenge.build import try_case
+from challenge.effects import LISTED
+from challenge.files import OUTPUT_COLUMNS
+from challenge.make import make, make_case, plan
+from challenge.seal import open_key, sha256
 
 CONTRACT_COLUMNS = (
     "run_order", "slip_ratio", "inflation_pressure_kpa", "inflation_pressure_psi",
@@ -191,8 +190,8 @@ def test_drawn_lab_is_described_by_the_cases_models() -> None:
     drawn = [case for case in (try_case(rng, "hard", "none") for _ in range(6)) if case]
     assert drawn
     for case in drawn:
-        stage = case.stage
-        predicted = stage.simulator.predict(stage.field)
-        for name, sd in stage.field_sd.items():
-            miss = (predicted[name] - stage.field_without[name]) / sd
+        scenario = case.scenario
+        predicted = scenario.simulator.predict(scenario.field)
+        for name, sd in scenario.field_sd.items():
+            miss = (predicted[name] - scenario.field_without[name]) / sd
             assert np.sqrt(np.mean(miss**2)) < 0.35

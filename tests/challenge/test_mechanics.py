@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from realities import conditions, reality, sandy_loam
 
-from calib.challenge.contact import settle, solve_increasing
-from calib.challenge.density import draw_cone_law
-from calib.challenge.mechanics import self_propelled_slip, simulate
-from calib.challenge.soil import draw_soil, shear_stress
-from calib.challenge.tyre import PSI_KPA, Tyre, average_ground_pressure
-
-from .conftest import conditions, reality, sandy_loam
+from challenge.contact import settle, solve_increasing
+from challenge.density import draw_cone_law
+from challenge.mechanics import self_propelled_slip, simulate
+from challenge.soil import draw_soil, shear_stress
+from challenge.tyre import PSI_KPA, Tyre, average_ground_pressure
 
 
 def test_contact_lengths_are_the_measured_ones() -> None:
