@@ -173,7 +173,7 @@ def _reality(
     return None if reality is None else (reality, reality.mechanisms[0].sentence)
 
 
-def recalibration_closes(scenario: Scenario, field: Readings, fresh: Readings) -> bool:
+def _recalibration_closes(scenario: Scenario, field: Readings, fresh: Readings) -> bool:
     """Whether the same models with other parameters describe field and fresh."""
     noise = scenario.design.noise
     fresh_sd = {name: noise.sd(name, value, scenario.fresh.slip) for name, value in fresh.items()}
@@ -206,17 +206,12 @@ def _telling(
     return None if truth == UNKNOWN and told.rival_nats < UNLISTED_NATS[tier] else told
 
 
-def unlisted_weight(kind: EffectKind) -> float:
-    """Return how often an unlisted mechanism is drawn, relative to those of a wheel."""
-    return DENSITY_ODDITY if kind.outputs == (DENSITY,) else 1.0
-
-
 def unlisted_order(rng: np.random.Generator) -> list[EffectKind]:
     """Return the unlisted mechanisms in random order, those of wheels mostly first.
 
     A density gauge is one instrument among many: its oddities are the rarer ones.
     """
-    weights = np.array([unlisted_weight(kind) for kind in UNLISTED])
+    weights = np.array([DENSITY_ODDITY if k.outputs == (DENSITY,) else 1.0 for k in UNLISTED])
     order = rng.choice(len(UNLISTED), len(UNLISTED), replace=False, p=weights / weights.sum())
     return [UNLISTED[int(i)] for i in order]
 
@@ -263,7 +258,7 @@ def try_case(
     gap = scenario.gap(field)
     if not all(np.isfinite(part).all() for part in (*field.values(), *fresh.values())):
         return None
-    if truth == SHIFT and not recalibration_closes(scenario, field, fresh):
+    if truth == SHIFT and not _recalibration_closes(scenario, field, fresh):
         return None
     told = _telling(rng, scenario, gap, truth, kinds)
     if told is None:

@@ -18,7 +18,6 @@ _NODES, _WEIGHTS = 0.5 * (_NODES + 1.0), 0.5 * _WEIGHTS
 _SHALLOW_M, _DEEP_M = 1e-4, 0.25
 _ITERATIONS = 60
 _TOLERANCE = 1e-9
-_BESIDE = 0.02
 
 
 @dataclass(frozen=True)
@@ -132,43 +131,7 @@ def solve_increasing(
     return np.where(outside, ends, now)
 
 
-def solve_near(function: Callable[[Array], Array], low: Array, high: Array, near: Array) -> Array:
-    """Return what `solve_increasing` returns, from a place that is not far from the root.
-
-    Parameters
-    ----------
-    function, low, high
-        As for `solve_increasing`.
-    near : array
-        Where to begin, shape ``(N,)``.
-    """
-    low, high = low.astype(np.float64), high.astype(np.float64)
-    old, now = near, near + _BESIDE
-    f_old, f_now = function(old), function(now)
-    for _ in range(_ITERATIONS):
-        low, high = np.where(f_now > 0.0, low, now), np.where(f_now > 0.0, now, high)
-        slope = (f_now - f_old) / np.where(now == old, 1.0, now - old)
-        step = f_now / np.where(slope > 0.0, slope, 1.0)
-        safe = (slope > 0.0) & (now - step >= low) & (now - step <= high)
-        new = np.where(safe, now - step, 0.5 * (low + high))
-        # What has arrived stays: two values that are the same say nothing about the slope.
-        moving = np.abs(new - now) > _TOLERANCE
-        if not moving.any():
-            break
-        old, f_old = np.where(moving, now, old), np.where(moving, f_now, f_old)
-        now = np.where(moving, new, now)
-        f_now = function(now)
-    return now
-
-
-def settle(
-    soil: Soil,
-    tyre: Tyre,
-    slip: Array,
-    inflation_kpa: Array,
-    load_kn: Array,
-    near_m: Array | None = None,
-) -> Contact:
+def settle(soil: Soil, tyre: Tyre, slip: Array, inflation_kpa: Array, load_kn: Array) -> Contact:
     """Return the contact in vertical equilibrium.
 
     A flat patch, as long as on firm ground, at the depth where the soil carries the load, and an
@@ -184,8 +147,6 @@ def settle(
         The tyre.
     slip, inflation_kpa, load_kn : array
         Conditions, shape ``(N,)``.
-    near_m : array, optional
-        A sinkage from which to look for the equilibrium, shape ``(N,)``: the same, sooner.
 
     References
     ----------
@@ -198,10 +159,7 @@ def settle(
         return np.log(_profile(soil, tyre, slip, length, np.exp(log_depth)).vertical / load_kn)
 
     bounds = np.full(slip.shape, np.log(_SHALLOW_M)), np.full(slip.shape, np.log(_DEEP_M))
-    if near_m is None:
-        sinkage = np.exp(solve_increasing(excess, *bounds))
-    else:
-        sinkage = np.exp(solve_near(excess, *bounds, np.log(near_m)))
+    sinkage = np.exp(solve_increasing(excess, *bounds))
     got = _profile(soil, tyre, slip, length, sinkage)
     return Contact(
         soil=soil,

@@ -130,7 +130,7 @@ class Design:
         return tuple(self.models)
 
 
-def draw_outputs(rng: np.random.Generator, needs: Needs) -> tuple[str, ...]:
+def _draw_outputs(rng: np.random.Generator, needs: Needs) -> tuple[str, ...]:
     """Draw what is measured."""
     wheels = ((DRAWBAR, RUT), (DRAWBAR,), (RUT,))
     options = (*wheels, (DENSITY,), (DRAWBAR, RUT, DENSITY))
@@ -144,7 +144,9 @@ def draw_outputs(rng: np.random.Generator, needs: Needs) -> tuple[str, ...]:
     return options[int(chosen)]
 
 
-def draw_models(rng: np.random.Generator, outputs: tuple[str, ...], needs: Needs) -> dict[str, str]:
+def _draw_models(
+    rng: np.random.Generator, outputs: tuple[str, ...], needs: Needs
+) -> dict[str, str]:
     """Draw the model of every output."""
     rut = needs.rut_model or ("modified_bekker" if rng.random() < 0.84 else "bekker")
     single = outputs == (DRAWBAR,) and "inflation_kpa" not in needs.varies and rng.random() < 0.25
@@ -174,7 +176,7 @@ def _draw_slips(rng: np.random.Generator, pressures: int) -> tuple[float, ...]:
 _COVARIATES = ("run_order", "speed_m_s", "pass_number", "water_content")
 
 
-def draw_columns(
+def _draw_columns(
     rng: np.random.Generator, outputs: tuple[str, ...], needs: Needs, pressures: int
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Draw which conditions are recorded and which of them vary."""
@@ -232,11 +234,11 @@ def draw_design(rng: np.random.Generator, tier: Tier, needs: Needs) -> Design:
     needs : Needs
         What the case's effects ask for.
     """
-    outputs = draw_outputs(rng, needs)
-    models = draw_models(rng, outputs, needs)
+    outputs = _draw_outputs(rng, needs)
+    models = _draw_models(rng, outputs, needs)
     pressures = _draw_pressures(rng, models)
     slips = _draw_slips(rng, len(pressures))
-    columns, varying = draw_columns(rng, outputs, needs, len(pressures))
+    columns, varying = _draw_columns(rng, outputs, needs, len(pressures))
     wheel = outputs != (DENSITY,)
     field_rows = _EASY_ROWS if tier == "easy" else int(rng.choice(_HARD_ROWS))
     spread = rng.random()

@@ -16,7 +16,7 @@ from challenge.design import Tier
 from challenge.effects import LISTED, wheel_effects
 from challenge.files import CaseFiles, case_files
 from challenge.mechanism import NONE, SHIFT, UNKNOWN
-from challenge.seal import KEY_SCHEMA, check_outside, publish, seal
+from challenge.seal import KEY_SCHEMA, check_new, publish, seal
 
 type Progress = Callable[[int, int], None]
 type Job = tuple[np.random.SeedSequence, Tier, str]
@@ -141,22 +141,6 @@ def make_job(job: Job) -> CaseFiles:
     return make_case(*job)
 
 
-def _check(out_dir: Path, key_path: Path) -> None:
-    check_outside(out_dir, key_path)
-    if out_dir.exists() and any(out_dir.iterdir()):
-        raise CalibError(
-            "the folder is not empty",
-            where=str(out_dir),
-            mend="choose a new folder, so that cases of two tests cannot mix",
-        )
-    if key_path.exists():
-        raise CalibError(
-            "a key is there already",
-            where=str(key_path),
-            mend="choose another path; without its key a test cannot be scored",
-        )
-
-
 def make(
     out_dir: Path,
     key_path: Path,
@@ -200,7 +184,7 @@ def make(
     CalibError
         If a path or a number will not do.
     """
-    _check(out_dir, key_path)
+    check_new(out_dir, key_path)
     jobs, planning = case_jobs(seed, n_cases, tiers, null_fraction)
     entries: dict[str, Any] = {}
     out_dir.mkdir(parents=True, exist_ok=True)

@@ -53,28 +53,16 @@ def _pull_at(reality: Reality, slip: Array, inflation: Array) -> Array:
     return settle(reality.soil, reality.tyre, slip, inflation, load).pull_kn
 
 
-def zero_pull_slip(reality: Reality, inflation_kpa: Array) -> Array:
-    """Return the slip against the unloaded radius at which the pull vanishes, shape ``(N,)``.
-
-    Parameters
-    ----------
-    reality : Reality
-        Its soil may have one value per row.
-    inflation_kpa : array
-        Shape ``(N,)``.
-    """
-    low, high = np.full(inflation_kpa.shape, -0.01), np.full(inflation_kpa.shape, 0.3)
-    return solve_increasing(lambda s: _pull_at(reality, s, inflation_kpa), low, high, 1e-8)
-
-
 def self_propelled_slip(reality: Reality, inflation_kpa: Array) -> Array:
-    """Return `zero_pull_slip` of one soil, shape ``(N,)``.
+    """Return the slip against the unloaded radius at which the pull vanishes, shape ``(N,)``.
 
     Recorded slips count from there, as in the source paper: a wheel without drawbar pull slips
     just enough to overcome its own resistance. Solved at the distinct pressures only.
     """
     distinct, back = np.unique(inflation_kpa, return_inverse=True)
-    return np.asarray(zero_pull_slip(reality, distinct)[back], dtype=np.float64)
+    low, high = np.full(distinct.shape, -0.01), np.full(distinct.shape, 0.3)
+    zero = solve_increasing(lambda s: _pull_at(reality, s, distinct), low, high, 1e-8)
+    return np.asarray(zero[back], dtype=np.float64)
 
 
 def simulate(reality: Reality, recorded: Conditions, zero: Array | None = None) -> Readings:

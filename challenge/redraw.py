@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from calib.errors import CalibError
-from calib.folders import check_folder
 from calib.tasks import completed
 from challenge.files import CaseFiles
-from challenge.seal import KEY_SCHEMA, check_outside, open_key, publish, seal
+from challenge.seal import KEY_SCHEMA, check_new, open_key, publish, seal
 
 type Draw = Callable[[Path, str, float], tuple[dict[str, str], dict[str, Any]]]
 
@@ -68,12 +67,7 @@ def redraw(
         If the key is not that of the cases, a path will not do, or no case could be drawn.
     """
     key = open_key(cases, key_path)
-    check_outside(out, out_key)
-    check_folder(out, overwrite=False)
-    if out_key.exists():
-        raise CalibError(
-            "a key is there already", where=str(out_key), mend="choose another path for the new key"
-        )
+    check_new(out, out_key)
     jobs = {
         name: _Job(cases / name, entry["tier"], entry["truth"], entry["gap_over_noise"])
         for name, entry in key["cases"].items()

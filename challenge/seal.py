@@ -28,20 +28,32 @@ def commitment(seed: int, salt: str) -> str:
     return sha256(f"{salt}:{seed}".encode())
 
 
-def check_outside(cases_dir: Path, key_path: Path) -> None:
-    """Refuse a key within the cases.
+def check_new(cases_dir: Path, key_path: Path) -> None:
+    """Check where cases and their key are to be written.
 
     Raises
     ------
     CalibError
-        If the key would lie in the cases' folder or below it.
+        If the key would lie with the cases, or something is there already.
     """
     if key_path.resolve().is_relative_to(cases_dir.resolve()):
         raise CalibError(
             "the key must not lie with the cases that it answers",
             where=str(key_path),
             allowed=f"a path outside {cases_dir}",
-            mend="choose another --key path",
+            mend="choose another path for the key",
+        )
+    if cases_dir.exists() and any(cases_dir.iterdir()):
+        raise CalibError(
+            "the folder is not empty",
+            where=str(cases_dir),
+            mend="choose a new folder, so that cases of two tests cannot mix",
+        )
+    if key_path.exists():
+        raise CalibError(
+            "a key is there already",
+            where=str(key_path),
+            mend="choose another path; without its key a test cannot be scored",
         )
 
 
