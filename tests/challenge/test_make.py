@@ -133,8 +133,8 @@ def test_same_seed_same_bytes(blind_test: BlindTest, tmp_path: Path) -> None:
     assert (tmp_path / "key.json").read_bytes() == blind_test.key.read_bytes()
     for path in blind_test.cases.rglob("*"):
         if path.is_file():
-            twin = tmp_path / "c" / path.relative_to(blind_test.cases)
-            assert twin.read_bytes() == path.read_bytes()
+            other = tmp_path / "c" / path.relative_to(blind_test.cases)
+            assert other.read_bytes() == path.read_bytes()
     a, b = (make_case(np.random.SeedSequence(seed), "hard", "none") for seed in (1, 2))
     assert a.files["lab.csv"] != b.files["lab.csv"]
 
