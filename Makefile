@@ -32,14 +32,14 @@ bench: $(BENCH_IN)/.ready
 	$(BENCH_IN)/bin/python benchmarks/bench.py $(PART)
 
 lint: $(READY)
-	$(BIN)/ruff check calib tests benchmarks
-	$(BIN)/ruff format --check calib tests benchmarks
+	$(BIN)/ruff check calib challenge tests benchmarks
+	$(BIN)/ruff format --check calib challenge tests benchmarks
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 format: $(READY)
-	$(BIN)/ruff check --fix calib tests benchmarks
-	$(BIN)/ruff format calib tests benchmarks
+	$(BIN)/ruff check --fix calib challenge tests benchmarks
+	$(BIN)/ruff format calib challenge tests benchmarks
 
 # $(call setup,extra,constraints): make the target's virtual environment with an optional extra.
 define setup

@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=200, help="diagnoses")
     parser.add_argument("--repeats", type=int, default=3, help="of the overhead")
     options = parser.parse_args()
-    from calib.challenge.make import make
+    from challenge.make import make
 
     result: dict[str, object] = {
         "machine": describe(),

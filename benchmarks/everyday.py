@@ -87,7 +87,8 @@ class Tree:
         kept = {k: v for k, v in os.environ.items() if k not in drop}
         self.env = {**kept, "PYTHONPATH": str(root), "OPENBLAS_NUM_THREADS": "1"}
         scratch.mkdir()
-        self.output(["-m", "compileall", "-q", "calib", "tests"])
+        there = [name for name in ("calib", "challenge", "tests") if (root / name).is_dir()]
+        self.output(["-m", "compileall", "-q", *there])
         at = self.output(["-c", "import calib; print(calib.__file__)"])
         if not Path(at.strip()).is_relative_to(root):
             raise SystemExit(f"calib is imported from {at.strip()}, not from {root}")
@@ -194,7 +195,7 @@ def made_or_shared(scratch: Path) -> list[Path]:
     """Case folders: the shared ones, or some of the blind test's where there are none."""
     shared = ROOT.parent / "shared" / "cases"
     if not shared.is_dir():
-        from calib.challenge.make import make
+        from challenge.make import make
 
         shared = scratch / "cases"
         make(shared, scratch / "key.json", seed=SEED, n_cases=CASES)

@@ -20,11 +20,11 @@ from shared.machine import describe, use_one_core
 from shared.measure import spread
 
 from calib.data import Table, hold_out
+from calib.he2019.tasks import he2019_tasks
 from calib.inference.estimators.base import PointEstimate
 from calib.inference.estimators.differential_evolution import estimate_differential_evolution
 from calib.inference.estimators.genetic import estimate_genetic
 from calib.inference.problem import Problem, build_problem
-from calib.he2019.tasks import he2019_tasks
 
 SEEDS = 20
 # A final cost is the optimum's if it exceeds it by less than this part.

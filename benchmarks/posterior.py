@@ -23,12 +23,12 @@ from shared.machine import describe, hold_memory, use_one_core
 from shared.measure import spread
 from shared.peers import pymc_model
 
+from calib.he2019.tasks import he2019_tasks
 from calib.inference.diagnostics import ess
 from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings, sample_posterior
 from calib.models.base import Array
-from calib.he2019.tasks import he2019_tasks
 
 # Draws of each sampler: its defaults, and so many that what comes before them is of no account.
 OURS = {"default": {}, "long": {"walkers": 1024, "steps": 640}}

@@ -21,8 +21,6 @@ from scipy.special import logsumexp
 
 from calib.batch.tasks import completed
 from calib.batch.threads import one_thread
-from calib.challenge.design import Tier
-from calib.challenge.make import make_case
 from calib.gap.case import OutputData, campaigns, read_case
 from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
@@ -30,6 +28,8 @@ from calib.gap.hypotheses import SHIFTS
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.shifts import alone_sd, coordinates
 from calib.gap.which import calibrate_lab
+from challenge.design import Tier
+from challenge.make import make_case
 
 type Array = NDArray[np.float64]
 

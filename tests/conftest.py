@@ -13,7 +13,7 @@ from calib.he2019.gaps.find import FoundGap, find_gaps
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
-from tests.challenge.blind import blind_test  # noqa: F401
+from tests.blind import blind_test  # noqa: F401
 from tests.report.figures.fixtures import (  # noqa: F401
     all_plates,
     density,

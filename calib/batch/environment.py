@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Environment", "code_sha256", "sha256", "versions"]
+__all__ = ["Environment", "code_sha256", "sha256", "source_sha256", "versions"]
 
 _PACKAGES = (
     "terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-base", "arviz-stats", "xarray",
@@ -107,9 +107,31 @@ def code_sha256() -> str:
     files = {
         f"priors/{path.relative_to(priors).as_posix()}": path for path in priors.rglob("*.toml")
     }
-    for path in package.rglob("*"):
-        if path.suffix in _SOURCES and path.is_file() and packaged not in path.parents:
-            files[path.relative_to(package).as_posix()] = path
+    return _digest(files | _sources(package, but=packaged))
+
+
+@cache
+def source_sha256(package: Path) -> str:
+    """Return the SHA-256 over the source files of a package.
+
+    Parameters
+    ----------
+    package : Path
+        Its folder.
+    """
+    return _digest(_sources(package))
+
+
+def _sources(package: Path, but: Path | None = None) -> dict[str, Path]:
+    """Return the source files of a package, those of one of its folders left out."""
+    return {
+        path.relative_to(package).as_posix(): path
+        for path in package.rglob("*")
+        if path.suffix in _SOURCES and path.is_file() and but not in path.parents
+    }
+
+
+def _digest(files: Mapping[str, Path]) -> str:
     digest = hashlib.sha256()
     for name, path in sorted(files.items()):
         # Line ends are the checkout's, not the code's.

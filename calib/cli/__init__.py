@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from calib.cli import audit, calibration, campaign, check, gap, sbc
+from calib.cli import audit, calibration, campaign, challenge, check, gap, sbc
 
 __all__ = ["app", "main"]
 
@@ -23,6 +23,7 @@ app = typer.Typer(
 )
 calibration.register(app)
 gap.register(app)
+challenge.register(app)
 check.register(app)
 audit.register(app)
 campaign.register(app)

@@ -1,14 +1,14 @@
-"""Verbs of the diagnosis: diagnose a case, and the blind test that proves it."""
+"""Verb of the diagnosis: where a calibrated model misses in the field, and why."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import CORES, Models, Scheduler, Workers, announce, resumable
+from calib.cli.parallel import CORES, Models, Workers
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -18,15 +18,8 @@ _Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlie
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verbs to an app."""
+    """Add the verb to an app."""
     app.command()(diagnose)
-    challenge = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.")
-    challenge.command("make")(make)
-    challenge.command("run")(run)
-    challenge.command("limit")(limit)
-    challenge.command("twin")(twin)
-    challenge.command("score")(score)
-    app.add_typer(challenge, name="challenge")
 
 
 def diagnose(
@@ -96,136 +89,3 @@ def diagnose(
             f"{100 * high:.0f} %), noise sd {format_number(s.noise_floor)} {unit}"
         )
     print(out / "index.html")
-
-
-def make(
-    out: Annotated[Path, typer.Option(help="Folder for the cases.")],
-    key: Annotated[Path, typer.Option(help="File for the sealed answers, outside it.")],
-    seed: _Seed,
-    cases: Annotated[int, typer.Option(help="How many.", min=1)] = 300,
-    tier: Annotated[Literal["both", "easy", "hard"], typer.Option(help="Difficulty.")] = "both",
-    workers: Workers = 2,
-    scheduler: Scheduler = None,
-) -> None:
-    """Write cases of known cause, and their answers into a sealed key."""
-    from calib.challenge.make import make as make_cases
-    from calib.cli.display import progress_bars
-
-    with progress_bars() as tell:
-        digest = make_cases(
-            out, key, seed=seed, n_cases=cases, workers=workers, scheduler=scheduler,
-            tiers=("easy", "hard") if tier == "both" else (tier,),
-            progress=lambda done, n: tell("making cases", done, n),
-        )  # fmt: skip
-    print(f"{cases} cases in {out}; the key's SHA-256 is {digest}")
-
-
-def run(
-    folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
-    out: Annotated[Path, typer.Option(help="Folder for the diagnoses; resumed if it is there.")],
-    seed: _Seed = 1,
-    workers: Workers = 2,
-    scheduler: Scheduler = None,
-    plugins: Models = None,
-) -> None:
-    """Diagnose every case of a folder; run again to resume."""
-    from calib.cli.display import progress_bars
-    from calib.gap.batch import case_folders, diagnose_cases
-
-    cases = case_folders(folder)
-    with resumable(), progress_bars() as tell:
-        failed = diagnose_cases(
-            cases, out, seed, workers=workers, scheduler=scheduler, announce=announce,
-            progress=lambda done, n: tell("diagnosing", done, n),
-        )  # fmt: skip
-    for name, error in failed.items():
-        print(f"calib: {name} failed: {error}", file=sys.stderr)
-    print(f"{len(cases) - len(failed)} of {len(cases)} cases diagnosed in {out}")
-    if failed:
-        raise typer.Exit(1)
-
-
-def limit(
-    folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
-    key: Annotated[Path, typer.Option(help="The sealed answers.")],
-    out: Annotated[Path, typer.Option(help="Folder for limit.json; resumed if it is there.")],
-    seed: _Seed = 1,
-    effort: Annotated[int, typer.Option(help="Multiplies the places looked at.", min=1)] = 1,
-    workers: Workers = 2,
-    scheduler: Scheduler = None,
-) -> None:
-    """Find the best any method could do on these cases, by one who knows how they were made."""
-    from calib.challenge.limit import find_limit
-    from calib.cli.display import progress_bars
-
-    with progress_bars() as tell:
-        path = find_limit(
-            folder, key, out, seed=seed, effort=effort, workers=workers, scheduler=scheduler,
-            progress=lambda done, n: tell("asking the oracle", done, n), announce=announce,
-        )  # fmt: skip
-    print(path)
-
-
-def twin(
-    folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
-    key: Annotated[Path, typer.Option(help="Their sealed answers.")],
-    out: Annotated[Path, typer.Option(help="Folder for the twins.")],
-    twin_key: Annotated[Path, typer.Option(help="File for the twins' answers, outside it.")],
-    seed: _Seed = 1,
-    workers: Workers = 2,
-    scheduler: Scheduler = None,
-) -> None:
-    """Write twins of cases, in which effects act exactly as the diagnosis believes."""
-    from calib.cli.display import progress_bars
-    from calib.twins import make_twins
-
-    with progress_bars() as tell:
-        without = make_twins(
-            folder, key, out, twin_key, seed=seed, workers=workers, scheduler=scheduler,
-            progress=lambda done, n: tell("drawing twins", done, n), announce=announce,
-        )  # fmt: skip
-    for name, why in without.items():
-        print(f"calib: {name} has no twin: {why}", file=sys.stderr)
-    print(f"twins in {out}; diagnose and score them as any other cases")
-
-
-def score(
-    folder: Annotated[Path, typer.Argument(help="Folder with cases.")],
-    results: Annotated[Path, typer.Option(help="Folder with the diagnoses.")],
-    key: Annotated[Path, typer.Option(help="The sealed answers.")],
-    limit: Annotated[Path | None, typer.Option(help="limit.json of these cases.")] = None,
-    outputs: Annotated[
-        str, typer.Option(help="Only cases that measure these, e.g. drawbar_pull,rut_depth.")
-    ] = "",
-    out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
-    overwrite: _Overwrite = False,
-) -> None:
-    """Compare diagnoses with the sealed answers."""
-    from calib.batch.folders import check_folder, fresh_folder
-    from calib.challenge.figures import confusion_figure, levels_figure, reliability_figure
-    from calib.challenge.limit import read_limit
-    from calib.challenge.score import score as score_all
-    from calib.challenge.table import text_table
-
-    if out is not None:
-        check_folder(out, overwrite=overwrite)
-    found = score_all(folder, results, key, [o.strip() for o in outputs.split(",") if o.strip()])
-    known = None if limit is None else read_limit(limit, folder).of({a.case for a in found.answers})
-    table = text_table(found, known)
-    for warning in found.warnings:
-        print(f"calib: {warning}", file=sys.stderr)
-    print(table)
-    if out is None:
-        return
-    with fresh_folder(out, overwrite=overwrite) as scratch:
-        (scratch / "score.txt").write_text(table + "\n", encoding="utf-8")
-        levels = levels_figure(list(found.tiers.values()), known)
-        levels.savefig(scratch / "levels.png", dpi=150)
-        for tier, confusion in found.confusion.items():
-            figure = confusion_figure(confusion, f"{tier} cases")
-            figure.savefig(scratch / f"confusion_{tier}.png", dpi=150)
-            bins = found.tiers[tier].reliability
-            reliability_figure(bins, f"{tier} cases").savefig(
-                scratch / f"reliability_{tier}.png", dpi=150
-            )
-    print(out)

@@ -12,7 +12,7 @@ from calib.batch.environment import code_sha256, sha256
 from calib.errors import CalibError
 from calib.gap.case import Case, case_files
 
-__all__ = ["INPUTS", "case_hashes", "check_resumable", "inputs_record", "listed", "recorded_inputs"]
+__all__ = ["INPUTS", "case_hashes", "check_resumable", "inputs_record", "recorded_inputs"]
 
 INPUTS = "inputs.json"
 _SHOWN = 5
@@ -83,14 +83,13 @@ def check_resumable(cases: Sequence[Path], out: Path, seed: int) -> None:
     if found:
         reason, names = next(iter(found.items()))
         raise CalibError(
-            f"{len(names)} of the diagnoses that are there {reason}: {listed(names)}",
+            f"{len(names)} of the diagnoses that are there {reason}: {_listed(names)}",
             where=str(out), allowed="an empty folder, or earlier diagnoses of the same cases",
             mend="choose another --out, or delete this folder",
         )  # fmt: skip
 
 
-def listed(names: Sequence[str]) -> str:
-    """Return the first few names."""
+def _listed(names: Sequence[str]) -> str:
     return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from scipy.stats import norm
 
-from calib.challenge.answers import read_answer
+from challenge.answers import read_answer
 from tests.challenge.test_score import entry
 
 

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.challenge.build import try_case
-from calib.challenge.effects import LISTED
-from calib.challenge.files import OUTPUT_COLUMNS
-from calib.challenge.make import make, make_case, plan
-from calib.challenge.seal import open_key, sha256
 from calib.errors import CalibError
-from tests.challenge.blind import BlindTest
+from challenge.build import try_case
+from challenge.effects import LISTED
+from challenge.files import OUTPUT_COLUMNS
+from challenge.make import make, make_case, plan
+from challenge.seal import open_key, sha256
+from tests.blind import BlindTest
 
 CONTRACT_COLUMNS = (
     "run_order", "slip_ratio", "inflation_pressure_kpa", "inflation_pressure_psi",
@@ -133,8 +133,8 @@ def test_same_seed_same_bytes(blind_test: BlindTest, tmp_path: Path) -> None:
     assert (tmp_path / "key.json").read_bytes() == blind_test.key.read_bytes()
     for path in blind_test.cases.rglob("*"):
         if path.is_file():
-            twin = tmp_path / "c" / path.relative_to(blind_test.cases)
-            assert twin.read_bytes() == path.read_bytes()
+            other = tmp_path / "c" / path.relative_to(blind_test.cases)
+            assert other.read_bytes() == path.read_bytes()
     a, b = (make_case(np.random.SeedSequence(seed), "hard", "none") for seed in (1, 2))
     assert a.files["lab.csv"] != b.files["lab.csv"]
 
@@ -190,8 +190,8 @@ def test_drawn_lab_is_described_by_the_cases_models() -> None:
     drawn = [case for case in (try_case(rng, "hard", "none") for _ in range(6)) if case]
     assert drawn
     for case in drawn:
-        stage = case.stage
-        predicted = stage.simulator.predict(stage.field)
-        for name, sd in stage.field_sd.items():
-            miss = (predicted[name] - stage.field_without[name]) / sd
+        scenario = case.scenario
+        predicted = scenario.simulator.predict(scenario.field)
+        for name, sd in scenario.field_sd.items():
+            miss = (predicted[name] - scenario.field_without[name]) / sd
             assert np.sqrt(np.mean(miss**2)) < 0.35

@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.challenge.contact import settle, solve_increasing
-from calib.challenge.density import draw_cone_law
-from calib.challenge.mechanics import self_propelled_slip, simulate
-from calib.challenge.soil import draw_soil, shear_stress
-from calib.challenge.tyre import PSI_KPA, Tyre, average_ground_pressure
-from tests.challenge.conftest import conditions, reality, sandy_loam
+from challenge.contact import settle, solve_increasing
+from challenge.density import draw_cone_law
+from challenge.mechanics import self_propelled_slip, simulate
+from challenge.soil import draw_soil, shear_stress
+from challenge.tyre import PSI_KPA, Tyre, average_ground_pressure
+from tests.challenge.realities import conditions, reality, sandy_loam
 
 
 def test_contact_lengths_are_the_measured_ones() -> None:

@@ -14,15 +14,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.challenge.answers import auc
-from calib.challenge.figures import confusion_figure, levels_figure, reliability_figure
-from calib.challenge.files import OUTPUT_COLUMNS
-from calib.challenge.levels import LEVELS
-from calib.challenge.score import Proportion, score
-from calib.challenge.seal import KEY_SCHEMA, open_key, publish, seal
-from calib.challenge.table import text_table
 from calib.errors import CalibError
 from calib.gap.provenance import INPUTS, case_hashes
+from challenge.answers import auc
+from challenge.figures import confusion_figure, levels_figure, reliability_figure
+from challenge.files import OUTPUT_COLUMNS
+from challenge.levels import LEVELS
+from challenge.score import Proportion, score
+from challenge.seal import KEY_SCHEMA, open_key, publish, seal
+from challenge.table import text_table
 
 Answer = Callable[[dict[str, Any]], dict[str, Any]]
 TRUTHS = ("none", "none", "unknown", "rate_effect", "force_offset+rate_effect", "parameter_shift")

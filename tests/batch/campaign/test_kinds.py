@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from calib.batch.campaign import read_plan, run_campaign
-from calib.challenge.make import make
 from calib.check.check import check
 from calib.data import hold_out, read_table
 from calib.errors import CalibError
@@ -23,6 +22,7 @@ from calib.inference.random import generator
 from calib.models import example_csv
 from calib.validation.sbc.run import run_sbc
 from calib.validation.validate import validate_held_out
+from challenge.make import make
 from tests.batch.campaign.sites import EFFECT, NAMES, WIND, content, refuse_all
 
 

@@ -1,8 +1,12 @@
-"""Challenge cases: made of known cause, diagnosed without it, and held against it."""
+"""Challenge cases: made of known cause, diagnosed without it, and held against it.
+
+They are made by the repository's test bench, which a wheel does not have.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -10,16 +14,19 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import Field
 
+from calib.batch.bench import from_the_bench
 from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
 from calib.batch.campaign.kinds.diagnose import diagnosis_numbers
 from calib.batch.campaign.place import Place
-from calib.challenge.answers import read_answer
-from calib.challenge.make import NULL_FRACTION, Job, case_jobs, make_job
+from calib.batch.environment import source_sha256
+from calib.errors import CalibError
 from calib.gap.batch import written
 from calib.gap.case import read_case
 from calib.gap.diagnose import diagnose
 
-__all__ = ["Challenge", "ChallengeSection"]
+__all__ = ["Challenge", "ChallengeItem", "ChallengeSection"]
+
+_TABLE = "[[challenge]]"
 
 
 class ChallengeSection(Section):
@@ -31,11 +38,31 @@ class ChallengeSection(Section):
         default="both", description="'easy', 'hard' or 'both'"
     )
     null_fraction: float = Field(
-        default=NULL_FRACTION, ge=0.0, le=0.7, description="the share without a gap, 0 to 0.7"
+        default=1.0 / 3.0, ge=0.0, le=0.7, description="the share without a gap, 0 to 0.7"
     )
 
 
-class Challenge(Kind[ChallengeSection, Job]):
+@dataclass(frozen=True)
+class ChallengeItem:
+    """What a case is made from.
+
+    Parameters
+    ----------
+    own : SeedSequence
+        The case's seed.
+    tier : str
+    truth : str
+    bench : str
+        Hash of the code that makes it.
+    """
+
+    own: np.random.SeedSequence
+    tier: Literal["easy", "hard"]
+    truth: str
+    bench: str
+
+
+class Challenge(Kind[ChallengeSection, ChallengeItem]):
     """Make, diagnose and mark one case.
 
     The cases are those of `calib challenge make --seed DRAW_SEED`, but their answers lie beside
@@ -47,24 +74,37 @@ class Challenge(Kind[ChallengeSection, Job]):
 
     def plan(self, section: ChallengeSection, place: Place) -> Iterator[Planned]:
         """Yield a task for each case."""
+        with from_the_bench(place.where):
+            from challenge.make import case_jobs
+
         tiers: tuple[Any, ...] = ("easy", "hard") if section.tier == "both" else (section.tier,)
         jobs, _ = case_jobs(section.draw_seed, section.cases, tiers, section.null_fraction)
         for name, (own, tier, truth) in jobs.items():
             yield Planned(
                 name,
                 {"draw_seed": section.draw_seed, "spawn_key": list(own.spawn_key), "tier": tier,
-                 "truth": truth},
+                 "truth": truth, "bench": _bench()},
             )  # fmt: skip
 
-    def load(self, task: Task) -> Job:
+    def load(self, task: Task) -> ChallengeItem:
         """Return what the case is made from."""
         s = task.settings
         own = np.random.SeedSequence(s["draw_seed"], spawn_key=tuple(s["spawn_key"]))
-        return own, s["tier"], s["truth"]
+        return ChallengeItem(own, s["tier"], s["truth"], s["bench"])
 
-    def work(self, item: Job, seed: int) -> Work:
+    def work(self, item: ChallengeItem, seed: int) -> Work:
         """Make the case, diagnose its files, and mark the diagnosis with its key."""
-        made = make_job(item)
+        with from_the_bench(_TABLE):
+            from challenge.answers import read_answer
+            from challenge.make import make_case
+
+        if _bench() != item.bench:
+            raise CalibError(
+                "this worker would make other cases", where=_TABLE,
+                allowed=f"the folder `challenge` whose hash is {item.bench}",
+                mend="give the worker the same checkout",
+            )  # fmt: skip
+        made = make_case(item.own, item.tier, item.truth)
         with TemporaryDirectory() as scratch:
             folder = Path(scratch) / "case"
             made.write(folder)
@@ -85,3 +125,10 @@ class Challenge(Kind[ChallengeSection, Job]):
             "shrink_covered": {s.output: s.covered for s in answer.shrinks},
         }
         return Work(numbers | diagnosis_numbers(found), files)
+
+
+def _bench() -> str:
+    """Return the hash of the bench's code here."""
+    import challenge
+
+    return source_sha256(Path(challenge.__path__[0]))[:12]

@@ -1,0 +1,145 @@
+"""Verbs of the blind test that the diagnosis is held against; most need the repository's bench."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from calib.batch.bench import from_the_bench
+from calib.cli.parallel import Models, Scheduler, Workers, announce, resumable
+
+__all__ = ["register"]
+
+_Cases = Annotated[Path, typer.Argument(help="Folder with cases.")]
+_Key = Annotated[Path, typer.Option(help="Their sealed answers.")]
+_Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verbs to an app."""
+    verbs = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.")
+    verbs.command("make")(make)
+    verbs.command("run")(run)
+    verbs.command("well-specified")(well_specified)
+    verbs.command("score")(score)
+    app.add_typer(verbs, name="challenge")
+
+
+def make(
+    out: Annotated[Path, typer.Option(help="Folder for the cases.")],
+    key: Annotated[Path, typer.Option(help="File for the sealed answers, outside it.")],
+    seed: _Seed,
+    cases: Annotated[int, typer.Option(help="How many.", min=1)] = 300,
+    tier: Annotated[Literal["both", "easy", "hard"], typer.Option(help="Difficulty.")] = "both",
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+) -> None:
+    """Write cases of known cause, and their answers into a sealed key."""
+    with from_the_bench("calib challenge make"):
+        from challenge.make import make as make_cases
+    from calib.cli.display import progress_bars
+
+    with progress_bars() as tell:
+        digest = make_cases(
+            out, key, seed=seed, n_cases=cases, workers=workers, scheduler=scheduler,
+            tiers=("easy", "hard") if tier == "both" else (tier,),
+            progress=lambda done, n: tell("making cases", done, n),
+        )  # fmt: skip
+    print(f"{cases} cases in {out}; the key's SHA-256 is {digest}")
+
+
+def run(
+    folder: _Cases,
+    out: Annotated[Path, typer.Option(help="Folder for the diagnoses; resumed if it is there.")],
+    seed: _Seed = 1,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+    plugins: Models = None,
+) -> None:
+    """Diagnose every case of a folder; run again to resume."""
+    from calib.cli.display import progress_bars
+    from calib.gap.batch import case_folders, diagnose_cases
+
+    cases = case_folders(folder)
+    with resumable(), progress_bars() as tell:
+        failed = diagnose_cases(
+            cases, out, seed, workers=workers, scheduler=scheduler, announce=announce,
+            progress=lambda done, n: tell("diagnosing", done, n),
+        )  # fmt: skip
+    for name, error in failed.items():
+        print(f"calib: {name} failed: {error}", file=sys.stderr)
+    print(f"{len(cases) - len(failed)} of {len(cases)} cases diagnosed in {out}")
+    if failed:
+        raise typer.Exit(1)
+
+
+def well_specified(
+    folder: _Cases,
+    key: _Key,
+    out: Annotated[Path, typer.Option(help="Folder for the well-specified cases.")],
+    out_key: Annotated[Path, typer.Option(help="File for their answers, outside it.")],
+    seed: _Seed = 1,
+    workers: Workers = 2,
+    scheduler: Scheduler = None,
+) -> None:
+    """Write the same designs again, with effects that act exactly as the diagnosis believes."""
+    with from_the_bench("calib challenge well-specified"):
+        from challenge.redraw import redraw
+    from functools import partial
+
+    from calib.cli.display import progress_bars
+    from calib.gap.well_specified import well_specified_case
+
+    with progress_bars() as tell:
+        without = redraw(
+            folder, key, out, out_key, partial(well_specified_case, seed), seed=seed,
+            workers=workers, scheduler=scheduler, announce=announce,
+            progress=lambda done, n: tell("drawing cases", done, n),
+        )  # fmt: skip
+    for name, why in without.items():
+        print(f"calib: {name} has no well-specified case: {why}", file=sys.stderr)
+    print(f"well-specified cases in {out}; diagnose and score them as any others")
+
+
+def score(
+    folder: _Cases,
+    results: Annotated[Path, typer.Option(help="Folder with the diagnoses.")],
+    key: _Key,
+    outputs: Annotated[
+        str, typer.Option(help="Only cases that measure these, e.g. drawbar_pull,rut_depth.")
+    ] = "",
+    out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier result.")
+    ] = False,
+) -> None:
+    """Compare diagnoses with the sealed answers."""
+    with from_the_bench("calib challenge score"):
+        from challenge.figures import confusion_figure, levels_figure, reliability_figure
+        from challenge.score import score as score_all
+        from challenge.table import text_table
+    from calib.batch.folders import check_folder, fresh_folder
+
+    if out is not None:
+        check_folder(out, overwrite=overwrite)
+    found = score_all(folder, results, key, [o.strip() for o in outputs.split(",") if o.strip()])
+    table = text_table(found)
+    for warning in found.warnings:
+        print(f"calib: {warning}", file=sys.stderr)
+    print(table)
+    if out is None:
+        return
+    with fresh_folder(out, overwrite=overwrite) as scratch:
+        (scratch / "score.txt").write_text(table + "\n", encoding="utf-8")
+        levels_figure(list(found.tiers.values())).savefig(scratch / "levels.png", dpi=150)
+        for tier, confusion in found.confusion.items():
+            figure = confusion_figure(confusion, f"{tier} cases")
+            figure.savefig(scratch / f"confusion_{tier}.png", dpi=150)
+            bins = found.tiers[tier].reliability
+            reliability_figure(bins, f"{tier} cases").savefig(
+                scratch / f"reliability_{tier}.png", dpi=150
+            )
+    print(out)

@@ -1,0 +1,253 @@
+"""One case's diagnosis held against its key: what was said, and how right it was."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr
+from scipy.stats import rankdata
+
+from challenge.files import OUTPUT_COLUMNS
+from challenge.mechanism import NONE
+
+type Array = NDArray[np.float64]
+
+FAILED = "failed"
+# Below one noise sd there is no gap on an output whose shrink would mean anything.
+GAP_ON_OUTPUT = 1.0
+
+
+@dataclass(frozen=True)
+class ShrinkAnswer:
+    """One output's shrink.
+
+    Attributes
+    ----------
+    output : str
+        Name of the output.
+    actual : float
+        1 - rmse(after) / rmse(before) against the truth on the fresh conditions; 0 without
+        a readable prediction.
+    interval : tuple of float, optional
+        The stated 90 % interval; None where none was given.
+    """
+
+    output: str
+    actual: float
+    interval: tuple[float, float] | None
+
+    @property
+    def covered(self) -> bool:
+        """Whether the stated interval holds the actual shrink."""
+        return self.interval is not None and self.interval[0] <= self.actual <= self.interval[1]
+
+
+@dataclass(frozen=True)
+class CaseAnswer:
+    """What was said of one case and what was true.
+
+    Attributes
+    ----------
+    case, tier, truth : str
+        From the key.
+    verdict : str
+        As stated; ``failed`` without a readable diagnosis.
+    ranked : tuple of (str, float)
+        Hypotheses and probabilities, the most probable first.
+    auc : float, optional
+        Of the stated probabilities against true gaps beyond the noise; None where all rows
+        or no rows have one.
+    shrinks : tuple of ShrinkAnswer
+        For each output with a true gap.
+    outputs : tuple of str
+        That were measured.
+    problem : str
+        Why the case failed, empty otherwise.
+    told_apart : float, optional
+        Probability that one who knows the truth and its nearest rival, both equally probable, and
+        what each does on this design, chooses the truth (linearised); None where nobody worked
+        that out.
+    """
+
+    case: str
+    tier: str
+    truth: str
+    verdict: str
+    ranked: tuple[tuple[str, float], ...]
+    auc: float | None
+    shrinks: tuple[ShrinkAnswer, ...]
+    outputs: tuple[str, ...]
+    problem: str = ""
+    told_apart: float | None = None
+
+    @property
+    def called(self) -> str:
+        """The most probable hypothesis."""
+        return self.ranked[0][0] if self.ranked else FAILED
+
+    @property
+    def confidence(self) -> float:
+        """Its probability."""
+        return self.ranked[0][1] if self.ranked else 0.0
+
+    @property
+    def truth_probability(self) -> float:
+        """Probability given to the truth."""
+        return dict(self.ranked).get(self.truth, 0.0)
+
+    def among_first(self, count: int) -> bool:
+        """Whether the truth is among the first hypotheses."""
+        return self.truth in [name for name, _ in self.ranked[:count]]
+
+    @property
+    def brier(self) -> float:
+        """Sum over hypotheses of the squared miss of the probability; 1 for a failed case."""
+        others = sum(p**2 for name, p in self.ranked if name != self.truth)
+        return others + (1.0 - self.truth_probability) ** 2
+
+    def confidently_wrong(self, at: float = 0.9) -> bool:
+        """Whether a wrong hypothesis has at least this probability."""
+        return any(p >= at for name, p in self.ranked if name != self.truth)
+
+
+def auc(score: Array, positive: NDArray[np.bool_]) -> float | None:
+    """Return the area under the ROC curve by ranks, ties shared; None with one class only.
+
+    Parameters
+    ----------
+    score : array
+        Shape ``(M,)``.
+    positive : array of bool
+        Shape ``(M,)``.
+    """
+    n_positive = int(positive.sum())
+    n_negative = positive.size - n_positive
+    if n_positive == 0 or n_negative == 0:
+        return None
+    ranks = np.asarray(rankdata(score), dtype=np.float64)
+    excess = ranks[positive].sum() - n_positive * (n_positive + 1) / 2.0
+    return float(excess / (n_positive * n_negative))
+
+
+def _true_gap(entry: dict[str, Any], output: str) -> Array:
+    truth, without = (np.array(entry[name][output]) for name in ("field_truth", "field_without"))
+    return np.asarray(truth - without, dtype=np.float64)
+
+
+def _localisation(entry: dict[str, Any], diagnosis: dict[str, Any]) -> float | None:
+    """Return the AUC over all rows and outputs; rows that were left out count as probability 0."""
+    said = {
+        (str(item["output"]), int(item["row"])): float(item["probability"])
+        for item in diagnosis.get("where", [])
+    }
+    scores, positives = [], []
+    for output, sd in entry["noise_sd"].items():
+        beyond = np.abs(_true_gap(entry, output)) > np.array(sd)
+        positives.append(beyond)
+        scores.append(np.array([said.get((output, row), 0.0) for row in range(beyond.size)]))
+    return auc(np.concatenate(scores), np.concatenate(positives))
+
+
+def _predictions(path: Path) -> dict[str, Array]:
+    with path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    wanted = [f"{c}_{when}" for c in OUTPUT_COLUMNS.values() for when in ("before", "after")]
+    return {
+        name: np.array([float(row[name]) for row in rows])
+        for name in wanted
+        if rows and name in rows[0]
+    }
+
+
+def _actual_shrink(predictions: dict[str, Array], output: str, truth: Array) -> float:
+    column = OUTPUT_COLUMNS[output]
+    before, after = (predictions.get(f"{column}_{when}") for when in ("before", "after"))
+    if before is None or after is None or not before.size == after.size == truth.size:
+        return 0.0
+    miss_before, miss_after = (float(np.sqrt(np.mean((p - truth) ** 2))) for p in (before, after))
+    if not np.isfinite(miss_after) or miss_before <= 0.0:
+        return 0.0
+    return 1.0 - miss_after / miss_before
+
+
+def _interval(diagnosis: dict[str, Any], output: str) -> tuple[float, float] | None:
+    stated = diagnosis.get("shrink", {}).get(output, {}).get("interval")
+    return None if stated is None else (float(stated[0]), float(stated[1]))
+
+
+def _shrinks(
+    entry: dict[str, Any], diagnosis: dict[str, Any], predictions: dict[str, Array]
+) -> tuple[ShrinkAnswer, ...]:
+    answers = []
+    for output, sd in entry["noise_sd"].items():
+        gap = _true_gap(entry, output) / np.array(sd)
+        if np.sqrt(np.mean(gap**2)) < GAP_ON_OUTPUT:
+            continue
+        actual = _actual_shrink(predictions, output, np.array(entry["fresh_truth"][output]))
+        answers.append(ShrinkAnswer(output, actual, _interval(diagnosis, output)))
+    return tuple(answers)
+
+
+def _normal(name: str) -> str:
+    return "+".join(sorted(name.split("+")))
+
+
+def _ranked(diagnosis: dict[str, Any]) -> tuple[tuple[str, float], ...]:
+    said = [(_normal(str(e["name"])), float(e["probability"])) for e in diagnosis["effects"]]
+    if not said or not all(np.isfinite(p) and 0.0 <= p <= 1.0 + 1e-9 for _, p in said):
+        raise ValueError("probabilities are missing or outside [0, 1]")
+    return tuple(sorted(said, key=lambda item: -item[1]))
+
+
+def read_answer(name: str, entry: dict[str, Any], folder: Path) -> CaseAnswer:
+    """Return one case's answer; what cannot be read is a failure, never a gap in the count.
+
+    Parameters
+    ----------
+    name : str
+        The case.
+    entry : dict
+        Its entry in the key.
+    folder : Path
+        Where its diagnosis was written.
+    """
+    outputs = tuple(entry["noise_sd"])
+    try:
+        diagnosis = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+        ranked, verdict = _ranked(diagnosis), str(diagnosis["verdict"])
+        located = _localisation(entry, diagnosis)
+        path = folder / "fresh_prediction.csv"
+        predictions = _predictions(path) if path.exists() else {}
+        shrinks = _shrinks(entry, diagnosis, predictions)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, IndexError) as problem:
+        verdict, ranked, diagnosis = FAILED, (), {}
+        # A failed case locates nothing: no better than chance, on cases where there is a gap.
+        located = None if _localisation(entry, {}) is None else 0.5
+        shrinks = _shrinks(entry, {}, {})
+        text = f"{type(problem).__name__}: {problem}"
+        if isinstance(problem, FileNotFoundError):
+            text = "not diagnosed; go on with `calib challenge run`"
+        return CaseAnswer(
+            name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs, text,
+            _told_apart(entry),
+        )  # fmt: skip
+    located = None if entry["truth"] == NONE else located
+    return CaseAnswer(
+        name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs,
+        told_apart=_told_apart(entry),
+    )  # fmt: skip
+
+
+def _told_apart(entry: Mapping[str, Any]) -> float | None:
+    """Two laws whose means lie d noise sds apart are told apart with probability Phi(d / 2)."""
+    if entry["truth"] in (NONE, entry.get("rival")) or "rival_nats" not in entry:
+        return None
+    nats = entry["rival_nats"]  # half the square of d; none without a rival
+    return 1.0 if nats is None else float(ndtr(np.sqrt(0.5 * nats)))

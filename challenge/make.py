@@ -1,0 +1,204 @@
+"""Make a blind test: cases with withheld answers, a sealed key, and the key's hash."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.batch.tasks import completed
+from calib.errors import CalibError
+from challenge.build import try_case, unlisted_order
+from challenge.design import Tier
+from challenge.effects import LISTED, wheel_effects
+from challenge.files import CaseFiles, case_files
+from challenge.mechanism import NONE, SHIFT, UNKNOWN
+from challenge.seal import KEY_SCHEMA, check_new, publish, seal
+
+type Progress = Callable[[int, int], None]
+type Job = tuple[np.random.SeedSequence, Tier, str]
+
+NULL_FRACTION, UNKNOWN_FRACTION, SHIFT_FRACTION = 1.0 / 3.0, 1.0 / 8.0, 1.0 / 10.0
+PAIR_FRACTION = 0.5  # of the hard tier's listed effects
+_TIERS: tuple[Tier, ...] = ("easy", "hard")
+_TRIES = 60
+_FALLBACKS = 12
+
+
+def plan(
+    rng: np.random.Generator,
+    n_cases: int,
+    tiers: tuple[Tier, ...],
+    null_fraction: float = NULL_FRACTION,
+) -> list[tuple[Tier, str]]:
+    """Return tier and truth of every case, in random order within each tier.
+
+    Parameters
+    ----------
+    rng : numpy.random.Generator
+        Source of randomness.
+    n_cases : int
+        Number of cases, shared evenly among the tiers, the earlier tier first.
+    tiers : tuple of str
+        ``easy``, ``hard`` or both.
+    null_fraction : float
+        Share of cases without any effect.
+    """
+    planned: list[tuple[Tier, str]] = []
+    for i, tier in enumerate(tiers):
+        count = n_cases // len(tiers) + (1 if i < n_cases % len(tiers) else 0)
+        truths = _truths(rng, count, tier, null_fraction)
+        planned += [(tier, truths[j]) for j in rng.permutation(count)]
+    return planned
+
+
+def _truths(rng: np.random.Generator, count: int, tier: Tier, null_fraction: float) -> list[str]:
+    nulls = round(null_fraction * count)
+    unknown, shift = (round(part * count) for part in (UNKNOWN_FRACTION, SHIFT_FRACTION))
+    fixed = [NONE] * nulls + [UNKNOWN] * unknown + [SHIFT] * shift
+    listed = count - len(fixed)
+    pairs = round(PAIR_FRACTION * listed) if tier == "hard" else 0
+    truths = fixed + [_draw_pair(rng) for _ in range(pairs)]
+    while len(truths) < count:
+        truths += [str(name) for name in rng.permutation(list(LISTED))]
+    return truths[:count]
+
+
+def _draw_pair(rng: np.random.Generator) -> str:
+    return "+".join(sorted(str(n) for n in rng.choice(wheel_effects(), size=2, replace=False)))
+
+
+def _draw_like(rng: np.random.Generator, truth: str) -> str:
+    """Draw another truth of the same class, for one that no design seems to show."""
+    if truth in (NONE, UNKNOWN, SHIFT):
+        return truth
+    return _draw_pair(rng) if "+" in truth else str(rng.choice(list(LISTED)))
+
+
+def make_case(seed: np.random.SeedSequence, tier: Tier, truth: str) -> CaseFiles:
+    """Return one case, the same for the same seed.
+
+    Parameters
+    ----------
+    seed : numpy.random.SeedSequence
+        The case's own seed.
+    tier, truth : str
+        Level of difficulty and what happens in the field; where no design shows an effect,
+        another of the same class takes its place.
+
+    Raises
+    ------
+    CalibError
+        If no fair case is found.
+    """
+    rng = np.random.default_rng(seed)
+    unlisted = unlisted_order(rng)
+    wanted = truth
+    for i in range(_FALLBACKS):
+        for _ in range(_TRIES):
+            case = try_case(rng, tier, wanted, unlisted[i % len(unlisted)])
+            if case is not None:
+                return case_files(rng, case)
+        wanted = _draw_like(rng, truth)
+    raise CalibError(
+        f"no fair {tier} case of {truth} in {_TRIES * _FALLBACKS} draws",
+        mend="use another seed",
+    )
+
+
+def case_jobs(
+    seed: int, n_cases: int, tiers: tuple[Tier, ...], null_fraction: float = NULL_FRACTION
+) -> tuple[dict[str, Job], np.random.SeedSequence]:
+    """Return what each case of a blind test is made from, by name, and the seed of the plan.
+
+    Parameters
+    ----------
+    seed, n_cases, tiers, null_fraction
+        As for `make`.
+
+    Raises
+    ------
+    CalibError
+        If a number will not do.
+    """
+    if n_cases < 1:
+        raise CalibError(f"{n_cases} cases were asked for", allowed="1 or more")
+    if not tiers or not set(tiers) <= set(_TIERS):
+        raise CalibError(f"unknown tiers {tiers}", allowed=", ".join(_TIERS))
+    if not 0.0 <= null_fraction <= 0.7:
+        raise CalibError(f"null_fraction is {null_fraction}", allowed="0 to 0.7")
+    planning, *own = np.random.SeedSequence(seed).spawn(n_cases + 1)
+    planned = plan(np.random.default_rng(planning), n_cases, tiers, null_fraction)
+    jobs = zip(own, planned, strict=True)
+    return {f"case-{i:03d}": (s, *job) for i, (s, job) in enumerate(jobs)}, planning
+
+
+def make_job(job: Job) -> CaseFiles:
+    """Return the case of a job."""
+    return make_case(*job)
+
+
+def make(
+    out_dir: Path,
+    key_path: Path,
+    *,
+    seed: int,
+    n_cases: int,
+    tiers: tuple[Tier, ...] = _TIERS,
+    null_fraction: float = NULL_FRACTION,
+    workers: int = 1,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> str:
+    """Write a blind test and return the hash of its key.
+
+    Parameters
+    ----------
+    out_dir : Path
+        Folder for ``case-000/`` and so on, ``manifest.json`` and ``HASH``; new or empty.
+    key_path : Path
+        Where the sealed key goes, outside `out_dir`.
+    seed : int
+        Seed of everything; kept in the key only, since it gives the answers away.
+    n_cases : int
+        Number of cases.
+    tiers : tuple of str
+        ``easy``, ``hard`` or both.
+    null_fraction : float
+        Share of cases without any effect.
+    workers, scheduler
+        As for `calib.batch.tasks.completed`; the result does not depend on them.
+    progress : callable, optional
+        Called with the number of cases done and their total.
+
+    Returns
+    -------
+    str
+        SHA-256 of the key.
+
+    Raises
+    ------
+    CalibError
+        If a path or a number will not do.
+    """
+    check_new(out_dir, key_path)
+    jobs, planning = case_jobs(seed, n_cases, tiers, null_fraction)
+    entries: dict[str, Any] = {}
+    out_dir.mkdir(parents=True, exist_ok=True)
+    with closing(completed(make_job, jobs, workers=workers, scheduler=scheduler)) as coming:
+        for task in coming:
+            if task.result is None:
+                raise CalibError(f"{task.name} could not be made: {task.error}")
+            task.result.write(out_dir / task.name)
+            entries[task.name] = task.result.key
+            if progress is not None:
+                progress(len(entries), n_cases)
+    keys = {name: entries[name] for name in jobs}
+    salt = "".join(f"{word:08x}" for word in planning.generate_state(8)[4:])
+    key = {"schema": KEY_SCHEMA, "seed": seed, "salt": salt, "cases": keys}
+    digest = seal(key, key_path)
+    publish(out_dir, key, digest, tiers)
+    return digest

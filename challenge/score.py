@@ -1,0 +1,325 @@
+"""Score a blind test: diagnoses against the sealed key, per tier, with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import beta
+
+from calib.errors import CalibError
+from challenge.answers import FAILED, CaseAnswer, read_answer
+from challenge.mechanism import NONE, UNKNOWN
+from challenge.results import check_results
+from challenge.seal import open_key
+
+PAIR, OTHER_PAIR = "a pair", "another pair"
+_BINS = 10
+
+
+@dataclass(frozen=True)
+class Proportion:
+    """A share with its Jeffreys 95 % interval.
+
+    Attributes
+    ----------
+    successes, n : int
+        How many of how many.
+    """
+
+    successes: int
+    n: int
+
+    @property
+    def value(self) -> float:
+        """The share; NaN of nothing."""
+        return self.successes / self.n if self.n else float("nan")
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """Jeffreys 95 % interval, closed at the ends where all or none succeed [1]_.
+
+        References
+        ----------
+        .. [1] L. D. Brown, T. T. Cai, A. DasGupta, Statistical Science 16 (2001) 101-133,
+           doi 10.1214/ss/1009213286.
+        """
+        if not self.n:
+            return 0.0, 1.0
+        a, b = self.successes + 0.5, self.n - self.successes + 0.5
+        low = 0.0 if self.successes == 0 else float(beta.ppf(0.025, a, b))
+        high = 1.0 if self.successes == self.n else float(beta.ppf(0.975, a, b))
+        return low, high
+
+
+@dataclass(frozen=True)
+class Average:
+    """A mean or a median with the spread of its sampling.
+
+    Attributes
+    ----------
+    value : float
+        NaN of nothing.
+    interval : tuple of float
+        95 % bootstrap interval.
+    n : int
+        Number of values.
+    """
+
+    value: float
+    interval: tuple[float, float]
+    n: int
+
+
+@dataclass(frozen=True)
+class ReliabilityBin:
+    """Cases whose first hypothesis has a probability in one range.
+
+    Attributes
+    ----------
+    low, high : float
+        The range.
+    confidence : float
+        Mean probability of the first hypothesis; NaN of nothing.
+    correct : Proportion
+        How many were right.
+    """
+
+    low: float
+    high: float
+    confidence: float
+    correct: Proportion
+
+
+@dataclass(frozen=True)
+class TierScore:
+    """Figures of merit of one tier.
+
+    ``top_1``, ``top_2`` and ``truth_probability`` are over the cases with a gap; the
+    ``*_all`` figures have the nulls in them as well.
+
+    Attributes
+    ----------
+    tier : str
+        Name.
+    n_cases, n_failed : int
+        Cases, and those without a readable diagnosis (they count as wrong everywhere).
+    top_1, top_2, top_1_all, top_2_all : Proportion
+        Truth first, or among the first two.
+    truth_probability, truth_probability_all : Average
+        Mean probability of the truth.
+    false_alarm : Proportion
+        Nulls with a verdict other than none.
+    unlisted_recognised : Proportion
+        Unlisted effects with the verdict unknown or ambiguous.
+    listed_called_unknown : Proportion
+        Named effects and parameter shifts with the verdict unknown.
+    confidently_wrong : Proportion
+        Cases with a wrong hypothesis at 0.9 or more.
+    localisation_auc : Average
+        Median over cases with a gap in some rows and none in others.
+    shrink_coverage : Proportion
+        Outputs with a gap and a stated interval whose actual shrink lies within.
+    no_shrink_interval : Proportion
+        Outputs with a gap for which no interval was stated.
+    actual_shrink : Average
+        Median over outputs with a gap.
+    told_apart : Average
+        Over cases with a gap, the probability to choose the truth rather than its nearest rival
+        for one who knows what both do on the design: how often the truth could be first if its
+        nearest rival were all there is.
+    brier : Average
+        Mean multi-class Brier score, 0 (best) to 2.
+    reliability : tuple of ReliabilityBin
+        Ten ranges of confidence.
+    """
+
+    tier: str
+    n_cases: int
+    n_failed: int
+    top_1: Proportion
+    top_2: Proportion
+    top_1_all: Proportion
+    top_2_all: Proportion
+    truth_probability: Average
+    truth_probability_all: Average
+    false_alarm: Proportion
+    unlisted_recognised: Proportion
+    listed_called_unknown: Proportion
+    confidently_wrong: Proportion
+    localisation_auc: Average
+    shrink_coverage: Proportion
+    no_shrink_interval: Proportion
+    actual_shrink: Average
+    told_apart: Average
+    brier: Average
+    reliability: tuple[ReliabilityBin, ...]
+
+
+@dataclass(frozen=True)
+class Confusion:
+    """Truths against what was called first, pairs taken together.
+
+    Attributes
+    ----------
+    truths, calls : tuple of str
+        Labels of rows and columns; the column ``another pair`` is a pair called wrongly.
+    counts : tuple of tuple of int
+        Cases, ``[truth][call]``.
+    """
+
+    truths: tuple[str, ...]
+    calls: tuple[str, ...]
+    counts: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
+class Score:
+    """A scored blind test.
+
+    Attributes
+    ----------
+    tiers : dict
+        Tier to its figures.
+    confusion : dict
+        Tier to its confusion matrix.
+    answers : tuple of CaseAnswer
+        Every case of the key, failed ones included.
+    warnings : tuple of str
+        What could not be made sure of.
+    """
+
+    tiers: dict[str, TierScore]
+    confusion: dict[str, Confusion]
+    answers: tuple[CaseAnswer, ...]
+    warnings: tuple[str, ...] = ()
+
+
+def _share(answers: Iterable[CaseAnswer], hit: Callable[[CaseAnswer], bool]) -> Proportion:
+    hits = [hit(answer) for answer in answers]
+    return Proportion(sum(hits), len(hits))
+
+
+def _average(values: list[float], statistic: Callable[..., np.ndarray]) -> Average:
+    """Return a statistic with a bootstrap interval, the same for the same values."""
+    if not values:
+        return Average(float("nan"), (float("nan"), float("nan")), 0)
+    data, rng = np.array(values), np.random.default_rng(0)
+    again = statistic(data[rng.integers(0, data.size, (2000, data.size))], axis=1)
+    low, high = (float(q) for q in np.quantile(again, [0.025, 0.975]))
+    return Average(float(statistic(data)), (low, high), len(values))
+
+
+def _reliability(answers: list[CaseAnswer]) -> tuple[ReliabilityBin, ...]:
+    edges = np.linspace(0.0, 1.0, _BINS + 1)
+    bins = []
+    for i in range(_BINS):
+        inside = [a for a in answers if min(int(a.confidence * _BINS), _BINS - 1) == i]
+        mean = float(np.mean([a.confidence for a in inside])) if inside else float("nan")
+        correct = _share(inside, lambda a: a.called == a.truth)
+        bins.append(ReliabilityBin(float(edges[i]), float(edges[i + 1]), mean, correct))
+    return tuple(bins)
+
+
+def score_tier(tier: str, answers: list[CaseAnswer]) -> TierScore:
+    """Return the figures of merit of one tier.
+
+    Parameters
+    ----------
+    tier : str
+        Name.
+    answers : list of CaseAnswer
+        All its cases.
+    """
+    nulls = [a for a in answers if a.truth == NONE]
+    gaps = [a for a in answers if a.truth != NONE]
+    unlisted = [a for a in gaps if a.truth == UNKNOWN]
+    listed = [a for a in gaps if a.truth != UNKNOWN]
+    shrinks = [s for a in gaps for s in a.shrinks]
+    stated = [s for s in shrinks if s.interval is not None]
+    return TierScore(
+        tier=tier,
+        n_cases=len(answers),
+        n_failed=sum(a.verdict == FAILED for a in answers),
+        top_1=_share(gaps, lambda a: a.among_first(1)),
+        top_2=_share(gaps, lambda a: a.among_first(2)),
+        top_1_all=_share(answers, lambda a: a.among_first(1)),
+        top_2_all=_share(answers, lambda a: a.among_first(2)),
+        truth_probability=_average([a.truth_probability for a in gaps], np.mean),
+        truth_probability_all=_average([a.truth_probability for a in answers], np.mean),
+        false_alarm=_share(nulls, lambda a: a.verdict != NONE),
+        unlisted_recognised=_share(unlisted, lambda a: a.verdict in (UNKNOWN, "ambiguous")),
+        listed_called_unknown=_share(listed, lambda a: a.verdict in (UNKNOWN, FAILED)),
+        confidently_wrong=_share(answers, lambda a: a.confidently_wrong()),
+        localisation_auc=_average([a.auc for a in gaps if a.auc is not None], np.median),
+        shrink_coverage=Proportion(sum(s.covered for s in stated), len(stated)),
+        no_shrink_interval=Proportion(len(shrinks) - len(stated), len(shrinks)),
+        actual_shrink=_average([s.actual for s in shrinks], np.median),
+        told_apart=_average([a.told_apart for a in gaps if a.told_apart is not None], np.mean),
+        brier=_average([a.brier for a in answers], np.mean),
+        reliability=_reliability([a for a in answers if a.ranked]),
+    )
+
+
+def _label(name: str) -> str:
+    return PAIR if "+" in name else name
+
+
+def _call_label(answer: CaseAnswer) -> str:
+    wrong_pair = "+" in answer.called and answer.called != answer.truth and "+" in answer.truth
+    return OTHER_PAIR if wrong_pair else _label(answer.called)
+
+
+def confusion(answers: list[CaseAnswer]) -> Confusion:
+    """Return the confusion matrix of some cases, its labels in alphabetical order."""
+    truths = sorted({_label(a.truth) for a in answers})
+    calls = truths + sorted({_call_label(a) for a in answers} - set(truths))
+    counts = np.zeros((len(truths), len(calls)), dtype=int)
+    for answer in answers:
+        counts[truths.index(_label(answer.truth)), calls.index(_call_label(answer))] += 1
+    return Confusion(tuple(truths), tuple(calls), tuple(tuple(map(int, row)) for row in counts))
+
+
+def score(
+    cases_dir: Path, results_dir: Path, key_path: Path, outputs: Collection[str] = ()
+) -> Score:
+    """Score the diagnoses of a blind test.
+
+    Parameters
+    ----------
+    cases_dir : Path
+        Folder that `challenge.make.make` wrote.
+    results_dir : Path
+        Folder with ``<case>/diagnosis.json`` and ``<case>/fresh_prediction.csv``.
+    key_path : Path
+        The sealed key.
+    outputs : collection of str
+        Score the cases that measure these and no others; all cases by default.
+
+    Raises
+    ------
+    CalibError
+        If no case measures these outputs, the key does not match the hash published with the
+        cases, there is no diagnosis, or diagnoses are of other cases.
+    """
+    entries = open_key(cases_dir, key_path)["cases"]
+    warnings = check_results(cases_dir, results_dir, sorted(entries))
+    answers = [read_answer(name, entries[name], results_dir / name) for name in sorted(entries)]
+    if outputs:
+        answers = [a for a in answers if set(a.outputs) == set(outputs)]
+        if not answers:
+            there = sorted({",".join(sorted(entry["noise_sd"])) for entry in entries.values()})
+            raise CalibError(
+                f"no case measures {' and '.join(outputs)} alone", where=str(cases_dir),
+                allowed="; ".join(there), mend="name the outputs of some cases, or leave them out",
+            )  # fmt: skip
+    tiers = {tier: [a for a in answers if a.tier == tier] for tier in ("easy", "hard")}
+    tiers = {tier: part for tier, part in tiers.items() if part}
+    return Score(
+        tiers={tier: score_tier(tier, part) for tier, part in tiers.items()},
+        confusion={tier: confusion(part) for tier, part in tiers.items()},
+        answers=tuple(answers),
+        warnings=warnings,
+    )

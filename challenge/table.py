@@ -1,0 +1,104 @@
+"""The score as text: every figure with its interval, its count and the level asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+from challenge.answers import CaseAnswer
+from challenge.levels import LEVELS, Level
+from challenge.mechanism import NONE
+from challenge.score import Average, Proportion, Score, TierScore
+
+_EXTRA = (
+    ("top_1_all", "right hypothesis first, nulls included"),
+    ("truth_probability_all", "mean probability of the truth, nulls included"),
+    ("told_apart", "truth told from its nearest rival alone"),
+    ("no_shrink_interval", "outputs with a gap without a shrink interval"),
+    ("brier", "Brier score (0 best, 2 worst)"),
+)
+
+
+def _figure(tier: TierScore, name: str) -> Proportion | Average:
+    figure: Proportion | Average = getattr(tier, name)
+    return figure
+
+
+def asked(level: Level, tier: str) -> str:
+    """Return a level in words."""
+    low, high = level.limits(tier)
+    if level.direction == 0:
+        return f"{low:.2f}-{high:.2f}"
+    return f">= {low:.2f}" if level.direction > 0 else f"<= {high:.2f}"
+
+
+def _span(figure: Proportion | Average) -> str:
+    low, high = figure.interval
+    return f"[{low:.2f}, {high:.2f}]"
+
+
+def _line(label: str, figure: Proportion | Average, asked_for: str, mark: str) -> str:
+    count = f"{figure.successes}/{figure.n}" if isinstance(figure, Proportion) else f"n={figure.n}"
+    value, span = (f"{figure.value:6.3f}", _span(figure)) if figure.n else ("-", "")
+    mark = mark if figure.n else ""
+    return f"  {label:<47} {value:>6} {span:>14} {count:>8}  {asked_for:>10}  {mark}"
+
+
+def tier_table(tier: TierScore) -> str:
+    """Return one tier's table.
+
+    Parameters
+    ----------
+    tier : TierScore
+    """
+    lines = [
+        f"{tier.tier}: {tier.n_cases} cases, {tier.n_failed} failed",
+        f"  {'':<47} {'value':>6} {'95 % interval':>14} {'count':>8}  {'asked':>10}",
+    ]
+    for level in LEVELS:
+        figure = _figure(tier, level.name)
+        mark = level.mark(tier.tier, figure)
+        lines.append(_line(level.label, figure, asked(level, tier.tier), mark))
+    lines += [_line(label, _figure(tier, name), "", "") for name, label in _EXTRA]
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def outputs_table(answers: Iterable[CaseAnswer]) -> str:
+    """Return how the truth fared where there is a gap, by the outputs that are measured.
+
+    Parameters
+    ----------
+    answers : iterable of CaseAnswer
+    """
+    parts: dict[tuple[str, tuple[str, ...]], list[CaseAnswer]] = {}
+    for answer in answers:
+        if answer.truth != NONE:
+            parts.setdefault((answer.tier, answer.outputs), []).append(answer)
+    lines = [f"  {'':<47} {'first':>16} {'first two':>16} {'mean p':>7}"]
+    for (tier, outputs), part in sorted(
+        parts.items(), key=lambda item: (item[0][0], -len(item[1]))
+    ):
+        label = f"{tier}, {' and '.join(name.replace('_', ' ') for name in outputs)}"
+        cells = []
+        for count in (1, 2):
+            right = sum(a.among_first(count) for a in part)
+            cells.append(f"{right / len(part):8.3f} {f'{right}/{len(part)}':>7}")
+        mean = sum(a.truth_probability for a in part) / len(part)
+        lines.append(f"  {label:<47} {' '.join(cells)} {mean:7.3f}")
+    return "\n".join(lines)
+
+
+def text_table(score: Score) -> str:
+    """Return the table of all tiers, and the cases that failed.
+
+    Parameters
+    ----------
+    score : Score
+        From `challenge.score.score`.
+    """
+    parts = [tier_table(tier) for tier in score.tiers.values()]
+    if len({a.outputs for a in score.answers if a.truth != NONE}) > 1:
+        parts.append("cases with a gap, by what is measured:\n" + outputs_table(score.answers))
+    failed = [f"  {a.case}: {a.problem}" for a in score.answers if a.problem]
+    if failed:
+        parts.append("\n".join(["without a readable diagnosis, counted as wrong:", *failed]))
+    return "\n\n".join(parts)
