@@ -42,8 +42,10 @@ def _gaps_again(record: Any) -> Section:
     from calib.he2019.sections import GapsSection
 
     known = {gap.name: gap for gap in paper_gaps()}
-    if not isinstance(record, dict) or not set(record) <= set(known):
-        raise ValueError(f"not some of {', '.join(known)}")
+    if not isinstance(record, dict):
+        raise ValueError("not a table of gaps by name")
+    if strange := sorted(set(record) - set(known)):
+        raise ValueError(f"{strange[0]!r} is not one of {', '.join(known)}")
     return GapsSection(tuple(gap for name, gap in known.items() if name in record))
 
 
@@ -55,8 +57,9 @@ def _audit_again(record: Any) -> Section:
     names = set(Seeds.__dataclass_fields__)
     if not isinstance(seeds, dict) or set(seeds) != names:
         raise ValueError(f"seeds: not {', '.join(sorted(names))}")
-    if not all(isinstance(n, int) and 1 <= n <= 1000 for n in seeds.values()):
-        raise ValueError("seeds: not numbers from 1 to 1000")
+    wrong = [name for name, n in seeds.items() if not (isinstance(n, int) and 1 <= n <= 1000)]
+    if wrong:
+        raise ValueError(f"seeds: {', '.join(wrong)}: not a whole number from 1 to 1000")
     return AuditSection(Seeds(**seeds))
 
 

@@ -256,3 +256,19 @@ def test_equations_are_read_from_their_latex() -> None:
     model = declared(latex=(r"$\frac{a}{b} \sqrt{x_1} - \mathrm{CI}^{2n}$",), numbers="Eq 3")
     assert model.equation == "(a)/(b) \u221a(x_1) - CI^(2n)  (Eq 3)"
     assert "<i>x</i><sub>1</sub>" in equation(BoundModel(model, {}))
+
+
+def test_the_readmes_own_model_goes_as_printed(run: Calib) -> None:
+    readme = (HERE.parents[1] / "README.md").read_text(encoding="utf-8")
+    start = readme.index("# my_model.py\n")
+    end = readme.index("\n```\n\n```console\ncalib template janosi_pull", start)
+    Path("my_model.py").write_text(readme[start:end], encoding="utf-8")
+    commands = [
+        line.split()[1:]
+        for line in readme[end:].partition("\n```\n\n```console\n")[2].splitlines()[:2]
+    ]
+    assert [words[0] for words in commands] == ["template", "report"]
+    for words in commands:
+        ran = run(*words)
+        assert ran.code == 0, ran.err
+    assert "janosi_pull" in Path("report/summary.json").read_text()
