@@ -20,12 +20,15 @@ class KnownData:
     label : str
     words : str
         What it is, in a sentence.
+    methods : str
+        What a paper must say of it, a sentence with marks (`calib.report.publish.markup`).
     holds : callable
         ``table -> bool``: whether all rows of a table are rows of it.
     """
 
     label: str
     words: str
+    methods: str
     holds: Callable[[Table], bool]
 
     def register(self) -> None:

@@ -85,7 +85,13 @@ class Plugin:
         if _LABEL in REFERENCES:
             return
         register(
-            KnownData(_LABEL, "the embedded data", _holds),
+            KnownData(
+                _LABEL,
+                "the embedded data",
+                "The data are reconstructed from published results [@He_2019]; they are not "
+                "measurements.",
+                _holds,
+            ),
             Method(
                 "geometric", _later("estimators.geometric", "estimate_geometric"),
                 "geometric (Eqs 6-9)", "Geom.",

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from calib.data.labels import KNOWN_DATA
 from calib.inference.estimators import METHODS
 from calib.models import get_model
 from calib.report.figures.labels import axis_of, joined
@@ -49,11 +50,7 @@ def _everything(manifest: Mapping[str, Any], outputs: Sequence[Output]) -> list[
     gate = s["gate"]
     sentences = [f"Tyre-soil models were calibrated with calib {v['terracalib']} [@calib]."]
     labels = sorted({o.label for o in outputs if o.label})
-    if labels:
-        sentences.append(
-            f"The data are {joined(labels)}, from the results published there; they are not "
-            "measurements."
-        )
+    sentences += [KNOWN_DATA[label].methods for label in labels if label in KNOWN_DATA]
     if any("genetic" in o.found["estimates"] for o in outputs):
         sentences.append(_genetic(manifest["genetic_algorithm"]))
     return [
