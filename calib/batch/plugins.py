@@ -13,7 +13,7 @@ from types import ModuleType
 
 from calib.errors import CalibError
 
-__all__ = ["PLUGINS", "inherit", "load_files", "load_installed", "run_file"]
+__all__ = ["PLUGINS", "inherit", "load_files", "load_installed", "loaded_files", "run_file"]
 
 # Entry points of packages that register several things.
 PLUGINS = "terracalib.plugins"
@@ -76,17 +76,20 @@ def load_files(paths: Sequence[Path]) -> None:
     """
     for path in paths:
         run_file(path, "models")
-    known = [p for p in os.environ.get(_VARIABLE, "").split(os.pathsep) if p]
     new = [str(Path(p).resolve()) for p in paths]
     if new:
+        known = map(str, loaded_files())
         os.environ[_VARIABLE] = os.pathsep.join(dict.fromkeys([*known, *new]))
+
+
+def loaded_files() -> list[Path]:
+    """Return the files that this process has loaded, or was started with."""
+    return [Path(p) for p in os.environ.get(_VARIABLE, "").split(os.pathsep) if p]
 
 
 def inherit() -> None:
     """Load what the process that started this one had loaded."""
-    for path in os.environ.get(_VARIABLE, "").split(os.pathsep):
-        if path:
-            run_file(Path(path), "models")
+    load_files(loaded_files())
 
 
 def load_installed(group: str) -> None:

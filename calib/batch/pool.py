@@ -12,10 +12,11 @@ from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_all_start_methods, get_context
+from pathlib import Path
 from threading import Thread
 from typing import Protocol
 
-from calib.batch.plugins import inherit
+from calib.batch.plugins import load_files, loaded_files
 from calib.errors import CalibError
 
 __all__ = ["HERE", "Later", "Pool", "pool"]
@@ -108,7 +109,10 @@ def pool(workers: int, modules: Sequence[str] = _REPORT) -> Iterator[Pool]:
     context = get_context("forkserver" if forked else "spawn")
     if forked:
         context.set_forkserver_preload(list(modules))
-    executor = ProcessPoolExecutor(workers, mp_context=context, initializer=_begin)
+    # Handed over: a server that forks keeps the environment it was started with.
+    executor = ProcessPoolExecutor(
+        workers, mp_context=context, initializer=_begin, initargs=(loaded_files(),)
+    )
     # A first process starts now, not when there is work for it; it starts where it can wait.
     Thread(target=executor.submit, args=(_begun,), daemon=True).start()
     try:
@@ -117,10 +121,10 @@ def pool(workers: int, modules: Sequence[str] = _REPORT) -> Iterator[Pool]:
         executor.shutdown(wait=False, cancel_futures=True)
 
 
-def _begin() -> None:
+def _begin(files: Sequence[Path]) -> None:
     """Leave an interruption to the process that waits for the pieces; know what it knows."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    inherit()
+    load_files(files)
 
 
 def _begun() -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import calib
+from calib.batch.pool import pool
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.gap.effects import EFFECTS
@@ -259,6 +260,9 @@ def test_equations_are_read_from_their_latex() -> None:
 
 
 def test_the_readmes_own_model_goes_as_printed(run: Calib) -> None:
+    # On two processes, whose server was started before the model was known.
+    with pool(2) as before:
+        before.submit(len, "").result()
     readme = (HERE.parents[1] / "README.md").read_text(encoding="utf-8")
     start = readme.index("# my_model.py\n")
     end = readme.index("\n```\n\n```console\ncalib template janosi_pull", start)
