@@ -18,6 +18,7 @@ from calib.inference.prior_files import (
     DeclaredPriors,
     PriorFile,
     default_priors,
+    prior_references,
     read_priors,
 )  # fmt: skip
 from calib.inference.priors import Priors
@@ -89,8 +90,8 @@ def effect_priors(data: Campaigns, effect: Effect) -> Priors:
     file: PriorFile = effect.prior_file or default_priors(f"effects/{effect.name}")
     if effect.priors:
         file = DeclaredPriors(f"{effect.name}.toml", effect.priors)
-    loads = {"normal_load_kn": data.view.load_kn}
-    return read_priors(file, effect.name, effect.parameters, loads)
+    references = prior_references(data.case.lab.columns) | {"normal_load_kn": data.view.load_kn}
+    return read_priors(file, effect.name, effect.parameters, references)
 
 
 def singles(data: Campaigns, effects: Mapping[str, Effect]) -> list[Hypothesis]:

@@ -19,11 +19,11 @@ import numpy as np
 import xarray as xr
 
 from calib.batch.environment import Environment
-from calib.data import Table, read_for_model, write_table
+from calib.data import read_for_model, write_table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.estimators import PointEstimate
-from calib.inference.prior_files import parse_priors
+from calib.inference.prior_files import parse_priors, prior_references, relative_columns
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem
 from calib.inference.random import generator
@@ -122,7 +122,7 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         "fixed": {p.name: p.loc for p in problem.priors.entries if p.fixed},
         "prior_file": PurePath(problem.priors.source).name,
         "prior_text": problem.priors.text,
-        "prior_references": _loads(problem.table),
+        "prior_references": _references(problem),
         "seed": calibration.seed,
         "label": calibration.label,
         "shape": list(calibration.draws.t.shape),
@@ -160,9 +160,9 @@ def describe_estimates(estimates: Sequence[PointEstimate]) -> list[dict[str, Any
     ]
 
 
-def _loads(table: Table) -> dict[str, float]:
-    name = "normal_load_kn"
-    return {name: float(np.median(table[name]))} if name in table else {}
+def _references(problem: Problem) -> dict[str, float]:
+    known = prior_references(problem.table.columns)
+    return {name: known[name] for name in relative_columns(problem.priors.text) if name in known}
 
 
 def write_netcdf(tree: xr.DataTree, path: Path) -> None:

@@ -10,8 +10,10 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
@@ -22,8 +24,17 @@ __all__ = [
     "default_priors",
     "parse_priors",
     "prior_file_model",
+    "prior_references",
     "read_priors",
+    "relative_columns",
 ]
+
+
+# Beyond these, squares and products of numbers leave the range of double precision; no quantity of
+# the field comes near them. An sd of 20 on the logarithm is a factor of 5e8 to either side.
+_Number = Annotated[float, Field(ge=-1e15, le=1e15)]
+_Positive = Annotated[float, Field(gt=1e-15, le=1e15)]
+_LogSd = Annotated[float, Field(gt=1e-6, le=20.0)]
 
 
 class _Entry(BaseModel):
@@ -31,40 +42,40 @@ class _Entry(BaseModel):
     unit: str
     reason: str = Field(min_length=1)
     source: str = Field(min_length=1)
-    relative_to: Literal["normal_load_kn"] | None = None
-    default_reference: float = Field(default=1.0, gt=0.0)
+    relative_to: str | None = None
+    default_reference: _Positive = 1.0
 
 
 class _Normal(_Entry):
     dist: Literal["normal"]
-    mean: float
-    sd: float = Field(gt=0.0)
-    lower: float | None = None
-    upper: float | None = None
+    mean: _Number
+    sd: _Positive
+    lower: _Number | None = None
+    upper: _Number | None = None
 
 
 class _LogNormal(_Entry):
     dist: Literal["lognormal"]
-    median: float = Field(gt=0.0)
-    sd_log: float = Field(gt=0.0)
-    lower: float | None = Field(default=None, gt=0.0)
-    upper: float | None = Field(default=None, gt=0.0)
+    median: _Positive
+    sd_log: _LogSd
+    lower: _Positive | None = None
+    upper: _Positive | None = None
 
 
 class _HalfNormal(_Entry):
     dist: Literal["half_normal"]
-    sd: float = Field(gt=0.0)
+    sd: _Positive
 
 
 class _Uniform(_Entry):
     dist: Literal["uniform"]
-    lower: float
-    upper: float
+    lower: _Number
+    upper: _Number
 
 
 class _Fixed(_Entry):
     dist: Literal["fixed"]
-    value: float
+    value: _Number
 
 
 type _AnyEntry = Annotated[
@@ -170,7 +181,7 @@ def read_priors(
     parameters : sequence of str
         The parameters it must give, in order; the noise scale ``sigma`` among them.
     references : mapping of str to float
-        Values of the columns that priors may be relative to (a median normal load).
+        Values of the columns that priors may be relative to, as `prior_references` returns them.
 
     Raises
     ------
@@ -186,6 +197,37 @@ def read_priors(
             mend="give the path of a readable TOML file",
         ) from None
     return parse_priors(text, str(path), model_name, parameters, references)
+
+
+def prior_references(columns: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
+    """Return the scales that priors may be relative to: medians of columns, where positive.
+
+    Parameters
+    ----------
+    columns : mapping of str to ndarray, shape (n,)
+    """
+    medians = {
+        name: float(np.median(values[np.isfinite(values)]))
+        for name, values in columns.items()
+        if np.isfinite(values).any()
+    }
+    return {name: median for name, median in medians.items() if median > 0.0}
+
+
+def relative_columns(text: str) -> dict[str, float]:
+    """Return the columns that priors are relative to, and what is assumed where one is not there.
+
+    Parameters
+    ----------
+    text : str
+        Of a prior file that was read.
+    """
+    entries = tomllib.loads(text)["parameters"].values()
+    return {
+        e["relative_to"]: float(e.get("default_reference", 1.0))
+        for e in entries
+        if "relative_to" in e
+    }
 
 
 def parse_priors(
@@ -276,6 +318,7 @@ def _prior(name: str, entry: _AnyEntry, source: str, references: Mapping[str, fl
     reference = 1.0
     suffix = ""
     if entry.relative_to is not None:
+        _check_relative(name, entry.relative_to, source)
         reference = references.get(entry.relative_to, entry.default_reference)
         suffix = f" x {reference:g} ({entry.relative_to})"
     log, loc, scale, lower, upper, text = _internal(entry, reference)
@@ -288,6 +331,16 @@ def _prior(name: str, entry: _AnyEntry, source: str, references: Mapping[str, fl
     return Prior(
         name, entry.unit, entry.reason, entry.source, text + suffix, log, loc, scale, lower, upper
     )
+
+
+def _check_relative(name: str, column: str, source: str) -> None:
+    if all(q.canonical != column for q in QUANTITIES.values()):
+        raise CalibError(
+            f"relative_to names no known column: {column!r}",
+            where=f"{source}, parameters.{name}",
+            allowed=", ".join(q.canonical for q in QUANTITIES.values()),
+            mend="name one of these, as the table has it in its own unit",
+        )
 
 
 def _internal(entry: _AnyEntry, reference: float) -> tuple[bool, float, float, float, float, str]:

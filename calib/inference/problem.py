@@ -21,7 +21,12 @@ import numpy as np
 from calib.data import Table, check_enough, check_varies
 from calib.errors import CalibError
 from calib.inference.likelihood import Squares
-from calib.inference.prior_files import default_priors, read_priors
+from calib.inference.prior_files import (
+    default_priors,
+    prior_references,
+    read_priors,
+    relative_columns,
+)
 from calib.inference.priors import Priors
 from calib.models import Array, BoundModel, get_model
 
@@ -174,14 +179,12 @@ def build_problem(
         )
     check_enough(table, len(model.parameters), model=model.name)
     check_varies(table, model.output)
-    loads = {}
-    if "normal_load_kn" in table:
-        loads["normal_load_kn"] = float(np.median(table["normal_load_kn"]))
+    references = prior_references(table.columns)
     priors = read_priors(
         prior_path or default_priors(model.name),
         model.name,
         (*model.parameters, "sigma"),
-        loads,
+        references,
     )
     try:
         bound = model.bind(table.columns)
@@ -192,11 +195,11 @@ def build_problem(
             allowed=error.allowed,
             mend=error.mend,
         ) from None
-    notes: tuple[str, ...] = ()
-    if not loads and 'relative_to = "normal_load_kn"' in priors.text:
-        notes = (
-            "the data have no normal_load column, so the priors of forces assume 5 kN; give the "
-            "load of your wheel if it differs",
-        )
+    notes = tuple(
+        f"the data have no column {name}, so priors that are relative to it assume {value:g}; give "
+        "it if yours differs"
+        for name, value in relative_columns(priors.text).items()
+        if name not in references
+    )
     problem = Problem(bound, table, priors, notes)
     return problem.with_fixed(fixed) if fixed else problem

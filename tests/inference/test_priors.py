@@ -11,7 +11,13 @@ from scipy import stats
 from scipy.integrate import quad
 
 from calib.errors import CalibError
-from calib.inference.prior_files import default_priors, parse_priors, read_priors
+from calib.inference.prior_files import (
+    default_priors,
+    parse_priors,
+    prior_references,
+    read_priors,
+    relative_columns,
+)
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
 
@@ -191,6 +197,12 @@ def refusal(call: Callable[[], object]) -> str:
         ('dist = "normal"\nmean = 0.0\nsd = -1.0', ["normal.sd", "greater than 0", "-1.0"]),
         ('dist = "half_normal"\nsd = 0.0', ["half_normal.sd", "greater than 0"]),
         ('dist = "lognormal"\nmedian = 1.0\nsd_log = 0', ["sd_log", "greater than 0"]),
+        ('dist = "lognormal"\nmedian = 1.0\nsd_log = 1e300', ["sd_log", "equal to 20", "1e+300"]),
+        ('dist = "normal"\nmean = 1e300\nsd = 1', ["mean", "less than or equal to"]),
+        (
+            'dist = "half_normal"\nsd = 1\nrelative_to = "weight"',
+            ["relative_to names no known column: 'weight'", "normal_load_kn"],
+        ),
         ('dist = "lognormal"\nmedian = -1.0\nsd_log = 1', ["median", "greater than 0"]),
         ('dist = "normal"\nmean = nan\nsd = 1.0', ["mean", "finite", "nan"]),
         ('dist = "normal"\nmean = 0.0\nsd = inf', ["sd", "finite", "inf"]),
@@ -316,3 +328,15 @@ def test_a_prior_says_what_it_is() -> None:
     assert prior.text == "normal(1, 2) on [0, inf]"
     assert isinstance(prior, Prior)
     assert not prior.fixed
+
+
+def test_a_prior_may_be_relative_to_any_column() -> None:
+    relative = 'relative_to = "cone_index_kpa"\ndefault_reference = 3'
+    body = f'dist = "normal"\nmean = 1.0\nsd = 0.5\n{relative}'
+    columns = {"cone_index_kpa": np.array([100.0, np.nan, 300.0]), "slip_ratio": np.zeros(3)}
+    references = prior_references(columns)
+    assert references == {"cone_index_kpa": 200.0}
+    (given,), (assumed,) = one(body, references).entries, one(body).entries
+    assert (given.loc, given.scale) == (200.0, 100.0)
+    assert (assumed.loc, assumed.scale) == (3.0, 1.5)
+    assert relative_columns(one(body).text) == {"cone_index_kpa": 3.0}
