@@ -20,7 +20,7 @@ from calib.errors import CalibError
 from calib.gap.covariates import Covariates
 from calib.gap.effects import View
 from calib.gap.noise import At, noise_at, noise_at_lab
-from calib.gap.oddities import oddities
+from calib.gap.oddities import identical_rows, oddities
 from calib.gap.simulated import Simulated
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem, build_problem
@@ -209,10 +209,30 @@ def read_case(folder: Path) -> Case:
             allowed=", ".join(OUTPUTS), mend="correct the name",
         )  # fmt: skip
     missing_ok = tuple(OUTPUTS.values())
-    lab = read_table(folder / str(files["calibration"]), allow_missing=missing_ok)
-    field = read_table(folder / str(files["field"]), allow_missing=missing_ok)
-    fresh = read_table(folder / content["predict"]) if content.get("predict") else None
+    lab = read_table(_inside(folder, "calibration", content), allow_missing=missing_ok)
+    field = read_table(_inside(folder, "field", content), allow_missing=missing_ok)
+    fresh = read_table(_inside(folder, "predict", content)) if content.get("predict") else None
     return Case(folder.name, lab, field, models, fresh, oddities(lab, field, models))
+
+
+def _inside(folder: Path, key: str, content: Mapping[str, Any]) -> Path:
+    """Return the path of a file of the case, which opens no others: it may be from elsewhere."""
+    name = content[key]
+    path = folder / str(name)
+    if not isinstance(name, str) or not _is_inside(path, folder):
+        raise CalibError(
+            f"{key} = {name!r} is not a file of the case", where=str(folder / "case.toml"),
+            allowed="the name of a file in the case's folder, not reached by a link out of it",
+            mend="put the file, or a copy of it, into the folder",
+        )  # fmt: skip
+    return path
+
+
+def _is_inside(path: Path, folder: Path) -> bool:
+    try:
+        return path.resolve().is_relative_to(folder.resolve())
+    except (OSError, ValueError):  # no path at all
+        return False
 
 
 def case_files(folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
@@ -229,7 +249,11 @@ def case_files(folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
         content = {}
     named = {key: content.get(key) for key in _FILES}
-    files = {key: path.parent / name for key, name in named.items() if isinstance(name, str)}
+    files = {
+        key: path.parent / name
+        for key, name in named.items()
+        if isinstance(name, str) and _is_inside(path.parent / name, path.parent)
+    }
     return content, {"case.toml": path} | files
 
 
@@ -268,6 +292,11 @@ def campaigns(case: Case) -> Campaigns:
     """
     outputs = tuple(_output(case, name, model) for name, model in case.models.items())
     lab, field = case.lab, case.field
+    if identical_rows(lab, field) == len(field):
+        raise CalibError(
+            "every field row is a row of the calibration, value for value", where=field.source,
+            allowed="measurements of another campaign", mend="name the field's own file",
+        )  # fmt: skip
     load = _recorded(lab, "load", _recorded(field, "load", np.array([5.0])))
     order = _recorded(field, "order", np.array([0.0, 1.0]))
     view = View(

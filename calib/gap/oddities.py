@@ -11,7 +11,7 @@ from calib.data.quantities import OUTPUTS, columns_of, role_of
 from calib.models import get_model
 from calib.models.base import Array
 
-__all__ = ["oddities"]
+__all__ = ["identical_rows", "oddities"]
 
 # Typical outputs of two campaigns differ by less than this, whatever acts in the field.
 _ODD_RATIO = 4.0
@@ -42,7 +42,7 @@ def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, 
         A sentence each.
     """
     said = []
-    same = _identical_rows(lab, field)
+    same = identical_rows(lab, field)
     if same:
         said.append(
             f"{same} of {len(field)} field rows are rows of the calibration, value for value; the "
@@ -136,7 +136,7 @@ def _times(lab: Array, field: Array, near: float = _NEAR) -> str:
     return f"{typical}, {factor:.3g} times {way}{between}"
 
 
-def _identical_rows(lab: Table, field: Table) -> int:
+def identical_rows(lab: Table, field: Table) -> int:
     """Count field rows that are in the calibration too, in every column of both."""
     both = [name for name in lab if name in field]
     known = set(zip(*(lab[name].tolist() for name in both), strict=True))

@@ -9,7 +9,7 @@ import pytest
 
 from calib.data import table_from_arrays, write_table
 from calib.errors import CalibError
-from calib.gap.case import Case, campaigns, read_case
+from calib.gap.case import Case, campaigns, case_files, read_case
 from tests.gap.cases import MODELS, PULL_ONLY, make_case, table_without, write_case
 
 
@@ -144,3 +144,31 @@ def test_field_rows_that_are_the_calibrations_are_counted(tmp_path):
     assert any("3 of 27 field rows are rows of the calibration" in w for w in said)
     said = read_case(write_case(case, tmp_path / "other")).warnings
     assert not any("rows of the calibration" in w for w in said)
+
+
+@pytest.mark.parametrize("name", ["../outside.csv", "/etc/passwd", "a/../../outside.csv", "\0"])
+@pytest.mark.parametrize("key", ["calibration", "field", "predict"])
+def test_a_case_opens_no_file_but_its_own(tmp_path, key, name):
+    folder = write_case(make_case("force_offset", n_fresh=4), tmp_path / "case")
+    (tmp_path / "outside.csv").write_bytes((folder / "field.csv").read_bytes())
+    toml = (folder / "case.toml").read_text()
+    named = {"calibration": "lab.csv", "field": "field.csv", "predict": "fresh.csv"}[key]
+    written = name.replace("\0", "\\u0000")
+    (folder / "case.toml").write_text(toml.replace(f'"{named}"', f'"{written}"'))
+    with pytest.raises(CalibError, match=f"{key} = .* is not a file of the case"):
+        read_case(folder)
+    assert key not in case_files(folder)[1]
+
+
+def test_a_link_out_of_a_case_is_not_followed(tmp_path):
+    folder = write_case(make_case("force_offset"), tmp_path / "case")
+    (folder / "field.csv").rename(tmp_path / "field.csv")
+    (folder / "field.csv").symlink_to(tmp_path / "field.csv")
+    with pytest.raises(CalibError, match="not reached by a link out of it"):
+        read_case(folder)
+
+
+def test_the_calibration_itself_is_no_field(tmp_path):
+    case = make_case()
+    with pytest.raises(CalibError, match="every field row is a row of the calibration"):
+        campaigns(replace(case, field=case.lab))
