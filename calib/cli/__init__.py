@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from calib.cli import audit, calibration, campaign, challenge, check, gap, sbc
+from calib.cli import audit, calibration, campaign, challenge, check, doctor, gap, sbc
 
 __all__ = ["app", "main"]
 
@@ -16,7 +16,6 @@ app = typer.Typer(
     name="calib",
     help="Probabilistic calibration of tyre-soil models.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -28,6 +27,7 @@ check.register(app)
 audit.register(app)
 campaign.register(app)
 sbc.register(app)
+doctor.register(app)
 
 
 def main() -> None:

@@ -1,0 +1,105 @@
+"""The verb that says what is installed, what is optional, and on which processor it runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+__all__ = ["register"]
+
+# Extra of `pip install terracalib[...]` to the package that shows it is there, and what it is for.
+_OPTIONAL = {
+    "dashboard": ("bokeh", "Dask's page of what the workers do"),
+    "test": ("pytest", "the tests of a checkout"),
+}
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to an app."""
+    app.command()(doctor)
+
+
+def doctor(
+    report: Annotated[
+        Path | None,
+        typer.Option(help="Report to check; reports/he2019 of a checkout by default."),
+    ] = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Check it without the sampling.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="For machines to read.")] = False,
+) -> None:
+    """Say what is installed, on which processor, and whether the shipped report checks here.
+
+    Ends with 0 where all is well, 1 where the report differs, 2 where it cannot be checked.
+    """
+    from calib.batch.environment import Environment
+
+    here = Environment.here()
+    folder = report if report is not None else _shipped()
+    found: dict[str, Any] = {
+        **here.document(),
+        "optional": {name: _installed(package) for name, (package, _) in _OPTIONAL.items()},
+        "registered": _registered(),
+        "report": None if folder is None else _checked(folder, quick=quick),
+    }
+    print(json.dumps(found, indent=1) if as_json else _text(found))
+    if found["report"] is not None and found["report"]["exit_code"]:
+        raise typer.Exit(found["report"]["exit_code"])
+
+
+def _installed(package: str) -> str | None:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def _registered() -> dict[str, list[str]]:
+    from calib.data.quantities import QUANTITIES
+    from calib.gap.effects import EFFECTS
+    from calib.models import MODELS
+
+    return {"models": sorted(MODELS), "effects": sorted(EFFECTS), "quantities": sorted(QUANTITIES)}
+
+
+def _shipped() -> Path | None:
+    """Return the report that a checkout has; a wheel has none."""
+    import calib
+
+    folder = Path(calib.__path__[0]).parent / "reports" / "he2019"
+    return folder if (folder / "manifest.json").is_file() else None
+
+
+def _checked(folder: Path, *, quick: bool) -> dict[str, Any]:
+    from calib.batch.pool import pool
+    from calib.check.check import check
+    from calib.cli.display import progress_bars
+    from calib.cli.parallel import CORES
+
+    with pool(1 if quick else CORES) as side, progress_bars() as tell:
+        outcome = check(folder, quick=quick, progress=tell, pool=side)
+    return {"folder": str(folder), "verdict": outcome.verdict, "exit_code": outcome.exit_code}
+
+
+def _text(found: dict[str, Any]) -> str:
+    report = found["report"]
+    lines = [
+        "versions", *(f"  {name} {version}" for name, version in found["versions"].items()),
+        "machine", *(f"  {name}: {value}" for name, value in found["machine"].items()),
+        "optional",
+        *(
+            f"  {name}: {found['optional'][name] or 'not installed'} ({what})"
+            for name, (_, what) in _OPTIONAL.items()
+        ),
+        "registered",
+        *(f"  {len(names)} {kind}: {', '.join(names)}" for kind, names in
+          found["registered"].items()),
+        "shipped report",
+        "  none here: it is in the repository" if report is None
+        else f"  {report['folder']}: {report['verdict']}",
+    ]  # fmt: skip
+    return "\n".join(lines)

@@ -1,0 +1,41 @@
+"""`calib doctor` says what is there, and what a check of a report finds."""
+
+from __future__ import annotations
+
+import json
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from calib.he2019.datasets import embedded
+from calib.models import MODELS
+from tests.cli.test_cli import Calib, calib  # noqa: F401
+
+
+@pytest.fixture
+def run(calib: Calib) -> Path:  # noqa: F811
+    embedded.write(Path("data"))
+    made = calib("fit", "data/rut_depth.csv", "--model", "bekker", "--out", "run", "--seed", 4)
+    assert made.code == 0, made.err
+    return Path("run")
+
+
+def test_what_is_installed_and_whether_a_report_checks(calib: Calib, run: Path) -> None:  # noqa: F811
+    told = calib("doctor", "--report", run, "--quick")
+    assert told.code == 0, told.err
+    assert f"  numpy {version('numpy')}\n" in told.out
+    assert f"  {len(MODELS)} models: " in told.out
+    assert f"  {run}: NOTHING DIFFERENT" in told.out
+    machine = json.loads(calib("doctor", "--report", run, "--quick", "--json").out)
+    assert machine["report"]["exit_code"] == 0
+    assert machine["machine"]["kernels"]
+    assert "bekker" in machine["registered"]["models"]
+
+
+def test_a_report_that_differs_is_told_by_the_exit_code(calib: Calib, run: Path) -> None:  # noqa: F811
+    data = run / "data.csv"
+    data.write_text(data.read_text() + "\n")
+    told = calib("doctor", "--report", run, "--quick")
+    assert told.code == 1
+    assert "DIFFERENT" in told.out
