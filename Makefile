@@ -8,7 +8,7 @@ OUT ?= out/he2019
 # Small matrices: threads of the linear algebra would only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: report reference test test-slow bench lint format clean
+.PHONY: report reference test test-slow docs bench lint format clean
 
 report: $(READY)
 	$(BIN)/calib report --out $(OUT) --overwrite
@@ -24,6 +24,11 @@ test: $(READY)
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
 
+# Static pages in out/docs, made from docs/ and the declarations; warnings are errors.
+docs: $(VENV)/.docs
+	$(BIN)/python -m sphinx -W --keep-going -q -b html -d out/.doctrees docs out/docs
+	@echo out/docs/index.html
+
 # Against the peers, written to reports/benchmarks; PART="posterior likelihood" does a part of it.
 # The everyday commands have no peers and run where people run them; PART="everyday --full" has the
 # tests too.
@@ -32,14 +37,14 @@ bench: $(BENCH_IN)/.ready
 	$(BENCH_IN)/bin/python benchmarks/bench.py $(PART)
 
 lint: $(READY)
-	$(BIN)/ruff check calib challenge tests benchmarks
-	$(BIN)/ruff format --check calib challenge tests benchmarks
+	$(BIN)/ruff check calib challenge tests benchmarks docs
+	$(BIN)/ruff format --check calib challenge tests benchmarks docs
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
 format: $(READY)
-	$(BIN)/ruff check --fix calib challenge tests benchmarks
-	$(BIN)/ruff format calib challenge tests benchmarks
+	$(BIN)/ruff check --fix calib challenge tests benchmarks docs
+	$(BIN)/ruff format calib challenge tests benchmarks docs
 
 # $(call setup,extra,constraints): make the target's virtual environment with an optional extra.
 define setup
@@ -59,6 +64,9 @@ endef
 
 $(READY): pyproject.toml constraints.txt
 	$(call setup,test,-c constraints.txt)
+
+$(VENV)/.docs: pyproject.toml constraints.txt
+	$(call setup,docs,-c constraints.txt)
 
 $(BENCH_VENV)/.ready: pyproject.toml constraints.txt constraints-bench.txt
 	$(call setup,bench,-c constraints.txt -c constraints-bench.txt)

@@ -13,6 +13,7 @@ __all__ = ["register"]
 # Extra of `pip install terracalib[...]` to the package that shows it is there, and what it is for.
 _OPTIONAL = {
     "dashboard": ("bokeh", "Dask's page of what the workers do"),
+    "docs": ("sphinx", "the documentation of a checkout"),
     "test": ("pytest", "the tests of a checkout"),
 }
 

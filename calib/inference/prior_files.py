@@ -22,6 +22,7 @@ __all__ = [
     "DeclaredPriors",
     "PriorFile",
     "default_priors",
+    "json_schema",
     "parse_priors",
     "prior_file_model",
     "prior_references",
@@ -90,6 +91,11 @@ class _File(BaseModel):
 
 
 _FILE: TypeAdapter[_File] = TypeAdapter(_File)
+
+
+def json_schema() -> dict[str, Any]:
+    """Return the JSON schema of a prior file."""
+    return _FILE.json_schema()
 
 
 @dataclass(frozen=True)

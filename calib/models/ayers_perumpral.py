@@ -194,6 +194,11 @@ AYERS_PERUMPRAL = Model(
         "[$gamma_d] the dry bulk density (g/cm³), CI the cone index (kPa), [$theta_g] "
         "the gravimetric water content (g/g)"
     ),
+    applies=(
+        "One soil, at several states of compaction and water content. Data with a narrow range of "
+        "water content hardly narrow C2 and C3: the report marks what the prior sets. At water "
+        "contents or cone indices outside those of the data it is extrapolated."
+    ),
     parametrisation=(
         "The density gamma_ref at a cone index of {ci_ref_kpa:.4g} kPa and a water "
         "content of {water_ref:.3g} (means of the data) is sampled in the place of "
@@ -239,6 +244,11 @@ AYERS_PERUMPRAL_VOLUMETRIC = Model(
     letters=(
         "[$gamma_d] the dry bulk density (g/cm³), CI the cone index (kPa), [$theta_v] "
         "the volumetric water content (cm³/cm³)"
+    ),
+    applies=(
+        "As the gravimetric form, with water at 1 g/cm³. The equation is implicit in the density "
+        "and is solved between 0.1 and 5 g/cm³; where it has no root there, there is no value. "
+        "Data with a narrow range of water content hardly narrow A3 and A4."
     ),
     parametrisation=(
         "The density gamma_ref at a cone index of {ci_ref_kpa:.4g} kPa and a water "

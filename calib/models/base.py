@@ -202,6 +202,8 @@ class Model:
         The equation, in the mathematics of `calib.models.latex`, and where it helps its parts.
     letters : str
         What its letters mean that are not parameters, with marks of `calib.report.publish.markup`.
+    applies : str
+        When it applies, and its limits, in plain sentences.
     numbers : str
         Where its source prints it: ``"Eqs 12-15"``.
     source : str
@@ -248,6 +250,7 @@ class Model:
     response: Literal["identity", "log"] = "identity"
     latex: tuple[str, ...] = ()
     letters: str = ""
+    applies: str = ""
     numbers: str = ""
     source: str = ""
     cited: str = ""

@@ -125,6 +125,11 @@ BEKKER = Model(
     cited="He_2019",
     source="He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003",
     letters="[$z_0] the rut depth (m), [$p_gr] the ground pressure (kPa)",
+    applies=(
+        "A towed wheel, or one of little slip, on one soil: it knows nothing of slip sinkage. k "
+        "has a unit that depends on n, so its values are to be compared at equal n only. The "
+        "logarithm of the rut depth is compared, so a rut must be deeper than zero."
+    ),
     parametrisation=(
         "The rut z_ref of a towed wheel at {p_ref_kpa:.4g} kPa (mean of the data) is "
         "sampled in the place of k, which is almost collinear with n; k follows from "
@@ -163,6 +168,11 @@ MODIFIED_BEKKER = Model(
     source="He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003",
     letters=(
         "[$z_t] the rut depth (m), [$p_gr] the ground pressure (kPa), [$s] the slip (as a fraction)"
+    ),
+    applies=(
+        "A driven wheel on one soil, while the rut equals the sinkage: He et al. (2019) fit slips "
+        "up to 20 %, for above 30 % the rut rebounds. There is no value where n0 + n1 s is not "
+        "positive. The logarithm of the rut depth is compared, so a rut must be deeper than zero."
     ),
     parametrisation=(
         "The rut z_ref of a towed wheel at {p_ref_kpa:.4g} kPa (mean of the data) is "

@@ -144,6 +144,11 @@ MAGIC_FORMULA = Model(
     cited="He_2019",
     source="He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003",
     letters="[$Y] the drawbar pull (kN), [$x] the slip (%)",
+    applies=(
+        "One tyre, soil, load and inflation pressure: it knows slip alone, and takes whatever else "
+        "varies between the rows for noise. E is at most 1, which keeps the curve single-peaked; a "
+        "pull that falls more steeply past its peak is not captured."
+    ),
     parametrisation=(
         "The initial slope K = BCD is sampled in the place of B, and G = 1 - E in "
         "that of E; B and E follow."

@@ -194,6 +194,13 @@ MAGIC_FORMULA_PRESSURE = Model(
     cited="He_2019",
     source="He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003",
     letters=("[$Y] the drawbar pull (kN), [$x] the slip (%), [$p] the inflation pressure (psi)"),
+    applies=(
+        "One tyre, soil and load, at two inflation pressures or more; with one pressure it is "
+        "refused. Two pressures cannot determine a quadratic: the curvature between them is then "
+        "the prior's, and the report says so. Slope, peak and 1 - E must be positive over the "
+        "calibrated pressures; far outside these the quadratics may turn negative, and there is "
+        "no value."
+    ),
     parametrisation=(
         "Each quadratic in pressure is sampled through its values at the lowest (_lo) "
         "and highest (_hi) calibrated pressure, {p_low_psi:.4g} and {p_high_psi:.4g} "

@@ -103,6 +103,9 @@ class Effect:
         Its name in a diagnosis and of its prior file.
     title : str
         What happens, in a few words.
+    latex : tuple of str
+        What it changes, words with mathematics between dollars: quantities that truly held in the
+        field have the subscript f.
     parameters : tuple of str
         In the order of the columns of `phi`.
     outputs : tuple of str
@@ -125,6 +128,7 @@ class Effect:
 
     name: str = ""
     title: str = ""
+    latex: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
     outputs: tuple[str, ...] = ()
     needs: tuple[str, ...] = ()

@@ -19,6 +19,7 @@ class SlipZeroShift(Effect):
     name = "slip_zero_shift"
     form = ("pressure",)  # a tyre rolls on a smaller radius at less inflation
     title = "the rolling radius behind the recorded slip is wrong"
+    latex = (r"$1 - s_\mathrm{f} = (1 - s)(1 - \text{radius error})$ for the slip $s$",)
     parameters = ("radius_error",)
     outputs = ("pull", "sinkage")
     covariates = ("slip",)
@@ -39,6 +40,7 @@ class ForceOffset(Effect):
 
     name = "force_offset"
     title = "the drawbar reading is off by a constant"
+    latex = (r"$P_\mathrm{f} = P + \text{offset}$ for the pull $P$",)
     parameters = ("offset",)
     outputs = ("pull",)
     varies = False
@@ -53,6 +55,13 @@ class SensorDrift(Effect):
 
     name = "sensor_drift"
     title = "the drawbar reading drifts with run order"
+    latex = (
+        r"$P_\mathrm{f} = P + \text{drift}\,[g(u) - \text{zero at}]$ for the pull $P$",
+        (
+            r"$g(u) = (1 + h^c)\, u^c / (u^c + h^c)$, $u$ being the part of the campaign that is "
+            r"over, $c$ the curvature and $h$ half way"
+        ),
+    )
     parameters = ("drift", "curvature", "half_way", "zero_at")
     form = ("shape",)
     outputs = ("pull",)
@@ -86,6 +95,20 @@ class PressureGaugeBias(Effect):
     name = "pressure_gauge_bias"
     form = ("extrapolation",)  # the simulator is used at pressures it was not fitted at
     title = "true inflation pressure differs from the recorded one"
+    latex = (
+        (
+            r"$p_\mathrm{f} = p\, e^{\text{gain}} + \text{offset}$ for the inflation pressure "
+            r"$p$, at least a fifth of it"
+        ),
+        (
+            r"$q_\mathrm{f} = q\, (p_\mathrm{f}/p)^{a \cdot \text{ground response}}$ for the "
+            r"ground pressure $q$, $a$ being its exponent of $p$ over the data"
+        ),
+        (
+            r"$1 - s_\mathrm{f} = (1 - s)[1 - \text{rolling radius} \cdot \ln(p_\mathrm{f}/p)]$ "
+            r"for the slip $s$"
+        ),
+    )
     parameters = ("gain", "offset", "ground_response", "rolling_radius")
     outputs = ("pull", "sinkage")
     covariates = ("pressure",)
@@ -114,6 +137,13 @@ class ConeIndexBias(Effect):
 
     name = "cone_index_bias"
     title = "the cone penetrometer reads wrong"
+    latex = (
+        (
+            r"$\mathrm{CI}_\mathrm{f} = \mathrm{CI}\, e^{\text{gain}} + \text{offset} \cdot "
+            r"\mathrm{CI}_\mathrm{lab}$ for the cone index, $\mathrm{CI}_\mathrm{lab}$ being the "
+            r"laboratory's median"
+        ),
+    )
     parameters = ("gain", "offset")
     form = ("size", "cone", "water")
     outputs = ("density",)
@@ -137,6 +167,12 @@ class WaterContentBias(Effect):
 
     name = "water_content_bias"
     title = "the moisture probe reads wrong"
+    latex = (
+        (
+            r"$w_\mathrm{f} = w\, e^{\text{gain}} + \text{offset}$ for the water content $w$, at "
+            r"least zero"
+        ),
+    )
     parameters = ("gain", "offset")
     form = ("size", "cone", "water")
     outputs = ("density",)

@@ -17,6 +17,15 @@ from calib.models.base import Array
 
 __all__ = ["MoistureSoftening", "MultipassCompaction", "RateEffect"]
 
+_STRENGTH = (
+    r"$P_\mathrm{f}(s) = e^{\text{pull} \cdot h}\, P(s\, e^{\text{slope} \cdot h}) + "
+    r"\text{resistance} \cdot h\, W$ for the pull $P$ at the slip $s$, $W$ being the normal load",
+    (
+        r"$\ln z_\mathrm{f} = \ln z + (\text{rut} + \text{rut slip} \cdot s)\, h$ for the rut "
+        r"depth $z$"
+    ),
+)
+
 
 class _SoilStrength(Effect):
     """Common form; subclasses give the covariate."""
@@ -59,6 +68,10 @@ class MultipassCompaction(_SoilStrength):
 
     name = "multipass_compaction"
     title = "earlier passes in the same rut have compacted the soil"
+    latex = (
+        *_STRENGTH,
+        r"$h = \ln(N/N_\mathrm{lab})$, $N$ being the pass number",
+    )
     covariates = ("passes",)
 
     def covariate(self, view: View) -> Array:
@@ -71,6 +84,10 @@ class RateEffect(_SoilStrength):
 
     name = "rate_effect"
     title = "soil strength changes with speed"
+    latex = (
+        *_STRENGTH,
+        r"$h = \ln(v/v_\mathrm{lab})$, $v$ being the speed",
+    )
     covariates = ("speed",)
 
     def covariate(self, view: View) -> Array:
@@ -85,6 +102,10 @@ class MoistureSoftening(_SoilStrength):
 
     name = "moisture_softening"
     title = "soil strength changes with water content"
+    latex = (
+        *_STRENGTH,
+        r"$h = (w - w_\mathrm{lab})/0.02$, $w$ being the gravimetric water content",
+    )
     covariates = ("water",)
 
     def covariate(self, view: View) -> Array:

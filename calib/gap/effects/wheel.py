@@ -18,6 +18,16 @@ class BulldozingResistance(Effect):
 
     name = "bulldozing_resistance"
     title = "the wheel pushes soil ahead of it, more as it sinks and slips"
+    latex = (
+        (
+            r"$P_\mathrm{f} = P - W \cdot \text{resistance} \cdot Z^{\text{sinkage exponent}}\, "
+            r"(1 + \text{slip growth} \cdot s)$ for the pull $P$"
+        ),
+        (
+            r"$Z$ is the simulator's sinkage over 30 mm where the case models it, else $1 + s$; "
+            r"$W$ the normal load, $s$ the slip"
+        ),
+    )
     parameters = ("resistance", "sinkage_exponent", "slip_growth")
     form = ("slip", "pressure")
     outputs = ("pull",)
@@ -42,6 +52,16 @@ class LugThrust(Effect):
 
     name = "lug_thrust"
     title = "tread lugs or grousers add thrust as slip grows"
+    latex = (
+        (
+            r"$P_\mathrm{f} = P + W \cdot \text{thrust} \cdot (1 - e^{-s/\text{slip scale}})$ for "
+            r"the pull $P$"
+        ),
+        (
+            r"$\ln z_\mathrm{f} = \ln z + \text{digging} \cdot s$ for the rut depth $z$; $W$ is "
+            r"the normal load, $s$ the slip"
+        ),
+    )
     parameters = ("thrust", "slip_scale", "digging")
     form = ("slip", "pressure")
     outputs = ("pull", "sinkage")
@@ -68,6 +88,16 @@ class SlipSinkage(Effect):
 
     name = "slip_sinkage"
     title = "sinkage grows with slip beyond what the model has"
+    latex = (
+        (
+            r"$\ln z_\mathrm{f} = \ln z + d$, $d = \text{growth} \cdot s^{\text{slip exponent}}$ "
+            r"for the rut depth $z$"
+        ),
+        (
+            r"$P_\mathrm{f} = P - W \cdot \text{pull loss} \cdot Z (e^d - 1)$ for the pull $P$; "
+            r"$Z$ is the simulator's sinkage over 30 mm, $W$ the normal load, $s$ the slip"
+        ),
+    )
     parameters = ("growth", "slip_exponent", "pull_loss")
     form = ("slip", "pressure")
     outputs = ("pull", "sinkage")
@@ -98,6 +128,16 @@ class RutRebound(Effect):
 
     name = "rut_rebound"
     title = "part of the sinkage springs back, more at high slip"
+    latex = (
+        (
+            r"$\ln z_\mathrm{f} = \ln z - \text{towed} - \text{growth} \cdot g(s)$ for the rut "
+            r"depth $z$"
+        ),
+        (
+            r"$g(s) = (1 + h^c)\, s^c / (s^c + h^c)$, $s$ being the slip, $c$ the slip exponent "
+            r"and $h$ half way"
+        ),
+    )
     parameters = ("towed", "growth", "slip_exponent", "half_way")
     form = ("slip", "pressure")
     outputs = ("sinkage",)
@@ -121,6 +161,13 @@ class PostPeakSoftening(Effect):
 
     name = "post_peak_softening"
     title = "shear strength falls past its peak"
+    latex = (
+        (
+            r"$P_\mathrm{f} = P\, [1 - \text{loss} \cdot (1 - e^{-(s - \text{peak "
+            r"slip})/\text{slip scale}})]$ for the pull $P$ where the slip $s$ is larger than the "
+            r"peak slip"
+        ),
+    )
     parameters = ("loss", "peak_slip", "slip_scale")
     form = ("slip", "pressure")
     outputs = ("pull",)
@@ -143,6 +190,14 @@ class LoadTransfer(Effect):
 
     name = "load_transfer"
     title = "drawbar pull changes the normal load"
+    latex = (
+        r"$N = W + \text{transfer} \cdot P$, between a fifth of $W$ and five times it",
+        r"$P_\mathrm{f} = P\, (N/W)^{\text{pull exponent}}$ for the pull $P$",
+        (
+            r"$q_\mathrm{f} = q\, (N/W)^{\text{pressure exponent}}$ for the ground pressure $q$; "
+            r"$W$ is the normal load"
+        ),
+    )
     parameters = ("transfer", "pull_exponent", "pressure_exponent")
     form = ("slip",)
     outputs = ("pull", "sinkage")

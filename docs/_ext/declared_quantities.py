@@ -1,0 +1,89 @@
+"""A page for each quantity, from its `Quantity`."""
+
+from __future__ import annotations
+
+from declared_text import code, quantity_link, table, unit, words
+
+from calib.data.headers import accepted_headers
+from calib.data.quantities import QUANTITIES, Quantity
+from calib.gap.effects import EFFECTS
+from calib.models import MODELS
+
+TITLE = "Quantities and units"
+LEAD = (
+    "Everything that a column may hold. A column name is a quantity and a unit; upper and lower "
+    "case, spaces and brackets make no difference (`Rut depth [mm]` is `rut_depth_mm`). Each page "
+    "is made from the quantity's declaration; [one of your own](../../extend.md) is one "
+    "declaration more."
+)
+_ROLES = {
+    "output": "An output: models predict it.",
+    "condition": "A condition: models predict from it, effects may need it.",
+    "bookkeeping": "Bookkeeping: no model predicts from it.",
+}
+
+
+def overview() -> list[str]:
+    """Return a table of all quantities."""
+    rows = (
+        (f"[{code(c)}]({c}.md)", words(q.description), unit(q.unit), q.role)
+        for c, q in QUANTITIES.items()
+    )
+    return [table(("column", "what", "unit inside", "role"), rows)]
+
+
+def pages() -> dict[str, str]:
+    """Return the page of every quantity by its column."""
+    return {column: _page(quantity) for column, quantity in QUANTITIES.items()}
+
+
+def _page(q: Quantity) -> str:
+    facts = [
+        ("column inside the program", quantity_link(q.canonical)),
+        ("unit inside the program", unit(q.unit)),
+        ("allowed", words(q.range.describe())),
+        ("drawn in", words(q.shown[0]) if q.shown else unit(q.unit)),
+        ("known to effects as", code(q.physical)),
+    ]
+    if q.synonyms:
+        facts.insert(1, ("also called", ", ".join(map(code, q.synonyms))))
+    scale = ["Models compare its logarithm, so it must be positive.\n"] if q.log_scale else []
+    return "\n".join(
+        [
+            f"# {q.title} ({code(q.canonical)})\n",
+            f"{words(q.description[0].upper() + q.description[1:])}. {_ROLES[q.role]}\n",
+            table(("", ""), facts),
+            *scale,
+            "## Column names\n",
+            *_headers(q),
+            *_users(q),
+        ]
+    )
+
+
+def _headers(q: Quantity) -> list[str]:
+    if not q.units:
+        return [f"{code(q.stem)}, without a unit.\n"]
+    rows = [(code(f"{q.stem}_{suffix}"), unit(u)) for suffix, u in q.units.items()]
+    if q.bare_unit:
+        rows.insert(0, (code(q.stem), unit(q.bare_unit)))
+    else:
+        rows.append((f"{code(q.stem)} alone", "refused: the unit must be said"))
+    assert {name for name, _ in rows} >= {code(h) for h in accepted_headers(q)}
+    return [table(("name", "unit"), rows)]
+
+
+def _users(q: Quantity) -> list[str]:
+    predicted = [n for n, m in MODELS.items() if m.output == q.canonical]
+    used = [n for n, m in MODELS.items() if q.canonical in m.conditions]
+    acting = [n for n, e in EFFECTS.items() if q.role == "output" and q.physical in e.outputs]
+    needing = [n for n, e in EFFECTS.items() if q.role != "output" and q.physical in e.covariates]
+    rows = [
+        (what, ", ".join(f"[{code(n)}](../{folder}/{n}.md)" for n in names))
+        for what, folder, names in (
+            ("predicted by", "models", predicted), ("used by", "models", used),
+            ("touched by", "effects", acting), ("needed by", "effects", needing),
+        )
+        if names
+    ]  # fmt: skip
+    return ["## Who uses it\n", table(("", ""), rows)] if rows else []

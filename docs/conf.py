@@ -1,0 +1,34 @@
+"""How the documentation is built: `make docs`."""
+
+import sys
+from importlib import metadata
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
+
+project = "calib"
+author = "The calib contributors"
+copyright = "the calib contributors, MIT licence"  # noqa: A001
+try:
+    release = metadata.version("terracalib")
+except metadata.PackageNotFoundError:  # a checkout that is not installed
+    release = ""
+
+extensions = ["myst_parser", "mathml", "declared"]
+exclude_patterns = ["_ext"]
+myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "attrs_block"]
+myst_heading_anchors = 3
+html_math_renderer = "mathml"
+html_theme = "furo"
+html_title = "calib"
+html_static_path = ["_static"]
+html_css_files = ["tables.css"]
+html_copy_source = False
+html_show_sourcelink = False
+html_theme_options = {"navigation_with_keys": True}
+# What the pages show is what they were made from, not when.
+html_last_updated_fmt = None
+pygments_style = "friendly"
+pygments_dark_style = "monokai"
+nitpicky = True
