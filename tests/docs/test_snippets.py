@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ def follow(page: str, run: Calib, *, slow: bool) -> None:
             code = "\n" * (block.line - 1) + block.text
             exec(compile(code, page, "exec"), names)
             printed = ""
+        elif block.language == "toml":
+            tomllib.loads(block.text)
         elif block.language == "text" and printed:
             compare(block, printed, page)
 

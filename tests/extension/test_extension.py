@@ -20,6 +20,7 @@ from calib.models import MODELS
 from calib.models.base import BoundModel
 from calib.report.page.equations import equation
 from tests.cli.test_cli import Calib
+from tests.docs.pages import ROOT, blocks
 
 HERE = Path(__file__).parent
 FEW = ["--max-steps", 400]
@@ -259,20 +260,16 @@ def test_equations_are_read_from_their_latex() -> None:
     assert "<i>x</i><sub>1</sub>" in equation(BoundModel(model, {}))
 
 
-def test_the_readmes_own_model_goes_as_printed(run: Calib) -> None:
+def test_the_documentations_own_model_goes_as_printed(run: Calib) -> None:
     # On two processes, whose server was started before the model was known.
     with pool(2) as before:
         before.submit(len, "").result()
-    readme = (HERE.parents[1] / "README.md").read_text(encoding="utf-8")
-    start = readme.index("# my_model.py\n")
-    end = readme.index("\n```\n\n```console\ncalib template janosi_pull", start)
-    Path("my_model.py").write_text(readme[start:end], encoding="utf-8")
-    commands = [
-        line.split()[1:]
-        for line in readme[end:].partition("\n```\n\n```console\n")[2].splitlines()[:2]
-    ]
-    assert [words[0] for words in commands] == ["template", "report"]
-    for words in commands:
-        ran = run(*words)
+    page = list(blocks((ROOT / "docs" / "extend.md").read_text(encoding="utf-8")))
+    declared = next(block for block in page if block.caption == "my_model.py")
+    Path("my_model.py").write_text(declared.text, encoding="utf-8")
+    lines = [line for b in page if b.language == "console" for line in b.text.splitlines()]
+    of_it = {line.split()[1]: line.split()[1:] for line in lines if "my_model.py" in line}
+    for verb in ("template", "report"):
+        ran = run(*of_it[verb])
         assert ran.code == 0, ran.err
     assert "janosi_pull" in Path("report/summary.json").read_text()

@@ -13,7 +13,7 @@ from calib.errors import CalibError
 from calib.inference.prior_files import default_priors
 from tests.batch.campaign.sites import EFFECT, NAMES, WIND, make_site
 
-README = Path(__file__).resolve().parents[3] / "README.md"
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "formats" / "inputs.md"
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +75,8 @@ def test_fits_are_files_by_models_by_priors_by_hold_outs(folder):
     ]
 
 
-def test_the_readmes_plan_is_one(tmp_path):
-    blocks = re.findall(r"```toml\n(.*?)```", README.read_text(encoding="utf-8"), flags=re.S)
+def test_the_documentations_plan_is_one(tmp_path):
+    blocks = re.findall(r"```toml\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.S)
     text = next(block for block in blocks if "[[fit]]" in block)
     plan = make_site(tmp_path / "site", text)
     (plan.parent / "my_priors.toml").write_text(default_priors("bekker").read_text())
