@@ -51,5 +51,8 @@ def test_every_key_is_told(file: str) -> None:
 
 def test_the_keys_of_a_run_are_told() -> None:
     of_run = RESULTS.partition("`run.json`, schema")[2].partition("## Report folder")[0]
-    fields = {f.alias or name for name, f in RunRecord.model_fields.items()} - {"document", "schema"}
+    fields = {f.alias or name for name, f in RunRecord.model_fields.items()} - {
+        "document",
+        "schema",
+    }
     assert fields <= set(re.findall(r"`(\w+)`", of_run))

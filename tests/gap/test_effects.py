@@ -12,6 +12,7 @@ from calib.data.quantities import role_of
 from calib.gap.effects import EFFECTS, View
 from calib.gap.effects.base import saturating
 from calib.inference.prior_files import default_priors, read_priors
+from calib.models.latex import text
 from tests.gap.cases import make_case, parameters, simulate
 
 OUTPUTS = ("pull", "sinkage", "density")
@@ -314,3 +315,11 @@ def test_an_effect_names_every_output_that_it_changes(name, view):
     for output in {"pull", "sinkage", "density"} - set(effect.outputs):
         location = np.ones((1, view.slip().size))
         np.testing.assert_array_equal(effect.on_output(phi, output, location, view), location)
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_an_effects_equation_names_its_parameters(name: str) -> None:
+    effect = EFFECTS[name]
+    written = " ".join(map(text, effect.latex))
+    for parameter in effect.parameters:
+        assert parameter.replace("_", " ") in written

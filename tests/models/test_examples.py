@@ -28,3 +28,11 @@ def test_an_unknown_template_lists_the_models() -> None:
     with pytest.raises(CalibError, match="there is no model 'magic'") as caught:
         example_csv("magic")
     assert all(name in str(caught.value) for name in MODELS)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_says_when_it_applies(name: str) -> None:
+    model = MODELS[name]
+    assert model.applies.endswith(".")
+    assert model.latex
+    assert model.source
