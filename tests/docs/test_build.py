@@ -1,4 +1,4 @@
-"""The documentation builds without a warning, asks for nothing outside, and has all declarations."""
+"""The documentation builds without a warning, asks for nothing outside, has all declarations."""
 
 from __future__ import annotations
 
@@ -24,8 +24,10 @@ pytestmark = pytest.mark.skipif(
     bool(ABSENT), reason=f"{', '.join(ABSENT)} not installed: pip install -e '.[docs]'"
 )
 # What a browser fetches by itself.
-FETCHED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src",
-           "object": "data", "embed": "src", "video": "src", "audio": "src", "input": "src"}  # fmt: skip
+FETCHED = {
+    "script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src",
+    "object": "data", "embed": "src", "video": "src", "audio": "src", "input": "src",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -84,8 +86,10 @@ def test_no_page_asks_for_anything_outside(built: Path) -> None:
 
 
 def test_what_is_outside_is_seen() -> None:
-    page = Page('<script src="https://cdn.example/x.js"></script><a href="https://doi.org">d</a>'
-                '<link rel="stylesheet" href="//fonts.example/a.css"><img src="a.png" alt="A">')  # fmt: skip
+    page = Page(
+        '<script src="https://cdn.example/x.js"></script><a href="https://doi.org">d</a>'
+        '<link rel="stylesheet" href="//fonts.example/a.css"><img src="a.png" alt="A">'
+    )
     assert [outside(a) for a in page.fetched] == [True, True, False]
     assert page.alt == ["A"]
 

@@ -1,4 +1,4 @@
-"""The pages of the file formats name every key that the committed files have, and the schemas hold."""
+"""The page of the result files names every key that the committed files have."""
 
 from __future__ import annotations
 
