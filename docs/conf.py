@@ -3,6 +3,9 @@
 import sys
 from importlib import metadata
 from pathlib import Path
+from typing import Any
+
+from pygments.lexers.shell import BashLexer
 
 HERE = Path(__file__).parent
 sys.path[:0] = [str(HERE / "_ext"), str(HERE.parent)]
@@ -32,3 +35,8 @@ html_last_updated_fmt = None
 pygments_style = "friendly"
 pygments_dark_style = "monokai"
 nitpicky = True
+
+
+def setup(app: Any) -> None:
+    """Draw commands as commands: without a prompt they would be taken for output."""
+    app.add_lexer("console", BashLexer)
