@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from declared_text import code, quantity_link, table, unit, words
+from declared_text import code, table, unit, words
 
 from calib.data.headers import accepted_headers
 from calib.data.quantities import QUANTITIES, Quantity
@@ -39,20 +39,19 @@ def pages() -> dict[str, str]:
 
 def _page(q: Quantity) -> str:
     facts = [
-        ("column inside the program", quantity_link(q.canonical)),
         ("unit inside the program", unit(q.unit)),
         ("allowed", words(q.range.describe())),
         ("drawn in", words(q.shown[0]) if q.shown else unit(q.unit)),
         ("known to effects as", code(q.physical)),
     ]
     if q.synonyms:
-        facts.insert(1, ("also called", ", ".join(map(code, q.synonyms))))
+        facts.insert(0, ("also called", ", ".join(map(code, q.synonyms))))
     scale = ["Models compare its logarithm, so it must be positive.\n"] if q.log_scale else []
     return "\n".join(
         [
-            f"# {q.title} ({code(q.canonical)})\n",
-            f"{words(q.description[0].upper() + q.description[1:])}. {_ROLES[q.role]}\n",
-            table(("", ""), facts),
+            f"# {words(q.canonical)}\n",
+            f"{words(q.title)}: {words(q.description)}. {_ROLES[q.role]}\n",
+            table(("what", "is"), facts),
             *scale,
             "## Column names\n",
             *_headers(q),
@@ -81,9 +80,9 @@ def _users(q: Quantity) -> list[str]:
     rows = [
         (what, ", ".join(f"[{code(n)}](../{folder}/{n}.md)" for n in names))
         for what, folder, names in (
-            ("predicted by", "models", predicted), ("used by", "models", used),
-            ("touched by", "effects", acting), ("needed by", "effects", needing),
+            ("predicted by models", "models", predicted), ("used by models", "models", used),
+            ("touched by effects", "effects", acting), ("needed by effects", "effects", needing),
         )
         if names
     ]  # fmt: skip
-    return ["## Who uses it\n", table(("", ""), rows)] if rows else []
+    return ["## Who uses it\n", table(("how", "by name"), rows)] if rows else []
