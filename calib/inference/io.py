@@ -173,7 +173,9 @@ def write_netcdf(tree: xr.DataTree, path: Path) -> None:
     }
     for node in tree.subtree:
         node.attrs.pop("created_at", None)
-    tree.to_netcdf(path, engine="h5netcdf", encoding=encoding)
+    # Made in memory: a disk that fills up while HDF5 writes leaves it in a state it dies of.
+    content = bytes(tree.to_netcdf(None, engine="h5netcdf", encoding=encoding))
+    path.write_bytes(content)
 
 
 def save_calibration(
