@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import os
 import re
 import shutil
@@ -25,6 +26,10 @@ _WRITTEN = (
 )  # fmt: skip
 
 _YOUNG_SECONDS = 60.0
+# A folder with posteriors is of some megabytes; with less than this left it is not begun.
+_ROOM_BYTES = 16_000_000
+# The disk is full, the quota used up, the file system read-only.
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
 
 def _is_ours(name: str) -> bool:
@@ -65,6 +70,10 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
             shutil.rmtree(old)
         else:
             scratch.replace(out)
+    except OSError as error:
+        if error.errno not in _NO_ROOM:
+            raise
+        raise unwritable(out, str(error.strerror)) from None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
         if lock is not None:
@@ -121,7 +130,7 @@ def unwritable(out: Path, why: str) -> CalibError:
     return CalibError(
         f"the output folder cannot be written ({why})",
         where=str(out),
-        mend="choose another folder with --out, or change its permissions",
+        mend="choose another folder with --out, change its permissions, or make room",
     )
 
 
@@ -131,6 +140,9 @@ def _check_parent(out: Path) -> None:
         raise unwritable(out, f"{parent} is a file")
     if not os.access(parent, os.W_OK | os.X_OK):
         raise unwritable(out, f"no permission to write in {parent}")
+    left = shutil.disk_usage(parent).free
+    if left < _ROOM_BYTES:
+        raise unwritable(out, f"only {left / 1e6:.1f} MB are left on its disk")
 
 
 def _umask() -> int:

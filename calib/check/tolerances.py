@@ -143,8 +143,9 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     ("summary.json/models/*/validation/{rmse,crps,max_relative_error,elpd,elpd_se}", _DRAWN),
     ("summary.json/models/*/validation/n_relative_error_above_6_percent", _DRAWN),
     ("summary.json/models/*/validation/{pit,coverage,coverage_interval}/*", _DRAWN),
+    # Fitted to the 190 largest of 4000 weights, k has an sd of (1 + k)/sqrt(190), which is 0.1.
     ("summary.json/models/*/validation/largest_pareto_k",
-     Tolerance(ORDER_OF_MAGNITUDE, 0.2, Of.ONE)),
+     Tolerance(MONTE_CARLO, 1.0, Of.ONE)),
     ("summary.json/models/*/validation/{refitted,refits_not_converged}{,/*}", _SIDES),
     # Prior sensitivity: eight seeds moved it by no more than half of this.
     ("summary.json/models/*/prior_sensitivity/parameters/*/{prior,likelihood}",

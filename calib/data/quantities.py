@@ -180,6 +180,16 @@ class Quantity:
                 allowed=f"{self.stem} and a suffix of the unit: {', '.join(self.units)}",
                 mend="correct the canonical column",
             )
+        mine = {self.stem, *self.synonyms}
+        for other in QUANTITIES.values():
+            taken = mine & {other.stem, *other.synonyms}
+            if taken and other.canonical != self.canonical:
+                raise CalibError(
+                    f"columns called {min(taken)} are those of {other.stem} already",
+                    where=f"the quantity {self.stem}",
+                    allowed="a stem and synonyms that name nothing else",
+                    mend=f"name it otherwise, or use {other.canonical}",
+                )
         QUANTITIES.add(self)
 
 

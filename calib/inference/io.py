@@ -6,8 +6,11 @@ A run folder holds everything that is needed to predict from it and to compute i
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
+import os
+import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -173,6 +176,9 @@ def write_netcdf(tree: xr.DataTree, path: Path) -> None:
     }
     for node in tree.subtree:
         node.attrs.pop("created_at", None)
+    # HDF5 does not survive a disk that fills up while it writes.
+    if shutil.disk_usage(path.parent).free < tree.nbytes:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
     tree.to_netcdf(path, engine="h5netcdf", encoding=encoding)
 
 

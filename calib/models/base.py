@@ -9,7 +9,8 @@ published coefficients, which are reported beside them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -286,6 +287,15 @@ class Model:
     def by_sampled(self) -> bool:
         """Whether the sampled parameters are those that are reported."""
         return tuple(self.reported) == self.parameters
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # By its name where it has one: another process knows it too, and what it is made of, a
+        # lambda perhaps, need not travel.
+        from calib.models import MODELS, get_model
+
+        if MODELS.get(self.name) is self:
+            return get_model, (self.name,)
+        return partial(Model, **{f.name: getattr(self, f.name) for f in fields(self)}), ()
 
     def register(self) -> None:
         """Make it known by its name.

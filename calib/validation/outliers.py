@@ -1,4 +1,4 @@
-"""Rows that a calibration's other rows do not expect: a slip of the pen weighs as much as a row."""
+"""Rows that a calibration's other rows do not expect, as a mistyped reading is."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ VERBS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("diagnosis.json", "corrected.json"),
     ),
     "sbc": (
-        ("sbc", "--model", "bekker", "--simulations", "3", "--workers", "1", "--out", "out"),
+        ("sbc", "--model", "bekker", "--simulations", "10", "--workers", "1", "--out", "out"),
         ("summary.json",),
     ),
 }  # fmt: skip

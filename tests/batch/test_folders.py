@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -175,3 +177,28 @@ def test_the_current_folder_cannot_be_replaced(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     assert "is the current folder" in refusal(Path())
+
+
+def test_a_disk_that_fills_up_is_one_line(tmp_path, monkeypatch):
+    def full(path, content):
+        raise OSError(errno.ENOSPC, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with (
+        pytest.raises(CalibError, match=r"cannot be written \(No space left on device\)"),
+        fresh_folder(tmp_path / "out") as scratch,
+    ):
+        (scratch / "summary.json").write_bytes(b"{}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_errors_of_the_system_are_not_taken_for_a_full_disk(tmp_path):
+    with pytest.raises(FileNotFoundError), fresh_folder(tmp_path / "out"):
+        (tmp_path / "nowhere" / "file").write_bytes(b"")
+
+
+def test_a_disk_with_nothing_left_is_found_before_the_work(tmp_path, monkeypatch):
+    usage = shutil.disk_usage(tmp_path)._replace(free=2_000_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage)
+    with pytest.raises(CalibError, match=r"only 2\.0 MB are left on its disk"):
+        check_folder(tmp_path / "out")

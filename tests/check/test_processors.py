@@ -98,7 +98,7 @@ def test_tampering_is_found_whatever_processor_made_it(kernel: str) -> None:
     """All tests of tampering, on originals of another processor (Prescott's are the fast ones)."""
     skip_what_crashes(Setting(kernel, False, 1))
     environment = os.environ | {"CALIB_MADE_UNDER": str(Setting(kernel, False, 1))}
-    files = [f"tests/reproduce/test_check_{name}.py" for name in ("report", "whole", "run")]
+    files = [f"tests/check/test_check_{name}.py" for name in ("report", "whole", "run")]
     ran = subprocess.run(
         [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *files],
         env=environment, cwd=made.ROOT, capture_output=True, text=True, check=False,

@@ -2,7 +2,7 @@
 
 Beside these: leaving rows out (`tests/test_validate.py`), diagnoses of many cases
 (`tests/gap/test_batch.py`), making a challenge (`tests/challenge/test_make.py`) and campaigns
-(`tests/campaign/test_run.py`), each on one process and on two.
+(`tests/batch/campaign/test_run.py`), each on one process and on two.
 """
 
 from __future__ import annotations

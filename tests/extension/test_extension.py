@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -241,6 +243,10 @@ def test_a_quantity_must_read_as_itself() -> None:
         calib.register(calib.Quantity(**torque | {"suffixes": {}}))
     with pytest.raises(CalibError, match="a quantity 'hub_torque_knm' already"):
         calib.register(calib.Quantity(**torque))
+    with pytest.raises(CalibError, match="columns called sinkage are those of rut_depth already"):
+        calib.register(
+            calib.Quantity("sinkage", "sinkage_m", "length", "m", "condition", "of a plate")
+        )
     with pytest.raises(CalibError, match="cannot be registered"):
         calib.register("hub_torque")  # type: ignore[arg-type]
 
@@ -273,3 +279,42 @@ def test_the_documentations_own_model_goes_as_printed(run: Calib) -> None:
         ran = run(*of_it[verb])
         assert ran.code == 0, ran.err
     assert "janosi_pull" in Path("report/summary.json").read_text()
+
+
+def test_a_density_model_of_lambdas_is_reported_on_two_processes(run: Calib) -> None:
+    """Its conditions are not those of the shipped density models, and it cannot be pickled."""
+    Path("dens.py").write_text(
+        """
+import calib
+
+ROWS = zip([50, 60, 80, 100, 120, 150, 180, 220], [1.34, 1.34, 1.4, 1.41, 1.41, 1.46, 1.45, 1.49])
+NORMAL = 'dist = "normal"\\nmean = 1.0\\nsd = 1.0\\n'
+WORDS = 'unit = "g/cm^3"\\nreason = "compaction"\\nsource = "a guess"\\n'
+calib.register(calib.Model(
+    name="compaction", title="Density by ground pressure", output="bulk_density_g_cm3",
+    conditions=("average_ground_pressure_kpa",), parameters=("a", "b"),
+    predict=lambda t, c: t[:, :1] * (c["average_ground_pressure_kpa"] / 100.0) ** t[:, 1:],
+    latex=(r"$\\\\rho = a (p/p_0)^b$",), source="a guess",
+    example="average_ground_pressure_kpa,bulk_density_g_cm3\\n"
+    + "".join(f"{p},{d}\\n" for p, d in ROWS),
+    priors='model = "compaction"\\n'
+    + "".join(f"[parameters.{n}]\\n{NORMAL}{WORDS}" for n in ("a", "b"))
+    + f'[parameters.sigma]\\ndist = "half_normal"\\nsd = 0.1\\n{WORDS}',
+))
+""",
+        encoding="utf-8",
+    )
+    own = ["--models", "dens.py"]
+    Path("d.csv").write_text(run("template", "compaction", *own).out)
+    made = run("report", "d.csv", "--model", "compaction", "--only", "bulk_density", *own,
+               "--out", "report", "--workers", 2, *FEW)  # fmt: skip
+    assert made.code == 0, made.err
+    assert "could not be drawn" not in Path("report/index.html").read_text()
+
+
+def test_models_travel_by_name_or_whole() -> None:
+    model = MODELS["bekker"]
+    assert pickle.loads(pickle.dumps(model)) is model
+    other = replace(model, name="another", title="Not registered")
+    again = pickle.loads(pickle.dumps(other))
+    assert (again.name, again.title) == ("another", "Not registered")

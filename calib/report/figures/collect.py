@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from calib.report.figures.bands import bands_plate
 from calib.report.figures.corner import corner_plate
-from calib.report.figures.density import density_plate
+from calib.report.figures.density import cone_and_water, density_plate
 from calib.report.figures.ensembles import ensembles_plate
 from calib.report.figures.estimates import by_pressure_plate, estimates_plate
 from calib.report.figures.learned import learned_plate
@@ -37,11 +37,10 @@ def plates(result: OutputResult, reference: Reference = NOTHING) -> list[Plate]:
         In reading order. A figure that failed has ``figure=None`` and a caption saying why.
     """
     model = result.calibration.problem.bound.model
-    density = model.output == "bulk_density_g_cm3"
     drawings: dict[str, _Draw] = {
         "bands": (
             (lambda: density_plate(result))
-            if density
+            if cone_and_water(model)
             else (lambda: bands_plate(result, reference=reference))
         ),
         "validation": lambda: validation_plate(result, reference=reference),

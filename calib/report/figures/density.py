@@ -11,7 +11,9 @@ from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from calib.models.base import Array
+from calib.data.quantities import role_of
+from calib.errors import CalibError
+from calib.models.base import Array, Model
 from calib.report.figures.bands import observed_words
 from calib.report.figures.labels import axis_of, percent, short
 from calib.report.figures.plate import Plate
@@ -19,7 +21,7 @@ from calib.report.figures.rows import data_word, held_table, smooth_bands
 from calib.report.figures.style import BLACK, DASHES, GREY, VERMILION, legend_below, panels
 from calib.report.study import OutputResult
 
-__all__ = ["density_plate", "draw_predicted_observed"]
+__all__ = ["cone_and_water", "density_plate", "draw_predicted_observed"]
 
 _WATER_QUANTILES = (0.1, 0.5, 0.9)
 # Yellow would vanish on white.
@@ -43,14 +45,28 @@ def density_plate(result: OutputResult) -> Plate:
     return Plate(fig, "bands", _caption(result), "Prediction and data")
 
 
-def _water(result: OutputResult) -> str:
-    conditions = result.calibration.problem.bound.model.conditions
-    return next(name for name in conditions if name != "cone_index_kpa")
+def cone_and_water(model: Model) -> tuple[str, str] | None:
+    """Return the columns of a density model of cone index and water content; None for another."""
+    roles = {role_of(name): name for name in model.conditions}
+    water = roles.get("water", roles.get("water_by_volume"))
+    if role_of(model.output) != "density" or len(roles) != 2 or "cone" not in roles or not water:
+        return None
+    return roles["cone"], water
+
+
+def _columns(result: OutputResult) -> tuple[str, str]:
+    found = cone_and_water(result.calibration.problem.bound.model)
+    if found is None:
+        raise CalibError(
+            "the figure is of density models of cone index and water content",
+            mend="draw `bands_plate` of other models",
+        )
+    return found
 
 
 def _against_cone_index(ax: Axes, fig: Figure, result: OutputResult) -> dict[str, Any]:
-    problem, water = result.calibration.problem, _water(result)
-    ci, w = problem.table["cone_index_kpa"], axis_of(water).scale(problem.table[water])
+    problem, (cone, water) = result.calibration.problem, _columns(result)
+    ci, w = problem.table[cone], axis_of(water).scale(problem.table[water])
     handles: dict[str, Any] = {}
     points = ax.scatter(
         ci, problem.observed, c=w, cmap=_COLOURS, s=17, edgecolor=BLACK, linewidth=0.4, zorder=4
@@ -58,9 +74,7 @@ def _against_cone_index(ax: Axes, fig: Figure, result: OutputResult) -> dict[str
     x = np.linspace(ci.min(), ci.max(), 60)
     for quantile, dashes in zip(_WATER_QUANTILES, DASHES, strict=False):
         at = float(np.quantile(problem.table[water], quantile))
-        mean, measured = smooth_bands(
-            result.calibration, {"cone_index_kpa": x, water: np.full_like(x, at)}
-        )
+        mean, measured = smooth_bands(result.calibration, {cone: x, water: np.full_like(x, at)})
         scaled = axis_of(water).factor * at
         colour = points.to_rgba(np.array([scaled]))[0]
         (line,) = ax.plot(x, mean.median, ls=dashes, lw=1.4, color=colour)
@@ -71,7 +85,7 @@ def _against_cone_index(ax: Axes, fig: Figure, result: OutputResult) -> dict[str
                     x, measured.lower[0.9], measured.upper[0.9], color="#e4e4e4", lw=0.0, zorder=0
                 )
             )
-    ax.set_xlabel(axis_of("cone_index_kpa").label)
+    ax.set_xlabel(axis_of(cone).label)
     ax.set_ylabel(axis_of(problem.bound.model.output).label)
     bar = fig.colorbar(points, ax=ax, cax=ax.inset_axes((1.03, 0.0, 0.035, 1.0)))
     bar.set_label(axis_of(water).label)
@@ -114,16 +128,16 @@ def _ends(*values: Array) -> Array:
 
 
 def _caption(result: OutputResult) -> str:
-    problem, water = result.calibration.problem, _water(result)
+    problem, (cone, water) = result.calibration.problem, _columns(result)
     axis = axis_of(problem.bound.model.output)
     conditions = {
         name: np.median(problem.table[name]) * np.ones(2) for name in problem.bound.model.conditions
     }
-    ci = np.quantile(problem.table["cone_index_kpa"], [0.1, 0.9])
+    ci = np.quantile(problem.table[cone], [0.1, 0.9])
     wet = np.quantile(problem.table[water], [0.1, 0.9])
     effect = [
         np.diff(smooth_bands(result.calibration, {**conditions, name: ends})[0].median)[0]
-        for name, ends in (("cone_index_kpa", ci), (water, wet))
+        for name, ends in ((cone, ci), (water, wet))
     ]
     words = observed_words(result)
     return (

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from calib.report.figures.density import draw_predicted_observed
+from calib.report.figures.density import cone_and_water, draw_predicted_observed
 from calib.report.figures.joint import effective_rows, ks_distance, pit_half_width
 from calib.report.figures.labels import MINUS, NO_UNIT, axis_of, percent, short
 from calib.report.figures.plate import Plate
@@ -40,8 +40,10 @@ def validation_plate(result: OutputResult, *, reference: Reference = NOTHING) ->
         Whose errors and stated limits are added.
     """
     fig, axes = panels(2, 2, height=52.0, left=15.0, bottom=22.0, gap_x=17.0, gap_y=15.0, top=10.0)
-    density = result.calibration.problem.bound.model.output == "bulk_density_g_cm3"
-    if density and result.validation.pareto_k is not None:
+    if (
+        cone_and_water(result.calibration.problem.bound.model)
+        and result.validation.pareto_k is not None
+    ):
         # The density figure before this one has predicted against observed already.
         first, handles = "Can rows be left out by reweighting?", _pareto(axes[0, 0], result)
     else:
