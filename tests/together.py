@@ -34,6 +34,8 @@ GROUPS = (
      "he2019/page/test_audit.py"),
     ("gap/test_which.py", "gap/test_isolate.py", "gap/test_relevance.py",
      "gap/test_next_measurement.py"),
+    ("docs/test_snippets.py",),
+    ("docs/test_build.py",),
     ("gap/test_batch.py",),
     ("validation/sbc/test_replicate.py",),
     ("cli/test_check.py",),
