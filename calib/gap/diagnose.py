@@ -13,6 +13,7 @@ from calib.batch.threads import one_thread
 from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns, read_case
 from calib.gap.corrected import Corrected, conditions_outside
 from calib.gap.effects import EFFECTS, Effect, View
+from calib.gap.inclusion import UNLISTED, Inclusion, inclusion, inclusion_probability
 from calib.gap.mixture import Truth, mixture
 from calib.gap.next_measurement import NextMeasurement, next_measurements
 from calib.gap.outliers import rank_without_outliers, without_outputs
@@ -51,6 +52,8 @@ class Diagnosis:
     corrected : Corrected
         To predict at other conditions.
     seed : int
+    inclusion : Inclusion
+        Which causes act, whatever acts besides, and their shares of the gap.
     """
 
     data: Campaigns
@@ -64,6 +67,7 @@ class Diagnosis:
     next_measurements: tuple[NextMeasurement, ...]
     corrected: Corrected
     seed: int
+    inclusion: Inclusion
 
     def __repr__(self) -> str:
         """Name the case, the verdict and the most probable hypotheses."""
@@ -134,6 +138,7 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
         next_measurements(data, ranking, seed),
         corrected,
         seed,
+        inclusion(mixed, ranking),
     )
 
 
@@ -204,8 +209,15 @@ def _unseen(
 
 
 def verdict(probability: Mapping[str, float]) -> str:
-    """Name the outcome: a hypothesis at least `NAMED` probable, or `ambiguous`."""
-    best = max(probability, key=lambda name: probability[name])
-    if probability[best] < NAMED:
-        return "ambiguous"
-    return best if best in ("none", "unknown") else "effect"
+    """Name the outcome.
+
+    ``none`` and ``unknown``, which is nothing but unlisted, where they are at least `NAMED`
+    probable; ``effect`` where some listed cause acts so probably, whatever acts besides; else
+    ``ambiguous``.
+    """
+    for name in ("none", "unknown"):
+        if probability.get(name, 0.0) >= NAMED:
+            return name
+    acting = inclusion_probability(probability)
+    acting.pop(UNLISTED, None)
+    return "effect" if max(acting.values(), default=0.0) >= NAMED else "ambiguous"
