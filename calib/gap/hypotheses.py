@@ -77,7 +77,12 @@ _COVERED_BY = {
     "speed": "rate_effect", "passes": "multipass_compaction", "water": "moisture_softening",
     "slip": "slip_sinkage", "pressure": "pressure_gauge_bias",
 }  # fmt: skip
-
+# Roles of conditions that go with each other: who knows one of them ignores none.
+_SAME: Mapping[str, set[str]] = {
+    role: same
+    for same in ({"pressure", "ground_pressure"}, {"water", "water_by_volume"})
+    for role in same
+}
 
 type _Over = Literal["slip", "level", "sinkage", "order"]
 type _Touched = tuple[str, ...]
@@ -125,10 +130,11 @@ def dependences(data: Campaigns) -> dict[str, Effect]:
         lab = data.case.lab.columns.get(column)
         if quantity is None or quantity.role != "condition" or lab is None:
             continue
+        same = _SAME.get(quantity.physical, {quantity.physical})
         logs = {
             o.role: o.problem.bound.model.response == "log"
             for o in data.outputs
-            if quantity.physical not in map(role_of, o.problem.bound.model.conditions)
+            if not same & set(map(role_of, o.problem.bound.model.conditions))
         }
         both = np.concatenate([values, lab])
         both = both[np.isfinite(both)]

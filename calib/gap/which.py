@@ -66,8 +66,9 @@ _HOPELESS = 15.0
 _SEARCHED = 8.0
 # Draws for the relevance of a hypothesis: at first, and while it is still in play.
 _QUICK, _CAREFUL = 160, 3000
-# A hypothesis is in play within so many nats of the best, its variants within so many of its best.
-_IN_PLAY, _BESIDE = 5.0, 3.0
+# A hypothesis is in play within so many nats of the best, its variants within so many of its best;
+# one that is farther behind than the last of these is not made likely by its relevance.
+_IN_PLAY, _BESIDE, _FAR_BEHIND = 4.0, 2.5, 10.0
 
 
 @dataclass(frozen=True)
@@ -122,10 +123,11 @@ def rank(
     able, unable = split_testable(data, {**effects, **dependences(data)})
     lab_mode, noise = lab or calibrate_lab(data, seed)
     single = singles(data, able)
-    design = isolability(data, single, lab_mode, noise, seed)
+    beside = {h.name for h in single if covered(h.effects[0], able)}
+    listed = [h for h in single if h.name not in beside]
+    design = isolability(data, listed, lab_mode, noise, seed)
     single = [h for h in single if h.name not in design.idle]
     unable |= dict.fromkeys(design.idle, _IDLE)
-    beside = {h.name for h in single if covered(h.effects[0], able)}
     single = [replace(h, share=COVERED) if h.name in beside else h for h in single]
     worker = _Worker(data, lab_mode, noise, seed, len(single) - len(beside))
     fits = worker.fit([Hypothesis("none"), *shifts(data), *single])
@@ -243,10 +245,10 @@ def _scored(
 ) -> tuple[dict[str, tuple[Fit, ...]], dict[str, tuple[float, ...]]]:
     """Score every variant, and by draws of their posteriors those that are still in play."""
     promise = {name: [_with_prior(f, n_single) for f in group] for name, group in fits.items()}
-    hopeless = max(max(values) for values in promise.values()) - _HOPELESS
+    far = max(max(values) for values in promise.values()) - _FAR_BEHIND
     scores = {
         name: [
-            _score(f, seed, _QUICK if p > hopeless else 0)
+            _score(f, seed, _QUICK if p > far else 0)
             for f, p in zip(group, promise[name], strict=True)
         ]
         for name, group in fits.items()
