@@ -13,6 +13,7 @@ from calib.batch.threads import one_thread
 from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns, read_case
 from calib.gap.corrected import Corrected, conditions_outside
 from calib.gap.effects import EFFECTS, Effect, View
+from calib.gap.hypotheses import dependences, inseparable
 from calib.gap.inclusion import UNLISTED, Inclusion, inclusion, inclusion_probability
 from calib.gap.mixture import Truth, mixture
 from calib.gap.next_measurement import NextMeasurement, next_measurements
@@ -27,6 +28,8 @@ __all__ = ["Diagnosis", "diagnose", "diagnose_once", "verdict", "with_unseen_row
 
 # A single hypothesis is named when it is at least this probable.
 NAMED = 0.5
+# A cause that is less probable needs no caveat.
+_WORTH_SAYING = 0.05
 # Parts the field rows are left out in, where there are no other conditions to judge by.
 _FOLDS = 5
 
@@ -126,8 +129,9 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
     corrected = Corrected(mixed, ranking.lab_mode)
     before = corrected.calibrated(target.conditions)
     far = shrink(data, at_target, before, at_target.means)
+    causes = inclusion(mixed, ranking)
     return Diagnosis(
-        _beyond(data, corrected, before),
+        _confounded(_beyond(data, corrected, before), causes),
         ranking,
         verdict(ranking.probability),
         truth,
@@ -138,7 +142,7 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
         next_measurements(data, ranking, seed),
         corrected,
         seed,
-        inclusion(mixed, ranking),
+        causes,
     )
 
 
@@ -171,6 +175,20 @@ def _beyond(data: Campaigns, corrected: Corrected, before: Mapping[str, Array]) 
                 f"{case.fresh.source}: the simulator has no {name.replace('_', ' ')} at {empty} of "
                 f"{len(case.fresh)} rows; they are left out of the shrink"
             )
+    return replace(data, case=replace(case, warnings=(*case.warnings, *said)))
+
+
+def _confounded(data: Campaigns, causes: Inclusion) -> Campaigns:
+    """Warn of causes that go with a condition which differs between the campaigns only."""
+    said = [
+        f"{name}: this condition is one value in the laboratory and another in the field; what "
+        "depends on it cannot be separated from anything else that changed between them"
+        for name, effect in dependences(data).items()
+        if name in causes.causes
+        and causes.causes[name].probability >= _WORTH_SAYING
+        and inseparable(data, effect)
+    ]
+    case = data.case
     return replace(data, case=replace(case, warnings=(*case.warnings, *said)))
 
 

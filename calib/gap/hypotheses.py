@@ -71,7 +71,7 @@ REMAINDER = 0.15
 WIDE, WIDER, WIDER_LOG = 0.1, 4.0, 2.0
 # How probable it is, beside that of a listed effect, that an output depends on a condition for
 # which an effect is listed in another way than that effect says.
-COVERED = 0.05
+COVERED = 0.02
 # Conditions that listed effects are about, and those effects.
 _COVERED_BY = {
     "speed": "rate_effect", "passes": "multipass_compaction", "water": "moisture_softening",

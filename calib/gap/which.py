@@ -90,6 +90,8 @@ class Ranking:
         Internal parameters of each simulator as the lab calibrated it.
     isolability : Isolability
         What the design could show before its outcomes were looked at.
+    n_single : int
+        Effects among which the prior probability of one listed effect is shared out.
     """
 
     fits: Mapping[str, tuple[Fit, ...]]
@@ -99,6 +101,7 @@ class Ranking:
     not_testable: Mapping[str, str]
     lab_mode: Mapping[str, Array]
     isolability: Isolability
+    n_single: int
 
     @property
     def order(self) -> list[str]:
@@ -108,8 +111,11 @@ class Ranking:
     @property
     def prior(self) -> dict[str, float]:
         """Probability of each hypothesis before the data; sums to one."""
-        names = [n for n in self.probability if n not in LN_PRIOR and "+" not in n]
-        return probabilities(dict.fromkeys(self.probability, 0.0), len(names))
+        shares = {
+            name: min(sum(f.forward.hypothesis.share for f in group), 1.0)
+            for name, group in self.fits.items()
+        }
+        return probabilities({n: float(np.log(s)) for n, s in shares.items()}, self.n_single)
 
     def best(self, name: str) -> Fit:
         """The most probable fit of a hypothesis."""
@@ -138,7 +144,9 @@ def rank(
     fits, scores = _scored(fits, worker.n_single, seed)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
     probability = probabilities(log_evidence, worker.n_single)
-    return Ranking(fits, scores, log_evidence, probability, unable, lab_mode, design)
+    return Ranking(
+        fits, scores, log_evidence, probability, unable, lab_mode, design, worker.n_single
+    )
 
 
 def _far_out(found: Fit) -> bool:

@@ -141,7 +141,15 @@ class GapEvidence:
     @property
     def acting(self) -> list[CauseFact]:
         """Causes that are more likely to act than not, the largest share first."""
-        return sorted((c for c in self.causes if c.probability >= 0.5), key=lambda c: -c.share)
+        found = [c for c in self.causes if c.probability >= 0.5]
+        if not self.causes:
+            # Of the best explanation alone, where nothing is known of its parts.
+            best = self.ranked[0]
+            nan = float("nan")
+            found = [
+                CauseFact(best.name, best.words, best.title, best.probability, nan, (nan, nan))
+            ]
+        return sorted(found, key=lambda c: -c.share)
 
 
 @dataclass(frozen=True)
