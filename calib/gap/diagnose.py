@@ -13,6 +13,8 @@ from calib.batch.threads import one_thread
 from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns, read_case
 from calib.gap.corrected import Corrected, conditions_outside
 from calib.gap.effects import EFFECTS, Effect, View
+from calib.gap.hypotheses import dependences, inseparable
+from calib.gap.inclusion import UNLISTED, Inclusion, inclusion, inclusion_probability
 from calib.gap.mixture import Truth, mixture
 from calib.gap.next_measurement import NextMeasurement, next_measurements
 from calib.gap.outliers import rank_without_outliers, without_outputs
@@ -26,6 +28,8 @@ __all__ = ["Diagnosis", "diagnose", "diagnose_once", "verdict", "with_unseen_row
 
 # A single hypothesis is named when it is at least this probable.
 NAMED = 0.5
+# A cause that is less probable needs no caveat.
+_WORTH_SAYING = 0.05
 # Parts the field rows are left out in, where there are no other conditions to judge by.
 _FOLDS = 5
 
@@ -51,6 +55,8 @@ class Diagnosis:
     corrected : Corrected
         To predict at other conditions.
     seed : int
+    inclusion : Inclusion
+        Which causes act, whatever acts besides, and their shares of the gap.
     """
 
     data: Campaigns
@@ -64,6 +70,7 @@ class Diagnosis:
     next_measurements: tuple[NextMeasurement, ...]
     corrected: Corrected
     seed: int
+    inclusion: Inclusion
 
     def __repr__(self) -> str:
         """Name the case, the verdict and the most probable hypotheses."""
@@ -122,8 +129,9 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
     corrected = Corrected(mixed, ranking.lab_mode)
     before = corrected.calibrated(target.conditions)
     far = shrink(data, at_target, before, at_target.means)
+    causes = inclusion(mixed, ranking)
     return Diagnosis(
-        _beyond(data, corrected, before),
+        _confounded(_beyond(data, corrected, before), causes),
         ranking,
         verdict(ranking.probability),
         truth,
@@ -134,6 +142,7 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
         next_measurements(data, ranking, seed),
         corrected,
         seed,
+        causes,
     )
 
 
@@ -166,6 +175,20 @@ def _beyond(data: Campaigns, corrected: Corrected, before: Mapping[str, Array]) 
                 f"{case.fresh.source}: the simulator has no {name.replace('_', ' ')} at {empty} of "
                 f"{len(case.fresh)} rows; they are left out of the shrink"
             )
+    return replace(data, case=replace(case, warnings=(*case.warnings, *said)))
+
+
+def _confounded(data: Campaigns, causes: Inclusion) -> Campaigns:
+    """Warn of causes that go with a condition which differs between the campaigns only."""
+    said = [
+        f"{name}: this condition is one value in the laboratory and another in the field; what "
+        "depends on it cannot be separated from anything else that changed between them"
+        for name, effect in dependences(data).items()
+        if name in causes.causes
+        and causes.causes[name].probability >= _WORTH_SAYING
+        and inseparable(data, effect)
+    ]
+    case = data.case
     return replace(data, case=replace(case, warnings=(*case.warnings, *said)))
 
 
@@ -204,8 +227,15 @@ def _unseen(
 
 
 def verdict(probability: Mapping[str, float]) -> str:
-    """Name the outcome: a hypothesis at least `NAMED` probable, or `ambiguous`."""
-    best = max(probability, key=lambda name: probability[name])
-    if probability[best] < NAMED:
-        return "ambiguous"
-    return best if best in ("none", "unknown") else "effect"
+    """Name the outcome.
+
+    ``none`` and ``unknown``, which is nothing but unlisted, where they are at least `NAMED`
+    probable; ``effect`` where some listed cause acts so probably, whatever acts besides; else
+    ``ambiguous``.
+    """
+    for name in ("none", "unknown"):
+        if probability.get(name, 0.0) >= NAMED:
+            return name
+    acting = inclusion_probability(probability)
+    acting.pop(UNLISTED, None)
+    return "effect" if max(acting.values(), default=0.0) >= NAMED else "ambiguous"

@@ -13,6 +13,7 @@ from calib.data.quantities import OUTPUTS
 from calib.gap.corrected import save_corrected
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
+from calib.gap.inclusion import Included
 from calib.models.base import Array
 
 __all__ = ["SCHEMA", "document", "write_diagnosis"]
@@ -34,6 +35,14 @@ def document(found: Diagnosis) -> dict[str, Any]:
             }
             for name in ranking.order
         ],
+        "inclusion": {name: _included(c) for name, c in found.inclusion.causes.items()},
+        "remainder": {
+            **_included(found.inclusion.remainder),
+            "where": [
+                {"output": r.output, "conditions": {k: list(v) for k, v in r.conditions.items()}}
+                for r in found.inclusion.where
+            ],
+        },
         "not_testable": [{"name": n, "reason": r} for n, r in ranking.not_testable.items()],
         "where": [
             {
@@ -73,6 +82,14 @@ def document(found: Diagnosis) -> dict[str, Any]:
             }
             for m in found.next_measurements
         ],
+    }
+
+
+def _included(cause: Included) -> dict[str, Any]:
+    return {
+        "probability": cause.probability,
+        "share": cause.share,
+        "share_interval": list(cause.share_interval),
     }
 
 

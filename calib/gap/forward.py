@@ -211,12 +211,34 @@ class Forward:
             plain[name] = s.predict(t, psi[:, self.misfit_slices[name]], conditions)
         return self.departed(psi, view, plain)
 
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """What acts: effects by name, ``parameter_shift``, and ``unknown`` for a discrepancy."""
+        names = [e.name for e in self.hypothesis.effects]
+        names += ["parameter_shift"] if self.shift is not None else []
+        return (*names, *(["unknown"] if self.smooth_slices else []))
+
     @_SILENT
-    def departed(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
-        """Add effects and discrepancies to what the simulators predict."""
+    def without(self, psi: Array, view: View, cause: str) -> dict[str, Array]:
+        """Predict field rows with all of `causes` in force but one."""
+        names = [e.name for e in self.hypothesis.effects]
+        if cause in names:
+            plain = self.simulator(psi, view)
+            return self.departed(psi, view, plain, idle=names.index(cause))
+        rest = psi.copy()
+        shifted = [self.shift_slice] if cause == "parameter_shift" else []
+        for part in shifted or self.smooth_slices.values():
+            rest[:, part] = 0.0
+        return self.field(rest, view)
+
+    @_SILENT
+    def departed(
+        self, psi: Array, view: View, plain: dict[str, Array], idle: int | None = None
+    ) -> dict[str, Array]:
+        """Add effects, all but one that is idle, and discrepancies to what simulators predict."""
         changed = dict(plain)
         if self.hypothesis.effects:
-            changed = self._with_effects(psi, view, changed)
+            changed = self._with_effects(psi, view, changed, idle)
         if self.smooth_slices:
             threshold = psi[:, self.threshold :].ravel()  # of one that sets in, else empty
             for name, part in self.smooth_slices.items():
@@ -241,7 +263,9 @@ class Forward:
         error = shift @ radius_error
         return {**conditions, column: 1.0 - (1.0 - conditions[column]) * (1.0 - error[:, None])}
 
-    def _with_effects(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
+    def _with_effects(
+        self, psi: Array, view: View, plain: dict[str, Array], idle: int | None
+    ) -> dict[str, Array]:
         base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in self.data.outputs}
         view = replace(view, base=base)
         acting = [
@@ -251,6 +275,8 @@ class Forward:
                 strict=True,
             )
         ]  # fmt: skip
+        if idle is not None:
+            del acting[idle]
         form = self._form(view)
         return {name: self._changed(psi, name, view, acting, plain[name], form) for name in plain}
 

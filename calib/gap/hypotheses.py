@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 
+from calib.data.quantities import QUANTITIES, role_of
 from calib.gap.case import Campaigns
 from calib.gap.covariates import columns_over, other_conditions
 from calib.gap.discrepancy import SETTINGS
 from calib.gap.effects import EFFECTS, Effect
+from calib.gap.effects.dependence import DependsOn
 from calib.gap.hypothesis import Hypothesis, OnsetOver, SmoothOver
 from calib.gap.shifts import ShiftAs
 from calib.inference.prior_files import (
@@ -26,13 +28,18 @@ from calib.inference.priors import Priors
 __all__ = [
     "LN_PAIR_TO_SINGLE",
     "LN_PRIOR",
+    "covered",
+    "dependences",
     "effect_priors",
+    "inseparable",
+    "joined",
     "pair",
-    "remainders",
     "shifts",
     "singles",
     "split_testable",
     "unknowns",
+    "wider",
+    "with_remainder",
 ]
 
 # Prior probabilities of the kinds, but for pairs; singles share theirs equally, and a given pair is
@@ -57,9 +64,25 @@ SMOOTHS = (1.5, 5.0)
 ONSET = 4.0
 # Part of `unknown` that a limp tyre has, whichever output shows it.
 LIMP = 0.06
-# Part of `unknown` that comes on top of a listed effect instead of alone.
-REMAINDER = 0.2
-
+# How often something unlisted, of a size that would be noticed, comes on top of listed causes: no
+# measured gap is of a formula's shape alone. (Named `<causes>+unknown`.)
+REMAINDER = 0.15
+# Sizes of priors have heavy tails: one in ten effects is several times as large as its prior says.
+WIDE, WIDER, WIDER_LOG = 0.1, 4.0, 2.0
+# How probable it is, beside that of a listed effect, that an output depends on a condition for
+# which an effect is listed in another way than that effect says.
+COVERED = 0.02
+# Conditions that listed effects are about, and those effects.
+_COVERED_BY = {
+    "speed": "rate_effect", "passes": "multipass_compaction", "water": "moisture_softening",
+    "slip": "slip_sinkage", "pressure": "pressure_gauge_bias",
+}  # fmt: skip
+# Roles of conditions that go with each other: who knows one of them ignores none.
+_SAME: Mapping[str, set[str]] = {
+    role: same
+    for same in ({"pressure", "ground_pressure"}, {"water", "water_by_volume"})
+    for role in same
+}
 
 type _Over = Literal["slip", "level", "sinkage", "order"]
 type _Touched = tuple[str, ...]
@@ -92,6 +115,45 @@ def effect_priors(data: Campaigns, effect: Effect) -> Priors:
         file = DeclaredPriors(f"{effect.name}.toml", effect.priors)
     references = prior_references(data.case.lab.columns) | {"normal_load_kn": data.view.load_kn}
     return read_priors(file, effect.name, effect.parameters, references)
+
+
+def dependences(data: Campaigns) -> dict[str, Effect]:
+    """Return what may depend on each recorded condition that a simulator ignores, by name.
+
+    Parameters
+    ----------
+    data : Campaigns
+    """
+    found: dict[str, Effect] = {}
+    for column, values in data.view.conditions.items():
+        quantity = QUANTITIES.get(column)
+        lab = data.case.lab.columns.get(column)
+        if quantity is None or quantity.role != "condition" or lab is None:
+            continue
+        same = _SAME.get(quantity.physical, {quantity.physical})
+        logs = {
+            o.role: o.problem.bound.model.response == "log"
+            for o in data.outputs
+            if not same & set(map(role_of, o.problem.bound.model.conditions))
+        }
+        both = np.concatenate([values, lab])
+        both = both[np.isfinite(both)]
+        if logs and both.size and np.isfinite(values).all() and np.ptp(both) > 1e-9:
+            effect = DependsOn(quantity.physical, quantity.stem, logs, 0.5 * float(np.ptp(both)))
+            found.setdefault(effect.name, effect)
+    return found
+
+
+def covered(effect: Effect, listed: Collection[str]) -> bool:
+    """Whether a dependence is on a condition that another effect which is tested is about."""
+    return isinstance(effect, DependsOn) and _COVERED_BY.get(effect.role) in listed
+
+
+def inseparable(data: Campaigns, effect: Effect) -> bool:
+    """Whether a dependence is on a condition that differs between the campaigns only."""
+    if not isinstance(effect, DependsOn):
+        return False
+    return bool(np.ptp(data.view.of(effect.role)) < 1e-9)
 
 
 def singles(data: Campaigns, effects: Mapping[str, Effect]) -> list[Hypothesis]:
@@ -147,10 +209,9 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
             Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over="low_pressure")
             for t in of_wheel
         ]
-    half = (1.0 - REMAINDER) / 2.0
-    onsets = half - LIMP if limp else half
+    onsets = 0.5 - LIMP if limp else 0.5
     return [
-        *(replace(h, share=half / len(smooth)) for h in smooth),
+        *(replace(h, share=0.5 / len(smooth)) for h in smooth),
         *(replace(h, share=onsets / len(sudden)) for h in sudden),
         *(replace(h, share=LIMP / len(limp)) for h in limp),
     ]
@@ -161,27 +222,34 @@ def _varies(data: Campaigns, over: str) -> bool:
     return any(np.ptp(recorded[c]) > 0 for c in columns_over(over) if c in recorded)
 
 
-def remainders(data: Campaigns, best: Sequence[Hypothesis], n_single: int) -> list[Hypothesis]:
-    """A listed effect, or a shift, and besides it something that is not listed.
-
-    The best of them stand for all: the others' evidence is negligible beside theirs.
-    """
-    overs: tuple[SmoothOver, ...] = ("all", "level")
+def with_remainder(data: Campaigns, causes: Hypothesis) -> list[Hypothesis]:
+    """Listed causes, or a shift, and besides them something that is not listed."""
+    overs: list[tuple[SmoothOver, float]] = [("level", SMOOTHS[0])]
+    overs += [("all", size) for size in SMOOTHS]
     if data.view.column("slip") is not None:
-        overs = ("all", "level", "slip")
-    share = REMAINDER / ((n_single + 1) * len(overs))
+        overs += [("slip", size) for size in SMOOTHS]
     return [
         replace(
-            h,
-            name="unknown",
-            smooth=SMOOTHS[0],
+            causes,
+            name=f"{causes.name}+unknown",
+            smooth=size,
             smooth_outputs=data.names,
             smooth_over=over,
-            share=share,
+            share=causes.share / len(overs),
         )
-        for h in best
-        for over in overs
+        for over, size in overs
     ]
+
+
+def wider(single: Hypothesis) -> Hypothesis:
+    """Return an effect whose size may be several times as large as its prior says."""
+    (priors,) = single.effect_priors
+    entries = tuple(
+        p if p.fixed else replace(p, scale=p.scale * (WIDER_LOG if p.log else WIDER))
+        for p in priors.entries
+    )
+    wide = Priors(entries, priors.text, priors.source)
+    return replace(single, effect_priors=(wide,), share=single.share * WIDE)
 
 
 def shifts(data: Campaigns) -> list[Hypothesis]:
@@ -196,16 +264,20 @@ def shifts(data: Campaigns) -> list[Hypothesis]:
     ]
 
 
-def pair(a: Hypothesis, b: Hypothesis) -> Hypothesis:
-    """Two effects at once, named in alphabetical order."""
-    first, second = sorted((a, b), key=lambda h: h.name)
+def joined(*causes: Hypothesis) -> Hypothesis:
+    """Several effects at once, named in alphabetical order."""
+    parts = [
+        (e.name, e, p) for h in causes for e, p in zip(h.effects, h.effect_priors, strict=True)
+    ]
+    parts.sort(key=lambda part: part[0])
     return Hypothesis(
-        f"{first.name}+{second.name}",
-        first.effects + second.effects,
-        first.effect_priors + second.effect_priors,
+        "+".join(name for name, _, _ in parts),
+        tuple(effect for _, effect, _ in parts),
+        tuple(priors for _, _, priors in parts),
+        share=float(np.prod([h.share for h in causes])),
     )
 
 
-def pairs_of(hypotheses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """All pairs of different effects."""
-    return [pair(a, b) for i, a in enumerate(hypotheses) for b in hypotheses[i + 1 :]]
+def pair(a: Hypothesis, b: Hypothesis) -> Hypothesis:
+    """Two effects at once, named in alphabetical order."""
+    return joined(a, b)

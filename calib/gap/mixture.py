@@ -73,16 +73,18 @@ class Mixture:
     probability: tuple[float, ...]
     seed: int
 
-    def at(self, view: View) -> Truth:
+    def at(self, view: View, without: str | None = None) -> Truth:
         """Draw the truth at conditions.
 
         Parameters
         ----------
         view : View
             From `Campaigns.at` for conditions other than the field's.
+        without : str, optional
+            A cause, part of every fit: what is predicted without it is in the simulator's place.
         """
         parts = [
-            self._part(fit, probability, view, i)
+            self._part(fit, probability, view, i, without)
             for i, (fit, probability) in enumerate(zip(self.fits, self.probability, strict=True))
         ]
         weight = np.concatenate([part.weight for part in parts])
@@ -95,12 +97,16 @@ class Mixture:
             weight / weight.sum(),
         )
 
-    def _part(self, fit: Fit, probability: float, view: View, index: int) -> Truth:
+    def _part(
+        self, fit: Fit, probability: float, view: View, index: int, without: str | None
+    ) -> Truth:
         """Draw under one hypothesis; the weights carry its probability."""
         size = max(100, int(N_DRAWS * probability))
         rng = generator(self.seed, "gap", "truth", fit.forward.hypothesis.name, index)
         psi = fit.draws(rng, size)
         full, plain = fit.forward.field_and_plain(psi, view)
+        if without is not None:
+            plain = fit.forward.without(psi, view, without)
         # Draws for which a model has no value somewhere are left out for all outputs.
         good = np.ones(size, dtype=np.bool_)
         for o in self.data.outputs:

@@ -1,8 +1,8 @@
 """An effect that nobody could notice is no effect: hypotheses are about gaps that matter.
 
 Every hypothesis but `none` is the claim that its effect is *relevant*: that in some output its
-root-mean-square size over the field rows is at least `RELEVANT` noise sds (of a pair: that each of
-the two alone is at least `RELEVANT_IN_PAIR`).
+root-mean-square size over the field rows is at least `RELEVANT` noise sds (of several causes: that
+each of them is at least `RELEVANT_IN_PAIR`).
 Restricting its prior to relevant sizes multiplies its evidence by
 
     P(relevant | data, hypothesis) / P(relevant | hypothesis),
@@ -14,7 +14,6 @@ too small to see, and that of one effect among pairs whose other half is idle.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -64,35 +63,25 @@ def _log_share(size: Array) -> float:
 
 
 def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
-    """Size of each effect in noise sds, rms over an output's field rows, shape (k, n_effects).
+    """Size of each cause in noise sds, rms over an output's field rows, shape (k, n_causes).
 
     Of several outputs, that in which it is largest: what it does to the pull is no smaller because
     ruts, which it leaves alone, were measured as well. A parameter shift or a free discrepancy
-    counts as one effect; of a discrepancy on top of an effect the size is that of the discrepancy.
+    counts as one cause; one of several has the size of what goes when it alone is taken away.
     A discrepancy of several outputs is as large as in the output where it is smallest: what changes
     one output only is not one of several.
     """
-    hypothesis = forward.hypothesis
-    data = forward.data
-    named = bool(hypothesis.effects) or hypothesis.shift > 0.0
-    if len(hypothesis.effects) > 1:
-        # The form errors belong to the pair; each effect's own size is that of its formula.
+    data, causes = forward.data, forward.causes
+    alone = len(causes) == 1
+    if len(forward.hypothesis.effects) > 1:
+        # The form errors belong to all; each effect's own size is that of its formula.
         psi = psi.copy()
         for s in forward.form_slices.values():
             psi[:, s] = 0.0
     with np.errstate(all="ignore"):
         full, plain = forward.field_and_plain(psi, data.view)
-        if hypothesis.smooth_outputs and named:
-            rest = psi.copy()
-            for s in forward.smooth_slices.values():
-                rest[:, s] = 0.0
-            without = [forward.field(rest, data.view)]
-        elif len(hypothesis.effects) <= 1:
-            without = [plain]
-        else:
-            without = [_lone(forward, psi, i) for i in range(len(hypothesis.effects))]
+        without = [plain if alone else forward.without(psi, data.view, c) for c in causes]
     at = noise_at(data.view)
-    joint = not named and len(hypothesis.smooth_outputs) > 1
     columns = []
     for other in without:
         squares = {
@@ -102,28 +91,8 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
             for o in data.outputs
         }
         each = {name: np.sqrt(values.mean(axis=1)) for name, values in squares.items()}
-        if joint:
-            columns.append(np.min([each[name] for name in hypothesis.smooth_outputs], axis=0))
+        if alone and len(forward.hypothesis.smooth_outputs) > 1:
+            columns.append(np.min([each[n] for n in forward.hypothesis.smooth_outputs], axis=0))
         else:
             columns.append(np.max(list(each.values()), axis=0))
     return np.stack(columns, axis=1)
-
-
-def _lone(forward: Forward, psi: Array, idle: int) -> dict[str, Array]:
-    """Predict the field with one effect of a pair left out."""
-    keep = 1 - idle
-    hypothesis = forward.hypothesis
-    alone = replace(
-        hypothesis,
-        name=hypothesis.effects[keep].name,
-        effects=(hypothesis.effects[keep],),
-        effect_priors=(hypothesis.effect_priors[keep],),
-    )
-    reduced = Forward(forward.data, alone, forward.noise)
-    short = np.zeros((psi.shape[0], reduced.n_dim))
-    for name, s in reduced.theta_slices.items():
-        short[:, s] = psi[:, forward.theta_slices[name]]
-    for name, s in reduced.misfit_slices.items():
-        short[:, s] = psi[:, forward.misfit_slices[name]]
-    short[:, reduced.phi_slices[0]] = psi[:, forward.phi_slices[keep]]
-    return reduced.field(short, forward.data.view)

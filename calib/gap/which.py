@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.special import logsumexp
@@ -15,14 +16,19 @@ from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit, finish, look
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
+    COVERED,
     LN_PAIR_TO_SINGLE,
     LN_PRIOR,
-    pairs_of,
-    remainders,
+    REMAINDER,
+    covered,
+    dependences,
+    joined,
     shifts,
     singles,
     split_testable,
     unknowns,
+    wider,
+    with_remainder,
 )
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.isolate import Isolability, isolability
@@ -37,12 +43,20 @@ __all__ = ["Lab", "Ranking", "calibrate_lab", "rank"]
 
 # Internal parameters of each simulator, and its noise.
 type Lab = tuple[dict[str, Array], dict[str, Noise]]
+# A hypothesis, and fits of parts of it.
+type _Started = tuple[Hypothesis, list[Fit]]
 
 _N_SCREEN = 96
 _N_BEGUN = 5
 _N_THRESHOLDS = 24
-_N_PAIR_SEEDS = 6
-_N_LEADING = 2
+# Effects of which one is in every pair that is tried, and sets from which larger ones grow.
+_N_PAIR_SEEDS, _N_SETS, _MOST_CAUSES = 6, 3, 4
+# Effects that a set is enlarged by, and guesses from which a larger one is begun.
+_N_ADDED, _N_BEGUN_LARGER = 5, 2
+# Explanations beside which something unlisted is tried as well.
+_N_LEADING, _N_LEADING_SETS = 5, 2
+# An effect that far out in its prior (sds) is fitted with a wider one as well.
+_FAR_OUT = 2.0
 _IDLE = "it changes nothing that the models of this case predict"
 # A discrepancy or a pair that is so many nats (prior and all) behind the best hypothesis at first
 # look is given up. Of 1344 discrepancies and 2698 first looks at pairs (14 cases) those that ended
@@ -52,8 +66,9 @@ _HOPELESS = 15.0
 _SEARCHED = 8.0
 # Draws for the relevance of a hypothesis: at first, and while it is still in play.
 _QUICK, _CAREFUL = 160, 3000
-# A hypothesis is in play within so many nats of the best, its variants within so many of its best.
-_IN_PLAY, _BESIDE = 5.0, 3.0
+# A hypothesis is in play within so many nats of the best, its variants within so many of its best;
+# one that is farther behind than the last of these is not made likely by its relevance.
+_IN_PLAY, _BESIDE, _FAR_BEHIND = 4.0, 2.5, 10.0
 
 
 @dataclass(frozen=True)
@@ -75,6 +90,8 @@ class Ranking:
         Internal parameters of each simulator as the lab calibrated it.
     isolability : Isolability
         What the design could show before its outcomes were looked at.
+    n_single : int
+        Effects among which the prior probability of one listed effect is shared out.
     """
 
     fits: Mapping[str, tuple[Fit, ...]]
@@ -84,6 +101,7 @@ class Ranking:
     not_testable: Mapping[str, str]
     lab_mode: Mapping[str, Array]
     isolability: Isolability
+    n_single: int
 
     @property
     def order(self) -> list[str]:
@@ -93,8 +111,11 @@ class Ranking:
     @property
     def prior(self) -> dict[str, float]:
         """Probability of each hypothesis before the data; sums to one."""
-        names = [n for n in self.probability if n not in LN_PRIOR and "+" not in n]
-        return probabilities(dict.fromkeys(self.probability, 0.0), len(names))
+        shares = {
+            name: min(sum(f.forward.hypothesis.share for f in group), 1.0)
+            for name, group in self.fits.items()
+        }
+        return probabilities({n: float(np.log(s)) for n, s in shares.items()}, self.n_single)
 
     def best(self, name: str) -> Fit:
         """The most probable fit of a hypothesis."""
@@ -105,45 +126,102 @@ def rank(
     data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS, lab: Lab | None = None
 ) -> Ranking:
     """Fit every hypothesis and rank them; `lab` if `calibrate_lab` has been called before."""
-    able, unable = split_testable(data, effects)
+    able, unable = split_testable(data, {**effects, **dependences(data)})
     lab_mode, noise = lab or calibrate_lab(data, seed)
     single = singles(data, able)
-    design = isolability(data, single, lab_mode, noise, seed)
+    beside = {h.name for h in single if covered(h.effects[0], able)}
+    listed = [h for h in single if h.name not in beside]
+    design = isolability(data, listed, lab_mode, noise, seed)
     single = [h for h in single if h.name not in design.idle]
     unable |= dict.fromkeys(design.idle, _IDLE)
-    worker = _Worker(data, lab_mode, noise, seed)
+    single = [replace(h, share=COVERED) if h.name in beside else h for h in single]
+    worker = _Worker(data, lab_mode, noise, seed, len(single) - len(beside))
     fits = worker.fit([Hypothesis("none"), *shifts(data), *single])
-    fits |= _unlisted_and_pairs(worker, single, fits)
-    fits, scores = _scored(fits, len(single), seed)
+    far = [h for h in single if _far_out(fits[h.name][0])]
+    for name, more in worker.fit([wider(h) for h in far]).items():
+        fits[name] += more
+    fits |= _sets_and_unlisted(worker, [h.name for h in single if h.name not in beside], fits)
+    fits, scores = _scored(fits, worker.n_single, seed)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
-    probability = probabilities(log_evidence, len(single))
-    return Ranking(fits, scores, log_evidence, probability, unable, lab_mode, design)
-
-
-def _unlisted_and_pairs(
-    worker: _Worker, single: Sequence[Hypothesis], fits: Mapping[str, tuple[Fit, ...]]
-) -> dict[str, tuple[Fit, ...]]:
-    """Fit what is not listed, and pairs; finish those that are not hopeless at first look."""
-    n = len(single)
-    alone = [fits["parameter_shift"], *(fits[h.name] for h in single)]
-    best = sorted((max(group, key=_evidence) for group in alone), key=_evidence, reverse=True)
-    leaders = [f.forward.hypothesis for f in best[:_N_LEADING]]
-    others = unknowns(worker.data) + remainders(worker.data, leaders, n)
-    pairs = [(h, [fits[e.name][0] for e in h.effects]) for h in _promising_pairs(single, fits)]
-    looked = together(
-        [worker.look(h) for h in others] + [worker.look_pair(h, members, 1) for h, members in pairs]
+    probability = probabilities(log_evidence, worker.n_single)
+    return Ranking(
+        fits, scores, log_evidence, probability, unable, lab_mode, design, worker.n_single
     )
-    leading = max(_promise(looks, n) for looks in (*fits.values(), *looked))
-    first = len(others)
-    searched = [
-        i for i in range(len(pairs)) if _promise(looked[first + i], n) > leading - _SEARCHED
+
+
+def _far_out(found: Fit) -> bool:
+    """Whether an effect is larger than its prior says."""
+    part = found.forward.phi_slices[0]
+    priors = found.forward.priors.free[part]
+    off = [abs(t - p.loc) / p.scale for t, p in zip(found.psi[part], priors, strict=True)]
+    return max(off, default=0.0) > _FAR_OUT
+
+
+def _sets_and_unlisted(
+    worker: _Worker, single: Sequence[str], fits: Mapping[str, tuple[Fit, ...]]
+) -> dict[str, tuple[Fit, ...]]:
+    """Fit what is not listed, by itself and beside the best explanations, and sets of effects."""
+    n = worker.n_single
+    best = {name: max(group, key=partial(_with_prior, n_single=n)) for name, group in fits.items()}
+    alone = sorted((best[m] for m in best if m != "none"), key=lambda f: -_with_prior(f, n))
+    others: list[_Started] = [(h, []) for h in unknowns(worker.data)]
+    others += [
+        (h, [f])
+        for f in alone[:_N_LEADING]
+        for h in with_remainder(worker.data, f.forward.hypothesis)
     ]
-    more = together([worker.look_pair(*pairs[i], _N_BEGUN, skip=1) for i in searched])
-    for i, looks in zip(searched, more, strict=True):
-        looked[first + i] += looks
+    ranked = sorted(single, key=lambda m: -best[m].log_evidence)
+    seeds = ranked[:_N_PAIR_SEEDS]
+    pairs: list[_Started] = [
+        (joined(best[a].forward.hypothesis, best[b].forward.hypothesis), [best[a], best[b]])
+        for i, a in enumerate(single)
+        for b in single[i + 1 :]
+        if a in seeds or b in seeds
+    ]
+    looked = together([worker.look_joint(h, members, 1) for h, members in others + pairs])
+    leading = max(_promise(looks, n) for looks in (*((f,) for f in best.values()), *looked))
+    first = len(others)
+    looked[first:] = worker.search(pairs, looked[first:], leading)
     ended = _finished(looked, leading - _HOPELESS, n)
-    found = {h.name: (f,) for (h, _), f in zip(pairs, ended[first:], strict=True)}
-    return {"unknown": tuple(ended[:first])} | found
+    leading = max(leading, *(_with_prior(f, n) for f in ended))
+    sets = ended[first:]
+    members = [best[m] for m in seeds[:_N_ADDED]]
+    grown = sorted(sets, key=lambda f: -_with_prior(f, n))[:_N_SETS]
+    for _ in range(2, _MOST_CAUSES):
+        # Only beside what is in play could a larger set be.
+        grown = [f for f in grown if _with_prior(f, n) > leading - _IN_PLAY]
+        larger = _larger(grown, members)
+        looked = together([worker.look_joint(h, of, _N_BEGUN_LARGER) for h, of in larger])
+        found = _finished(looked, leading - _SEARCHED, n)
+        sets += found
+        leading = max([leading, *(_with_prior(f, n) for f in found)])
+        grown = sorted(found, key=lambda f: -_with_prior(f, n))[:_N_SETS]
+    top = sorted(sets, key=lambda f: -_with_prior(f, n))[:_N_LEADING_SETS]
+    top = [f for f in top if _with_prior(f, n) > leading - _SEARCHED]
+    beside = _with_remainders(worker.data, top)
+    looked = together([worker.look_joint(h, of, 1) for h, of in beside])
+    everything = [*ended[:first], *sets, *_finished(looked, leading - _HOPELESS, n)]
+    by_name: dict[str, tuple[Fit, ...]] = {}
+    for found_one in everything:
+        name = found_one.forward.hypothesis.name
+        by_name[name] = (*by_name.get(name, ()), found_one)
+    return by_name
+
+
+def _with_remainders(data: Campaigns, causes: Sequence[Fit]) -> list[_Started]:
+    return [(h, [f]) for f in causes for h in with_remainder(data, f.forward.hypothesis)]
+
+
+def _larger(sets: Sequence[Fit], single: Sequence[Fit]) -> list[_Started]:
+    """Sets of one more effect than some; each once, whatever it grew from."""
+    found: dict[str, _Started] = {}
+    for a in sets:
+        names = {e.name for e in a.forward.hypothesis.effects}
+        for b in single:
+            if b.forward.hypothesis.name not in names:
+                h = joined(a.forward.hypothesis, b.forward.hypothesis)
+                found.setdefault(h.name, (h, [a, b]))
+    return list(found.values())
 
 
 def _finished(looked: Sequence[Sequence[Fit]], hopeless: float, n_single: int) -> list[Fit]:
@@ -175,10 +253,10 @@ def _scored(
 ) -> tuple[dict[str, tuple[Fit, ...]], dict[str, tuple[float, ...]]]:
     """Score every variant, and by draws of their posteriors those that are still in play."""
     promise = {name: [_with_prior(f, n_single) for f in group] for name, group in fits.items()}
-    hopeless = max(max(values) for values in promise.values()) - _HOPELESS
+    far = max(max(values) for values in promise.values()) - _FAR_BEHIND
     scores = {
         name: [
-            _score(f, seed, _QUICK if p > hopeless else 0)
+            _score(f, seed, _QUICK if p > far else 0)
             for f, p in zip(group, promise[name], strict=True)
         ]
         for name, group in fits.items()
@@ -213,19 +291,15 @@ def probabilities(log_evidence: Mapping[str, float], n_single: int) -> dict[str,
 
 
 def _ln_prior(name: str, n_single: int) -> float:
-    if name in ("none", "unknown", "parameter_shift"):
+    if name in ("none", "unknown"):
         return LN_PRIOR[name]
+    causes = name.split("+")
+    listed = [c for c in causes if c != "unknown"]
+    rest = REMAINDER if len(listed) < len(causes) else 1.0 - REMAINDER
+    if listed == ["parameter_shift"]:
+        return LN_PRIOR["parameter_shift"] + float(np.log(rest))
     single = LN_PRIOR["single"] - float(np.log(max(n_single, 1)))
-    return single + LN_PAIR_TO_SINGLE if "+" in name else single
-
-
-def _promising_pairs(
-    single: Sequence[Hypothesis], fits: Mapping[str, tuple[Fit, ...]]
-) -> list[Hypothesis]:
-    """Pairs that contain one of the best single effects; the others cannot be the best pair."""
-    ranked = sorted(single, key=lambda h: -fits[h.name][0].log_evidence)
-    best = {h.name for h in ranked[:_N_PAIR_SEEDS]}
-    return [h for h in pairs_of(single) if best & {e.name for e in h.effects}]
+    return single + (len(listed) - 1) * LN_PAIR_TO_SINGLE + float(np.log(rest))
 
 
 def calibrate_lab(data: Campaigns, seed: int) -> Lab:
@@ -242,9 +316,11 @@ def calibrate_lab(data: Campaigns, seed: int) -> Lab:
 
 class _Worker:
     def __init__(
-        self, data: Campaigns, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise], seed: int
-    ) -> None:
+        self, data: Campaigns, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise], seed: int,
+        n_single: int,
+    ) -> None:  # fmt: skip
         self.data, self.lab_mode, self.noise, self.seed = data, lab_mode, noise, seed
+        self.n_single = n_single
         self._bases: Bases = {}
 
     def fit(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Fit, ...]]:
@@ -266,18 +342,43 @@ class _Worker:
         starts = self._spread(forward, start, _N_SCREEN, range(len(hypothesis.effects)))
         return look(self.data, forward, start, self.noise, starts=starts, count=_N_BEGUN)
 
-    def look_pair(
+    def search(
+        self,
+        pairs: Sequence[_Started],
+        looked: Sequence[list[Fit]],
+        leading: float,
+    ) -> list[list[Fit]]:
+        """Look at the pairs that are in play from more guesses."""
+        in_play = [
+            i for i in range(len(pairs)) if _promise(looked[i], self.n_single) > leading - _SEARCHED
+        ]
+        more = together([self.look_joint(*pairs[i], _N_BEGUN, skip=1) for i in in_play])
+        searched = [list(looks) for looks in looked]
+        for i, looks in zip(in_play, more, strict=True):
+            searched[i] += looks
+        return searched
+
+    def look_joint(
         self, hypothesis: Hypothesis, members: Sequence[Fit], count: int, skip: int = 0
     ) -> Walk[list[Fit]]:
-        """Begin two effects where each alone has led."""
+        """Begin where parts of a hypothesis have led, the effects they lack by their prior."""
+        if not members:
+            return self.look(hypothesis)
         forward, start = self._forward(hypothesis)
+        place = {e.name: s for e, s in zip(hypothesis.effects, forward.phi_slices, strict=True)}
         parts = []
-        for i, member in enumerate(members):
-            led = start.copy()
+        for member in members:
+            old, led = member.forward, start.copy()
             for o in self.data.outputs:
-                led[forward.theta_slices[o.name]] = member.psi[member.forward.theta_slices[o.name]]
-            led[forward.phi_slices[i]] = member.psi[member.forward.phi_slices[0]]
-            parts.append(self._spread(forward, led, _N_SCREEN // 2, [1 - i]))
+                led[forward.theta_slices[o.name]] = member.psi[old.theta_slices[o.name]]
+            for e, s in zip(old.hypothesis.effects, old.phi_slices, strict=True):
+                led[place[e.name]] = member.psi[s]
+            if old.shift is not None:
+                led[forward.shift_slice] = member.psi[old.shift_slice]
+            known = {e.name for e in old.hypothesis.effects}
+            lacking = [i for i, e in enumerate(hypothesis.effects) if e.name not in known]
+            size = _N_SCREEN // len(members) if lacking else 1
+            parts.append(self._spread(forward, led, size, lacking))
         starts = np.concatenate(parts)
         return look(self.data, forward, start, self.noise, starts=starts, count=count, skip=skip)
 

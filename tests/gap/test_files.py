@@ -37,8 +37,17 @@ def numbers(value) -> list[float]:
 def test_the_document_follows_the_contract(written):
     text = (written / "diagnosis.json").read_text()
     d = json.loads(text, parse_constant=no_constants)
-    assert set(d) == {"schema", "verdict", "effects", "not_testable", "where", "regions", "shrink",
-                      "next_measurement"}  # fmt: skip
+    assert set(d) == {"schema", "verdict", "effects", "inclusion", "remainder", "not_testable",
+                      "where", "regions", "shrink", "next_measurement"}  # fmt: skip
+    parts = [*d["inclusion"].values(), d["remainder"]]
+    for part in parts:
+        low, high = part["share_interval"]
+        assert 0.0 <= low <= part["share"] <= high <= 1.0
+        assert 0.0 <= part["probability"] <= 1.0
+    assert sum(part["share"] for part in parts) == pytest.approx(1.0)
+    assert {"parameter_shift", *CHOICE} <= set(d["inclusion"])
+    for place in d["remainder"]["where"]:
+        assert set(place) == {"output", "conditions"}
     assert d["schema"] == "calib/diagnosis/1"
     assert d["verdict"] in ("effect", "none", "unknown", "ambiguous")
     for e in d["effects"]:

@@ -10,8 +10,19 @@ import pytest
 from calib.data import table_from_arrays
 from calib.gap.case import Case, campaigns
 from calib.gap.diagnose import diagnose
+from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import SHIFTS, shifts, unknowns
+from calib.gap.hypotheses import (
+    SHIFTS,
+    dependences,
+    inseparable,
+    joined,
+    shifts,
+    singles,
+    unknowns,
+    wider,
+    with_remainder,
+)
 from calib.gap.hypothesis import Hypothesis
 from calib.report.page.gap_sizes import size_sentences
 from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
@@ -32,8 +43,27 @@ def of_low_pressure(data) -> list[Hypothesis]:
     return [h for h in unknowns(data) if h.onset_over == "low_pressure"]
 
 
-def test_the_shares_of_what_is_unlisted_leave_room_for_what_a_listed_effect_leaves(data):
-    assert sum(h.share for h in unknowns(data)) == pytest.approx(0.8)
+def test_shares_of_a_name_sum_to_one(data):
+    assert sum(h.share for h in unknowns(data)) == pytest.approx(1.0)
+    (single,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
+    beside = with_remainder(data, single)
+    assert sum(h.share for h in beside) == pytest.approx(1.0)
+    assert {h.name for h in beside} == {"force_offset+unknown"}
+
+
+def test_a_wider_prior_has_the_same_middle(data):
+    (single,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
+    wide = wider(single)
+    for a, b in zip(single.effect_priors[0].free, wide.effect_priors[0].free, strict=True):
+        assert (b.loc, b.lower, b.upper) == (a.loc, a.lower, a.upper)
+        assert b.scale > a.scale
+    assert wide.share == pytest.approx(0.1 * single.share)
+
+
+def test_effects_are_joined_in_alphabetical_order(data):
+    few = singles(data, {n: EFFECTS[n] for n in ("sensor_drift", "force_offset", "lug_thrust")})
+    assert joined(*few).name == joined(*few[::-1]).name == "force_offset+lug_thrust+sensor_drift"
+    assert [e.name for e in joined(*few).effects] == joined(*few).name.split("+")
 
 
 def test_no_onset_of_one_output_over_slip_or_drift_is_unlisted(data):
@@ -151,3 +181,38 @@ def test_a_soil_that_sets_hard_is_unlisted_and_said_to_change_with_its_water():
     assert lead.startswith("what is missing sets in beyond a water content of")
     assert 9.0 < float(lead.split(" of ")[1].split()[0]) < 11.0
     assert lead.endswith("% of dry mass")
+
+
+def with_load(lab_kn: np.ndarray, field_kn: np.ndarray, exponent: float, seed: int = 3) -> Case:
+    """A pull that goes with the normal load, which the simulator ignores."""
+    case = make_case(None, models=PULL_ONLY)
+    rng = np.random.default_rng(seed)
+    parts = []
+    for table, load in ((case.lab, lab_kn), (case.field, field_kn)):
+        kn = rng.choice(load, len(table))
+        pull = table["drawbar_pull_kn"] * (kn / np.median(lab_kn)) ** exponent
+        parts.append(replace(table, columns={
+            **table.columns, "normal_load_kn": kn, "drawbar_pull_kn": pull,
+        }))  # fmt: skip
+    return replace(case, lab=parts[0], field=parts[1])
+
+
+def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause():
+    found = diagnose(with_load(np.array([5.0]), np.array([4.0, 6.0, 8.0]), 0.9))
+    assert found.verdict == "effect"
+    load = found.inclusion.causes["depends_on_normal_load"]
+    assert load.probability > 0.9
+    assert load.share > 0.6
+    assert not inseparable(found.data, dependences(found.data)["depends_on_normal_load"])
+
+
+def test_a_condition_that_differs_between_the_campaigns_only_is_said_to_be_inseparable():
+    found = diagnose(with_load(np.array([5.0]), np.array([8.0]), 1.0))
+    assert inseparable(found.data, dependences(found.data)["depends_on_normal_load"])
+    assert any("cannot be separated" in w for w in found.data.case.warnings)
+
+
+def test_a_condition_that_a_simulator_knows_is_no_dependence(data):
+    assert "depends_on_inflation_pressure" not in {
+        name for name, e in dependences(data).items() if "pull" in e.outputs
+    }

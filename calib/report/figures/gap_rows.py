@@ -34,6 +34,8 @@ _WORDS = {
     "parameter_shift": "the same model with other parameter values",
 }
 _SHORT = {"none": "none (noise)", "unknown": "unknown effect", "parameter_shift": "parameter shift"}
+# What is not listed, as a part of an explanation.
+_PART = {"unknown": "something unlisted"}
 _MOST_PANELS = 4
 # Pulls below this (kN) are those of a single small wheel, written in newtons.
 _SMALL_PULL = 0.1
@@ -43,7 +45,7 @@ def short_name(name: str) -> str:
     """Return a hypothesis's name in words."""
     if name in _SHORT:
         return _SHORT[name]
-    return " + ".join(part.replace("_", " ") for part in name.split("+"))
+    return " + ".join(_PART.get(part, part.replace("_", " ")) for part in name.split("+"))
 
 
 def title_of(found: Diagnosis, name: str) -> str:
@@ -51,6 +53,7 @@ def title_of(found: Diagnosis, name: str) -> str:
     if name in _WORDS:
         return _WORDS[name]
     titles = {e.name: e.title for e in EFFECTS.values()}
+    titles |= _PART | {"parameter_shift": _WORDS["parameter_shift"]}
     for fit in found.ranking.fits.get(name, ()):
         titles |= {e.name: e.title for e in fit.forward.hypothesis.effects}
     return ", and ".join(titles.get(part) or part.replace("_", " ") for part in name.split("+"))

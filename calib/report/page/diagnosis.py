@@ -11,6 +11,7 @@ from typing import Any
 
 from calib.batch.pool import HERE, Pool
 from calib.gap.diagnose import Diagnosis
+from calib.gap.inclusion import UNLISTED, Included
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
 from calib.models import get_model
@@ -40,15 +41,20 @@ from calib.report.page.gap_tables import (
 )
 from calib.report.page.gap_verdict import (
     Candidate,
+    CauseFact,
     GapEvidence,
     NextFact,
     ShrinkFact,
     WhereFact,
     judge_gap,
+    odds_text,
 )
 from calib.report.page.template import template
 
 __all__ = ["gap_evidence", "render_diagnosis", "write_page"]
+
+# A cause less probable is not shown.
+_POSSIBLE = 0.01
 
 _MARKS = {
     "fine": "\N{HEAVY CHECK MARK}",
@@ -126,6 +132,7 @@ def render_diagnosis(
         figures={p.name: _figure(p, images) for p in plates},
         facts=_case_facts(found),
         warnings=case.warnings,
+        causes=_cause_rows(evidence),
         groups=hypothesis_groups(found),
         prior=prior_text(found),
         relevant=f"{RELEVANT:g}",
@@ -178,7 +185,38 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         alike=alike,
         smallest=max(design.detectable.values(), default=float("nan")),
         look=where_to_look(found) if best == "unknown" else "",
+        causes=[_cause(found, n, c) for n, c in found.inclusion.causes.items()],
+        remainder=_cause(found, UNLISTED, found.inclusion.remainder),
+        remainder_where=_remainder_where(found),
     )
+
+
+def _cause(found: Diagnosis, name: str, c: Included) -> CauseFact:
+    words = "something unlisted" if name == UNLISTED else short_name(name)
+    return CauseFact(
+        name, words, title_of(found, name), c.probability, c.share, c.share_interval
+    )  # fmt: skip
+
+
+def _remainder_where(found: Diagnosis) -> str:
+    where = found.inclusion.where[:1]
+    return "".join(f"{output_word(r.output)} at {region_text(found, r)}" for r in where)
+
+
+def _cause_rows(evidence: GapEvidence) -> list[dict[str, str]]:
+    """Return the causes that are not ruled out, and the remainder, with their shares."""
+    shown = [c for c in evidence.causes if c.probability >= _POSSIBLE]
+    shown += [evidence.remainder] if evidence.remainder is not None else []
+    return [
+        {
+            "words": c.words,
+            "title": c.title if c.name != UNLISTED else "of no listed shape, alone or besides",
+            "probability": odds_text(c.probability),
+            "share": f"{100.0 * c.share:.0f} %",
+            "interval": f"{100.0 * c.interval[0]:.0f} to {100.0 * c.interval[1]:.0f} %",
+        }
+        for c in shown
+    ]
 
 
 def _region_words(found: Diagnosis, region: Region) -> tuple[str, str]:

@@ -12,6 +12,7 @@ from markupsafe import Markup
 from calib.data.quantities import role_of
 from calib.gap.case import OutputData
 from calib.gap.diagnose import NAMED, Diagnosis
+from calib.gap.effects.dependence import PREFIX
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.next_measurement import NextMeasurement
@@ -79,12 +80,23 @@ def hypothesis_groups(found: Diagnosis) -> list[dict[str, Any]]:
 def prior_text(found: Diagnosis) -> str:
     """Say how probable the hypotheses were before the data."""
     prior = found.ranking.prior
-    singles = [n for n in prior if n not in LN_PRIOR and "+" not in n]
-    pairs = [n for n in prior if "+" in n]
+    listed = [n for n in prior if n not in LN_PRIOR and "unknown" not in n.split("+")]
+    kinds = {
+        "effects by themselves": [n for n in listed if "+" not in n and not n.startswith(PREFIX)],
+        "dependences on a condition": [n for n in listed if "+" not in n and n.startswith(PREFIX)],
+        "pairs that were tried": [n for n in listed if n.count("+") == 1],
+        "larger sets": [n for n in listed if n.count("+") > 1],
+        "explanations with something unlisted besides": [
+            n for n in prior if "unknown" in n.split("+") and "+" in n
+        ],
+    }
     parts = [f"{short_name(n)} {percent(prior[n])}" for n in ("none", "parameter_shift", "unknown")]
-    for names, kind in ((singles, "effects by themselves"), (pairs, "pairs that were tried")):
+    for kind, names in kinds.items():
         if names:
-            parts.append(f"each of {len(names)} {kind} {percent(prior[names[0]])}")
+            low, high = (percent(f(prior[n] for n in names)) for f in (min, max))
+            parts.append(
+                f"each of {len(names)} {kind} {high if low == high else f'{low} to {high}'}"
+            )
     return ", ".join(parts)
 
 
@@ -118,9 +130,7 @@ def _sizes(found: Diagnosis, name: str) -> list[Markup]:
             for prior, value, s in zip(priors.free, fit.psi[part], sd[part], strict=True)
         ]
         # Whose they are is said once, before the first.
-        if name == "unknown":
-            own[0] = f"on top of {short_name(effect.name)}: {own[0]}"
-        elif len(hypothesis.effects) > 1:
+        if len(hypothesis.effects) > 1:
             own[0] = f"{short_name(effect.name)}: {own[0]}"
         sizes += [Markup("{}").format(text) for text in own]
     return sizes

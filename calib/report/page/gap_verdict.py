@@ -61,6 +61,18 @@ class WhereFact:
 
 
 @dataclass(frozen=True)
+class CauseFact:
+    """A cause: its name, in words, what happens, whether it acts, and its share of the gap."""
+
+    name: str
+    words: str
+    title: str
+    probability: float
+    share: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class ShrinkFact:
     """Errors in words with units; fraction and interval as ratios."""
 
@@ -104,6 +116,12 @@ class GapEvidence:
         Smallest size that this design can name, in noise sds of the laboratory.
     look : str
         What to measure where nothing that is listed explains the gap.
+    causes : sequence of CauseFact
+        Listed causes, whatever acts besides.
+    remainder : CauseFact, optional
+        Something that is not listed, by itself or beside listed causes.
+    remainder_where : str
+        Where that lies.
     """
 
     verdict: str
@@ -116,6 +134,22 @@ class GapEvidence:
     alike: Sequence[str] = ()
     smallest: float = float("nan")
     look: str = ""
+    causes: Sequence[CauseFact] = ()
+    remainder: CauseFact | None = None
+    remainder_where: str = ""
+
+    @property
+    def acting(self) -> list[CauseFact]:
+        """Causes that are more likely to act than not, the largest share first."""
+        found = [c for c in self.causes if c.probability >= 0.5]
+        if not self.causes:
+            # Of the best explanation alone, where nothing is known of its parts.
+            best = self.ranked[0]
+            nan = float("nan")
+            found = [
+                CauseFact(best.name, best.words, best.title, best.probability, nan, (nan, nan))
+            ]
+        return sorted(found, key=lambda c: -c.share)
 
 
 @dataclass(frozen=True)
@@ -169,17 +203,24 @@ def _judge(e: GapEvidence) -> GapVerdict:
         if len(words) == 1:
             headline = f"There may be a gap; {words[0]} is the likeliest of many explanations"
         return GapVerdict(Tone.CARE, "tie", "Not told apart", headline, facts)
-    sure = best.probability >= SURE
+    acting = e.acting
+    sure = min(c.probability for c in acting) >= SURE
     tone = Tone.FINE if sure else Tone.CARE
-    if best.name == "parameter_shift":
+    if [c.name for c in acting] == ["parameter_shift"]:
         return GapVerdict(
             tone, "recalibrate", "Recalibrate",
             f"{_hedge(sure)}the same model with other parameter values closes the gap", facts,
         )  # fmt: skip
-    two = "two effects at once: " if "+" in best.name else ""
+    count = {1: "", 2: "two causes at once: ", 3: "three causes at once: "}
+    several = count.get(len(acting), f"{len(acting)} causes at once: ")
+    rest = ""
+    if e.remainder is not None and e.remainder.probability >= 0.5:
+        rest = ", and something besides that is not listed"
+    named = "Cause named" if len(acting) == 1 else "Causes named"
+    likely = "Likely cause" if len(acting) == 1 else "Likely causes"
     return GapVerdict(
-        tone, "named" if sure else "likely", "Cause named" if sure else "Likely cause",
-        f"{_hedge(sure)}{two}{best.title}", facts,
+        tone, "named" if sure else "likely", named if sure else likely,
+        f"{_hedge(sure)}{several}{', and '.join(c.title for c in acting)}{rest}", facts,
     )  # fmt: skip
 
 
@@ -207,16 +248,38 @@ def _no_gap(e: GapEvidence, best: Candidate) -> GapVerdict:
 
 
 def _facts(e: GapEvidence) -> list[tuple[str, str]]:
-    facts = [("Which", _which(e))]
+    facts = [("Causes", _causes(e))] if e.causes else []
+    facts.append(("Which", _which(e)))
     if e.sizes:
         facts.append(("How large", f"{'; '.join(e.sizes)}"))
     facts += [("Where", _where(e)), ("How far", _how_far(e)), *_next(e)]
     return facts
 
 
+def _causes(e: GapEvidence) -> str:
+    """Say what acts, whatever acts besides, and what part of the gap it is."""
+    named = e.acting or [c for c in e.causes if c.probability >= 0.05][:2]
+    parts = [
+        f"{c.words} acts ({odds_text(c.probability)}) and is {_share(c)} of the gap" for c in named
+    ]
+    rest = e.remainder
+    if rest is not None and rest.probability >= 0.05:
+        where = f", {e.remainder_where}," if e.remainder_where else ""
+        parts.append(
+            f"what is of no listed shape{where} is there with {odds_text(rest.probability)} and is "
+            f"{_share(rest)} of it"
+        )
+    return "; ".join(parts) or "No listed cause reaches 5 %"
+
+
+def _share(c: CauseFact) -> str:
+    low, high = (_per_cent(v) for v in c.interval)
+    return f"{_per_cent(c.share)} % ({low} to {high} %)"
+
+
 def _which(e: GapEvidence) -> str:
     best = e.ranked[0]
-    text = f"{best.words}, probability {odds_text(best.probability)}"
+    text = f"As a whole: {best.words}, probability {odds_text(best.probability)}"
     rivals = [c for c in e.ranked[1:_MOST_TIED] if c.probability >= 0.05]
     if rivals:
         listed = joined([f"{c.words} ({odds_text(c.probability)})" for c in rivals])

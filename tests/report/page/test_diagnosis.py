@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 
+from calib.gap.inclusion import Included, Inclusion, inclusion_probability
 from calib.gap.next_measurement import NextMeasurement
 from calib.inference.priors import Prior
 from calib.report.page.diagnosis import gap_evidence, render_diagnosis, write_page
@@ -21,6 +22,7 @@ from calib.report.page.gap_tables import (
 )
 from calib.report.page.gap_verdict import (
     Candidate,
+    CauseFact,
     GapEvidence,
     NextFact,
     ShrinkFact,
@@ -79,7 +81,7 @@ def test_a_named_effect_says_everything_at_once():
     found = judge_gap(evidence("effect", drift=0.93, lug_thrust=0.04))
     facts = dict(found.facts)
     assert found.headline == "What drift does"
-    assert facts["Which"] == "Drift, probability 93 %; nothing else reaches 5 %"
+    assert facts["Which"] == "As a whole: drift, probability 93 %; nothing else reaches 5 %"
     assert facts["How large"] == "Pull reads 0.13 ± 0.04 kN high"
     assert facts["Where"].endswith("0.1 kN above the simulator (97 %)")
     assert "0.11 to 0.04 kN rms (noise 0.03 kN): it shrinks by 63 %" in facts["How far"]
@@ -115,7 +117,21 @@ def test_a_tie_with_no_gap_at_all_does_not_claim_one():
 
 
 def test_two_effects_are_said_to_be_two():
-    assert "two effects at once" in judge_gap(evidence("effect", **{"a+b": 0.95})).headline.lower()
+    parts = [CauseFact(n, n, f"what {n} does", p, s, (0.1, 0.9)) for n, p, s in
+             (("a", 0.95, 0.3), ("b", 0.96, 0.6), ("c", 0.2, 0.02))]  # fmt: skip
+    e = replace(evidence("effect", **{"a+b": 0.95}), causes=parts)
+    found = judge_gap(e)
+    assert found.headline == "Two causes at once: what b does, and what a does"
+    causes = dict(found.facts)["Causes"]
+    assert causes.startswith("B acts (96 %) and is 60 % (10 to 90 %) of the gap; a acts (95 %)")
+    assert "c acts" not in causes
+    rest = CauseFact("unknown", "something unlisted", "", 0.8, 0.08, (0.0, 0.2))
+    left = judge_gap(replace(e, remainder=rest, remainder_where="drawbar pull at slip 60 to 70 %"))
+    assert left.headline.endswith("and something besides that is not listed")
+    assert (
+        "what is of no listed shape, drawbar pull at slip 60 to 70 %, is there with 80 %"
+        in (dict(left.facts)["Causes"])
+    )
 
 
 def test_a_shrink_that_may_be_nothing_says_so():
@@ -282,14 +298,6 @@ def test_parameters_say_of_which_effect_they_are(found):
     assert pair[1].startswith("sensor drift: drift ")
     assert pair[2].startswith("curvature ")  # said once
     assert rows["force_offset"][0].startswith("offset ")
-    on_top = next(f for f in found.ranking.fits["unknown"] if f.forward.hypothesis.effects)
-    fits = dict(found.ranking.fits) | {"unknown": (on_top,)}
-    scores = dict(found.ranking.scores) | {"unknown": (0.0,)}
-    other = replace(found, ranking=replace(found.ranking, fits=fits, scores=scores))
-    rows = {r["name"]: r["sizes"] for g in hypothesis_groups(other) for r in g["rows"]}
-    name = on_top.forward.hypothesis.effects[0].name.replace("_", " ")
-    assert rows["unknown"][0].startswith(f"on top of {name}: ")
-    assert not any("on top of" in s for s in rows["unknown"][1:])
 
 
 def test_what_the_parameters_are_can_be_read_on_the_page(found, page):
@@ -339,7 +347,7 @@ def test_warnings_and_names_of_the_case_are_shown_and_escaped(found):
         ("ambiguous", "lug_thrust", "the data cannot tell"),
         ("unknown", "unknown", "no effect on the list explains it"),
         ("effect", "parameter_shift", "the same model with other parameter values"),
-        ("effect", "force_offset+lug_thrust", "wo effects at once"),
+        ("effect", "force_offset+lug_thrust", "wo causes at once"),
     ],
 )
 def test_every_verdict_has_its_page(found, verdict, best, words):
@@ -350,7 +358,9 @@ def test_every_verdict_has_its_page(found, verdict, best, words):
         fits = dict(ranking.fits) | {best: ranking.fits["force_offset+sensor_drift"]}
         evidence_of = dict(ranking.log_evidence) | {best: 0.0}
         ranking = replace(ranking, fits=fits, log_evidence=evidence_of)
-    other = replace(found, verdict=verdict, ranking=ranking)
+    causes = {name: Included(p, p, (0.0, 1.0)) for name, p in inclusion_probability(p).items()}
+    rest = causes.pop("unknown", Included(0.0, 0.0, (0.0, 0.0)))
+    other = replace(found, verdict=verdict, ranking=ranking, inclusion=Inclusion(causes, rest, ()))
     reader = Reader()
     reader.feed(render_diagnosis(other, [], {}, manifest={}))
     opening = reader.text[: reader.text.index("Before the outcomes")]
@@ -508,8 +518,8 @@ def test_prior_probabilities_are_said():
     said = prior_text(pull_diagnosis(None))
     assert said.startswith("none (noise) ")
     assert "each of 3 effects by themselves" in said
-    assert "each of 3 pairs that were tried" in said
-    shares = [float(s) for s in re.findall(r"([0-9.]+) %", said)]
-    # None, shift and unknown once, three effects and three pairs.
-    total = sum(n * p for n, p in zip((1, 1, 1, 3, 3), shares, strict=True))
-    assert total == pytest.approx(100.0, abs=2.0)
+    for words in ("dependences on a condition", "pairs that were tried", "something unlisted"):
+        assert words in said
+    prior = pull_diagnosis(None).ranking.prior
+    assert sum(prior.values()) == pytest.approx(1.0)
+    assert prior["none"] > prior["force_offset"] > prior["force_offset+sensor_drift"]

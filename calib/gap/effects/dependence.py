@@ -1,0 +1,106 @@
+"""Dependence on a recorded condition that the simulator ignores.
+
+Let u be the condition over its median in the laboratory: the logarithm of the ratio where factors
+of it count (normal load, speed), else the difference over half the range of both campaigns. Then
+
+    y' = y exp(c u + b u^2) + a u W  (pull, and whatever is compared as it is; W the normal load)
+    ln z' = ln z + c u + b u^2       (sinkage, and whatever is compared by its logarithm)
+
+with c, b of each output, and a of the pull. Forces on a wheel are nearly proportional to the load
+(c = 1), by dimensional analysis at constant contact pressure; about that c is free.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from calib.data.quantities import QUANTITIES, columns_of
+from calib.gap.effects.base import Effect, View
+from calib.models.base import Array
+
+__all__ = ["PREFIX", "DependsOn"]
+
+PREFIX = "depends_on_"
+# Roles of outputs that are forces on the wheel.
+_FORCES = ("pull",)
+_SOURCE = "Wismer & Luth (1973), Brixius (1987): traction over load depends on the load by its "
+_SOURCE += "mobility number only; Bekker (1969): sinkage grows with pressure to the power 1/n"
+
+
+class DependsOn(Effect):
+    """The output depends on a recorded condition that its simulator ignores.
+
+    Parameters
+    ----------
+    role : str
+        Physical role of the condition.
+    stem : str
+        Its name without the unit.
+    logs : mapping of str to bool
+        Physical roles of the outputs whose simulators ignore it, and whether their logarithms are
+        compared.
+    half_range : float
+        Of the condition over both campaigns, in its unit.
+    """
+
+    form = ("slip", "pressure", "shape")
+
+    def __init__(self, role: str, stem: str, logs: Mapping[str, bool], half_range: float) -> None:
+        self.role, self.logs, self.half_range = role, dict(logs), half_range
+        self.name = f"{PREFIX}{stem}"
+        self.title = f"the output depends on the {stem.replace('_', ' ')}, which its model ignores"
+        self.outputs = tuple(logs)
+        self.covariates = (role,)
+        self.of_factors = any(QUANTITIES[c].of_factors for c in columns_of(role))
+        self._additive = tuple(o for o, log in logs.items() if not log and o in _FORCES)
+        self.parameters = (
+            *(f"{output}_{kind}" for output in logs for kind in ("slope", "bend")),
+            *(f"{output}_offset" for output in self._additive),
+        )
+        self.priors = self._priors()
+
+    def _priors(self) -> str:
+        lines = [f'model = "{self.name}"']
+        for parameter in self.parameters:
+            output, kind = parameter.rsplit("_", 1)
+            mean, sd = 0.0, {"slope": 0.3, "bend": 0.15, "offset": 0.02}[kind]
+            if kind == "slope" and self.of_factors:
+                mean, sd = {
+                    ("load", "pull"): (1.0, 0.3), ("load", "sinkage"): (0.7, 0.5),
+                }.get((self.role, output), (0.0, 0.5))  # fmt: skip
+            lines.append(
+                f"[parameters.{parameter}]\n"
+                f'dist = "normal"\nmean = {mean}\nsd = {sd}\nunit = "1"\n'
+                f'reason = "Change with the {self.role}, which the simulator ignores"\n'
+                f'source = "{_SOURCE}"'
+            )
+        return "\n\n".join(lines) + "\n"
+
+    def covariate(self, view: View) -> Array:
+        """The condition over the laboratory's, u, shape (n,)."""
+        values = view.of(self.role)
+        lab = view.lab_of(self.role, float(np.median(values)))
+        if self.of_factors:
+            return np.log(np.maximum(values, 1e-6) / max(lab, 1e-6))
+        return (values - lab) / self.half_range
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Scale the output along the condition."""
+        if output not in self.logs:
+            return location
+        u = self.covariate(view)
+        i = 2 * list(self.logs).index(output)
+        change = np.clip(phi[:, i : i + 1] * u + phi[:, i + 1 : i + 2] * u**2, -4.0, 4.0)
+        if self.logs[output]:
+            return np.asarray(location + change)
+        changed = location * np.exp(change)
+        if output in self._additive:
+            j = 2 * len(self.logs) + self._additive.index(output)
+            changed = changed + phi[:, j : j + 1] * u * view.load_kn
+        return np.asarray(changed)
+
+    def shape(self, view: View) -> Array | None:
+        """The condition itself."""
+        return self.covariate(view)
