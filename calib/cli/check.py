@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import CORES, Models, Workers
+from calib.cli.parallel import CORES, Models, Simulators, Workers
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -32,6 +32,7 @@ def check(
     ] = None,
     workers: Workers = CORES,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Compute a report or a run again from its own folder and compare everything.
 

@@ -1,0 +1,234 @@
+"""An emulator: what a slow simulator would answer, how surely, and where it has no answer.
+
+Every run gives its output at the same m conditions (the nodes). Runs are a matrix, of which a few
+basis curves hold all that matters (Higdon et al. 2008, doi:10.1198/016214507000000888):
+
+    y(theta, x) = m(x) + sum_j c_j(theta) b_j(x)
+
+Each c_j is a function of the parameters alone, known at as many points as there are runs
+(`kriging`), the curves are functions of the conditions alone (`over`). Of the two ways to emulate
+over conditions this is the better conditioned: one process over parameters and conditions would
+have a matrix of runs times nodes on a side (200 times 40: 8,000), nearly singular as neighbouring
+nodes say the same, in the place of matrices of 200 and of 40.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.models.base import Array
+from calib.models.simulators.emulator.kriging import Scales
+from calib.models.simulators.emulator.levels import Level, Region, level_on, mixed
+from calib.models.simulators.emulator.over import Over, over_conditions
+from calib.models.simulators.emulator.support import Support, learn_support
+
+__all__ = ["Axes", "Emulator", "Training", "build_emulator"]
+
+_MOST_CURVES = 14
+# What is left out by the basis, in units of what may be neglected: near the posterior, elsewhere.
+_LEFT_OUT = (1.0, 20.0)
+# Runs whose curves the length scales over conditions are found from.
+_CURVES = 12
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Coordinates in which a prior is round.
+
+    Parameters
+    ----------
+    log : ndarray of bool, shape (d,)
+        Which parameters are taken as logarithms.
+    loc, width : ndarray, shape (d,)
+        Middle and sd of the prior.
+    """
+
+    log: NDArray[np.bool_]
+    loc: Array
+    width: Array
+
+    def of(self, theta: Array) -> Array:
+        """Return coordinates of natural parameters, shape (k, d) to (k, d)."""
+        with np.errstate(all="ignore"):
+            t = np.where(self.log, np.log(np.where(self.log, theta, 1.0)), theta)
+        return np.asarray((t - self.loc) / self.width)
+
+    def natural(self, z: Array) -> Array:
+        """Return natural parameters of coordinates."""
+        t = z * self.width + self.loc
+        return np.where(self.log, np.exp(np.minimum(np.where(self.log, t, 0.0), 700.0)), t)
+
+
+@dataclass(frozen=True)
+class Training:
+    """The runs that an emulator stands on, those that failed among them.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (k, d)
+        Natural parameters.
+    values : ndarray, shape (k, m)
+        Output on the scale of the response; NaN where a run failed.
+    nodes : mapping of str to ndarray, shape (m,)
+        Canonical conditions.
+    noisy : bool
+        Whether the simulator gives other values each time.
+    """
+
+    theta: Array
+    values: Array
+    nodes: Mapping[str, Array]
+    noisy: bool = False
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """Which runs have values, shape (k,)."""
+        return np.asarray(np.isfinite(self.values).all(axis=1))
+
+    def plus(self, theta: Array, values: Array) -> Training:
+        """Return these runs and others."""
+        return Training(
+            np.concatenate([self.theta, theta]), np.concatenate([self.values, values]), self.nodes,
+            self.noisy,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """See the module.
+
+    Parameters
+    ----------
+    training : Training
+    axes : Axes
+    negligible : float
+        Error of the output that need not be looked into.
+    mean : ndarray, shape (m,)
+    curves : ndarray, shape (j, m)
+        Orthonormal.
+    levels : tuple of Level
+        The last without bounds.
+    over : Over
+    support : Support, optional
+    """
+
+    training: Training
+    axes: Axes
+    negligible: float
+    mean: Array
+    curves: Array
+    levels: tuple[Level, ...]
+    over: Over
+    support: Support | None
+
+    @cached_property
+    def _weights(self) -> Array:
+        return self.over.weights(np.concatenate([self.mean[None], self.curves]))
+
+    def curves_at(self, conditions: Mapping[str, Array]) -> Array:
+        """Return mean and basis curves at conditions, shape (..., 1 + j)."""
+        return self.over.at(conditions, self._weights)
+
+    def coefficients(self, theta: Array) -> Array:
+        """Return the curves' coefficients, shape (k, d) to (k, j); NaN where there is no value."""
+        return self._evaluate(theta, variance=False)[0]
+
+    def with_variance(self, theta: Array) -> tuple[Array, Array]:
+        """Return coefficients and their variances, shape (k, j) each."""
+        means, variances = self._evaluate(theta, variance=True)
+        return means, np.zeros_like(means) if variances is None else variances
+
+    def _evaluate(self, theta: Array, *, variance: bool) -> tuple[Array, Array | None]:
+        z = self.axes.of(np.atleast_2d(theta))
+        known = np.isfinite(z).all(axis=1)
+        z = np.where(known[:, None], z, 0.0)
+        means, variances = mixed(self.levels, z, variance=variance)
+        if self.support is not None:
+            known &= self.support.holds(z)
+        means[~known] = np.nan
+        return means, variances
+
+    def predict(self, theta: Array, conditions: Mapping[str, Array]) -> Array:
+        """Return the output on the scale of the response, shape (k, n)."""
+        at = self.curves_at(conditions)
+        c = self.coefficients(theta)
+        if at.ndim == 2:
+            return np.asarray(at[:, 0] + c @ at[:, 1:].T)
+        return np.asarray(at[..., 0] + np.einsum("kj,knj->kn", c, at[..., 1:]))
+
+
+def _basis(near: Array, all_values: Array, negligible: float) -> tuple[Array, Array]:
+    """Return mean and orthonormal curves: first what near runs need, then what the others do."""
+    mean = near.mean(axis=0)
+    curves = np.zeros((0, mean.size))
+    for values, left in ((near, _LEFT_OUT[0]), (all_values, _LEFT_OUT[1])):
+        rest = values - mean
+        rest = rest - (rest @ curves.T) @ curves
+        _, size, right = np.linalg.svd(rest, full_matrices=False)
+        # Of the rest's mean square per value, what the curves from the i-th on would leave.
+        open_ = np.append(np.cumsum((size**2)[::-1])[::-1], 0.0) / values.size
+        count = int(np.argmax(open_ <= (left * negligible) ** 2))
+        curves = np.concatenate([curves, right[: min(count, _MOST_CURVES - len(curves))]])
+    if not len(curves):
+        curves = np.ones((1, mean.size)) / np.sqrt(mean.size)
+    return mean, curves
+
+
+def build_emulator(
+    training: Training,
+    axes: Axes,
+    negligible: float,
+    regions: Sequence[Region] = (),
+    *,
+    scales: Sequence[Sequence[Scales]] | None = None,
+    known: bool = False,
+    over: Over | None = None,
+) -> Emulator:
+    """Build an emulator on runs.
+
+    Parameters
+    ----------
+    training : Training
+    axes : Axes
+    negligible : float
+        Error of the output, on the scale of the response, that need not be looked into.
+    regions : sequence of Region
+        Where it should be best; the whole prior comes behind them.
+    scales : sequence of sequence of Scales, optional
+        Of an earlier emulator, for each level: where to begin.
+    known : bool
+        Whether they are to be used as they are.
+    over : Over, optional
+        Of an earlier emulator on the same nodes.
+    """
+    ok = training.ok
+    z, values = axes.of(training.theta), training.values
+    d = z.shape[1]
+    least = 3 * ((d + 1) * (d + 2) // 2)
+    whole = Region(np.zeros(d), np.eye(d))
+    picked = [region.nearest(z[ok], least) for region in regions]
+    near = values[ok][np.unique(np.concatenate(picked))] if picked else values[ok]
+    mean, curves = _basis(near, values[ok], negligible)
+    coefficients = (values[ok] - mean) @ curves.T
+    tiny = 0.3 * negligible * np.sqrt(mean.size)
+    levels = []
+    for i, region in enumerate((*regions, whole)):
+        rows = picked[i] if i < len(picked) else np.arange(int(ok.sum()))
+        begin = scales[i] if scales is not None and i < len(scales) else None
+        levels.append(
+            level_on(
+                region, region.coordinates(z[ok][rows]), coefficients[rows], tiny,
+                noisy=training.noisy, scales=begin, known=known,
+            )
+        )  # fmt: skip
+    if over is None:
+        some = near[np.linspace(0, len(near) - 1, min(_CURVES, len(near))).astype(int)]
+        over = over_conditions(training.nodes, some)
+    return Emulator(
+        training, axes, negligible, mean, curves, tuple(levels), over, learn_support(z, ok)
+    )
