@@ -64,12 +64,14 @@ def report(
     from calib.batch.folders import check_folder
     from calib.batch.pool import pool
     from calib.cli.display import progress_bars
+    from calib.cli.simulators import say
     from calib.data import read_table
     from calib.data.labels import labelled
     from calib.data.quantities import OUTPUTS
+    from calib.inference.emulation.prepared import prepare
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.report.contents import work_out
-    from calib.report.study_tasks import plan_tasks
+    from calib.report.study_tasks import fitted_rows, plan_tasks
     from calib.report.writer import write_report
     from calib.validation.outliers import outlying_notes
 
@@ -93,6 +95,15 @@ def report(
         sections = (GapsSection(), AuditSection())
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
+    with progress_bars() as tell:
+        emulations = {
+            task.model: prepare(
+                task.model, fitted_rows(task)[0], seed, priors=task.prior_path,
+                elsewhere=[task.table], workers=workers, progress=tell,
+            )
+            for task in tasks
+        }  # fmt: skip
+    good = [say(model, emulation) for model, emulation in emulations.items()]
     with pool(workers) as side, progress_bars() as tell:
         found = work_out(
             tasks, seed, settings=settings, sections=sections, progress=tell, workers=workers,
@@ -114,7 +125,7 @@ def report(
     print(page)
     if study.failures:
         raise typer.Exit(1)
-    if not all(r.calibration.converged for r in study.successes.values()):
+    if not all(r.calibration.converged for r in study.successes.values()) or not all(good):
         raise typer.Exit(3)
 
 
