@@ -47,5 +47,5 @@ def log_normal(residuals: Array, sigma: Array, variances: Array, curves: Array) 
     taken = np.square(np.linalg.solve(lower, seen[:, :, None])).sum(axis=(1, 2))
     log_det = np.log(np.einsum("kjj->kj", lower)).sum(axis=1)
     value = -n * (np.log(scale) + 0.5 * np.log(2.0 * np.pi)) - log_det
-    value -= 0.5 * (squares / scale**2 - taken)
+    value -= 0.5 * (squares - taken) / scale**2
     return np.where(bad, np.nan, value)

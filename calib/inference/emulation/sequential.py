@@ -122,15 +122,18 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
     batch = max(2 * int(state.free.sum()), 4)
     checks = min(chosen.checks, most // 5) if chosen.sequential else 0
     state.sample(0)
+    all_ran = True
     while True:
         state.rebuild()
         z = state.sample(len(history) + 1)
         history.append((len(state.runs), state.error(z)))
         room = most - checks - len(state.runs)
-        if room < 1 or _settled(history, chosen.tolerance):
+        if room < 1 or (all_ran and _settled(history, chosen.tolerance)):
             break
         theta = state.axes.natural(_next(state, z, min(batch, room), len(history)))
-        state.learn(theta, state.carry_out(theta))
+        values = state.carry_out(theta)
+        all_ran = bool(np.isfinite(values).all())
+        state.learn(theta, values)
     measured = _check(state, z, checks, len(history)) if checks else None
     state.rebuild()
     return judged(state, z, chosen, measured, own_noise, history)
@@ -194,8 +197,11 @@ def _next(state: State, z: Array, count: int, step: int) -> Array:
     candidates = np.concatenate([inner, middle + _WIDER * (wide - middle)])
     if state.emulator is None or state.level is None:
         return candidates[:count]
-    if state.emulator.support is not None:
-        candidates = candidates[state.emulator.support.holds(candidates)]
+    edge = state.emulator.from_edge(inner)
+    # Where there may be no value the edge matters as much as the values do.
+    at_edge = inner[np.argsort(edge)[: count // 2]] if state.emulator.support else inner[:0]
+    candidates = candidates[state.emulator.holds(candidates)]
+    count -= len(at_edge)
     unknown = state.row_variance(candidates)
     x = state.level.region.coordinates(candidates)
     # Of the curve that is least known: what one run tells of another.
@@ -206,7 +212,7 @@ def _next(state: State, z: Array, count: int, step: int) -> Array:
         picked.append(i)
         unknown = unknown * (1.0 - correlation(x, x[i : i + 1], lengths)[:, 0] ** 2)
         unknown[i] = -1.0
-    return np.asarray(candidates[picked])
+    return np.concatenate([candidates[picked], at_edge])
 
 
 def _check(state: State, z: Array, count: int, step: int) -> HeldOut | None:

@@ -115,6 +115,9 @@ class Emulator:
         The last without bounds.
     over : Over
     support : Support, optional
+        Where there is a value at all.
+    near : tuple of (Region, Support)
+        The same, more finely, in regions in which some runs failed.
     """
 
     training: Training
@@ -125,6 +128,7 @@ class Emulator:
     levels: tuple[Level, ...]
     over: Over
     support: Support | None
+    near: tuple[tuple[Region, Support], ...] = ()
 
     @cached_property
     def _weights(self) -> Array:
@@ -148,10 +152,22 @@ class Emulator:
         known = np.isfinite(z).all(axis=1)
         z = np.where(known[:, None], z, 0.0)
         means, variances = mixed(self.levels, z, variance=variance)
-        if self.support is not None:
-            known &= self.support.holds(z)
+        known &= self.holds(z)
         means[~known] = np.nan
         return means, variances
+
+    def holds(self, z: Array) -> NDArray[np.bool_]:
+        """Whether the simulator has a value at z, in units of the prior's sds; (k, d) to (k,)."""
+        return np.asarray(self.from_edge(z) >= 0.0)
+
+    def from_edge(self, z: Array) -> Array:
+        """Return what is zero where a value is as likely as none, and grows inside, (k,)."""
+        found = np.ones(len(z)) if self.support is None else self.support.latent(z)
+        for region, support in self.near:
+            x = region.coordinates(z)
+            inside = np.linalg.norm(x, axis=1) <= region.reach
+            found[inside] = support.latent(x[inside])
+        return found
 
     def predict(self, theta: Array, conditions: Mapping[str, Array]) -> Array:
         """Return the output on the scale of the response, shape (k, n)."""
@@ -230,5 +246,19 @@ def build_emulator(
         some = near[np.linspace(0, len(near) - 1, min(_CURVES, len(near))).astype(int)]
         over = over_conditions(training.nodes, some)
     return Emulator(
-        training, axes, negligible, mean, curves, tuple(levels), over, learn_support(z, ok)
-    )
+        training, axes, negligible, mean, curves, tuple(levels), over, learn_support(z, ok),
+        _near(z, ok, regions),
+    )  # fmt: skip
+
+
+def _near(
+    z: Array, ok: NDArray[np.bool_], regions: Sequence[Region]
+) -> tuple[tuple[Region, Support], ...]:
+    found = []
+    for region in regions:
+        x = region.coordinates(z)
+        inside = np.linalg.norm(x, axis=1) <= region.reach
+        support = learn_support(x[inside], ok[inside]) if inside.any() else None
+        if support is not None:
+            found.append((region, support))
+    return tuple(found)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,9 @@ from calib.models.base import Array
 
 __all__ = ["Over", "over_conditions"]
 
-_NUGGET = 1e-9
+_NUGGET = 1e-8
+# The smallest with which the matrix has a factor: by it curves miss their nodes.
+_NUGGETS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
 # Beyond the nodes' box curves go on straight for so much of its width; farther they have no value.
 BEYOND = 0.15
 _INSIDE = 0.02
@@ -96,6 +99,9 @@ class Over:
         if not self.columns:
             return np.eye(len(self.nodes)), True
         k = _matern(self.nodes, self.nodes, self.lengths)
+        for nugget in _NUGGETS:
+            with suppress(np.linalg.LinAlgError):
+                return cho_factor(k + nugget * np.eye(len(k)), lower=True)[0], True
         return cho_factor(k + _NUGGET * np.eye(len(k)), lower=True)[0], True
 
     def left_out(self, curves: Array) -> Array:

@@ -34,13 +34,12 @@ class Support:
     lengths: Array
     amplitude: float
 
-    def holds(self, at: Array) -> NDArray[np.bool_]:
-        """Whether a value is the likelier outcome, shape (k, d) to (k,)."""
+    def latent(self, at: Array) -> Array:
+        """Return what is positive where a value is the likelier outcome, (k, d) to (k,)."""
         a, b = at / self.lengths, self.x / self.lengths
         squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * (a @ b.T)
-        latent = self.amplitude * np.exp(-0.5 * np.maximum(squared, 0.0)) @ self.weights
-        # Far from all runs the latent function is zero: nothing speaks against a value there.
-        return np.asarray(latent >= 0.0)
+        # Far from all runs it is zero: nothing speaks against a value there.
+        return np.asarray(self.amplitude * np.exp(-0.5 * np.maximum(squared, 0.0)) @ self.weights)
 
 
 def learn_support(x: Array, ok: NDArray[np.bool_]) -> Support | None:
