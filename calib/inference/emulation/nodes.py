@@ -15,7 +15,7 @@ __all__ = ["choose_nodes"]
 
 # Nodes by the number of conditions that vary: a curve is smooth, a surface needs more.
 _ENOUGH = {0: 1, 1: 24, 2: 56}
-_MANY, _MOST = 90, 160
+_MANY, _MOST, _CORNERS = 90, 160, 3
 # The box of the nodes is wider than the recorded conditions by so much of their range on each
 # side: an effect on a gauge takes the simulator there.
 _MARGIN = 0.1
@@ -54,7 +54,7 @@ def choose_nodes(
     wanted = count or _ENOUGH.get(int(varying.sum()), _MANY)
     more = max(wanted - len(inside), 0)
     if more:
-        inside = np.concatenate([inside, _between(inside, varying, more)])
+        inside = np.concatenate([inside, *_between(inside, varying, more)])
     found = np.where(varying, low + inside * unit, low)
     for i, column in enumerate(columns):
         if QUANTITIES[column].range.integer:
@@ -84,14 +84,31 @@ def _positive(open_: bool, low: float) -> float:
     return 0.5 * low if open_ else -np.inf
 
 
-def _between(inside: Array, varying: NDArray[np.bool_], more: int) -> Array:
-    """Points far from all nodes, the corners of the box first."""
+def _between(inside: Array, varying: NDArray[np.bool_], more: int) -> tuple[Array, Array]:
+    """Corners of the box, and points far from all nodes, as dense as the data are.
+
+    Far is measured half by the conditions and half by their ranks: where readings were taken
+    close together the output changes fast.
+    """
     d = int(varying.sum())
-    corners = np.stack(np.meshgrid(*[[0.0, 1.0]] * d), axis=-1).reshape(-1, d)
-    spread = qmc.Sobol(d, scramble=False).random_base2(9)
-    candidates = np.zeros((len(corners) + len(spread), inside.shape[1]))
-    candidates[:, varying] = np.concatenate([corners, spread])
-    return np.asarray(candidates[_spread(candidates, inside, more)])
+    corners = np.zeros((2**d if d <= _CORNERS else 0, inside.shape[1]))
+    if len(corners):
+        corners[:, varying] = np.stack(np.meshgrid(*[[0.0, 1.0]] * d), axis=-1).reshape(-1, d)
+    candidates = np.zeros((512, inside.shape[1]))
+    candidates[:, varying] = qmc.Sobol(d, scramble=False).random_base2(9)
+    there = np.concatenate([inside, corners])
+    rest = max(more - len(corners), 0)
+    picked = _spread(_ranked(candidates, inside), _ranked(there, inside), rest)
+    return corners, np.asarray(candidates[picked])
+
+
+def _ranked(points: Array, inside: Array) -> Array:
+    found = points.copy()
+    for i, column in enumerate(inside.T):
+        known = np.unique(np.concatenate([[0.0], column, [1.0]]))
+        rank = np.interp(points[:, i], known, np.linspace(0.0, 1.0, known.size))
+        found[:, i] = 0.5 * (points[:, i] + rank)
+    return found
 
 
 def _spread(candidates: Array, there: Array, count: int) -> list[int]:
