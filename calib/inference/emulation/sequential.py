@@ -37,8 +37,8 @@ __all__ = ["emulate", "extend", "prior_design"]
 _CANDIDATES = 400
 # Some of the candidates are so many times as far from the posterior's middle as its draws.
 _WIDER = 1.6
-# Length scales beyond this many posterior sds would put the runs of a batch too far apart.
-_SHORT = 3.0
+# How far in posterior sds a run is taken to tell of others when a batch is picked.
+_APART = 2.0
 _TRIMMED = 0.002
 _LEAST_OK = 0.5
 
@@ -148,7 +148,9 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
     """Spread runs over the prior, some of them twice; return the sd of the simulator's noise."""
     d = int(state.free.sum())
     count = chosen.runs if not chosen.sequential else chosen.first or 10 * d
-    theta = prior_design(state.problem, min(count, chosen.runs), state.seed)
+    theta = prior_design(
+        state.problem, min(count, chosen.runs), state.seed, latin=not chosen.sequential
+    )
     values = state.carry_out(theta)
     ok = np.isfinite(values).all(axis=1)
     if ok.mean() < _LEAST_OK:
@@ -167,12 +169,18 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
     return 0.0
 
 
-def prior_design(problem: Problem, count: int, seed: int) -> Array:
-    """Return natural parameters spread over the prior (Sobol), shape (count, d)."""
+def prior_design(problem: Problem, count: int, seed: int, *, latin: bool = False) -> Array:
+    """Return natural parameters spread over the prior, shape (count, d).
+
+    By Sobol's sequence, of which every beginning is even, or a Latin hypercube.
+    """
     d = len(problem.priors.free)
     bits = int(np.ceil(np.log2(max(count, 2))))
     rng = generator(seed, "emulate", "design")
-    u = qmc.Sobol(d, scramble=True, rng=rng).random_base2(bits)[:count]
+    if latin:
+        u = qmc.LatinHypercube(d, rng=rng).random(count)
+    else:
+        u = qmc.Sobol(d, scramble=True, rng=rng).random_base2(bits)[:count]
     t = problem.priors.ppf(_TRIMMED + (1.0 - 2.0 * _TRIMMED) * u)
     return problem.theta(t)[:, :-1]
 
@@ -195,7 +203,7 @@ def _next(state: State, z: Array, count: int, step: int) -> Array:
     middle, half = z.mean(axis=0), _CANDIDATES // 2
     inner, wide = (z[rng.permutation(len(z))[:half]] for _ in range(2))
     candidates = np.concatenate([inner, middle + _WIDER * (wide - middle)])
-    if state.emulator is None or state.level is None:
+    if state.emulator is None or state.region is None:
         return candidates[:count]
     edge = state.emulator.from_edge(inner)
     # Where there may be no value the edge matters as much as the values do.
@@ -203,9 +211,8 @@ def _next(state: State, z: Array, count: int, step: int) -> Array:
     candidates = candidates[state.emulator.holds(candidates)]
     count -= len(at_edge)
     unknown = state.row_variance(candidates)
-    x = state.level.region.coordinates(candidates)
-    # Of the curve that is least known: what one run tells of another.
-    lengths = np.minimum(state.level.functions[0].scales.lengths, _SHORT)
+    x = state.region.coordinates(candidates)
+    lengths = np.full(x.shape[1], _APART)
     picked: list[int] = []
     for _ in range(min(count, len(candidates))):
         i = int(np.argmax(unknown))

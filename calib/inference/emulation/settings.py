@@ -34,7 +34,7 @@ class EmulationSettings:
         Conditions at which each run is evaluated, see `calib.inference.emulation.nodes`.
     sequential : bool
         Whether points are put where the posterior needs them; else the whole budget is one
-        space-filling design.
+        Latin hypercube over the prior.
     """
 
     runs: int = 200

@@ -14,9 +14,8 @@ from calib.inference.sampling.mode import prior_widths
 from calib.inference.sampling.sampler import SamplerSettings, sample_posterior
 from calib.models.base import Array
 from calib.models.simulators.emulator import Axes, Emulator, Training, build_emulator
-from calib.models.simulators.emulator.kriging import Scales
-from calib.models.simulators.emulator.levels import Level, Region
 from calib.models.simulators.emulator.model import emulated_model
+from calib.models.simulators.emulator.region import Region
 from calib.models.simulators.runs import Run, RunKeeper
 
 __all__ = ["State"]
@@ -69,18 +68,13 @@ class State:
         """Return the state in which an emulator begins to serve another problem as well."""
         state = cls(problem, keeper, emulator.training.nodes, seed, "extend")
         state.training, state.emulator = emulator.training, emulator
-        state.earlier = tuple(level.region for level in emulator.levels[:-1])
+        state.earlier = emulator.regions
         state._emulate(emulator)
         return state
 
     def _emulate(self, emulator: Emulator) -> None:
         model = emulated_model(self.problem.bound.model, emulator)
         self.emulated = replace(self.problem, bound=replace(self.problem.bound, model=model))
-
-    @property
-    def level(self) -> Level | None:
-        """The level of the posterior at hand."""
-        return None if self.emulator is None else self.emulator.levels[len(self.earlier)]
 
     def carry_out(self, theta: Array, replicate: Sequence[int] | int = 0) -> Array:
         """Make runs; return their values on the scale of the response, shape (k, m)."""
@@ -100,14 +94,12 @@ class State:
 
     def rebuild(self) -> None:
         """Fit the emulator again to all runs."""
-        known = None if self.emulator is None else _scales(self.emulator)
         regions = self.earlier if self.region is None else (*self.earlier, self.region)
-        if known is not None and len(known) == len(regions):
-            # The whole prior's, for the first time a region is there.
-            known = [*known[:-1], known[-1], known[-1]]
+        known = self.emulator
         self.emulator = build_emulator(
-            self.training, self.axes, _NEGLIGIBLE * self.sigma, regions, scales=known,
-            over=None if self.emulator is None or self.region is None else self.emulator.over,
+            self.training, self.axes, _NEGLIGIBLE * self.sigma, regions,
+            scales=None if known is None else [f.scales for f in known.functions],
+            over=None if known is None or self.region is None else known.over,
         )  # fmt: skip
         self._emulate(self.emulator)
 
@@ -155,7 +147,3 @@ def _region(z: Array, free: NDArray[np.bool_]) -> Region:
     covariance = np.cov(z.T) if z.shape[1] > 1 else np.atleast_2d(np.var(z))
     covariance = covariance + np.diag(np.where(free, 1e-8 * np.diag(covariance) + 1e-14, 1.0))
     return Region(z.mean(axis=0), np.linalg.cholesky(covariance), 2.5 + np.sqrt(free.sum()))
-
-
-def _scales(emulator: Emulator) -> list[list[Scales]]:
-    return [[f.scales for f in level.functions] for level in emulator.levels]

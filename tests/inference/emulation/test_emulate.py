@@ -110,17 +110,17 @@ def test_a_simulator_that_never_runs_is_refused() -> None:
 
 def test_its_own_noise_is_found_and_smoothed_over() -> None:
     rng = np.random.default_rng(3)
-    own = 0.01
+    own = 0.003  # a tenth of the readings' noise
 
     def noisy(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
         exact = pull(theta, x)
         return exact + own * rng.standard_normal(exact.shape)
 
-    declared(noisy, "noisy", emulate=True, deterministic=False, runs=100)
+    declared(noisy, "noisy", emulate=True, deterministic=False, runs=60)
     data = table()
     emulation = calib.emulated(calib.build_problem("noisy", data), seed=1)
     assert 0.7 * own < emulation.own_noise < 1.4 * own
-    agree(calib.calibrate(emulation.problem, seed=1), exact(data), mean=0.5, sd=0.25)
+    agree(calib.calibrate(emulation.problem, seed=1), exact(data), mean=0.3, sd=0.2)
 
 
 def test_a_simulator_that_only_seems_deterministic_is_found_out() -> None:

@@ -14,9 +14,9 @@ from calib.errors import CalibError
 from calib.models import MODELS, get_model
 from calib.models.simulators.emulator.emulator import Axes, Emulator, Training, build_emulator
 from calib.models.simulators.emulator.kriging import Scales
-from calib.models.simulators.emulator.levels import Region
 from calib.models.simulators.emulator.model import emulated_model
 from calib.models.simulators.emulator.over import over_conditions
+from calib.models.simulators.emulator.region import Region
 
 __all__ = ["load_emulator", "save_emulator", "use_emulator"]
 
@@ -32,22 +32,21 @@ def save_emulator(emulator: Emulator, model: str, path: Path) -> None:
     path : Path
         Ending in ``.npz``.
     """
-    t, bounded = emulator.training, emulator.levels[:-1]
+    t = emulator.training
     meta = {
         "model": model, "nodes": list(t.nodes), "noisy": t.noisy,
-        "negligible": emulator.negligible, "reach": [level.region.reach for level in bounded],
+        "negligible": emulator.negligible, "reach": [r.reach for r in emulator.regions],
     }  # fmt: skip
     arrays: dict[str, Any] = {
         "meta": np.array(json.dumps(meta)), "theta": t.theta, "values": t.values,
         "log": emulator.axes.log, "loc": emulator.axes.loc, "width": emulator.axes.width,
         "over": emulator.over.lengths,
         **{f"node_{i}": v for i, v in enumerate(t.nodes.values())},
-        **{f"centre_{i}": level.region.centre for i, level in enumerate(bounded)},
-        **{f"root_{i}": level.region.root for i, level in enumerate(bounded)},
+        **{f"centre_{i}": r.centre for i, r in enumerate(emulator.regions)},
+        **{f"root_{i}": r.root for i, r in enumerate(emulator.regions)},
     }  # fmt: skip
-    for i, level in enumerate(emulator.levels):
-        arrays[f"lengths_{i}"] = np.stack([f.scales.lengths for f in level.functions])
-        arrays[f"nuggets_{i}"] = np.array([f.scales.nugget for f in level.functions])
+    arrays["lengths"] = np.stack([f.scales.lengths for f in emulator.functions])
+    arrays["nuggets"] = np.array([f.scales.nugget for f in emulator.functions])
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part.npz")
     # In the archive no time of its making: equal emulators give equal files.
@@ -82,11 +81,8 @@ def _built(meta: dict[str, Any], arrays: dict[str, Any]) -> Emulator:
         for i, reach in enumerate(meta["reach"])
     ]
     scales = [
-        [
-            Scales(lengths, float(nugget))
-            for lengths, nugget in zip(arrays[f"lengths_{i}"], arrays[f"nuggets_{i}"], strict=True)
-        ]
-        for i in range(len(regions) + 1)
+        Scales(lengths, float(nugget))
+        for lengths, nugget in zip(arrays["lengths"], arrays["nuggets"], strict=True)
     ]
     values = arrays["values"]
     return build_emulator(

@@ -3,10 +3,8 @@
     f(x) = b(x)' beta + g(x),   g ~ GP(0, s^2 [r(x, x') + nugget 1(x = x')]),
     r(x, x') = exp(-1/2 sum_j ((x_j - x'_j) / l_j)^2)
 
-with b the monomials up to degree 0, 1 or 2 and beta flat beforehand (Rasmussen & Williams 2006,
-*Gaussian Processes for Machine Learning*, section 2.7). Near a posterior's mode, in coordinates in
-which the posterior is round, most simulators are parabolas with a small rest; the trend takes the
-parabola and the process the rest.
+with b the constant and the coordinates, beta flat beforehand (Rasmussen & Williams 2006, *Gaussian
+Processes for Machine Learning*, section 2.7).
 
 The length scales, the only part that is easy to get wrong, are those of the greatest marginal
 likelihood as scikit-learn's `GaussianProcessRegressor` finds it. It is the oldest and best kept of
@@ -58,8 +56,6 @@ class Kriging:
     x : ndarray, shape (n, d)
         Where values are known.
     scales : Scales
-    degree : int
-        Of the trend.
     beta : ndarray, shape (q,)
     gamma : ndarray, shape (n,)
         What the correlations with the known points multiply.
@@ -75,7 +71,6 @@ class Kriging:
 
     x: Array
     scales: Scales
-    degree: int
     beta: Array
     gamma: Array
     root: Array
@@ -86,14 +81,13 @@ class Kriging:
     def mean(self, at: Array) -> Array:
         """Return the mean at points, shape (k, d) to (k,)."""
         return np.asarray(
-            monomials(at, self.degree) @ self.beta
-            + correlation(at, self.x, self.scales.lengths) @ self.gamma
+            trend_of(at) @ self.beta + correlation(at, self.x, self.scales.lengths) @ self.gamma
         )
 
     def mean_and_variance(self, at: Array) -> tuple[Array, Array]:
         """Return mean and variance at points, shape (k, d) to (k,) each."""
         r = correlation(at, self.x, self.scales.lengths)
-        b = monomials(at, self.degree)
+        b = trend_of(at)
         left = r @ self.root.T
         open_trend = (b - r @ self.trend.T) @ self.trend_root.T
         part = 1.0 - np.einsum("kn,kn->k", left, left)
@@ -101,16 +95,9 @@ class Kriging:
         return b @ self.beta + r @ self.gamma, self.variance * np.maximum(part, 0.0)
 
 
-def monomials(x: Array, degree: int) -> Array:
-    """Return the trend's functions, shape (k, q)."""
-    k, d = x.shape
-    parts = [np.ones((k, 1))]
-    if degree > 0:
-        parts.append(x)
-    if degree > 1:
-        i, j = np.triu_indices(d)
-        parts.append(x[:, i] * x[:, j])
-    return np.concatenate(parts, axis=1)
+def trend_of(x: Array) -> Array:
+    """Return the trend's functions, shape (k, 1 + d)."""
+    return np.concatenate([np.ones((len(x), 1)), x], axis=1)
 
 
 def correlation(a: Array, b: Array, lengths: Array) -> Array:
@@ -124,13 +111,6 @@ def correlation(a: Array, b: Array, lengths: Array) -> Array:
     return np.asarray(np.exp(squared, out=squared))
 
 
-def degree_for(n: int, d: int) -> int:
-    """Return the degree of the trend that so many values bear: twice as many as coefficients."""
-    if n >= (d + 1) * (d + 2):
-        return 2
-    return 1 if n >= 2 * (d + 1) else 0
-
-
 def krige(x: Array, y: Array, scales: Scales) -> Kriging:
     """Fit trend and process for given scales.
 
@@ -141,8 +121,7 @@ def krige(x: Array, y: Array, scales: Scales) -> Kriging:
     scales : Scales
     """
     n = len(x)
-    degree = degree_for(*x.shape)
-    b = monomials(x, degree)
+    b = trend_of(x)
     lower = cholesky(correlation(x, x, scales.lengths) + scales.nugget * np.eye(n), lower=True)
     within = solve_triangular(lower, b, lower=True)
     # A trend along a coordinate that did not vary is none.
@@ -154,7 +133,7 @@ def krige(x: Array, y: Array, scales: Scales) -> Kriging:
     gamma = cho_solve((lower, True), rest)
     variance = float(rest @ gamma) / max(n - b.shape[1], 1)
     return Kriging(
-        x, scales, degree, beta, gamma,
+        x, scales, beta, gamma,
         solve_triangular(lower, np.eye(n), lower=True),
         cho_solve((lower, True), b).T,
         solve_triangular(trend_lower, np.eye(len(precision)), lower=True),
@@ -178,7 +157,7 @@ def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-    b = monomials(x, degree_for(*x.shape))
+    b = trend_of(x)
     rest = y - b @ np.linalg.lstsq(b, y, rcond=None)[0]
     spread = float(rest.std())
     if spread <= 1e-12 * max(float(np.abs(y).max()), 1e-300):

@@ -10,7 +10,7 @@ from calib.models.simulators.emulator.kriging import (
     correlation,
     find_scales,
     krige,
-    monomials,
+    trend_of,
 )
 
 
@@ -21,7 +21,7 @@ def test_it_is_the_limit_of_a_wide_prior_of_the_trend() -> None:
     scales = Scales(np.array([1.3, 2.1]), 1e-4)
     found = krige(x, y, scales)
     mean, variance = found.mean_and_variance(at)
-    b, b_at, wide = monomials(x, 2), monomials(at, 2), 1e6
+    b, b_at, wide = trend_of(x), trend_of(at), 1e6
 
     def covariance(u: np.ndarray, v: np.ndarray, bu: np.ndarray, bv: np.ndarray) -> np.ndarray:
         return correlation(u, v, scales.lengths) + wide * bu @ bv.T
