@@ -184,8 +184,9 @@ def diagnosed(seed: int, folder: Path) -> dict[str, object]:
         "more": len(more.runs) if more else 0, "named": found.order[0], "exact_names": best,
         "probability": found.probability[best], "exact_probability": truth.probability[best],
     }  # fmt: skip
-    print("diagnosis, data {seed}: {runs} runs, {more} more; {named} {probability:.3f}, the "
-          "simulator itself {exact_names} {exact_probability:.3f}".format(**row), flush=True)  # fmt: skip
+    said = "diagnosis, data {seed}: {runs} runs, {more} more; {named} {probability:.3f}, the "
+    said += "simulator itself {exact_names} {exact_probability:.3f}"
+    print(said.format(**row), flush=True)
     return row
 
 

@@ -108,6 +108,7 @@ def test_a_simulator_that_never_runs_is_refused() -> None:
     assert "ZeroDivisionError" in str(caught.value)
 
 
+@pytest.mark.slow
 def test_its_own_noise_is_found_and_smoothed_over() -> None:
     rng = np.random.default_rng(3)
     own = 0.003  # a tenth of the readings' noise
