@@ -71,6 +71,7 @@ def report(
     from calib.inference.emulation.prepared import prepare
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.report.contents import work_out
+    from calib.report.emulators import EmulatorSection
     from calib.report.study_tasks import fitted_rows, plan_tasks
     from calib.report.writer import write_report
     from calib.validation.outliers import outlying_notes
@@ -104,6 +105,9 @@ def report(
             for task in tasks
         }  # fmt: skip
     good = [say(model, emulation) for model, emulation in emulations.items()]
+    made = {model: e.document() for model, e in emulations.items() if e is not None}
+    if made:
+        sections = (*sections, EmulatorSection(made))
     with pool(workers) as side, progress_bars() as tell:
         found = work_out(
             tasks, seed, settings=settings, sections=sections, progress=tell, workers=workers,

@@ -129,6 +129,11 @@ def test_a_report_and_its_check(run: Calib) -> None:
                *FEW)  # fmt: skip
     assert made.code == 0, made.err
     assert json.loads(Path("report/summary.json").read_text())["models"]["drawbar_pull"]
+    page = Path("report/index.html").read_text()
+    assert "Emulators of slow simulators" in page
+    record = json.loads(Path("report/manifest.json").read_text())["emulators"]["wheel"]
+    assert record["passed"]
+    assert record["held_out"]["runs"] == 20
     checked = run("check", "report", *own, "--workers", 1)
     assert checked.code == 0, checked.out
     assert checked.out.startswith("SAME")
