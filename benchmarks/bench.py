@@ -33,6 +33,7 @@ PARTS: dict[str, list[str]] = {
     "campaign": ["campaign.py", "--cases", "100", "--repeats", "1"],
     "survival": ["campaign_survival.py", "--cases", "200"],
     "everyday": ["everyday.py"],
+    "emulator": ["emulator.py"],
 }
 FULL = {"campaign": ["--cases", "200"], "everyday": ["--tests"]}
 

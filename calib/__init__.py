@@ -22,11 +22,15 @@ if TYPE_CHECKING:
     from calib.he2019.audit import Audit, run_audit
     from calib.he2019.datasets.embedded import load_he2019
     from calib.inference.calibration import Calibration, calibrate
+    from calib.inference.emulation import Emulation
+    from calib.inference.emulation.prepared import emulated
     from calib.inference.estimators import PointEstimate, estimate
     from calib.inference.io import load_calibration, save_calibration, to_datatree
     from calib.inference.problem import Problem, build_problem
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import MODELS, Model
+    from calib.models.simulators.files import read_simulator
+    from calib.models.simulators.registered import from_callable
     from calib.validation.prediction import Prediction, predict
     from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
@@ -46,6 +50,10 @@ _HOME = {
     "table_from_arrays": "calib.data",
     "load_he2019": "calib.he2019.datasets.embedded",
     "CalibError": "calib.errors",
+    "Emulation": "calib.inference.emulation",
+    "emulated": "calib.inference.emulation.prepared",
+    "from_callable": "calib.models.simulators.registered",
+    "read_simulator": "calib.models.simulators.files",
     "PointEstimate": "calib.inference.estimators",
     "estimate": "calib.inference.estimators",
     "Case": "calib.gap.case",
@@ -77,6 +85,7 @@ __all__ = [
     "Case",
     "Diagnosis",
     "Effect",
+    "Emulation",
     "Model",
     "PointEstimate",
     "Prediction",
@@ -90,7 +99,9 @@ __all__ = [
     "calibrate",
     "check",
     "diagnose",
+    "emulated",
     "estimate",
+    "from_callable",
     "hold_out",
     "leave_one_out",
     "load_calibration",
@@ -98,6 +109,7 @@ __all__ = [
     "predict",
     "read_case",
     "read_plan",
+    "read_simulator",
     "read_table",
     "register",
     "run_audit",

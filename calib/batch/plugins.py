@@ -7,6 +7,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
@@ -67,7 +68,10 @@ def run_file(path: Path, what: str) -> ModuleType:
 
 
 def load_files(paths: Sequence[Path]) -> None:
-    """Run files that register quantities, models or effects, here and in processes to come.
+    """Load files that register things, here and in processes to come.
+
+    Python files of quantities, models or effects; simulator files (``.toml``); emulators
+    (``.npz``).
 
     Raises
     ------
@@ -75,7 +79,7 @@ def load_files(paths: Sequence[Path]) -> None:
         If one cannot be run, or what it declares does not hold together.
     """
     for path in paths:
-        run_file(path, "models")
+        _load(Path(path))
     new = [str(Path(p).resolve()) for p in paths]
     if new:
         known = map(str, loaded_files())
@@ -90,6 +94,16 @@ def loaded_files() -> list[Path]:
 def inherit() -> None:
     """Load what the process that started this one had loaded."""
     load_files(loaded_files())
+
+
+def _load(path: Path) -> None:
+    # The batch layer lies below what these register.
+    if path.suffix == ".toml":
+        import_module("calib.models.simulators.files").register_file(path)
+    elif path.suffix == ".npz":
+        import_module("calib.models.simulators.emulator.files").use_emulator(path)
+    else:
+        run_file(path, "models")
 
 
 def load_installed(group: str) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from calib.cli.parallel import CORES, Models, Workers
+from calib.cli.parallel import CORES, Models, Simulators, Workers
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
@@ -58,17 +58,21 @@ def report(
     ] = True,
     workers: Workers = CORES,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from calib.batch.folders import check_folder
     from calib.batch.pool import pool
     from calib.cli.display import progress_bars
+    from calib.cli.simulators import say
     from calib.data import read_table
     from calib.data.labels import labelled
     from calib.data.quantities import OUTPUTS
+    from calib.inference.emulation.prepared import prepare
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.report.contents import work_out
-    from calib.report.study_tasks import plan_tasks
+    from calib.report.emulators import EmulatorSection
+    from calib.report.study_tasks import fitted_rows, plan_tasks
     from calib.report.writer import write_report
     from calib.validation.outliers import outlying_notes
 
@@ -92,6 +96,18 @@ def report(
         sections = (GapsSection(), AuditSection())
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
+    with progress_bars() as tell:
+        emulations = {
+            task.model: prepare(
+                task.model, fitted_rows(task)[0], seed, priors=task.prior_path,
+                elsewhere=[task.table], workers=workers, progress=tell,
+            )
+            for task in tasks
+        }  # fmt: skip
+    good = [say(model, emulation) for model, emulation in emulations.items()]
+    made = {model: e.document() for model, e in emulations.items() if e is not None}
+    if made:
+        sections = (*sections, EmulatorSection(made))
     with pool(workers) as side, progress_bars() as tell:
         found = work_out(
             tasks, seed, settings=settings, sections=sections, progress=tell, workers=workers,
@@ -113,7 +129,7 @@ def report(
     print(page)
     if study.failures:
         raise typer.Exit(1)
-    if not all(r.calibration.converged for r in study.successes.values()):
+    if not all(r.calibration.converged for r in study.successes.values()) or not all(good):
         raise typer.Exit(3)
 
 
@@ -126,15 +142,19 @@ def fit(
     hold_out: _HoldOut = None,
     overwrite: _Overwrite = False,
     max_steps: _MaxSteps = 25_600,
+    workers: Workers = CORES,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Calibrate one model on one file and save the posterior."""
     from calib.batch.folders import check_folder, fresh_folder
     from calib.cli.display import posterior_table, progress_bars, verdict_line
+    from calib.cli.simulators import say
     from calib.data import hold_out as split
     from calib.data import read_for_model
     from calib.data.labels import labelled
     from calib.inference.calibration import calibrate
+    from calib.inference.emulation.prepared import prepare
     from calib.inference.estimators import estimate
     from calib.inference.io import save_calibration
     from calib.inference.problem import build_problem
@@ -150,9 +170,13 @@ def fit(
     table = labelled(read_for_model(file, (*chosen.conditions, chosen.output)))
     kept = _parse_hold_out(hold_out)
     fitted, held = split(table, kept.column, kept.value) if kept else (table, None)
-    problem = build_problem(model, fitted, priors)
-    point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
     with progress_bars() as tell:
+        emulation = prepare(
+            model, fitted, seed, priors=priors, elsewhere=[] if held is None else [held],
+            workers=workers, progress=tell,
+        )  # fmt: skip
+        problem = build_problem(model, fitted, priors)
+        point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
         calibration = calibrate(
             problem, seed, estimates=(point,), settings=SamplerSettings(max_steps=max_steps),
             progress=lambda done, planned: tell("sampling", done, planned),
@@ -161,6 +185,7 @@ def fit(
         save_calibration(calibration, folder)
     posterior_table(calibration)
     print(verdict_line(calibration))
+    good = say(model, emulation)
     for note in (*problem.notes, *outlying_notes(problem, calibration.draws.mode)):
         print(f"note: {note}", file=sys.stderr)
     if held is not None:
@@ -171,7 +196,7 @@ def fit(
             f"RMSE {format_number(scores.rmse)}, CRPS {format_number(scores.crps)}"
         )
     print(f"run folder: {out}")
-    if not calibration.converged:
+    if not (calibration.converged and good):
         raise typer.Exit(3)
 
 
@@ -184,6 +209,7 @@ def predict(
     ] = None,
     overwrite: _Overwrite = False,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Predict at new conditions: with 50, 90 and 95 % bands; a diagnosis with 90 % bands."""
     if out is not None and out.exists() and not overwrite:
@@ -302,6 +328,7 @@ def template(
     model: Annotated[str, typer.Argument(help="See `calib models`.")],
     out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Write an example CSV of a model to fill in."""
     from calib.models import example_csv, get_model
@@ -313,6 +340,7 @@ def priors(
     model: Annotated[str, typer.Argument(help="See `calib models`.")],
     out: Annotated[Path | None, typer.Option(help="TOML to write; printed if none.")] = None,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Write the shipped priors of a model, to copy and edit."""
     from calib.inference.prior_files import default_priors
@@ -321,7 +349,7 @@ def priors(
     _emit(default_priors(get_model(model).name).read_text(encoding="utf-8"), out)
 
 
-def models(plugins: Models = None) -> None:
+def models(plugins: Models = None, simulator: Simulators = None) -> None:
     """List the models with their equations and columns."""
     from calib.models import MODELS
 

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import Models, Scheduler, Workers, announce, resumable
+from calib.cli.parallel import Models, Scheduler, Simulators, Workers, announce, resumable
 
 __all__ = ["register"]
 
@@ -32,6 +32,7 @@ def campaign(
         bool, typer.Option("--overwrite", help="Do again what was made from other inputs.")
     ] = False,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Run many fits, diagnoses, challenge cases or SBC replicates as tasks; run again to resume."""
     from calib.batch.campaign import read_plan, run_campaign

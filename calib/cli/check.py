@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import CORES, Models, Workers
+from calib.cli.parallel import CORES, Models, Simulators, Workers
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -32,16 +32,20 @@ def check(
     ] = None,
     workers: Workers = CORES,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Compute a report or a run again from its own folder and compare everything.
 
     Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
     """
+    from calib.batch.plugins import load_files
     from calib.batch.pool import pool
     from calib.check.check import check as find
     from calib.cli.check_display import show
     from calib.cli.display import progress_bars
 
+    # A slow simulator is checked as it was emulated: nothing is run.
+    load_files(sorted((folder / "emulators").glob("*.npz")))
     try:
         with pool(1 if quick else workers) as side, progress_bars() as tell:
             outcome = find(folder, quick=quick, progress=tell, pool=side)

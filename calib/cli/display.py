@@ -20,24 +20,38 @@ def progress_bars() -> Iterator[Callable[[str, int, int], None]]:
         BarColumn,
         MofNCompleteColumn,
         Progress,
+        ProgressColumn,
+        Task,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.text import Text
+
+    class _Speed(ProgressColumn):
+        def render(self, task: Task) -> Text:
+            return Text("" if task.speed is None else f"{task.speed:.2g}/s")
 
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-        TimeElapsedColumn(), TimeRemainingColumn(),
+        TimeElapsedColumn(), TimeRemainingColumn(), _Speed(),
     )  # fmt: skip
     tasks: dict[str, object] = {}
-    with Progress(*columns, console=Console(stderr=True)) as bars:
+    bars = Progress(*columns, console=Console(stderr=True))
 
-        def tell(what: str, done: int, planned: int) -> None:
-            if what not in tasks:
-                tasks[what] = bars.add_task(what, total=planned)
-            bars.update(tasks[what], completed=done, total=planned)  # type: ignore[arg-type]
+    def tell(what: str, done: int, planned: int) -> None:
+        # Not before there is something to tell: an error that comes first has the terminal alone.
+        if not tasks:
+            bars.start()
+        if what not in tasks:
+            tasks[what] = bars.add_task(what, total=planned)
+        bars.update(tasks[what], completed=done, total=planned)  # type: ignore[arg-type]
 
+    try:
         yield tell
+    finally:
+        if tasks:
+            bars.stop()
 
 
 def posterior_table(calibration: Calibration) -> None:

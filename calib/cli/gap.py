@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import CORES, Models, Workers
+from calib.cli.parallel import CORES, Models, Simulators, Workers
 from calib.errors import CalibError
 
 __all__ = ["register"]
@@ -32,10 +32,13 @@ def diagnose(
     overwrite: _Overwrite = False,
     workers: Workers = CORES,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
     from calib.batch.folders import check_folder, fresh_folder
     from calib.batch.pool import pool
+    from calib.cli.display import progress_bars
+    from calib.cli.simulators import prepare_case, say
     from calib.data.quantities import OUTPUTS, QUANTITIES
     from calib.gap.case import case_from_run, read_case
     from calib.gap.diagnose import diagnose as find
@@ -64,6 +67,9 @@ def diagnose(
         check_on_case(own, given, effects)
         paths = [effects, *(effects.with_name(f"{name}.toml") for name in own)]
         files = {path.name: path.read_bytes() for path in paths}
+    with progress_bars() as tell:
+        emulations = prepare_case(given, run, seed, workers, tell)
+    told = [say(what, emulation) for what, emulation in emulations]
     manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
     with pool(workers, ["calib.report.page.diagnosis"]) as side:
         found = find(given, seed, effects={**EFFECTS, **own}, pool=side)
@@ -89,3 +95,5 @@ def diagnose(
             f"{100 * high:.0f} %), noise sd {format_number(s.noise_floor)} {unit}"
         )
     print(out / "index.html")
+    if not all(told):
+        raise typer.Exit(3)

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["CORES", "Models", "Scheduler", "Workers", "announce", "resumable"]
+__all__ = ["CORES", "Models", "Scheduler", "Simulators", "Workers", "announce", "resumable"]
 
 # As many processes as there are cores, of which two bring most of what there is to gain.
 CORES = min(2, os.cpu_count() or 1)
@@ -35,6 +35,17 @@ Models = Annotated[
     typer.Option(
         "--models",
         help="Python file that registers quantities, models or effects of your own; repeatable.",
+        callback=_load,
+        is_eager=True,
+    ),
+]
+
+
+Simulators = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--simulator",
+        help="TOML file of a simulator of your own, whose command is run; repeatable.",
         callback=_load,
         is_eager=True,
     ),

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import Models, Scheduler, Workers, announce
+from calib.cli.parallel import Models, Scheduler, Simulators, Workers, announce
 
 __all__ = ["register"]
 
@@ -28,6 +28,7 @@ def sbc(
     workers: Workers = 2,
     scheduler: Scheduler = None,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Prove posteriors and bands calibrated on simulated data whose truth is known."""
     from dataclasses import asdict

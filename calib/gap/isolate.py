@@ -183,7 +183,9 @@ def _metric_root(
     """A root R of C^-1 (R'R = C^-1), block by output, shape (N, N)."""
     blocks = []
     for o in data.outputs:
-        mode = np.append(lab_mode[o.name], np.log(noise[o.name].sigma))
+        sigma = noise[o.name].sigma
+        scale = o.problem.priors.entries[-1]
+        mode = np.append(lab_mode[o.name], np.log(sigma) if scale.log else sigma)
         width = prior_widths(o.problem.priors)
         covariance = hessian_scale(o.problem.log_prob, mode, width)[:-1, :-1]
         step = 1e-4 * width[:-1]

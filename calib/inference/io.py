@@ -1,7 +1,8 @@
 """Save and load calibrations: a run folder, and posteriors as ArviZ DataTrees.
 
 A run folder holds everything that is needed to predict from it and to compute it again:
-`posterior.nc`, `data.csv` (the fitted rows), `priors.toml` and `run.json`.
+`posterior.nc`, `data.csv` (the fitted rows), `priors.toml`, `run.json` and, of a simulator that was
+emulated, `emulator.npz`.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ from calib.inference.sampling.gate import GateReport
 from calib.inference.sampling.sampler import Draws
 from calib.models import BoundModel, get_model
 from calib.models.base import Array
+from calib.models.simulators.emulator.files import load_emulator, save_emulator
+from calib.models.simulators.emulator.model import emulated_model, emulator_of
 
 __all__ = [
     "SCHEMA", "describe_estimates", "load_calibration", "run_problem", "save_calibration",
@@ -42,6 +45,7 @@ __all__ = [
 
 SCHEMA = "calib/run/1"
 _HASHED = ("posterior.nc", "priors.toml", "data.csv")
+_EMULATOR = "emulator.npz"
 N_PRIOR = 2000
 MAX_CELLS = 8_000_000
 
@@ -198,7 +202,12 @@ def save_calibration(
     write_netcdf(to_datatree(calibration), folder / "posterior.nc")
     (folder / "priors.toml").write_text(problem.priors.text, encoding="utf-8")
     write_table(folder / "data.csv", problem.table.columns)
-    hashes = {name: _sha256(folder / name) for name in _HASHED}
+    hashed = [*_HASHED]
+    emulator = emulator_of(problem.bound.model)
+    if emulator is not None:
+        save_emulator(emulator, problem.bound.model.name, folder / _EMULATOR)
+        hashed.append(_EMULATOR)
+    hashes = {name: _sha256(folder / name) for name in hashed}
     described = {
         **_describe(calibration),
         "seconds": calibration.draws.seconds,
@@ -272,6 +281,8 @@ def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
         Its ``data.csv``.
     """
     model = get_model(meta["model"])
+    if (data.parent / _EMULATOR).exists():
+        model = emulated_model(model, load_emulator(data.parent / _EMULATOR)[1])
     priors = parse_priors(
         meta["prior_text"], meta["prior_file"], model.name,
         (*model.parameters, "sigma"), meta["prior_references"],

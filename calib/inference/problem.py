@@ -6,7 +6,9 @@ deviation sigma,
 
     ln L = -n ln sigma - SSE(theta)/(2 sigma^2) - (n/2) ln 2 pi  [- sum ln y for a log response],
 
-the bracket making it a density of the output itself, so that models can be compared.
+the bracket making it a density of the output itself, so that models can be compared. Where the
+prediction has an error of its own, that of an emulator, its covariance over the rows is added to
+that of the noise (`calib.inference.uncertain`).
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from calib.inference.prior_files import (
     relative_columns,
 )
 from calib.inference.priors import Priors
+from calib.inference.uncertain import log_normal
 from calib.models import Array, BoundModel, get_model
 
 __all__ = ["Problem", "build_problem"]
@@ -106,6 +109,8 @@ class Problem:
     def log_likelihood(self, t: Array) -> Array:
         """Log likelihood of internal coordinates, shape (k,); ``-inf`` where undefined."""
         natural = self.theta(t)
+        if self.bound.model.uncertain is not None:
+            return self._uncertain_log_likelihood(natural)
         n, sigma = self.response.size, natural[:, -1]
         # A prior may admit sigma <= 0 or predictions beyond all bounds: they become -inf below.
         with np.errstate(all="ignore"):
@@ -114,11 +119,28 @@ class Problem:
         value += self._sum_ln_jacobian
         return np.where(np.isfinite(value), value, -np.inf)
 
+    def _predicted(self, natural: Array) -> tuple[Array, Array, Array]:
+        """Residuals (k, n), and the error of the prediction: variances (k, j), curves (n, j)."""
+        uncertain = self.bound.model.uncertain
+        if uncertain is None:
+            none = np.zeros((len(natural), 0)), np.zeros((self.response.size, 0))
+            return self.residuals(natural), *none
+        location, variances, curves = uncertain(natural[:, :-1], self.conditions)
+        return self.response - location, variances, curves
+
+    def _uncertain_log_likelihood(self, natural: Array) -> Array:
+        with np.errstate(all="ignore"):
+            residuals, variances, curves = self._predicted(natural)
+            value = log_normal(residuals, natural[:, -1], variances, curves)
+        value += self._sum_ln_jacobian
+        return np.where(np.isfinite(value), value, -np.inf)
+
     def log_likelihood_rows(self, t: Array) -> Array:
-        """Log likelihood of every row, shape (k, n)."""
+        """Log likelihood of every row by itself, shape (k, n)."""
         natural = self.theta(t)
-        sigma = natural[:, -1:]
-        z = self.residuals(natural) / sigma
+        residuals, variances, curves = self._predicted(natural)
+        sigma = np.sqrt(natural[:, -1:] ** 2 + variances @ (curves**2).T)
+        z = residuals / sigma
         return np.asarray(-0.5 * z * z - np.log(sigma) - _HALF_LN_2PI + self._ln_jacobian)
 
     def log_prob(self, t: Array) -> Array:

@@ -21,7 +21,7 @@ from calib.models.latex import text
 
 __all__ = [
     "N_WORK", "Alone", "Array", "BoundModel", "Columns", "Conditions", "Model", "References",
-    "Rows", "Searched", "columns",
+    "Rows", "Searched", "columns", "not_given",
 ]  # fmt: skip
 
 N_WORK = 3
@@ -54,7 +54,8 @@ def _no_references(conditions: Conditions) -> dict[str, float]:
     return {}
 
 
-def _not_given(*_: Any) -> Any:
+def not_given(*_: Any) -> Any:
+    """Stand for a function of a model that is made up when the model is."""
     raise NotImplementedError
 
 
@@ -239,6 +240,10 @@ class Model:
     prepare : callable
         ``(conditions, references) -> rows``: what `location` needs of the conditions, worked out
         once for any number of parameter vectors.
+    uncertain : callable, optional
+        Of a prediction that is known with an error of its own (an emulator's): ``(theta (k, d),
+        conditions (n,)) -> prediction (k, n), variances (k, j), curves (n, j)`` on the scale of
+        the response, the error being the curves times independent normals of these variances.
     """
 
     name: str
@@ -262,18 +267,19 @@ class Model:
     alone: Alone | None = None
     searched: Searched | None = None
     estimates_all_rows: bool = False
-    location: Callable[[Columns, Rows, References, Array], Array] = _not_given
-    report_theta: Callable[[Array, References], dict[str, Array]] = _not_given
-    theta_from_reported: Callable[[Mapping[str, float], References], Array] = _not_given
+    location: Callable[[Columns, Rows, References, Array], Array] = not_given
+    report_theta: Callable[[Array, References], dict[str, Array]] = not_given
+    theta_from_reported: Callable[[Mapping[str, float], References], Array] = not_given
     bind_references: Callable[[Conditions], dict[str, float]] = _no_references
     prepare: Callable[[Conditions, References], Rows] = _as_they_are
+    uncertain: Callable[[Array, Conditions], tuple[Array, Array, Array]] | None = None
 
     def __post_init__(self) -> None:
         if not self.reported:
             object.__setattr__(self, "reported", dict.fromkeys(self.parameters, "1"))
-        if self.location is _not_given:
+        if self.location is not_given:
             object.__setattr__(self, "location", _Plain(self))
-        if self.report_theta is _not_given:
+        if self.report_theta is not_given:
             object.__setattr__(self, "report_theta", _Named(self.parameters))
             object.__setattr__(self, "theta_from_reported", _Vector(self.parameters))
 

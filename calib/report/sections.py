@@ -90,4 +90,15 @@ class SectionKind:
         SECTIONS.add(self)
 
 
-SECTIONS: Registry[SectionKind] = Registry("section", lambda kind: kind.name)
+def _emulators_again(record: Any) -> Section:
+    # It needs this module.
+    from calib.report.emulators import EmulatorSection
+
+    if not isinstance(record, Mapping) or not all(isinstance(d, Mapping) for d in record.values()):
+        raise ValueError("no record of emulators")
+    return EmulatorSection(record)
+
+
+SECTIONS: Registry[SectionKind] = Registry(
+    "section", lambda kind: kind.name, SectionKind("emulators", _emulators_again)
+)

@@ -15,6 +15,9 @@ from calib.data import write_table
 from calib.inference.io import to_datatree, write_netcdf
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
+from calib.models import get_model
+from calib.models.simulators.emulator.files import save_emulator
+from calib.models.simulators.emulator.model import emulator_of
 from calib.report.figures import Plate
 from calib.report.figures.collect import plates
 from calib.report.figures.export import pdf_bytes, png
@@ -168,6 +171,9 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
         data = (folder / "data" / f"{key}.csv").read_bytes()
         priors = prior_path.read_bytes()
         (folder / "priors" / f"{key}.toml").write_bytes(priors)
+        emulator = emulator_of(get_model(task.model))
+        if emulator is not None:
+            save_emulator(emulator, task.model, folder / "emulators" / f"{key}.npz")
         inputs[key] = {
             "data": {
                 "file": f"data/{key}.csv",

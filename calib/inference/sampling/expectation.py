@@ -134,6 +134,7 @@ def _improved(
     tail = share * ((dof + d) / (dof + squared))
     mass = share.sum(axis=1)
     kept = mass * effective >= d
+    kept[np.argmax(mass)] = True  # however little the draws are worth
     tail, mass, dof = tail[kept], mass[kept], dof[kept]
     means = tail @ x.T / tail.sum(axis=1)[:, None]
     second = np.empty((mass.size, d, d))

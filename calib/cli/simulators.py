@@ -1,0 +1,73 @@
+"""Emulation of simulators before the verbs that need it, and what is said of it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from calib.data import Table
+    from calib.gap.case import Case
+    from calib.inference.emulation import Emulation
+
+__all__ = ["prepare_case", "say"]
+
+
+def say(model: str, emulation: Emulation | None) -> bool:
+    """Say what became of an emulation; return whether it is good enough (or was not needed)."""
+    if emulation is None:
+        return True
+    h = emulation.held_out
+    seen = "" if h is None else (
+        f"; on {h.runs} runs not seen it is off by {h.rmse:.3f} noise sds (rms), "
+        f"{100 * h.covered:.0f} % inside its 90 % intervals"
+    )  # fmt: skip
+    print(f"{model}: emulated from {len(emulation.emulator.training.theta)} runs{seen}")
+    if emulation.own_noise:
+        print(f"{model}: the simulator has a noise of its own, sd {emulation.own_noise:.3g}")
+    if emulation.failed:
+        first = emulation.failed[0].failure
+        why = "" if first is None else f", the first as {first.reason}"
+        print(
+            f"calib: {len(emulation.failed)} of {len(emulation.runs)} runs failed{why}; they are "
+            "listed beside the runs, and the posterior keeps out of where they lie",
+            file=sys.stderr,
+        )
+    for reason in emulation.reasons:
+        print(f"EMULATOR NOT GOOD ENOUGH: {reason}")
+    return emulation.passed
+
+
+def prepare_case(
+    case: Case, run: Path | None, seed: int, workers: int, tell: Callable[[str, int, int], None]
+) -> list[tuple[str, Emulation | None]]:
+    """Emulate the simulators of a case for both of its campaigns."""
+    import numpy as np
+
+    from calib.batch.plugins import load_files
+    from calib.data.quantities import OUTPUTS
+    from calib.inference.emulation.prepared import prepare, prepare_field, reaches
+
+    said = []
+    others = [case.field, *([] if case.fresh is None else [case.fresh])]
+    for output, model in case.models.items():
+        column = OUTPUTS[output]
+        if column not in case.lab or column not in case.field:
+            continue  # told when the case is bound
+
+        def measured(table: Table, column: str = column) -> Table:
+            return table.take(np.isfinite(table[column]))
+
+        kept = None if run is None else run / "emulator.npz"
+        if kept is not None and kept.exists():
+            load_files([kept])
+        if not reaches(model, [case.lab, *others]):
+            found = prepare(
+                model, measured(case.lab), seed, elsewhere=others, workers=workers, progress=tell
+            )
+            said.append((model, found))
+        found = prepare_field(model, measured(case.field), seed, workers=workers, progress=tell)
+        said.append((f"{model}, field", found))
+    return said

@@ -1,0 +1,213 @@
+"""A model's simulator emulated for data at hand, and the model made the emulator from then on."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calib.batch.plugins import load_files
+from calib.data import Table
+from calib.errors import CalibError
+from calib.inference.emulation.sequential import emulate, extend
+from calib.inference.emulation.settings import Emulation, EmulationSettings
+from calib.inference.emulation.tabulated import emulate_table
+from calib.inference.problem import Problem, build_problem
+from calib.models import get_model
+from calib.models.simulators.emulator.files import save_emulator
+from calib.models.simulators.emulator.model import emulator_of
+from calib.models.simulators.registered import SIMULATED, Simulated, simulated_by
+from calib.models.simulators.runs import RunKeeper
+from calib.models.simulators.ways import TableWay
+
+__all__ = ["emulated", "prepare", "prepare_field", "reaches", "write_failed"]
+
+type Progress = Callable[[str, int, int], None]
+
+
+def emulated(
+    problem: Problem,
+    seed: int,
+    *,
+    elsewhere: Sequence[Table] = (),
+    workers: int = 1,
+    scheduler: str | None = None,
+    progress: Progress | None = None,
+) -> Emulation:
+    """Emulate the simulator behind a problem; the emulation's problem can be calibrated.
+
+    Parameters
+    ----------
+    problem : Problem
+    seed : int
+    elsewhere : sequence of Table
+        Whose conditions will be predicted beside those of the problem.
+    workers : int
+    scheduler : str, optional
+    progress : callable, optional
+        Called with what is done, how much of it, and of how much.
+
+    Raises
+    ------
+    CalibError
+        If the model is no simulator's.
+    """
+    found = _simulated(problem.bound.model.name)
+    settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
+    if isinstance(found.simulator.way, TableWay):
+        return emulate_table(problem, found.simulator, seed, settings)
+    keeper = _keeper(found, workers, scheduler, progress, settings.runs)
+    return emulate(
+        problem, keeper, seed, settings=settings, elsewhere=[t.columns for t in elsewhere]
+    )
+
+
+def _simulated(model: str) -> Simulated:
+    found = simulated_by(model)
+    if found is None:
+        raise CalibError(
+            f"the model {model} is none of a simulator", allowed=", ".join(SIMULATED) or "none yet",
+            mend="register it first, see calib.from_callable and --simulator",
+        )  # fmt: skip
+    return found
+
+
+def _keeper(
+    found: Simulated, workers: int, scheduler: str | None, progress: Progress | None, planned: int
+) -> RunKeeper:
+    tell = None if progress is None else _Tell(progress, planned)
+    return RunKeeper(found.simulator, found.folder, workers, scheduler, tell)
+
+
+class _Tell:
+    """Runs of all batches in one count."""
+
+    def __init__(self, progress: Progress, planned: int) -> None:
+        self._progress, self._planned, self._before, self._batch = progress, planned, 0, 0
+
+    def __call__(self, done: int, planned: int) -> None:
+        """Tell what is done of a batch."""
+        if done < self._batch:
+            self._before, self._batch = self._before + self._batch, 0
+        self._batch = done
+        self._progress("simulator runs", self._before + done, self._planned)
+
+
+def prepare(
+    model: str,
+    table: Table,
+    seed: int,
+    *,
+    priors: Path | None = None,
+    elsewhere: Sequence[Table] = (),
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> Emulation | None:
+    """Emulate a model's simulator if it has to be, for all that this process does from now on.
+
+    Parameters
+    ----------
+    model : str
+    table : Table
+        What it is calibrated on.
+    seed : int
+    priors : Path, optional
+    elsewhere : sequence of Table
+    workers : int
+    progress : callable, optional
+
+    Returns
+    -------
+    Emulation, optional
+        None for a model that is none of a slow simulator.
+    """
+    found = simulated_by(model)
+    if found is None or not found.simulator.emulate:
+        return None
+    emulation = emulated(
+        build_problem(model, table, priors), seed, elsewhere=elsewhere, workers=workers,
+        progress=progress,
+    )  # fmt: skip
+    load_files([_kept(found, model, emulation)])
+    return emulation
+
+
+def prepare_field(
+    model: str,
+    field: Table,
+    seed: int,
+    *,
+    more: int = 100,
+    workers: int = 1,
+    progress: Progress | None = None,
+) -> Emulation | None:
+    """Have an emulator in use serve a field campaign as well.
+
+    Parameters
+    ----------
+    model : str
+        One that is an emulator by now.
+    field : Table
+        Rows that have the output.
+    seed : int
+    more : int
+        Runs at most.
+    workers : int
+    progress : callable, optional
+
+    Returns
+    -------
+    Emulation, optional
+        None where no run can be made: of no slow simulator, or of a table of runs.
+    """
+    found, emulator = simulated_by(model), emulator_of(get_model(model))
+    if found is None or emulator is None or not found.simulator.way.runs:
+        return None
+    problem = build_problem(model, field)
+    settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
+    keeper = _keeper(found, workers, None, progress, more)
+    emulation = extend(emulator, problem, keeper, seed, settings=settings, more=more)
+    load_files([_kept(found, model, emulation)])
+    return emulation
+
+
+def reaches(model: str, tables: Sequence[Table]) -> bool:
+    """Whether the emulator that a model is now has a value at all conditions of some tables."""
+    emulator = emulator_of(get_model(model))
+    if emulator is None:
+        return False
+    return all(
+        bool(np.isfinite(emulator.curves_at(get_model(model).select(t.columns))).all())
+        for t in tables
+    )
+
+
+def _kept(found: Simulated, model: str, emulation: Emulation) -> Path:
+    """Write the emulator beside the runs; return where."""
+    folder = (found.folder or Path(f"{found.name}.runs")) / "emulators"
+    theta = emulation.emulator.training.theta
+    digest = hashlib.sha256(theta.tobytes() + found.simulator.digest.encode()).hexdigest()[:16]
+    path = folder / f"{model}-{digest}.npz"
+    save_emulator(emulation.emulator, model, path)
+    write_failed(emulation, found.simulator.parameters, folder / f"{model}-failed.csv")
+    report = json.dumps(emulation.document(), indent=1)
+    (folder / f"{model}-{digest}.json").write_text(report + "\n", encoding="utf-8")
+    return path
+
+
+def write_failed(emulation: Emulation, parameters: Sequence[str], path: Path) -> None:
+    """List the runs that failed with their parameters and the tail of what they printed."""
+    if not emulation.failed:
+        path.unlink(missing_ok=True)
+        return
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*parameters, "kind", "reason", "printed"])
+        for run in emulation.failed:
+            if run.failure is not None:
+                what = run.failure.kind, run.failure.reason, run.failure.printed.strip()
+                writer.writerow([*map(repr, run.theta.tolist()), *what])

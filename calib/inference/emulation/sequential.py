@@ -1,0 +1,232 @@
+"""Emulate a problem's simulator: a space-filling design, then runs where the posterior needs them.
+
+    1. Runs spread over the prior give a first emulator.
+    2. The posterior under the emulator, its own variance in the likelihood, is sampled.
+    3. Of draws of it, and of points somewhat farther out, those are run where the emulator knows
+       least, apart from each other. Back to 2, until the error that the emulator expects is a
+       small part of the noise.
+    4. Runs at further draws are predicted first: these are its held-out check.
+
+After Kennedy & O'Hagan (2001, doi:10.1111/1467-9868.00294) and, for the choice of runs, Sinsbeck &
+Nowak (2017, doi:10.1137/15M1047659) in the simplest form that does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy.stats import qmc
+
+from calib.batch.threads import one_thread
+from calib.errors import CalibError
+from calib.inference.emulation.judge import WORTH, held_out, judged
+from calib.inference.emulation.nodes import choose_nodes
+from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut
+from calib.inference.emulation.state import State
+from calib.inference.problem import Problem
+from calib.inference.random import generator
+from calib.models.base import Array
+from calib.models.simulators.emulator import Emulator
+from calib.models.simulators.emulator.kriging import correlation
+from calib.models.simulators.runs import RunKeeper
+
+__all__ = ["emulate", "extend", "prior_design"]
+
+_CANDIDATES = 400
+# Some of the candidates are so many times as far from the posterior's middle as its draws.
+_WIDER = 1.6
+# How far in posterior sds a run is taken to tell of others when a batch is picked.
+_APART = 2.0
+_TRIMMED = 0.002
+_LEAST_OK = 0.5
+
+
+@one_thread()
+def emulate(
+    problem: Problem,
+    keeper: RunKeeper,
+    seed: int,
+    *,
+    settings: EmulationSettings | None = None,
+    elsewhere: Sequence[Mapping[str, Array]] = (),
+) -> Emulation:
+    """Emulate the simulator of a problem as well as its posterior needs it.
+
+    Parameters
+    ----------
+    problem : Problem
+    keeper : RunKeeper
+    seed : int
+        Same seed, same runs, same emulator.
+    settings : EmulationSettings, optional
+    elsewhere : sequence of mapping of str to ndarray
+        Conditions that will be predicted beside those of the data.
+
+    Returns
+    -------
+    Emulation
+        Read ``passed`` before use.
+
+    Raises
+    ------
+    CalibError
+        If fewer than half of the first runs have a value, with what the others printed.
+    """
+    chosen = settings or EmulationSettings()
+    recorded = [problem.conditions, *(problem.bound.model.select(e) for e in elsewhere)]
+    nodes = choose_nodes(recorded, keeper.simulator.ranges, chosen.nodes)
+    state = State(problem, keeper, nodes, seed)
+    own_noise = _first_design(state, chosen)
+    state.rebuild()
+    return _improved(state, chosen, chosen.runs, own_noise)
+
+
+@one_thread()
+def extend(
+    emulator: Emulator,
+    problem: Problem,
+    keeper: RunKeeper,
+    seed: int,
+    *,
+    settings: EmulationSettings | None = None,
+    more: int = 100,
+) -> Emulation:
+    """Make runs where another problem of the same simulator needs them, a field campaign's.
+
+    Parameters
+    ----------
+    emulator : Emulator
+        That serves the calibration; where it is good it stays so.
+    problem : Problem
+        The same model and priors with the rows of the field.
+    keeper : RunKeeper
+    seed : int
+    settings : EmulationSettings, optional
+    more : int
+        Runs at most.
+
+    Returns
+    -------
+    Emulation
+        Its runs are the new ones.
+    """
+    state = State.beyond(emulator, problem, keeper, seed)
+    return _improved(state, settings or EmulationSettings(), more, 0.0)
+
+
+def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: float) -> Emulation:
+    """Make runs where the posterior needs them, then some to check the emulator on."""
+    history: list[tuple[int, float]] = []
+    batch = max(2 * int(state.free.sum()), 4)
+    checks = min(chosen.checks, most // 5) if chosen.sequential else 0
+    state.sample(0)
+    all_ran = True
+    while True:
+        state.rebuild()
+        z = state.sample(len(history) + 1)
+        history.append((len(state.runs), state.error(z)))
+        room = most - checks - len(state.runs)
+        if room < 1 or (all_ran and _settled(history, chosen.tolerance)):
+            break
+        theta = state.axes.natural(_next(state, z, min(batch, room), len(history)))
+        values = state.carry_out(theta)
+        all_ran = bool(np.isfinite(values).all())
+        state.learn(theta, values)
+    measured = _check(state, z, checks, len(history)) if checks else None
+    state.rebuild()
+    return judged(state, z, chosen, measured, own_noise, history)
+
+
+def _settled(history: Sequence[tuple[int, float]], tolerance: float) -> bool:
+    """Whether the error was small enough twice: the first time may be luck of the draws."""
+    return len(history) > 1 and all(error <= WORTH * tolerance for _, error in history[-2:])
+
+
+def _first_design(state: State, chosen: EmulationSettings) -> float:
+    """Spread runs over the prior, some of them twice; return the sd of the simulator's noise."""
+    d = int(state.free.sum())
+    count = chosen.runs if not chosen.sequential else chosen.first or 10 * d
+    theta = prior_design(
+        state.problem, min(count, chosen.runs), state.seed, latin=not chosen.sequential
+    )
+    values = state.carry_out(theta)
+    ok = np.isfinite(values).all(axis=1)
+    if ok.mean() < _LEAST_OK:
+        raise _hardly_any(state, int(ok.sum()))
+    state.learn(theta, values)
+    repeats = np.flatnonzero(ok)[: 1 if state.keeper.simulator.deterministic else 5]
+    times = [1] if state.keeper.simulator.deterministic else [1, 2]
+    again = [state.carry_out(theta[repeats], r) for r in times]
+    apart = np.stack([values[repeats], *again])
+    own = float(np.sqrt(np.nanmean(apart.var(axis=0, ddof=1))))
+    if own > 1e-6 * float(np.nanstd(values)):
+        state.training = replace(state.training, noisy=True)
+        for found in again:
+            state.learn(theta[repeats], found)
+        return own
+    return 0.0
+
+
+def prior_design(problem: Problem, count: int, seed: int, *, latin: bool = False) -> Array:
+    """Return natural parameters spread over the prior, shape (count, d).
+
+    By Sobol's sequence, of which every beginning is even, or a Latin hypercube.
+    """
+    d = len(problem.priors.free)
+    bits = int(np.ceil(np.log2(max(count, 2))))
+    rng = generator(seed, "emulate", "design")
+    if latin:
+        u = qmc.LatinHypercube(d, rng=rng).random(count)
+    else:
+        u = qmc.Sobol(d, scramble=True, rng=rng).random_base2(bits)[:count]
+    t = problem.priors.ppf(_TRIMMED + (1.0 - 2.0 * _TRIMMED) * u)
+    return problem.theta(t)[:, :-1]
+
+
+def _hardly_any(state: State, ok: int) -> CalibError:
+    first = next(run.failure for run in state.runs if run.failure is not None)
+    printed = f"; it printed: {first.printed.strip()}" if first.printed.strip() else ""
+    return CalibError(
+        f"only {ok} of the {len(state.runs)} first runs have a value ({first.kind}: "
+        f"{first.reason}{printed})",
+        where=f"simulator {state.keeper.simulator.name}",
+        allowed="a simulator with values in at least half of its prior",
+        mend="correct the simulator, its limit of time, or priors that reach where it has none",
+    )
+
+
+def _next(state: State, z: Array, count: int, step: int) -> Array:
+    """Pick the runs to make next: where the emulator knows least of what the posterior needs."""
+    rng = generator(state.seed, state.label, "next", step)
+    middle, half = z.mean(axis=0), _CANDIDATES // 2
+    inner, wide = (z[rng.permutation(len(z))[:half]] for _ in range(2))
+    candidates = np.concatenate([inner, middle + _WIDER * (wide - middle)])
+    if state.emulator is None or state.region is None:
+        return candidates[:count]
+    edge = state.emulator.from_edge(inner)
+    # Where there may be no value the edge matters as much as the values do.
+    at_edge = inner[np.argsort(edge)[: count // 2]] if state.emulator.support else inner[:0]
+    candidates = candidates[state.emulator.holds(candidates)]
+    count -= len(at_edge)
+    unknown = state.row_variance(candidates)
+    x = state.region.coordinates(candidates)
+    lengths = np.full(x.shape[1], _APART)
+    picked: list[int] = []
+    for _ in range(min(count, len(candidates))):
+        i = int(np.argmax(unknown))
+        picked.append(i)
+        unknown = unknown * (1.0 - correlation(x, x[i : i + 1], lengths)[:, 0] ** 2)
+        unknown[i] = -1.0
+    return np.concatenate([candidates[picked], at_edge])
+
+
+def _check(state: State, z: Array, count: int, step: int) -> HeldOut | None:
+    """Predict runs at fresh draws before the emulator sees them, then let it."""
+    rng = generator(state.seed, state.label, "check", step)
+    theta = state.axes.natural(z[rng.choice(len(z), count, replace=False)])
+    values = state.carry_out(theta)
+    found = held_out(state, theta, values)
+    state.learn(theta, values)
+    return found

@@ -1,0 +1,138 @@
+"""How a simulator is emulated, and what became of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from calib.inference.problem import Problem
+from calib.models.base import Array
+from calib.models.simulators.emulator import Emulator
+from calib.models.simulators.runs import Run
+
+__all__ = ["Emulation", "EmulationSettings", "HeldOut"]
+
+
+@dataclass(frozen=True)
+class EmulationSettings:
+    """How many runs an emulator may take, and how good it has to be.
+
+    Parameters
+    ----------
+    runs : int
+        At most, those of an earlier call with the same cache among them.
+    first : int, optional
+        Of the space-filling design over the prior; ten for each parameter by default.
+    checks : int
+        Runs at draws of the posterior that the emulator is checked on before it sees them.
+    tolerance : float
+        Largest rms error of the emulator over rows and posterior, in sds of the noise. Runs are
+        made until a third of it is expected. At 0.1 the error adds 1 % to the variance of a
+        reading; it is in the likelihood besides.
+    nodes : int, optional
+        Conditions at which each run is evaluated, see `calib.inference.emulation.nodes`.
+    sequential : bool
+        Whether points are put where the posterior needs them; else the whole budget is one
+        Latin hypercube over the prior.
+    """
+
+    runs: int = 200
+    first: int | None = None
+    checks: int = 20
+    tolerance: float = 0.1
+    nodes: int | None = None
+    sequential: bool = True
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """The emulator against runs that it had not seen, at draws of the posterior.
+
+    Parameters
+    ----------
+    runs : int
+    rmse : float
+        Error over runs and rows, in sds of the noise.
+    z : ndarray
+        Errors of the coefficients in their predicted sds.
+    pit : ndarray
+        Where the true coefficients lie in their predicted distributions; even from 0 to 1 if the
+        emulator knows its error.
+    covered : float
+        Share of the coefficients within their central 90 % intervals.
+    """
+
+    runs: int
+    rmse: float
+    z: Array
+    pit: Array
+    covered: float
+
+
+@dataclass(frozen=True)
+class Emulation:
+    """A problem whose simulator is emulated, and how well.
+
+    Parameters
+    ----------
+    problem : Problem
+        To be calibrated: its model is the emulator.
+    emulator : Emulator
+    runs : tuple of Run
+        All that were asked for, those that failed among them.
+    held_out : HeldOut, optional
+        None where no run was left for it.
+    expected : float
+        The error that the emulator itself expects, as `HeldOut.rmse`.
+    between : float
+        Rms error at conditions between the nodes, in sds of the noise.
+    own_noise : float
+        Sd of the simulator's own noise on the scale of the response; zero if it is deterministic.
+    passed : bool
+        Whether the emulator is good enough.
+    reasons : tuple of str
+        Why not.
+    history : tuple of (int, float)
+        Runs, and the expected error then.
+    """
+
+    problem: Problem
+    emulator: Emulator
+    runs: tuple[Run, ...]
+    held_out: HeldOut | None
+    expected: float
+    between: float
+    own_noise: float
+    passed: bool
+    reasons: tuple[str, ...]
+    history: tuple[tuple[int, float], ...]
+
+    @property
+    def failed(self) -> tuple[Run, ...]:
+        """Runs without a value."""
+        return tuple(run for run in self.runs if not run.ok)
+
+    def document(self) -> Mapping[str, Any]:
+        """Return it for JSON."""
+        h = self.held_out
+        return {
+            "runs": len(self.runs),
+            "nodes": next(iter(self.emulator.training.nodes.values())).size,
+            "curves": len(self.emulator.curves),
+            "expected_error_in_noise_sds": self.expected,
+            "between_nodes_error_in_noise_sds": self.between,
+            "simulator_noise_sd": self.own_noise,
+            "passed": self.passed,
+            "reasons": list(self.reasons),
+            "history": [list(entry) for entry in self.history],
+            "held_out": None if h is None else {
+                "runs": h.runs, "rmse_in_noise_sds": h.rmse,
+                "covered_90": h.covered, "pit": h.pit.tolist(),
+            },
+            "failed": [
+                {"parameters": r.theta.tolist(), "kind": r.failure.kind,
+                 "reason": r.failure.reason, "printed": r.failure.printed}
+                for r in self.failed if r.failure is not None
+            ],
+        }  # fmt: skip

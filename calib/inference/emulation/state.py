@@ -1,0 +1,149 @@
+"""What is known of an emulation on the way: runs, emulator, posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.inference.problem import Problem
+from calib.inference.random import stream
+from calib.inference.sampling.mode import prior_widths
+from calib.inference.sampling.sampler import SamplerSettings, sample_posterior
+from calib.models.base import Array
+from calib.models.simulators.emulator import Axes, Emulator, Training, build_emulator
+from calib.models.simulators.emulator.model import emulated_model
+from calib.models.simulators.emulator.region import Region
+from calib.models.simulators.runs import Run, RunKeeper
+
+__all__ = ["State"]
+
+# Draws on the way to the next runs: for a picture, not for a result.
+_ROUGH = SamplerSettings(ensembles=2, walkers=64, steps=60, max_steps=60, keep=1024)
+_DRAWS = 512
+# A first guess of the noise is this part of the spread of the data.
+_FIRST_NOISE = 0.1
+# Errors below this part of the noise sd (per value) need not be looked into.
+_NEGLIGIBLE = 0.003
+
+
+class State:
+    """What is known so far.
+
+    Parameters
+    ----------
+    problem : Problem
+        Whose posterior the emulator is to serve.
+    keeper : RunKeeper
+    nodes : mapping of str to ndarray, shape (m,)
+        Conditions of every run.
+    seed : int
+    label : str
+        Names the random streams.
+    """
+
+    def __init__(
+        self, problem: Problem, keeper: RunKeeper, nodes: Mapping[str, Array], seed: int,
+        label: str = "emulate",
+    ) -> None:  # fmt: skip
+        self.problem, self.keeper, self.nodes = problem, keeper, nodes
+        self.seed, self.label = seed, label
+        entries = problem.priors.entries[:-1]
+        self.axes = _axes(problem)
+        self.free = np.array([not p.fixed for p in entries])
+        n = next(iter(nodes.values())).size
+        self.training = Training(np.zeros((0, len(entries))), np.zeros((0, n)), nodes)
+        self.runs: list[Run] = []
+        self.sigma = _FIRST_NOISE * float(problem.response.std())
+        self.emulator: Emulator | None = None
+        self.emulated = problem
+        self.mode: Array | None = None
+        self.region: Region | None = None
+        self.earlier: tuple[Region, ...] = ()
+
+    @classmethod
+    def beyond(cls, emulator: Emulator, problem: Problem, keeper: RunKeeper, seed: int) -> State:
+        """Return the state in which an emulator begins to serve another problem as well."""
+        state = cls(problem, keeper, emulator.training.nodes, seed, "extend")
+        state.training, state.emulator = emulator.training, emulator
+        state.earlier = emulator.regions
+        state._emulate(emulator)
+        return state
+
+    def _emulate(self, emulator: Emulator) -> None:
+        model = emulated_model(self.problem.bound.model, emulator)
+        self.emulated = replace(self.problem, bound=replace(self.problem.bound, model=model))
+
+    def carry_out(self, theta: Array, replicate: Sequence[int] | int = 0) -> Array:
+        """Make runs; return their values on the scale of the response, shape (k, m)."""
+        found = self.keeper.runs(theta, self.nodes, replicate)
+        self.runs += found
+        values = np.full((len(theta), self.training.values.shape[1]), np.nan)
+        output = self.problem.bound.model.output
+        with np.errstate(all="ignore"):
+            for i, run in enumerate(found):
+                if run.ok:
+                    values[i] = self.problem.bound.to_response(run.outputs[output])
+        return values
+
+    def learn(self, theta: Array, values: Array) -> None:
+        """Take runs into the training."""
+        self.training = self.training.plus(theta, values)
+
+    def rebuild(self) -> None:
+        """Fit the emulator again to all runs."""
+        regions = self.earlier if self.region is None else (*self.earlier, self.region)
+        known = self.emulator
+        self.emulator = build_emulator(
+            self.training, self.axes, _NEGLIGIBLE * self.sigma, regions,
+            scales=None if known is None else [f.scales for f in known.functions],
+            over=None if known is None or self.region is None else known.over,
+        )  # fmt: skip
+        self._emulate(self.emulator)
+
+    def sample(self, step: int) -> Array:
+        """Draw from the posterior under the emulator; return z of the draws, shape (k, d)."""
+        starts = None if self.mode is None else self.mode[None]
+        draws = sample_posterior(
+            self.emulated, stream(self.seed, self.label, step), starts=starts, settings=_ROUGH
+        )
+        self.mode = draws.mode
+        picked = np.linspace(0, len(draws.flat) - 1, _DRAWS).round().astype(int)
+        natural = self.emulated.theta(draws.flat[picked])
+        self.sigma = float(np.median(natural[:, -1]))
+        z = self.axes.of(natural[:, :-1])
+        self.region = _region(z, self.free)
+        return z
+
+    def error(self, z: Array) -> float:
+        """The emulator's expected error at draws, rms over the rows, in sds of the noise."""
+        rows = self.problem.response.size
+        return float(np.sqrt(self.row_variance(z).mean() / rows)) / self.sigma
+
+    def row_variance(self, z: Array) -> Array:
+        """Sum over the data's rows of the emulator's variance, shape (k,)."""
+        if self.emulator is None:
+            return np.full(len(z), np.inf)
+        _, variances = self.emulator.with_variance(self.axes.natural(z))
+        curves = self.emulator.curves_at(self.problem.conditions)[:, 1:]
+        return np.asarray(variances @ (curves**2).sum(axis=0))
+
+
+def _axes(problem: Problem) -> Axes:
+    entries = problem.priors.entries[:-1]
+    free = np.array([not p.fixed for p in entries])
+    width = np.ones(len(entries))
+    width[free] = prior_widths(problem.priors)[: int(free.sum())]
+    return Axes(
+        np.array([p.log and not p.fixed for p in entries]), np.array([p.loc for p in entries]),
+        width,
+    )  # fmt: skip
+
+
+def _region(z: Array, free: NDArray[np.bool_]) -> Region:
+    """A region in which draws are round; parameters that are held stay as they are."""
+    covariance = np.cov(z.T) if z.shape[1] > 1 else np.atleast_2d(np.var(z))
+    covariance = covariance + np.diag(np.where(free, 1e-8 * np.diag(covariance) + 1e-14, 1.0))
+    return Region(z.mean(axis=0), np.linalg.cholesky(covariance), 2.5 + np.sqrt(free.sum()))

@@ -1,0 +1,138 @@
+"""Emulate a simulator from a table of runs that were made already: nothing is carried out."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from calib.data.headers import parse_header
+from calib.errors import CalibError
+from calib.inference.emulation.judge import held_out, judged
+from calib.inference.emulation.settings import Emulation, EmulationSettings
+from calib.inference.emulation.state import State
+from calib.inference.problem import Problem
+from calib.inference.random import generator
+from calib.models.base import Array
+from calib.models.simulators.base import Failure, Simulator
+from calib.models.simulators.emulator import Training
+from calib.models.simulators.runs import Run, RunKeeper
+from calib.models.simulators.ways import TableWay
+
+__all__ = ["emulate_table", "read_runs"]
+
+# Every so many-th run is kept for the check.
+_EVERY = 5
+_LEAST = 8
+
+
+def emulate_table(
+    problem: Problem, simulator: Simulator, seed: int, settings: EmulationSettings
+) -> Emulation:
+    """Emulate from a table; every fifth run checks the emulator before it is taken in.
+
+    Raises
+    ------
+    CalibError
+        If the table lacks a column, has too few runs, or they have different conditions.
+    """
+    training = read_runs(simulator, problem)
+    state = State(problem, RunKeeper(simulator), training.nodes, seed)
+    state.runs = [
+        Run(t, {problem.bound.model.output: v})
+        if np.isfinite(v).all()
+        else Run(t, {}, Failure("nan", "the table has no value for it"))
+        for t, v in zip(training.theta, training.values, strict=True)
+    ]
+    order = generator(seed, "emulate", "table").permutation(len(training.theta))
+    checks, kept = order[::_EVERY], np.delete(order, np.s_[::_EVERY])
+    state.learn(training.theta[kept], training.values[kept])
+    for step in range(2):
+        state.rebuild()
+        z = state.sample(step)
+    state.rebuild()
+    history = [(len(training.theta), state.error(z))]
+    measured = held_out(state, training.theta[checks], training.values[checks])
+    state.learn(training.theta[checks], training.values[checks])
+    state.rebuild()
+    return judged(state, z, settings, measured, 0.0, history)
+
+
+def read_runs(simulator: Simulator, problem: Problem) -> Training:
+    """Read a table of runs: a row for each row of conditions of each run, in any order.
+
+    Raises
+    ------
+    CalibError
+        If a column is missing, a cell is no number, there are too few runs, or the runs do not
+        all have the same conditions.
+    """
+    way = simulator.way
+    if not isinstance(way, TableWay):
+        raise ValueError(f"{simulator.name} is no table")
+    columns = _columns(way.path)
+    output = next(
+        o for o in simulator.outputs if simulator.canonical(o.header) == problem.bound.model.output
+    )
+    needed = (*simulator.parameters, *simulator.conditions, output.column)
+    missing = [name for name in needed if name not in columns]
+    if missing:
+        raise CalibError(
+            f"the table of runs has no column {', '.join(missing)}", where=str(way.path),
+            allowed=", ".join(needed), mend="add it, or correct its name in the simulator file",
+        )  # fmt: skip
+    theta = np.stack([columns[name] for name in simulator.parameters], axis=1)
+    x = {
+        simulator.canonical(h): _in_canonical(h, columns[n])
+        for n, h in simulator.conditions.items()
+    }
+    y = _in_canonical(output.header, columns[output.column])
+    with np.errstate(all="ignore"):
+        y = problem.bound.to_response(y)
+    return _by_run(theta, x, y, way.path)
+
+
+def _in_canonical(header: str, values: Array) -> Array:
+    column = parse_header(header)
+    return values if column is None else column.to_canonical(values)
+
+
+def _by_run(theta: Array, x: Mapping[str, Array], y: Array, path: Path) -> Training:
+    vectors, of_run = np.unique(theta, axis=0, return_inverse=True)
+    # Every run's rows in one order of the conditions.
+    order = np.lexsort((*reversed(list(x.values())), of_run.ravel()))
+    m = len(y) // len(vectors)
+    rows = np.stack(list(x.values()), axis=1)[order]
+    same = m * len(vectors) == len(y) and np.allclose(
+        rows.reshape(len(vectors), m, -1), rows[:m], rtol=1e-9, atol=1e-12
+    )
+    if not same or len(vectors) < _LEAST:
+        raise CalibError(
+            f"there are {len(vectors)} runs, not all at the same conditions"
+            if not same
+            else f"there are {len(vectors)} runs",
+            where=str(path),
+            allowed=f"at least {_LEAST} runs, each at the same rows of conditions",
+            mend="make the runs at the same conditions",
+        )
+    nodes = {name: rows[:m, i].copy() for i, name in enumerate(x)}
+    return Training(vectors, y[order].reshape(len(vectors), m), nodes)
+
+
+def _columns(path: Path) -> dict[str, Array]:
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = [row for row in csv.reader(file) if row]
+    names = [cell.strip() for cell in rows[0]] if rows else []
+    found = {}
+    for i, name in enumerate(names):
+        try:
+            found[name] = np.array([_number(row[i]) for row in rows[1:]])
+        except (ValueError, IndexError):
+            continue  # a label, or a column that is not asked for
+    return found
+
+
+def _number(cell: str) -> float:
+    return float(cell) if cell.strip() else float("nan")

@@ -1,0 +1,51 @@
+"""The density of residuals where the prediction itself is known with an error.
+
+The noise is independent, the prediction's error is shared by the rows: a few curves B, (n, j),
+times independent normals of variances v. So the residuals r are normal with the covariance
+sigma^2 I + B diag(v) B', whose inverse and determinant follow from matrices of j on a side
+(Woodbury): with S = diag(sqrt v) and M = I + S B'B S / sigma^2,
+
+    ln N = -n ln sigma - 1/2 ln |M| - n/2 ln 2 pi
+           - (r'r - r'B S M^-1 S B'r / sigma^2) / (2 sigma^2)
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.models.base import Array
+
+__all__ = ["log_normal"]
+
+
+def log_normal(residuals: Array, sigma: Array, variances: Array, curves: Array) -> Array:
+    """Evaluate the log density.
+
+    Parameters
+    ----------
+    residuals : ndarray, shape (k, n)
+    sigma : ndarray, shape (k,)
+        Sd of the noise.
+    variances : ndarray, shape (k, j)
+        Of the coefficients of the prediction's error.
+    curves : ndarray, shape (n, j)
+
+    Returns
+    -------
+    ndarray, shape (k,)
+        NaN where a residual is.
+    """
+    n = residuals.shape[1]
+    squares = np.einsum("kn,kn->k", residuals, residuals)
+    bad = ~(np.isfinite(squares) & (sigma > 0.0))
+    scale = np.where(bad, 1.0, sigma)
+    root = np.sqrt(np.where(bad[:, None], 0.0, variances)) / scale[:, None]
+    gram = curves.T @ curves
+    m = np.eye(gram.shape[0]) + root[:, :, None] * gram * root[:, None, :]
+    lower = np.linalg.cholesky(m)
+    seen = np.where(bad[:, None], 0.0, residuals @ curves) * root
+    taken = np.square(np.linalg.solve(lower, seen[:, :, None])).sum(axis=(1, 2))
+    log_det = np.log(np.einsum("kjj->kj", lower)).sum(axis=1)
+    value = -n * (np.log(scale) + 0.5 * np.log(2.0 * np.pi)) - log_det
+    value -= 0.5 * (squares - taken) / scale**2
+    return np.where(bad, np.nan, value)

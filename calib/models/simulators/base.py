@@ -1,0 +1,238 @@
+"""What every simulator is: parameters and conditions in, outputs or a reason why not out.
+
+A run is one parameter vector at all conditions asked for. That is the unit that is counted, kept
+and limited in time, whatever carries it out (`calib.models.simulators.ways`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, Protocol
+
+import numpy as np
+
+from calib.data.headers import parse_header
+from calib.data.quantities import QUANTITIES
+from calib.data.units import convert
+from calib.errors import CalibError
+from calib.models.base import Array
+
+__all__ = ["Failure", "Output", "Result", "Simulator", "Way", "checked", "tail"]
+
+type Kind = Literal["time", "exit", "nan", "short", "unreadable", "error"]
+type Values = Mapping[str, Array]
+
+# Of what a failed run printed, so many characters are kept.
+_TAIL = 600
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A run without a value.
+
+    Parameters
+    ----------
+    kind : str
+        ``time`` (limit passed), ``exit`` (code other than zero), ``nan``, ``short`` (fewer values
+        than rows), ``unreadable`` (no output, or none that can be read), ``error`` (an exception).
+    reason : str
+        In a sentence.
+    printed : str
+        The tail of what it printed.
+    """
+
+    kind: Kind
+    reason: str
+    printed: str = ""
+
+
+type Result = Values | Failure
+
+
+class Way(Protocol):
+    """How a simulator is carried out."""
+
+    @property
+    def identity(self) -> str:
+        """What results depend on besides parameters and conditions, as text."""
+
+    @property
+    def runs(self) -> bool:
+        """Whether new runs can be made at all."""
+
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+        """Return the outputs by the simulator's own names, (n,) each, or why there are none."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """An output that is calibrated.
+
+    Parameters
+    ----------
+    header : str
+        A column name of `calib.data.quantities` in the simulator's own unit, such as
+        ``drawbar_pull_n``.
+    column : str
+        What the simulator calls it.
+    sigma : str
+        The prior of its noise, a table of a prior file as TOML text.
+    """
+
+    header: str
+    column: str
+    sigma: str
+
+
+@dataclass(frozen=True)
+class Simulator:
+    """A simulator of the user's own.
+
+    Parameters
+    ----------
+    name : str
+        Of the simulator, and of its model where there is one output.
+    way : Way
+    parameters : tuple of str
+    priors : str
+        TOML text of their tables ``parameters.NAME``, as in a prior file.
+    conditions : mapping of str to str
+        The simulator's own name of each condition to a header in the unit it takes.
+    outputs : tuple of Output
+    title : str
+    source : str
+        Whom it is after.
+    limit : float
+        Seconds a run may take.
+    retries : int
+        How often a run that failed is tried again.
+    deterministic : bool
+        Whether equal input gives equal output.
+    emulate : bool
+        Whether it is too slow to be evaluated by the sampler itself.
+    ranges : mapping of str to (float, float)
+        Bounds within which it may be asked, by canonical condition.
+    """
+
+    name: str
+    way: Way
+    parameters: tuple[str, ...]
+    priors: str
+    conditions: Mapping[str, str]
+    outputs: tuple[Output, ...]
+    title: str = ""
+    source: str = ""
+    limit: float = 600.0
+    retries: int = 1
+    deterministic: bool = True
+    emulate: bool = True
+    ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of whatever its results depend on besides parameters and conditions."""
+        what = [self.way.identity, list(self.parameters), dict(self.conditions)]
+        what += [[o.header, o.column] for o in self.outputs]
+        return hashlib.sha256(json.dumps(what).encode()).hexdigest()
+
+    def canonical(self, header: str) -> str:
+        """Return the canonical column of one of its headers.
+
+        Raises
+        ------
+        CalibError
+            If the header names no known quantity.
+        """
+        return _parsed(header, self.name)[0]
+
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """Canonical columns of its conditions."""
+        return tuple(self.canonical(header) for header in self.conditions.values())
+
+    def run(self, theta: Array, conditions: Mapping[str, Array]) -> Result:
+        """Carry out one run, tried again where it fails.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (d,)
+            In the order of `parameters`, in the units of the priors.
+        conditions : mapping of str to ndarray, shape (n,)
+            Canonical columns in canonical units.
+
+        Returns
+        -------
+        mapping of str to ndarray, shape (n,), or Failure
+            Outputs by canonical column, in canonical units.
+        """
+        parameters = dict(zip(self.parameters, map(float, theta), strict=True))
+        asked = self.asked(conditions)
+        n = next(iter(asked.values())).size
+        found: Result = Failure("error", "it was not run")
+        for _ in range(1 + self.retries):
+            found = self._once(parameters, asked, n)
+            if not isinstance(found, Failure):
+                return found
+        return found
+
+    def asked(self, conditions: Mapping[str, Array]) -> dict[str, Array]:
+        """Return conditions by the simulator's own names and in its units."""
+        found = {}
+        for name, header in self.conditions.items():
+            column, unit = _parsed(header, self.name)
+            found[name] = convert(conditions[column], QUANTITIES[column].unit, unit)
+        return found
+
+    def converted(self, found: Values, output: str) -> Array:
+        """Return an output, by its canonical column, in its canonical unit."""
+        own = next(o for o in self.outputs if self.canonical(o.header) == output)
+        unit = _parsed(own.header, self.name)[1]
+        return convert(found[own.column], unit, QUANTITIES[output].unit)
+
+    def _once(
+        self, parameters: Mapping[str, float], conditions: Mapping[str, Array], n: int
+    ) -> Result:
+        found = self.way.run(parameters, conditions)
+        if isinstance(found, Failure):
+            return found
+        canonical: dict[str, Array] = {}
+        for output in self.outputs:
+            values = checked(found, output.column, n)
+            if isinstance(values, Failure):
+                return values
+            column, unit = _parsed(output.header, self.name)
+            canonical[column] = convert(values, unit, QUANTITIES[column].unit)
+        return canonical
+
+
+def _parsed(header: str, name: str) -> tuple[str, str]:
+    found = parse_header(header, where=f"simulator {name}")
+    if found is None:
+        raise CalibError(
+            f"{header!r} is no known quantity with a unit", where=f"simulator {name}",
+            allowed=", ".join(QUANTITIES) + ", or the same in another unit",
+            mend="correct the name, or register a Quantity for it in a file given by --models",
+        )  # fmt: skip
+    return found.quantity.canonical, found.unit
+
+
+def checked(found: Values, column: str, n: int) -> Array | Failure:
+    """Return one output as n numbers, or why it is not that."""
+    if column not in found:
+        there = ", ".join(found) or "nothing"
+        return Failure("unreadable", f"there is no output {column!r}; it gave {there}")
+    values = np.asarray(found[column], dtype=np.float64).ravel()
+    if values.size != n:
+        return Failure("short", f"{column} has {values.size} values for {n} rows of conditions")
+    bad = np.flatnonzero(~np.isfinite(values))
+    if bad.size:
+        return Failure("nan", f"{column} is not finite in {bad.size} of {n} rows, first {bad[0]}")
+    return values
+
+
+def tail(printed: str) -> str:
+    """Return the end of what a run printed."""
+    return printed if len(printed) <= _TAIL else "..." + printed[-_TAIL:]

@@ -1,0 +1,277 @@
+"""An emulator: what a slow simulator would answer, how surely, and where it has no answer.
+
+Every run gives its output at the same m conditions (the nodes). Runs are a matrix, of which a few
+basis curves hold all that matters (Higdon et al. 2008, doi:10.1198/016214507000000888):
+
+    y(theta, x) = m(x) + sum_j c_j(theta) b_j(x)
+
+Each c_j is a function of the parameters alone, known at as many points as there are runs
+(`kriging`), the curves are functions of the conditions alone (`over`). One process over the whole
+prior is the best of what was tried: processes of their own near the posterior, in coordinates in
+which it is round, and parabolas in the place of the linear trend had two to four times its error
+there (five parameters, 60 to 200 runs). Of the two ways to emulate
+over conditions this is the better conditioned: one process over parameters and conditions would
+have a matrix of runs times nodes on a side (200 times 40: 8,000), nearly singular as neighbouring
+nodes say the same, in the place of matrices of 200 and of 40.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.models.base import Array
+from calib.models.simulators.emulator.kriging import Kriging, Scales, find_scales, krige
+from calib.models.simulators.emulator.over import Over, over_conditions
+from calib.models.simulators.emulator.region import Region
+from calib.models.simulators.emulator.support import Support, learn_support
+
+__all__ = ["Axes", "Emulator", "Training", "build_emulator"]
+
+_MOST_CURVES = 14
+# What is left out by the basis, in units of what may be neglected: near the posterior, elsewhere.
+_LEFT_OUT = (1.0, 20.0)
+# Runs whose curves the length scales over conditions are found from.
+_CURVES = 12
+# Fewer runs in a region do not tell what matters there.
+_FEW = 8
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Coordinates in which a prior is round.
+
+    Parameters
+    ----------
+    log : ndarray of bool, shape (d,)
+        Which parameters are taken as logarithms.
+    loc, width : ndarray, shape (d,)
+        Middle and sd of the prior.
+    """
+
+    log: NDArray[np.bool_]
+    loc: Array
+    width: Array
+
+    def of(self, theta: Array) -> Array:
+        """Return coordinates of natural parameters, shape (k, d) to (k, d)."""
+        with np.errstate(all="ignore"):
+            t = np.where(self.log, np.log(np.where(self.log, theta, 1.0)), theta)
+        return np.asarray((t - self.loc) / self.width)
+
+    def natural(self, z: Array) -> Array:
+        """Return natural parameters of coordinates."""
+        t = z * self.width + self.loc
+        return np.where(self.log, np.exp(np.minimum(np.where(self.log, t, 0.0), 700.0)), t)
+
+
+@dataclass(frozen=True)
+class Training:
+    """The runs that an emulator stands on, those that failed among them.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (k, d)
+        Natural parameters.
+    values : ndarray, shape (k, m)
+        Output on the scale of the response; NaN where a run failed.
+    nodes : mapping of str to ndarray, shape (m,)
+        Canonical conditions.
+    noisy : bool
+        Whether the simulator gives other values each time.
+    """
+
+    theta: Array
+    values: Array
+    nodes: Mapping[str, Array]
+    noisy: bool = False
+
+    @property
+    def ok(self) -> NDArray[np.bool_]:
+        """Which runs have values, shape (k,)."""
+        return np.asarray(np.isfinite(self.values).all(axis=1))
+
+    def plus(self, theta: Array, values: Array) -> Training:
+        """Return these runs and others."""
+        return Training(
+            np.concatenate([self.theta, theta]), np.concatenate([self.values, values]), self.nodes,
+            self.noisy,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Emulator:
+    """See the module.
+
+    Parameters
+    ----------
+    training : Training
+    axes : Axes
+    negligible : float
+        Error of the output that need not be looked into.
+    mean : ndarray, shape (m,)
+    curves : ndarray, shape (j, m)
+        Orthonormal.
+    functions : tuple of Kriging
+        The coefficients as functions of the parameters, in units of the prior's sds.
+    over : Over
+    regions : tuple of Region
+    support : Support, optional
+        Where there is a value at all.
+    near : tuple of (Region, Support)
+        The same, more finely, in regions in which some runs failed.
+    """
+
+    training: Training
+    axes: Axes
+    negligible: float
+    mean: Array
+    curves: Array
+    functions: tuple[Kriging, ...]
+    over: Over
+    regions: tuple[Region, ...]
+    support: Support | None
+    near: tuple[tuple[Region, Support], ...] = ()
+
+    @cached_property
+    def _weights(self) -> Array:
+        return self.over.weights(np.concatenate([self.mean[None], self.curves]))
+
+    def curves_at(self, conditions: Mapping[str, Array]) -> Array:
+        """Return mean and basis curves at conditions, shape (..., 1 + j)."""
+        return self.over.at(conditions, self._weights)
+
+    def coefficients(self, theta: Array) -> Array:
+        """Return the curves' coefficients, shape (k, d) to (k, j); NaN where there is no value."""
+        return self._evaluate(theta, variance=False)[0]
+
+    def with_variance(self, theta: Array) -> tuple[Array, Array]:
+        """Return coefficients and their variances, shape (k, j) each."""
+        means, variances = self._evaluate(theta, variance=True)
+        return means, np.zeros_like(means) if variances is None else variances
+
+    def _evaluate(self, theta: Array, *, variance: bool) -> tuple[Array, Array | None]:
+        z = self.axes.of(np.atleast_2d(theta))
+        known = np.isfinite(z).all(axis=1)
+        z = np.where(known[:, None], z, 0.0)
+        known &= self.holds(z)
+        if variance:
+            both = [f.mean_and_variance(z) for f in self.functions]
+            means = np.stack([mean for mean, _ in both], axis=1)
+            variances = np.stack([v for _, v in both], axis=1)
+        else:
+            means, variances = np.stack([f.mean(z) for f in self.functions], axis=1), None
+        means[~known] = np.nan
+        return means, variances
+
+    def holds(self, z: Array) -> NDArray[np.bool_]:
+        """Whether the simulator has a value at z, in units of the prior's sds; (k, d) to (k,)."""
+        return np.asarray(self.from_edge(z) >= 0.0)
+
+    def from_edge(self, z: Array) -> Array:
+        """Return what is zero where a value is as likely as none, and grows inside, (k,)."""
+        found = np.ones(len(z)) if self.support is None else self.support.latent(z)
+        for region, support in self.near:
+            inside = region.inside(z)
+            found[inside] = support.latent(region.coordinates(z[inside]))
+        return found
+
+    def predict(self, theta: Array, conditions: Mapping[str, Array]) -> Array:
+        """Return the output on the scale of the response, shape (k, n)."""
+        at = self.curves_at(conditions)
+        c = self.coefficients(theta)
+        if at.ndim == 2:
+            return np.asarray(at[:, 0] + c @ at[:, 1:].T)
+        return np.asarray(at[..., 0] + np.einsum("kj,knj->kn", c, at[..., 1:]))
+
+
+def _basis(near: Array, all_values: Array, negligible: float) -> tuple[Array, Array]:
+    """Return mean and orthonormal curves: first what near runs need, then what the others do."""
+    mean = near.mean(axis=0)
+    curves = np.zeros((0, mean.size))
+    for values, left in ((near, _LEFT_OUT[0]), (all_values, _LEFT_OUT[1])):
+        rest = values - mean
+        rest = rest - (rest @ curves.T) @ curves
+        _, size, right = np.linalg.svd(rest, full_matrices=False)
+        # Of the rest's mean square per value, what the curves from the i-th on would leave.
+        open_ = np.append(np.cumsum((size**2)[::-1])[::-1], 0.0) / values.size
+        count = int(np.argmax(open_ <= (left * negligible) ** 2))
+        curves = np.concatenate([curves, right[: min(count, _MOST_CURVES - len(curves))]])
+    if not len(curves):
+        curves = np.ones((1, mean.size)) / np.sqrt(mean.size)
+    return mean, curves
+
+
+def build_emulator(
+    training: Training,
+    axes: Axes,
+    negligible: float,
+    regions: Sequence[Region] = (),
+    *,
+    scales: Sequence[Scales] | None = None,
+    known: bool = False,
+    over: Over | None = None,
+) -> Emulator:
+    """Build an emulator on runs.
+
+    Parameters
+    ----------
+    training : Training
+    axes : Axes
+    negligible : float
+        Error of the output, on the scale of the response, that need not be looked into.
+    regions : sequence of Region
+        Where posteriors lie: the basis serves the runs there first, and edges beyond which there
+        is no value are looked at more closely.
+    scales : sequence of Scales, optional
+        Of an earlier emulator, for each curve: where to begin.
+    known : bool
+        Whether they are to be used as they are.
+    over : Over, optional
+        Of an earlier emulator on the same nodes.
+    """
+    ok = training.ok
+    z, values = axes.of(training.theta), training.values[training.ok]
+    inside = np.zeros(len(values), dtype=bool)
+    for region in regions:
+        inside |= region.inside(z[ok])
+    near = values[inside] if inside.sum() >= _FEW else values
+    mean, curves = _basis(near, values, negligible)
+    coefficients = (values - mean) @ curves.T
+    tiny = 0.3 * negligible * np.sqrt(mean.size)
+    functions = []
+    for j, y in enumerate(coefficients.T):
+        begin = scales[j] if scales is not None and j < len(scales) else None
+        if begin is None or not known:
+            begin = _scales(z[ok], y, tiny, training.noisy, begin)
+        functions.append(krige(z[ok], y, begin))
+    if over is None:
+        some = near[np.linspace(0, len(near) - 1, min(_CURVES, len(near))).astype(int)]
+        over = over_conditions(training.nodes, some)
+    return Emulator(
+        training, axes, negligible, mean, curves, tuple(functions), over, tuple(regions),
+        learn_support(z, ok), _near(z, ok, regions),
+    )  # fmt: skip
+
+
+def _scales(z: Array, y: Array, tiny: float, noisy: bool, begin: Scales | None) -> Scales:
+    if y.std() < tiny:
+        return Scales(np.full(z.shape[1], 3.0), 1e-3)
+    return find_scales(z, y, noisy=noisy, start=begin)
+
+
+def _near(
+    z: Array, ok: NDArray[np.bool_], regions: Sequence[Region]
+) -> tuple[tuple[Region, Support], ...]:
+    found = []
+    for region in regions:
+        inside = region.inside(z)
+        x = region.coordinates(z[inside])
+        support = learn_support(x, ok[inside]) if inside.any() else None
+        if support is not None:
+            found.append((region, support))
+    return tuple(found)

@@ -1,0 +1,248 @@
+"""A simulator file: TOML that says how a simulator is run, what it takes and what it gives."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+import shlex
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from calib.batch.plugins import run_file
+from calib.errors import CalibError
+from calib.models.simulators.base import Way
+from calib.models.simulators.exchange import check_template
+from calib.models.simulators.registered import SIMULATED, Simulated, declare
+from calib.models.simulators.ways import CallableWay, CommandWay, TableWay, UmbridgeWay
+
+__all__ = ["read_simulator", "register_file"]
+
+_WAYS = ("run", "python", "url", "table")
+
+
+class _Budget(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    runs: int = Field(default=200, ge=10)
+    first: int | None = Field(default=None, ge=4)
+    checks: int = Field(default=20, ge=0)
+    tolerance: float = Field(default=0.1, gt=0.0)
+    nodes: int | None = Field(default=None, ge=2)
+
+
+class _File(BaseModel):
+    """What a simulator file may say; exactly one of run, python, url and table."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    name: str = Field(pattern=r"^[A-Za-z]\w*$")
+    title: str = ""
+    source: str = ""
+    run: str = ""
+    python: str = ""
+    url: str = ""
+    model: str = ""
+    table: str = ""
+    input: Literal["json", "csv", "template"] = "json"
+    template: str = ""
+    output: Literal["json", "csv", "pattern"] = "json"
+    rows: Literal["all", "each"] = "all"
+    batched: bool = True
+    limit: float = Field(default=600.0, gt=0.0)
+    retries: int = Field(default=1, ge=0)
+    deterministic: bool = True
+    emulate: bool = True
+    cache: str = ""
+    conditions: dict[str, str] = Field(min_length=1)
+    outputs: dict[str, str] = Field(min_length=1)
+    patterns: dict[str, str] = {}
+    ranges: dict[str, tuple[float, float]] = {}
+    emulator: _Budget = _Budget()
+    parameters: dict[str, dict[str, Any]] = Field(min_length=1)
+
+
+def register_file(path: Path) -> Simulated:
+    """Read a simulator file and make its models known, once.
+
+    Raises
+    ------
+    CalibError
+        See `read_simulator`.
+    """
+    found = read_simulator(path)
+    known = SIMULATED.get(found.name)
+    if known is not None and known.simulator.digest == found.simulator.digest:
+        return known
+    found.register()
+    return found
+
+
+def read_simulator(path: Path) -> Simulated:
+    """Read a simulator file.
+
+    Raises
+    ------
+    CalibError
+        Naming the file and the key: it is not TOML, a key is unknown, missing or impossible, a
+        parameter has no prior, the command does not exist, or a template lacks a place.
+    """
+    path = Path(path).resolve()
+    try:
+        text = path.read_text(encoding="utf-8")
+        content = tomllib.loads(text)
+    except OSError as error:
+        raise CalibError(
+            f"the simulator file cannot be read ({error.strerror})", where=str(path),
+            mend="give the path of a TOML file",
+        ) from None  # fmt: skip
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
+    try:
+        file = _File.model_validate(content)
+    except ValidationError as error:
+        raise _explain(error, path) from None
+    priors = "\n".join(_table(name, table) for name, table in file.parameters.items())
+    try:
+        return declare(
+            file.name, _way(file, path), priors, file.conditions, file.outputs,
+            folder=path.parent / (file.cache or f"{path.stem}.runs"),
+            budget=file.emulator.model_dump(), title=file.title, source=file.source,
+            limit=file.limit, retries=file.retries, deterministic=file.deterministic,
+            emulate=file.emulate, ranges=_ranges(file, path),
+        )  # fmt: skip
+    except CalibError as error:
+        where = str(path) if error.where is None else f"{path}, {error.where}"
+        found = where if str(path) not in (error.where or "") else error.where
+        raise CalibError(
+            error.message, where=found, allowed=error.allowed, mend=error.mend
+        ) from None
+
+
+def _table(name: str, table: dict[str, Any]) -> str:
+    import json
+
+    lines = "\n".join(f"{key} = {json.dumps(v)}" for key, v in table.items())
+    return f"[parameters.{name}]\n{lines}\n"
+
+
+def _explain(error: ValidationError, path: Path) -> CalibError:
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    known = list((_Budget if key.startswith("emulator.") else _File).model_fields)
+    mend = "correct it"
+    if first["type"] == "extra_forbidden":
+        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
+        mend = f"was {near[0]} meant?" if near else "correct its name, or leave it out"
+        return CalibError(
+            f"unknown key {key}", where=str(path), allowed=", ".join(known), mend=mend
+        )
+    if first["type"] == "missing":
+        return CalibError(f"the key {key} is missing", where=str(path), mend="add it")
+    return CalibError(
+        f"{first['msg']} (found {first.get('input')!r})", where=f"{path}, {key}", mend=mend
+    )
+
+
+def _ranges(file: _File, path: Path) -> dict[str, tuple[float, float]]:
+    """Ranges by canonical condition; they are given by the simulator's own names, in its units."""
+    from calib.data.headers import parse_header
+
+    found = {}
+    for name, (low, high) in file.ranges.items():
+        column = parse_header(file.conditions.get(name, ""))
+        if column is None or not low < high:
+            raise CalibError(
+                f"the range [{low:g}, {high:g}] is of no condition, or not from low to high",
+                where=f"{path}, ranges.{name}", allowed=", ".join(file.conditions),
+                mend="name a condition, and give [low, high]",
+            )  # fmt: skip
+        low, high = (float(column.to_canonical(v)) for v in (low, high))
+        found[column.quantity.canonical] = (low, high)
+    return found
+
+
+def _way(file: _File, path: Path) -> Way:
+    given = [key for key in _WAYS if getattr(file, key)]
+    if len(given) != 1:
+        raise CalibError(
+            f"it is not clear how to run it: {', '.join(given) or 'nothing'} is given",
+            where=str(path), allowed=f"exactly one of {', '.join(_WAYS)}",
+            mend="give one of them",
+        )  # fmt: skip
+    makers: dict[str, Callable[[_File, Path], Way]] = {
+        "run": _command, "python": _callable, "url": _umbridge, "table": _of_table,
+    }  # fmt: skip
+    return makers[given[0]](file, path)
+
+
+def _command(file: _File, path: Path) -> CommandWay:
+    arguments = tuple(shlex.split(file.run))
+    template = ""
+    if file.input == "template" or file.template:
+        template = _template(file, path)
+    if file.output == "pattern" and set(file.patterns) != set(file.outputs):
+        raise CalibError(
+            "patterns and outputs differ", where=f"{path}, patterns",
+            allowed=", ".join(file.outputs), mend="give each output a regular expression",
+        )  # fmt: skip
+    way = CommandWay(
+        arguments, path.parent, "template" if template else file.input, template, file.output,
+        file.patterns, file.rows == "each", file.limit,
+    )  # fmt: skip
+    if way.program is None:
+        raise CalibError(
+            f"there is no program {arguments[0]!r}", where=f"{path}, run",
+            allowed=f"a program on the search path, or a path relative to {path.parent.name}/",
+            mend="build or install it, or correct its path",
+        )  # fmt: skip
+    return way
+
+
+def _template(file: _File, path: Path) -> str:
+    where = path.parent / file.template
+    try:
+        template = where.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise CalibError(
+            f"the template cannot be read ({error})", where=f"{path}, template",
+            mend="give the path of a text file",
+        ) from None  # fmt: skip
+    noise = {"sigma", *(f"sigma_{own}" for own in file.outputs)}
+    names = tuple(p for p in file.parameters if p not in noise)
+    check_template(template, (*names, *file.conditions), f"{path}, template {file.template}")
+    return template
+
+
+def _callable(file: _File, path: Path) -> CallableWay:
+    script, _, name = file.python.rpartition(":")
+    function = getattr(run_file(path.parent / script, "simulator"), name, None)
+    if not callable(function):
+        raise CalibError(
+            f"there is no function {name!r} in {script}", where=f"{path}, python",
+            allowed='python = "file.py:function"', mend="correct the name",
+        )  # fmt: skip
+    return CallableWay(function, tuple(file.outputs), file.batched)
+
+
+def _umbridge(file: _File, path: Path) -> UmbridgeWay:
+    if not file.model:
+        raise CalibError(
+            "the model of the server is not named", where=f"{path}, model",
+            allowed='model = "NAME"', mend="add it: GET /Info of the server lists them",
+        )  # fmt: skip
+    rows: Literal["each", "config"] = "each" if file.rows == "each" else "config"
+    return UmbridgeWay(file.url, file.model, tuple(file.outputs), rows, file.limit)
+
+
+def _of_table(file: _File, path: Path) -> TableWay:
+    where = path.parent / file.table
+    try:
+        content = where.read_bytes()
+    except OSError as error:
+        raise CalibError(
+            f"the table of runs cannot be read ({error.strerror})", where=f"{path}, table",
+            mend="give the path of a CSV file",
+        ) from None  # fmt: skip
+    return TableWay(where, hashlib.sha256(content).hexdigest())

@@ -1,0 +1,243 @@
+"""Simulators by the names of their models, and the models that stand for them."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.data.headers import parse_header
+from calib.data.registry import Registry
+from calib.errors import CalibError
+from calib.models.base import Array, Conditions, Model
+from calib.models.simulators.base import Failure, Output, Simulator
+from calib.models.simulators.ways import CallableWay
+
+__all__ = [
+    "SIMULATED", "Simulated", "declare", "from_callable", "models_of", "simulated_by",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """A simulator that is calibrated as one or several models.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    folder : Path, optional
+        Where its runs are kept; in memory without.
+    budget : mapping of str to number
+        Fields of `calib.inference.emulation.EmulationSettings` that the user gave.
+    """
+
+    simulator: Simulator
+    folder: Path | None = None
+    budget: Mapping[str, float] | None = None
+
+    @property
+    def name(self) -> str:
+        """The simulator's."""
+        return self.simulator.name
+
+    @property
+    def models(self) -> tuple[str, ...]:
+        """Names of its models, in the order of its outputs."""
+        return tuple(model.name for model in models_of(self.simulator))
+
+    def register(self) -> None:
+        """Make the simulator and its models known.
+
+        Raises
+        ------
+        CalibError
+            If a declaration does not hold together, or a name is taken.
+        """
+        for model in models_of(self.simulator):
+            model.register()
+        SIMULATED.add(self)
+
+
+SIMULATED: Registry[Simulated] = Registry("simulator", lambda one: one.name)
+
+
+def simulated_by(model: str) -> Simulated | None:
+    """Return the simulator behind a model; None if there is none."""
+    return next((s for s in SIMULATED.values() if model in s.models), None)
+
+
+@dataclass(frozen=True)
+class _Direct:
+    """Asks a simulator for each parameter vector: only where it is quick enough for that."""
+
+    simulator: Simulator
+    output: str
+
+    def __call__(self, theta: Array, conditions: Conditions) -> Array:
+        if self.simulator.emulate:
+            raise CalibError(
+                f"the simulator {self.simulator.name} is not run for each parameter vector that a "
+                "sampler asks for",
+                allowed="calib.emulate(problem), or a verb that takes --simulator",
+                mend="emulate it first, or declare it with emulate = false",
+            )
+        way = self.simulator.way
+        if isinstance(way, CallableWay) and way.batched:
+            asked = self.simulator.asked(conditions)
+            return self.simulator.converted(way.call(theta, asked), self.output)
+        found = [self.simulator.run(t, conditions) for t in theta]
+        empty = np.full(next(iter(conditions.values())).shape[-1], np.nan)
+        return np.stack([empty if isinstance(f, Failure) else f[self.output] for f in found])
+
+
+def models_of(simulator: Simulator) -> tuple[Model, ...]:
+    """Return a model for each output of a simulator."""
+    return tuple(_model(simulator, output) for output in simulator.outputs)
+
+
+def _model(simulator: Simulator, output: Output) -> Model:
+    parsed = parse_header(output.header, where=f"simulator {simulator.name}")
+    column = simulator.canonical(output.header)
+    alone = len(simulator.outputs) == 1 or parsed is None
+    name = simulator.name if alone else f"{simulator.name}_{parsed.quantity.stem}"  # type: ignore[union-attr]
+    log = parsed is not None and parsed.quantity.log_scale
+    return Model(
+        name=name,
+        title=simulator.title or f"The simulator {simulator.name}",
+        output=column,
+        conditions=simulator.takes,
+        parameters=simulator.parameters,
+        predict=_Direct(simulator, column),
+        response="log" if log else "identity",
+        source=simulator.source,
+        parametrisation="The parameters of the simulator are sampled.",
+        priors=f'model = "{name}"\n\n{simulator.priors}\n{output.sigma}',
+    )
+
+
+def from_callable(
+    f: Callable[..., Any],
+    *,
+    parameters: str,
+    conditions: Mapping[str, str] | Sequence[str],
+    output: str | Mapping[str, str],
+    name: str = "",
+    batched: bool = True,
+    emulate: bool = False,
+    folder: Path | None = None,
+    deterministic: bool = True,
+    **budget: float,
+) -> Simulated:
+    """Make a simulator of a Python function; `calib.register` makes its models known.
+
+    Parameters
+    ----------
+    f : callable
+        ``(theta, conditions) -> output``: theta of shape (k, d), or (d,) if not `batched`, in the
+        order of the priors; conditions by name, shape (n,) each. Returns (k, n) or (n,), or a
+        mapping of such by the names of `output`.
+    parameters : str
+        Priors as the TOML text of a prior file: ``[parameters.NAME]`` each, and for the noise of
+        the one output ``[parameters.sigma]``, or of several ``[parameters.sigma_OUTPUT]``.
+    conditions : mapping of str to str, or sequence of str
+        The function's own name of each condition to a column name with the unit that it takes;
+        the column names alone where both are the same.
+    output : str or mapping of str to str
+        A column name with the unit of what it returns; of several, by the function's own names.
+    name : str, optional
+        That of the function by default.
+    batched : bool
+    emulate : bool
+        Whether it is too slow for the tens of thousands of calls of a sampler.
+    folder : Path, optional
+        Where runs are kept, if it is emulated.
+    deterministic : bool
+        Whether equal input gives equal output.
+    **budget
+        ``runs``, ``first``, ``checks``, ``tolerance``, ``nodes``: see
+        `calib.inference.emulation.EmulationSettings`.
+
+    Returns
+    -------
+    Simulated
+
+    Raises
+    ------
+    CalibError
+        If the priors are not valid TOML, or a column names no known quantity.
+    """
+    named = {output: output} if isinstance(output, str) else dict(output)
+    taken = dict(conditions) if isinstance(conditions, Mapping) else {c: c for c in conditions}
+    return declare(
+        name or getattr(f, "__name__", "simulator"),
+        CallableWay(f, tuple(named), batched),
+        parameters, taken, named, folder=folder, emulate=emulate, deterministic=deterministic,
+        budget=budget,
+    )  # fmt: skip
+
+
+def declare(
+    name: str, way: Any, priors: str, conditions: Mapping[str, str], outputs: Mapping[str, str],
+    *, folder: Path | None = None, budget: Mapping[str, float] | None = None, **details: Any,
+) -> Simulated:  # fmt: skip
+    """Put a simulator together from its parts.
+
+    Parameters
+    ----------
+    name : str
+    way : Way
+    priors : str
+        TOML text of all prior tables, those of the noise among them.
+    conditions, outputs : mapping of str to str
+        The simulator's own names to headers.
+    folder : Path, optional
+    budget : mapping, optional
+    **details
+        Other fields of `Simulator`.
+    """
+    tables = split_tables(priors, name)
+    sigmas = {own: "sigma" if len(outputs) == 1 else f"sigma_{own}" for own in outputs}
+    missing = [s for s in sigmas.values() if s not in tables]
+    if missing:
+        raise CalibError(
+            f"there is no prior of the noise: {', '.join(missing)}", where=f"simulator {name}",
+            allowed=f"[parameters.{missing[0]}] with dist, unit, reason and source",
+            mend="add it: how far may readings lie from a perfect simulator's?",
+        )  # fmt: skip
+    declared = tuple(
+        Output(header, own, tables[sigmas[own]].replace(sigmas[own], "sigma", 1))
+        for own, header in outputs.items()
+    )
+    parameters = tuple(t for t in tables if t not in sigmas.values())
+    text = "\n".join(tables[t] for t in parameters)
+    simulator = Simulator(name, way, parameters, text, conditions, declared, **details)
+    for header in (*conditions.values(), *outputs.values()):
+        simulator.canonical(header)
+    return Simulated(simulator, folder, budget)
+
+
+def split_tables(priors: str, name: str) -> dict[str, str]:
+    """Return the text of each table ``[parameters.NAME]``."""
+    try:
+        known = tomllib.loads(priors).get("parameters", {})
+    except tomllib.TOMLDecodeError as error:
+        raise CalibError(
+            f"the priors are not valid TOML: {error}", where=f"simulator {name}",
+            mend="correct that line",
+        ) from None  # fmt: skip
+    if not isinstance(known, Mapping) or not known:
+        raise CalibError(
+            "there are no parameters with priors", where=f"simulator {name}",
+            allowed="[parameters.NAME] with dist, unit, reason and source", mend="add them",
+        )  # fmt: skip
+    return {key: _written(key, table) for key, table in known.items()}
+
+
+def _written(name: str, table: Mapping[str, Any]) -> str:
+    lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items()]
+    return "\n".join([f"[parameters.{name}]", *lines]) + "\n"

@@ -1,0 +1,174 @@
+"""Every run kept: on disk by its content, done where it is missing, in parallel where that pays."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.batch.tasks import run_tasks
+from calib.models.base import Array
+from calib.models.simulators.base import Failure, Result, Simulator
+
+__all__ = ["Run", "RunKeeper"]
+
+type Progress = Callable[[int, int], None]
+
+# Processes of their own take some seconds to start: only for batches that take longer here.
+_WORTH_SECONDS = 8.0
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that was made.
+
+    Parameters
+    ----------
+    theta : ndarray, shape (d,)
+    outputs : mapping of str to ndarray, shape (n,)
+        By canonical column; empty where it failed.
+    failure : Failure, optional
+    """
+
+    theta: Array
+    outputs: Mapping[str, Array]
+    failure: Failure | None = None
+
+    @property
+    def ok(self) -> bool:
+        """Whether there is a value."""
+        return self.failure is None
+
+
+@dataclass(frozen=True)
+class _Item:
+    """What one task works on."""
+
+    simulator: Simulator
+    theta: Array
+    conditions: Mapping[str, Array]
+
+
+@dataclass
+class RunKeeper:
+    """Carries runs out, those that were not made before.
+
+    Parameters
+    ----------
+    simulator : Simulator
+    folder : Path, optional
+        Where runs are kept, each a file named after a hash of simulator, parameters and
+        conditions, written whole or not at all; without one, in memory.
+    workers : int
+        Processes on this machine, used for batches that take more than a few seconds.
+    scheduler : str, optional
+        A Dask scheduler in their place.
+    progress : callable, optional
+        Called with runs done and runs asked for, of each batch.
+
+    Attributes
+    ----------
+    made, kept : int
+        Runs carried out, and runs that were there.
+    seconds : float
+        That a run has typically taken; zero while none was made.
+    """
+
+    simulator: Simulator
+    folder: Path | None = None
+    workers: int = 1
+    scheduler: str | None = None
+    progress: Progress | None = None
+    made: int = 0
+    kept: int = 0
+    seconds: float = 0.0
+    _memory: dict[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def runs(
+        self, thetas: Array, conditions: Mapping[str, Array], replicate: Sequence[int] | int = 0
+    ) -> list[Run]:
+        """Return runs in the order asked for.
+
+        Parameters
+        ----------
+        thetas : ndarray, shape (k, d)
+        conditions : mapping of str to ndarray, shape (n,)
+            Canonical columns.
+        replicate : int or sequence of int
+            Tells runs with equal input apart.
+
+        Raises
+        ------
+        CalibError
+            If the folder cannot be written, or is in use by another process.
+        """
+        replicates = np.broadcast_to(np.asarray(replicate), (len(thetas),))
+        names = [_name(t, conditions, r) for t, r in zip(thetas, replicates, strict=True)]
+        items = {
+            name: _Item(self.simulator, theta, conditions)
+            for name, theta in zip(names, thetas, strict=True)
+        }
+        found = self._in_memory(items) if self.folder is None else self._on_disk(items)
+        return [_run(found[name], t) for name, t in zip(names, thetas, strict=True)]
+
+    def _in_memory(self, items: Mapping[str, _Item]) -> Mapping[str, Mapping[str, Any]]:
+        for name, item in items.items():
+            if name in self._memory:
+                self.kept += 1
+            else:
+                self._memory[name] = _carry_out(item)
+                self.made += 1
+        return self._memory
+
+    def _on_disk(self, items: Mapping[str, _Item]) -> Mapping[str, Mapping[str, Any]]:
+        folder = Path(self.folder or ".") / self.simulator.digest[:16]
+        outcome = run_tasks(
+            _carry_out, items, folder, workers=self._workers(len(items)),
+            scheduler=self.scheduler, progress=self.progress,
+        )  # fmt: skip
+        new = [s for n, s in outcome.seconds.items() if n not in outcome.resumed]
+        self.seconds = float(np.median(new)) if new else self.seconds
+        self.kept += len(outcome.resumed)
+        self.made += len(items) - len(outcome.resumed)
+        found: dict[str, Mapping[str, Any]] = {
+            name: {"failure": ["error", error, ""]} for name, error in outcome.failed.items()
+        }
+        for name in outcome.done:
+            found[name] = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
+        return found
+
+    def _workers(self, count: int) -> int:
+        return self.workers if self.seconds * count > _WORTH_SECONDS else 1
+
+
+def _name(theta: Array, conditions: Mapping[str, Array], replicate: int) -> str:
+    digest = hashlib.sha256(theta.astype("<f8").tobytes())
+    for column, values in sorted(conditions.items()):
+        digest.update(f"{column}\0{values.size}\0".encode() + values.astype("<f8").tobytes())
+    return f"{digest.hexdigest()[:40]}-{int(replicate)}"
+
+
+def _carry_out(item: _Item) -> dict[str, Any]:
+    """Make one run and describe it for JSON."""
+    found: Result = item.simulator.run(item.theta, item.conditions)
+    described: dict[str, Any] = {
+        "parameters": dict(zip(item.simulator.parameters, map(float, item.theta), strict=True))
+    }
+    if isinstance(found, Failure):
+        return described | {"failure": [found.kind, found.reason, found.printed]}
+    return described | {"outputs": {name: values.tolist() for name, values in found.items()}}
+
+
+def _run(described: Mapping[str, Any], theta: Array) -> Run:
+    if "failure" in described:
+        return Run(theta, {}, Failure(*described["failure"]))
+    outputs: dict[str, NDArray[np.float64]] = {
+        name: np.array(values, dtype=np.float64) for name, values in described["outputs"].items()
+    }
+    return Run(theta, outputs)

@@ -1,0 +1,304 @@
+"""Ways to carry out a simulator: a Python function, a command, an UM-Bridge server, a table."""
+
+from __future__ import annotations
+
+import hashlib
+import inspect
+import json
+import shutil
+import tempfile
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from calib.models.base import Array
+from calib.models.simulators.base import Failure, Result, tail
+from calib.models.simulators.exchange import filled, input_csv, input_json, output_of_text
+from calib.models.simulators.process import run_program
+
+__all__ = ["CallableWay", "CommandWay", "TableWay", "UmbridgeWay"]
+
+
+@dataclass(frozen=True)
+class CallableWay:
+    """A Python function.
+
+    Parameters
+    ----------
+    function : callable
+        ``(theta, conditions) -> output``: theta of shape (k, d), conditions of shape (n,) by the
+        simulator's own names; returns (k, n), or a mapping of such by output. With `batched`
+        false theta has the shape (d,), the output (n,).
+    columns : tuple of str
+        The outputs.
+    batched : bool
+    """
+
+    function: Callable[[Array, Mapping[str, Array]], Any]
+    columns: tuple[str, ...]
+    batched: bool = True
+
+    @property
+    def identity(self) -> str:
+        """The function's name and source."""
+        try:
+            source = inspect.getsource(self.function)
+        except (OSError, TypeError):
+            source = repr(self.function)
+        return f"callable {getattr(self.function, '__qualname__', '')} {self.batched}\n{source}"
+
+    @property
+    def runs(self) -> bool:
+        """Always."""
+        return True
+
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+        """Call it for one parameter vector."""
+        theta = np.array(list(parameters.values()))
+        try:
+            found = self.call(theta[None] if self.batched else theta, conditions)
+        except Exception as error:
+            return Failure("error", f"{type(error).__name__}: {error}")
+        return {name: values.ravel() for name, values in found.items()}
+
+    def call(self, theta: Array, conditions: Mapping[str, Array]) -> dict[str, Array]:
+        """Call it, and name what it returns."""
+        found = self.function(theta, conditions)
+        if not isinstance(found, Mapping):
+            found = dict.fromkeys(self.columns[:1], found)
+        return {name: np.asarray(v, dtype=np.float64) for name, v in found.items()}
+
+
+@dataclass(frozen=True)
+class CommandWay:
+    """A program, run without a shell in a scratch folder of its own.
+
+    Parameters
+    ----------
+    arguments : tuple of str
+        With ``{input}`` and ``{output}`` for the paths of the two files; without ``{output}``
+        what it prints is read.
+    folder : Path
+        Of the simulator file: a program named by a relative path is looked for here.
+    takes : {"json", "csv", "template"}
+    template : str
+        The input in the program's own format, ``@name@`` where a value belongs.
+    gives : {"json", "csv", "pattern"}
+    patterns : mapping of str to str
+    each_row : bool
+        Whether the program is run for each row of conditions by itself.
+    limit : float
+        Seconds for each time it is run.
+    """
+
+    arguments: tuple[str, ...]
+    folder: Path
+    takes: Literal["json", "csv", "template"] = "json"
+    template: str = ""
+    gives: Literal["json", "csv", "pattern"] = "json"
+    patterns: Mapping[str, str] = field(default_factory=dict)
+    each_row: bool = False
+    limit: float = 600.0
+
+    @property
+    def identity(self) -> str:
+        """The command, the formats, and the content of the files that it names."""
+        named = [self._found(a) for a in self.arguments]
+        files = [hashlib.sha256(p.read_bytes()).hexdigest() if p else "" for p in named]
+        what = [self.arguments, files, self.takes, self.template, self.gives]
+        return json.dumps(["command", *what, dict(self.patterns), self.each_row])
+
+    @property
+    def runs(self) -> bool:
+        """Always."""
+        return True
+
+    @property
+    def program(self) -> str | None:
+        """The program's path; None if there is none."""
+        found = self._found(self.arguments[0])
+        return str(found) if found else shutil.which(self.arguments[0])
+
+    def _found(self, argument: str) -> Path | None:
+        """Return the file beside the simulator file that an argument names."""
+        if "{" in argument:
+            return None
+        path = (self.folder / argument).resolve()
+        return path if path.is_file() else None
+
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+        """Run it once, or once for each row."""
+        if not self.each_row:
+            return self._one(parameters, conditions)
+        found: list[Mapping[str, Array]] = []
+        for i in range(next(iter(conditions.values())).size):
+            one = self._one(parameters, {name: v[i : i + 1] for name, v in conditions.items()})
+            if isinstance(one, Failure):
+                return Failure(one.kind, f"row {i} of the conditions: {one.reason}", one.printed)
+            found.append(one)
+        common = set(found[0]).intersection(*found)
+        return {name: np.concatenate([one[name] for one in found]) for name in common}
+
+    def _one(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+        with tempfile.TemporaryDirectory(prefix="calib-run-", ignore_cleanup_errors=True) as name:
+            scratch = Path(name)
+            given, taken = scratch / f"input.{self._ending}", scratch / f"output.{self.gives}"
+            given.write_text(self._input(parameters, conditions), encoding="utf-8")
+            paths = {"{input}": str(given), "{output}": str(taken)}
+            printed = run_program(self._arguments(paths), scratch, self.limit)
+            if isinstance(printed, Failure):
+                return printed
+            return self._read(taken, printed)
+
+    def _read(self, taken: Path, printed: str) -> Result:
+        text = printed
+        if any("{output}" in a for a in self.arguments):
+            try:
+                text = taken.read_text(encoding="utf-8")
+            except (OSError, UnicodeDecodeError):
+                return Failure("unreadable", "it left no readable output file", tail(printed))
+        found = output_of_text(text, self.gives, self.patterns)
+        if isinstance(found, Failure):
+            return Failure(found.kind, found.reason, tail(printed))
+        return found
+
+    @property
+    def _ending(self) -> str:
+        return "txt" if self.takes == "template" else self.takes
+
+    def _arguments(self, paths: Mapping[str, str]) -> list[str]:
+        written = []
+        for argument in self.arguments:
+            there = self._found(argument)
+            for mark, path in paths.items():
+                argument = argument.replace(mark, path)
+            written.append(str(there) if there else argument)
+        return written
+
+    def _input(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> str:
+        if self.takes == "template":
+            return filled(self.template, parameters, conditions)
+        return (input_json if self.takes == "json" else input_csv)(parameters, conditions)
+
+
+@dataclass(frozen=True)
+class UmbridgeWay:
+    """A model behind an UM-Bridge server (protocol 1.0, doi:10.21105/joss.04748).
+
+    The protocol is one POST of JSON. The client of the package `umbridge` has no limit of time and
+    stops at a NaN in a reply, so it is spoken here.
+
+    Parameters
+    ----------
+    url, model : str
+    columns : tuple of str
+        The outputs, in the order of the server's output vectors.
+    rows : {"each", "config"}
+        ``each``: one call for each row of conditions, parameters then conditions as one input
+        vector, an output vector of one number each. ``config``: one call, the conditions as lists
+        in the call's ``config``, an output vector of n numbers each.
+    limit : float
+        Seconds for each call.
+    """
+
+    url: str
+    model: str
+    columns: tuple[str, ...]
+    rows: Literal["each", "config"] = "each"
+    limit: float = 600.0
+
+    @property
+    def identity(self) -> str:
+        """Where it is and how it is called."""
+        return json.dumps(["umbridge", self.url, self.model, self.columns, self.rows])
+
+    @property
+    def runs(self) -> bool:
+        """Always."""
+        return True
+
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+        """Call the server."""
+        theta = list(parameters.values())
+        lists = {name: values.tolist() for name, values in conditions.items()}
+        if self.rows == "config":
+            calls = [self.ask("Evaluate", {"input": [theta], "config": lists})]
+        else:
+            calls = []
+            for row in zip(*lists.values(), strict=True):
+                calls.append(self.ask("Evaluate", {"input": [[*theta, *row]], "config": {}}))
+                if isinstance(calls[-1], Failure):
+                    break
+        outputs: dict[str, list[float]] = {name: [] for name in self.columns}
+        for reply in calls:
+            if isinstance(reply, Failure):
+                return reply
+            vectors = reply.get("output")
+            if not isinstance(vectors, list) or len(vectors) != len(self.columns):
+                return Failure("unreadable", f"the reply has no {len(self.columns)} output vectors")
+            for name, values in zip(self.columns, vectors, strict=True):
+                outputs[name] += [np.nan if v is None else float(v) for v in values]
+        return {name: np.array(values) for name, values in outputs.items()}
+
+    def ask(self, what: str, content: Mapping[str, Any]) -> dict[str, Any] | Failure:
+        """Send one request of the protocol."""
+        body = json.dumps({"name": self.model, **content}).encode()
+        request = urllib.request.Request(
+            f"{self.url.rstrip('/')}/{what}", body, {"Content-Type": "application/json"}
+        )
+        try:
+            with urllib.request.urlopen(request, timeout=self.limit) as reply:
+                # Python's reader takes the NaN and Infinity that JSON does not have.
+                found = json.loads(reply.read())
+        except urllib.error.HTTPError as error:
+            return Failure("error", f"the server answered {error.code}", tail(_body(error)))
+        except TimeoutError:
+            return Failure("time", f"the server took longer than {self.limit:g} s")
+        except (OSError, ValueError) as error:
+            reason = getattr(error, "reason", error)
+            if isinstance(reason, TimeoutError):
+                return Failure("time", f"the server took longer than {self.limit:g} s")
+            return Failure("error", f"the server at {self.url} did not answer: {reason}")
+        if not isinstance(found, dict) or "error" in found:
+            return Failure("error", "the server reports an error", tail(str(found)))
+        return found
+
+
+def _body(error: urllib.error.HTTPError) -> str:
+    return error.read().decode(errors="replace")
+
+
+@dataclass(frozen=True)
+class TableWay:
+    """Runs that were made already; nothing is carried out.
+
+    Parameters
+    ----------
+    path : Path
+        CSV with a column for each parameter, condition and output, a row for each row of
+        conditions of each run.
+    sha256 : str
+        Of the file.
+    """
+
+    path: Path
+    sha256: str
+
+    @property
+    def identity(self) -> str:
+        """The content of the table."""
+        return f"table {self.sha256}"
+
+    @property
+    def runs(self) -> bool:
+        """Never."""
+        return False
+
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+        """Refuse: there is nothing to carry out."""
+        return Failure("error", "there are the runs of the table and no others")

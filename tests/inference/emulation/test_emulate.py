@@ -1,0 +1,175 @@
+"""Emulated posteriors against those of the simulator itself."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calib
+from calib.data.registry import Registry
+from calib.errors import CalibError
+from calib.inference.calibration import Calibration
+from calib.inference.emulation.prepared import prepare, write_failed
+from calib.models import MODELS
+from calib.models.simulators.registered import SIMULATED, Simulated
+from tests.models.simulators.examples import PRIORS, lab, pull
+
+CONDITIONS = ("slip_ratio", "normal_load_kn")
+
+
+@pytest.fixture(autouse=True)
+def as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.delenv("CALIB_MODELS", raising=False)
+    registries: tuple[Registry, ...] = (MODELS, SIMULATED)
+    before = [set(r) for r in registries]
+    yield
+    for registry, names in zip(registries, before, strict=True):
+        for name in set(registry) - names:
+            registry.discard(name)
+
+
+def declared(f: Callable, name: str, **changes: object) -> Simulated:
+    found = calib.from_callable(
+        f, parameters=PRIORS, conditions=CONDITIONS, output="drawbar_pull_kn", name=name,
+        **changes,  # type: ignore[arg-type]
+    )  # fmt: skip
+    calib.register(found)
+    return found
+
+
+def table(seed: int = 1, noise: float = 0.03) -> calib.Table:
+    return calib.table_from_arrays(lab(np.random.default_rng(seed), noise))
+
+
+def exact(data: calib.Table) -> Calibration:
+    declared(pull, "direct")
+    return calib.calibrate(calib.build_problem("direct", data), seed=1)
+
+
+def agree(found: Calibration, truth: Calibration, mean: float = 0.05, sd: float = 0.1) -> None:
+    for name, s in truth.summary.items():
+        e = found.summary[name]
+        assert abs(e.mean - s.mean) < mean * s.sd + 3.0 * (e.mcse_mean + s.mcse_mean), name
+        assert abs(e.sd / s.sd - 1.0) < sd, name
+
+
+def test_few_runs_give_the_posterior_of_three_hundred_thousand() -> None:
+    data = table()
+    declared(pull, "slow", emulate=True)
+    emulation = calib.emulated(calib.build_problem("slow", data), seed=1)
+    assert emulation.passed, emulation.reasons
+    assert len(emulation.runs) <= 100
+    assert emulation.own_noise == 0.0
+    assert emulation.held_out is not None
+    assert emulation.held_out.rmse < 0.1
+    found = calib.calibrate(emulation.problem, seed=1)
+    assert found.converged
+    agree(found, exact(data))
+
+
+def test_a_budget_that_is_too_small_is_told() -> None:
+    declared(lambda t, x: pull(t, x) * np.cos(25.0 * t[:, :1]), "wild", emulate=True, runs=30)
+    emulation = calib.emulated(calib.build_problem("wild", table()), seed=1)
+    assert not emulation.passed
+    assert "give it more runs" in emulation.reasons[0]
+    assert len(emulation.runs) <= 30
+
+
+def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> None:
+    def crashing(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        if theta[0, 0] > 0.6:
+            raise RuntimeError("the mesh folds")
+        return pull(theta, x)
+
+    simulated = declared(crashing, "crashing", emulate=True)
+    emulation = calib.emulated(calib.build_problem("crashing", table()), seed=1)
+    assert emulation.failed
+    assert all(run.theta[0] > 0.6 for run in emulation.failed)
+    found = calib.calibrate(emulation.problem, seed=1)
+    # The data are of mu = 0.6: half of the posterior is cut off there.
+    assert np.quantile(found.parameters["mu"], 0.99) < 0.6 + 0.1 * found.summary["mu"].sd + 0.0015
+    whole = exact(table()).parameters["mu"]
+    kept = whole[whole < 0.6]
+    assert abs(found.summary["mu"].mean - kept.mean()) < 0.35 * kept.std()
+    write_failed(emulation, simulated.simulator.parameters, tmp_path / "failed.csv")
+    lines = (tmp_path / "failed.csv").read_text().splitlines()
+    assert lines[0] == "mu,s0,kind,reason,printed"
+    assert len(lines) == 1 + len(emulation.failed)
+    assert "the mesh folds" in lines[1]
+
+
+def test_a_simulator_that_never_runs_is_refused() -> None:
+    declared(lambda t, x: 1 / 0, "broken", emulate=True)
+    with pytest.raises(CalibError, match="only 0 of the 20 first runs") as caught:
+        calib.emulated(calib.build_problem("broken", table()), seed=1)
+    assert "ZeroDivisionError" in str(caught.value)
+
+
+@pytest.mark.slow
+def test_its_own_noise_is_found_and_smoothed_over() -> None:
+    rng = np.random.default_rng(3)
+    own = 0.003  # a tenth of the readings' noise
+
+    def noisy(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        exact = pull(theta, x)
+        return exact + own * rng.standard_normal(exact.shape)
+
+    declared(noisy, "noisy", emulate=True, deterministic=False, runs=60)
+    data = table()
+    emulation = calib.emulated(calib.build_problem("noisy", data), seed=1)
+    assert 0.7 * own < emulation.own_noise < 1.4 * own
+    agree(calib.calibrate(emulation.problem, seed=1), exact(data), mean=0.3, sd=0.2)
+
+
+def test_a_simulator_that_only_seems_deterministic_is_found_out() -> None:
+    rng = np.random.default_rng(3)
+    declared(lambda t, x: pull(t, x) + 0.02 * rng.standard_normal(), "coy", emulate=True, runs=40)
+    assert calib.emulated(calib.build_problem("coy", table()), seed=1).own_noise > 0.0
+
+
+def test_slow_simulators_are_not_called_by_the_sampler() -> None:
+    declared(pull, "slow", emulate=True)
+    problem = calib.build_problem("slow", table())
+    with pytest.raises(CalibError, match="emulate it first"):
+        problem.log_prob(problem.priors.to_internal(np.array([[0.5, 0.1, 0.1]])))
+
+
+def test_a_prepared_model_is_the_emulator_here_and_elsewhere(tmp_path: Path) -> None:
+    declared(pull, "slow", emulate=True, folder=tmp_path, runs=40)
+    emulation = prepare("slow", table(), 1)
+    assert emulation is not None
+    problem = calib.build_problem("slow", table())
+    t = problem.priors.to_internal(np.array([[0.59, 0.081, 0.04]]))
+    np.testing.assert_allclose(problem.log_prob(t), emulation.problem.log_prob(t), rtol=1e-6)
+    # The runs are on disk: the same again makes none.
+    before = len(list(tmp_path.rglob("*-0.json")))
+    prepare("slow", table(), 1)
+    assert len(list(tmp_path.rglob("*-0.json"))) == before
+
+
+def test_a_table_of_runs_is_emulated_and_nothing_carried_out(tmp_path: Path) -> None:
+    data = table()
+    rng = np.random.default_rng(5)
+    theta = np.stack([rng.uniform(0.5, 0.7, 60), rng.uniform(0.06, 0.1, 60)], axis=1)
+    x = {name: data[name] for name in CONDITIONS}
+    values = 1000.0 * pull(theta, x)
+    rows = [
+        f"{t[0]!r},{t[1]!r},{100 * s!r},{w!r},{v!r}"
+        for t, line in zip(theta.tolist(), values.tolist(), strict=True)
+        for s, w, v in zip(*(c.tolist() for c in x.values()), line, strict=True)
+    ]
+    rng.shuffle(rows)
+    (tmp_path / "runs.csv").write_text("mu,s0,s,w,pull\n" + "\n".join(rows) + "\n")
+    text = 'name = "made"\ntable = "runs.csv"\n[conditions]\ns = "slip_percent"\n'
+    text += 'w = "normal_load_kn"\n[outputs]\npull = "drawbar_pull_n"\n' + PRIORS
+    (tmp_path / "made.toml").write_text(text)
+    calib.register(calib.read_simulator(tmp_path / "made.toml"))
+    emulation = calib.emulated(calib.build_problem("made", data), seed=1)
+    assert emulation.passed, emulation.reasons
+    agree(calib.calibrate(emulation.problem, seed=1), exact(data))
+    (tmp_path / "runs.csv").write_text("mu,s0,s,w,pull\n" + "\n".join(rows[1:]) + "\n")
+    with pytest.raises(CalibError, match="not all at the same conditions"):
+        calib.emulated(calib.build_problem("made", data), seed=1)

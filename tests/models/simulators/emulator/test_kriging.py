@@ -1,0 +1,65 @@
+"""Kriging against the closed form of a Gaussian process with a vague trend."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.models.simulators.emulator.kriging import (
+    Scales,
+    correlation,
+    find_scales,
+    krige,
+    trend_of,
+)
+
+
+def test_it_is_the_limit_of_a_wide_prior_of_the_trend() -> None:
+    rng = np.random.default_rng(1)
+    x, at = rng.standard_normal((40, 2)), rng.standard_normal((7, 2))
+    y = np.sin(x[:, 0]) + x[:, 1] ** 2
+    scales = Scales(np.array([1.3, 2.1]), 1e-4)
+    found = krige(x, y, scales)
+    mean, variance = found.mean_and_variance(at)
+    b, b_at, wide = trend_of(x), trend_of(at), 1e6
+
+    def covariance(u: np.ndarray, v: np.ndarray, bu: np.ndarray, bv: np.ndarray) -> np.ndarray:
+        return correlation(u, v, scales.lengths) + wide * bu @ bv.T
+
+    k = covariance(x, x, b, b) + scales.nugget * np.eye(len(x))
+    across = covariance(at, x, b_at, b)
+    solved = np.linalg.solve(k, across.T)
+    left = np.diag(covariance(at, at, b_at, b_at)) - np.einsum("kn,nk->k", across, solved)
+    np.testing.assert_allclose(mean, solved.T @ y, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(variance / found.variance, left, rtol=0.02, atol=1e-4)
+    np.testing.assert_allclose(mean, found.mean(at))
+
+
+def test_it_meets_what_it_knows_and_is_unsure_elsewhere() -> None:
+    rng = np.random.default_rng(2)
+    x = rng.uniform(-1.0, 1.0, (30, 2))
+    y = np.exp(x[:, 0]) * np.cos(2.0 * x[:, 1])
+    found = krige(x, y, find_scales(x, y))
+    mean, variance = found.mean_and_variance(x)
+    np.testing.assert_allclose(mean, y, atol=1e-3)
+    far = found.mean_and_variance(np.array([[4.0, 4.0]]))[1]
+    assert far[0] > 100.0 * variance.max()
+
+
+@pytest.mark.parametrize("noise", [0.05, 0.2])
+def test_noise_is_told_from_shape(noise: float) -> None:
+    rng = np.random.default_rng(3)
+    x = np.repeat(rng.uniform(-2.0, 2.0, (40, 1)), 3, axis=0)
+    y = np.sin(2.0 * x[:, 0]) + noise * rng.standard_normal(len(x))
+    scales = find_scales(x, y, noisy=True)
+    found = krige(x, y, scales)
+    at = np.linspace(-1.5, 1.5, 21)[:, None]
+    assert np.sqrt(np.mean((found.mean(at) - np.sin(2.0 * at[:, 0])) ** 2)) < 0.5 * noise
+    assert noise / 2.0 < np.sqrt(found.variance * scales.nugget) < 2.0 * noise
+
+
+def test_a_constant_is_no_trouble() -> None:
+    x = np.random.default_rng(4).standard_normal((12, 3))
+    y = np.full(12, 5.0)
+    found = krige(x, y, find_scales(x, y))
+    np.testing.assert_allclose(found.mean(x + 0.3), 5.0)

@@ -1,0 +1,71 @@
+"""Every run is kept, and none is made twice."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.models.simulators.base import Output, Simulator
+from calib.models.simulators.runs import RunKeeper
+from calib.models.simulators.ways import CallableWay
+
+X = {"slip_ratio": np.array([0.1, 0.3])}
+THETAS = np.array([[0.6], [0.7], [-1.0]])
+CALLS: list[float] = []
+
+
+def recorded(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+    CALLS.append(float(theta[0, 0]))
+    if theta[0, 0] < 0.0:
+        raise ValueError("negative friction")
+    return theta[:, :1] * x["slip_ratio"]
+
+
+def simulator(f: object = recorded) -> Simulator:
+    return Simulator(
+        "line", CallableWay(f, ("pull",)), ("mu",), "",  # type: ignore[arg-type]
+        {"slip_ratio": "slip_ratio"}, (Output("drawbar_pull_kn", "pull", ""),), retries=0,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("on_disk", [True, False])
+def test_runs_are_made_once(tmp_path: Path, on_disk: bool) -> None:
+    CALLS.clear()
+    keeper = RunKeeper(simulator(), tmp_path / "runs" if on_disk else None)
+    first = keeper.runs(THETAS, X)
+    again = keeper.runs(THETAS[::-1], X)
+    assert CALLS == [0.6, 0.7, -1.0]
+    assert (keeper.made, keeper.kept) == (3, 3)
+    for run, same in zip(first, again[::-1], strict=True):
+        assert run.ok == same.ok
+        if run.ok:
+            np.testing.assert_array_equal(
+                run.outputs["drawbar_pull_kn"], same.outputs["drawbar_pull_kn"]
+            )
+    assert first[2].failure is not None
+    assert "negative friction" in first[2].failure.reason
+
+
+def test_other_conditions_replicates_and_simulators_are_other_runs(tmp_path: Path) -> None:
+    CALLS.clear()
+    keeper = RunKeeper(simulator(), tmp_path)
+    keeper.runs(THETAS[:1], X)
+    keeper.runs(THETAS[:1], {"slip_ratio": np.array([0.1, 0.30001])})
+    keeper.runs(THETAS[:1], X, 1)
+    RunKeeper(simulator(lambda t, x: recorded(t, x)), tmp_path).runs(THETAS[:1], X)
+    assert CALLS == [0.6] * 4
+
+
+def test_a_kill_loses_no_run_that_was_made(tmp_path: Path) -> None:
+    CALLS.clear()
+
+    def stop(done: int, planned: int) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        RunKeeper(simulator(), tmp_path, progress=stop).runs(THETAS, X)
+    RunKeeper(simulator(), tmp_path).runs(THETAS, X)
+    assert CALLS == [0.6, 0.7, -1.0]

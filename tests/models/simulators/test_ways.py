@@ -1,0 +1,191 @@
+"""The ways a simulator is carried out: one contract, whatever goes wrong."""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calib.models.simulators.base import Failure, Output, Simulator, Way
+from calib.models.simulators.files import read_simulator
+from calib.models.simulators.ways import CallableWay, CommandWay, UmbridgeWay
+from tests.models.simulators.examples import pull, write_program
+
+X = {"slip_ratio": np.array([0.1, 0.3]), "normal_load_kn": np.array([4.0, 5.0])}
+THETA = np.array([0.6, 0.08])
+EXACT = pull(THETA[None], X)[0]
+
+
+def simulator(way: Way, **changes: object) -> Simulator:
+    given = {
+        "name": "wheel", "way": way, "parameters": ("mu", "s0"), "priors": "",
+        "conditions": {"s": "slip_percent", "w": "normal_load_kn"},
+        "outputs": (Output("drawbar_pull_n", "pull", ""),), "retries": 0,
+    } | changes  # fmt: skip
+    return Simulator(**given)  # type: ignore[arg-type]
+
+
+def in_percent(theta: np.ndarray, x: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    own = {"slip_ratio": x["s"] / 100.0, "normal_load_kn": x["w"]}
+    return {"pull": 1000.0 * pull(theta, own)}
+
+
+def failure(found: object) -> Failure:
+    assert isinstance(found, Failure)
+    return found
+
+
+def test_a_callable_gives_canonical_units() -> None:
+    found = simulator(CallableWay(in_percent, ("pull",))).run(THETA, X)
+    assert not isinstance(found, Failure)
+    np.testing.assert_allclose(found["drawbar_pull_kn"], EXACT)
+
+
+def test_a_callable_of_one_vector() -> None:
+    def one(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        return in_percent(theta[None], x)["pull"][0]
+
+    found = simulator(CallableWay(one, ("pull",), batched=False)).run(THETA, X)
+    assert not isinstance(found, Failure)
+    np.testing.assert_allclose(found["drawbar_pull_kn"], EXACT)
+
+
+@pytest.mark.parametrize(
+    ("gives", "kind", "word"),
+    [
+        (lambda t, x: 1 / 0, "error", "ZeroDivisionError"),
+        (lambda t, x: np.array([1.0, np.nan]), "nan", "1 of 2 rows, first 1"),
+        (lambda t, x: np.array([1.0]), "short", "1 values for 2 rows"),
+        (lambda t, x: {"force": np.ones(2)}, "unreadable", "it gave force"),
+    ],
+)
+def test_a_run_without_value_says_why(gives: object, kind: str, word: str) -> None:
+    found = failure(simulator(CallableWay(gives, ("pull",))).run(THETA, X))  # type: ignore[arg-type]
+    assert found.kind == kind
+    assert word in found.reason
+
+
+def test_a_failed_run_is_tried_again() -> None:
+    calls = []
+
+    def now_and_then(theta: np.ndarray, x: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        calls.append(1)
+        return in_percent(theta, x) if len(calls) > 2 else {"pull": np.full(2, np.nan)}
+
+    way = CallableWay(now_and_then, ("pull",))
+    assert isinstance(simulator(way, retries=1).run(THETA, X), Failure)
+    assert not isinstance(simulator(way, retries=1).run(THETA, X), Failure)
+
+
+def test_a_command_gives_what_the_function_gives(tmp_path: Path) -> None:
+    found = read_simulator(write_program(tmp_path)).simulator.run(THETA, X)
+    assert not isinstance(found, Failure)
+    np.testing.assert_allclose(found["drawbar_pull_kn"], EXACT)
+    # Its scratch folder was not the simulator's.
+    assert {p.name for p in tmp_path.iterdir()} == {"wheel.py", "wheel.toml"}
+
+
+@pytest.mark.parametrize(
+    ("extra", "kind", "word"),
+    [
+        ("print('cannot mesh'); sys.exit(3)", "exit", "cannot mesh"),
+        ("time.sleep(30)", "time", ""),
+        ("sys.exit(0)", "unreadable", ""),
+        ("x['s'].pop()", "short", ""),
+        ("p['mu'] = float('nan')", "nan", ""),
+    ],
+)
+def test_a_command_that_fails(tmp_path: Path, extra: str, kind: str, word: str) -> None:
+    file = write_program(tmp_path, extra=extra, limit="2", retries="0")
+    found = failure(read_simulator(file).simulator.run(THETA, X))
+    assert found.kind == kind
+    assert word in found.printed
+
+
+def test_a_template_a_pattern_and_a_row_at_a_time(tmp_path: Path) -> None:
+    (tmp_path / "own.inp").write_text("mu @mu@\ns0 @s0@\nslip @s@\nload @w@\n")
+    (tmp_path / "own.py").write_text(
+        "import math, sys\n"
+        "v = {k: float(x) for k, x in (line.split() for line in open(sys.argv[1]))}\n"
+        "f = 1000 * v['load'] * v['mu'] * (1 - math.exp(-v['slip'] / 100 / v['s0']))\n"
+        "print(f'result: Fx={f!r} N')\n"
+    )
+    file = write_program(
+        tmp_path, run=f'"{sys.executable} own.py {{input}}"', template='"own.inp"',
+        output='"pattern"', rows='"each"',
+    )  # fmt: skip
+    file.write_text(file.read_text().replace(
+        "[conditions]", "[patterns]\npull = 'Fx=(\\S+)'\n[conditions]"
+    ))  # fmt: skip
+    found = read_simulator(file).simulator.run(THETA, X)
+    assert not isinstance(found, Failure)
+    np.testing.assert_allclose(found["drawbar_pull_kn"], EXACT)
+
+
+def test_what_a_command_is_made_of_is_its_identity(tmp_path: Path) -> None:
+    file = write_program(tmp_path)
+    before = read_simulator(file).simulator.digest
+    assert read_simulator(file).simulator.digest == before
+    program = tmp_path / "wheel.py"
+    program.write_text(program.read_text() + "\n# another version\n")
+    assert read_simulator(file).simulator.digest != before
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """An UM-Bridge server in a few lines, with a mood that the model's name sets."""
+
+    def do_POST(self) -> None:
+        given = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        mood = given["name"]
+        if mood == "slow":
+            time.sleep(3.0)
+        value = float("nan") if mood == "nan" else 1.0
+        reply = {"error": {"message": "no soil"}} if mood == "error" else {"output": [[value]]}
+        body = json.dumps(reply).encode()
+        self.send_response(500 if mood == "broken" else 200)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *args: object) -> None:
+        """Print nothing."""
+
+
+@pytest.fixture
+def url() -> Iterator[str]:
+    server = HTTPServer(("127.0.0.1", 0), _Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    server.server_close()
+    thread.join()
+
+
+@pytest.mark.parametrize(
+    ("mood", "kind"), [("slow", "time"), ("nan", "nan"), ("error", "error"), ("broken", "error")]
+)
+def test_a_server_that_fails(url: str, mood: str, kind: str) -> None:
+    way = UmbridgeWay(url, mood, ("pull",), limit=0.5)
+    assert failure(simulator(way).run(THETA, X)).kind == kind
+
+
+def test_a_server_that_is_not_there(url: str) -> None:
+    way = UmbridgeWay("http://127.0.0.1:9", "forward", ("pull",), limit=2.0)
+    found = failure(simulator(way).run(THETA, X))
+    assert "did not answer" in found.reason
+    well = simulator(UmbridgeWay(url, "forward", ("pull",))).run(THETA, X)
+    assert not isinstance(well, Failure)
+    np.testing.assert_allclose(well["drawbar_pull_kn"], [0.001, 0.001])
+
+
+def test_a_program_beside_the_file_is_found(tmp_path: Path) -> None:
+    (tmp_path / "wheel").write_text("#!/bin/sh\n")
+    assert CommandWay(("./wheel",), tmp_path).program == str((tmp_path / "wheel").resolve())
+    assert CommandWay(("./no-wheel",), tmp_path).program is None
