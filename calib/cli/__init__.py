@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from calib.cli import audit, calibration, campaign, challenge, check, gap, sbc
+from calib.cli import audit, calibration, campaign, challenge, check, compare, gap, sbc
 
 __all__ = ["app", "main"]
 
@@ -22,6 +22,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 calibration.register(app)
+compare.register(app)
 gap.register(app)
 challenge.register(app)
 check.register(app)

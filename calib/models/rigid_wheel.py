@@ -147,6 +147,8 @@ def contact(wheel: Wheel) -> Contact:
         low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
         step = x - value / slope
         new = np.where((step > low) & (step < high), step, 0.5 * (low + high))
+        # What is found stays, so that it does not depend on what it is found with.
+        new = np.where(np.abs(value) > _TOLERANCE, new, x)
         found = excess(new)
         moved = new - x
         with np.errstate(all="ignore"):

@@ -8,6 +8,10 @@ from calib.models import MODELS, Array, BoundModel
 
 # Ranges of the sampled parameters. The density ones keep the implicit equation monotone (a root
 # is then the only one): A2 exceeds the steepest the water term can be, w/sqrt(A3).
+_RIGID_WHEEL = {
+    "k1": (5.0, 60.0), "k2": (300.0, 3000.0), "n": (0.5, 1.3), "c": (0.1, 6.0),
+    "phi": (20.0, 40.0), "K": (5.0, 30.0), "c1": (0.18, 0.43), "c2": (0.2, 0.4),
+}  # fmt: skip
 THETA = {
     "magic_formula": {
         "K": (0.02, 0.4), "C": (1.0, 2.0), "D": (0.2, 3.0), "G": (0.1, 20.0),
@@ -28,10 +32,7 @@ THETA = {
         "c1": (0.4, 1.0), "c2": (0.05, 0.2), "c3": (4.0, 11.0), "c4": (0.5, 2.0), "c5": (0.2, 1.0),
     },
     "janosi_hanamoto": {"c": (0.0, 10.0), "phi": (10.0, 40.0), "K": (3.0, 30.0)},
-    **dict.fromkeys(("wong_reece_pull", "wong_reece_torque", "wong_reece_sinkage"), {
-        "k1": (5.0, 60.0), "k2": (300.0, 3000.0), "n": (0.5, 1.3), "c": (0.1, 6.0),
-        "phi": (20.0, 40.0), "K": (5.0, 30.0), "c1": (0.18, 0.43), "c2": (0.2, 0.4),
-    }),
+    **{f"wong_reece_{part}": _RIGID_WHEEL for part in ("pull", "torque", "sinkage")},
     "ayers_perumpral": {
         "gamma_ref": (1.0, 2.0), "C2": (1e-3, 0.05), "C3": (0.02, 0.7), "C4": (5.0, 45.0),
     },
