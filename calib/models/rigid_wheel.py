@@ -13,19 +13,23 @@ the stresses carry the load.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.models.base import Array, Conditions
 
 __all__ = ["Contact", "Wheel", "contact", "wheels"]
 
-N_NODES = 12
+N_NODES = 8
 _LN_ANGLE = (float(np.log(1e-4)), float(np.log(1.5)))
 _MAX_ITERATIONS = 60
-_TOLERANCE = 1e-10
+# Steps after which cells are asked whether they have a solution.
+_PATIENCE = 8
+_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -87,23 +91,42 @@ def _nodes() -> tuple[Array, Array]:
     return u * u, u * weight
 
 
-def _evaluate(entry: Array, wheel: Wheel) -> Contact:
-    """Integrate the stresses for entry angles, shape (k, n, 1)."""
+def _halves(entry: Array, wheel: Wheel) -> Iterator[tuple[Array, Array, Array, Array, Array]]:
+    """Yield sine and cosine, stresses and lengths of front and rear, for entry angles (..., 1)."""
     part, weight = _nodes()
     turning = np.minimum(wheel.c1 + wheel.c2 * wheel.slip, 0.999) * entry
     front = entry - (entry - turning) * part
-    rise = np.maximum(np.cos(front) - np.cos(entry), 0.0) * wheel.radius / wheel.width
+    sine_entry, cosine_entry = np.sin(entry), np.cos(entry)
+    sine, cosine = np.sin(front), np.cos(front)
+    rise = np.maximum(cosine - cosine_entry, 0.0) * wheel.radius / wheel.width
     normal = (wheel.k1 + wheel.k2 * wheel.width) * rise**wheel.n
+    strength = wheel.c + normal * wheel.tan_phi
+    rear = turning * part
+    for angle, length, sin, cos in (
+        (front, entry - turning, sine, cosine),
+        (rear, turning, np.sin(rear), np.cos(rear)),
+    ):
+        moved = entry - angle - (1.0 - wheel.slip) * (sine_entry - sin)
+        shear = -strength * np.expm1(moved * (-wheel.radius / wheel.K))
+        yield sin, cos, normal, shear, weight * length
+
+
+def _load(entry: Array, wheel: Wheel) -> Array:
+    """Return the load (kN) that wheels carry at entry angles, both (..., 1)."""
+    lifted = sum(
+        np.vecdot(normal * cosine + shear * sine, measure)
+        for sine, cosine, normal, shear, measure in _halves(entry, wheel)
+    )
+    return np.asarray(wheel.radius * wheel.width * np.asarray(lifted)[..., None])
+
+
+def _evaluate(entry: Array, wheel: Wheel) -> Contact:
+    """Integrate the stresses for entry angles, shape (k, n, 1)."""
     lifted = pulled = turned = np.zeros(entry.shape[:2])
-    for angle, length in ((front, entry - turning), (turning * part, turning)):
-        sine, cosine = np.sin(angle), np.cos(angle)
-        moved = entry - angle - (1.0 - wheel.slip) * (np.sin(entry) - sine)
-        mobilised = -np.expm1(-wheel.radius * moved / wheel.K)
-        shear = (wheel.c + normal * wheel.tan_phi) * mobilised
-        measure = weight * length
-        lifted = lifted + ((normal * cosine + shear * sine) * measure).sum(axis=-1)
-        pulled = pulled + ((shear * cosine - normal * sine) * measure).sum(axis=-1)
-        turned = turned + (shear * measure).sum(axis=-1)
+    for sine, cosine, normal, shear, measure in _halves(entry, wheel):
+        lifted = lifted + np.vecdot(normal * cosine + shear * sine, measure)
+        pulled = pulled + np.vecdot(shear * cosine - normal * sine, measure)
+        turned = turned + np.vecdot(shear, measure)
     radius, area = wheel.radius[..., 0], (wheel.radius * wheel.width)[..., 0]
     sinkage = radius * (1.0 - np.cos(entry[..., 0]))
     return Contact(area * lifted, area * pulled, area * radius * turned, sinkage)
@@ -131,30 +154,41 @@ def contact(wheel: Wheel) -> Contact:
     ----------
     Wong & Reece (1967), J. Terramechanics 4(1), 81-98, doi:10.1016/0022-4898(67)90105-X.
     """
-    fields = vars(wheel).values()
-    shape = np.broadcast_shapes(*(np.shape(v) for v in fields))
-    ln_load = np.log(np.broadcast_to(wheel.load, shape))
-    low, high = (np.full(shape, edge) for edge in _LN_ANGLE)
+    fields = [np.asarray(v) for v in vars(wheel).values()]
+    shape = np.broadcast_shapes(*(v.shape for v in fields))
+    flat = [np.broadcast_to(v, shape).reshape(-1, 1) for v in fields]
+    return _evaluate(_entry(Wheel(*flat)).reshape(shape), wheel)
 
-    def excess(ln_entry: Array) -> Array:
-        return np.log(_evaluate(np.exp(ln_entry), wheel).load)[..., None] - ln_load
 
-    slope = np.broadcast_to(2.0 * wheel.n + 1.0, shape)
-    carried = (excess(high) > 0.0) & (np.broadcast_to(wheel.slip, shape) >= 0.0)
-    x = np.full(shape, np.log(0.4))
-    value = excess(x)
-    for _ in range(_MAX_ITERATIONS):
+def _entry(wheel: Wheel) -> Array:
+    """Solve for the entry angles of wheels, shape (cells, 1); NaN where there is none."""
+    entry = np.full(wheel.load.shape, np.nan)
+    cells = np.flatnonzero(wheel.slip[:, 0] >= 0.0)
+    low, high = (np.full((cells.size, 1), edge) for edge in _LN_ANGLE)
+    left, x = _some(wheel, cells), np.full((cells.size, 1), np.log(0.4))
+    slope = 2.0 * left.n + 1.0
+    value = np.log(_load(np.exp(x), left) / left.load)
+    for step in range(_MAX_ITERATIONS):
         low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
-        step = x - value / slope
-        new = np.where((step > low) & (step < high), step, 0.5 * (low + high))
-        # What is found stays, so that it does not depend on what it is found with.
-        new = np.where(np.abs(value) > _TOLERANCE, new, x)
-        found = excess(new)
-        moved = new - x
+        new = x - value / slope
+        new = np.where((new > low) & (new < high), new, 0.5 * (low + high))
+        found = np.log(_load(np.exp(new), left) / left.load)
         with np.errstate(all="ignore"):
-            secant = (found - value) / moved
+            secant = (found - value) / (new - x)
         slope = np.where(np.isfinite(secant) & (secant > 0.1), secant, slope)
         x, value = new, found
-        if not np.any(np.abs(value[carried]) > _TOLERANCE):
+        done = np.abs(value[:, 0]) <= _TOLERANCE
+        entry[cells[done]] = np.exp(x[done])
+        stays = ~done
+        if step == _PATIENCE:  # those that are still sought may have no solution
+            stays &= (_load(np.exp(np.full_like(x, _LN_ANGLE[1])), left) > left.load)[:, 0]
+        # Cells that are found leave: their neighbours do not change them, nor cost them time.
+        cells, left = cells[stays], _some(left, np.flatnonzero(stays))
+        low, high, x, value, slope = (v[stays] for v in (low, high, x, value, slope))
+        if not cells.size:
             break
-    return _evaluate(np.where(carried, np.exp(x), np.nan), wheel)
+    return entry
+
+
+def _some(wheel: Wheel, cells: NDArray[np.intp]) -> Wheel:
+    return Wheel(*(v[cells] for v in vars(wheel).values()))
