@@ -18,11 +18,12 @@ from calib.errors import CalibError
 __all__ = ["check_folder", "fresh_folder", "read_folder", "unwritable"]
 
 # Files by which a folder is known to be one of ours, and may be replaced.
-_OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json")
+_OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json",
+         "comparison.json")  # fmt: skip
 _WRITTEN = (
     *_OURS, "index.html", "summary.json", "figures", "data", "priors", "gaps", "case",
     "corrected.json", "fresh_prediction.csv", "priors.toml", "data.csv", "tables", "methods.txt",
-    "methods.tex", "references.bib", "audit.csv", "inputs.json",
+    "methods.tex", "references.bib", "audit.csv", "inputs.json", "runs",
 )  # fmt: skip
 
 _YOUNG_SECONDS = 60.0

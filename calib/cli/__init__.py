@@ -8,7 +8,17 @@ import sys
 
 import typer
 
-from calib.cli import audit, calibration, campaign, challenge, check, doctor, gap, sbc
+from calib.cli import (
+    audit,
+    calibration,
+    campaign,
+    challenge,
+    check,
+    compare,
+    doctor,
+    gap,
+    sbc,
+)
 
 __all__ = ["app", "main"]
 
@@ -21,6 +31,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 calibration.register(app)
+compare.register(app)
 gap.register(app)
 challenge.register(app)
 check.register(app)

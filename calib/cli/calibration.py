@@ -201,7 +201,9 @@ def fit(
 
 
 def predict(
-    run: Annotated[Path, typer.Argument(help="Folder of `calib fit` or `calib diagnose`.")],
+    run: Annotated[
+        Path, typer.Argument(help="Folder of `calib fit`, `calib compare` or `calib diagnose`.")
+    ],
     at: Annotated[Path, typer.Option(help="CSV with the conditions.")],
     out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
     effects: Annotated[
@@ -221,7 +223,7 @@ def predict(
     from calib.data import read_for_model, write_table
     from calib.inference.io import load_calibration
     from calib.validation.prediction import predict as predict_at
-    from calib.validation.prediction import prediction_columns
+    from calib.validation.prediction import predict_stacked, prediction_columns
 
     if (run / "corrected.json").exists():
         _predict_corrected(run, at, out, effects)
@@ -231,14 +233,24 @@ def predict(
             "only a diagnosis has effects", where=str(run), allowed="a folder of `calib diagnose`",
             mend="leave --effects out",
         )  # fmt: skip
-    calibration = load_calibration(run)
-    if not calibration.converged:
+    if (run / "comparison.json").exists():
+        from calib.report.comparison import load_stack
+
+        found, parts = load_stack(run)
+        converged = bool(found["converged"])
+    else:
+        parts = [(1.0, load_calibration(run))]
+        converged = parts[0][1].converged
+    if not converged:
         print("calib: this calibration did not converge; its bands are not to be used",
               file=sys.stderr)  # fmt: skip
-    table = read_for_model(at, calibration.problem.bound.model.conditions)
-    prediction = predict_at(calibration, table)
+    used = dict.fromkeys(n for _, c in parts for n in c.problem.bound.model.conditions)
+    table = read_for_model(at, tuple(used))
+    prediction = (
+        predict_at(parts[0][1], table) if len(parts) == 1 else predict_stacked(parts, table)
+    )
     columns = prediction_columns(prediction, table)
-    if not calibration.converged:
+    if not converged:
         columns["converged"] = ["no"] * len(table)
     outside = sum(bool(flags) for flags in prediction.outside)
     if out is not None:
@@ -250,7 +262,7 @@ def predict(
             print(",".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in row))
         if outside:
             print(f"calib: {outside} rows lie outside the calibrated range", file=sys.stderr)
-    if not calibration.converged:
+    if not converged:
         raise typer.Exit(3)
 
 

@@ -7,8 +7,12 @@ from calib.errors import CalibError
 from calib.models.ayers_perumpral import AYERS_PERUMPRAL, AYERS_PERUMPRAL_VOLUMETRIC
 from calib.models.base import Array, BoundModel, Conditions, Model, References
 from calib.models.bekker import BEKKER, MODIFIED_BEKKER
+from calib.models.janosi_hanamoto import JANOSI_HANAMOTO
 from calib.models.magic_formula import MAGIC_FORMULA
 from calib.models.magic_formula_pressure import MAGIC_FORMULA_PRESSURE
+from calib.models.mobility import BRIXIUS, WISMER_LUTH
+from calib.models.plate_sinkage import BEKKER_PLATE, LYASKO, REECE
+from calib.models.wong_reece import WONG_REECE_PULL, WONG_REECE_SINKAGE, WONG_REECE_TORQUE
 
 __all__ = [
     "MODELS", "Array", "BoundModel", "Conditions", "Model", "References", "example_csv",
@@ -24,6 +28,15 @@ MODELS: Registry[Model] = Registry(
     MAGIC_FORMULA_PRESSURE,
     BEKKER,
     MODIFIED_BEKKER,
+    BEKKER_PLATE,
+    REECE,
+    LYASKO,
+    WISMER_LUTH,
+    BRIXIUS,
+    JANOSI_HANAMOTO,
+    WONG_REECE_PULL,
+    WONG_REECE_TORQUE,
+    WONG_REECE_SINKAGE,
     group="terracalib.models",
 )
 

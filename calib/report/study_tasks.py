@@ -85,7 +85,8 @@ def choose_model(output: str, table: Table) -> str:
     """Pick the model of an output (a key of `OUTPUTS`) that suits a table.
 
     Of the models whose conditions are all there it is the one that makes use of most of those that
-    vary; of several such, the simplest.
+    vary; of several such, the one of fewest parameters, then of fewest conditions, then the one
+    known first. Which of them the data prefer, `calib.compare` says.
 
     Raises
     ------
@@ -96,8 +97,11 @@ def choose_model(output: str, table: Table) -> str:
     suited = [m for m in known if all(c in table for c in m.conditions)]
     if suited:
         varied = {c for m in suited for c in m.conditions if np.unique(table[c]).size > 1}
-        uses = [len(varied & set(m.conditions)) - 0.01 * len(m.conditions) for m in suited]
-        return suited[int(np.argmax(uses))].name
+        uses = [
+            (len(varied & set(m.conditions)), -len(m.parameters), -len(m.conditions))
+            for m in suited
+        ]
+        return suited[uses.index(max(uses))].name
     raise CalibError(
         f"no model of {output} suits the columns",
         where=table.source,

@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from calib.inference.calibration import Calibration
 
 __all__ = [
-    "Bands", "Prediction", "bands", "outside", "predict", "prediction_columns", "predictive_draws",
+    "Bands", "Prediction", "bands", "outside", "predict", "predict_stacked", "prediction_columns",
+    "predictive_draws",
 ]  # fmt: skip
 
 N_DRAWS = 4000
@@ -80,6 +81,47 @@ def predictive_draws(
     noise = natural[:, -1:] * rng.standard_normal(location.shape)
     from_response = problem.bound.from_response
     return from_response(location), from_response(location + noise)
+
+
+def predict_stacked(parts: Sequence[tuple[float, Calibration]], table: Table) -> Prediction:
+    """Predict with the mixture of several calibrations.
+
+    Parameters
+    ----------
+    parts : sequence of (float, Calibration)
+        Weights, which sum to 1, and calibrations of one output.
+    table : Table
+        With the conditions of all of those that have a weight.
+
+    Raises
+    ------
+    CalibError
+        If a condition is missing.
+
+    Notes
+    -----
+    Each calibration gives as many of the `N_DRAWS` draws as is its weight.
+    """
+    used = [(weight, c) for weight, c in parts if round(weight * N_DRAWS) > 0]
+    means, measured, outer = [], [], []
+    conditions: dict[str, Array] = {}
+    for weight, c in used:
+        own = c.problem.bound.model.select(table.columns)
+        rng = generator(c.seed, c.label, "predict stacked")
+        mean, reading = predictive_draws(c, own, rng, round(weight * N_DRAWS))
+        means.append(mean)
+        measured.append(reading)
+        outer.append(outside(c.problem.conditions, own))
+        conditions |= own
+    whole = np.concatenate(means)
+    share = np.isfinite(whole).mean(axis=0)
+    kept = np.where(share >= MIN_DEFINED, 0.0, np.nan)
+    flags = (tuple(dict.fromkeys(name for f in row for name in f))
+             for row in zip(*outer, strict=True))  # fmt: skip
+    return Prediction(
+        used[0][1].problem.bound.model.output, conditions, bands(whole + kept),
+        bands(np.concatenate(measured) + kept), tuple(flags), share,
+    )  # fmt: skip
 
 
 def predict(calibration: Calibration, table: Table) -> Prediction:

@@ -48,6 +48,8 @@ class Validation:
         Expected log predictive density of leave-one-out and its standard error; NaN otherwise.
     unconverged : tuple of int
         Those of `refitted` whose posterior did not pass the gate.
+    elpd_rows : ndarray, shape (n,), optional
+        The terms of `elpd`.
     """
 
     method: str
@@ -60,6 +62,7 @@ class Validation:
     elpd: float = float("nan")
     elpd_se: float = float("nan")
     unconverged: tuple[int, ...] = ()
+    elpd_rows: Array | None = None
 
 
 @one_thread()
@@ -155,7 +158,7 @@ def leave_one_out(
     return Validation(
         "leave_one_out", problem.table, problem.observed, drawn, score(drawn, problem.observed),
         k, tuple(refits), float(elpd.sum()), float(np.sqrt(n * elpd.var(ddof=1))),
-        tuple(i for i, refit in refits.items() if not refit.passed),
+        tuple(i for i, refit in refits.items() if not refit.passed), elpd,
     )  # fmt: skip
 
 

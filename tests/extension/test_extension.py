@@ -97,23 +97,23 @@ def test_a_new_output_its_model_and_its_effect_go_through_every_verb(run: Calib)
 def test_without_its_file_a_model_is_unknown(
     run: Calib,
 ) -> None:
-    refused = run("template", "wismer_luth")
+    refused = run("template", "one_tyre")
     assert refused.code == 2
     assert "--models FILE" in refused.err
 
 
 def test_a_traction_model_of_ones_own_is_simulated_and_reported(run: Calib) -> None:
-    own = ["--models", HERE / "wismer_luth.py"]
-    Path("pull.csv").write_text(run("template", "wismer_luth", *own).out)
-    proved = run("sbc", "--model", "wismer_luth", *own, "--simulations", 10, "--out", "sbc",
+    own = ["--models", HERE / "one_tyre.py"]
+    Path("pull.csv").write_text(run("template", "one_tyre", *own).out)
+    proved = run("sbc", "--model", "one_tyre", *own, "--simulations", 10, "--out", "sbc",
                  "--workers", 1)  # fmt: skip
     assert proved.code in (0, 1), proved.err
-    assert "wismer_luth  10" in proved.out
+    assert "one_tyre  10" in proved.out
     made = run("report", "pull.csv", *own, "--out", "report", "--workers", 1, *FEW)
     assert made.code == 0, made.err
     # It makes use of more of the columns than the Magic Formula.
     summary = json.loads(Path("report/summary.json").read_text())
-    assert summary["models"]["drawbar_pull"]["model"] == "wismer_luth"
+    assert summary["models"]["drawbar_pull"]["model"] == "one_tyre"
     assert "Wismer &amp; Luth" in Path("report/index.html").read_text()
 
 

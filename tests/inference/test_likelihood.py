@@ -30,7 +30,11 @@ def plain(bound: BoundModel, theta, conditions, response) -> np.ndarray:
     return np.square(response - bound.location(theta, conditions)).sum(axis=1)
 
 
-@pytest.mark.parametrize("name", MODELS)
+# Without the rigid wheel, whose integrals cost a thousand times the others.
+FAST = [name for name in MODELS if not name.startswith("wong_reece")]
+
+
+@pytest.mark.parametrize("name", FAST)
 @settings(max_examples=10, deadline=None)
 @given(seed=SEEDS, n=st.sampled_from(LENGTHS), levels=st.sampled_from([None, 1, 3]))
 def test_sums_are_those_over_all_rows(name: str, seed: int, n: int, levels: int | None) -> None:
@@ -58,7 +62,7 @@ def test_repeats_that_agree_leave_nothing_within() -> None:
     assert squares(theta[:1])[0] < 1e-24 * exact.size
 
 
-@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("name", FAST)
 @pytest.mark.parametrize("n", LENGTHS)
 def test_a_sum_does_not_depend_on_what_it_is_evaluated_with(
     name: str, n: int, monkeypatch: pytest.MonkeyPatch

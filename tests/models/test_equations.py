@@ -63,7 +63,55 @@ def scalar_ayers_perumpral_volumetric(p, c):
     return brentq(excess, 0.1, 5.0, xtol=1e-14, rtol=1e-14)
 
 
+def scalar_bekker_plate(p, c):
+    modulus = p["kc"] / (c["plate_width_mm"] / 1000.0) + p["kphi"]
+    return 1000.0 * (c["average_ground_pressure_kpa"] / modulus) ** (1.0 / p["n"])
+
+
+def scalar_reece(p, c):
+    width = c["plate_width_mm"] / 1000.0
+    modulus = p["k1"] + p["k2"] * width
+    return 1000.0 * width * (c["average_ground_pressure_kpa"] / modulus) ** (1.0 / p["n"])
+
+
+def scalar_lyasko(p, c):
+    s = c["slip_ratio"]
+    standing = 1000.0 * (c["average_ground_pressure_kpa"] / p["k"]) ** (1.0 / p["n"])
+    return standing * (1.0 + s) / (1.0 - p["a"] * s)
+
+
+def numeric(c):
+    return c["cone_index_kpa"] * c["tyre_width_m"] * c["tyre_diameter_m"] / c["normal_load_kn"]
+
+
+def scalar_wismer_luth(p, c):
+    cn = numeric(c)
+    gross = p["c1"] * (1.0 - math.exp(-p["c2"] * cn * c["slip_ratio"]))
+    return c["normal_load_kn"] * (gross - (p["c3"] / cn + p["c4"]))
+
+
+def scalar_brixius(p, c):
+    """Gross traction and motion resistance apart, each with the 0.04 of the source."""
+    s = c["slip_ratio"]
+    bn = numeric(c) * (1.0 + 5.0 * c["tyre_deflection_mm"] / c["section_height_mm"])
+    bn /= 1.0 + 3.0 * c["tyre_width_m"] / c["tyre_diameter_m"]
+    gross = p["c1"] * (1.0 - math.exp(-p["c2"] * bn)) * (1.0 - math.exp(-p["c3"] * s)) + 0.04
+    resistance = p["c4"] / bn + 0.04 + p["c5"] * s / math.sqrt(bn)
+    return c["normal_load_kn"] * (gross - resistance)
+
+
+def scalar_janosi_hanamoto(p, c):
+    strength = p["c"] + c["normal_stress_kpa"] * math.tan(math.radians(p["phi"]))
+    return strength * (1.0 - math.exp(-c["shear_displacement_mm"] / p["K"]))
+
+
 SCALAR = {
+    "bekker_plate": scalar_bekker_plate,
+    "reece": scalar_reece,
+    "lyasko": scalar_lyasko,
+    "wismer_luth": scalar_wismer_luth,
+    "brixius": scalar_brixius,
+    "janosi_hanamoto": scalar_janosi_hanamoto,
     "magic_formula": scalar_magic_formula,
     "magic_formula_pressure": scalar_magic_formula_pressure,
     "bekker": scalar_bekker,
@@ -73,7 +121,8 @@ SCALAR = {
 }
 
 
-@pytest.mark.parametrize("name", MODELS)
+# The rigid wheel has its own test beside the quadrature, to the accuracy of that.
+@pytest.mark.parametrize("name", [m for m in MODELS if "wong_reece" not in m])
 @settings(max_examples=25, deadline=None)
 @given(seed=SEEDS)
 def test_a_model_is_its_published_equation(name: str, seed: int) -> None:

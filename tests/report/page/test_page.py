@@ -292,7 +292,7 @@ def test_validation_facts_have_the_numbers(rut):
 @pytest.mark.parametrize("name", MODELS)
 def test_every_model_has_an_equation_and_a_parametrisation(name):
     references = {"ci_ref_kpa": 500.0, "water_ref": 0.06, "p_ref_kpa": 140.0, "p_mid_psi": 30.0,
-                  "p_half_psi": 12.0}  # fmt: skip
+                  "p_half_psi": 12.0, "b_ref_mm": 120.0}  # fmt: skip
     bound = BoundModel(MODELS[name], references)
     assert "<i>" in equation(bound)
     text = parametrisation(bound)

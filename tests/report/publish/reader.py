@@ -11,12 +11,16 @@ GREEK = {
 }  # fmt: skip
 COMMANDS = {
     "allowbreak", "arctan", "ast", "begin", "bottomrule", "caption", "centering", "chi", "cite",
+    "cos", "exp", "int", "sqrt", "tan",
     "end", "footnotesize", "gamma", "label", "ldots", "le", "ge", "mathrm", "midrule", "mu",
     "paragraph", "pm", "raggedright", "rlap", "sigma", "sin", "small", "tabularnewline", "tau",
     "textasciicircum", "textbackslash", "texttt", "textwidth", "theta", "times", "toprule",
     "textasciitilde", "circ", *GREEK,
 }  # fmt: skip
-MATH_ONLY = {"arctan", "ast", "circ", "le", "ge", "mathrm", "pm", "sin", "times", *GREEK}
+MATH_ONLY = {
+    "arctan", "ast", "circ", "cos", "exp", "int", "le", "ge", "mathrm", "pm", "sin", "sqrt", "tan",
+    "times", *GREEK,
+}  # fmt: skip
 
 
 def check(text: str) -> None:

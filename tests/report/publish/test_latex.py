@@ -46,7 +46,9 @@ def test_every_model_has_its_equation(name):
     check(latex_equation(name))
     check(to_latex(letters(name)))
     assert "Eq" not in text_equation(name)
-    assert equation_numbers(name).startswith("Eq")
+    # Of other sources than the paper the numbers are not known.
+    numbers = equation_numbers(name)
+    assert numbers.startswith("Eq") if MODELS[name].cited == "He_2019" else not numbers
     # The parameters that the source prints are all in it.
     for parameter in MODELS[name].reported:
         digits = parameter.strip("ABCDEKSbcknvh")

@@ -34,8 +34,8 @@ def _example() -> str:
 
 calib.register(
     calib.Model(
-        name="wismer_luth",
-        title="Wismer-Luth traction",
+        name="one_tyre",
+        title="Wismer-Luth traction of one tyre",
         output="drawbar_pull_kn",
         conditions=("slip_ratio", "cone_index_kpa", "normal_load_kn"),
         parameters=("gross", "rate", "rolling"),
@@ -48,7 +48,7 @@ calib.register(
         source="Wismer & Luth (1973), J. Terramechanics 10(2), 49-61",
         example=_example(),
         priors="""
-model = "wismer_luth"
+model = "one_tyre"
 
 [parameters.gross]
 dist = "lognormal"

@@ -1,0 +1,70 @@
+"""The verb that compares models on the same data."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calib.cli.parallel import CORES, Models, Workers
+
+__all__ = ["register"]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the verb to an app."""
+    app.command()(compare)
+
+
+def compare(
+    what: Annotated[list[str], typer.Argument(help="Models, then the CSV: A B my.csv.")],
+    out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-comparison"),
+    priors: Annotated[
+        list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)] = 2019,
+    hold_out: Annotated[
+        str | None, typer.Option("--hold-out", help="Rows kept, e.g. plate_width_mm=80.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier one.")] = False,
+    max_steps: Annotated[int, typer.Option(help="Where extending the chains stops.")] = 25_600,
+    workers: Workers = CORES,
+    plugins: Models = None,
+) -> None:
+    """Say which of several models the same data prefer, and what they cannot tell."""
+    from calib.batch.folders import check_folder, fresh_folder
+    from calib.cli.display import progress_bars
+    from calib.data import hold_out as split
+    from calib.data import read_for_model
+    from calib.data.labels import labelled
+    from calib.inference.prior_files import prior_file_model
+    from calib.inference.sampling.sampler import SamplerSettings
+    from calib.models import get_model
+    from calib.report.comparison import write_comparison
+    from calib.report.page.comparison import text
+    from calib.report.study_tasks import HoldOut
+    from calib.validation.comparison import check_comparable
+    from calib.validation.comparison import compare as find
+
+    *models, file = what
+    check_folder(out, overwrite=overwrite)
+    check_comparable(models)
+    chosen = [get_model(name) for name in models]
+    needed = {c for m in chosen for c in (*m.conditions, m.output)}
+    table = labelled(read_for_model(Path(file), sorted(needed)))
+    kept = None if hold_out is None else HoldOut.parse(hold_out)
+    fitted, held = split(table, kept.column, kept.value) if kept else (table, None)
+    with progress_bars() as tell:
+        found = find(
+            fitted, models, seed, held_out=held,
+            priors={prior_file_model(path): path for path in priors or ()},
+            settings=SamplerSettings(max_steps=max_steps), progress=tell, workers=workers,
+        )  # fmt: skip
+    with fresh_folder(out, overwrite=overwrite) as folder:
+        written = write_comparison(found, folder, ["calib", *sys.argv[1:]], hold_out or "")
+    print(text(written))
+    print(out / "index.html")
+    if not found.sound:
+        raise typer.Exit(3)

@@ -1,0 +1,90 @@
+"""Shear stress from normal stress and displacement: Janosi & Hanamoto (1961).
+
+tau = (c + sigma tan phi)[1 - exp(-j/K)], with tau, c and sigma in kPa, phi in degrees, j and K in
+mm. For soils without a peak of the shear stress.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.models.base import Array, Conditions, Model
+
+__all__ = ["JANOSI_HANAMOTO"]
+
+
+def _predict(theta: Array, conditions: Conditions) -> Array:
+    c, phi, K = (theta[:, j, None] for j in range(3))
+    strength = c + conditions["normal_stress_kpa"] * np.tan(np.radians(phi))
+    return np.asarray(-strength * np.expm1(-conditions["shear_displacement_mm"] / K))
+
+
+JANOSI_HANAMOTO = Model(
+    name="janosi_hanamoto",
+    title="Janosi-Hanamoto shear",
+    output="shear_stress_kpa",
+    conditions=("normal_stress_kpa", "shear_displacement_mm"),
+    parameters=("c", "phi", "K"),
+    reported={"c": "kPa", "phi": "degree", "K": "mm"},
+    predict=_predict,
+    latex=(r"$\tau = (c + \sigma_\mathrm{n} \tan \phi)[1 - \exp(-j/K)]$",),
+    source="Janosi & Hanamoto (1961), 1st Int. Conf. Mechanics of Soil-Vehicle Systems, Turin",
+    letters=(
+        "[$tau] the shear stress, [$sigma_n] the normal stress (kPa), [$j] the displacement (mm)"
+    ),
+    example="""\
+normal_stress_kpa,shear_displacement_mm,shear_stress_kpa
+10,2,0.632
+10,6,2.132
+10,15,5.373
+10,30,7.43
+10,60,8.516
+25,2,2.6
+25,6,6.079
+25,15,11.18
+25,30,15.61
+25,60,17.47
+50,2,4.93
+50,6,11.28
+50,15,21.35
+50,30,29.45
+50,60,30.8
+""",
+    priors="""\
+model = "janosi_hanamoto"
+
+[parameters.c]
+dist = "lognormal"
+median = 1.5
+sd_log = 1.0
+unit = "kPa"
+reason = "Cohesion of mineral soils: 0.2 (dry sand) to 10 kPa and more (clay)"
+source = "Wong (2008), Table 2.3"
+
+[parameters.phi]
+dist = "normal"
+mean = 29.0
+sd = 8.0
+lower = 3.0
+upper = 50.0
+unit = "degree"
+reason = "Friction angles of mineral soils: 6 (wet clay) to 40 degrees (dense sand)"
+source = "Wong (2008), Table 2.3"
+
+[parameters.K]
+dist = "lognormal"
+median = 14.0
+sd_log = 0.6
+unit = "mm"
+reason = "Shear deformation moduli of mineral soils: 6-30 mm"
+source = "Wong (2008); Janosi & Hanamoto (1961)"
+
+[parameters.sigma]
+dist = "lognormal"
+median = 0.7
+sd_log = 1.2
+unit = "kPa"
+reason = "Scatter of shear stresses: some percent of the 1-100 kPa measured"
+source = "This project: order of magnitude for shear boxes and rings, not read off data"
+""",
+)

@@ -1,0 +1,229 @@
+"""Net traction from a mobility number and slip: Wismer & Luth (1973), Brixius (1987).
+
+With W the load, CI the cone index, b and d width and diameter of the tyre, delta its deflection
+and h the height of its section,
+
+    Cn = CI b d / W                                      Bn = Cn (1 + 5 delta/h)/(1 + 3 b/d)
+    P/W = c1 [1 - exp(-c2 Cn s)] - c3/Cn - c4            (Wismer & Luth)
+    P/W = c1 [1 - exp(-c2 Bn)] [1 - exp(-c3 s)] - c4/Bn - c5 s/sqrt(Bn)    (Brixius, bias ply)
+
+The published coefficients are the medians of the priors. In Brixius' net traction the two terms
+0.04, of the gross traction and of the motion resistance, cancel; printed forms that omit the first
+of them differ. The exponent of radial tyres is 9.5 or 10.5, by source: it lies within its prior.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calib.models.base import Array, Conditions, Model
+
+__all__ = ["BRIXIUS", "WISMER_LUTH", "mobility_number", "wheel_numeric"]
+
+
+def wheel_numeric(conditions: Conditions) -> Array:
+    """Return Cn = CI b d / W, dimensionless, of the shape of the conditions."""
+    area = conditions["tyre_width_m"] * conditions["tyre_diameter_m"]
+    return np.asarray(conditions["cone_index_kpa"] * area / conditions["normal_load_kn"])
+
+
+def mobility_number(conditions: Conditions) -> Array:
+    """Return Brixius' Bn, dimensionless, of the shape of the conditions."""
+    flattened = 1.0 + 5.0 * conditions["tyre_deflection_mm"] / conditions["section_height_mm"]
+    slender = 1.0 + 3.0 * conditions["tyre_width_m"] / conditions["tyre_diameter_m"]
+    return np.asarray(wheel_numeric(conditions) * flattened / slender)
+
+
+def _wismer_luth(theta: Array, conditions: Conditions) -> Array:
+    c1, c2, c3, c4 = (theta[:, j, None] for j in range(4))
+    numeric = wheel_numeric(conditions)
+    gross = c1 * -np.expm1(-c2 * numeric * conditions["slip_ratio"])
+    return np.asarray(conditions["normal_load_kn"] * (gross - c3 / numeric - c4))
+
+
+def _brixius(theta: Array, conditions: Conditions) -> Array:
+    c1, c2, c3, c4, c5 = (theta[:, j, None] for j in range(5))
+    number, slip = mobility_number(conditions), conditions["slip_ratio"]
+    gross = c1 * np.expm1(-c2 * number) * np.expm1(-c3 * slip)
+    resistance = c4 / number + c5 * slip / np.sqrt(number)
+    return np.asarray(conditions["normal_load_kn"] * (gross - resistance))
+
+
+WISMER_LUTH = Model(
+    name="wismer_luth",
+    title="Wismer-Luth net traction",
+    output="drawbar_pull_kn",
+    conditions=(
+        "slip_ratio", "cone_index_kpa", "normal_load_kn", "tyre_width_m", "tyre_diameter_m",
+    ),
+    parameters=("c1", "c2", "c3", "c4"),
+    predict=_wismer_luth,
+    latex=(
+        r"$P/W = c_1[1 - \exp(-c_2 C_\mathrm{n} s)] - c_3/C_\mathrm{n} - c_4$",
+        r"$C_\mathrm{n} = I b d/W$",
+    ),
+    source="Wismer & Luth (1973), J. Terramechanics 10(2), 49-61",
+    letters=(
+        "[$P] the pull (kN), [$W] the load (kN), [$s] the slip, [$C_n] the wheel numeric, [$I] the "
+        "cone index (kPa), [$b] and [$d] width and diameter of the tyre (m)"
+    ),
+    example="""\
+slip_ratio,cone_index_kpa,normal_load_kn,tyre_width_m,tyre_diameter_m,drawbar_pull_kn
+0.03,600,6,0.3,1,0.7685
+0.08,600,6,0.3,1,1.6
+0.15,600,6,0.3,1,2.891
+0.25,600,6,0.3,1,3.495
+0.4,600,6,0.3,1,3.856
+0.03,600,10,0.3,1,0.02268
+0.08,600,10,0.3,1,1.261
+0.15,600,10,0.3,1,3.062
+0.25,600,10,0.3,1,4.359
+0.4,600,10,0.3,1,6.067
+0.03,1100,10,0.42,1.4,2.758
+0.08,1100,10,0.42,1.4,5.273
+0.15,1100,10,0.42,1.4,6.464
+0.25,1100,10,0.42,1.4,6.756
+0.4,1100,10,0.42,1.4,6.753
+""",
+    priors="""\
+model = "wismer_luth"
+
+[parameters.c1]
+dist = "lognormal"
+median = 0.75
+sd_log = 0.3
+unit = "1"
+reason = "Largest gross traction over load; soils differ by a third"
+source = "Wismer & Luth (1973), its coefficient is the median; read in two secondary sources"
+
+[parameters.c2]
+dist = "lognormal"
+median = 0.3
+sd_log = 0.5
+unit = "1"
+reason = "How soon traction is mobilised; tyres and soils differ by a factor of about 2.7"
+source = "Wismer & Luth (1973), its coefficient is the median; read in two secondary sources"
+
+[parameters.c3]
+dist = "lognormal"
+median = 1.2
+sd_log = 0.5
+unit = "1"
+reason = "Resistance of soft ground; within a factor of about 2.7"
+source = "Wismer & Luth (1973), its coefficient is the median; read in two secondary sources"
+
+[parameters.c4]
+dist = "lognormal"
+median = 0.04
+sd_log = 0.5
+unit = "1"
+reason = "Rolling resistance on hard ground: 0.015-0.1"
+source = "Wismer & Luth (1973), its coefficient is the median; read in two secondary sources"
+
+[parameters.sigma]
+dist = "lognormal"
+median = 0.02
+sd_log = 1.0
+relative_to = "normal_load_kn"
+default_reference = 5.0
+unit = "kN"
+reason = "Load cells and uneven ground scatter pulls by some percent of the load"
+source = "This project: order of magnitude for single-wheel testers, not read off data"
+""",
+)  # fmt: skip
+
+BRIXIUS = Model(
+    name="brixius",
+    title="Brixius net traction",
+    output="drawbar_pull_kn",
+    conditions=(
+        "slip_ratio", "cone_index_kpa", "normal_load_kn", "tyre_width_m", "tyre_diameter_m",
+        "tyre_deflection_mm", "section_height_mm",
+    ),
+    parameters=("c1", "c2", "c3", "c4", "c5"),
+    predict=_brixius,
+    latex=(
+        (
+            r"$P/W = c_1[1 - \exp(-c_2 B_\mathrm{n})][1 - \exp(-c_3 s)] - c_4/B_\mathrm{n} "
+            r"- c_5 s/\sqrt{B_\mathrm{n}}$"
+        ),
+        r"$B_\mathrm{n} = (I b d/W)(1 + 5 \delta/h)/(1 + 3 b/d)$",
+    ),
+    source="Brixius (1987), ASAE paper 87-1622; ASABE D497",
+    letters=(
+        "[$P] the pull (kN), [$W] the load (kN), [$s] the slip, [$B_n] the mobility number, [$I] "
+        "the cone index (kPa), [$b], [$d] and [$h] width, diameter (m) and section height of the "
+        "tyre, [$delta] its deflection"
+    ),
+    example="""\
+slip_ratio,cone_index_kpa,normal_load_kn,tyre_width_m,tyre_diameter_m,tyre_deflection_mm,section_height_mm,drawbar_pull_kn
+0.03,600,6,0.3,1,30,200,0.7273
+0.08,600,6,0.3,1,30,200,2.013
+0.15,600,6,0.3,1,30,200,3.017
+0.25,600,6,0.3,1,30,200,3.915
+0.4,600,6,0.3,1,30,200,4.237
+0.03,600,10,0.3,1,45,200,1.01
+0.08,600,10,0.3,1,45,200,3.086
+0.15,600,10,0.3,1,45,200,4.567
+0.25,600,10,0.3,1,45,200,5.604
+0.4,600,10,0.3,1,45,200,6.275
+0.03,1100,10,0.42,1.4,50,260,1.684
+0.08,1100,10,0.42,1.4,50,260,4.057
+0.15,1100,10,0.42,1.4,50,260,5.654
+0.25,1100,10,0.42,1.4,50,260,7.102
+0.4,1100,10,0.42,1.4,50,260,8.107
+""",
+    priors="""\
+model = "brixius"
+
+[parameters.c1]
+dist = "lognormal"
+median = 0.88
+sd_log = 0.3
+unit = "1"
+reason = "Largest gross traction over load; soils differ by a third"
+source = "Brixius (1987), bias-ply tyres: the median; read in two secondary sources"
+
+[parameters.c2]
+dist = "lognormal"
+median = 0.1
+sd_log = 0.5
+unit = "1"
+reason = "How soon firmer soil gives more; within a factor of about 2.7"
+source = "Brixius (1987), bias-ply tyres: the median; read in two secondary sources"
+
+[parameters.c3]
+dist = "lognormal"
+median = 7.5
+sd_log = 0.4
+unit = "1"
+reason = "How soon slip mobilises traction: 7.5 for bias-ply, 9.5 or 10.5 for radial tyres"
+source = "Brixius (1987), bias-ply tyres: the median; read in two secondary sources"
+
+[parameters.c4]
+dist = "lognormal"
+median = 1.0
+sd_log = 0.5
+unit = "1"
+reason = "Resistance of soft ground: 1 for bias-ply, 0.9 for radial tyres"
+source = "Brixius (1987), bias-ply tyres: the median; read in two secondary sources"
+
+[parameters.c5]
+dist = "lognormal"
+median = 0.5
+sd_log = 0.7
+unit = "1"
+reason = "Resistance that slip adds; within a factor of four"
+source = "Brixius (1987), bias-ply tyres: the median; read in two secondary sources"
+
+[parameters.sigma]
+dist = "lognormal"
+median = 0.02
+sd_log = 1.0
+relative_to = "normal_load_kn"
+default_reference = 5.0
+unit = "kN"
+reason = "Load cells and uneven ground scatter pulls by some percent of the load"
+source = "This project: order of magnitude for single-wheel testers, not read off data"
+""",
+)  # fmt: skip

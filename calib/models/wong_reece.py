@@ -1,0 +1,248 @@
+"""Drawbar pull, torque and sinkage of a driven rigid wheel: Wong & Reece (1967), part I.
+
+The stresses and their integration are in `calib.models.rigid_wheel`. The three models share their
+soil: eight parameters, of which pull, torque or sinkage alone determine but a few.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+from calib.models.base import Array, Conditions, Model
+from calib.models.rigid_wheel import contact, wheels
+
+__all__ = ["WONG_REECE_PULL", "WONG_REECE_SINKAGE", "WONG_REECE_TORQUE"]
+
+_MM_PER_M = 1000.0
+
+
+def _pull(theta: Array, conditions: Conditions) -> Array:
+    return contact(wheels(theta, conditions)).pull
+
+
+def _torque(theta: Array, conditions: Conditions) -> Array:
+    return contact(wheels(theta, conditions)).torque
+
+
+def _sinkage(theta: Array, conditions: Conditions) -> Array:
+    return _MM_PER_M * contact(wheels(theta, conditions)).sinkage
+
+
+_LETTERS = (
+    "[$W] the load (kN), [$s] the slip, [$b] and [$r] width and radius of the wheel (m), [$theta] "
+    "the angle from the vertical, [$theta_1] where the wheel enters and [$theta_m] where the "
+    "normal stress [$sigma_n] (kPa) is largest (below, it falls in proportion to zero), [$tau] "
+    "the shear stress (kPa), [$j] the slip displacement (mm)"
+)
+_STRESS = (
+    r"$\sigma_\mathrm{n} = (k_1 + k_2 b)(r/b)^n (\cos\theta - \cos\theta_1)^n$",
+    r"$\tau = (c + \sigma_\mathrm{n} \tan\phi)[1 - \exp(-j/K)]$",
+    r"$\theta_\mathrm{m} = (c_1 + c_2 s)\theta_1$",
+    r"$W = r b \int (\sigma_\mathrm{n} \cos\theta + \tau \sin\theta) d\theta$",
+)
+_SOIL = """\
+[parameters.k1]
+dist = "lognormal"
+median = 20.0
+sd_log = 1.3
+unit = "kPa"
+reason = "Reece's cohesive modulus, c kc': from almost none to 200 kPa"
+source = "This project: orders of magnitude of sands to firm loams, wide on purpose"
+
+[parameters.k2]
+dist = "lognormal"
+median = 1000.0
+sd_log = 1.2
+unit = "kPa/m"
+reason = "Reece's frictional modulus, gamma kphi': 100 to 10000 kPa/m"
+source = "This project: orders of magnitude of sands to firm loams, wide on purpose"
+
+[parameters.n]
+dist = "lognormal"
+median = 0.9
+sd_log = 0.4
+lower = 0.2
+upper = 2.0
+unit = "1"
+reason = "Sinkage exponents of mineral soils: 0.5 (clay) to 1.6 (dense sand)"
+source = "Wong (2008), Table 2.3"
+
+[parameters.c]
+dist = "lognormal"
+median = 1.5
+sd_log = 1.0
+unit = "kPa"
+reason = "Cohesion of mineral soils: 0.2 (dry sand) to 10 kPa and more (clay)"
+source = "Wong (2008), Table 2.3"
+
+[parameters.phi]
+dist = "normal"
+mean = 29.0
+sd = 8.0
+lower = 3.0
+upper = 50.0
+unit = "degree"
+reason = "Friction angles of mineral soils: 6 (wet clay) to 40 degrees (dense sand)"
+source = "Wong (2008), Table 2.3"
+
+[parameters.K]
+dist = "lognormal"
+median = 14.0
+sd_log = 0.6
+unit = "mm"
+reason = "Shear deformation moduli of mineral soils: 6-30 mm"
+source = "Wong (2008); Janosi & Hanamoto (1961)"
+
+[parameters.c1]
+dist = "normal"
+mean = 0.3
+sd = 0.12
+lower = 0.0
+upper = 0.8
+unit = "1"
+reason = "Where the stress is largest, at no slip: 0.43 (compact sand), 0.18 (loose sand)"
+source = "Wong & Reece (1967), Table 1, read in two secondary sources"
+
+[parameters.c2]
+dist = "normal"
+mean = 0.32
+sd = 0.1
+lower = 0.0
+upper = 0.8
+unit = "1"
+reason = "How slip moves it forward: 0.32 for both sands"
+source = "Wong & Reece (1967), Table 1, read in two secondary sources"
+
+"""
+
+_model = partial(
+    Model,
+    conditions=("slip_ratio", "normal_load_kn", "tyre_width_m", "tyre_diameter_m"),
+    parameters=("k1", "k2", "n", "c", "phi", "K", "c1", "c2"),
+    reported={
+        "k1": "kPa", "k2": "kPa/m", "n": "1", "c": "kPa", "phi": "degree", "K": "mm", "c1": "1",
+        "c2": "1",
+    },
+    source="Wong & Reece (1967), J. Terramechanics 4(1), 81-98, doi:10.1016/0022-4898(67)90105-X",
+)  # fmt: skip
+
+WONG_REECE_PULL = _model(
+    name="wong_reece_pull",
+    title="Wong-Reece rigid wheel: drawbar pull",
+    output="drawbar_pull_kn",
+    predict=_pull,
+    response="identity",
+    latex=(r"$P = r b \int (\tau \cos\theta - \sigma_\mathrm{n} \sin\theta) d\theta$", *_STRESS),
+    letters="[$P] the pull (kN), " + _LETTERS,
+    example="""\
+slip_ratio,normal_load_kn,tyre_width_m,tyre_diameter_m,drawbar_pull_kn
+0.05,2,0.2,0.8,0.07713
+0.12,2,0.2,0.8,0.2987
+0.2,2,0.2,0.8,0.3535
+0.35,2,0.2,0.8,0.4524
+0.5,2,0.2,0.8,0.4773
+0.05,4,0.3,1,0.3569
+0.12,4,0.3,1,0.7811
+0.2,4,0.3,1,0.9191
+0.35,4,0.3,1,1.011
+0.5,4,0.3,1,1.116
+0.05,6,0.3,1.2,0.9344
+0.12,6,0.3,1.2,1.062
+0.2,6,0.3,1.2,1.446
+0.35,6,0.3,1.2,1.487
+0.5,6,0.3,1.2,1.585
+""",
+    priors='model = "wong_reece_pull"\n\n'
+    + _SOIL
+    + """\
+[parameters.sigma]
+dist = "lognormal"
+median = 0.02
+sd_log = 1.0
+relative_to = "normal_load_kn"
+default_reference = 5.0
+unit = "kN"
+reason = "Load cells and uneven ground scatter pulls by some percent of the load"
+source = "This project: order of magnitude for single-wheel testers, not read off data"
+""",
+)
+
+WONG_REECE_TORQUE = _model(
+    name="wong_reece_torque",
+    title="Wong-Reece rigid wheel: torque",
+    output="driving_torque_knm",
+    predict=_torque,
+    response="identity",
+    latex=(r"$T = r^2 b \int \tau d\theta$", *_STRESS),
+    letters="[$T] the torque (kN m), " + _LETTERS,
+    example="""\
+slip_ratio,normal_load_kn,tyre_width_m,tyre_diameter_m,driving_torque_knm
+0.05,2,0.2,0.8,0.2416
+0.12,2,0.2,0.8,0.3144
+0.2,2,0.2,0.8,0.3552
+0.35,2,0.2,0.8,0.3896
+0.5,2,0.2,0.8,0.3966
+0.05,4,0.3,1,0.6503
+0.12,4,0.3,1,0.795
+0.2,4,0.3,1,0.8841
+0.35,4,0.3,1,1.01
+0.5,4,0.3,1,1.002
+0.05,6,0.3,1.2,1.379
+0.12,6,0.3,1.2,1.625
+0.2,6,0.3,1.2,1.632
+0.35,6,0.3,1.2,1.855
+0.5,6,0.3,1.2,1.818
+""",
+    priors='model = "wong_reece_torque"\n\n'
+    + _SOIL
+    + """\
+[parameters.sigma]
+dist = "lognormal"
+median = 0.01
+sd_log = 1.0
+relative_to = "normal_load_kn"
+default_reference = 5.0
+unit = "kN m"
+reason = "Load cells and uneven ground scatter pulls by some percent of the load"
+source = "This project: order of magnitude for single-wheel testers, not read off data"
+""",
+)
+
+WONG_REECE_SINKAGE = _model(
+    name="wong_reece_sinkage",
+    title="Wong-Reece rigid wheel: sinkage",
+    output="rut_depth_mm",
+    predict=_sinkage,
+    response="log",
+    latex=(r"$z = r(1 - \cos\theta_1)$", *_STRESS),
+    letters="[$z] the sinkage (m), " + _LETTERS,
+    example="""\
+slip_ratio,normal_load_kn,tyre_width_m,tyre_diameter_m,rut_depth_mm
+0.05,2,0.2,0.8,50.75
+0.12,2,0.2,0.8,50.94
+0.2,2,0.2,0.8,43.72
+0.35,2,0.2,0.8,51.84
+0.5,2,0.2,0.8,53.88
+0.05,4,0.3,1,60.41
+0.12,4,0.3,1,51.03
+0.2,4,0.3,1,60.12
+0.35,4,0.3,1,53.54
+0.5,4,0.3,1,59.33
+0.05,6,0.3,1.2,66.07
+0.12,6,0.3,1.2,79.62
+0.2,6,0.3,1.2,75.05
+0.35,6,0.3,1.2,90.03
+0.5,6,0.3,1.2,81.4
+""",
+    priors='model = "wong_reece_sinkage"\n\n'
+    + _SOIL
+    + """\
+[parameters.sigma]
+dist = "lognormal"
+median = 0.1
+sd_log = 0.8
+unit = "1"
+reason = "Relative scatter of sinkage readings: 2-50 %"
+source = "This project: order of magnitude for repeated readings, not read off data"
+""",
+)

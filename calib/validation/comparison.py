@@ -1,0 +1,275 @@
+"""Several models on the same rows: what each predicts of a row that it has not seen.
+
+Of each model the log predictive density of every row is found without that row (leave-one-out by
+smoothed importance sampling, by fitting again where its Pareto k is above 0.7), and of rows that
+were held out besides. Densities are of the output itself, whatever scale a model's noise is on, so
+that models of its logarithm can be compared with others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.special import logsumexp
+
+from calib.data import Table
+from calib.errors import CalibError
+from calib.inference.calibration import Calibration, calibrate
+from calib.inference.estimators import estimate
+from calib.inference.problem import build_problem
+from calib.inference.random import generator
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.models import get_model
+from calib.models.base import Array
+from calib.validation.validate import Validation, leave_one_out, validate_held_out
+
+__all__ = [
+    "Candidate", "Comparison", "Difference", "check_comparable", "compare", "stacking_weights",
+]  # fmt: skip
+
+# Differences of less are small whatever their standard error, which few rows then underestimate.
+SMALL = 4.0
+# A difference of more standard errors than this is called one.
+CLEAR = 2.0
+_MAX_ITERATIONS = 100_000
+
+type Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model, calibrated and scored.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    loo : Validation
+        By leave-one-out, on the fitted rows.
+    held : Validation or None
+        On the rows held out.
+    held_elpd : float
+        Their summed log predictive density, each given the fitted rows; NaN without any.
+    """
+
+    calibration: Calibration
+    loo: Validation
+    held: Validation | None
+    held_elpd: float
+
+    @property
+    def model(self) -> str:
+        """Name of the model."""
+        return self.calibration.problem.bound.model.name
+
+    @property
+    def rows(self) -> Array:
+        """Log predictive density of each fitted row without it, shape (n,)."""
+        found = self.loo.elpd_rows
+        return np.full(self.loo.observed.size, np.nan) if found is None else found
+
+    @property
+    def sound(self) -> bool:
+        """Whether the calibration, and every one without a row, passed the gate."""
+        return self.calibration.converged and not self.loo.unconverged
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How far a model's expected log predictive density is below the best, and its error."""
+
+    elpd: float
+    se: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether the data tell the two models apart."""
+        return self.elpd > max(SMALL, CLEAR * self.se)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Models on the same rows, the best first.
+
+    Parameters
+    ----------
+    candidates : tuple of Candidate
+        By their expected log predictive densities.
+    weights : mapping of str to float
+        Stacking weights by model; they sum to 1.
+    seed : int
+    """
+
+    candidates: tuple[Candidate, ...]
+    weights: Mapping[str, float]
+    seed: int
+
+    @property
+    def sound(self) -> bool:
+        """Whether every posterior it rests on passed the gate."""
+        return all(c.sound for c in self.candidates)
+
+    @property
+    def differences(self) -> dict[str, Difference]:
+        """Of each model from the best; zero for that itself."""
+        best = self.candidates[0].rows
+        return {c.model: _difference(best - c.rows) for c in self.candidates}
+
+    @property
+    def sentence(self) -> str:
+        """What the data prefer, and what they cannot tell, in plain words."""
+        if not self.sound:
+            bad = [c.model for c in self.candidates if not c.sound]
+            return (
+                f"No preference is stated: {_joined(bad)} did not converge. Raise --max-steps, or "
+                "give tighter priors."
+            )
+        best, *others = (c.model for c in self.candidates)
+        told = [m for m in others if self.differences[m].clear]
+        untold = [m for m in others if not self.differences[m].clear]
+        parts = []
+        if told:
+            parts.append(f"The data prefer {best} to {_joined(told)}.")
+        if untold:
+            parts.append(f"They cannot tell {best} from {_joined(untold)}." if told else
+                         f"The data cannot tell {_joined([best, *untold])} apart.")  # fmt: skip
+        return " ".join(parts)
+
+
+def _joined(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _difference(rows: Array) -> Difference:
+    return Difference(float(rows.sum()), float(np.sqrt(rows.size * rows.var(ddof=1))))
+
+
+def compare(
+    table: Table,
+    models: Sequence[str],
+    seed: int = 2019,
+    *,
+    held_out: Table | None = None,
+    priors: Mapping[str, Path] | None = None,
+    settings: SamplerSettings | None = None,
+    progress: Progress | None = None,
+    workers: int = 1,
+) -> Comparison:
+    """Calibrate several models on the same rows and compare what they predict.
+
+    Parameters
+    ----------
+    table : Table
+        With the output, and the conditions of every model.
+    models : sequence of str
+        At least two, of one output.
+    seed : int
+    held_out : Table, optional
+        Rows of the same campaign that are not fitted.
+    priors : mapping of str to Path, optional
+        Prior files by model; the shipped ones by default.
+    settings : SamplerSettings, optional
+    progress : callable, optional
+        Called with what is being done, steps done and steps planned.
+    workers : int
+        Processes for fits without a row; the numbers do not depend on it.
+
+    Raises
+    ------
+    CalibError
+        If there are not two models, they have different outputs, or the table lacks a column.
+
+    References
+    ----------
+    Vehtari, Gelman & Gabry (2017), doi:10.1007/s11222-016-9696-4; Yao, Vehtari, Simpson & Gelman
+    (2018), doi:10.1214/17-BA1091; Sivula, Magnusson, Matamoros & Vehtari (2020), arXiv:2008.10296.
+    """
+    check_comparable(models)
+    tell = progress or (lambda what, done, planned: None)
+    given = priors or {}
+    found = [
+        _candidate(name, table, held_out, given.get(name), seed, settings, tell, workers)
+        for name in models
+    ]
+    weights = stacking_weights(np.stack([c.rows for c in found], axis=1))
+    named = dict(zip(models, map(float, weights), strict=True))
+    ranked = tuple(sorted(found, key=lambda c: -c.loo.elpd))
+    return Comparison(ranked, {c.model: named[c.model] for c in ranked}, seed)
+
+
+def check_comparable(models: Sequence[str]) -> None:
+    """Check that there are at least two models, all of one output.
+
+    Raises
+    ------
+    CalibError
+        If not, or there is no model of a name.
+    """
+    if len(models) < 2 or len(set(models)) < len(models):
+        raise CalibError(
+            f"there is nothing to compare in {', '.join(models) or 'no model'}",
+            allowed="two or more models, each once",
+            mend="name them before the file: calib compare MODEL MODEL my.csv",
+        )
+    outputs = {name: get_model(name).output for name in models}
+    if len(set(outputs.values())) > 1:
+        raise CalibError(
+            "the models predict different outputs",
+            where="; ".join(f"{name}: {output}" for name, output in outputs.items()),
+            allowed="models of one output",
+            mend="compare those of one output at a time",
+        )
+
+
+def _candidate(
+    name: str, table: Table, held_out: Table | None, priors: Path | None, seed: int,
+    settings: SamplerSettings | None, tell: Progress, workers: int,
+) -> Candidate:  # fmt: skip
+    problem = build_problem(name, table, priors)
+    start = estimate(problem, "least_squares", generator(seed, name, "least_squares"))
+    calibration = calibrate(
+        problem, seed, label=name, estimates=(start,), settings=settings,
+        progress=lambda done, n: tell(f"{name}: sampling", done, n),
+    )  # fmt: skip
+    loo = leave_one_out(
+        calibration, settings=settings, workers=workers,
+        progress=lambda done, n: tell(f"{name}: leaving rows out", done, n),
+    )  # fmt: skip
+    if held_out is None:
+        return Candidate(calibration, loo, None, float("nan"))
+    rows = problem.with_table(held_out).log_likelihood_rows(calibration.draws.flat)
+    # Where a parameter vector gives the equation no value, its density is zero.
+    density = logsumexp(np.where(np.isfinite(rows), rows, -np.inf), axis=0) - np.log(len(rows))
+    return Candidate(
+        calibration, loo, validate_held_out(calibration, held_out), float(density.sum())
+    )
+
+
+def stacking_weights(elpd: Array) -> Array:
+    """Weights of predictive distributions whose mixture predicts the rows best.
+
+    Parameters
+    ----------
+    elpd : ndarray, shape (n, models)
+        Log predictive density of each row without it.
+
+    Returns
+    -------
+    ndarray, shape (models,)
+
+    References
+    ----------
+    Yao et al. (2018), doi:10.1214/17-BA1091, Eq 4. The sum of logarithms is concave in the
+    weights; each step of expectation maximisation increases it.
+    """
+    density = np.exp(elpd - elpd.max(axis=1, keepdims=True))
+    weights = np.full(density.shape[1], 1.0 / density.shape[1])
+    for _ in range(_MAX_ITERATIONS):
+        mixed = density * weights
+        new = (mixed / mixed.sum(axis=1, keepdims=True)).mean(axis=0)
+        if np.abs(new - weights).max() < 1e-9:
+            break
+        weights = new
+    return np.asarray(new / new.sum())

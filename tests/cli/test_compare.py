@@ -1,0 +1,48 @@
+"""`calib compare`, and `calib predict` on what it leaves."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from calib.models import example_csv
+from tests.cli.test_cli import Calib
+from tests.cli.test_cli import calib as calib
+
+FEW = ["--max-steps", 800, "--workers", 1]
+
+
+def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
+    Path("plates.csv").write_text(example_csv("reece"))
+    made = calib("compare", "reece", "bekker_plate", "plates.csv", "--out", "c", *FEW,
+                 "--hold-out", "plate_width_mm=80")  # fmt: skip
+    assert made.code in (0, 3), made.err
+    found = json.loads(Path("c/comparison.json").read_text())
+    assert found["verdict"] in made.out
+    assert set(found["models"]) == {"reece", "bekker_plate"}
+    assert abs(sum(m["weight"] for m in found["models"].values()) - 1.0) < 1e-9
+    assert all(m["held_out"]["rows"] == 4 for m in found["models"].values())
+    assert "figures/bands.png" in {p.relative_to("c").as_posix() for p in Path("c").rglob("*")}
+    told = calib("predict", "c", "--at", "plates.csv", "--out", "bands.csv")
+    assert told.code == (0 if found["converged"] else 3), told.err
+    assert "rut_depth_mm_predictive_90_lower" in Path("bands.csv").read_text()
+    again = calib("compare", "reece", "bekker_plate", "plates.csv", "--out", "c", *FEW)
+    assert again.code == 2
+    assert "--overwrite" in again.err
+    Path("c/comparison.json").write_text("{}")
+    broken = calib("predict", "c", "--at", "plates.csv")
+    assert broken.code == 2
+    assert "run `calib compare` again" in broken.err
+
+
+def test_what_cannot_be_compared_is_refused(calib: Calib) -> None:
+    Path("plates.csv").write_text(example_csv("bekker"))
+    lone = calib("compare", "reece", "plates.csv")
+    assert lone.code == 2
+    assert "two or more models" in lone.err
+    other = calib("compare", "reece", "magic_formula", "plates.csv")
+    assert "the models predict different outputs" in other.err
+    lacking = calib("compare", "reece", "bekker", "plates.csv")
+    assert lacking.code == 2
+    assert "plate_width_mm" in lacking.err
+    assert not Path("calib-comparison").exists()

@@ -1,0 +1,152 @@
+"""Comparing models: weights against an optimiser and ArviZ, and data whose model is known."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+
+import calib
+from calib.data import hold_out, table_from_arrays
+from calib.errors import CalibError
+from calib.models import MODELS
+from calib.report.comparison import document, load_stack, write_comparison
+from calib.validation.comparison import Comparison, compare, stacking_weights
+from calib.validation.prediction import N_DRAWS, predict, predict_stacked
+
+SHARED = Path(__file__).parents[2] / ".." / "shared"
+PLATE = ("average_ground_pressure_kpa", "plate_width_mm", "rut_depth_mm")
+
+
+def plates(seed: int, friction: float) -> calib.Table:
+    """Sinkages by Reece's equation with a known part of friction, 10 % noise."""
+    rng = np.random.default_rng(seed)
+    pressure, width = (a.ravel() for a in np.meshgrid(np.geomspace(5, 80, 8), [50.0, 100.0, 300.0]))
+    modulus = 60.0 * (1.0 - friction + friction * width / 100.0)
+    depth = width * (pressure / modulus) ** (1.0 / 1.1)
+    depth = depth * np.exp(0.1 * rng.standard_normal(depth.size))
+    return table_from_arrays(dict(zip(PLATE, (pressure, width, depth), strict=True)))
+
+
+@pytest.fixture(scope="module")
+def frictional() -> Comparison:
+    fitted, held = hold_out(plates(1, 1.0), "plate_width_mm", 100.0)
+    return compare(fitted, ["bekker", "reece", "bekker_plate"], 3, held_out=held)
+
+
+def test_weights_are_those_of_an_optimiser() -> None:
+    rng = np.random.default_rng(2)
+    elpd = rng.normal(-1.0, 1.0, (60, 3)) - np.array([0.0, 0.3, 2.5])
+    found = stacking_weights(elpd)
+
+    def loss(free: np.ndarray) -> float:
+        weights = np.append(free, 1.0 - free.sum())
+        return -float(np.log(np.clip(np.exp(elpd) @ weights, 1e-300, None)).sum())
+
+    best = minimize(
+        loss, [0.3, 0.3], method="SLSQP", bounds=[(0, 1)] * 2, options={"ftol": 1e-12},
+        constraints={"type": "ineq", "fun": lambda w: 1.0 - w.sum()},
+    )  # fmt: skip
+    np.testing.assert_allclose(found[:2], best.x, atol=2e-4)
+    assert found.sum() == pytest.approx(1.0)
+
+
+def test_the_model_that_made_the_data_is_preferred(frictional: Comparison) -> None:
+    assert frictional.candidates[0].model == "reece"
+    assert frictional.sound
+    assert frictional.sentence.startswith("The data prefer reece to ")
+    assert frictional.differences["bekker"].clear
+    assert frictional.weights["reece"] > 0.8
+    held = {c.model: c.held_elpd for c in frictional.candidates}
+    assert held["reece"] > held["bekker"]
+
+
+def test_leave_one_out_is_that_of_arviz(frictional: Comparison) -> None:
+    import arviz as az
+
+    from calib.inference.io import to_datatree
+
+    best = frictional.candidates[0]
+    theirs = az.loo(to_datatree(best.calibration), pointwise=True)
+    # ArviZ smooths with the effective sample size, which weighs the tail a little otherwise.
+    assert best.loo.elpd == pytest.approx(float(theirs.elpd), abs=0.1)
+
+
+def test_models_that_say_the_same_are_not_told_apart() -> None:
+    rows = plates(4, 0.0).columns
+    # Of one width, Reece's and Bekker's equations are the same curve.
+    one = table_from_arrays({**rows, "plate_width_mm": np.full(len(rows[PLATE[0]]), 100.0)})
+    found = compare(one, ["reece", "bekker_plate"], 5)
+    assert not found.differences[found.candidates[1].model].clear
+    assert "cannot tell" in found.sentence
+
+
+def test_unlike_models_are_refused() -> None:
+    table = plates(1, 1.0)
+    with pytest.raises(CalibError, match="nothing to compare in reece"):
+        compare(table, ["reece"])
+    with pytest.raises(CalibError, match="different outputs"):
+        compare(table, ["reece", "magic_formula"])
+    with pytest.raises(CalibError, match="there is no model"):
+        compare(table, ["reece", "rice"])
+
+
+def test_a_stack_is_written_and_predicts(frictional: Comparison, tmp_path: Path) -> None:
+    folder = tmp_path / "out"
+    folder.mkdir()
+    written = write_comparison(frictional, folder, ["calib", "compare"], "plate_width_mm=100")
+    assert json.loads((folder / "comparison.json").read_text()) == written
+    assert written == document(frictional, "plate_width_mm=100")
+    page = (folder / "index.html").read_text()
+    assert frictional.sentence in page
+    assert "held-out elpd" in page
+    found, parts = load_stack(folder)
+    assert found["converged"] is True
+    used = {c.problem.bound.model.name for _, c in parts}
+    assert used == {m for m, w in frictional.weights.items() if round(w * N_DRAWS) > 0}
+    best = frictional.candidates[0].calibration
+    at = frictional.candidates[0].loo.table
+    stacked = predict_stacked([(0.5, best), (0.5, best)], at)
+    plain = predict(best, at)
+    # Quantiles of 4000 draws of one distribution and the other.
+    np.testing.assert_allclose(stacked.predictive.median, plain.predictive.median, rtol=0.02)
+    np.testing.assert_allclose(
+        stacked.predictive.lower[0.9], plain.predictive.lower[0.9], rtol=0.04
+    )
+
+
+def test_measured_plates_prefer_the_law_without_width() -> None:
+    """Sand of which the smaller plates sank deeper: neither width term can follow."""
+    path = SHARED / "data" / "cmu_plate_sinkage.csv"
+    if not path.exists():
+        pytest.skip("the measured plate data are not here")
+    with path.open() as file:
+        measured = [r for r in csv.DictReader(file)
+                    if r["element"] == "plate" and r["container"] == "large"]  # fmt: skip
+    rows = []
+    # Readings along a run depend on each other: four of each, spread over it.
+    for run in sorted({r["run_id"] for r in measured}):
+        own = [r for r in measured if r["run_id"] == run and float(r["pressure_kPa"]) > 1.0]
+        rows += [own[i] for i in np.linspace(0, len(own) - 1, 4).round().astype(int)]
+    keys = ("pressure_kPa", "plate_diameter_m", "sinkage_corrected_m")
+    columns = [np.array([float(r[k]) for r in rows]) for k in keys]
+    table = table_from_arrays(
+        dict(zip(PLATE, (columns[0], 1e3 * columns[1], 1e3 * columns[2]), strict=True))
+    )
+    found = compare(table, ["bekker", "bekker_plate", "reece"], 7)
+    assert found.sound
+    assert found.candidates[0].model == "bekker"
+    assert found.differences["reece"].clear
+
+
+def test_no_shipped_model_is_chosen_for_the_papers_tables_but_its_own() -> None:
+    from calib.he2019.tasks import he2019_tasks
+    from calib.report.study_tasks import choose_model
+
+    for task in he2019_tasks():
+        assert choose_model(task.output, task.table) == task.model
+        assert MODELS[task.model].cited == "He_2019"
