@@ -29,6 +29,12 @@ JANOSI_HANAMOTO = Model(
     predict=_predict,
     latex=(r"$\tau = (c + \sigma_\mathrm{n} \tan \phi)[1 - \exp(-j/K)]$",),
     source="Janosi & Hanamoto (1961), 1st Int. Conf. Mechanics of Soil-Vehicle Systems, Turin",
+    applies=(
+        "Plastic soils whose shear stress rises to its strength and stays there: loose "
+        "sand, saturated clay, most disturbed soils. Soils with a peak (firm, cemented or "
+        "rooted) lose strength past it. At one normal stress cohesion and friction cannot "
+        "be told apart."
+    ),
     letters=(
         "[$tau] the shear stress, [$sigma_n] the normal stress (kPa), [$j] the displacement (mm)"
     ),

@@ -63,6 +63,13 @@ WISMER_LUTH = Model(
         r"$C_\mathrm{n} = I b d/W$",
     ),
     source="Wismer & Luth (1973), J. Terramechanics 10(2), 49-61",
+    applies=(
+        "One pneumatic tyre or several on cohesive-frictional agricultural soils whose "
+        "strength a cone penetrometer describes; not sand, and not soil so firm that the "
+        "tyre stays rigid on it. Pull, load and cone index of a row belong together. With "
+        "one mobility number in the data the rate and the coefficients of motion resistance "
+        "are hardly told apart."
+    ),
     letters=(
         "[$P] the pull (kN), [$W] the load (kN), [$s] the slip, [$C_n] the wheel numeric, [$I] the "
         "cone index (kPa), [$b] and [$d] width and diameter of the tyre (m)"
@@ -150,6 +157,12 @@ BRIXIUS = Model(
         r"$B_\mathrm{n} = (I b d/W)(1 + 5 \delta/h)/(1 + 3 b/d)$",
     ),
     source="Brixius (1987), ASAE paper 87-1622; ASABE D497",
+    applies=(
+        "Bias-ply tyres on cohesive-frictional soils, for which its coefficients were "
+        "published: radial tyres have a larger slip coefficient and less motion resistance, "
+        "within the priors. Mobility numbers of the published data are about 10 to 80. With "
+        "one mobility number in the data the coefficients of thrust are hardly told apart."
+    ),
     letters=(
         "[$P] the pull (kN), [$W] the load (kN), [$s] the slip, [$B_n] the mobility number, [$I] "
         "the cone index (kPa), [$b], [$d] and [$h] width, diameter (m) and section height of the "

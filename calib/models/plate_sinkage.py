@@ -116,6 +116,11 @@ BEKKER_PLATE = Model(
     prepare=_prepare,
     latex=(r"$p = (k_\mathrm{c}/b + k_\phi) z^n$",),
     source="Bekker (1956), Theory of Land Locomotion; Wong (2008), Theory of Ground Vehicles",
+    applies=(
+        "Plates pressed into one homogeneous soil, at two widths or more: with one width "
+        "k_c and k_phi cannot be told apart. The moduli depend on the exponent by their "
+        "units, so they carry over to another soil only together with it."
+    ),
     letters="[$p] the pressure (kPa), [$z] the sinkage and [$b] the width of the plate (m)",
     parametrisation=(
         "The sinkage z_ref at {p_ref_kpa:.4g} kPa and a width of {b_ref_mm:.4g} mm (means of the "
@@ -190,6 +195,11 @@ REECE = Model(
     prepare=_prepare,
     latex=(r"$p = (k_1 + k_2 b)(z/b)^n$",),
     source="Reece (1965), Proc. Inst. Mech. Eng. 180(2A), 45-66; Wong & Reece (1967)",
+    applies=(
+        "Plates pressed into one homogeneous soil, at two widths or more; pressures grow "
+        "with width where friction carries the plate and do not where cohesion does. Not "
+        "for layered soil or a box whose walls are within a few plate widths."
+    ),
     letters="[$p] the pressure (kPa), [$z] the sinkage and [$b] the width of the plate (m)",
     parametrisation=(
         "The sinkage z_ref at {p_ref_kpa:.4g} kPa and a width of {b_ref_mm:.4g} mm (means of the "
@@ -264,6 +274,11 @@ LYASKO = Model(
     prepare=_prepare,
     latex=(r"$z = (p/k)^{1/n}(1 + s)/(1 - a s)$",),
     source="Lyasko (2010), J. Terramechanics 47(1), 21-31",
+    applies=(
+        "Driven wheels at slips of zero or more, well below where the denominator vanishes. "
+        "The coefficient of slip sinkage could not be confirmed from a second source: its "
+        "prior is wide, and says so."
+    ),
     letters="[$z] the sinkage (m), [$p] the ground pressure (kPa), [$s] the slip (as a fraction)",
     parametrisation=(
         "The sinkage z_ref at {p_ref_kpa:.4g} kPa (mean of the data) is sampled in the "
