@@ -21,7 +21,9 @@ def test_the_data_are_among_them_and_their_box_is_filled() -> None:
 
 
 def test_a_margin_changes_the_sign_only_if_asked_to() -> None:
-    found = choose_nodes([{"slip_ratio": SLIP}], {}, across_zero=True)["slip_ratio"]
+    small = SLIP - 0.04
+    assert choose_nodes([{"slip_ratio": small}], {})["slip_ratio"].min() >= 0.0
+    found = choose_nodes([{"slip_ratio": small}], {}, across_zero=True)["slip_ratio"]
     assert -0.1 < found.min() < 0.0
     positive = choose_nodes([{"normal_load_kn": SLIP}], {}, across_zero=True)["normal_load_kn"]
     assert positive.min() > 0.0
