@@ -17,8 +17,8 @@ _HEAD = """# Benchmarks
 Made by `make bench`; `make bench PART="posterior likelihood"` renews some of the parts posterior,
 likelihood, genetic, million, campaign, survival, everyday and emulator. Medians over repeats that
 take turns with the peers', with the least and the most of them; the median decides whether a level
-is met. The levels are goals that were set before any of it was built. Every line is in [results.md](results.md)
-and `results.csv`, every measurement in `measured/`.
+is met. The levels are goals that were set before any of it was built. Every line is in
+[results.md](results.md) and `results.csv`, every measurement in `measured/`.
 
 ![What a posterior costs, and the likelihood against its floor](benchmarks.png)
 """
