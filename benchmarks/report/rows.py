@@ -11,6 +11,7 @@ from scipy import stats
 from shared.measure import spread
 
 from calib.inference.sampling.gate import Gate
+from report.emulated import emulator_lines
 
 __all__ = ["NAMES", "RHAT_MAX", "Row", "largest_z", "rows_of", "sound"]
 
@@ -69,11 +70,16 @@ def rows_of(measured: Mapping[str, Measured]) -> list[Row]:
     makers = {
         "posterior": _posterior, "likelihood": _likelihood, "genetic": _genetic,
         "million": _million, "campaign": _campaign, "survival": _survival,
-        "everyday": _everyday,
+        "everyday": _everyday, "emulator": _emulator,
     }  # fmt: skip
     return [
         row for part, make in makers.items() if part in measured for row in make(measured[part])
     ]
+
+
+def _emulator(m: Measured) -> Iterator[Row]:
+    for subject, quantity, s, most in emulator_lines(m):
+        yield _asked("emulator", subject, quantity, s, most=most)
 
 
 def largest_z(scores: Mapping[str, list[float]]) -> tuple[float, int, float]:

@@ -268,11 +268,13 @@ def predict(
 
 def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | None) -> None:
     """Predict with the corrected model of a diagnosis, beside the calibrated simulator."""
+    from calib.batch.plugins import load_files
     from calib.data import read_for_model, write_table
     from calib.gap.corrected import conditions_outside, load_corrected, predict_columns
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.load import load_effects
 
+    load_files(sorted((run / "emulators").glob("*.npz")))
     own = {} if effects is None else load_effects(effects)
     corrected = load_corrected(run, {**EFFECTS, **own})
     used = {c for o in corrected.data.outputs for c in o.problem.bound.model.conditions}

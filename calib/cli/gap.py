@@ -38,7 +38,7 @@ def diagnose(
     from calib.batch.folders import check_folder, fresh_folder
     from calib.batch.pool import pool
     from calib.cli.display import progress_bars
-    from calib.cli.simulators import prepare_case, say
+    from calib.cli.simulators import keep_emulators, prepare_case, say
     from calib.data.quantities import OUTPUTS, QUANTITIES
     from calib.gap.case import case_from_run, read_case
     from calib.gap.diagnose import diagnose as find
@@ -77,6 +77,7 @@ def diagnose(
 
         with fresh_folder(out, overwrite=overwrite) as folder:
             write_diagnosis(found, folder)
+            keep_emulators(given.models.values(), folder)
             (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed, files))
             write_page(found, folder, manifest, pool=side)
     for warning in found.data.case.warnings:

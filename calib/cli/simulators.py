@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from calib.gap.case import Case
     from calib.inference.emulation import Emulation
 
-__all__ = ["prepare_case", "say"]
+__all__ = ["keep_emulators", "prepare_case", "say"]
 
 
 def say(model: str, emulation: Emulation | None) -> bool:
@@ -38,6 +38,18 @@ def say(model: str, emulation: Emulation | None) -> bool:
     for reason in emulation.reasons:
         print(f"EMULATOR NOT GOOD ENOUGH: {reason}")
     return emulation.passed
+
+
+def keep_emulators(models: Iterable[str], folder: Path) -> None:
+    """Keep the emulators among some models in a folder, to predict from it again."""
+    from calib.models import get_model
+    from calib.models.simulators.emulator.files import save_emulator
+    from calib.models.simulators.emulator.model import emulator_of
+
+    for model in models:
+        emulator = emulator_of(get_model(model))
+        if emulator is not None:
+            save_emulator(emulator, model, folder / "emulators" / f"{model}.npz")
 
 
 def prepare_case(

@@ -25,6 +25,8 @@ def choose_nodes(
     recorded: Sequence[Mapping[str, Array]],
     ranges: Mapping[str, tuple[float, float]],
     count: int | None = None,
+    *,
+    across_zero: bool = False,
 ) -> dict[str, Array]:
     """Choose nodes.
 
@@ -36,6 +38,9 @@ def choose_nodes(
         Bounds that the user gave, which the nodes then span.
     count : int, optional
         About how many; by default as many as the number of varying conditions asks for.
+    across_zero : bool
+        Whether the margin may change a condition's sign, as a slip's does with another rolling
+        radius: many formulas and some simulators end there.
 
     Returns
     -------
@@ -45,7 +50,7 @@ def choose_nodes(
     columns = tuple(recorded[0])
     rows = np.concatenate([np.stack([r[c] for c in columns], axis=1) for r in recorded])
     rows = np.unique(rows, axis=0)
-    low, high = _box(columns, rows, ranges)
+    low, high = _box(columns, rows, ranges, across_zero)
     varying = high > low
     unit = np.where(varying, high - low, 1.0)
     inside = (rows - low) / unit
@@ -64,7 +69,10 @@ def choose_nodes(
 
 
 def _box(
-    columns: Sequence[str], rows: Array, ranges: Mapping[str, tuple[float, float]]
+    columns: Sequence[str],
+    rows: Array,
+    ranges: Mapping[str, tuple[float, float]],
+    across_zero: bool,
 ) -> tuple[Array, Array]:
     low, high = rows.min(axis=0), rows.max(axis=0)
     wide = _MARGIN * (high - low)
@@ -72,9 +80,8 @@ def _box(
         if column in ranges:
             low[i], high[i] = min(low[i], ranges[column][0]), max(high[i], ranges[column][1])
             continue
-        # No further than the quantity can go, nor across zero: many formulas end there.
         span = QUANTITIES[column].range
-        least = max(span.low, 0.0 if low[i] >= 0.0 else -np.inf)
+        least = max(span.low, 0.0 if low[i] >= 0.0 and not across_zero else -np.inf)
         low[i] = max(low[i] - wide[i], min(least, low[i]), _positive(span.low_open, low[i]))
         high[i] = min(high[i] + wide[i], span.high)
     return low, high

@@ -76,8 +76,7 @@ def emulate(
     """
     chosen = settings or EmulationSettings()
     recorded = [problem.conditions, *(problem.bound.model.select(e) for e in elsewhere)]
-    nodes = choose_nodes(recorded, keeper.simulator.ranges, chosen.nodes)
-    state = State(problem, keeper, nodes, seed)
+    state = State(problem, keeper, _nodes(problem, keeper, recorded, chosen.nodes), seed)
     own_noise = _first_design(state, chosen)
     state.rebuild()
     return _improved(state, chosen, chosen.runs, own_noise)
@@ -137,6 +136,19 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
     measured = _check(state, z, checks, len(history)) if checks else None
     state.rebuild()
     return judged(state, z, chosen, measured, own_noise, history)
+
+
+def _nodes(
+    problem: Problem, keeper: RunKeeper, recorded: Sequence[Mapping[str, Array]], count: int | None
+) -> dict[str, Array]:
+    """Choose nodes, across zero if the simulator has values there in the middle of the prior."""
+    middle = problem.theta(problem.priors.ppf(np.full((1, len(problem.priors.free)), 0.5)))[:, :-1]
+    ranges = keeper.simulator.ranges
+    inside = choose_nodes(recorded, ranges, count)
+    wide = choose_nodes(recorded, ranges, count, across_zero=True)
+    if all(np.array_equal(inside[name], wide[name]) for name in inside):
+        return inside
+    return wide if keeper.runs(middle, wide)[0].ok else inside
 
 
 def _settled(history: Sequence[tuple[int, float]], tolerance: float) -> bool:

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
+from calib.errors import CalibError
 from calib.models.simulators.base import Failure, tail
 
 __all__ = ["run_program"]
@@ -33,6 +34,11 @@ def run_program(arguments: Sequence[str], folder: Path, limit: float) -> Failure
     str or Failure
         What it printed, or why it failed.
 
+    Raises
+    ------
+    CalibError
+        If it cannot be started.
+
     Notes
     -----
     It leads a process group (a session of its own), which is killed when it has come to its end,
@@ -46,7 +52,11 @@ def run_program(arguments: Sequence[str], folder: Path, limit: float) -> Failure
                 stderr=subprocess.STDOUT, start_new_session=True,
             )  # fmt: skip
         except OSError as error:
-            return Failure("exit", f"{arguments[0]} cannot be started ({error.strerror})")
+            # No fault of the parameters: nothing is learned from it.
+            raise CalibError(
+                f"{arguments[0]} cannot be started ({error.strerror})",
+                mend="make it a program that can be run here; the runs that were made are kept",
+            ) from None
         try:
             code: int | None = child.wait(limit)
         except subprocess.TimeoutExpired:

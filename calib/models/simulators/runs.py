@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.batch.tasks import run_tasks
+from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Result, Simulator
 
@@ -106,7 +107,8 @@ class RunKeeper:
         Raises
         ------
         CalibError
-            If the folder cannot be written, or is in use by another process.
+            If the folder cannot be written or is in use by another process, or if runs cannot be
+            made at all: the program does not start, the server is not there.
         """
         replicates = np.broadcast_to(np.asarray(replicate), (len(thetas),))
         names = [_name(t, conditions, r) for t, r in zip(thetas, replicates, strict=True)]
@@ -128,6 +130,7 @@ class RunKeeper:
 
     def _on_disk(self, items: Mapping[str, _Item]) -> Mapping[str, Mapping[str, Any]]:
         folder = Path(self.folder or ".") / self.simulator.digest[:16]
+        self._forget_failures(folder, items)
         outcome = run_tasks(
             _carry_out, items, folder, workers=self._workers(len(items)),
             scheduler=self.scheduler, progress=self.progress,
@@ -136,15 +139,30 @@ class RunKeeper:
         self.seconds = float(np.median(new)) if new else self.seconds
         self.kept += len(outcome.resumed)
         self.made += len(items) - len(outcome.resumed)
-        found: dict[str, Mapping[str, Any]] = {
-            name: {"failure": ["error", error, ""]} for name, error in outcome.failed.items()
-        }
-        for name in outcome.done:
-            found[name] = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))
-        return found
+        if outcome.failed:
+            first = next(iter(outcome.failed.values()))
+            raise CalibError(
+                f"{len(outcome.failed)} of {len(items)} runs could not be made: {first}",
+                where=f"simulator {self.simulator.name}",
+            )
+        return {name: _read(folder / f"{name}.json") for name in outcome.done}
+
+    def _forget_failures(self, folder: Path, names: Iterable[str]) -> None:
+        """Have runs made again that failed when they had less time or fewer tries."""
+        for name in names:
+            path = folder / f"{name}.json"
+            if path.exists() and "failure" in (kept := _read(path)):
+                now = self.simulator.limit, self.simulator.retries
+                if any(a > b for a, b in zip(now, kept["granted"], strict=True)):
+                    path.unlink()
 
     def _workers(self, count: int) -> int:
         return self.workers if self.seconds * count > _WORTH_SECONDS else 1
+
+
+def _read(path: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    return found
 
 
 def _name(theta: Array, conditions: Mapping[str, Array], replicate: int) -> str:
@@ -161,7 +179,10 @@ def _carry_out(item: _Item) -> dict[str, Any]:
         "parameters": dict(zip(item.simulator.parameters, map(float, item.theta), strict=True))
     }
     if isinstance(found, Failure):
-        return described | {"failure": [found.kind, found.reason, found.printed]}
+        granted = [item.simulator.limit, item.simulator.retries]
+        return described | {
+            "failure": [found.kind, found.reason, found.printed], "granted": granted,
+        }  # fmt: skip
     return described | {"outputs": {name: values.tolist() for name, values in found.items()}}
 
 

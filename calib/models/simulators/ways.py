@@ -6,6 +6,7 @@ import hashlib
 import inspect
 import json
 import shutil
+import socket
 import tempfile
 import urllib.error
 import urllib.request
@@ -16,6 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Result, tail
 from calib.models.simulators.exchange import filled, input_csv, input_json, output_of_text
@@ -246,7 +248,13 @@ class UmbridgeWay:
         return {name: np.array(values) for name, values in outputs.items()}
 
     def ask(self, what: str, content: Mapping[str, Any]) -> dict[str, Any] | Failure:
-        """Send one request of the protocol."""
+        """Send one request of the protocol.
+
+        Raises
+        ------
+        CalibError
+            If there is no server.
+        """
         body = json.dumps({"name": self.model, **content}).encode()
         request = urllib.request.Request(
             f"{self.url.rstrip('/')}/{what}", body, {"Content-Type": "application/json"}
@@ -261,6 +269,12 @@ class UmbridgeWay:
             return Failure("time", f"the server took longer than {self.limit:g} s")
         except (OSError, ValueError) as error:
             reason = getattr(error, "reason", error)
+            if isinstance(reason, (ConnectionRefusedError, socket.gaierror)):
+                # No fault of the parameters: nothing is learned from it.
+                raise CalibError(
+                    f"the server at {self.url} is not there ({reason})", allowed="a running server",
+                    mend="start it and call the same command: the runs that were made are kept",
+                ) from None  # fmt: skip
             if isinstance(reason, TimeoutError):
                 return Failure("time", f"the server took longer than {self.limit:g} s")
             return Failure("error", f"the server at {self.url} did not answer: {reason}")

@@ -20,6 +20,15 @@ def test_the_data_are_among_them_and_their_box_is_filled() -> None:
     assert np.diff(np.sort(found)).max() < 0.08
 
 
+def test_a_margin_changes_the_sign_only_if_asked_to() -> None:
+    small = SLIP - 0.04
+    assert choose_nodes([{"slip_ratio": small}], {})["slip_ratio"].min() >= 0.0
+    found = choose_nodes([{"slip_ratio": small}], {}, across_zero=True)["slip_ratio"]
+    assert -0.1 < found.min() < 0.0
+    positive = choose_nodes([{"normal_load_kn": SLIP}], {}, across_zero=True)["normal_load_kn"]
+    assert positive.min() > 0.0
+
+
 def test_given_ranges_are_spanned() -> None:
     nodes = choose_nodes([{"slip_ratio": SLIP}], {"slip_ratio": (-0.1, 0.9)})
     np.testing.assert_allclose([nodes["slip_ratio"].min(), nodes["slip_ratio"].max()], [-0.1, 0.9])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from calib.errors import CalibError
 from calib.models.simulators.base import Failure
 from calib.models.simulators.process import run_program
 
@@ -51,9 +52,8 @@ def test_the_tail_of_what_it_printed_is_kept(tmp_path: Path) -> None:
 
 
 def test_a_program_that_is_not_there(tmp_path: Path) -> None:
-    found = run_program(["no-such-wheel"], tmp_path, 1.0)
-    assert isinstance(found, Failure)
-    assert "cannot be started" in found.reason
+    with pytest.raises(CalibError, match="no-such-wheel cannot be started"):
+        run_program(["no-such-wheel"], tmp_path, 1.0)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="process groups are POSIX's")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from calib.errors import CalibError
 from calib.models.simulators.base import Output, Simulator
 from calib.models.simulators.runs import RunKeeper
 from calib.models.simulators.ways import CallableWay
@@ -69,3 +71,24 @@ def test_a_kill_loses_no_run_that_was_made(tmp_path: Path) -> None:
         RunKeeper(simulator(), tmp_path, progress=stop).runs(THETAS, X)
     RunKeeper(simulator(), tmp_path).runs(THETAS, X)
     assert CALLS == [0.6, 0.7, -1.0]
+
+
+def test_a_failed_run_is_made_again_only_with_more_time_or_tries(tmp_path: Path) -> None:
+    CALLS.clear()
+    for limit, calls in ((10.0, 1), (10.0, 1), (5.0, 1), (20.0, 2)):
+        RunKeeper(replace(simulator(), limit=limit), tmp_path).runs(THETAS[2:], X)
+        assert len(CALLS) == calls
+
+
+def test_what_is_no_fault_of_the_parameters_is_not_kept(tmp_path: Path) -> None:
+    def unplugged(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        raise CalibError("the server is not there")
+
+    class Way(CallableWay):
+        def run(self, parameters: object, conditions: object) -> object:  # type: ignore[override]
+            raise CalibError("the server is not there")
+
+    broken = replace(simulator(), way=Way(unplugged, ("pull",)))
+    with pytest.raises(CalibError, match="3 of 3 runs could not be made: the server is not there"):
+        RunKeeper(broken, tmp_path).runs(THETAS, X)
+    assert not list(tmp_path.rglob("*-0.json"))

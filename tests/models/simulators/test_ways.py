@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.errors import CalibError
 from calib.models.simulators.base import Failure, Output, Simulator, Way
 from calib.models.simulators.files import read_simulator
 from calib.models.simulators.ways import CallableWay, CommandWay, UmbridgeWay
@@ -178,8 +179,8 @@ def test_a_server_that_fails(url: str, mood: str, kind: str) -> None:
 
 def test_a_server_that_is_not_there(url: str) -> None:
     way = UmbridgeWay("http://127.0.0.1:9", "forward", ("pull",), limit=2.0)
-    found = failure(simulator(way).run(THETA, X))
-    assert "did not answer" in found.reason
+    with pytest.raises(CalibError, match="is not there"):
+        simulator(way).run(THETA, X)
     well = simulator(UmbridgeWay(url, "forward", ("pull",))).run(THETA, X)
     assert not isinstance(well, Failure)
     np.testing.assert_allclose(well["drawbar_pull_kn"], [0.001, 0.001])
