@@ -167,6 +167,12 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     ("summary.json/paper_gaps/*/probability/*", _chance(0.05)),
     ("summary.json/paper_gaps/*/open_sd_rms", Tolerance("diagnosis", 0.05)),
     ("gaps/*/diagnosis.json/effects/*/probability", _chance(0.05)),
+    ("gaps/*/diagnosis.json/inclusion/*/probability", _chance(0.05)),
+    ("gaps/*/diagnosis.json/remainder/probability", _chance(0.05)),
+    # Of 800 draws; the sd of a share is 0.35 at the most.
+    ("gaps/*/diagnosis.json/{inclusion/*,remainder}/share", _chance(0.12)),
+    ("gaps/*/diagnosis.json/{inclusion/*,remainder}/share_interval/*", _chance(0.25)),
+    ("gaps/*/diagnosis.json/remainder/where*", _JUMPS),
     ("{summary.json/paper_gaps/*/parameters,gaps/*/diagnosis.json/effects/*/parameters}/*/mean",
      Tolerance("diagnosis", 0.1, Of.ITS_SD)),
     ("{summary.json/paper_gaps/*/parameters,gaps/*/diagnosis.json/effects/*/parameters}/*/sd",

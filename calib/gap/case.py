@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import tomllib
 from collections.abc import Mapping
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from calib.data import Table, read_table
 from calib.data.quantities import OUTPUTS, columns_of, output_of, physical_role
 from calib.errors import CalibError
+from calib.gap.context import Context, read_context
 from calib.gap.covariates import Covariates
 from calib.gap.effects import View
 from calib.gap.noise import At, noise_at, noise_at_lab
@@ -35,7 +37,7 @@ __all__ = [
 MIN_FIELD_ROWS = 5
 MAX_RATIO = 100.0
 _FILES = ("calibration", "field", "predict")
-_KEYS = (*_FILES, "models")
+_KEYS = (*_FILES, "models", "context")
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Case:
         Conditions to predict.
     warnings : tuple of str
         What a reader must know about the input.
+    context : Context
+        What is known besides the data.
     """
 
     name: str
@@ -61,6 +65,7 @@ class Case:
     models: Mapping[str, str]
     fresh: Table | None = None
     warnings: tuple[str, ...] = ()
+    context: Context = dataclasses.field(default_factory=Context)
 
 
 @dataclass(frozen=True)
@@ -212,7 +217,8 @@ def read_case(folder: Path) -> Case:
     lab = read_table(_inside(folder, "calibration", content), allow_missing=missing_ok)
     field = read_table(_inside(folder, "field", content), allow_missing=missing_ok)
     fresh = read_table(_inside(folder, "predict", content)) if content.get("predict") else None
-    return Case(folder.name, lab, field, models, fresh, oddities(lab, field, models))
+    context = read_context(content.get("context"), str(path))
+    return Case(folder.name, lab, field, models, fresh, oddities(lab, field, models), context)
 
 
 def _inside(folder: Path, key: str, content: Mapping[str, Any]) -> Path:

@@ -11,6 +11,7 @@ import numpy as np
 from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
 from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns, read_case
+from calib.gap.context import Context
 from calib.gap.corrected import Corrected, conditions_outside
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.hypotheses import dependences, inseparable
@@ -57,6 +58,9 @@ class Diagnosis:
     seed : int
     inclusion : Inclusion
         Which causes act, whatever acts besides, and their shares of the gap.
+    without_context : mapping of str to float, optional
+        How probable each cause is to act without what the case's context put in; ``none`` and
+        ``unknown`` (something unlisted) among them. None without a context.
     """
 
     data: Campaigns
@@ -71,6 +75,7 @@ class Diagnosis:
     corrected: Corrected
     seed: int
     inclusion: Inclusion
+    without_context: Mapping[str, float] | None = None
 
     def __repr__(self) -> str:
         """Name the case, the verdict and the most probable hypotheses."""
@@ -143,6 +148,7 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
         corrected,
         seed,
         causes,
+        _without_context(case, seed, effects),
     )
 
 
@@ -190,6 +196,16 @@ def _confounded(data: Campaigns, causes: Inclusion) -> Campaigns:
     ]
     case = data.case
     return replace(data, case=replace(case, warnings=(*case.warnings, *said)))
+
+
+def _without_context(
+    case: Case, seed: int, effects: Mapping[str, Effect]
+) -> dict[str, float] | None:
+    if not case.context:
+        return None
+    _, ranking = rank_without_outliers(replace(case, context=Context()), seed, effects)
+    probability = ranking.probability
+    return {"none": probability["none"], **inclusion_probability(probability)}
 
 
 def _left_out(

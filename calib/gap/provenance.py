@@ -11,6 +11,7 @@ from typing import Any
 from calib.batch.environment import code_sha256, sha256
 from calib.errors import CalibError
 from calib.gap.case import Case, case_files
+from calib.gap.context import read_context
 
 __all__ = ["INPUTS", "case_hashes", "check_resumable", "inputs_record", "recorded_inputs"]
 
@@ -34,6 +35,8 @@ def inputs_record(case: Case, seed: int, effects: Mapping[str, bytes] | None = N
         "models": dict(case.models),
         "sha256": {key: table.sha256 for key, table in tables.items() if table is not None},
     }
+    if case.context:
+        content["context"] = case.context.words()
     if effects:
         content["effects"] = {name: sha256(found) for name, found in effects.items()}
     return (json.dumps(content, indent=1) + "\n").encode()
@@ -68,7 +71,11 @@ def case_hashes(folder: Path) -> dict[str, Any]:
         for key, path in files.items()
         if key != "case.toml" and path.is_file()
     }
-    return {"models": content.get("models"), "sha256": hashes}
+    try:
+        context = read_context(content.get("context"), str(folder)).words() or None
+    except CalibError:
+        context = ["it cannot be read"]
+    return {"models": content.get("models"), "sha256": hashes, "context": context}
 
 
 def check_resumable(cases: Sequence[Path], out: Path, seed: int) -> None:

@@ -9,8 +9,10 @@ from functools import partial
 import numpy as np
 from scipy.special import logsumexp
 
+from calib.errors import CalibError
 from calib.gap.ascent import Walk, together
 from calib.gap.case import Campaigns
+from calib.gap.context import Context
 from calib.gap.discrepancy import Bases
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit, finish, look
@@ -39,7 +41,7 @@ from calib.inference.random import generator
 from calib.inference.sampling.mode import find_mode
 from calib.models.base import Array
 
-__all__ = ["Lab", "Ranking", "calibrate_lab", "rank"]
+__all__ = ["Lab", "Odds", "Ranking", "calibrate_lab", "rank"]
 
 # Internal parameters of each simulator, and its noise.
 type Lab = tuple[dict[str, Array], dict[str, Noise]]
@@ -90,8 +92,8 @@ class Ranking:
         Internal parameters of each simulator as the lab calibrated it.
     isolability : Isolability
         What the design could show before its outcomes were looked at.
-    n_single : int
-        Effects among which the prior probability of one listed effect is shared out.
+    odds : Odds
+        Probabilities of the hypotheses before the data.
     """
 
     fits: Mapping[str, tuple[Fit, ...]]
@@ -101,7 +103,7 @@ class Ranking:
     not_testable: Mapping[str, str]
     lab_mode: Mapping[str, Array]
     isolability: Isolability
-    n_single: int
+    odds: Odds
 
     @property
     def order(self) -> list[str]:
@@ -115,7 +117,7 @@ class Ranking:
             name: min(sum(f.forward.hypothesis.share for f in group), 1.0)
             for name, group in self.fits.items()
         }
-        return probabilities({n: float(np.log(s)) for n, s in shares.items()}, self.n_single)
+        return probabilities({n: float(np.log(s)) for n, s in shares.items()}, self.odds)
 
     def best(self, name: str) -> Fit:
         """The most probable fit of a hypothesis."""
@@ -135,18 +137,35 @@ def rank(
     single = [h for h in single if h.name not in design.idle]
     unable |= dict.fromkeys(design.idle, _IDLE)
     single = [replace(h, share=COVERED) if h.name in beside else h for h in single]
-    worker = _Worker(data, lab_mode, noise, seed, len(single) - len(beside))
+    context = data.case.context
+    _check_names(context, {*able, *unable})
+    single = [context.sized(h) for h in single if h.name not in context.excluded]
+    unable |= dict.fromkeys(context.excluded, "it is excluded in the case's [context]")
+    beside -= set(context.excluded)
+    odds = Odds.of(len(single) - len(beside), context)
+    worker = _Worker(data, lab_mode, noise, seed, odds)
     fits = worker.fit([Hypothesis("none"), *shifts(data), *single])
     far = [h for h in single if _far_out(fits[h.name][0])]
     for name, more in worker.fit([wider(h) for h in far]).items():
         fits[name] += more
     fits |= _sets_and_unlisted(worker, [h.name for h in single if h.name not in beside], fits)
-    fits, scores = _scored(fits, worker.n_single, seed)
+    fits, scores = _scored(fits, worker.odds, seed)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
-    probability = probabilities(log_evidence, worker.n_single)
-    return Ranking(
-        fits, scores, log_evidence, probability, unable, lab_mode, design, worker.n_single
-    )
+    probability = probabilities(log_evidence, worker.odds)
+    return Ranking(fits, scores, log_evidence, probability, unable, lab_mode, design, worker.odds)
+
+
+def _check_names(context: Context, known: set[str]) -> None:
+    """Refuse a context that speaks of what nobody knows."""
+    strange = [n for n in context.names if n not in known and n != "parameter_shift"]
+    strange += [n for n in (*context.excluded, *context.sizes) if n == "parameter_shift"]
+    if strange:
+        raise CalibError(
+            f"the context speaks of {strange[0]}",
+            where="[context] of case.toml",
+            allowed=", ".join(sorted(known)) + "; parameter_shift may be suspected",
+            mend="correct the name, or leave it out",
+        )
 
 
 def _far_out(found: Fit) -> bool:
@@ -161,8 +180,8 @@ def _sets_and_unlisted(
     worker: _Worker, single: Sequence[str], fits: Mapping[str, tuple[Fit, ...]]
 ) -> dict[str, tuple[Fit, ...]]:
     """Fit what is not listed, by itself and beside the best explanations, and sets of effects."""
-    n = worker.n_single
-    best = {name: max(group, key=partial(_with_prior, n_single=n)) for name, group in fits.items()}
+    n = worker.odds
+    best = {name: max(group, key=partial(_with_prior, odds=n)) for name, group in fits.items()}
     alone = sorted((best[m] for m in best if m != "none"), key=lambda f: -_with_prior(f, n))
     others: list[_Started] = [(h, []) for h in unknowns(worker.data)]
     others += [
@@ -224,35 +243,35 @@ def _larger(sets: Sequence[Fit], single: Sequence[Fit]) -> list[_Started]:
     return list(found.values())
 
 
-def _finished(looked: Sequence[Sequence[Fit]], hopeless: float, n_single: int) -> list[Fit]:
+def _finished(looked: Sequence[Sequence[Fit]], hopeless: float, odds: Odds) -> list[Fit]:
     """Climb on from first looks at hypotheses, but for those that are hopeless."""
-    worth = [i for i, looks in enumerate(looked) if _promise(looks, n_single) > hopeless]
+    worth = [i for i, looks in enumerate(looked) if _promise(looks, odds) > hopeless]
     ended = [max(looks, key=_evidence) for looks in looked]
     for i, found in zip(worth, together([finish(looked[i]) for i in worth]), strict=True):
         ended[i] = found
     return ended
 
 
-def _promise(looks: Sequence[Fit], n_single: int) -> float:
-    return max(_with_prior(f, n_single) for f in looks)
+def _promise(looks: Sequence[Fit], odds: Odds) -> float:
+    return max(_with_prior(f, odds) for f in looks)
 
 
 def _evidence(found: Fit) -> float:
     return found.log_evidence
 
 
-def _with_prior(found: Fit, n_single: int) -> float:
+def _with_prior(found: Fit, odds: Odds) -> float:
     """Log of evidence times the prior of a variant of a hypothesis."""
     hypothesis = found.forward.hypothesis
-    prior = _ln_prior(hypothesis.name, n_single) + float(np.log(hypothesis.share))
+    prior = odds.ln_prior(hypothesis.name) + float(np.log(hypothesis.share))
     return found.log_evidence + prior
 
 
 def _scored(
-    fits: Mapping[str, tuple[Fit, ...]], n_single: int, seed: int
+    fits: Mapping[str, tuple[Fit, ...]], odds: Odds, seed: int
 ) -> tuple[dict[str, tuple[Fit, ...]], dict[str, tuple[float, ...]]]:
     """Score every variant, and by draws of their posteriors those that are still in play."""
-    promise = {name: [_with_prior(f, n_single) for f in group] for name, group in fits.items()}
+    promise = {name: [_with_prior(f, odds) for f in group] for name, group in fits.items()}
     far = max(max(values) for values in promise.values()) - _FAR_BEHIND
     scores = {
         name: [
@@ -261,13 +280,13 @@ def _scored(
         ]
         for name, group in fits.items()
     }
-    total = {name: max(values) + _ln_prior(name, n_single) for name, values in scores.items()}
+    total = {name: max(values) + odds.ln_prior(name) for name, values in scores.items()}
     least = max(total.values()) - _IN_PLAY
     refined = {name: list(group) for name, group in fits.items()}
     for name, values in scores.items():
         beside = max(values) - _BESIDE
         for i, value in enumerate(values):
-            if value > beside and value + _ln_prior(name, n_single) > least:
+            if value > beside and value + odds.ln_prior(name) > least:
                 refined[name][i] = refine(fits[name][i], seed)
                 values[i] = _score(refined[name][i], seed, _CAREFUL)
     return (
@@ -283,23 +302,57 @@ def _score(found: Fit, seed: int, draws: int) -> float:
     return found.log_evidence + relevant + float(np.log(share))
 
 
-def probabilities(log_evidence: Mapping[str, float], n_single: int) -> dict[str, float]:
+def probabilities(log_evidence: Mapping[str, float], odds: Odds) -> dict[str, float]:
     """Posterior probabilities of hypotheses from their evidence."""
-    score = {name: value + _ln_prior(name, n_single) for name, value in log_evidence.items()}
+    score = {name: value + odds.ln_prior(name) for name, value in log_evidence.items()}
     total = logsumexp(list(score.values()))
     return {name: float(np.exp(value - total)) for name, value in score.items()}
 
 
-def _ln_prior(name: str, n_single: int) -> float:
-    if name in ("none", "unknown"):
-        return LN_PRIOR[name]
-    causes = name.split("+")
-    listed = [c for c in causes if c != "unknown"]
-    rest = REMAINDER if len(listed) < len(causes) else 1.0 - REMAINDER
-    if listed == ["parameter_shift"]:
-        return LN_PRIOR["parameter_shift"] + float(np.log(rest))
-    single = LN_PRIOR["single"] - float(np.log(max(n_single, 1)))
-    return single + (len(listed) - 1) * LN_PAIR_TO_SINGLE + float(np.log(rest))
+@dataclass(frozen=True)
+class Odds:
+    """Probabilities of hypotheses before the data.
+
+    Parameters
+    ----------
+    n_single : int
+        Effects among which the prior probability of one listed effect is shared out.
+    suspicion : mapping of str to float
+        Cause to the logarithm of the ratio of its odds to act to what they are without a context.
+    """
+
+    n_single: int
+    suspicion: Mapping[str, float]
+
+    @classmethod
+    def of(cls, n_single: int, context: Context) -> Odds:
+        """Take what is suspected into account."""
+        plain = cls(n_single, {})
+        usual = {
+            name: float(np.exp(plain.ln_prior(name)) / (1.0 - REMAINDER))
+            for name in context.suspected
+        }
+        return cls(
+            n_single,
+            {n: _logit(p) - _logit(min(usual[n], 0.5)) for n, p in context.suspected.items()},
+        )
+
+    def ln_prior(self, name: str) -> float:
+        """Log probability of a hypothesis, up to a constant."""
+        if name in ("none", "unknown"):
+            return LN_PRIOR[name]
+        causes = name.split("+")
+        listed = [c for c in causes if c != "unknown"]
+        rest = REMAINDER if len(listed) < len(causes) else 1.0 - REMAINDER
+        prior = float(np.log(rest)) + sum(self.suspicion.get(c, 0.0) for c in listed)
+        if listed == ["parameter_shift"]:
+            return LN_PRIOR["parameter_shift"] + prior
+        single = LN_PRIOR["single"] - float(np.log(max(self.n_single, 1)))
+        return single + (len(listed) - 1) * LN_PAIR_TO_SINGLE + prior
+
+
+def _logit(p: float) -> float:
+    return float(np.log(p / (1.0 - p)))
 
 
 def calibrate_lab(data: Campaigns, seed: int) -> Lab:
@@ -317,10 +370,10 @@ def calibrate_lab(data: Campaigns, seed: int) -> Lab:
 class _Worker:
     def __init__(
         self, data: Campaigns, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise], seed: int,
-        n_single: int,
+        odds: Odds,
     ) -> None:  # fmt: skip
         self.data, self.lab_mode, self.noise, self.seed = data, lab_mode, noise, seed
-        self.n_single = n_single
+        self.odds = odds
         self._bases: Bases = {}
 
     def fit(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Fit, ...]]:
@@ -350,7 +403,7 @@ class _Worker:
     ) -> list[list[Fit]]:
         """Look at the pairs that are in play from more guesses."""
         in_play = [
-            i for i in range(len(pairs)) if _promise(looked[i], self.n_single) > leading - _SEARCHED
+            i for i in range(len(pairs)) if _promise(looked[i], self.odds) > leading - _SEARCHED
         ]
         more = together([self.look_joint(*pairs[i], _N_BEGUN, skip=1) for i in in_play])
         searched = [list(looks) for looks in looked]

@@ -44,7 +44,7 @@ def test_units_in_column_names_are_converted(tmp_path):
         (
             'calibration = "lab.csv"\nfield = "field.csv"\nprdict = "fresh.csv"\n[models]\n'
             'rut_depth = "bekker"\n',
-            "unknown key prdict\n  allowed: calibration, field, predict, models\n"
+            "unknown key prdict\n  allowed: calibration, field, predict, models, context\n"
             "  to mend: was predict meant?",
         ),
         (

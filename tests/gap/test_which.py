@@ -12,7 +12,7 @@ from calib.data.quantities import OUTPUTS
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import dependences
-from calib.gap.which import probabilities, rank
+from calib.gap.which import Odds, probabilities, rank
 from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
 
@@ -70,11 +70,12 @@ def test_untestable_effects_are_listed_and_not_fitted():
 
 def test_probabilities_from_evidence():
     even = {"none": 0.0, "unknown": 0.0, "parameter_shift": 0.0, "a": 0.0, "b": 0.0, "a+b": 0.0}
-    p = probabilities(even, 2)
+    odds = Odds(2, {})
+    p = probabilities(even, odds)
     assert sum(p.values()) == pytest.approx(1.0)
     assert p["a"] == pytest.approx(p["b"])
     assert p["a+b"] < p["a"] < p["none"]
-    better = probabilities(even | {"a": np.log(10.0)}, 2)
+    better = probabilities(even | {"a": np.log(10.0)}, odds)
     # Ten times the evidence is ten times the odds.
     assert better["a"] / better["b"] == pytest.approx(10.0)
 

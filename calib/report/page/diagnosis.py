@@ -28,7 +28,7 @@ from calib.report.figures.gap_rows import (
     title_of,
 )
 from calib.report.figures.gap_shrink import scaled_shrink
-from calib.report.figures.labels import MINUS, short
+from calib.report.figures.labels import MINUS, joined, short
 from calib.report.figures.plate import Plate
 from calib.report.page.gap_sizes import size_sentences, where_to_look
 from calib.report.page.gap_tables import (
@@ -161,6 +161,7 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
     ranking = found.ranking
     best = best_of(found)
     design = ranking.isolability
+    case_context = found.data.case.context
     alike = [
         short_name(b if a == best else a) for a, b in design.alike if best in (a, b)
     ]  # fmt: skip
@@ -188,7 +189,19 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         causes=[_cause(found, n, c) for n, c in found.inclusion.causes.items()],
         remainder=_cause(found, UNLISTED, found.inclusion.remainder),
         remainder_where=_remainder_where(found),
+        put_in="; ".join(case_context.words()),
+        without=_without(found),
     )
+
+
+def _without(found: Diagnosis) -> str:
+    """Say which causes act without what the case's context put in."""
+    if found.without_context is None:
+        return ""
+    p = found.without_context
+    leading = sorted((n for n in p if p[n] >= 0.05), key=lambda n: -p[n])[:4]
+    words = {"none": "no gap", UNLISTED: "something unlisted"}
+    return joined([f"{words.get(n, short_name(n))} ({odds_text(p[n])})" for n in leading])
 
 
 def _cause(found: Diagnosis, name: str, c: Included) -> CauseFact:

@@ -122,6 +122,8 @@ class GapEvidence:
         Something that is not listed, by itself or beside listed causes.
     remainder_where : str
         Where that lies.
+    put_in, without : str
+        What was put into the diagnosis besides the data, and what it finds without that.
     """
 
     verdict: str
@@ -137,6 +139,8 @@ class GapEvidence:
     causes: Sequence[CauseFact] = ()
     remainder: CauseFact | None = None
     remainder_where: str = ""
+    put_in: str = ""
+    without: str = ""
 
     @property
     def acting(self) -> list[CauseFact]:
@@ -231,6 +235,8 @@ def _no_gap(e: GapEvidence, best: Candidate) -> GapVerdict:
         "laboratory's noise) would have shown in four of five campaigns like this one"
     )  # fmt: skip
     facts = [("Which", f"No gap, probability {odds_text(best.probability)}{size}")]
+    if e.put_in:
+        facts.append(("Put in", f"{e.put_in}. Without that: {e.without}"))
     others = [c for c in e.ranked[1:4] if c.probability >= 0.05]
     if others:
         listed = joined([f"{c.words} ({odds_text(c.probability)})" for c in others])
@@ -249,6 +255,8 @@ def _no_gap(e: GapEvidence, best: Candidate) -> GapVerdict:
 
 def _facts(e: GapEvidence) -> list[tuple[str, str]]:
     facts = [("Causes", _causes(e))] if e.causes else []
+    if e.put_in:
+        facts.append(("Put in", f"{e.put_in}. Without that: {e.without}"))
     facts.append(("Which", _which(e)))
     if e.sizes:
         facts.append(("How large", f"{'; '.join(e.sizes)}"))

@@ -1,0 +1,151 @@
+"""What the engineer knows before the diagnosis: causes suspected or excluded, sizes that are known.
+
+It changes what is believed before the data, never the data; a diagnosis that was given a context
+says what it finds without it as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from calib.errors import CalibError
+from calib.inference.priors import Priors
+
+if TYPE_CHECKING:
+    from calib.gap.hypothesis import Hypothesis
+
+__all__ = ["Context", "Size", "read_context"]
+
+_Number = Annotated[float, Field(ge=-1e15, le=1e15)]
+
+
+class Size(BaseModel):
+    """A parameter of an effect as it is known: mean and sd, in its own unit."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    mean: _Number
+    sd: Annotated[float, Field(gt=1e-15, le=1e15)]
+
+
+class _Written(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    suspected: dict[str, Annotated[float, Field(gt=0.0, lt=1.0)]] = {}
+    excluded: list[str] = []
+    sizes: dict[str, dict[str, Size]] = {}
+
+
+@dataclass(frozen=True)
+class Context:
+    """What is put into a diagnosis besides its data.
+
+    Parameters
+    ----------
+    suspected : mapping of str to float
+        Prior probability that a cause acts, whatever acts besides.
+    excluded : tuple of str
+        Causes that cannot have acted.
+    sizes : mapping of str to mapping of str to Size
+        Effect to parameter to what is known of it.
+    """
+
+    suspected: Mapping[str, float] = field(default_factory=dict)
+    excluded: tuple[str, ...] = ()
+    sizes: Mapping[str, Mapping[str, Size]] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.suspected or self.excluded or self.sizes)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every cause it speaks of."""
+        return tuple(dict.fromkeys([*self.suspected, *self.excluded, *self.sizes]))
+
+    def sized(self, single: Hypothesis) -> Hypothesis:
+        """Return an effect with what is known of its size in the place of its prior.
+
+        Raises
+        ------
+        CalibError
+            If it has no such parameter, or one that is positive is said to be zero or less.
+        """
+        known = self.sizes.get(single.name)
+        if not known:
+            return single
+        (priors,) = single.effect_priors
+        strange = set(known) - {p.name for p in priors.free}
+        if strange:
+            raise CalibError(
+                f"{single.name} has no parameter {min(strange)!r}", where="[context] sizes",
+                allowed=", ".join(p.name for p in priors.free), mend="correct the name",
+            )  # fmt: skip
+        return replace(single, effect_priors=(_known(single.name, priors, known),))
+
+    def words(self) -> list[str]:
+        """Say what was put in."""
+        said = [f"{n.replace('_', ' ')} suspected ({p:g})" for n, p in self.suspected.items()]
+        said += [f"{name.replace('_', ' ')} excluded" for name in self.excluded]
+        said += [
+            f"{name.replace('_', ' ')}: {parameter} {size.mean:g} ± {size.sd:g}"
+            for name, known in self.sizes.items()
+            for parameter, size in known.items()
+        ]
+        return said
+
+
+def _known(effect: str, priors: Priors, known: Mapping[str, Size]) -> Priors:
+    entries = []
+    for p in priors.entries:
+        size = known.get(p.name)
+        if size is not None and p.log:
+            if size.mean <= 0.0:
+                raise CalibError(
+                    f"{effect}: {p.name} is positive", where="[context] sizes",
+                    allowed="a mean above zero", mend="correct it",
+                )  # fmt: skip
+            p = replace(p, loc=float(np.log(size.mean)), scale=size.sd / size.mean)
+        elif size is not None:
+            p = replace(p, loc=size.mean, scale=size.sd)
+        entries.append(p)
+    return Priors(tuple(entries), priors.text, priors.source)
+
+
+def read_context(content: Any, where: str) -> Context:
+    """Check the table ``[context]`` of a ``case.toml``.
+
+    Parameters
+    ----------
+    content : Any
+        The table, or None where there is none.
+    where : str
+        Its file, for messages.
+
+    Raises
+    ------
+    CalibError
+        Naming the entry, and what is allowed there.
+    """
+    if content is None:
+        return Context()
+    try:
+        written = _Written.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise CalibError(
+            f"{first['msg']} (found {first.get('input')!r})", where=f"{where}, context.{place}",
+            allowed="suspected = {name = probability}, excluded = [names], "
+            "sizes = {name = {parameter = {mean = …, sd = …}}}",
+            mend="correct this entry",
+        ) from None  # fmt: skip
+    twice = set(written.suspected) & set(written.excluded)
+    if twice:
+        raise CalibError(
+            f"{min(twice)} is both suspected and excluded", where=f"{where}, [context]",
+            mend="leave one of the two out",
+        )  # fmt: skip
+    return Context(written.suspected, tuple(written.excluded), written.sizes)
