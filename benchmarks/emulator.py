@@ -4,7 +4,7 @@
 
 A wheel of five parameters (Bekker's resistance, Janosi & Hanamoto's thrust), quick enough that its
 exact posterior is known: calib on the simulator itself. Its data are 28 readings at seven slips and
-four loads, drawn with seeds that were used for nothing else. Every way gets the same runs in
+four loads. Every way gets the same runs in
 number, the same nodes, the same sampler; what is compared is how far means and sds of the posterior
 are off. The peer is scikit-learn's GaussianProcessRegressor on principal components of a Latin
 hypercube, its mean in the place of the simulator, as most tutorials have it.

@@ -6,11 +6,11 @@ missing when they are called again; `completed` hands results over as they come 
 
 from calib.batch.tasks.attempt import Finished
 from calib.batch.tasks.items import LateItems
-from calib.batch.tasks.landing import check_names, failed_tasks
+from calib.batch.tasks.landing import check_names, failed_tasks, read_seconds
 from calib.batch.tasks.run import Outcome, run_folder_tasks, run_tasks
 from calib.batch.tasks.stream import completed
 
 __all__ = [
     "Finished", "LateItems", "Outcome", "check_names", "completed", "failed_tasks",
-    "run_folder_tasks", "run_tasks",
+    "read_seconds", "run_folder_tasks", "run_tasks",
 ]  # fmt: skip

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.batch.tasks import run_tasks
+from calib.batch.tasks import read_seconds, run_tasks
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Result, Simulator
@@ -131,6 +131,13 @@ class RunKeeper:
     def _on_disk(self, items: Mapping[str, _Item]) -> Mapping[str, Mapping[str, Any]]:
         folder = Path(self.folder or ".") / self.simulator.digest[:16]
         self._forget_failures(folder, items)
+        if self.workers > 1 and not self.seconds:
+            # The first run tells how long one takes.
+            missing = [name for name in items if not (folder / f"{name}.json").exists()]
+            if len(missing) > 1:
+                run_tasks(_carry_out, {missing[0]: items[missing[0]]}, folder)
+                self.seconds = read_seconds(folder).get(missing[0], 0.0)
+                self.made, self.kept = self.made + 1, self.kept - 1
         outcome = run_tasks(
             _carry_out, items, folder, workers=self._workers(len(items)),
             scheduler=self.scheduler, progress=self.progress,
