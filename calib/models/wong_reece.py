@@ -1,7 +1,8 @@
 """Drawbar pull, torque and sinkage of a driven rigid wheel: Wong & Reece (1967), part I.
 
 The stresses and their integration are in `calib.models.rigid_wheel`. The three models share their
-soil: eight parameters, of which pull, torque or sinkage alone determine but a few.
+soil: eight parameters, of which pull, torque or sinkage alone determine but a few. What is known
+of the soil is best fixed in a prior file. A braked wheel (slip below zero) has no value.
 """
 
 from __future__ import annotations
