@@ -15,7 +15,7 @@ from scipy.special import ndtr
 from scipy.stats import rankdata
 
 from challenge.files import OUTPUT_COLUMNS
-from challenge.mechanism import NONE
+from challenge.mechanism import NONE, UNKNOWN
 
 type Array = NDArray[np.float64]
 
@@ -195,15 +195,20 @@ def _shrinks(
     return tuple(answers)
 
 
-def _normal(name: str) -> str:
-    return "+".join(sorted(name.split("+")))
+def _listed(name: str) -> str:
+    """The listed causes of an explanation: those with something unlisted besides are the same."""
+    causes = sorted(cause for cause in name.split("+") if cause != UNKNOWN)
+    return "+".join(causes) or UNKNOWN
 
 
 def _ranked(diagnosis: dict[str, Any]) -> tuple[tuple[str, float], ...]:
-    said = [(_normal(str(e["name"])), float(e["probability"])) for e in diagnosis["effects"]]
+    said = [(_listed(str(e["name"])), float(e["probability"])) for e in diagnosis["effects"]]
     if not said or not all(np.isfinite(p) and 0.0 <= p <= 1.0 + 1e-9 for _, p in said):
         raise ValueError("probabilities are missing or outside [0, 1]")
-    return tuple(sorted(said, key=lambda item: -item[1]))
+    total: dict[str, float] = {}
+    for name, p in said:
+        total[name] = min(total.get(name, 0.0) + p, 1.0)
+    return tuple(sorted(total.items(), key=lambda item: -item[1]))
 
 
 def read_answer(name: str, entry: dict[str, Any], folder: Path) -> CaseAnswer:

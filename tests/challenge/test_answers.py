@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from scipy.stats import norm
 
-from challenge.answers import read_answer
+from challenge.answers import _ranked, read_answer
 from tests.challenge.test_score import entry
 
 
@@ -38,3 +38,11 @@ def test_a_null_and_keys_that_do_not_say_are_left_out(tmp_path):
 def test_a_case_without_a_diagnosis_says_how_to_go_on(tmp_path):
     found = read_answer("case-000", entry("none", "easy"), tmp_path / "nowhere")
     assert found.problem == "not diagnosed; go on with `calib challenge run`"
+
+
+def test_listed_causes_with_something_unlisted_besides_are_those_causes():
+    said = {"lug_thrust+unknown": 0.4, "lug_thrust": 0.3, "b+a": 0.1, "unknown": 0.2}
+    effects = [{"name": name, "probability": p} for name, p in said.items()]
+    ranked = _ranked({"effects": effects})
+    assert dict(ranked) == pytest.approx({"lug_thrust": 0.7, "unknown": 0.2, "a+b": 0.1})
+    assert ranked[0][0] == "lug_thrust"
