@@ -42,10 +42,24 @@ def log_normal(residuals: Array, sigma: Array, variances: Array, curves: Array) 
     root = np.sqrt(np.where(bad[:, None], 0.0, variances)) / scale[:, None]
     gram = curves.T @ curves
     m = np.eye(gram.shape[0]) + root[:, :, None] * gram * root[:, None, :]
-    lower = np.linalg.cholesky(m)
+    bad |= ~np.isfinite(m).all(axis=(1, 2))
+    m[bad] = np.eye(gram.shape[0])
     seen = np.where(bad[:, None], 0.0, residuals @ curves) * root
-    taken = np.square(np.linalg.solve(lower, seen[:, :, None])).sum(axis=(1, 2))
-    log_det = np.log(np.einsum("kjj->kj", lower)).sum(axis=1)
+    taken, log_det = _solved(m, seen)
     value = -n * (np.log(scale) + 0.5 * np.log(2.0 * np.pi)) - log_det
     value -= 0.5 * (squares - taken) / scale**2
     return np.where(bad, np.nan, value)
+
+
+def _solved(m: Array, seen: Array) -> tuple[Array, Array]:
+    """Return s' M^-1 s and half the log determinant of every M = I + P, P positive, each (k,)."""
+    try:
+        lower = np.linalg.cholesky(m)
+    except np.linalg.LinAlgError:
+        # At a tiny sigma the I is lost in rounding; but no eigenvalue is less than one.
+        values, vectors = np.linalg.eigh(m)
+        values = np.maximum(values, 1.0)
+        along = np.einsum("kji,kj->ki", vectors, seen)
+        return (np.square(along) / values).sum(axis=1), 0.5 * np.log(values).sum(axis=1)
+    taken = np.square(np.linalg.solve(lower, seen[:, :, None])).sum(axis=(1, 2))
+    return taken, np.log(np.einsum("kjj->kj", lower)).sum(axis=1)

@@ -26,3 +26,18 @@ def test_where_there_is_no_prediction_there_is_no_density() -> None:
     residuals = np.array([[1.0, np.nan], [1.0, 1.0]])
     found = log_normal(residuals, np.array([1.0, -1.0]), np.ones((2, 1)), np.ones((2, 1)))
     assert np.isnan(found).all()
+
+
+def test_a_tiny_noise_beside_a_large_error_is_no_failure() -> None:
+    rng = np.random.default_rng(2)
+    curves = np.repeat(rng.normal(size=(6, 1)), 3, axis=1)  # of rank one
+    residuals, variances = rng.normal(size=(4, 6)), np.full((4, 3), 2.0)
+    sigma = np.array([0.5, 1e-9, 1e-12, 1e-200])
+    with np.errstate(all="ignore"):
+        values = log_normal(residuals, sigma, variances, curves)
+    covariance = 0.25 * np.eye(6) + 2.0 * curves @ curves.T
+    expected = multivariate_normal(np.zeros(6), covariance).logpdf(residuals[0])
+    np.testing.assert_allclose(values[0], expected)
+    # Residuals that the curves do not explain are impossible without noise.
+    assert (values[1:3] < -1e15).all()
+    assert np.isnan(values[3])

@@ -89,11 +89,13 @@ def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> N
     assert emulation.failed
     assert all(run.theta[0] > 0.6 for run in emulation.failed)
     found = calib.calibrate(emulation.problem, seed=1)
-    # The data are of mu = 0.6: half of the posterior is cut off there.
-    assert np.quantile(found.parameters["mu"], 0.99) < 0.6 + 0.1 * found.summary["mu"].sd + 0.0015
+    # The data are of mu = 0.6: half of the posterior is cut off there. The edge lies somewhere
+    # between runs, so that it is known to the distance between these only: two sds here, at most.
     whole = exact(table()).parameters["mu"]
     kept = whole[whole < 0.6]
-    assert abs(found.summary["mu"].mean - kept.mean()) < 0.35 * kept.std()
+    assert np.quantile(found.parameters["mu"], 0.99) < 0.6 + 2.0 * kept.std()
+    assert np.quantile(whole, 0.99) > 0.6 + 2.5 * kept.std()
+    assert abs(found.summary["mu"].mean - kept.mean()) < kept.std()
     write_failed(emulation, simulated.simulator.parameters, tmp_path / "failed.csv")
     lines = (tmp_path / "failed.csv").read_text().splitlines()
     assert lines[0] == "mu,s0,kind,reason,printed"
