@@ -94,7 +94,7 @@ def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> N
     whole = exact(table()).parameters["mu"]
     kept = whole[whole < 0.6]
     assert np.quantile(found.parameters["mu"], 0.99) < 0.6 + 2.0 * kept.std()
-    assert np.quantile(whole, 0.99) > 0.6 + 2.5 * kept.std()
+    assert (found.parameters["mu"] > 0.6).mean() < (whole > 0.6).mean()
     assert abs(found.summary["mu"].mean - kept.mean()) < kept.std()
     write_failed(emulation, simulated.simulator.parameters, tmp_path / "failed.csv")
     lines = (tmp_path / "failed.csv").read_text().splitlines()
