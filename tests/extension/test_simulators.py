@@ -124,6 +124,7 @@ def test_a_slow_command_that_fails_now_and_then_gives_the_same(run: Calib) -> No
     assert "could not be drawn" not in Path("gap/index.html").read_text()
 
 
+@pytest.mark.slow
 def test_a_report_and_its_check(run: Calib) -> None:
     own = ["--simulator", write_program(Path.cwd())]
     write_table("lab.csv", lab(np.random.default_rng(1)))

@@ -10,7 +10,7 @@ import pytest
 from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.context import Context, Size, read_context
-from calib.gap.diagnose import diagnose
+from calib.gap.diagnose import diagnose_once
 from calib.gap.which import Odds
 from calib.report.page.diagnosis import gap_evidence
 from calib.report.page.gap_verdict import judge_gap
@@ -29,20 +29,20 @@ def test_suspicion_multiplies_the_odds_of_every_explanation_with_the_cause():
 
 def test_an_excluded_cause_is_not_tested_and_both_verdicts_are_told():
     case = make_case("sensor_drift", models=PULL_ONLY)
-    found = diagnose(replace(case, context=Context(excluded=("sensor_drift",))))
+    found = diagnose_once(replace(case, context=Context(excluded=("sensor_drift",))), 1)
     assert "sensor_drift" not in found.inclusion.causes
     assert "excluded" in found.ranking.not_testable["sensor_drift"]
     assert found.without_context is not None
     assert found.without_context["sensor_drift"] > 0.5
     facts = dict(judge_gap(gap_evidence(found)).facts)
     assert facts["Put in"].startswith("Sensor drift excluded. Without that: sensor drift (")
-    assert diagnose(case).without_context is None
+    assert diagnose_once(case, 1).without_context is None
 
 
 def test_a_known_size_takes_the_place_of_the_prior():
     case = make_case("force_offset", models=PULL_ONLY)
     context = Context(sizes={"force_offset": {"offset": Size(mean=0.02, sd=0.001)}})
-    found = diagnose(replace(case, context=context))
+    found = diagnose_once(replace(case, context=context), 1)
     priors = found.ranking.fits["force_offset"][0].forward.hypothesis.effect_priors[0]
     (offset,) = priors.free
     assert (offset.loc, offset.scale) == (0.02, 0.001)
@@ -81,7 +81,7 @@ def test_what_is_wrong_with_a_context_is_named(tmp_path, table, words):
 def test_names_that_nobody_knows_are_refused(context):
     case = make_case("force_offset", models=PULL_ONLY)
     with pytest.raises(CalibError, match=r"speaks of|no parameter"):
-        diagnose(replace(case, context=context))
+        diagnose_once(replace(case, context=context), 1)
 
 
 def test_a_context_is_read_from_the_case(tmp_path):

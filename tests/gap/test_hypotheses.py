@@ -9,7 +9,7 @@ import pytest
 
 from calib.data import table_from_arrays
 from calib.gap.case import Case, campaigns
-from calib.gap.diagnose import diagnose
+from calib.gap.diagnose import diagnose, diagnose_once
 from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
@@ -198,7 +198,7 @@ def with_load(lab_kn: np.ndarray, field_kn: np.ndarray, exponent: float, seed: i
 
 
 def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause():
-    found = diagnose(with_load(np.array([5.0]), np.array([4.0, 6.0, 8.0]), 0.9))
+    found = diagnose_once(with_load(np.array([5.0]), np.array([4.0, 6.0, 8.0]), 0.9), 1)
     assert found.verdict == "effect"
     load = found.inclusion.causes["depends_on_normal_load"]
     assert load.probability > 0.9
@@ -207,7 +207,7 @@ def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause():
 
 
 def test_a_condition_that_differs_between_the_campaigns_only_is_said_to_be_inseparable():
-    found = diagnose(with_load(np.array([5.0]), np.array([8.0]), 1.0))
+    found = diagnose_once(with_load(np.array([5.0]), np.array([8.0]), 1.0), 1)
     assert inseparable(found.data, dependences(found.data)["depends_on_normal_load"])
     assert any("cannot be separated" in w for w in found.data.case.warnings)
 

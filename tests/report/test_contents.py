@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from calib.batch.pool import pool
 from calib.he2019.audit import Seeds
 from calib.he2019.gaps.cases import paper_gaps
@@ -17,6 +19,7 @@ from calib.report.writer import write_report
 SHORT = SamplerSettings(steps=60, max_steps=60)
 
 
+@pytest.mark.slow  # `tests/check/test_threads_and_processes.py` has a smaller one
 def test_processes_make_the_same_report_as_one(tmp_path: Path) -> None:
     """Outputs, a gap, the audit and all figures, to the byte."""
     tasks = [task for task in he2019_tasks() if task.output == "rut_depth"]
