@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import get_all_start_methods, get_context
@@ -21,6 +21,7 @@ from calib.errors import CalibError
 
 __all__ = ["HERE", "Later", "Pool", "pool"]
 
+_LOOK_SECONDS = 2.0
 _REPORT = ("calib.report.contents", "calib.report.writer")
 
 
@@ -44,11 +45,15 @@ class _Here[R]:
 class _There[R]:
     """A piece that another process works out."""
 
-    def __init__(self, future: Future[R]) -> None:
-        self._future = future
+    def __init__(self, future: Future[R], executor: ProcessPoolExecutor) -> None:
+        self._future, self._executor = future, executor
 
     def result(self) -> R:
         try:
+            while not wait([self._future], timeout=_LOOK_SECONDS).done:
+                # An executor that starts a process watches it from the next call on only: without
+                # one, its death might never be seen.
+                self._executor.submit(_begun)
             return self._future.result()
         except BrokenProcessPool:
             raise CalibError(
@@ -84,7 +89,7 @@ class Pool:
         """
         if self._executor is None:
             return _Here(lambda: function(*args, **kwargs))
-        return _There(self._executor.submit(function, *args, **kwargs))
+        return _There(self._executor.submit(function, *args, **kwargs), self._executor)
 
 
 HERE = Pool()

@@ -172,7 +172,6 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     # Of 800 draws; the sd of a share is 0.35 at the most.
     ("gaps/*/diagnosis.json/{inclusion/*,remainder}/share", _chance(0.12)),
     ("gaps/*/diagnosis.json/{inclusion/*,remainder}/share_interval/*", _chance(0.25)),
-    ("gaps/*/diagnosis.json/remainder/where*", _JUMPS),
     ("{summary.json/paper_gaps/*/parameters,gaps/*/diagnosis.json/effects/*/parameters}/*/mean",
      Tolerance("diagnosis", 0.1, Of.ITS_SD)),
     ("{summary.json/paper_gaps/*/parameters,gaps/*/diagnosis.json/effects/*/parameters}/*/sd",
@@ -180,7 +179,7 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     ("gaps/*/diagnosis.json/where/*/gap", Tolerance("diagnosis", 0.3, Of.ITS_SD)),
     ("gaps/*/diagnosis.json/where/*/gap_sd", Tolerance("diagnosis", 0.25)),
     ("gaps/*/diagnosis.json/where/*/probability", _chance(0.15)),
-    ("gaps/*/diagnosis.json/{regions,next_measurement}*", _JUMPS),
+    ("gaps/*/diagnosis.json/{regions,next_measurement,remainder/where}*", _JUMPS),
     ("gaps/*/fresh_prediction.csv/*/*_{before,after,after_lower,after_upper}",
      Tolerance("diagnosis", 0.2, Of.BAND)),
     # The audit: least costs of searches from many starts; two findings rest on posterior draws.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -58,3 +59,15 @@ def test_what_goes_wrong_with_a_piece_is_raised_where_it_is_wanted(workers: int)
 def test_a_process_that_dies_is_a_clear_error() -> None:
     with pool(2) as side, pytest.raises(CalibError, match="a process died"):
         side.submit(die).result()
+
+
+def test_a_death_that_the_executor_did_not_see_is_noticed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """While one waits, the executor is made to look at its processes again."""
+    monkeypatch.setattr("calib.batch.pool._LOOK_SECONDS", 0.05)
+    with pool(2) as side:
+        slow = side.submit(time.sleep, 0.4)
+        assert slow.result() is None
+        with pytest.raises(CalibError, match="a process died"):
+            side.submit(die).result()

@@ -16,7 +16,7 @@ REPORTS = ROOT / "reports"
 RESULTS = (DOCS / "formats" / "results.md").read_text(encoding="utf-8")
 # Below these keys, how many levels of keys are names of one's own: outputs, methods, parameters.
 NAMES = {"models": 1, "estimates": 2, "fit": 1, "priors": 1, "posterior": 1, "parameters": 1,
-         "shrink": 1, "quantities": 1}  # fmt: skip
+         "shrink": 1, "quantities": 1, "inclusion": 1}  # fmt: skip
 # Told in words, or of other programs.
 WHOLE = {"ranges", "references", "mode", "coverage", "coverage_interval", "by_pressure", "criteria",
          "gate", "conditions", "paper_gaps", "audit", "tasks", "files", "left_out", "versions",
