@@ -24,7 +24,7 @@ from calib.errors import CalibError
 from calib.gap.case import Campaigns, Case, campaigns, read_case
 from calib.gap.diagnose import diagnose
 from calib.gap.hypotheses import split_testable
-from calib.gap.noise import noise_at
+from calib.gap.noise import noise_conditions
 from calib.gap.well_specified import Draw, draw_from_hypothesis
 from calib.gap.which import Lab, calibrate_lab
 
@@ -69,7 +69,7 @@ def deformed(case: Case, data: Campaigns, lab: Lab, draw: Draw, rng: np.random.G
     for o in data.outputs:
         column, back, noise = OUTPUTS[o.name], o.problem.bound.from_response, lab[1][o.name]
         location = plain[o.name][0] + (full[o.name] - plain[o.name])[0] * factor
-        sd = noise.sd(noise_at(data.view))
+        sd = noise.sd(noise_conditions(data.view))
         tables["field"][column] = back(location + sd * rng.standard_normal(location.size))
         measured = np.isfinite(case.lab[column])
         sd = noise.sd(data.lab_at[o.name])
@@ -77,7 +77,7 @@ def deformed(case: Case, data: Campaigns, lab: Lab, draw: Draw, rng: np.random.G
         values[measured] = back(at_lab[o.name][0] + sd * rng.standard_normal(measured.sum()))
         tables["lab"][column] = values
     new = {name: table_from_arrays(columns) for name, columns in tables.items()}
-    return replace(case, lab=new["lab"], field=new["field"], fresh=None)
+    return replace(case, lab=new["lab"], field=new["field"], new_conditions=None)
 
 
 def main() -> None:

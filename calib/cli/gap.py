@@ -80,7 +80,7 @@ def diagnose(
             keep_emulators(given.models.values(), folder)
             (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed, files))
             write_page(found, folder, manifest, pool=side)
-    for warning in found.data.case.warnings:
+    for warning in found.warnings:
         print(f"calib: {warning}", file=sys.stderr)
     print(f"verdict: {found.verdict} ({judge_gap(gap_evidence(found)).headline})")
     for name in found.ranking.order[:4]:

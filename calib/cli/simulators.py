@@ -63,7 +63,7 @@ def prepare_case(
     from calib.inference.emulation.prepared import prepare, prepare_field, reaches
 
     said = []
-    others = [case.field, *([] if case.fresh is None else [case.fresh])]
+    others = [case.field, *([] if case.new_conditions is None else [case.new_conditions])]
     for output, model in case.models.items():
         column = OUTPUTS[output]
         if column not in case.lab or column not in case.field:

@@ -21,9 +21,10 @@ from calib.errors import CalibError
 from calib.gap.context import Context, read_context
 from calib.gap.covariates import Covariates
 from calib.gap.effects import View
-from calib.gap.noise import At, noise_at, noise_at_lab
-from calib.gap.oddities import identical_rows, oddities
+from calib.gap.noise import NoiseConditions, noise_conditions, noise_conditions_of_lab
+from calib.gap.oddities import identical_rows
 from calib.gap.simulated import Simulated
+from calib.inference.prior_files import DeclaredPriors
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS, get_model
@@ -37,7 +38,7 @@ __all__ = [
 MIN_FIELD_ROWS = 5
 MAX_RATIO = 100.0
 _FILES = ("calibration", "field", "predict")
-_KEYS = (*_FILES, "models", "context")
+_KEYS = (*_FILES, "models", "priors", "context")
 
 
 @dataclass(frozen=True)
@@ -51,21 +52,24 @@ class Case:
         The campaign of the calibration, and the one the simulator is used for.
     models : mapping of str to str
         Output (`calib.data.quantities.OUTPUTS`) to model.
-    fresh : Table, optional
+    new_conditions : Table, optional
         Conditions to predict.
-    warnings : tuple of str
-        What a reader must know about the input.
+    notes : tuple of str
+        What a reader must know about where the data are from.
     context : Context
         What is known besides the data.
+    priors : mapping of str to DeclaredPriors
+        Of an output's simulator, as its prior file says; the model's own where there is none.
     """
 
     name: str
     lab: Table
     field: Table
     models: Mapping[str, str]
-    fresh: Table | None = None
-    warnings: tuple[str, ...] = ()
+    new_conditions: Table | None = None
+    notes: tuple[str, ...] = ()
     context: Context = dataclasses.field(default_factory=Context)
+    priors: Mapping[str, DeclaredPriors] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -104,7 +108,7 @@ class Campaigns:
 
     outputs: tuple[OutputData, ...]
     view: View
-    lab_at: Mapping[str, At]
+    lab_at: Mapping[str, NoiseConditions]
     case: Case
 
     @property
@@ -136,9 +140,9 @@ class Campaigns:
         return Covariates(self)
 
     @cached_property
-    def at_rows(self) -> dict[str, At]:
+    def at_rows(self) -> dict[str, NoiseConditions]:
         """What the noise of every output's lab rows, then field rows, depends on."""
-        field = noise_at(self.view)
+        field = noise_conditions(self.view)
         return {o.name: self.lab_at[o.name] + field.rows(o.rows) for o in self.outputs}
 
     @cached_property
@@ -216,9 +220,34 @@ def read_case(folder: Path) -> Case:
     missing_ok = tuple(OUTPUTS.values())
     lab = read_table(_inside(folder, "calibration", content), allow_missing=missing_ok)
     field = read_table(_inside(folder, "field", content), allow_missing=missing_ok)
-    fresh = read_table(_inside(folder, "predict", content)) if content.get("predict") else None
+    new = read_table(_inside(folder, "predict", content)) if content.get("predict") else None
     context = read_context(content.get("context"), str(path))
-    return Case(folder.name, lab, field, models, fresh, oddities(lab, field, models), context)
+    priors = _read_priors(folder, content.get("priors", {}), models)
+    return Case(folder.name, lab, field, models, new, (), context, priors)
+
+
+def _read_priors(
+    folder: Path, named: object, models: Mapping[str, str]
+) -> dict[str, DeclaredPriors]:
+    """Read the prior files of a case's simulators; what is in them is checked with the models."""
+    where = f"{folder / 'case.toml'}, [priors]"
+    if not isinstance(named, dict) or not set(named) <= set(models):
+        raise CalibError(
+            f"it says {named!r}", where=where,
+            allowed=f'the name of a prior file for any of {", ".join(models)}',
+            mend="correct the name of the output, or leave it out",
+        )  # fmt: skip
+    found = {}
+    for output in named:
+        path = _inside(folder, output, named)
+        try:
+            found[output] = DeclaredPriors(path.name, path.read_text(encoding="utf-8"))
+        except (OSError, UnicodeDecodeError) as error:
+            raise CalibError(
+                f"the prior file cannot be read ({error})", where=f"{where}, {output}",
+                mend="name a readable TOML file of the case's folder",
+            ) from None  # fmt: skip
+    return found
 
 
 def _inside(folder: Path, key: str, content: Mapping[str, Any]) -> Path:
@@ -255,6 +284,8 @@ def case_files(folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
         content = {}
     named = {key: content.get(key) for key in _FILES}
+    priors = content.get("priors")
+    named |= {f"priors.{k}": v for k, v in (priors if isinstance(priors, dict) else {}).items()}
     files = {
         key: path.parent / name
         for key, name in named.items()
@@ -283,9 +314,9 @@ def case_from_run(run: Path, field: Path) -> Case:
     model = problem.bound.model
     output = output_of(model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))
-    models = {output: model.name}
-    warnings = oddities(problem.table, table, models)
-    return Case(Path(run).name, problem.table, table, models, warnings=warnings)
+    # The run's priors, which need not be the model's own.
+    priors = {output: DeclaredPriors(f"{model.name}.toml", problem.priors.text)}
+    return Case(Path(run).name, problem.table, table, {output: model.name}, priors=priors)
 
 
 def campaigns(case: Case) -> Campaigns:
@@ -312,9 +343,9 @@ def campaigns(case: Case) -> Campaigns:
         ground_exponent=_ground_exponent(lab, field),
         order_range=(float(order.min()), float(order.max())),
     )
-    if case.fresh is not None:
-        _check_conditions(case.fresh, case.models)
-    lab_at = {o.name: noise_at_lab(o.problem.table, view) for o in outputs}
+    if case.new_conditions is not None:
+        _check_conditions(case.new_conditions, case.models)
+    lab_at = {o.name: noise_conditions_of_lab(o.problem.table, view) for o in outputs}
     return Campaigns(outputs, view, lab_at, case)
 
 
@@ -335,7 +366,7 @@ def _output(case: Case, name: str, model: str) -> OutputData:
     for table in (case.lab, case.field):
         _check_conditions(table, {name: model})
     lab = case.lab.take(np.isfinite(case.lab[column]))
-    problem = build_problem(model, lab)
+    problem = build_problem(model, lab, case.priors.get(name))
     rows = np.flatnonzero(np.isfinite(case.field[column]))
     _check_field(case, name, column, rows)
     response = problem.bound.to_response(case.field[column][rows])

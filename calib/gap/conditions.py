@@ -48,13 +48,14 @@ def check_units(case: Case) -> None:
         )
 
 
-def without_far_conditions(case: Case) -> Case:
+def without_far_conditions(case: Case) -> tuple[Case, list[str]]:
     """Set rows aside whose conditions are far from those of all others, as a typing error's are.
 
     Their outputs are left out and the condition taken as it typically is, so that rows keep their
-    numbers. The case's warnings say so.
+    numbers. What was set aside is said beside the case.
     """
-    lab, field, said = case.lab, case.field, list(case.warnings)
+    lab, field = case.lab, case.field
+    said: list[str] = []
     for name in case.field:
         if role_of(name) == _ANY or name in OUTPUTS.values() or name not in case.lab:
             continue
@@ -66,7 +67,7 @@ def without_far_conditions(case: Case) -> Case:
         if in_field.size:
             said.append(_said(field, name, in_field))
             field = _blanked(field, name, in_field)
-    return replace(case, lab=lab, field=field, warnings=tuple(said))
+    return replace(case, lab=lab, field=field), said
 
 
 def _used(case: Case) -> list[str]:

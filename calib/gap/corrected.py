@@ -26,7 +26,7 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
 from calib.gap.shifts import ShiftMap
-from calib.gap.shrink import predict_fresh
+from calib.gap.shrink import predict_new
 from calib.models.base import Array
 from calib.validation.prediction import outside
 
@@ -76,12 +76,16 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
     write_table(inner / "lab.csv", case.lab.columns)
     write_table(inner / "field.csv", case.field.columns)
     files = ["calibration", "field"]
-    if case.fresh is not None:
-        write_table(inner / "fresh.csv", case.fresh.columns)
+    if case.new_conditions is not None:
+        write_table(inner / "fresh.csv", case.new_conditions.columns)
         files.append("predict")
     names = {"calibration": "lab.csv", "field": "field.csv", "predict": "fresh.csv"}
     lines = [f'{name} = "{names[name]}"' for name in files]
     lines += ["", "[models]", *(f'{output} = "{model}"' for output, model in case.models.items())]
+    lines += ["", "[priors]"] if case.priors else []
+    for output, priors in case.priors.items():
+        (inner / f"{output}_priors.toml").write_text(priors.text, encoding="utf-8")
+        lines.append(f'{output} = "{output}_priors.toml"')
     (inner / "case.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     content = {
         "schema": SCHEMA,
@@ -280,7 +284,7 @@ def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array]:
     columns: dict[str, Array] = {
         n: v for n, v in table.columns.items() if n not in OUTPUTS.values()
     }
-    for name, p in predict_fresh(truth, corrected.calibrated(conditions)).items():
+    for name, p in predict_new(truth, corrected.calibrated(conditions)).items():
         column = OUTPUTS[name]
         columns |= {
             f"{column}_before": p.before, f"{column}_after": p.after,

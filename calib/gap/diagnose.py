@@ -18,14 +18,23 @@ from calib.gap.hypotheses import dependences, inseparable
 from calib.gap.inclusion import UNLISTED, Inclusion, inclusion, inclusion_probability
 from calib.gap.mixture import Truth, mixture
 from calib.gap.next_measurement import NextMeasurement, next_measurements
-from calib.gap.outliers import rank_without_outliers, without_outputs
-from calib.gap.shrink import FreshPrediction, Shrink, predict_fresh, shrink
+from calib.gap.oddities import oddities
+from calib.gap.screening import (
+    MOST_ROUNDS,
+    left_over,
+    screen,
+    without_field_outliers,
+    without_outputs,
+)
+from calib.gap.shrink import NewPrediction, Shrink, predict_new, shrink
 from calib.gap.where import Region, RowGap, regions, row_gaps
 from calib.gap.which import Lab, Ranking, calibrate_lab, rank
 from calib.inference.random import generator
 from calib.models.base import Array
 
-__all__ = ["Diagnosis", "diagnose", "diagnose_once", "verdict", "with_unseen_rows"]
+__all__ = [
+    "Diagnosis", "diagnose", "diagnose_once", "screened_ranking", "verdict", "with_unseen_rows",
+]  # fmt: skip
 
 # A single hypothesis is named when it is at least this probable.
 NAMED = 0.5
@@ -49,7 +58,7 @@ class Diagnosis:
     gaps : tuple of RowGap
     regions : tuple of Region
     shrink : mapping of str to Shrink
-    fresh : mapping of str to FreshPrediction
+    new_predictions : mapping of str to NewPrediction
         Empty without conditions to predict.
     next_measurements : tuple of NextMeasurement
         What would separate hypotheses that are still in play.
@@ -61,6 +70,8 @@ class Diagnosis:
     without_context : mapping of str to float, optional
         How probable each cause is to act without what the case's context put in; ``none`` and
         ``unknown`` (something unlisted) among them. None without a context.
+    warnings : tuple of str
+        What a reader must know: of the input, what was set aside, what is extrapolated.
     """
 
     data: Campaigns
@@ -70,12 +81,13 @@ class Diagnosis:
     gaps: tuple[RowGap, ...]
     regions: tuple[Region, ...]
     shrink: Mapping[str, Shrink]
-    fresh: Mapping[str, FreshPrediction]
+    new_predictions: Mapping[str, NewPrediction]
     next_measurements: tuple[NextMeasurement, ...]
     corrected: Corrected
     seed: int
     inclusion: Inclusion
     without_context: Mapping[str, float] | None = None
+    warnings: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
         """Name the case, the verdict and the most probable hypotheses."""
@@ -124,32 +136,49 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
 
     Unless there are other conditions to predict, `with_unseen_rows` has to follow.
     """
-    data, ranking = rank_without_outliers(case, seed, effects)
+    data, ranking, said = screened_ranking(case, seed, effects)
     mixed = mixture(data, ranking, seed)
     truth = mixed.at(data.view)
     gaps = row_gaps(data, truth)
     # Without conditions to predict, the field's own are the best guess at where it will be used.
-    target = data.view if case.fresh is None else data.at(case.fresh)
-    at_target = truth if case.fresh is None else mixed.at(target)
+    target = data.view if case.new_conditions is None else data.at(case.new_conditions)
+    at_target = truth if case.new_conditions is None else mixed.at(target)
     corrected = Corrected(mixed, ranking.lab_mode)
     before = corrected.calibrated(target.conditions)
     far = shrink(data, at_target, before, at_target.means)
     causes = inclusion(mixed, ranking)
+    said += [*_beyond(corrected, before), *_confounded(data, causes)]
     return Diagnosis(
-        _confounded(_beyond(data, corrected, before), causes),
+        data,
         ranking,
         verdict(ranking.probability),
         truth,
         gaps,
         regions(data, truth, gaps),
         far,
-        {} if case.fresh is None else predict_fresh(at_target, before),
+        {} if case.new_conditions is None else predict_new(at_target, before),
         next_measurements(data, ranking, seed),
         corrected,
         seed,
         causes,
         _without_context(case, seed, effects),
+        (*case.notes, *oddities(case.lab, case.field, case.models), *said),
     )
+
+
+def screened_ranking(
+    case: Case, seed: int, effects: Mapping[str, Effect]
+) -> tuple[Campaigns, Ranking, list[str]]:
+    """Rank, rows set aside that nothing explains; say which."""
+    data, lab, said = screen(case, seed)
+    ranking = rank(data, seed, effects=effects, lab=lab)
+    for _ in range(MOST_ROUNDS):
+        kept, more = without_field_outliers(data, ranking)
+        if not more:
+            break
+        data, said = kept, said + more
+        ranking = rank(data, seed, effects=effects, lab=lab)
+    return data, ranking, said + left_over(data, ranking)
 
 
 def with_unseen_rows(
@@ -157,36 +186,36 @@ def with_unseen_rows(
 ) -> Diagnosis:
     """Judge how far a gap shrinks on rows that were left out, where there is nothing to predict."""
     data = found.data
-    if not found.shrink or data.case.fresh is not None:
+    if not found.shrink or data.case.new_conditions is not None:
         return found
     before = found.corrected.calibrated(data.view.conditions)
     predicted = _left_out(data, found.truth, found.seed, effects, pool)
     return replace(found, shrink=shrink(data, found.truth, before, predicted))
 
 
-def _beyond(data: Campaigns, corrected: Corrected, before: Mapping[str, Array]) -> Campaigns:
+def _beyond(corrected: Corrected, before: Mapping[str, Array]) -> list[str]:
     """Warn of conditions to predict that neither campaign covered."""
-    case = data.case
-    if case.fresh is None:
-        return data
+    new = corrected.data.case.new_conditions
+    if new is None:
+        return []
     said = [
-        f"{case.fresh.source}: {rows} of {len(case.fresh)} rows lie outside what either campaign "
-        f"covered in {name}; what is predicted there is extrapolated"
-        for name, rows in conditions_outside(corrected, case.fresh).items()
+        f"{new.source}: {rows} of {len(new)} rows lie outside what either campaign covered in "
+        f"{name}; what is predicted there is extrapolated"
+        for name, rows in conditions_outside(corrected, new).items()
     ]
     for name, values in before.items():
         empty = int(np.isnan(values).sum())
         if empty:
             said.append(
-                f"{case.fresh.source}: the simulator has no {name.replace('_', ' ')} at {empty} of "
-                f"{len(case.fresh)} rows; they are left out of the shrink"
+                f"{new.source}: the simulator has no {name.replace('_', ' ')} at {empty} of "
+                f"{len(new)} rows; they are left out of the shrink"
             )
-    return replace(data, case=replace(case, warnings=(*case.warnings, *said)))
+    return said
 
 
-def _confounded(data: Campaigns, causes: Inclusion) -> Campaigns:
+def _confounded(data: Campaigns, causes: Inclusion) -> list[str]:
     """Warn of causes that go with a condition which differs between the campaigns only."""
-    said = [
+    return [
         f"{name}: this condition is one value in the laboratory and another in the field; what "
         "depends on it cannot be separated from anything else that changed between them"
         for name, effect in dependences(data).items()
@@ -194,8 +223,6 @@ def _confounded(data: Campaigns, causes: Inclusion) -> Campaigns:
         and causes.causes[name].probability >= _WORTH_SAYING
         and inseparable(data, effect)
     ]
-    case = data.case
-    return replace(data, case=replace(case, warnings=(*case.warnings, *said)))
 
 
 def _without_context(
@@ -203,7 +230,7 @@ def _without_context(
 ) -> dict[str, float] | None:
     if not case.context:
         return None
-    _, ranking = rank_without_outliers(replace(case, context=Context()), seed, effects)
+    _, ranking, _ = screened_ranking(replace(case, context=Context()), seed, effects)
     probability = ranking.probability
     return {"none": probability["none"], **inclusion_probability(probability)}
 

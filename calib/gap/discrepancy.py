@@ -84,7 +84,7 @@ class Discrepancy:
         beyond = (u - threshold[:, None]) / _ONSET_WIDTH
         step = expit(beyond)
         if self.hypothesis.onset_over == "low_pressure":
-            # A limp tyre may lose a part of the pull, and more of it the more it pulls.
+            # An underinflated tyre may lose a part of the pull, and more of it the more it pulls.
             return step, step * self._known(self._level(view, output))
         return step, _ONSET_WIDTH * np.logaddexp(0.0, beyond)
 

@@ -116,15 +116,15 @@ def write_diagnosis(found: Diagnosis, folder: Path) -> None:
     """Write the files of a diagnosis into an existing folder."""
     (folder / "diagnosis.json").write_text(json.dumps(document(found), indent=1) + "\n")
     save_corrected(found.corrected, folder)
-    fresh = found.data.case.fresh
-    if fresh is None:
+    new = found.data.case.new_conditions
+    if new is None:
         return
     columns: dict[str, Array | list[str]] = {
-        name: [row[j] for row in fresh.text] for j, name in enumerate(fresh.header)
+        name: [row[j] for row in new.text] for j, name in enumerate(new.header)
     }
-    if not fresh.text:
-        columns = dict(fresh.columns)
-    for name, prediction in found.fresh.items():
+    if not new.text:
+        columns = dict(new.columns)
+    for name, prediction in found.new_predictions.items():
         column = OUTPUTS[name]
         columns[f"{column}_before"] = prediction.before
         columns[f"{column}_after"] = prediction.after

@@ -22,15 +22,15 @@ from calib.gap.noise import Noise, ln_prior
 from calib.gap.residuals import Residuals
 from calib.models.base import Array
 
-__all__ = ["Fit", "climb_on", "finish", "fit", "log_joint", "look"]
+__all__ = ["Fit", "finish", "fit", "full_fit", "log_joint", "truncated_fit"]
 
 # The noise of an output is known beforehand to this factor (sd of its logarithm).
 SIGMA_SD_LOG = 1.0
 _MAX_STEPS = 40
-# Steps of a first look; of one at a discrepancy alone, which predictions are linear in.
+# Steps of a truncated fit; of one at a discrepancy alone, which predictions are linear in.
 _FIRST_STEPS, _LINEAR_STEPS = 3, 1
-# How many nats behind the best of several looks one is given up, and within how many posterior sds
-# of a better one.
+# How many nats behind the best of several truncated fits one is given up, and within how many
+# posterior sds of a better one.
 _WORTH, _NEAR = 6.0, 1.5
 # Draws whose predictions stay in the processor's cache; more at once take twice as long each.
 _AT_ONCE = 1024
@@ -75,7 +75,7 @@ class Fit:
         return np.clip(drawn, lower, upper)
 
 
-def look(
+def truncated_fit(
     data: Campaigns,
     forward: Forward,
     start: Array,
@@ -85,7 +85,7 @@ def look(
     count: int = 1,
     skip: int = 0,
 ) -> Walk[list[Fit]]:
-    """Take the first steps of a fit, from one guess or several.
+    """Take the first Gauss-Newton steps of a fit, from one guess or several.
 
     Parameters
     ----------
@@ -119,35 +119,37 @@ def fit(
     data: Campaigns, forward: Forward, start: Array, noise: Mapping[str, Noise],
     *, starts: Array | None = None, count: int = 1,
 ) -> Fit:  # fmt: skip
-    """Fit a hypothesis, the parameters as for `look`."""
-    (looks,) = together([look(data, forward, start, noise, starts=starts, count=count)])
-    return together([finish(looks)])[0]
+    """Fit a hypothesis, the parameters as for `truncated_fit`."""
+    (truncated,) = together(
+        [truncated_fit(data, forward, start, noise, starts=starts, count=count)]
+    )
+    return together([finish(truncated)])[0]
 
 
-def finish(looks: Sequence[Fit]) -> Walk[Fit]:
-    """Climb on from the first looks that are worth it, and keep the most probable mode."""
-    ranked = sorted(looks, key=lambda f: -f.log_evidence)
+def finish(begun: Sequence[Fit]) -> Walk[Fit]:
+    """Fit fully from the truncated fits that are worth it, and keep the most probable mode."""
+    ranked = sorted(begun, key=lambda f: -f.log_evidence)
     kept: list[Fit] = []
     for found in ranked:
         worth = found.log_evidence >= ranked[0].log_evidence - _WORTH
         if worth and not any(_near(found, other) for other in kept):
             kept.append(found)
-    climbed = yield from climb_on(kept or ranked[:1])
+    climbed = yield from full_fit(kept or ranked[:1])
     return max(climbed, key=lambda f: f.log_evidence)
 
 
 def _near(found: Fit, other: Fit) -> bool:
-    """Whether two looks are on the way to the same mode."""
+    """Whether two truncated fits are on the way to the same mode."""
     sd = np.sqrt(np.diag(other.covariance))
     return bool((np.abs(found.psi - other.psi) < _NEAR * sd).all())
 
 
-def climb_on(looks: Sequence[Fit]) -> Walk[list[Fit]]:
+def full_fit(begun: Sequence[Fit]) -> Walk[list[Fit]]:
     """Climb from where fits of one hypothesis have stopped to the modes beside them."""
-    forward = looks[0].forward
+    forward = begun[0].forward
     problem = Residuals(forward.data, forward)
-    raw = yield problem, np.stack([f.psi for f in looks])
-    ascents = [Ascent(f.psi, r, dict(f.noise)) for f, r in zip(looks, raw, strict=True)]
+    raw = yield problem, np.stack([f.psi for f in begun])
+    ascents = [Ascent(f.psi, r, dict(f.noise)) for f, r in zip(begun, raw, strict=True)]
     return (yield from _climbed(problem, ascents, _MAX_STEPS))
 
 

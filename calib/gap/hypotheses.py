@@ -62,8 +62,8 @@ SOIL = 2.0 / 3.0
 SMOOTHS = (1.5, 5.0)
 # Size (noise sds) of a discrepancy that sets in beyond a threshold.
 ONSET = 4.0
-# Part of `unknown` that a limp tyre has, whichever output shows it.
-LIMP = 0.06
+# Part of `unknown` that an underinflated tyre has, whichever output shows it.
+UNDERINFLATED = 0.06
 # How often something unlisted, of a size that would be noticed, comes on top of listed causes: no
 # measured gap is of a formula's shape alone. (Named `<causes>+unknown`.)
 REMAINDER = 0.15
@@ -203,17 +203,17 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
         for over, t in setting_in
     ]
     # At low inflation a tyre may creep on its rim, buckle or run on it.
-    limp: list[Hypothesis] = []
+    soft: list[Hypothesis] = []
     if _varies(data, "low_pressure"):
-        limp = [
+        soft = [
             Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over="low_pressure")
             for t in of_wheel
         ]
-    onsets = 0.5 - LIMP if limp else 0.5
+    onsets = 0.5 - UNDERINFLATED if soft else 0.5
     return [
         *(replace(h, share=0.5 / len(smooth)) for h in smooth),
         *(replace(h, share=onsets / len(sudden)) for h in sudden),
-        *(replace(h, share=LIMP / len(limp)) for h in limp),
+        *(replace(h, share=UNDERINFLATED / len(soft)) for h in soft),
     ]
 
 

@@ -50,8 +50,8 @@ class Hypothesis:
     onset_over : OnsetOver, optional
         Instead of smooth, the discrepancy may set in beyond a threshold of one of these, water
         content and cone index among them: a step and a change of slope there. Below a threshold
-        of inflation pressure, where a limp tyre may creep on its rim or buckle: a step, and a part
-        of the output's level.
+        of inflation pressure, where an underinflated tyre may creep on its rim or buckle: a step,
+        and a part of the output's level.
     share : float
         Part of the prior probability of its name.
     """

@@ -20,7 +20,7 @@ import numpy as np
 from calib.gap.case import Campaigns
 from calib.gap.fit import Fit
 from calib.gap.mixture import Mixture
-from calib.gap.noise import noise_at
+from calib.gap.noise import noise_conditions
 from calib.gap.where import Region, regions, row_gaps
 from calib.gap.which import Ranking
 from calib.inference.random import generator
@@ -127,7 +127,7 @@ def _shares(mixed: Mixture, names: list[str]) -> tuple[Array, Array]:
 
 def _sizes(data: Campaigns, fit: Fit, psi: Array) -> Array:
     """Rms of what goes with each cause over all field rows, in noise sds, shape (k, causes)."""
-    forward, at = fit.forward, noise_at(data.view)
+    forward, at = fit.forward, noise_conditions(data.view)
     full = forward.field(psi, data.view)
     columns = []
     for cause in forward.causes:

@@ -19,7 +19,7 @@ from calib.gap.case import Campaigns
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.hypothesis import Hypothesis
-from calib.gap.noise import Noise, noise_at
+from calib.gap.noise import Noise, noise_conditions
 from calib.gap.relevance import RELEVANT
 from calib.inference.random import generator
 from calib.inference.sampling.curvature import hessian_scale
@@ -170,7 +170,7 @@ def _signatures(
     full = forward.departed(psi, data.view, plain)
     parts = [
         (full[o.name] - plain[o.name])[:, o.rows]
-        / noise[o.name].sd(noise_at(data.view).rows(o.rows))
+        / noise[o.name].sd(noise_conditions(data.view).rows(o.rows))
         for o in data.outputs
     ]
     g = np.concatenate(parts, axis=1)
@@ -195,7 +195,7 @@ def _metric_root(
         d = step.size
         sensitivity = ((location[:d] - location[d:]) / (2.0 * step[:, None])).T
         sensitivity = np.nan_to_num(sensitivity) / noise[o.name].sd(
-            noise_at(data.view).rows(o.rows)
+            noise_conditions(data.view).rows(o.rows)
         ).reshape(-1, 1)
         c = np.eye(o.rows.size) + sensitivity @ covariance @ sensitivity.T
         blocks.append(np.linalg.inv(np.linalg.cholesky(c)))

@@ -10,7 +10,7 @@ import numpy as np
 from calib.gap.case import Campaigns
 from calib.gap.effects import View
 from calib.gap.fit import Fit
-from calib.gap.noise import noise_at
+from calib.gap.noise import noise_conditions
 from calib.gap.which import Ranking
 from calib.inference.random import generator
 from calib.models.base import Array
@@ -114,7 +114,7 @@ class Mixture:
         simulator, truth, noise, measured = {}, {}, {}, {}
         for o in self.data.outputs:
             bound, location = o.problem.bound, full[o.name][good]
-            sd = fit.noise[o.name].sd(noise_at(view)) * np.ones_like(location)
+            sd = fit.noise[o.name].sd(noise_conditions(view)) * np.ones_like(location)
             simulator[o.name] = bound.from_response(plain[o.name][good])
             truth[o.name] = bound.from_response(location)
             noise[o.name] = sd * truth[o.name] if bound.model.response == "log" else sd

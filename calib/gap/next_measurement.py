@@ -12,7 +12,7 @@ from calib.data.quantities import QUANTITIES, role_of
 from calib.gap.case import Campaigns
 from calib.gap.effects import View
 from calib.gap.fit import Fit
-from calib.gap.noise import noise_at
+from calib.gap.noise import noise_conditions
 from calib.gap.which import Ranking
 from calib.inference.random import generator
 from calib.models.base import Array
@@ -102,7 +102,7 @@ def _moments(data: Campaigns, fit: Fit, view: View, seed: int) -> dict[str, tupl
         location = fit.forward.field(psi, view)
     found = {}
     for o in data.outputs:
-        noise = fit.noise[o.name].sd(noise_at(view))
+        noise = fit.noise[o.name].sd(noise_conditions(view))
         found[o.name] = (
             np.nanmean(location[o.name], axis=0),
             np.nanvar(location[o.name], axis=0) + noise**2,

@@ -14,7 +14,14 @@ from calib.data.quantities import columns_of
 from calib.gap.effects import View
 from calib.models.base import Array
 
-__all__ = ["At", "Noise", "ln_prior", "most_probable", "noise_at", "noise_at_lab"]
+__all__ = [
+    "Noise",
+    "NoiseConditions",
+    "ln_prior",
+    "most_probable",
+    "noise_conditions",
+    "noise_conditions_of_lab",
+]
 
 # Growth of the noise with slip: sigma (1 + rho s), and the prior probability of each.
 RHO = np.array([0.0, 1.0, 2.5, 5.0])
@@ -26,7 +33,7 @@ LN_KAPPA_PRIOR = np.log(np.array([0.7, 0.2, 0.1]))
 
 
 @dataclass(frozen=True)
-class At:
+class NoiseConditions:
     """What the noise of some rows depends on, shape (n,) each.
 
     Parameters
@@ -48,13 +55,13 @@ class At:
         growth = np.array([[_growth(self, rho, kappa) for kappa in kappas] for rho in RHO])
         return growth, np.log(growth).sum(axis=2)
 
-    def rows(self, rows: NDArray[np.int64]) -> At:
+    def rows(self, rows: NDArray[np.int64]) -> NoiseConditions:
         """Some of the rows."""
-        return At(self.slip[rows], self.softness[rows])
+        return NoiseConditions(self.slip[rows], self.softness[rows])
 
-    def __add__(self, other: At) -> At:
+    def __add__(self, other: NoiseConditions) -> NoiseConditions:
         """These rows, then others."""
-        return At(
+        return NoiseConditions(
             np.concatenate([self.slip, other.slip]),
             np.concatenate([self.softness, other.softness]),
         )
@@ -68,22 +75,22 @@ class Noise:
     rho: float = 0.0
     kappa: float = 0.0
 
-    def sd(self, at: At) -> Array:
+    def sd(self, at: NoiseConditions) -> Array:
         """Noise sd, shape (n,)."""
         return self.sigma * _growth(at, self.rho, self.kappa)
 
 
-def noise_at(view: View) -> At:
+def noise_conditions(view: View) -> NoiseConditions:
     """What the noise of a view's rows depends on."""
     return _at(view.conditions, view.lab, view.slip().size)
 
 
-def noise_at_lab(lab: Table, view: View) -> At:
+def noise_conditions_of_lab(lab: Table, view: View) -> NoiseConditions:
     """What the noise of calibration rows depends on, beside a view of the field."""
     return _at(lab.columns, view.lab, len(lab))
 
 
-def _at(conditions: Mapping[str, Array], lab: Mapping[str, float], size: int) -> At:
+def _at(conditions: Mapping[str, Array], lab: Mapping[str, float], size: int) -> NoiseConditions:
     softness = np.zeros(size)
     slip, recorded = (
         next((c for c in columns_of(role) if c in conditions), "") for role in ("slip", "pressure")
@@ -91,10 +98,10 @@ def _at(conditions: Mapping[str, Array], lab: Mapping[str, float], size: int) ->
     pressure, reference = conditions.get(recorded), lab.get(recorded)
     if pressure is not None and reference is not None:
         softness = -np.log(np.maximum(pressure, 1e-6) / max(reference, 1e-6))
-    return At(conditions.get(slip, np.zeros(size)), softness)
+    return NoiseConditions(conditions.get(slip, np.zeros(size)), softness)
 
 
-def _growth(at: At, rho: float, kappa: float) -> Array:
+def _growth(at: NoiseConditions, rho: float, kappa: float) -> Array:
     return np.asarray((1.0 + rho * np.maximum(at.slip, 0.0)) * np.exp(kappa * at.softness))
 
 
@@ -105,14 +112,14 @@ def ln_prior(noise: Noise) -> float:
     return float(LN_RHO_PRIOR[rho] + LN_KAPPA_PRIOR[kappa])
 
 
-def most_probable(squared: Array, at: At) -> Noise:
+def most_probable(squared: Array, at: NoiseConditions) -> Noise:
     """Maximise likelihood times prior over the grids of rho and kappa, sigma in closed form.
 
     Parameters
     ----------
     squared : ndarray, shape (n,)
         Squares of the residuals.
-    at : At
+    at : NoiseConditions
     """
     growth, ln_growth = at.growths
     variance = np.maximum((squared / growth**2).mean(axis=2), 1e-18)

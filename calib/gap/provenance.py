@@ -30,13 +30,15 @@ def inputs_record(case: Case, seed: int, effects: Mapping[str, bytes] | None = N
     effects : mapping of str to bytes, optional
         Files of the user's own effects, by name: code and priors.
     """
-    tables = {"calibration": case.lab, "field": case.field, "predict": case.fresh}
+    tables = {"calibration": case.lab, "field": case.field, "predict": case.new_conditions}
     content = _made_by(seed) | {
         "models": dict(case.models),
         "sha256": {key: table.sha256 for key, table in tables.items() if table is not None},
     }
     if case.context:
         content["context"] = case.context.words()
+    if case.priors:
+        content["priors"] = {name: sha256(p.read_bytes()) for name, p in case.priors.items()}
     if effects:
         content["effects"] = {name: sha256(found) for name, found in effects.items()}
     return (json.dumps(content, indent=1) + "\n").encode()
@@ -71,11 +73,15 @@ def case_hashes(folder: Path) -> dict[str, Any]:
         for key, path in files.items()
         if key != "case.toml" and path.is_file()
     }
+    priors = {
+        key.removeprefix("priors."): hashes.pop(key) for key in list(hashes) if "." in key
+    } or None
     try:
         context = read_context(content.get("context"), str(folder)).words() or None
     except CalibError:
         context = ["it cannot be read"]
-    return {"models": content.get("models"), "sha256": hashes, "context": context}
+    models = content.get("models")
+    return {"models": models, "sha256": hashes, "context": context, "priors": priors}
 
 
 def check_resumable(cases: Sequence[Path], out: Path, seed: int) -> None:

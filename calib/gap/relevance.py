@@ -20,7 +20,7 @@ import numpy as np
 
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.noise import Noise, noise_at
+from calib.gap.noise import Noise, noise_conditions
 from calib.inference.random import generator
 from calib.models.base import Array
 
@@ -81,7 +81,7 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
     with np.errstate(all="ignore"):
         full, plain = forward.field_and_plain(psi, data.view)
         without = [plain if alone else forward.without(psi, data.view, c) for c in causes]
-    at = noise_at(data.view)
+    at = noise_conditions(data.view)
     columns = []
     for other in without:
         squares = {

@@ -11,7 +11,7 @@ from calib.gap.case import Campaigns
 from calib.gap.mixture import Truth
 from calib.models.base import Array
 
-__all__ = ["FreshPrediction", "Shrink", "predict_fresh", "shrink"]
+__all__ = ["NewPrediction", "Shrink", "predict_new", "shrink"]
 
 # A gap smaller than this part of the noise (rms) is not one that could shrink.
 _SMALLEST = 0.5
@@ -39,7 +39,7 @@ class Shrink:
 
 
 @dataclass(frozen=True)
-class FreshPrediction:
+class NewPrediction:
     """Predictions of one output at new conditions; the band is the 90 % predictive one."""
 
     before: Array
@@ -48,7 +48,7 @@ class FreshPrediction:
     upper: Array
 
 
-def predict_fresh(truth: Truth, before: Mapping[str, Array]) -> dict[str, FreshPrediction]:
+def predict_new(truth: Truth, before: Mapping[str, Array]) -> dict[str, NewPrediction]:
     """Predict with the calibrated simulator and with the corrected one.
 
     Parameters
@@ -59,7 +59,7 @@ def predict_fresh(truth: Truth, before: Mapping[str, Array]) -> dict[str, FreshP
         The simulator as it was calibrated in the lab.
     """
     return {
-        name: FreshPrediction(
+        name: NewPrediction(
             before[name],
             truth.mean(values),
             truth.quantile(truth.measured[name], 0.05),

@@ -23,7 +23,7 @@ from calib.gap.case import Campaigns, campaigns, read_case
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import pair, shifts, singles, split_testable, unknowns
 from calib.gap.hypothesis import Hypothesis
-from calib.gap.noise import Noise, noise_at
+from calib.gap.noise import Noise, noise_conditions
 from calib.gap.relevance import RELEVANT_IN_PAIR, sizes
 from calib.gap.which import calibrate_lab
 from calib.inference.random import generator
@@ -65,20 +65,20 @@ def well_specified_case(
         If the diagnosis does not test this truth on this design, or no draw has the size.
     """
     case = read_case(folder)
-    if case.fresh is None:
+    if case.new_conditions is None:
         raise CalibError("there is no fresh.csv", where=str(folder))
     data = campaigns(case)
     lab_mode, noise = calibrate_lab(data, seed)
     # The label is that of the first such cases: the same seed gives the same readings as then.
     rng = generator(seed, "twin", folder.name)
     draw = draw_from_hypothesis(data, lab_mode, noise, truth, gap_over_noise, rng)
-    forward, psi, view, fresh = draw.forward, draw.psi, data.view, data.at(case.fresh)
+    forward, psi, view, new = draw.forward, draw.psi, data.view, data.at(case.new_conditions)
     lab, in_field = forward.lab(psi), forward.field(psi, view)
     said = {
         "field_truth": in_field,
         "field_without": forward.simulator(psi, view),
-        "fresh_truth": forward.field(psi, fresh),
-        "fresh_without": forward.simulator(psi, fresh),
+        "fresh_truth": forward.field(psi, new),
+        "fresh_without": forward.simulator(psi, new),
     }
     key: dict[str, Any] = {
         "gap_over_noise": draw.gap_over_noise,
@@ -90,7 +90,7 @@ def well_specified_case(
         back, sd_of = o.problem.bound.from_response, noise[o.name].sd
         for name, values in said.items():
             key.setdefault(name, {})[o.name] = back(values[o.name][0]).tolist()
-        sd = np.broadcast_to(sd_of(noise_at(view)), in_field[o.name][0].shape)
+        sd = np.broadcast_to(sd_of(noise_conditions(view)), in_field[o.name][0].shape)
         # On a logarithm the noise is relative; the key states it in the output's own unit.
         log = o.problem.bound.model.response == "log"
         unit = back(in_field[o.name][0]) if log else np.ones_like(sd)
@@ -102,7 +102,7 @@ def well_specified_case(
         "case.toml": (folder / "case.toml").read_text(encoding="utf-8"),
         "lab.csv": _table(case.lab, lab_readings),
         "field.csv": _table(case.field, field_readings),
-        "fresh.csv": _table(case.fresh, {}),
+        "fresh.csv": _table(case.new_conditions, {}),
     }
     return files, key
 
@@ -202,7 +202,7 @@ def _hypothesis(data: Campaigns, truth: str, rng: np.random.Generator) -> Hypoth
 
 def _gap(forward: Forward, psi: Array, noise: Mapping[str, Noise]) -> NDArray[np.float64]:
     data = forward.data
-    at = noise_at(data.view)
+    at = noise_conditions(data.view)
     with np.errstate(all="ignore"):
         full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
     each = [

@@ -15,7 +15,7 @@ from calib.gap.case import Campaigns
 from calib.gap.context import Context
 from calib.gap.discrepancy import Bases
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.fit import Fit, finish, look
+from calib.gap.fit import Fit, finish, truncated_fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
     COVERED,
@@ -60,11 +60,11 @@ _N_LEADING, _N_LEADING_SETS = 5, 2
 # An effect that far out in its prior (sds) is fitted with a wider one as well.
 _FAR_OUT = 2.0
 _IDLE = "it changes nothing that the models of this case predict"
-# A discrepancy or a pair that is so many nats (prior and all) behind the best hypothesis at first
-# look is given up. Of 1344 discrepancies and 2698 first looks at pairs (14 cases) those that ended
+# A discrepancy or a pair that is so many nats (prior and all) behind the best hypothesis after a
+# truncated fit is given up. Of 1344 discrepancies and 2698 pairs (14 cases) those that ended
 # within 8 nats of the best were then less than 13.5 and 10.6 behind.
 _HOPELESS = 15.0
-# One within so many nats is looked at from more guesses: a pair has many modes.
+# One within so many nats is begun from more guesses: a pair has many modes.
 _SEARCHED = 8.0
 # Draws for the relevance of a hypothesis: at first, and while it is still in play.
 _QUICK, _CAREFUL = 160, 3000
@@ -197,11 +197,15 @@ def _sets_and_unlisted(
         for b in single[i + 1 :]
         if a in seeds or b in seeds
     ]
-    looked = together([worker.look_joint(h, members, 1) for h, members in others + pairs])
-    leading = max(_promise(looks, n) for looks in (*((f,) for f in best.values()), *looked))
+    truncated_fits = together(
+        [worker.truncated_joint(h, members, 1) for h, members in others + pairs]
+    )
+    leading = max(
+        _promise(truncated, n) for truncated in (*((f,) for f in best.values()), *truncated_fits)
+    )
     first = len(others)
-    looked[first:] = worker.search(pairs, looked[first:], leading)
-    ended = _finished(looked, leading - _HOPELESS, n)
+    truncated_fits[first:] = worker.search(pairs, truncated_fits[first:], leading)
+    ended = _finished(truncated_fits, leading - _HOPELESS, n)
     leading = max(leading, *(_with_prior(f, n) for f in ended))
     sets = ended[first:]
     members = [best[m] for m in seeds[:_N_ADDED]]
@@ -210,16 +214,18 @@ def _sets_and_unlisted(
         # Only beside what is in play could a larger set be.
         grown = [f for f in grown if _with_prior(f, n) > leading - _IN_PLAY]
         larger = _larger(grown, members)
-        looked = together([worker.look_joint(h, of, _N_BEGUN_LARGER) for h, of in larger])
-        found = _finished(looked, leading - _SEARCHED, n)
+        truncated_fits = together(
+            [worker.truncated_joint(h, of, _N_BEGUN_LARGER) for h, of in larger]
+        )
+        found = _finished(truncated_fits, leading - _SEARCHED, n)
         sets += found
         leading = max([leading, *(_with_prior(f, n) for f in found)])
         grown = sorted(found, key=lambda f: -_with_prior(f, n))[:_N_SETS]
     top = sorted(sets, key=lambda f: -_with_prior(f, n))[:_N_LEADING_SETS]
     top = [f for f in top if _with_prior(f, n) > leading - _SEARCHED]
     beside = _with_remainders(worker.data, top)
-    looked = together([worker.look_joint(h, of, 1) for h, of in beside])
-    everything = [*ended[:first], *sets, *_finished(looked, leading - _HOPELESS, n)]
+    truncated_fits = together([worker.truncated_joint(h, of, 1) for h, of in beside])
+    everything = [*ended[:first], *sets, *_finished(truncated_fits, leading - _HOPELESS, n)]
     by_name: dict[str, tuple[Fit, ...]] = {}
     for found_one in everything:
         name = found_one.forward.hypothesis.name
@@ -243,17 +249,19 @@ def _larger(sets: Sequence[Fit], single: Sequence[Fit]) -> list[_Started]:
     return list(found.values())
 
 
-def _finished(looked: Sequence[Sequence[Fit]], hopeless: float, odds: Odds) -> list[Fit]:
-    """Climb on from first looks at hypotheses, but for those that are hopeless."""
-    worth = [i for i, looks in enumerate(looked) if _promise(looks, odds) > hopeless]
-    ended = [max(looks, key=_evidence) for looks in looked]
-    for i, found in zip(worth, together([finish(looked[i]) for i in worth]), strict=True):
+def _finished(truncated_fits: Sequence[Sequence[Fit]], hopeless: float, odds: Odds) -> list[Fit]:
+    """Fit hypotheses fully from their truncated fits, but for those that are hopeless."""
+    worth = [
+        i for i, truncated in enumerate(truncated_fits) if _promise(truncated, odds) > hopeless
+    ]
+    ended = [max(truncated, key=_evidence) for truncated in truncated_fits]
+    for i, found in zip(worth, together([finish(truncated_fits[i]) for i in worth]), strict=True):
         ended[i] = found
     return ended
 
 
-def _promise(looks: Sequence[Fit], odds: Odds) -> float:
-    return max(_with_prior(f, odds) for f in looks)
+def _promise(begun: Sequence[Fit], odds: Odds) -> float:
+    return max(_with_prior(f, odds) for f in begun)
 
 
 def _evidence(found: Fit) -> float:
@@ -378,45 +386,47 @@ class _Worker:
 
     def fit(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Fit, ...]]:
         """Fit from the lab's calibration, by name."""
-        looks = together([self.look(h) for h in hypotheses])
+        truncated = together([self.truncated(h) for h in hypotheses])
         fits: dict[str, tuple[Fit, ...]] = {}
-        for found in together([finish(group) for group in looks]):
+        for found in together([finish(group) for group in truncated]):
             name = found.forward.hypothesis.name
             fits[name] = (*fits.get(name, ()), found)
         return fits
 
-    def look(self, hypothesis: Hypothesis) -> Walk[list[Fit]]:
+    def truncated(self, hypothesis: Hypothesis) -> Walk[list[Fit]]:
         """Begin at the lab's calibration, effects at several guesses of their prior."""
         forward, start = self._forward(hypothesis)
         if hypothesis.onset_over is not None:
-            return look(self.data, forward, self._onset_start(forward, start), self.noise)
+            return truncated_fit(self.data, forward, self._onset_start(forward, start), self.noise)
         if not hypothesis.effects:
-            return look(self.data, forward, start, self.noise)
+            return truncated_fit(self.data, forward, start, self.noise)
         starts = self._spread(forward, start, _N_SCREEN, range(len(hypothesis.effects)))
-        return look(self.data, forward, start, self.noise, starts=starts, count=_N_BEGUN)
+        return truncated_fit(self.data, forward, start, self.noise, starts=starts, count=_N_BEGUN)
 
     def search(
         self,
         pairs: Sequence[_Started],
-        looked: Sequence[list[Fit]],
+        truncated_fits: Sequence[list[Fit]],
         leading: float,
     ) -> list[list[Fit]]:
-        """Look at the pairs that are in play from more guesses."""
+        """Begin the pairs that are in play from more guesses."""
         in_play = [
-            i for i in range(len(pairs)) if _promise(looked[i], self.odds) > leading - _SEARCHED
+            i
+            for i in range(len(pairs))
+            if _promise(truncated_fits[i], self.odds) > leading - _SEARCHED
         ]
-        more = together([self.look_joint(*pairs[i], _N_BEGUN, skip=1) for i in in_play])
-        searched = [list(looks) for looks in looked]
-        for i, looks in zip(in_play, more, strict=True):
-            searched[i] += looks
+        more = together([self.truncated_joint(*pairs[i], _N_BEGUN, skip=1) for i in in_play])
+        searched = [list(truncated) for truncated in truncated_fits]
+        for i, truncated in zip(in_play, more, strict=True):
+            searched[i] += truncated
         return searched
 
-    def look_joint(
+    def truncated_joint(
         self, hypothesis: Hypothesis, members: Sequence[Fit], count: int, skip: int = 0
     ) -> Walk[list[Fit]]:
         """Begin where parts of a hypothesis have led, the effects they lack by their prior."""
         if not members:
-            return self.look(hypothesis)
+            return self.truncated(hypothesis)
         forward, start = self._forward(hypothesis)
         place = {e.name: s for e, s in zip(hypothesis.effects, forward.phi_slices, strict=True)}
         parts = []
@@ -433,7 +443,9 @@ class _Worker:
             size = _N_SCREEN // len(members) if lacking else 1
             parts.append(self._spread(forward, led, size, lacking))
         starts = np.concatenate(parts)
-        return look(self.data, forward, start, self.noise, starts=starts, count=count, skip=skip)
+        return truncated_fit(
+            self.data, forward, start, self.noise, starts=starts, count=count, skip=skip
+        )
 
     def _forward(self, hypothesis: Hypothesis) -> tuple[Forward, Array]:
         scale = {o: n.sigma for o, n in self.noise.items()}

@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from calib.data import Table, check_enough, check_varies
 from calib.errors import CalibError
 from calib.inference.likelihood import Squares
 from calib.inference.prior_files import (
+    PriorFile,
     default_priors,
     prior_references,
     read_priors,
@@ -166,7 +166,7 @@ class Problem:
 def build_problem(
     model_name: str,
     table: Table,
-    prior_path: Path | None = None,
+    prior_path: PriorFile | None = None,
     *,
     fixed: Mapping[str, float] | None = None,
 ) -> Problem:
@@ -178,8 +178,8 @@ def build_problem(
         One of `calib.models.MODELS`.
     table : Table
         Calibration data with the model's conditions and its output.
-    prior_path : Path, optional
-        Prior file; the shipped one by default.
+    prior_path : Path or PriorFile, optional
+        The model's own, or the shipped one, by default.
     fixed : mapping of str to float, optional
         Natural parameters to hold at a value.
 

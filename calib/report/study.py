@@ -56,7 +56,7 @@ class OutputResult:
         Measurements the prior alone expects, at the calibration conditions.
     posterior_predictive : ndarray, shape (draws, n)
     seconds : mapping of str to float
-        Of each stage.
+        Of each step of the work.
     sensitivity : mapping of str to Sensitivity
         Of each parameter to prior and data.
     """
@@ -172,7 +172,7 @@ def _silent(what: str, done: int, planned: int) -> None:
 
 
 def _without_folder(task: Task, error: Exception) -> str:
-    """Return what failed; where the priors lie on this computer is nobody's business."""
+    """Return what failed, without the folder that the priors are in."""
     text = f"{type(error).__name__}: {error}"
     path = task.prior_path or default_priors(task.model)
     return text.replace(str(path), path.name)

@@ -160,9 +160,9 @@ def write_case(case: Case, folder: Path) -> Path:
     lines = ['calibration = "lab.csv"', 'field = "field.csv"']
     write_table(folder / "lab.csv", dict(case.lab.columns))
     write_table(folder / "field.csv", dict(case.field.columns))
-    if case.fresh is not None:
+    if case.new_conditions is not None:
         lines.append('predict = "fresh.csv"')
-        write_table(folder / "fresh.csv", dict(case.fresh.columns))
+        write_table(folder / "fresh.csv", dict(case.new_conditions.columns))
     lines += ["[models]", *(f'{o} = "{m}"' for o, m in case.models.items())]
     (folder / "case.toml").write_text("\n".join(lines) + "\n")
     return folder

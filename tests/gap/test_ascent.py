@@ -7,7 +7,7 @@ import pytest
 
 from calib.gap.ascent import together
 from calib.gap.case import Campaigns, campaigns
-from calib.gap.fit import Fit, finish, log_joint, look
+from calib.gap.fit import Fit, finish, log_joint, truncated_fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import pair, shifts, singles, split_testable, unknowns
 from calib.gap.hypothesis import Hypothesis
@@ -76,13 +76,13 @@ def test_hypotheses_in_step_end_where_each_alone_does(data, problems):
 
     def fitted(chosen: list[Residuals]) -> list[Fit]:
         starts = [drawn(p, 8) for p in chosen]
-        looks = together(
+        truncated = together(
             [
-                look(data, p.forward, s[0], noise, starts=s[1:], count=3)
+                truncated_fit(data, p.forward, s[0], noise, starts=s[1:], count=3)
                 for p, s in zip(chosen, starts, strict=True)
             ]
         )
-        return together([finish(group) for group in looks])
+        return together([finish(group) for group in truncated])
 
     for problem, found in zip(problems, fitted(problems), strict=True):
         (alone,) = fitted([problem])
@@ -94,8 +94,8 @@ def test_hypotheses_in_step_end_where_each_alone_does(data, problems):
 def test_the_log_density_is_the_same_in_parts(data, problems):
     noise = {o: Noise(s) for o, s in SIGMA.items()}
     problem = problems[0]
-    (looks,) = together([look(data, problem.forward, drawn(problem, 1)[0], noise)])
+    (truncated,) = together([truncated_fit(data, problem.forward, drawn(problem, 1)[0], noise)])
     psi = drawn(problem, 2500)
-    whole = log_joint(looks[0], psi)
+    whole = log_joint(truncated[0], psi)
     some = np.array([0, 1023, 1024, 2047, 2048, 2499])
-    np.testing.assert_allclose(log_joint(looks[0], psi[some]), whole[some], rtol=1e-9)
+    np.testing.assert_allclose(log_joint(truncated[0], psi[some]), whole[some], rtol=1e-9)

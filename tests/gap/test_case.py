@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +11,16 @@ import pytest
 
 from calib.data import table_from_arrays, write_table
 from calib.errors import CalibError
-from calib.gap.case import Case, campaigns, case_files, read_case
+from calib.gap.case import Case, campaigns, case_files, case_from_run, read_case
+from calib.gap.corrected import load_corrected, save_corrected
+from calib.gap.diagnose import diagnose
+from calib.gap.effects import EFFECTS
+from calib.gap.oddities import oddities
+from calib.gap.provenance import case_hashes, inputs_record
+from calib.inference.calibration import calibrate
+from calib.inference.io import save_calibration
+from calib.inference.prior_files import DeclaredPriors, default_priors
+from calib.inference.problem import build_problem
 from tests.gap.cases import MODELS, PULL_ONLY, make_case, table_without, write_case
 
 
@@ -18,8 +29,8 @@ def test_a_written_case_is_read_back(tmp_path):
     found = read_case(write_case(case, tmp_path / "a-case"))
     assert found.name == "a-case"
     assert dict(found.models) == MODELS
-    assert found.fresh is not None
-    assert len(found.fresh) == 4
+    assert found.new_conditions is not None
+    assert len(found.new_conditions) == 4
     for name, values in case.field.columns.items():
         np.testing.assert_allclose(found.field[name], values, rtol=1e-12)
 
@@ -44,7 +55,7 @@ def test_units_in_column_names_are_converted(tmp_path):
         (
             'calibration = "lab.csv"\nfield = "field.csv"\nprdict = "fresh.csv"\n[models]\n'
             'rut_depth = "bekker"\n',
-            "unknown key prdict\n  allowed: calibration, field, predict, models, context\n"
+            "unknown key prdict\n  allowed: calibration, field, predict, models, priors, context\n"
             "  to mend: was predict meant?",
         ),
         (
@@ -133,16 +144,16 @@ def test_without_pressures_the_exponent_is_a_half():
     assert campaigns(Case("bare", *bare, PULL_ONLY)).view.ground_exponent == 0.5
 
 
-def test_field_rows_that_are_the_calibrations_are_counted(tmp_path):
+def test_field_rows_that_are_the_calibrations_are_counted():
     case = make_case()
     columns = {
         name: np.concatenate([case.lab[name][:3], values[3:]])
         for name, values in case.field.columns.items()
     }
     copied = replace(case, field=table_from_arrays(columns))
-    said = read_case(write_case(copied, tmp_path / "copied")).warnings
+    said = oddities(copied.lab, copied.field, copied.models)
     assert any("3 of 27 field rows are rows of the calibration" in w for w in said)
-    said = read_case(write_case(case, tmp_path / "other")).warnings
+    said = oddities(case.lab, case.field, case.models)
     assert not any("rows of the calibration" in w for w in said)
 
 
@@ -172,3 +183,61 @@ def test_the_calibration_itself_is_no_field(tmp_path):
     case = make_case()
     with pytest.raises(CalibError, match="every field row is a row of the calibration"):
         campaigns(replace(case, field=case.lab))
+
+
+def narrow_priors(text: str) -> str:
+    """The shipped priors, the peak pull a tenth as wide."""
+    content = text.split("\n")
+    return "\n".join(
+        re.sub(r"sd_log = [0-9.]+", "sd_log = 0.02", line) if "sd_log" in line else line
+        for line in content
+    )
+
+
+def test_a_case_may_bring_the_priors_of_its_simulators(tmp_path):
+    """And they go with it, to where a corrected model is kept."""
+    folder = write_case(make_case("force_offset", models=PULL_ONLY), tmp_path / "case")
+    text = narrow_priors(default_priors(PULL_ONLY["drawbar_pull"]).read_text(encoding="utf-8"))
+    (folder / "mine.toml").write_text(text, encoding="utf-8")
+    with (folder / "case.toml").open("a", encoding="utf-8") as file:
+        file.write('\n[priors]\ndrawbar_pull = "mine.toml"\n')
+    case = read_case(folder)
+    assert case_files(folder)[1]["priors.drawbar_pull"] == folder / "mine.toml"
+    (output,) = campaigns(case).outputs
+    assert output.problem.priors.text == text
+    found = diagnose(case, 1, effects={"force_offset": EFFECTS["force_offset"]})
+    (tmp_path / "out").mkdir()
+    save_corrected(found.corrected, tmp_path / "out")
+    kept = load_corrected(tmp_path / "out").data.outputs[0].problem.priors
+    assert kept.text == text
+    recorded = json.loads(inputs_record(case, 1))
+    assert recorded["priors"] == case_hashes(folder)["priors"]
+
+
+@pytest.mark.parametrize(
+    ("priors", "said"),
+    [
+        ('drawbar_pull = "../mine.toml"', "not a file of the case"),
+        ('drawbar_pull = "none.toml"', "cannot be read"),
+        ('rut_depth = "mine.toml"', "it says"),
+        ("drawbar_pull = 3", "not a file of the case"),
+    ],
+)
+def test_priors_that_are_not_there_are_refused(tmp_path, priors, said):
+    folder = write_case(make_case(models=PULL_ONLY), tmp_path / "case")
+    with (folder / "case.toml").open("a", encoding="utf-8") as file:
+        file.write(f"\n[priors]\n{priors}\n")
+    with pytest.raises(CalibError, match=said):
+        read_case(folder)
+
+
+def test_a_case_of_a_run_has_the_priors_of_the_run(tmp_path):
+    made = make_case("force_offset", models=PULL_ONLY)
+    model = PULL_ONLY["drawbar_pull"]
+    text = narrow_priors(default_priors(model).read_text(encoding="utf-8"))
+    problem = build_problem(model, made.lab, DeclaredPriors("mine.toml", text))
+    run = tmp_path / "run"
+    save_calibration(calibrate(problem, 1), run)
+    write_table(tmp_path / "field.csv", dict(made.field.columns))
+    case = case_from_run(run, tmp_path / "field.csv")
+    assert campaigns(case).outputs[0].problem.priors.text == text

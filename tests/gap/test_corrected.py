@@ -31,7 +31,7 @@ FEW = {name: EFFECTS[name] for name in ("force_offset", "rate_effect")}
 def saved(tmp_path_factory):
     folder = tmp_path_factory.mktemp("diagnosis")
     case = make_case("force_offset")
-    found = diagnose(replace(case, fresh=case.field), 1, effects=FEW)
+    found = diagnose(replace(case, new_conditions=case.field), 1, effects=FEW)
     save_corrected(found.corrected, folder)
     return found, folder
 
@@ -39,7 +39,7 @@ def saved(tmp_path_factory):
 def test_it_predicts_as_the_diagnosis_did(saved):
     found, folder = saved
     columns = predict_columns(load_corrected(folder), found.data.case.field)
-    for name, prediction in found.fresh.items():
+    for name, prediction in found.new_predictions.items():
         column = {"drawbar_pull": "drawbar_pull_kn", "rut_depth": "rut_depth_mm"}[name]
         np.testing.assert_allclose(columns[f"{column}_before"], prediction.before, rtol=1e-9)
         np.testing.assert_allclose(columns[f"{column}_after"], prediction.after, rtol=1e-9)
@@ -89,8 +89,10 @@ def test_conditions_beyond_both_campaigns_are_counted(saved):
 def test_the_conditions_to_predict_are_kept(saved):
     found, folder = saved
     kept = read_case(folder / "case")
-    assert kept.fresh is not None
-    np.testing.assert_allclose(kept.fresh["slip_ratio"], found.data.case.fresh["slip_ratio"])
+    assert kept.new_conditions is not None
+    np.testing.assert_allclose(
+        kept.new_conditions["slip_ratio"], found.data.case.new_conditions["slip_ratio"]
+    )
 
 
 def test_an_effect_of_ones_own_is_passed_to_predict(tmp_path, capsys):

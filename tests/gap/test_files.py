@@ -97,7 +97,7 @@ def test_parameters_of_a_pair_carry_their_effects_name(written):
 
 
 def test_fresh_predictions(written):
-    fresh = make_case("sensor_drift", n_fresh=9).fresh
+    fresh = make_case("sensor_drift", n_fresh=9).new_conditions
     with (written / "fresh_prediction.csv").open(newline="") as file:
         header, *rows = list(csv.reader(file))
     conditions = list(fresh.header)

@@ -209,7 +209,7 @@ def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause():
 def test_a_condition_that_differs_between_the_campaigns_only_is_said_to_be_inseparable():
     found = diagnose_once(with_load(np.array([5.0]), np.array([8.0]), 1.0), 1)
     assert inseparable(found.data, dependences(found.data)["depends_on_normal_load"])
-    assert any("cannot be separated" in w for w in found.data.case.warnings)
+    assert any("cannot be separated" in w for w in found.warnings)
 
 
 def test_a_condition_that_a_simulator_knows_is_no_dependence(data):

@@ -6,18 +6,28 @@ import numpy as np
 import pytest
 
 from calib.gap.case import campaigns
-from calib.gap.noise import KAPPA, RHO, At, Noise, ln_prior, most_probable, noise_at
+from calib.gap.noise import (
+    KAPPA,
+    RHO,
+    Noise,
+    NoiseConditions,
+    ln_prior,
+    most_probable,
+    noise_conditions,
+)
 from tests.gap.cases import PULL_ONLY, make_case
 
 
-def at(n: int, *, pressures: bool = True) -> At:
+def at(n: int, *, pressures: bool = True) -> NoiseConditions:
     rng = np.random.default_rng(5)
     pressure = rng.choice([18.0, 30.0, 42.0], n)
-    return At(rng.uniform(0.0, 0.6, n), np.log(30.0 / pressure) if pressures else np.zeros(n))
+    return NoiseConditions(
+        rng.uniform(0.0, 0.6, n), np.log(30.0 / pressure) if pressures else np.zeros(n)
+    )
 
 
 def test_it_grows_as_stated():
-    rows = At(np.array([0.0, 0.5, -0.1]), np.log(30.0 / np.array([30.0, 15.0, 60.0])))
+    rows = NoiseConditions(np.array([0.0, 0.5, -0.1]), np.log(30.0 / np.array([30.0, 15.0, 60.0])))
     found = Noise(0.1, 2.0, 1.0).sd(rows)
     np.testing.assert_allclose(found, [0.1, 0.1 * 2.0 * 2.0, 0.1 * 0.5])
 
@@ -26,7 +36,7 @@ def test_the_reference_is_the_calibrations_median_pressure():
     data = campaigns(make_case(models=PULL_ONLY))
     psi = data.view.conditions["inflation_pressure_psi"]
     median = np.median(data.case.lab["inflation_pressure_psi"])
-    np.testing.assert_allclose(noise_at(data.view).softness, np.log(median / psi))
+    np.testing.assert_allclose(noise_conditions(data.view).softness, np.log(median / psi))
     lab = data.lab_at["drawbar_pull"]
     assert np.median(lab.softness) == pytest.approx(0.0, abs=1e-12)
     np.testing.assert_array_equal(lab.slip, data.case.lab["slip_ratio"])
@@ -36,7 +46,7 @@ def test_without_pressures_there_is_nothing_to_be_soft():
     view = campaigns(make_case(models=PULL_ONLY)).view
     conditions = {k: v for k, v in view.conditions.items() if k != "inflation_pressure_psi"}
     bare = type(view)(conditions, view.lab, 5.0, 0.5, (0.0, 1.0))
-    assert not noise_at(bare).softness.any()
+    assert not noise_conditions(bare).softness.any()
     squared = np.random.default_rng(0).standard_normal(200) ** 2
     assert most_probable(squared, at(200, pressures=False)).kappa == 0.0
 

@@ -11,10 +11,10 @@ from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import campaigns
+from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
-from calib.gap.noise import noise_at
+from calib.gap.noise import noise_conditions
 from calib.gap.oddities import oddities
-from calib.gap.outliers import rank_without_outliers
 from tests.gap.cases import MODELS, make_case, table_without
 
 PULL, RUT = OUTPUTS["drawbar_pull"], OUTPUTS["rut_depth"]
@@ -59,7 +59,7 @@ def test_new_conditions_without_a_needed_one_are_refused_by_file():
     case = make_case(None)
     fresh = table_without(case.field, "slip_ratio")
     with pytest.raises(CalibError, match="slip_ratio") as error:
-        campaigns(replace(case, fresh=fresh))
+        campaigns(replace(case, new_conditions=fresh))
     assert error.value.where == fresh.source
 
 
@@ -67,10 +67,10 @@ def test_readings_left_far_off_are_named_by_line():
     case = make_case(None, models={"drawbar_pull": MODELS["drawbar_pull"]}, n_field=36)
     pull = np.array(case.field[PULL])
     few = {"force_offset": EFFECTS["force_offset"]}
-    data, ranking = rank_without_outliers(case, 1, few)
+    data, ranking, _ = screened_ranking(case, 1, few)
     none = ranking.best("none")
     row = int(np.argmax(none.field_residuals["drawbar_pull"]))
-    pull[row] += 6.0 * none.noise["drawbar_pull"].sd(noise_at(data.view))[row]
-    data, _ = rank_without_outliers(changed(case, **{PULL: pull}), 1, few)
-    warnings = "\n".join(data.case.warnings)
+    pull[row] += 6.0 * none.noise["drawbar_pull"].sd(noise_conditions(data.view))[row]
+    data, _, told = screened_ranking(changed(case, **{PULL: pull}), 1, few)
+    warnings = "\n".join(told)
     assert f"line {data.case.field.lines[row]} (+" in warnings

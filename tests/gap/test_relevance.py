@@ -7,7 +7,7 @@ import pytest
 
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import unknowns
-from calib.gap.noise import Noise, noise_at
+from calib.gap.noise import Noise, noise_conditions
 from calib.gap.relevance import relevance, sizes
 from tests.gap.cases import campaigns_of, ranking_of
 
@@ -29,7 +29,7 @@ def test_size_is_in_noise_sds_of_the_output_where_it_is_largest():
     assert size.shape == (2, 1)
     assert size[0, 0] == pytest.approx(0.0, abs=1e-12)
     # Ruts, which an offset of the pull does not touch, make it no smaller.
-    at = noise_at(fit.forward.data.view)
+    at = noise_conditions(fit.forward.data.view)
     in_noise = 0.1 / fit.noise["drawbar_pull"].sd(at)
     assert size[1, 0] == pytest.approx(np.sqrt(np.mean(np.square(in_noise))))
 

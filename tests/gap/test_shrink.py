@@ -13,7 +13,7 @@ from calib.gap.case import campaigns
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
 from calib.gap.mixture import Truth, mixture
-from calib.gap.shrink import predict_fresh, shrink
+from calib.gap.shrink import predict_new, shrink
 from calib.gap.which import rank
 from tests.gap.cases import PULL_ONLY, campaigns_of, diagnosis_of, make_case, write_case
 
@@ -66,7 +66,7 @@ def test_what_is_small_beside_the_noise_is_no_gap(data):
 
 
 def test_fresh_predictions_have_the_noise_in_their_band(data):
-    band = predict_fresh(truth(0.2, 0.0), {"drawbar_pull": np.full(N, 0.9)})["drawbar_pull"]
+    band = predict_new(truth(0.2, 0.0), {"drawbar_pull": np.full(N, 0.9)})["drawbar_pull"]
     np.testing.assert_array_equal(band.before, np.full(N, 0.9))
     np.testing.assert_allclose(band.after, 1.2)
     # 2000 draws: the sd of a 5 % quantile is 0.047 sd of the noise.
@@ -94,8 +94,8 @@ def test_the_correction_of_a_large_drift_predicts_new_conditions():
     from tests.gap.cases import simulate
 
     case = make_case("sensor_drift", n_fresh=9)
-    assert case.fresh is not None
-    columns = dict(case.fresh.columns) | {
+    assert case.new_conditions is not None
+    columns = dict(case.new_conditions.columns) | {
         c: np.linspace(1.0, 2.0, 9) for c in ("drawbar_pull_kn", "rut_depth_mm")
     }
 
@@ -103,7 +103,7 @@ def test_the_correction_of_a_large_drift_predicts_new_conditions():
     # The drift of the generator at the place that the rows have in the campaign.
     actual = simulate(Case("fresh", case.lab, fresh, case.models), None)[1]["drawbar_pull"]
     actual = actual + 0.25 * fresh["run_order"] / 26.0
-    band = found.fresh["drawbar_pull"]
+    band = found.new_predictions["drawbar_pull"]
     before = np.sqrt(np.mean(np.square(band.before - actual)))
     after = np.sqrt(np.mean(np.square(band.after - actual)))
     assert after < 0.6 * before
@@ -147,10 +147,10 @@ def test_rows_where_the_simulator_has_no_value_are_left_out(data):
 def test_extrapolated_conditions_are_said():
     few = {"force_offset": EFFECTS["force_offset"]}
     case = make_case("force_offset", n_fresh=9, size={"offset": 0.3})
-    columns = {name: np.array(v) for name, v in case.fresh.columns.items()}
+    columns = {name: np.array(v) for name, v in case.new_conditions.columns.items()}
     columns["inflation_pressure_psi"][0] = 420.0
-    far = replace(case, fresh=table_from_arrays(columns))
-    said = " ".join(diagnose(far, 1, effects=few).data.case.warnings)
+    far = replace(case, new_conditions=table_from_arrays(columns))
+    said = " ".join(diagnose(far, 1, effects=few).warnings)
     assert "1 of 9 rows lie outside what either campaign covered in inflation_pressure_psi" in said
 
 

@@ -121,7 +121,7 @@ def _kept_out(before: Axes, after: Axes, result: FoundGap) -> bool:
     rows = result.gap.unfitted
     if rows is None:
         return False
-    predicted = result.found.fresh[result.output]
+    predicted = result.found.new_predictions[result.output]
     x = axis_of("slip_ratio").scale(rows["slip_ratio"])
     measured = rows[OUTPUTS[result.output]]
     psi = float(rows["inflation_pressure_psi"][0])

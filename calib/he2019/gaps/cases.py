@@ -57,7 +57,7 @@ class PaperGap:
     withheld : str, optional
         The effect that the field has and the laboratory has not, where the source names one.
     unfitted : Table, optional
-        The conditions of `case.fresh` with the outcomes that the diagnosis is not shown.
+        The conditions of `case.new_conditions` with the outcomes that the diagnosis is not shown.
     variants : mapping of str to Case
         The same question asked otherwise, by how it differs.
     """
@@ -226,8 +226,8 @@ def _table(columns: Mapping[str, NDArray[np.float64]], file: str) -> Table:
 def _case(
     name: str, models: Mapping[str, str], lab: Table, field: Table, unfitted: Table | None = None
 ) -> Case:
-    fresh = None
+    new = None
     if unfitted is not None:
         conditions = {n: v for n, v in unfitted.columns.items() if n not in OUTPUTS.values()}
-        fresh = _table(conditions, "fresh.csv")
-    return Case(name, lab, field, models, fresh, (RECONSTRUCTED,))
+        new = _table(conditions, "fresh.csv")
+    return Case(name, lab, field, models, new, (RECONSTRUCTED,))

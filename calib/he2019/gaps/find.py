@@ -176,7 +176,7 @@ def unfitted_errors(found: Diagnosis, gap: PaperGap) -> Unfitted | None:
     if gap.unfitted is None:
         return None
     output = found.data.names[0]
-    measured, p = gap.unfitted[OUTPUTS[output]], found.fresh[output]
+    measured, p = gap.unfitted[OUTPUTS[output]], found.new_predictions[output]
     before, after = measured - p.before, measured - p.after
     return Unfitted(
         measured.size,

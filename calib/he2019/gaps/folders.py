@@ -44,8 +44,8 @@ def write_cases(gaps: Sequence[PaperGap], out: Path, *, overwrite: bool = False)
         folder.mkdir(parents=True, exist_ok=True)
         write_table(folder / "lab.csv", gap.case.lab.columns)
         write_table(folder / "field.csv", gap.case.field.columns)
-        if gap.case.fresh is not None and gap.unfitted is not None:
-            write_table(folder / "fresh.csv", gap.case.fresh.columns)
+        if gap.case.new_conditions is not None and gap.unfitted is not None:
+            write_table(folder / "fresh.csv", gap.case.new_conditions.columns)
             write_table(folder / "fresh_measured.csv", gap.unfitted.columns)
         (folder / "case.toml").write_text(_case_toml(gap), encoding="utf-8")
     return folders
@@ -60,7 +60,7 @@ def _case_toml(gap: PaperGap) -> str:
     )
     lines = [f"# {line}" for text in remarks for line in textwrap.wrap(text, 96)]
     lines += ['calibration = "lab.csv"', 'field = "field.csv"']
-    if gap.case.fresh is not None:
+    if gap.case.new_conditions is not None:
         lines.append('predict = "fresh.csv"')
     lines += ["", "[models]", *(f'{o} = "{m}"' for o, m in gap.case.models.items())]
     return "\n".join(lines) + "\n"

@@ -36,7 +36,7 @@ def _one(result: FoundGap) -> dict[str, Any]:
         "open_sd_rms": float((result.open_sd**2).mean() ** 0.5),
         "checks": {check.name: dict(check.values) for check in checks(result)},
         "variants": {name: _answer(other) for name, other in result.variants.items()},
-        "warnings": list(found.data.case.warnings),
+        "warnings": list(found.warnings),
     }
 
 

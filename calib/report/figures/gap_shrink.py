@@ -45,7 +45,7 @@ def how_far_plate(found: Diagnosis) -> Plate:
         _bars(row[2], found, own)
     axes[0, 0].set_title("Data against prediction", loc="left")
     axes[0, 1].set_title("Error at the field rows", loc="left")
-    where = "new conditions" if found.data.case.fresh is not None else "field conditions"
+    where = "new conditions" if found.data.case.new_conditions is not None else "field conditions"
     axes[0, 2].set_title(f"Expected at {where}", loc="left")
     legend_below(fig, list(handles.values()), list(handles), 4)
     return Plate(fig, "how_far", _caption(found, outputs), "How far: before and after")
@@ -151,7 +151,7 @@ def _caption(found: Diagnosis, outputs: list[OutputRows]) -> str:
         )
     place = (
         "at new conditions, which were not fitted"
-        if found.data.case.fresh is not None
+        if found.data.case.new_conditions is not None
         else "at the field's own conditions, since no others were asked for"
     )
     return (

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.gap.diagnose import Diagnosis
-from calib.gap.noise import noise_at
+from calib.gap.noise import noise_conditions
 from calib.models.base import Array
 from calib.report.figures.gap_rows import best_fit, best_of, short_name
 from calib.report.figures.labels import MINUS, NO_UNIT, joined, percent, short
@@ -120,7 +120,7 @@ def placebos(found: Diagnosis) -> Placebo:
     A fit's own residuals are standardised by its own noise, which a wrong hypothesis inflates:
     they are put on the noise of the best hypothesis first.
     """
-    at = noise_at(found.data.view)
+    at = noise_conditions(found.data.view)
     best = best_fit(found, best_of(found))
     rows = {o.name: o.rows for o in found.data.outputs}
     reference = {o: n.sd(at.rows(rows[o])) for o, n in best.noise.items()}

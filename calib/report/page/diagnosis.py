@@ -122,8 +122,8 @@ def render_diagnosis(
     verdict = judge_gap(evidence)
     case = found.data.case
     files = [("Calibration", case.lab), ("Field", case.field)]
-    if case.fresh is not None:
-        files.append(("New conditions", case.fresh))
+    if case.new_conditions is not None:
+        files.append(("New conditions", case.new_conditions))
     return template("diagnosis.html.j2").render(
         title=f"Sim-to-real gap: {case.name}",
         verdict=verdict,
@@ -131,7 +131,7 @@ def render_diagnosis(
         probability=round(100.0 * found.ranking.probability[best_of(found)]),
         figures={p.name: _figure(p, images) for p in plates},
         facts=_case_facts(found),
-        warnings=case.warnings,
+        warnings=found.warnings,
         causes=_cause_rows(evidence),
         groups=hypothesis_groups(found),
         prior=prior_text(found),
@@ -146,7 +146,7 @@ def render_diagnosis(
         ],
         regions=[_region_row(found, r) for r in found.regions],
         shrink=_shrink_rows(found),
-        unfitted=case.fresh is not None,
+        unfitted=case.new_conditions is not None,
         next_rows=next_rows(found),
         look=evidence.look,
         files=[(word, PurePath(t.source).name, len(t), t.sha256) for word, t in files],
@@ -174,7 +174,7 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         sizes=[] if found.verdict == "ambiguous" else size_sentences(found, best),
         where=[_where_fact(found, r) for r in _leading_regions(found)],
         shrink=_shrink_facts(found),
-        unfitted=found.data.case.fresh is not None,
+        unfitted=found.data.case.new_conditions is not None,
         next_facts=[
             NextFact(
                 (short_name(m.separates[0]), short_name(m.separates[1])),

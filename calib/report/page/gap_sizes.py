@@ -13,7 +13,7 @@ from calib.gap.covariates import columns_over
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit
-from calib.gap.noise import noise_at
+from calib.gap.noise import noise_conditions
 from calib.inference.random import generator
 from calib.models import get_model
 from calib.models.base import Array
@@ -177,7 +177,7 @@ def _threshold(found: Diagnosis, fit: Fit) -> str:
 
 def _changes(found: Diagnosis, fit: Fit, psi: Array) -> dict[str, _Change]:
     view = found.data.view
-    at = noise_at(view)
+    at = noise_conditions(view)
     with np.errstate(all="ignore"):
         full, plain = fit.forward.field(psi, view), fit.forward.simulator(psi, view)
     changes = {}

@@ -160,7 +160,7 @@ def _estimate_row(
 
 
 def _ticked(text: str, agrees: bool) -> Markup:
-    """A number with a tick, or with the room for one, so that digits stay aligned."""
+    """A number with a tick, or with the width of one, so that digits stay aligned."""
     return Markup('{}<span class="tick">{}</span>').format(text, _TICK if agrees else "")
 
 

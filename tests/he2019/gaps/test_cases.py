@@ -52,7 +52,7 @@ def test_every_row_is_embedded_and_stands_once(name):
     case, known = CASES[name], embedded(CASES[name])
     shift = 0.02 if name in NOMINAL else 0.0
     lab, field = rows(case.lab), rows(case.field, shift)
-    kept_out = [] if case.fresh is None else rows(case.fresh, shift)
+    kept_out = [] if case.new_conditions is None else rows(case.new_conditions, shift)
     # Lab, field and kept-out rows share none, and together are the data set.
     assert sorted(lab + field + kept_out) == sorted(known)
     column = OUTPUTS[next(iter(case.models))]
@@ -64,11 +64,11 @@ def test_every_row_is_embedded_and_stands_once(name):
 def test_the_outcomes_of_kept_out_rows_are_not_in_the_case(name):
     gap = GAPS[name]
     if gap.unfitted is None:
-        assert gap.case.fresh is None
+        assert gap.case.new_conditions is None
         return
-    assert not set(gap.case.fresh) & set(OUTPUTS.values())
-    for column in gap.case.fresh:
-        np.testing.assert_array_equal(gap.case.fresh[column], gap.unfitted[column])
+    assert not set(gap.case.new_conditions) & set(OUTPUTS.values())
+    for column in gap.case.new_conditions:
+        np.testing.assert_array_equal(gap.case.new_conditions[column], gap.unfitted[column])
     known, shift = embedded(gap.case), 0.02 if name in NOMINAL else 0.0
     column = OUTPUTS[next(iter(gap.case.models))]
     keys = rows(gap.unfitted, shift)
@@ -154,7 +154,7 @@ def test_folders_hold_the_same_cases(tmp_path):
         assert read.models == gap.case.models
         for table, own, file in (
             (read.lab, gap.case.lab, "lab.csv"), (read.field, gap.case.field, "field.csv"),
-            (read.fresh, gap.case.fresh, "fresh.csv"),
+            (read.new_conditions, gap.case.new_conditions, "fresh.csv"),
         ):  # fmt: skip
             if own is None:
                 assert table is None

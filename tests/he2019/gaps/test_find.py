@@ -33,7 +33,7 @@ def test_every_diagnosis_runs_and_its_probabilities_sum_to_one(found_gaps, name)
         assert math.isclose(sum(p.values()), 1.0, abs_tol=1e-9)
         assert found.verdict == verdict(p)
         assert {"none", "unknown", "parameter_shift"} <= set(p)
-        assert any("reconstructed" in warning for warning in found.data.case.warnings)
+        assert any("reconstructed" in warning for warning in found.warnings)
     withheld = result.gap.withheld
     assert withheld is None or withheld in result.found.ranking.probability
 

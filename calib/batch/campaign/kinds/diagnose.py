@@ -132,5 +132,5 @@ def diagnosis_numbers(found: Diagnosis) -> dict[str, Any]:
             }
             for output, s in found.shrink.items()
         },
-        "warnings": len(found.data.case.warnings),
+        "warnings": len(found.warnings),
     }  # fmt: skip

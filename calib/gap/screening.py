@@ -12,60 +12,74 @@ from calib.data import Table
 from calib.data.quantities import OUTPUTS
 from calib.gap.case import Campaigns, Case, OutputData, campaigns
 from calib.gap.conditions import check_units, without_far_conditions
-from calib.gap.effects import Effect
-from calib.gap.which import Lab, Ranking, calibrate_lab, rank
+from calib.gap.which import Lab, Ranking, calibrate_lab
 from calib.models.base import Array
 
-__all__ = ["LAB_OUTLIER", "LEFT_OVER", "OUTLIER", "rank_without_outliers", "without_outputs"]
+__all__ = [
+    "LAB_OUTLIER", "LEFT_OVER", "MOST_ROUNDS", "OUTLIER", "left_over", "screen",
+    "without_field_outliers", "without_outputs",
+]  # fmt: skip
 
 # Standardised residual beyond which a field row is set aside, and how often that is repeated.
 OUTLIER = 5.0
 # In the laboratory the row itself widens the noise, so the unit is a robust sd, and the bar higher.
 LAB_OUTLIER = 8.0
-_MOST_ROUNDS = 3
+MOST_ROUNDS = 3
 # A reading so many times the spread of the laboratory's off them is none: a code for "missing", a
-# slip of the comma. No gap is a tenth as large.
+# misplaced decimal point. No gap is a tenth as large.
 _IMPOSSIBLE = 20.0
 # Beyond this a reading is named; of noise alone, one in 2000 readings is.
 LEFT_OVER = 3.5
 
 
-def rank_without_outliers(
-    case: Case, seed: int, effects: Mapping[str, Effect]
-) -> tuple[Campaigns, Ranking]:
-    """Rank; set rows aside that no hypothesis explains, however good it is for the others.
+def screen(case: Case, seed: int) -> tuple[Campaigns, Lab, list[str]]:
+    """Set readings aside that a laboratory's calibration must not be made from.
 
     Parameters
     ----------
     case : Case
     seed : int
-    effects : mapping of str to Effect
 
     Returns
     -------
     Campaigns
-        Of the rows that are left; its case says which were set aside.
-    Ranking
+        Of the rows that are left.
+    Lab
+        The simulators calibrated on what is left of the laboratory.
+    list of str
+        What was set aside, and why.
+
+    Raises
+    ------
+    CalibError
+        If the case cannot be diagnosed.
     """
     campaigns(case)  # refuses what cannot be diagnosed, before rows are set aside
     check_units(case)
-    case = _without_impossible(without_far_conditions(case))
-    data, lab = _without_lab_outliers(case, seed)
-    case = data.case
-    ranking = rank(data, seed, effects=effects, lab=lab)
-    for _ in range(_MOST_ROUNDS):
-        far = _field_outliers(data, ranking)
-        if not far:
-            break
-        said = _said(case.field, far, _outlying(OUTLIER))
-        case = replace(without_outputs(case, far), warnings=(*case.warnings, *said))
-        data = campaigns(case)
-        ranking = rank(data, seed, effects=effects, lab=lab)
-    left = _left_over(data, ranking)
-    return replace(data, case=replace(case, warnings=(*case.warnings, *left))), ranking
+    case, far = without_far_conditions(case)
+    case, impossible = _without_impossible(case)
+    data, lab, outlying = _without_lab_outliers(case, seed)
+    return data, lab, far + impossible + outlying
 
 
-def _left_over(data: Campaigns, ranking: Ranking) -> list[str]:
+def without_field_outliers(data: Campaigns, ranking: Ranking) -> tuple[Campaigns, list[str]]:
+    """Set field rows aside that no hypothesis explains, however good it is for the others.
+
+    Returns
+    -------
+    Campaigns
+        The same object where there are none.
+    list of str
+        What was set aside, and why.
+    """
+    far = _field_outliers(data, ranking)
+    if not far:
+        return data, []
+    said = _said(data.case.field, far, _outlying(OUTLIER))
+    return campaigns(without_outputs(data.case, far)), said
+
+
+def left_over(data: Campaigns, ranking: Ranking) -> list[str]:
     """Name the readings that the most probable hypothesis leaves far off, though not set aside."""
     best = ranking.best(ranking.order[0])
     field, said = data.case.field, []
@@ -89,11 +103,11 @@ def without_outputs(case: Case, rows: Mapping[str, Sequence[int] | NDArray[np.in
     return replace(case, field=_blanked(case.field, rows))
 
 
-def _without_impossible(case: Case) -> Case:
+def _without_impossible(case: Case) -> tuple[Case, list[str]]:
     """Set readings aside that cannot be any, unless most of an output's are so."""
     lab, lab_said = _possible(case.lab, case)
     field, field_said = _possible(case.field, case)
-    return replace(case, lab=lab, field=field, warnings=(*case.warnings, *lab_said, *field_said))
+    return replace(case, lab=lab, field=field), lab_said + field_said
 
 
 def _possible(table: Table, case: Case) -> tuple[Table, list[str]]:
@@ -151,11 +165,12 @@ def _most(n: int) -> int:
     return max(1, n // 10)
 
 
-def _without_lab_outliers(case: Case, seed: int) -> tuple[Campaigns, Lab]:
+def _without_lab_outliers(case: Case, seed: int) -> tuple[Campaigns, Lab, list[str]]:
     """The campaigns without them, and the simulators calibrated on what is left of the lab."""
     data = campaigns(case)
     lab = calibrate_lab(data, seed)
-    for _ in range(_MOST_ROUNDS):
+    said: list[str] = []
+    for _ in range(MOST_ROUNDS):
         far = {}
         for o in data.outputs:
             z = _lab_residuals(o, lab[0][o.name])
@@ -165,11 +180,11 @@ def _without_lab_outliers(case: Case, seed: int) -> tuple[Campaigns, Lab]:
                 far[o.name] = [int(row) for row in measured[found]]
         if not far:
             break
-        said = _said(case.lab, far, _outlying(LAB_OUTLIER))
-        case = replace(case, lab=_blanked(case.lab, far), warnings=(*case.warnings, *said))
+        said += _said(case.lab, far, _outlying(LAB_OUTLIER))
+        case = replace(case, lab=_blanked(case.lab, far))
         data = campaigns(case)
         lab = calibrate_lab(data, seed)
-    return data, lab
+    return data, lab, said
 
 
 def _lab_residuals(o: OutputData, mode: Array) -> Array:

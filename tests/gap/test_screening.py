@@ -9,8 +9,8 @@ import pytest
 
 from calib.errors import CalibError
 from calib.gap.case import campaigns
+from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
-from calib.gap.outliers import rank_without_outliers
 from tests.gap.cases import PULL_ONLY, make_case
 
 FEW = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}
@@ -30,17 +30,17 @@ def test_a_gigantic_outlier_is_set_aside_and_changes_nothing_else(campaign, effe
     bad = spoiled(case, campaign, 4, 20.0)
     table = getattr(bad, campaign)
     table = replace(table, source=f"{campaign}.csv", lines=table.lines + 2)
-    data, ranking = rank_without_outliers(replace(bad, **{campaign: table}), 1, FEW)
+    _, ranking, told = screened_ranking(replace(bad, **{campaign: table}), 1, FEW)
     value = table["drawbar_pull_kn"][4]
     said = f"{campaign}.csv, line 6 (drawbar_pull_kn = {value:.4g}): more than"
-    assert any(said in warning for warning in data.case.warnings)
+    assert any(said in warning for warning in told)
     assert ranking.order[0] == (effect or "none")
 
 
 def test_a_clean_case_is_left_as_it_is():
     case = make_case(None, models=PULL_ONLY)
-    data, _ = rank_without_outliers(case, 1, FEW)
-    assert data.case.warnings == case.warnings
+    data, _, told = screened_ranking(case, 1, FEW)
+    assert told == []
     assert len(data.outputs[0].rows) == len(campaigns(case).outputs[0].rows)
 
 
@@ -48,7 +48,7 @@ def test_many_rows_that_lie_off_are_no_outliers():
     case = make_case(None, models=PULL_ONLY)
     for row in range(0, 27, 3):
         case = spoiled(case, "field", row, 3.0)
-    data, ranking = rank_without_outliers(case, 1, FEW)
+    data, ranking, _ = screened_ranking(case, 1, FEW)
     assert data.outputs[0].rows.size == 27
     assert ranking.probability["none"] < 0.5
 
@@ -60,9 +60,9 @@ def test_codes_for_missing_are_no_readings():
         columns = {name: np.array(v) for name, v in coded.field.columns.items()}
         columns["drawbar_pull_kn"][row] = -9999.0 if row else 1e300
         coded = replace(coded, field=replace(coded.field, columns=columns))
-    data, ranking = rank_without_outliers(coded, 1, FEW)
+    data, ranking, told = screened_ranking(coded, 1, FEW)
     assert data.outputs[0].rows.tolist() == [row for row in range(27) if row % 3]
-    (said,) = data.case.warnings
+    (said,) = told
     assert said.count("-9999") == 8
     assert "1e+300" in said
     assert ranking.order[0] == "force_offset"
@@ -73,4 +73,4 @@ def test_few_rows_are_counted_before_any_is_set_aside(rows):
     case = make_case(None, models=PULL_ONLY)
     few = replace(case, field=case.field.take(np.arange(rows)))
     with pytest.raises(CalibError, match=f"{rows} field rows with drawbar_pull_kn"):
-        rank_without_outliers(few, 1, FEW)
+        screened_ranking(few, 1, FEW)
