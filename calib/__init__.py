@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from calib.models import MODELS, Model
     from calib.models.simulators.files import read_simulator
     from calib.models.simulators.registered import from_callable
+    from calib.report.gap_evidence import gap_verdict
+    from calib.report.verdict import Verdict, verdict
     from calib.validation.prediction import Prediction, predict
     from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
@@ -75,6 +77,9 @@ _HOME = {
     "save_calibration": "calib.inference.io",
     "to_datatree": "calib.inference.io",
     "Validation": "calib.validation.validate",
+    "Verdict": "calib.report.verdict",
+    "verdict": "calib.report.verdict",
+    "gap_verdict": "calib.report.gap_evidence",
     "leave_one_out": "calib.validation.validate",
     "validate_held_out": "calib.validation.validate",
 }
@@ -98,6 +103,7 @@ __all__ = [
     "SamplerSettings",
     "Table",
     "Validation",
+    "Verdict",
     "build_problem",
     "calibrate",
     "check",
@@ -106,6 +112,7 @@ __all__ = [
     "emulated",
     "estimate",
     "from_callable",
+    "gap_verdict",
     "hold_out",
     "leave_one_out",
     "load_calibration",
@@ -122,6 +129,7 @@ __all__ = [
     "table_from_arrays",
     "to_datatree",
     "validate_held_out",
+    "verdict",
 ]
 
 

@@ -47,8 +47,8 @@ def diagnose(
     from calib.gap.effects.load import load_effects
     from calib.gap.files import write_diagnosis
     from calib.gap.provenance import INPUTS, inputs_record
+    from calib.report.gap_evidence import gap_verdict
     from calib.report.numbers import format_number
-    from calib.report.page.gap_verdict import judge_gap
 
     check_folder(out, overwrite=overwrite)
     if case is not None and run is None and field is None:
@@ -73,7 +73,7 @@ def diagnose(
     manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
     with pool(workers, ["calib.report.page.diagnosis"]) as side:
         found = find(given, seed, effects={**EFFECTS, **own}, pool=side)
-        from calib.report.page.diagnosis import gap_evidence, write_page
+        from calib.report.page.diagnosis import write_page
 
         with fresh_folder(out, overwrite=overwrite) as folder:
             write_diagnosis(found, folder)
@@ -82,7 +82,7 @@ def diagnose(
             write_page(found, folder, manifest, pool=side)
     for warning in found.warnings:
         print(f"calib: {warning}", file=sys.stderr)
-    print(f"verdict: {found.verdict} ({judge_gap(gap_evidence(found)).headline})")
+    print(f"verdict: {found.verdict} ({gap_verdict(found).headline})")
     for name in found.ranking.order[:4]:
         p = found.ranking.probability[name]
         text = ">0.999" if p >= 0.9995 else "<0.001" if p < 0.0005 else f"{p:.3f}"

@@ -9,12 +9,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
+from calib.data import table_from_arrays
+from calib.data.quantities import output_of
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import PointEstimate, estimate, methods_for
@@ -30,7 +32,7 @@ from calib.validation.sensitivity import Sensitivity, prior_sensitivity
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
 __all__ = [
-    "Failure", "OutputResult", "Study", "begin_study", "estimate_task", "run_study",
+    "Failure", "OutputResult", "Study", "begin_study", "estimate_task", "judged", "run_study",
 ]  # fmt: skip
 
 N_PRIOR_PREDICTIVE = 1000
@@ -222,6 +224,31 @@ def _work_out(
         replicated,
         seconds,
         prior_sensitivity(calibration),
+    )
+
+
+def judged(calibration: Calibration, validation: Validation) -> OutputResult:
+    """Return a calibration and its validation as a study has them, without point estimates.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    validation : Validation
+        On rows that were held out, or left out in turn.
+    """
+    problem = calibration.problem
+    table, model = problem.table, problem.bound.model
+    if validation.method == "held_out":
+        shared = [c for c in table if c in validation.table]
+        both = {c: np.append(table[c], validation.table[c]) for c in shared}
+        table = replace(table_from_arrays(both), label=table.label)
+    output = output_of(model.output)
+    _, replicated = predictive_draws(
+        calibration, problem.conditions, generator(calibration.seed, output, "replicate")
+    )
+    prior = _prior_predictive(problem, generator(calibration.seed, output, "prior"))
+    return OutputResult(
+        Task(output, model.name, table), calibration, validation, (), {}, prior, replicated
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from calib.data.quantities import QUANTITIES, columns_of
 from calib.inference.priors import Prior
-from calib.report.figures.labels import symbol
+from calib.report.labels import symbol
 
 _SPECIAL = re.compile(r"([\\*_{}\[\]<>|$~])")
 

@@ -12,8 +12,8 @@ from calib.gap.case import read_case
 from calib.gap.context import Context, Size, read_context
 from calib.gap.diagnose import diagnose_once
 from calib.gap.which import Odds
-from calib.report.page.diagnosis import gap_evidence
-from calib.report.page.gap_verdict import judge_gap
+from calib.report.gap_evidence import gap_evidence
+from calib.report.gap_verdict import judge_gap
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 

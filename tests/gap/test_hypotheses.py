@@ -24,7 +24,7 @@ from calib.gap.hypotheses import (
     with_remainder,
 )
 from calib.gap.hypothesis import Hypothesis
-from calib.report.page.gap_sizes import size_sentences
+from calib.report.gap_sizes import size_sentences
 from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case, table_without
 
 SIGMA = {o: NOISE[o] for o in MODELS}

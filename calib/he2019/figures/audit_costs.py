@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import FixedLocator, NullFormatter
 
 from calib.he2019.audit import Audit
-from calib.report.figures.labels import NO_UNIT
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import BLUE, DASHES, GREY, ORANGE, VERMILION, legend_below, panels
+from calib.report.labels import NO_UNIT
 
 __all__ = ["costs_plate"]
 

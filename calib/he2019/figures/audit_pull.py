@@ -12,7 +12,6 @@ from calib.he2019.audit.geometric import features
 from calib.he2019.datasets.published import FittedTable
 from calib.models.base import Array
 from calib.models.magic_formula import magic_formula
-from calib.report.figures.labels import joined, short
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -25,6 +24,7 @@ from calib.report.figures.style import (
     note,
     panels,
 )
+from calib.report.labels import joined, short
 
 __all__ = ["chord_plate", "digits_plate", "signs_plate"]
 

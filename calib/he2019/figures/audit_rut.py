@@ -12,7 +12,6 @@ from calib.he2019.audit import Audit
 from calib.he2019.audit.inverse_regression import InverseStudy, attenuation
 from calib.models.base import Array
 from calib.models.bekker import rut_depth
-from calib.report.figures.labels import NO_UNIT
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -24,6 +23,7 @@ from calib.report.figures.style import (
     legend_below,
     panels,
 )
+from calib.report.labels import NO_UNIT
 
 __all__ = ["rut_plate"]
 

@@ -12,14 +12,7 @@ from matplotlib.patches import Patch
 from calib.data.quantities import OUTPUTS
 from calib.he2019.gaps.find import FoundGap
 from calib.models.base import Array
-from calib.report.figures.gap_rows import (
-    OutputRows,
-    output_rows,
-    output_word,
-    short_name,
-)
 from calib.report.figures.gap_which import probability_text
-from calib.report.figures.labels import NO_UNIT, axis_of, short
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLUE,
@@ -33,6 +26,13 @@ from calib.report.figures.style import (
     panels,
     style,
 )
+from calib.report.gap_rows import (
+    OutputRows,
+    output_rows,
+    output_word,
+    short_name,
+)
+from calib.report.labels import NO_UNIT, axis_of, short
 
 __all__ = ["gap_plate"]
 

@@ -17,8 +17,8 @@ from calib.he2019.audit.files import audit_csv, audit_json
 from calib.he2019.datasets.published import DOI
 from calib.he2019.figures.audit import audit_plates
 from calib.report.figures.export import png, png_size
-from calib.report.figures.labels import unbroken
 from calib.report.figures.plate import Plate
+from calib.report.labels import unbroken
 from calib.report.numbers import NOTHING, format_number
 from calib.report.page.equations import unit_html
 from calib.report.page.template import template

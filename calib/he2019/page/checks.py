@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from calib.he2019.gaps.checks import Check
-from calib.report.figures.gap_rows import short_name
-from calib.report.figures.labels import percent, short
+from calib.report.gap_rows import short_name
+from calib.report.gap_verdict import odds_text
+from calib.report.labels import percent, short
 from calib.report.numbers import format_value
-from calib.report.page.gap_verdict import odds_text
 
 __all__ = ["check_text"]
 

@@ -16,11 +16,12 @@ from calib.he2019.page.checks import check_text
 from calib.models import get_model
 from calib.report.figures.export import pdf_bytes, png_size
 from calib.report.figures.gap import gap_plates
-from calib.report.figures.gap_rows import short_name
-from calib.report.figures.labels import short
 from calib.report.figures.plate import Plate
-from calib.report.page.diagnosis import gap_evidence, render_diagnosis
-from calib.report.page.gap_verdict import Tone, judge_gap, odds_text
+from calib.report.gap_evidence import gap_verdict
+from calib.report.gap_rows import short_name
+from calib.report.gap_verdict import Tone, odds_text
+from calib.report.labels import short
+from calib.report.page.diagnosis import render_diagnosis
 from calib.report.page.template import template
 
 __all__ = ["begin_gaps_section", "write_gaps"]
@@ -114,7 +115,7 @@ def _write_gap(
 
 def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
     gap, found = result.gap, result.found
-    verdict = judge_gap(gap_evidence(found))
+    verdict = gap_verdict(found)
     ranking = found.ranking
     case = found.data.case
     return {

@@ -8,18 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from calib.models.base import Array
-from calib.report.figures.labels import axis_of, joined, short
 from calib.report.figures.plate import Plate
-from calib.report.figures.rows import (
-    Group,
-    data_word,
-    grid,
-    group_column,
-    groups,
-    held_table,
-    smooth_bands,
-    x_column,
-)
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -32,7 +21,18 @@ from calib.report.figures.style import (
     legend_below,
     panels,
 )
+from calib.report.labels import axis_of, joined, short
 from calib.report.reference import NOTHING, Reference
+from calib.report.rows import (
+    Group,
+    data_word,
+    grid,
+    group_column,
+    groups,
+    held_table,
+    smooth_bands,
+    x_column,
+)
 from calib.report.study import OutputResult
 from calib.validation.prediction import Bands
 

@@ -6,8 +6,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calib.models.base import Array
-from calib.report.figures.labels import axis_of
 from calib.report.figures.style import BLACK, BLUE, legend_below, panels, style
+from calib.report.labels import axis_of
 from calib.validation.comparison import Candidate, Comparison
 
 __all__ = ["comparison_figure"]

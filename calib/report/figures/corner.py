@@ -14,7 +14,6 @@ from matplotlib.ticker import MaxNLocator
 from calib.inference.calibration import Calibration
 from calib.inference.priors import Prior
 from calib.models.base import Array
-from calib.report.figures.labels import MINUS, parameter_label, plain, short
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -28,6 +27,7 @@ from calib.report.figures.style import (
     SYMBOL_PT,
     WIDE,
 )
+from calib.report.labels import MINUS, parameter_label, plain, short
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 

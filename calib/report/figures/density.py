@@ -15,10 +15,10 @@ from calib.data.quantities import role_of
 from calib.errors import CalibError
 from calib.models.base import Array, Model
 from calib.report.figures.bands import observed_words
-from calib.report.figures.labels import axis_of, percent, short
 from calib.report.figures.plate import Plate
-from calib.report.figures.rows import data_word, held_table, smooth_bands
 from calib.report.figures.style import BLACK, DASHES, GREY, VERMILION, legend_below, panels
+from calib.report.labels import axis_of, percent, short
+from calib.report.rows import data_word, held_table, smooth_bands
 from calib.report.study import OutputResult
 
 __all__ = ["cone_and_water", "density_plate", "draw_predicted_observed"]

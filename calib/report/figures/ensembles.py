@@ -11,7 +11,6 @@ from matplotlib.ticker import MaxNLocator
 from scipy.stats import rankdata
 
 from calib.models.base import Array
-from calib.report.figures.labels import NO_UNIT, parameter_label, plain, short
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     CYCLE,
@@ -22,6 +21,7 @@ from calib.report.figures.style import (
     WIDE,
     legend_below,
 )
+from calib.report.labels import NO_UNIT, parameter_label, plain, short
 from calib.report.study import OutputResult
 
 __all__ = ["ensembles_plate", "rank_histograms"]

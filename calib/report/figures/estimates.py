@@ -12,7 +12,6 @@ from calib.inference.diagnostics import hdi
 from calib.inference.estimators import PointEstimate, method_name
 from calib.models.base import Array
 from calib.models.magic_formula_pressure import coefficients_at
-from calib.report.figures.labels import NO_UNIT, joined, parameter_label, plain, short, symbol
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -26,6 +25,7 @@ from calib.report.figures.style import (
     legend_below,
     panels,
 )
+from calib.report.labels import NO_UNIT, joined, parameter_label, plain, short, symbol
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 

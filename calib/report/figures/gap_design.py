@@ -9,8 +9,6 @@ from scipy.spatial.distance import squareform
 
 from calib.gap.diagnose import Diagnosis
 from calib.gap.isolate import ALIKE, Isolability
-from calib.report.figures.gap_rows import best_fit, best_of, output_word, short_name
-from calib.report.figures.labels import NO_UNIT, axis_of, joined, percent, short
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -24,6 +22,8 @@ from calib.report.figures.style import (
     legend_below,
     panels,
 )
+from calib.report.gap_rows import best_fit, best_of, output_word, short_name
+from calib.report.labels import NO_UNIT, axis_of, joined, percent, short
 
 __all__ = ["isolability_plate", "left_over_plate"]
 

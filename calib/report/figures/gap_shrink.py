@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from calib.gap.diagnose import Diagnosis
-from calib.gap.shrink import Shrink
 from calib.models.base import Array
-from calib.report.figures.gap_rows import OutputRows, output_rows, output_word
-from calib.report.figures.labels import MINUS, axis_of, percent, short
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -23,8 +19,11 @@ from calib.report.figures.style import (
     legend_below,
     panels,
 )
+from calib.report.gap_evidence import scaled_shrink
+from calib.report.gap_rows import OutputRows, output_rows, output_word
+from calib.report.labels import MINUS, axis_of, percent, short
 
-__all__ = ["how_far_plate", "scaled_shrink"]
+__all__ = ["how_far_plate"]
 
 
 def how_far_plate(found: Diagnosis) -> Plate:
@@ -119,17 +118,6 @@ def _bars(ax: Axes, found: Diagnosis, own: OutputRows) -> None:
     ax.set_xlim(-0.5, 1.5)
     ax.set_xticks([0.0, 1.0], ["before", "after"])
     ax.tick_params(axis="x", length=0.0)
-
-
-def scaled_shrink(found: Diagnosis, own: OutputRows) -> Shrink | None:
-    """Return the shrink of an output on the scale of its axis."""
-    s, factor = found.shrink.get(own.name), own.axis.factor
-    if s is None:
-        return None
-    return replace(
-        s, rmse_before=s.rmse_before * factor, rmse_after=s.rmse_after * factor,
-        noise_floor=s.noise_floor * factor,
-    )  # fmt: skip
 
 
 def _interval(interval: tuple[float, float]) -> str:

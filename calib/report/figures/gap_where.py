@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
@@ -16,8 +16,9 @@ from calib.data.quantities import role_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.where import Region, conditions_to_search
 from calib.models.base import Array
-from calib.report.figures.gap_rows import (
-    PROBABLE,
+from calib.report.figures.plate import Plate
+from calib.report.figures.style import BLACK, GREY, ORANGE, VERMILION, panels
+from calib.report.gap_rows import (
     OutputRows,
     output_axis,
     output_rows,
@@ -25,15 +26,15 @@ from calib.report.figures.gap_rows import (
     panel_groups,
     region_text,
 )
-from calib.report.figures.labels import MINUS, NO_UNIT, Axis, axis_of, percent, short
-from calib.report.figures.plate import Plate
-from calib.report.figures.style import BLACK, GREY, ORANGE, VERMILION, panels
+from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of, percent, short
 
 __all__ = ["conditions_plate", "where_plate"]
 
 _BAND = "#e6e6e6"
 _MOST_CONDITIONS = 6
 _NORM = Normalize(0.0, 1.0)
+# White to dark: how probable it is that a gap exceeds the noise. It survives greyscale.
+_PROBABLE = LinearSegmentedColormap.from_list("probable", ["#ffffff", "#f6c9a5", "#D55E00"])
 # Gaps that do not reach this part of the noise are none.
 _TINY = 0.02
 
@@ -164,7 +165,7 @@ def _points(ax: Axes, x: Array, own: OutputRows, mask: np.ndarray) -> None:
         capsize=0.0, zorder=2,
     )  # fmt: skip
     ax.scatter(
-        x, own.gap[mask], c=own.probability[mask], cmap=PROBABLE, norm=_NORM, s=20.0,
+        x, own.gap[mask], c=own.probability[mask], cmap=_PROBABLE, norm=_NORM, s=20.0,
         edgecolors=BLACK, linewidths=0.6, zorder=3,
     )  # fmt: skip
 
@@ -173,7 +174,7 @@ def _key(fig: Figure, *, regions: bool) -> None:
     """Put the colour scale and the meaning of the shades at the foot, below the axis labels."""
     height = fig.get_figheight() * 25.4
     bar = fig.add_axes((0.56, 7.0 / height, 0.28, 2.4 / height))
-    scale = fig.colorbar(ScalarMappable(_NORM, PROBABLE), cax=bar, orientation="horizontal")
+    scale = fig.colorbar(ScalarMappable(_NORM, _PROBABLE), cax=bar, orientation="horizontal")
     scale.set_ticks([0.0, 0.5, 1.0])
     scale.outline.set_linewidth(0.5)
     bar.set_title(f"Probability that the gap exceeds the noise ({NO_UNIT})", fontsize=7.0, pad=2.5)

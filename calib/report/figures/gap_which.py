@@ -9,8 +9,6 @@ import numpy as np
 from calib.gap.diagnose import Diagnosis
 from calib.gap.noise import noise_conditions
 from calib.models.base import Array
-from calib.report.figures.gap_rows import best_fit, best_of, short_name
-from calib.report.figures.labels import MINUS, NO_UNIT, joined, percent, short
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -23,6 +21,8 @@ from calib.report.figures.style import (
     note,
     panels,
 )
+from calib.report.gap_rows import best_fit, best_of, short_name
+from calib.report.labels import MINUS, NO_UNIT, joined, percent, short
 
 __all__ = ["IN_PLAY", "Placebo", "in_play", "placebos", "probability_text", "which_plate"]
 

@@ -12,9 +12,7 @@ from scipy.stats import gaussian_kde
 from calib.inference.calibration import Calibration
 from calib.inference.priors import Prior
 from calib.models.base import Array
-from calib.report.figures.labels import joined, parameter_label, plain, short
 from calib.report.figures.plate import Plate
-from calib.report.figures.roles import MOVED, PRIOR, ROLES, role
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -25,9 +23,11 @@ from calib.report.figures.style import (
     legend_below,
     panels,
 )
+from calib.report.labels import joined, parameter_label, plain, short
 from calib.report.numbers import TIMES
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
+from calib.validation.roles import MOVED, PRIOR, ROLES, role
 
 __all__ = ["learned_plate"]
 

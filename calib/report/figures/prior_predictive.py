@@ -8,13 +8,14 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from calib.report.figures.bands import FILLS, scatter_points
-from calib.report.figures.labels import axis_of, short
 from calib.report.figures.plate import Plate
-from calib.report.figures.rows import Group, data_word, grid, groups, smooth_bands, x_column
 from calib.report.figures.style import DOUBLE_MM, GREY, MIDDLE_MM, legend_below, panels
+from calib.report.labels import axis_of, short
+from calib.report.rows import Group, data_word, grid, groups, smooth_bands, x_column
 from calib.report.study import OutputResult
+from calib.validation.joint import hits
 
-__all__ = ["prior_hits", "prior_predictive_plate"]
+__all__ = ["prior_predictive_plate"]
 
 # A heavy prior tail would flatten the data: the axis ends at this multiple of their range.
 _ZOOM = 4.0
@@ -74,18 +75,11 @@ def _panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]:
     return handles
 
 
-def prior_hits(result: OutputResult) -> int:
-    """Count the calibrated points inside the priors' 95 % predictive band."""
-    observed = result.calibration.problem.observed
-    low, high = np.nanquantile(result.prior_predictive, [0.025, 0.975], axis=0)
-    return int(((observed >= low) & (observed <= high)).sum())
-
-
 def _caption(result: OutputResult) -> str:
     observed = result.calibration.problem.observed
     low, high = np.nanquantile(result.prior_predictive, [0.025, 0.975], axis=0)
     after = np.nanquantile(result.posterior_predictive, [0.025, 0.975], axis=0)
-    inside = prior_hits(result)
+    inside = hits(result.prior_predictive, observed, 0.95)
     ratio = float(np.median(high - low) / np.median(after[1] - after[0]))
     return (
         f"Before any datum, the priors' 95 % band holds {inside} of {observed.size} calibration "

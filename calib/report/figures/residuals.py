@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -10,11 +9,8 @@ from matplotlib.axes import Axes
 from scipy.stats import beta, levene, norm, shapiro
 
 from calib.data.quantities import role_of
-from calib.inference.problem import Problem
 from calib.models.base import Array
-from calib.report.figures.labels import NO_UNIT, axis_of, joined, plain, short, unit_plain
 from calib.report.figures.plate import Plate
-from calib.report.figures.rows import Group, data_word, group_column, groups, held_table, x_column
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -25,44 +21,25 @@ from calib.report.figures.style import (
     legend_below,
     panels,
 )
+from calib.report.labels import NO_UNIT, axis_of, joined, plain, short, unit_plain
 from calib.report.posterior_text import centre_text
+from calib.report.rows import (
+    Group,
+    data_word,
+    group_column,
+    groups,
+    held_table,
+    signs_along,
+    x_column,
+)
 from calib.report.study import OutputResult
+from calib.validation.residuals import Standardised, standardise
 
-__all__ = ["Standardised", "residuals_plate", "sign_changes", "standardise"]
+__all__ = ["residuals_plate"]
 
-_N_DRAWS = 1000
 # Rows of a group whose spread is compared, at least.
 _FEWEST = 5
 _SIGNIFICANT = 0.05
-
-
-@dataclass(frozen=True)
-class Standardised:
-    """Residuals over the noise scale, posterior means, of some rows.
-
-    Parameters
-    ----------
-    residual, predicted : ndarray, shape (n,)
-        In noise sds, on the scale of the response; the prediction is in the output's unit.
-    """
-
-    residual: Array
-    predicted: Array
-
-
-def standardise(result: OutputResult, problem: Problem) -> Standardised:
-    """Work residuals out at the posterior.
-
-    Parameters
-    ----------
-    result : OutputResult
-    problem : Problem
-        Its rows: the calibrated ones or, by ``with_table``, others.
-    """
-    natural = problem.theta(result.calibration.subset(_N_DRAWS))
-    location = problem.bound.location(natural[:, :-1], problem.conditions)
-    residual = np.nanmean((problem.response - location) / natural[:, -1:], axis=0)
-    return Standardised(residual, problem.bound.from_response(np.nanmedian(location, axis=0)))
 
 
 def residuals_plate(result: OutputResult) -> Plate:
@@ -74,8 +51,8 @@ def residuals_plate(result: OutputResult) -> Plate:
     """
     fig, axes = panels(2, 2, height=46.0, left=14.0, bottom=22.0, gap_x=17.0, gap_y=15.0)
     problem, other = result.calibration.problem, held_table(result)
-    fitted = standardise(result, problem)
-    held = None if other is None else standardise(result, problem.with_table(other))
+    fitted = standardise(result.calibration, problem)
+    held = None if other is None else standardise(result.calibration, problem.with_table(other))
     x = x_column(result)
     y_axis, x_axis = axis_of(problem.bound.model.output), axis_of(x)
     residuals = (fitted.residual, None if held is None else held.residual)
@@ -174,7 +151,7 @@ def _replicated(ax: Axes, result: OutputResult) -> dict[str, Any]:
 def _caption(result: OutputResult, fitted: Standardised, held: Standardised | None) -> str:
     n, large = fitted.residual.size, int((np.abs(fitted.residual) > 2.0).sum())
     p = float(shapiro(fitted.residual).pvalue) if n >= 3 else float("nan")
-    runs, pairs = sign_changes(result, fitted.residual)
+    runs, pairs = signs_along(result, fitted.residual)
     text = (
         f"Beyond 2 noise sds lie {large} of {n} residuals ({short(0.046 * n)} expected); they "
         f"{'are compatible with' if p > 0.05 else 'depart from'} a normal law (Shapiro-Wilk p = "
@@ -216,18 +193,3 @@ def _spread_words(result: OutputResult, fitted: Standardised) -> str:
         f"{plain('sigma')} for all makes the bands too narrow at {sds[0][1]} and too wide at "
         f"{sds[-1][1]}."
     )
-
-
-def sign_changes(result: OutputResult, residual: Array) -> tuple[int, int]:
-    """Count sign changes of residuals along x within each group, and neighbours in all.
-
-    Independent residuals change sign between half of the neighbours; a curve that misses a
-    pattern leaves long runs of one sign.
-    """
-    x = result.calibration.problem.table[x_column(result)]
-    changes, pairs = 0, 0
-    for group in groups(result, most=False):
-        sign = np.sign(residual[group.fitted][np.argsort(x[group.fitted], kind="stable")])
-        changes += int((sign[1:] != sign[:-1]).sum())
-        pairs += max(0, sign.size - 1)
-    return changes, pairs

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from calib.report.figures.labels import MINUS, short, symbol
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -24,6 +23,7 @@ from calib.report.figures.style import (
     panels,
     style,
 )
+from calib.report.labels import MINUS, short, symbol
 from calib.validation.sbc.score import LEVEL, ModelScore, Quantity, SbcScore
 from calib.validation.sbc.uniformity import ecdf_band
 

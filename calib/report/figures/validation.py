@@ -8,10 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from calib.report.figures.density import cone_and_water, draw_predicted_observed
-from calib.report.figures.joint import effective_rows, ks_distance, pit_half_width
-from calib.report.figures.labels import MINUS, NO_UNIT, axis_of, percent, short
 from calib.report.figures.plate import Plate
-from calib.report.figures.rows import data_word, held_table, x_column
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -23,8 +20,11 @@ from calib.report.figures.style import (
     note,
     panels,
 )
+from calib.report.labels import MINUS, NO_UNIT, axis_of, percent, short
 from calib.report.reference import NOTHING, Reference
+from calib.report.rows import data_word, held_table, x_column
 from calib.report.study import OutputResult
+from calib.validation.joint import effective_rows, ks_distance, pit_half_width
 from calib.validation.validate import PARETO_K_MAX
 
 __all__ = ["validation_plate"]

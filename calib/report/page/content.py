@@ -12,8 +12,7 @@ from typing import Any
 from calib.models import get_model
 from calib.report.figures import Plate
 from calib.report.figures.export import png_size
-from calib.report.figures.labels import axis_of, percent, short
-from calib.report.figures.rows import held_table
+from calib.report.labels import axis_of, percent, short
 from calib.report.page.equations import equation, likelihood, parametrisation, prose
 from calib.report.page.facts import repeats_words, sampling_facts, validation_facts, worst_row
 from calib.report.page.tables import (
@@ -23,9 +22,10 @@ from calib.report.page.tables import (
     prior_rows,
     sensitivity_grid,
 )
-from calib.report.page.verdict import Evidence, Level, gather, judge_evidence
 from calib.report.reference import reference_of
+from calib.report.rows import held_table
 from calib.report.study import Failure, OutputResult
+from calib.report.verdict import Evidence, Level, gather, judge_evidence
 from calib.validation.outliers import outlying_notes
 
 __all__ = ["MARKS", "failed_section", "section"]

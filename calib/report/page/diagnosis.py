@@ -11,47 +11,37 @@ from typing import Any
 
 from calib.batch.pool import HERE, Pool
 from calib.gap.diagnose import Diagnosis
-from calib.gap.inclusion import UNLISTED, Included
+from calib.gap.inclusion import UNLISTED
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
 from calib.models import get_model
 from calib.report.figures.export import png, png_size
 from calib.report.figures.gap import GAP_FIGURES, gap_plates
-from calib.report.figures.gap_rows import (
-    best_fit,
+from calib.report.figures.plate import Plate
+from calib.report.gap_evidence import gap_evidence, region_words, shrink_facts, where_fact
+from calib.report.gap_rows import (
     best_of,
     output_axis,
-    output_rows,
     output_word,
-    region_text,
     short_name,
     title_of,
 )
-from calib.report.figures.gap_shrink import scaled_shrink
-from calib.report.figures.labels import MINUS, joined, short
-from calib.report.figures.plate import Plate
-from calib.report.page.gap_sizes import size_sentences, where_to_look
+from calib.report.gap_verdict import (
+    GapEvidence,
+    judge_gap,
+    odds_text,
+)
+from calib.report.labels import MINUS, short
 from calib.report.page.gap_tables import (
-    conditions_text,
     hypothesis_groups,
     next_rows,
     parameter_rows,
     prior_text,
     simulators,
 )
-from calib.report.page.gap_verdict import (
-    Candidate,
-    CauseFact,
-    GapEvidence,
-    NextFact,
-    ShrinkFact,
-    WhereFact,
-    judge_gap,
-    odds_text,
-)
 from calib.report.page.template import template
 
-__all__ = ["gap_evidence", "render_diagnosis", "write_page"]
+__all__ = ["render_diagnosis", "write_page"]
 
 # A cause less probable is not shown.
 _POSSIBLE = 0.01
@@ -156,66 +146,6 @@ def render_diagnosis(
     )
 
 
-def gap_evidence(found: Diagnosis) -> GapEvidence:
-    """Collect what the verdict is made from."""
-    ranking = found.ranking
-    best = best_of(found)
-    design = ranking.isolability
-    case_context = found.data.case.context
-    alike = [
-        short_name(b if a == best else a) for a, b in design.alike if best in (a, b)
-    ]  # fmt: skip
-    return GapEvidence(
-        verdict=found.verdict,
-        ranked=[
-            Candidate(n, short_name(n), title_of(found, n), ranking.probability[n])
-            for n in ranking.order
-        ],
-        sizes=[] if found.verdict == "ambiguous" else size_sentences(found, best),
-        where=[_where_fact(found, r) for r in _leading_regions(found)],
-        shrink=_shrink_facts(found),
-        unfitted=found.data.case.new_conditions is not None,
-        next_facts=[
-            NextFact(
-                (short_name(m.separates[0]), short_name(m.separates[1])),
-                conditions_text(found, m),
-                m.gain_nats,
-            )
-            for m in found.next_measurements
-        ],
-        alike=alike,
-        smallest=max(design.detectable.values(), default=float("nan")),
-        look=where_to_look(found) if best == "unknown" else "",
-        causes=[_cause(found, n, c) for n, c in found.inclusion.causes.items()],
-        remainder=_cause(found, UNLISTED, found.inclusion.remainder),
-        remainder_where=_remainder_where(found),
-        put_in="; ".join(case_context.words()),
-        without=_without(found),
-    )
-
-
-def _without(found: Diagnosis) -> str:
-    """Say which causes act without what the case's context put in."""
-    if found.without_context is None:
-        return ""
-    p = found.without_context
-    leading = sorted((n for n in p if p[n] >= 0.05), key=lambda n: -p[n])[:4]
-    words = {"none": "no gap", UNLISTED: "something unlisted"}
-    return joined([f"{words.get(n, short_name(n))} ({odds_text(p[n])})" for n in leading])
-
-
-def _cause(found: Diagnosis, name: str, c: Included) -> CauseFact:
-    words = "something unlisted" if name == UNLISTED else short_name(name)
-    return CauseFact(
-        name, words, title_of(found, name), c.probability, c.share, c.share_interval
-    )  # fmt: skip
-
-
-def _remainder_where(found: Diagnosis) -> str:
-    where = found.inclusion.where[:1]
-    return "".join(f"{output_word(r.output)} at {region_text(found, r)}" for r in where)
-
-
 def _cause_rows(evidence: GapEvidence) -> list[dict[str, str]]:
     """Return the causes that are not ruled out, and the remainder, with their shares."""
     shown = [c for c in evidence.causes if c.probability >= _POSSIBLE]
@@ -232,62 +162,16 @@ def _cause_rows(evidence: GapEvidence) -> list[dict[str, str]]:
     ]
 
 
-def _region_words(found: Diagnosis, region: Region) -> tuple[str, str]:
-    own = output_axis(found, region.output)
-    gap = own.factor * region.gap
-    sign, way = (1.0, "above") if gap > 0.0 else (-1.0, "below")
-    low, high = sorted(sign * own.factor * end for end in region.interval)
-    spread = f"90 % interval {short(low)} to {short(high)}".replace("-", MINUS)
-    text = f"{short(abs(gap))} {own.unit} {way} the simulator ({spread})"
-    return region_text(found, region), text
-
-
-def _leading_regions(found: Diagnosis) -> list[Region]:
-    """One region of each output, along a condition of the best hypothesis if there is one."""
-    effects = best_fit(found, best_of(found)).forward.hypothesis.effects
-    wanted = {found.data.view.column(role) for e in effects for role in e.covariates}
-    leading = []
-    for o in found.data.outputs:
-        own = [r for r in found.regions if r.output == o.name]
-        own.sort(key=lambda r: not wanted & set(r.conditions))
-        leading += own[:1]
-    return leading
-
-
-def _where_fact(found: Diagnosis, region: Region) -> WhereFact:
-    place, gap = _region_words(found, region)
-    return WhereFact(f"{output_word(region.output)} at {place}", gap, region.probability)
-
-
 def _region_row(found: Diagnosis, region: Region) -> list[str]:
-    fact = _where_fact(found, region)
-    place, gap = _region_words(found, region)
+    fact = where_fact(found, region)
+    place, gap = region_words(found, region)
     p = fact.probability
     return [output_word(region.output), place, gap, f"{p:.2f}" if p < 0.995 else "> 0.99"]
 
 
-def _shrink_facts(found: Diagnosis) -> list[ShrinkFact]:
-    facts = []
-    for own in output_rows(found):
-        s = scaled_shrink(found, own)
-        if s is not None:
-            unit = own.axis.unit
-            facts.append(
-                ShrinkFact(
-                    output_word(own.name),
-                    short(s.rmse_before),
-                    f"{short(s.rmse_after)} {unit}",
-                    f"{short(s.noise_floor)} {unit}",
-                    s.fraction,
-                    s.interval,
-                )
-            )
-    return facts
-
-
 def _shrink_rows(found: Diagnosis) -> list[list[str]]:
     rows = []
-    for f in _shrink_facts(found):
+    for f in shrink_facts(found):
         low, high = (f"{100.0 * v:.0f}".replace("-", MINUS) for v in f.interval)
         fraction = f"{100.0 * f.fraction:.0f} %".replace("-", MINUS)
         rows.append([f.output, f.before, f.after, f.floor, fraction, f"{low} to {high} %"])

@@ -10,7 +10,7 @@ from markupsafe import Markup, escape
 
 from calib.models import BoundModel
 from calib.models.latex import html
-from calib.report.figures.labels import MINUS, plain, stem_and_subscript, unbroken
+from calib.report.labels import MINUS, plain, stem_and_subscript, unbroken
 
 __all__ = [
     "equation", "likelihood", "parametrisation", "prose", "symbol_html", "unit_html",

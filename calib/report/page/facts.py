@@ -6,9 +6,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.report.figures.labels import axis_of, percent
-from calib.report.figures.rows import held_table, x_column
+from calib.report.labels import axis_of, percent
 from calib.report.numbers import TIMES, format_number, format_value
+from calib.report.rows import held_table, x_column
 from calib.report.study import OutputResult
 
 __all__ = ["repeats_words", "sampling_facts", "validation_facts", "worst_row"]

@@ -9,29 +9,25 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from calib.data.quantities import role_of
 from calib.gap.case import OutputData
 from calib.gap.diagnose import NAMED, Diagnosis
 from calib.gap.effects.dependence import PREFIX
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PRIOR
-from calib.gap.next_measurement import NextMeasurement
 from calib.inference.priors import Prior
-from calib.models import get_model
-from calib.report.figures.gap_rows import (
+from calib.report.figures.gap_which import placebos
+from calib.report.gap_evidence import conditions_text
+from calib.report.gap_rows import (
     best_fit,
     short_name,
     title_of,
-    unit_after,
 )
-from calib.report.figures.gap_which import placebos
-from calib.report.figures.labels import MINUS, axis_of, percent
+from calib.report.gap_verdict import TIE, odds_text, repeats_needed
+from calib.report.labels import MINUS, percent
 from calib.report.numbers import format_number, format_value
 from calib.report.page.equations import equation, parametrisation, prose
-from calib.report.page.gap_verdict import TIE, odds_text, repeats_needed
 
 __all__ = [
-    "conditions_text",
     "hypothesis_groups",
     "next_rows",
     "parameter_rows",
@@ -250,42 +246,6 @@ def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
         return [Markup("no parameter moves clearly")]
     together = len(sizes) > 1 and fit.forward.hypothesis.shift_as == "soil"
     return [*sizes, Markup("together, as with another soil")] if together else sizes
-
-
-def conditions_text(found: Diagnosis, measurement: NextMeasurement) -> str:
-    """Write the conditions of a measurement: those that vary, and that the hypotheses differ by."""
-    field, lab = found.data.view.conditions, found.data.case.lab.columns
-    matters = _matter(found, measurement.separates)
-    measured = {role_of(column) for column in measurement.conditions}
-    parts = []
-    for column, value in measurement.conditions.items():
-        both = np.concatenate([field[column], lab.get(column, field[column])])
-        role = role_of(column)
-        follows = role == "ground_pressure" and "pressure" in measured
-        if np.ptp(both) == 0.0 or follows or role == "order" or role not in matters:
-            continue
-        axis = axis_of(column)
-        shown = f"{100.0 * value:.0f}" if role == "slip" else _rounded(axis.factor * value)
-        parts.append(f"{axis.name.lower()} {shown.replace('-', MINUS)}{unit_after(axis)}")
-    if "order" in matters & measured:
-        parts.append("after the last run")
-    return ", ".join(parts) or "the conditions of the field campaign"
-
-
-def _matter(found: Diagnosis, names: Sequence[str]) -> set[str]:
-    """Roles of what the simulators and the effects of some hypotheses depend on."""
-    models = found.data.case.models.values()
-    matters = {role_of(c) for m in models for c in get_model(m).conditions}
-    for name in names:
-        h = best_fit(found, name).forward.hypothesis
-        if h.smooth_outputs:
-            return {role_of(c) for c in found.data.view.conditions}
-        matters |= {c for effect in h.effects for c in effect.covariates}
-    return matters
-
-
-def _rounded(value: float) -> str:
-    return f"{value:.2g}" if abs(value) < 10.0 else f"{value:.3g}"
 
 
 def next_rows(found: Diagnosis) -> list[list[str]]:

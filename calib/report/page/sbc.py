@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from calib.models import get_model
-from calib.report.figures.labels import short
+from calib.report.labels import short
 from calib.report.page.template import template
 from calib.validation.sbc.designs import design_of
 from calib.validation.sbc.score import LEVEL, ModelScore, SbcScore

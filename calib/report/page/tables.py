@@ -10,13 +10,13 @@ import numpy as np
 from markupsafe import Markup
 
 from calib.inference.estimators import PointEstimate, method_name
-from calib.report.figures.roles import role
 from calib.report.numbers import NOTHING, format_as_printed, format_like, format_number
 from calib.report.page.equations import symbol_html, unit_html
 from calib.report.posterior_text import centre_text, interval_text, skewed
 from calib.report.reference import NOTHING as NONE
 from calib.report.reference import Figure, FittedTable, Reference
 from calib.report.study import OutputResult
+from calib.validation.roles import role
 from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 
 __all__ = [

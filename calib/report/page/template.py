@@ -7,7 +7,7 @@ from pathlib import PurePosixPath
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 
-from calib.report.figures.labels import unbroken
+from calib.report.labels import unbroken
 
 __all__ = ["template"]
 

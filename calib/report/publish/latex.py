@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 
-from calib.report.figures.labels import symbol, unit_text
+from calib.report.labels import symbol, unit_text
 
 __all__ = ["escape", "latex_symbol", "latex_unit"]
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from calib.report.figures.labels import plain, unbroken, unit_plain
+from calib.report.labels import plain, unbroken, unit_plain
 from calib.report.publish.equations import latex_equation, text_equation
 from calib.report.publish.latex import escape, latex_symbol, latex_unit
 from calib.report.publish.references import short_citation

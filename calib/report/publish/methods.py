@@ -10,7 +10,7 @@ from typing import Any
 from calib.data.labels import KNOWN_DATA
 from calib.inference.estimators import METHODS
 from calib.models import get_model
-from calib.report.figures.labels import axis_of, joined
+from calib.report.labels import axis_of, joined
 from calib.report.numbers import format_number, format_value
 from calib.report.publish.markup import joined_symbols
 from calib.report.publish.records import Output

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from calib.report.figures.labels import axis_of
+from calib.report.labels import axis_of
 from calib.report.numbers import (
     NOTHING,
     ascii_number,

@@ -12,7 +12,8 @@ from matplotlib.collections import PathCollection
 from calib.gap.where import Region
 from calib.report.figures import gap as collect
 from calib.report.figures.gap import gap_plates
-from calib.report.figures.gap_rows import (
+from calib.report.figures.gap_which import in_play, placebo_plate, placebos, probability_text
+from calib.report.gap_rows import (
     EVERYWHERE,
     best_fit,
     output_axis,
@@ -22,7 +23,6 @@ from calib.report.figures.gap_rows import (
     short_name,
     title_of,
 )
-from calib.report.figures.gap_which import in_play, placebo_plate, placebos, probability_text
 from tests.gap.cases import diagnosis_of, pull_diagnosis
 
 NAMES = ("isolability", "where", "where_conditions", "which", "how_far", "placebo", "left_over")
@@ -159,9 +159,7 @@ def test_placebos_are_on_one_noise(found):
 
 def test_placebos_do_not_depend_on_the_unit_that_is_drawn(found, monkeypatch):
     in_kn = placebos(found)
-    monkeypatch.setattr(
-        "calib.report.figures.gap_rows._SMALL_PULL", np.inf
-    )  # as a small wheel's, in N
+    monkeypatch.setattr("calib.report.gap_rows._SMALL_PULL", np.inf)  # as a small wheel's, in N
     assert output_axis(found, "drawbar_pull").unit == "N"
     assert placebos(found).before == pytest.approx(in_kn.before)
 

@@ -22,12 +22,13 @@ from calib.report.figures.estimates import distances, estimates_plate
 from calib.report.figures.learned import learned_plate
 from calib.report.figures.plate import Plate
 from calib.report.figures.prior_predictive import prior_predictive_plate
-from calib.report.figures.residuals import residuals_plate, sign_changes, standardise
-from calib.report.figures.roles import BOTH, DATA, MOVED, PRIOR, role_of
-from calib.report.figures.rows import groups, smooth_bands
+from calib.report.figures.residuals import residuals_plate
 from calib.report.figures.style import style
 from calib.report.figures.validation import validation_plate
 from calib.report.reference import NOTHING
+from calib.report.rows import groups, signs_along, smooth_bands
+from calib.validation.residuals import standardise
+from calib.validation.roles import BOTH, DATA, MOVED, PRIOR, role_of
 
 UNIT = re.compile(r"\(.+\)$")
 NAMES = ("bands", "validation", "prior_predictive", "learned", "corner", "ensembles", "residuals",
@@ -242,12 +243,12 @@ def test_prior_predictive_caption_compares_widths(rut):
 
 
 def test_residuals_are_in_noise_sds(rut):
-    residual = standardise(rut, rut.calibration.problem).residual
+    residual = standardise(rut.calibration, rut.calibration.problem).residual
     assert residual.std() == pytest.approx(1.0, abs=0.25)
-    changes, pairs = sign_changes(rut, residual)
+    changes, pairs = signs_along(rut, residual)
     assert pairs == 18 - 2
     assert 0 <= changes <= pairs
-    assert sign_changes(rut, np.ones(18)) == (0, 16)
+    assert signs_along(rut, np.ones(18)) == (0, 16)
 
 
 def with_residuals(drawbar, high, low):
@@ -256,7 +257,7 @@ def with_residuals(drawbar, high, low):
     table = problem.table
     rng = np.random.default_rng(5)
     noise = np.where(table["inflation_pressure_psi"] < 30.0, high, low)
-    predicted = standardise(drawbar, problem).predicted
+    predicted = standardise(drawbar.calibration, problem).predicted
     columns = dict(table.columns) | {
         "drawbar_pull_kn": predicted + noise * rng.standard_normal(len(table))
     }

@@ -11,16 +11,9 @@ import pytest
 from calib.gap.inclusion import Included, Inclusion, inclusion_probability
 from calib.gap.next_measurement import NextMeasurement
 from calib.inference.priors import Prior
-from calib.report.page.diagnosis import gap_evidence, render_diagnosis, write_page
-from calib.report.page.gap_sizes import size_sentences
-from calib.report.page.gap_tables import (
-    conditions_text,
-    hypothesis_groups,
-    parameter_rows,
-    parameter_text,
-    prior_text,
-)
-from calib.report.page.gap_verdict import (
+from calib.report.gap_evidence import gap_evidence
+from calib.report.gap_sizes import size_sentences
+from calib.report.gap_verdict import (
     Candidate,
     CauseFact,
     GapEvidence,
@@ -31,6 +24,14 @@ from calib.report.page.gap_verdict import (
     judge_gap,
     odds_text,
     repeats_needed,
+)
+from calib.report.page.diagnosis import render_diagnosis, write_page
+from calib.report.page.gap_tables import (
+    conditions_text,
+    hypothesis_groups,
+    parameter_rows,
+    parameter_text,
+    prior_text,
 )
 from tests.gap.cases import diagnosis_of, pull_diagnosis
 from tests.report.page.test_page import Reader
@@ -402,7 +403,7 @@ def test_what_is_unknown_is_described_by_what_it_goes_along_with():
     from calib.data import table_from_arrays
     from calib.gap.diagnose import diagnose
     from calib.gap.effects import EFFECTS
-    from calib.report.page.gap_sizes import size_sentences
+    from calib.report.gap_sizes import size_sentences
     from tests.gap.cases import PULL_ONLY, make_case
 
     # An amplifier that saturates: no reading above 0.9 kN.
@@ -433,7 +434,7 @@ def test_what_sets_in_at_low_pressure_is_said_so():
     from calib.data import table_from_arrays
     from calib.gap.diagnose import diagnose
     from calib.gap.effects import EFFECTS
-    from calib.report.page.gap_sizes import size_sentences
+    from calib.report.gap_sizes import size_sentences
     from tests.gap.cases import make_case
 
     # Below 24 psi the bead creeps on the rim: a third of the pull above 0.6 kN is lost.
@@ -460,7 +461,7 @@ def test_short_waves_are_said_so_beside_the_noise_that_is_left():
     from calib.data import table_from_arrays
     from calib.gap.diagnose import diagnose
     from calib.gap.effects import EFFECTS
-    from calib.report.page.gap_sizes import size_sentences
+    from calib.report.gap_sizes import size_sentences
     from tests.gap.cases import PULL_ONLY, make_case
 
     # Lugs that pass one by one rock the pull by 0.15 kN; the noise is a fifth of that.
@@ -494,7 +495,7 @@ def test_what_comes_and_goes_is_not_told_by_its_end(tmp_path):
     from calib.data import table_from_arrays
     from calib.gap.diagnose import diagnose
     from calib.gap.effects.load import load_effects
-    from calib.report.page.gap_sizes import size_sentences
+    from calib.report.gap_sizes import size_sentences
     from tests.gap.cases import PULL_ONLY, make_case
     from tests.gap.test_load_effects import CODE, write
 

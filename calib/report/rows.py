@@ -14,12 +14,15 @@ from calib.data.table import Table
 from calib.inference.calibration import Calibration
 from calib.inference.random import generator
 from calib.models.base import Array
-from calib.report.figures.labels import Axis, axis_of
+from calib.report.labels import Axis, axis_of
 from calib.report.study import OutputResult
 from calib.validation.prediction import Bands, bands
+from calib.validation.residuals import sign_changes
 
-__all__ = ["Group", "data_word", "grid", "group_column", "groups", "held_table", "smooth_bands",
-           "x_column"]  # fmt: skip
+__all__ = [
+    "Group", "data_word", "grid", "group_column", "groups", "held_table", "signs_along",
+    "smooth_bands", "x_column",
+]  # fmt: skip
 
 MAX_PANELS = 6
 _N_DRAWS = 1000
@@ -113,6 +116,12 @@ def groups(result: OutputResult, *, most: bool = True) -> list[Group]:
             Group(_title(axis, low, high, only_held), only_held, column, value, mine, theirs)
         )
     return _kept(found) if most else found
+
+
+def signs_along(result: OutputResult, residual: Array) -> tuple[int, int]:
+    """Count sign changes of the calibrated rows' residuals along x in each group; see there."""
+    x = result.calibration.problem.table[x_column(result)]
+    return sign_changes(x, residual, (g.fitted for g in groups(result, most=False)))
 
 
 def _kept(found: list[Group]) -> list[Group]:

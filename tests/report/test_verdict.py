@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from calib.report.page.verdict import Evidence, Level, Where, binomial_p, gather, judge_evidence
+import calib
+from calib.report.verdict import Evidence, Level, Where, binomial_p, gather, judge_evidence
 
 FINE = Evidence(
     converged=True,
@@ -192,3 +195,20 @@ def test_draws_without_values_are_not_scored(rut):
 
 def test_a_run_that_did_not_converge(unconverged):
     assert judge_evidence(gather(unconverged)).headline == "NOT CONVERGED"
+
+
+def test_a_calibration_and_its_validation_are_enough(drawbar):
+    """In Python there is a verdict without a study, a page or a figure."""
+    found = calib.verdict(drawbar.calibration, drawbar.validation)
+    said = judge_evidence(gather(drawbar))
+    assert (found.rule, found.trust, found.headline) == (said.rule, said.trust, said.headline)
+
+
+def test_verdicts_draw_nothing():
+    modules = "import sys, calib.report.verdict, calib.report.gap_evidence"
+    drawn = "sorted({'matplotlib', 'jinja2'} & set(sys.modules))"
+    found = subprocess.run(
+        [sys.executable, "-c", f"{modules}; print({drawn})"], capture_output=True, text=True,
+        check=True,
+    )  # fmt: skip
+    assert found.stdout.strip() == "[]"

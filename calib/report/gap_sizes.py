@@ -17,7 +17,7 @@ from calib.gap.noise import noise_conditions
 from calib.inference.random import generator
 from calib.models import get_model
 from calib.models.base import Array
-from calib.report.figures.gap_rows import (
+from calib.report.gap_rows import (
     EVERYWHERE,
     best_fit,
     output_axis,
@@ -25,7 +25,7 @@ from calib.report.figures.gap_rows import (
     region_text,
     unit_after,
 )
-from calib.report.figures.labels import axis_of, joined
+from calib.report.labels import axis_of, joined
 from calib.report.numbers import format_value
 
 __all__ = ["size_sentences", "where_to_look"]

@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from calib.report.figures.labels import joined
+from calib.report.labels import joined
 
 __all__ = [
     "Candidate", "GapEvidence", "GapVerdict", "NextFact", "ShrinkFact", "Tone", "WhereFact",

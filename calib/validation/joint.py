@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.models.base import Array
 
-__all__ = ["coverage_probability", "effective_rows", "ks_distance", "pit_half_width"]
+__all__ = ["coverage_probability", "effective_rows", "hits", "ks_distance", "pit_half_width"]
 
 _MAX_REPLICATES = 2000
 
@@ -51,6 +51,20 @@ def coverage_probability(draws: Array, hits: int, level: float) -> float:
     covered = (np.abs(_pit_of_draws(draws) - 0.5) <= 0.5 * level).sum(axis=1)
     # The draw that was observed counts among those possible, so it is never 0.
     return float((1 + (covered <= hits).sum()) / (1 + covered.size))
+
+
+def hits(draws: Array, observed: Array, level: float) -> int:
+    """Count the observations inside the central band of their draws.
+
+    Parameters
+    ----------
+    draws : ndarray, shape (size, n)
+    observed : ndarray, shape (n,)
+    level : float
+        Of the band.
+    """
+    low, high = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
+    return int(((observed >= low) & (observed <= high)).sum())
 
 
 def effective_rows(draws: Array) -> float:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstwo
 
-from calib.report.figures.joint import (
+from calib.validation.joint import (
     coverage_probability,
     effective_rows,
     ks_distance,

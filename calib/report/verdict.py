@@ -23,15 +23,16 @@ import numpy as np
 from scipy.stats import binomtest
 
 from calib.data.quantities import role_of
-from calib.report.figures.joint import coverage_probability, effective_rows
-from calib.report.figures.labels import axis_of, joined, percent, plain, short
-from calib.report.figures.prior_predictive import prior_hits
-from calib.report.figures.residuals import sign_changes, standardise
-from calib.report.figures.roles import MOVED, PRIOR, role
-from calib.report.figures.rows import held_table, x_column
-from calib.report.study import OutputResult
+from calib.inference.calibration import Calibration
+from calib.report.labels import axis_of, joined, percent, plain, short
+from calib.report.rows import held_table, signs_along, x_column
+from calib.report.study import OutputResult, judged
+from calib.validation.joint import coverage_probability, effective_rows, hits
+from calib.validation.residuals import standardise
+from calib.validation.roles import MOVED, PRIOR, role
+from calib.validation.validate import Validation
 
-__all__ = ["Evidence", "Level", "Verdict", "Where", "gather", "judge_evidence"]
+__all__ = ["Evidence", "Level", "Verdict", "Where", "gather", "judge_evidence", "verdict"]
 
 _SIGNIFICANT = 0.05
 _WEAK_SKILL = 0.5
@@ -231,6 +232,18 @@ def _between_two(e: Evidence, names: str, error: str) -> Verdict:
     return Verdict(Level.CARE, "extrapolated", "Curvature from the prior", trust, doubt)
 
 
+def verdict(calibration: Calibration, validation: Validation) -> Verdict:
+    """Say in a headline what can be trusted, as the pages do; nothing is drawn.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    validation : Validation
+        Of it: `calib.validate_held_out` or `calib.leave_one_out`.
+    """
+    return judge_evidence(gather(judged(calibration, validation)))
+
+
 def gather(result: OutputResult) -> Evidence:
     """Collect the evidence of a result."""
     calibration, v = result.calibration, result.validation
@@ -240,7 +253,7 @@ def gather(result: OutputResult) -> Evidence:
     complete = bool(np.isfinite(v.draws).all(axis=1).any())
     parabolic = problem.bound.model.parabolic_in
     quadratic = bool(parabolic)
-    changes, neighbours = sign_changes(result, standardise(result, problem).residual)
+    changes, neighbours = signs_along(result, standardise(calibration, problem).residual)
     scatter = float(np.mean(np.square(v.observed - problem.observed.mean())))
     return Evidence(
         converged=report.passed,
@@ -268,7 +281,7 @@ def gather(result: OutputResult) -> Evidence:
         label=problem.table.label,
         unseen_at=_unseen_at(result) if quadratic and held else Where.AT,
         at_pressures=_at_pressures(result) if quadratic else "",
-        prior_hits=prior_hits(result),
+        prior_hits=hits(result.prior_predictive, problem.observed, 0.95),
         prior_n=problem.observed.size,
         suspects=(
             "the units and the normal load"

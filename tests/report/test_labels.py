@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.report.figures.labels import (
+from calib.report.figures.learned import _log_ticks
+from calib.report.labels import (
     axis_of,
     joined,
     parameter_label,
@@ -13,7 +14,6 @@ from calib.report.figures.labels import (
     symbol,
     unit_text,
 )
-from calib.report.figures.learned import _log_ticks
 
 MINUS = "\N{MINUS SIGN}"
 TIMES = "\N{MULTIPLICATION SIGN}"

@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from matplotlib.colors import LinearSegmentedColormap
 from numpy.typing import NDArray
 
 from calib.data.quantities import OUTPUTS, role_of
@@ -15,18 +14,16 @@ from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
 from calib.gap.where import Region
 from calib.models.base import Array
-from calib.report.figures.labels import MINUS, Axis, axis_of
+from calib.report.labels import MINUS, Axis, axis_of
 
 __all__ = [
-    "EVERYWHERE", "PROBABLE", "OutputRows", "best_fit", "best_of", "output_axis",
+    "EVERYWHERE", "OutputRows", "best_fit", "best_of", "output_axis",
     "output_rows", "output_word", "panel_groups", "region_text", "short_name", "title_of",
     "unit_after",
 ]  # fmt: skip
 
 # The words for a region that covers all rows.
 EVERYWHERE = "all conditions"
-# White to dark: how probable it is that a gap exceeds the noise. It survives greyscale.
-PROBABLE = LinearSegmentedColormap.from_list("probable", ["#ffffff", "#f6c9a5", "#D55E00"])
 
 _WORDS = {
     "none": "no gap beyond the noise",

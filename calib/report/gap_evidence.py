@@ -1,0 +1,212 @@
+"""What was found about a gap, in words and few numbers: what its verdict is made from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from calib.data.quantities import role_of
+from calib.gap.diagnose import Diagnosis
+from calib.gap.inclusion import UNLISTED, Included
+from calib.gap.next_measurement import NextMeasurement
+from calib.gap.shrink import Shrink
+from calib.gap.where import Region
+from calib.models import get_model
+from calib.report.gap_rows import (
+    OutputRows,
+    best_fit,
+    best_of,
+    output_axis,
+    output_rows,
+    output_word,
+    region_text,
+    short_name,
+    title_of,
+    unit_after,
+)
+from calib.report.gap_sizes import size_sentences, where_to_look
+from calib.report.gap_verdict import (
+    Candidate,
+    CauseFact,
+    GapEvidence,
+    GapVerdict,
+    NextFact,
+    ShrinkFact,
+    WhereFact,
+    judge_gap,
+    odds_text,
+)
+from calib.report.labels import MINUS, axis_of, joined, short
+
+__all__ = [
+    "conditions_text", "gap_evidence", "gap_verdict", "region_words", "scaled_shrink",
+    "shrink_facts", "where_fact",
+]  # fmt: skip
+
+
+def gap_verdict(found: Diagnosis) -> GapVerdict:
+    """Say in a headline and a few sentences what a diagnosis found; nothing is drawn.
+
+    Parameters
+    ----------
+    found : Diagnosis
+    """
+    return judge_gap(gap_evidence(found))
+
+
+def gap_evidence(found: Diagnosis) -> GapEvidence:
+    """Collect what the verdict is made from."""
+    ranking = found.ranking
+    best = best_of(found)
+    design = ranking.isolability
+    case_context = found.data.case.context
+    alike = [
+        short_name(b if a == best else a) for a, b in design.alike if best in (a, b)
+    ]  # fmt: skip
+    return GapEvidence(
+        verdict=found.verdict,
+        ranked=[
+            Candidate(n, short_name(n), title_of(found, n), ranking.probability[n])
+            for n in ranking.order
+        ],
+        sizes=[] if found.verdict == "ambiguous" else size_sentences(found, best),
+        where=[where_fact(found, r) for r in _leading_regions(found)],
+        shrink=shrink_facts(found),
+        unfitted=found.data.case.new_conditions is not None,
+        next_facts=[
+            NextFact(
+                (short_name(m.separates[0]), short_name(m.separates[1])),
+                conditions_text(found, m),
+                m.gain_nats,
+            )
+            for m in found.next_measurements
+        ],
+        alike=alike,
+        smallest=max(design.detectable.values(), default=float("nan")),
+        look=where_to_look(found) if best == "unknown" else "",
+        causes=[_cause(found, n, c) for n, c in found.inclusion.causes.items()],
+        remainder=_cause(found, UNLISTED, found.inclusion.remainder),
+        remainder_where=_remainder_where(found),
+        put_in="; ".join(case_context.words()),
+        without=_without(found),
+    )
+
+
+def _without(found: Diagnosis) -> str:
+    """Say which causes act without what the case's context put in."""
+    if found.without_context is None:
+        return ""
+    p = found.without_context
+    leading = sorted((n for n in p if p[n] >= 0.05), key=lambda n: -p[n])[:4]
+    words = {"none": "no gap", UNLISTED: "something unlisted"}
+    return joined([f"{words.get(n, short_name(n))} ({odds_text(p[n])})" for n in leading])
+
+
+def _cause(found: Diagnosis, name: str, c: Included) -> CauseFact:
+    words = "something unlisted" if name == UNLISTED else short_name(name)
+    return CauseFact(
+        name, words, title_of(found, name), c.probability, c.share, c.share_interval
+    )  # fmt: skip
+
+
+def _remainder_where(found: Diagnosis) -> str:
+    where = found.inclusion.where[:1]
+    return "".join(f"{output_word(r.output)} at {region_text(found, r)}" for r in where)
+
+
+def region_words(found: Diagnosis, region: Region) -> tuple[str, str]:
+    """Say where a region lies, and how large the gap is there."""
+    own = output_axis(found, region.output)
+    gap = own.factor * region.gap
+    sign, way = (1.0, "above") if gap > 0.0 else (-1.0, "below")
+    low, high = sorted(sign * own.factor * end for end in region.interval)
+    spread = f"90 % interval {short(low)} to {short(high)}".replace("-", MINUS)
+    text = f"{short(abs(gap))} {own.unit} {way} the simulator ({spread})"
+    return region_text(found, region), text
+
+
+def _leading_regions(found: Diagnosis) -> list[Region]:
+    """One region of each output, along a condition of the best hypothesis if there is one."""
+    effects = best_fit(found, best_of(found)).forward.hypothesis.effects
+    wanted = {found.data.view.column(role) for e in effects for role in e.covariates}
+    leading = []
+    for o in found.data.outputs:
+        own = [r for r in found.regions if r.output == o.name]
+        own.sort(key=lambda r: not wanted & set(r.conditions))
+        leading += own[:1]
+    return leading
+
+
+def where_fact(found: Diagnosis, region: Region) -> WhereFact:
+    """Return a region as a verdict has it."""
+    place, gap = region_words(found, region)
+    return WhereFact(f"{output_word(region.output)} at {place}", gap, region.probability)
+
+
+def shrink_facts(found: Diagnosis) -> list[ShrinkFact]:
+    """Return how far the gap of each output shrinks, on the scale of its axis."""
+    facts = []
+    for own in output_rows(found):
+        s = scaled_shrink(found, own)
+        if s is not None:
+            unit = own.axis.unit
+            facts.append(
+                ShrinkFact(
+                    output_word(own.name),
+                    short(s.rmse_before),
+                    f"{short(s.rmse_after)} {unit}",
+                    f"{short(s.noise_floor)} {unit}",
+                    s.fraction,
+                    s.interval,
+                )
+            )
+    return facts
+
+
+def scaled_shrink(found: Diagnosis, own: OutputRows) -> Shrink | None:
+    """Return the shrink of an output on the scale of its axis."""
+    s, factor = found.shrink.get(own.name), own.axis.factor
+    if s is None:
+        return None
+    return replace(
+        s, rmse_before=s.rmse_before * factor, rmse_after=s.rmse_after * factor,
+        noise_floor=s.noise_floor * factor,
+    )  # fmt: skip
+
+
+def conditions_text(found: Diagnosis, measurement: NextMeasurement) -> str:
+    """Write the conditions of a measurement: those that vary, and that the hypotheses differ by."""
+    field, lab = found.data.view.conditions, found.data.case.lab.columns
+    matters = _matter(found, measurement.separates)
+    measured = {role_of(column) for column in measurement.conditions}
+    parts = []
+    for column, value in measurement.conditions.items():
+        both = np.concatenate([field[column], lab.get(column, field[column])])
+        role = role_of(column)
+        follows = role == "ground_pressure" and "pressure" in measured
+        if np.ptp(both) == 0.0 or follows or role == "order" or role not in matters:
+            continue
+        axis = axis_of(column)
+        shown = f"{100.0 * value:.0f}" if role == "slip" else _rounded(axis.factor * value)
+        parts.append(f"{axis.name.lower()} {shown.replace('-', MINUS)}{unit_after(axis)}")
+    if "order" in matters & measured:
+        parts.append("after the last run")
+    return ", ".join(parts) or "the conditions of the field campaign"
+
+
+def _matter(found: Diagnosis, names: Sequence[str]) -> set[str]:
+    """Roles of what the simulators and the effects of some hypotheses depend on."""
+    models = found.data.case.models.values()
+    matters = {role_of(c) for m in models for c in get_model(m).conditions}
+    for name in names:
+        h = best_fit(found, name).forward.hypothesis
+        if h.smooth_outputs:
+            return {role_of(c) for c in found.data.view.conditions}
+        matters |= {c for effect in h.effects for c in effect.covariates}
+    return matters
+
+
+def _rounded(value: float) -> str:
+    return f"{value:.2g}" if abs(value) < 10.0 else f"{value:.3g}"

@@ -1,0 +1,65 @@
+"""Residuals over the noise scale, and whether their signs run on along a curve."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calib.inference.calibration import Calibration
+from calib.inference.problem import Problem
+from calib.models.base import Array
+
+__all__ = ["Standardised", "sign_changes", "standardise"]
+
+_N_DRAWS = 1000
+
+
+@dataclass(frozen=True)
+class Standardised:
+    """Residuals over the noise scale, posterior means, of some rows.
+
+    Parameters
+    ----------
+    residual, predicted : ndarray, shape (n,)
+        In noise sds, on the scale of the response; the prediction is in the output's unit.
+    """
+
+    residual: Array
+    predicted: Array
+
+
+def standardise(calibration: Calibration, problem: Problem) -> Standardised:
+    """Work residuals out at the posterior.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    problem : Problem
+        Its rows: the calibrated ones or, by ``with_table``, others.
+    """
+    natural = problem.theta(calibration.subset(_N_DRAWS))
+    location = problem.bound.location(natural[:, :-1], problem.conditions)
+    residual = np.nanmean((problem.response - location) / natural[:, -1:], axis=0)
+    return Standardised(residual, problem.bound.from_response(np.nanmedian(location, axis=0)))
+
+
+def sign_changes(x: Array, residual: Array, groups: Iterable[NDArray[np.bool_]]) -> tuple[int, int]:
+    """Count sign changes of residuals along x within each group, and neighbours in all.
+
+    Independent residuals change sign between half of the neighbours; a curve that misses a
+    pattern leaves long runs of one sign.
+
+    Parameters
+    ----------
+    x, residual : ndarray, shape (n,)
+    groups : iterable of ndarray of bool, shape (n,)
+    """
+    changes, pairs = 0, 0
+    for rows in groups:
+        sign = np.sign(residual[rows][np.argsort(x[rows], kind="stable")])
+        changes += int((sign[1:] != sign[:-1]).sum())
+        pairs += max(0, sign.size - 1)
+    return changes, pairs
