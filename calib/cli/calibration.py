@@ -293,7 +293,7 @@ def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | No
         return
     print(",".join(columns))
     for row in zip(*columns.values(), strict=True):
-        print(",".join(f"{value:.6g}" for value in row))
+        print(",".join(v if isinstance(v, str) else f"{v:.6g}" for v in row))
 
 
 def data(

@@ -20,6 +20,7 @@ from calib.data.quantities import OUTPUTS, columns_of, output_of, physical_role
 from calib.errors import CalibError
 from calib.gap.context import Context, read_context
 from calib.gap.covariates import Covariates
+from calib.gap.declared import declared_covariates, with_declared
 from calib.gap.effects import View
 from calib.gap.noise import NoiseConditions, noise_conditions, noise_conditions_of_lab
 from calib.gap.oddities import identical_rows
@@ -38,7 +39,7 @@ __all__ = [
 MIN_FIELD_ROWS = 5
 MAX_RATIO = 100.0
 _FILES = ("calibration", "field", "predict")
-_KEYS = (*_FILES, "models", "priors", "context")
+_KEYS = (*_FILES, "models", "priors", "covariates", "context")
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,8 @@ class Case:
         What is known besides the data.
     priors : mapping of str to DeclaredPriors
         Of an output's simulator, as its prior file says; the model's own where there is none.
+    covariates : mapping of str to tuple of str
+        Columns that the case declares: the values of a category, none for numbers.
     """
 
     name: str
@@ -70,6 +73,7 @@ class Case:
     notes: tuple[str, ...] = ()
     context: Context = dataclasses.field(default_factory=Context)
     priors: Mapping[str, DeclaredPriors] = dataclasses.field(default_factory=dict)
+    covariates: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -223,7 +227,11 @@ def read_case(folder: Path) -> Case:
     new = read_table(_inside(folder, "predict", content)) if content.get("predict") else None
     context = read_context(content.get("context"), str(path))
     priors = _read_priors(folder, content.get("priors", {}), models)
-    return Case(folder.name, lab, field, models, new, (), context, priors)
+    tables = (lab, field) if new is None else (lab, field, new)
+    own = declared_covariates(content.get("covariates", {}), tables)
+    lab, field = with_declared(lab, own), with_declared(field, own)
+    new = None if new is None else with_declared(new, own)
+    return Case(folder.name, lab, field, models, new, (), context, priors, own)
 
 
 def _read_priors(

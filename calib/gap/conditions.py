@@ -59,6 +59,8 @@ def without_far_conditions(case: Case) -> tuple[Case, list[str]]:
     for name in case.field:
         if role_of(name) == _ANY or name in OUTPUTS.values() or name not in case.lab:
             continue
+        if case.covariates.get(name):  # a category has no distances
+            continue
         far = _far(np.concatenate([lab[name], field[name]]))
         in_lab, in_field = (np.flatnonzero(part) for part in (far[: len(lab)], far[len(lab) :]))
         if in_lab.size:

@@ -18,6 +18,7 @@ from calib.data import Table, write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import Campaigns, campaigns, read_case
+from calib.gap.declared import cells, with_declared
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
@@ -73,11 +74,11 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
     case = corrected.data.case
     inner = folder / "case"
     inner.mkdir()
-    write_table(inner / "lab.csv", case.lab.columns)
-    write_table(inner / "field.csv", case.field.columns)
+    write_table(inner / "lab.csv", cells(case.lab.columns, case.covariates))
+    write_table(inner / "field.csv", cells(case.field.columns, case.covariates))
     files = ["calibration", "field"]
     if case.new_conditions is not None:
-        write_table(inner / "fresh.csv", case.new_conditions.columns)
+        write_table(inner / "fresh.csv", cells(case.new_conditions.columns, case.covariates))
         files.append("predict")
     names = {"calibration": "lab.csv", "field": "field.csv", "predict": "fresh.csv"}
     lines = [f'{name} = "{names[name]}"' for name in files]
@@ -86,6 +87,9 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
     for output, priors in case.priors.items():
         (inner / f"{output}_priors.toml").write_text(priors.text, encoding="utf-8")
         lines.append(f'{output} = "{output}_priors.toml"')
+    lines += ["", "[covariates]"] if case.covariates else []
+    for name, levels in case.covariates.items():
+        lines.append(f"{json.dumps(name)} = {json.dumps(list(levels) or 'number')}")
     (inner / "case.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     content = {
         "schema": SCHEMA,
@@ -245,16 +249,17 @@ def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
         Rows outside by condition; those without any are left out.
     """
     case = corrected.data.case
+    table = with_declared(table, case.covariates)
     known = {
         name: np.concatenate([t[name] for t in (case.lab, case.field) if name in t])
         for name in corrected.data.view.conditions
-        if name not in OUTPUTS.values() and name in table
+        if name not in OUTPUTS.values() and name in table and not case.covariates.get(name)
     }
     beyond = outside(known, {name: table[name] for name in known})
     return dict(Counter(name for row in beyond for name in row))
 
 
-def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array]:
+def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array | list[str]]:
     """Lay out a prediction at new conditions: conditions, before, after, 90 % predictive band.
 
     Parameters
@@ -268,6 +273,7 @@ def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array]:
     CalibError
         If a condition is missing.
     """
+    table = with_declared(table, corrected.data.case.covariates)
     needed = corrected.data.view.conditions
     order = corrected.data.view.column("order")
     missing = [n for n in needed if n not in table and n not in (*OUTPUTS.values(), order)]
@@ -281,9 +287,8 @@ def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array]:
         # A drift is predicted as it stood at the end of the campaign.
         conditions[order] = np.full(len(table), corrected.data.view.order_range[1])
     truth = corrected.mixture.at(corrected.data.at_conditions(conditions))
-    columns: dict[str, Array] = {
-        n: v for n, v in table.columns.items() if n not in OUTPUTS.values()
-    }
+    recorded = {n: v for n, v in table.columns.items() if n not in OUTPUTS.values()}
+    columns = cells(recorded, corrected.data.case.covariates)
     for name, p in predict_new(truth, corrected.calibrated(conditions)).items():
         column = OUTPUTS[name]
         columns |= {

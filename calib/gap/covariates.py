@@ -29,7 +29,7 @@ _KNOWN = ("slip", "order", "speed", "passes", "load", "cone", "ground_pressure",
 
 def columns_over(what: str) -> tuple[str, ...]:
     """Return the columns of what something may vary with, the one to be preferred first."""
-    return tuple(c for role in _OVER.get(what, (what,)) for c in columns_of(role))
+    return tuple(c for role in _OVER.get(what, (what,)) for c in columns_of(role) or (role,))
 
 
 def other_conditions(view: View) -> tuple[str, ...]:

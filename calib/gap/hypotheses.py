@@ -13,7 +13,7 @@ from calib.gap.case import Campaigns
 from calib.gap.covariates import columns_over, other_conditions
 from calib.gap.discrepancy import SETTINGS
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.dependence import DependsOn
+from calib.gap.effects.dependence import DependsOn, DiffersBy
 from calib.gap.hypothesis import Hypothesis, OnsetOver, SmoothOver
 from calib.gap.shifts import ShiftAs
 from calib.inference.prior_files import (
@@ -141,7 +141,23 @@ def dependences(data: Campaigns) -> dict[str, Effect]:
         if logs and both.size and np.isfinite(values).all() and np.ptp(both) > 1e-9:
             effect = DependsOn(quantity.physical, quantity.stem, logs, 0.5 * float(np.ptp(both)))
             found.setdefault(effect.name, effect)
-    return found
+    return found | _declared(data)
+
+
+def _declared(data: Campaigns) -> dict[str, Effect]:
+    """Return what may depend on each column that the case declares."""
+    logs = {o.role: o.problem.bound.model.response == "log" for o in data.outputs}
+    found: list[Effect] = []
+    for name, levels in data.case.covariates.items():
+        lab, field = data.case.lab[name], data.view.conditions[name]
+        if levels:
+            codes, counts = np.unique(lab, return_counts=True)
+            usual = int(codes[np.argmax(counts)])
+            found.append(DiffersBy(name, levels, logs, usual))
+        else:
+            half = 0.5 * float(np.ptp(np.append(lab, field)))
+            found.append(DependsOn(name, name, logs, max(half, 1e-12)))
+    return {effect.name: effect for effect in found}
 
 
 def covered(effect: Effect, listed: Collection[str]) -> bool:
@@ -151,9 +167,9 @@ def covered(effect: Effect, listed: Collection[str]) -> bool:
 
 def inseparable(data: Campaigns, effect: Effect) -> bool:
     """Whether a dependence is on a condition that differs between the campaigns only."""
-    if not isinstance(effect, DependsOn):
+    if not isinstance(effect, DependsOn | DiffersBy):
         return False
-    return bool(np.ptp(data.view.of(effect.role)) < 1e-9)
+    return bool(np.ptp(data.view.of(effect.covariates[0])) < 1e-9)
 
 
 def singles(data: Campaigns, effects: Mapping[str, Effect]) -> list[Hypothesis]:

@@ -37,6 +37,8 @@ def inputs_record(case: Case, seed: int, effects: Mapping[str, bytes] | None = N
     }
     if case.context:
         content["context"] = case.context.words()
+    if case.covariates:
+        content["covariates"] = {name: list(v) for name, v in case.covariates.items()}
     if case.priors:
         content["priors"] = {name: sha256(p.read_bytes()) for name, p in case.priors.items()}
     if effects:

@@ -51,7 +51,7 @@ class View:
 
     def column(self, role: str) -> str | None:
         """Return the recorded column of a physical role; None if there is none."""
-        return next((c for c in columns_of(role) if c in self.conditions), None)
+        return next((c for c in (*columns_of(role), role) if c in self.conditions), None)
 
     def of(self, role: str) -> Array:
         """Return recorded values by their physical role, shape (n,)."""

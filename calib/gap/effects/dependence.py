@@ -8,11 +8,14 @@ of it count (normal load, speed), else the difference over half the range of bot
 
 with c, b of each output, and a of the pull. Forces on a wheel are nearly proportional to the load
 (c = 1), by dimensional analysis at constant contact pressure; about that c is free.
+
+Of a category (operator, site) each value has a factor of its own, ln z' = ln z + d_j or
+y' = y exp(d_j) + a_j W, with none for the one that is most frequent in the laboratory.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -20,7 +23,7 @@ from calib.data.quantities import QUANTITIES, columns_of
 from calib.gap.effects.base import Effect, View
 from calib.models.base import Array
 
-__all__ = ["PREFIX", "DependsOn"]
+__all__ = ["PREFIX", "DependsOn", "DiffersBy"]
 
 PREFIX = "depends_on_"
 # Roles of outputs that are forces on the wheel.
@@ -104,3 +107,60 @@ class DependsOn(Effect):
     def shape(self, view: View) -> Array | None:
         """The condition itself."""
         return self.covariate(view)
+
+
+class DiffersBy(Effect):
+    """The output differs between the values of a recorded category.
+
+    Parameters
+    ----------
+    column : str
+        Of the category, as the places of its values in a list.
+    levels : sequence of str
+        Its values.
+    logs : mapping of str to bool
+        Physical roles of the outputs, and whether their logarithms are compared.
+    usual : int
+        Place of the value that is most frequent in the laboratory.
+    """
+
+    form = ("slip", "pressure")
+
+    def __init__(
+        self, column: str, levels: Sequence[str], logs: Mapping[str, bool], usual: int
+    ) -> None:
+        self.column, self.logs, self.usual = column, dict(logs), usual
+        self.name = f"{PREFIX}{column}"
+        self.title = f"the output differs by {column.replace('_', ' ')}"
+        self.outputs = tuple(logs)
+        self.covariates = (column,)
+        self._levels = [j for j in range(len(levels)) if j != usual]
+        self._additive = tuple(o for o, log in logs.items() if not log and o in _FORCES)
+        self.parameters = (
+            *(f"{output}_factor_{j}" for output in logs for j in self._levels),
+            *(f"{output}_offset_{j}" for output in self._additive for j in self._levels),
+        )
+        self.priors = f'model = "{self.name}"\n' + "".join(
+            f'\n[parameters.{p}]\ndist = "normal"\nmean = 0.0\n'
+            f'sd = {0.02 if "_offset_" in p else 0.3}\nunit = "1"\n'
+            f'reason = "Difference of {column} number {p.rsplit("_", 1)[1]} from the usual one"\n'
+            'source = "Of the order of the scatter between laboratories and operators"\n'
+            for p in self.parameters
+        )
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Scale the output by the factor of each row's value."""
+        if output not in self.logs:
+            return location
+        code = np.rint(view.of(self.column)).astype(int)
+        hot = np.array([code == j for j in self._levels], dtype=float)
+        size = len(self._levels)
+        start = size * list(self.logs).index(output)
+        change = np.clip(phi[:, start : start + size] @ hot, -4.0, 4.0)
+        if self.logs[output]:
+            return np.asarray(location + change)
+        changed = location * np.exp(change)
+        if output in self._additive:
+            start = size * (len(self.logs) + self._additive.index(output))
+            changed = changed + phi[:, start : start + size] @ hot * view.load_kn
+        return np.asarray(changed)

@@ -1,0 +1,126 @@
+"""Columns that a case declares: what goes with them is found, named and used for prediction."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.data import read_table
+from calib.errors import CalibError
+from calib.gap.case import read_case
+from calib.gap.corrected import load_corrected, predict_columns, save_corrected
+from calib.gap.diagnose import diagnose_once
+from calib.gap.effects import EFFECTS
+from tests.gap.cases import PULL_ONLY, make_case, write_case
+
+FEW = {name: EFFECTS[name] for name in ("force_offset", "sensor_drift", "slip_zero_shift")}
+PULL = "drawbar_pull_kn"
+
+
+def case_with(folder, name, lab, field, kind, gap=None):
+    """Write a case with one more column; a relative change of the field's pull goes with it."""
+    made = make_case(None, models=PULL_ONLY, n_field=36)
+    pull = np.array(made.field[PULL]) * np.exp(np.zeros(36) if gap is None else gap)
+    columns = {**made.field.columns, PULL: pull}
+    write_case(replace(made, field=replace(made.field, columns=columns)), folder)
+    for file, values in (("lab.csv", lab), ("field.csv", field)):
+        with (folder / file).open(newline="") as read:
+            rows = list(csv.reader(read))
+        cells = [name, *values(len(rows) - 1)]
+        with (folder / file).open("w", newline="") as write:
+            csv.writer(write).writerows([*row, cell] for row, cell in zip(rows, cells, strict=True))
+    with (folder / "case.toml").open("a") as file:
+        file.write(f"\n[covariates]\n{name} = {kind}\n")
+    return folder
+
+
+def temperatures(n):
+    return np.linspace(12.0, 31.0, n)[np.random.default_rng(3).permutation(n)]
+
+
+def operators(n):
+    return [("Lind", "Berg", "Dahl")[i % 3] for i in range(n)]
+
+
+def saved(found, tmp_path):
+    (tmp_path / "out").mkdir()
+    save_corrected(found.corrected, tmp_path / "out")
+    return load_corrected(tmp_path / "out", FEW)
+
+
+def test_a_number_that_the_simulator_ignores_is_found(tmp_path):
+    u = (temperatures(36) - 20.0) / 10.0
+    folder = case_with(
+        tmp_path / "case", "tyre_temperature_c", lambda n: np.full(n, 20.0), temperatures,
+        '"number"', 0.35 * u,
+    )  # fmt: skip
+    found = diagnose_once(read_case(folder), 1, effects=FEW)
+    assert found.inclusion.causes["depends_on_tyre_temperature_c"].probability > 0.9
+    assert found.ranking.order[0] == "depends_on_tyre_temperature_c"
+    again = saved(found, tmp_path)
+    assert again.data.case.covariates == {"tyre_temperature_c": ()}
+    at = predict_columns(again, read_table(folder / "field.csv"))
+    before, after = at[f"{PULL}_before"], at[f"{PULL}_after"]
+    warm = temperatures(36) > 27.0
+    assert (after[warm] > before[warm]).all()
+
+
+def test_a_category_is_found_and_kept_by_its_names(tmp_path):
+    gap = 0.5 * np.array([name == "Dahl" for name in operators(36)])
+    folder = case_with(tmp_path / "case", "operator", operators, operators, '"category"', gap)
+    found = diagnose_once(read_case(folder), 1, effects=FEW)
+    assert found.data.case.covariates == {"operator": ("Berg", "Dahl", "Lind")}
+    assert found.inclusion.causes["depends_on_operator"].probability > 0.9
+    again = saved(found, tmp_path)
+    at = predict_columns(again, read_table(folder / "field.csv"))
+    assert at["operator"] == operators(36)
+    ratio = at[f"{PULL}_after"] / at[f"{PULL}_before"]
+    slips = again.data.view.slip() > 0.2
+    dahl = np.array([name == "Dahl" for name in operators(36)])
+    assert np.median(ratio[dahl & slips]) > 1.2 * np.median(ratio[~dahl & slips])
+
+
+def test_what_nothing_goes_with_is_not_named(tmp_path):
+    folder = case_with(tmp_path / "case", "operator", operators, operators, '"category"')
+    found = diagnose_once(read_case(folder), 1, effects=FEW)
+    assert found.inclusion.causes["depends_on_operator"].probability < 0.2
+    assert found.verdict == "none"
+
+
+def test_a_category_that_differs_between_the_campaigns_only_cannot_be_separated(tmp_path):
+    folder = case_with(
+        tmp_path / "case", "site", lambda n: ["barn"] * n, lambda n: ["field"] * n, '"category"',
+        np.full(36, 0.4),
+    )  # fmt: skip
+    found = diagnose_once(read_case(folder), 1, effects=FEW)
+    assert any("site: this condition is one value" in w for w in found.warnings) or any(
+        "depends_on_site" in w and "cannot be separated" in w for w in found.warnings
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "said"),
+    [
+        ("operator", '"word"', '"number", "category"'),
+        ("operator", '"number"', "operator is 'Lind'"),
+        ("operator", '["Lind", "Berg"]', "operator is 'Dahl'"),
+        ("speed_m_s", '"number"', "a quantity that is known"),
+    ],
+)
+def test_what_is_declared_wrongly_is_refused(tmp_path, name, kind, said):
+    folder = case_with(tmp_path / "case", "operator", operators, operators, '"category"')
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text(text.replace('operator = "category"', f"{name} = {kind}"))
+    with pytest.raises(CalibError, match=said):
+        read_case(folder)
+
+
+def test_a_column_that_is_not_there_is_refused(tmp_path):
+    folder = case_with(tmp_path / "case", "operator", operators, operators, '"category"')
+    text = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text(text.replace("operator =", "driver ="))
+    with pytest.raises(CalibError, match="there is no column 'driver'"):
+        read_case(folder)
