@@ -12,6 +12,7 @@ from calib.batch.environment import code_sha256, sha256
 from calib.errors import CalibError
 from calib.gap.case import Case, case_files
 from calib.gap.context import read_context
+from calib.gap.declared import NUMBER
 
 __all__ = ["INPUTS", "case_hashes", "check_resumable", "inputs_record", "recorded_inputs"]
 
@@ -38,7 +39,7 @@ def inputs_record(case: Case, seed: int, effects: Mapping[str, bytes] | None = N
     if case.context:
         content["context"] = case.context.words()
     if case.covariates:
-        content["covariates"] = {name: list(v) for name, v in case.covariates.items()}
+        content["covariates"] = _kinds(case.covariates)
     if case.priors:
         content["priors"] = {name: sha256(p.read_bytes()) for name, p in case.priors.items()}
     if effects:
@@ -82,8 +83,19 @@ def case_hashes(folder: Path) -> dict[str, Any]:
         context = read_context(content.get("context"), str(folder)).words() or None
     except CalibError:
         context = ["it cannot be read"]
-    models = content.get("models")
-    return {"models": models, "sha256": hashes, "context": context, "priors": priors}
+    own = content.get("covariates")
+    return {
+        "models": content.get("models"), "sha256": hashes, "context": context, "priors": priors,
+        "covariates": (_kinds(own) if isinstance(own, dict) else own) or None,
+    }  # fmt: skip
+
+
+def _kinds(covariates: Mapping[str, object]) -> dict[str, str]:
+    """Say of declared columns which hold numbers; the values of a category are in the files."""
+    return {
+        name: "number" if kind in ("number", NUMBER) else "category"
+        for name, kind in covariates.items()
+    }
 
 
 def check_resumable(cases: Sequence[Path], out: Path, seed: int) -> None:

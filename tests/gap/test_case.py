@@ -237,6 +237,7 @@ def test_a_case_of_a_run_has_the_priors_of_the_run(tmp_path):
     text = narrow_priors(default_priors(model).read_text(encoding="utf-8"))
     problem = build_problem(model, made.lab, DeclaredPriors("mine.toml", text))
     run = tmp_path / "run"
+    run.mkdir()
     save_calibration(calibrate(problem, 1), run)
     write_table(tmp_path / "field.csv", dict(made.field.columns))
     case = case_from_run(run, tmp_path / "field.csv")

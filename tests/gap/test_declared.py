@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +15,7 @@ from calib.gap.case import read_case
 from calib.gap.corrected import load_corrected, predict_columns, save_corrected
 from calib.gap.diagnose import diagnose_once
 from calib.gap.effects import EFFECTS
+from calib.gap.provenance import case_hashes, inputs_record
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 FEW = {name: EFFECTS[name] for name in ("force_offset", "sensor_drift", "slip_zero_shift")}
@@ -74,6 +76,8 @@ def test_a_category_is_found_and_kept_by_its_names(tmp_path):
     found = diagnose_once(read_case(folder), 1, effects=FEW)
     assert found.data.case.covariates == {"operator": ("Berg", "Dahl", "Lind")}
     assert found.inclusion.causes["depends_on_operator"].probability > 0.9
+    recorded = json.loads(inputs_record(found.data.case, 1))
+    assert recorded["covariates"] == case_hashes(folder)["covariates"] == {"operator": "category"}
     again = saved(found, tmp_path)
     at = predict_columns(again, read_table(folder / "field.csv"))
     assert at["operator"] == operators(36)

@@ -34,7 +34,8 @@ def test_the_record_of_a_case_is_what_its_folder_holds(diagnosed):
     case, out = diagnosed
     said = recorded_inputs(out / "case-0")
     assert said is not None
-    assert {key: said.get(key) for key in ("models", "sha256", "context")} == case_hashes(case)
+    kept = ("models", "sha256", "context", "priors", "covariates")
+    assert {key: said.get(key) for key in kept} == case_hashes(case)
     assert set(said["sha256"]) == {"calibration", "field", "predict"}
     check_resumable([case], out, 1)
 

@@ -334,8 +334,8 @@ def test_a_null_has_a_quiet_page():
 
 
 def test_warnings_and_names_of_the_case_are_shown_and_escaped(found):
-    case = replace(found.data.case, name="a <b>", warnings=("mind the <gap>",))
-    other = replace(found, data=replace(found.data, case=case))
+    case = replace(found.data.case, name="a <b>")
+    other = replace(found, data=replace(found.data, case=case), warnings=("mind the <gap>",))
     html = render_diagnosis(other, [], {}, manifest={})
     assert "mind the &lt;gap&gt;" in html
     assert "a &lt;b&gt;" in html
