@@ -15,13 +15,15 @@ from scipy.special import ndtr
 from scipy.stats import rankdata
 
 from challenge.files import OUTPUT_COLUMNS
-from challenge.mechanism import NONE, UNKNOWN
+from challenge.mechanism import NONE, SHIFT, UNKNOWN
 
 type Array = NDArray[np.float64]
 
 FAILED = "failed"
 # Below one noise sd there is no gap on an output whose shrink would mean anything.
 GAP_ON_OUTPUT = 1.0
+# A cause that adds less than so many noise sds (rms) need not be found.
+ASKED_FOR = 1.25
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,41 @@ class ShrinkAnswer:
 
 
 @dataclass(frozen=True)
+class CauseAnswer:
+    """One cause of one case.
+
+    Attributes
+    ----------
+    name : str
+        Of a listed effect or another cause that was considered; ``unknown`` for what is unlisted.
+    probability : float
+        That it acts, as stated.
+    contribution : float
+        To the true gap, in noise sds; 0 where it does not act.
+    share : float
+        Its true part of the gap.
+    interval : tuple of float
+        The stated 90 % interval of that.
+    """
+
+    name: str
+    probability: float
+    contribution: float
+    share: float
+    interval: tuple[float, float]
+
+    @property
+    def acts(self) -> bool | None:
+        """Whether it acts; None where what it does is too little to be asked for."""
+        return self.contribution > 0.0 if not 0.0 < self.contribution < ASKED_FOR else None
+
+    @property
+    def covered(self) -> bool:
+        """Whether the stated interval holds the true share."""
+        return self.interval[0] <= self.share <= self.interval[1]
+
+
+@dataclass(frozen=True)
 class CaseAnswer:
     """What was said of one case and what was true.
 
@@ -74,6 +111,8 @@ class CaseAnswer:
         Probability that one who knows the truth and its nearest rival, both equally probable, and
         what each does on this design, chooses the truth (linearised); None where nobody worked
         that out.
+    causes : tuple of CauseAnswer
+        Every cause that was considered or acts; empty where the key or the diagnosis does not say.
     """
 
     case: str
@@ -86,6 +125,7 @@ class CaseAnswer:
     outputs: tuple[str, ...]
     problem: str = ""
     told_apart: float | None = None
+    causes: tuple[CauseAnswer, ...] = ()
 
     @property
     def called(self) -> str:
@@ -246,8 +286,29 @@ def read_answer(name: str, entry: dict[str, Any], folder: Path) -> CaseAnswer:
     located = None if entry["truth"] == NONE else located
     return CaseAnswer(
         name, entry["tier"], entry["truth"], verdict, ranked, located, shrinks, outputs,
-        told_apart=_told_apart(entry),
+        told_apart=_told_apart(entry), causes=_causes(entry, diagnosis),
     )  # fmt: skip
+
+
+def _causes(entry: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> tuple[CauseAnswer, ...]:
+    """Hold inclusion probabilities and shares against what truly acts."""
+    if "contributions" not in entry or "inclusion" not in diagnosis:
+        return ()
+    true = dict(entry["contributions"])
+    if entry["truth"] in (UNKNOWN, SHIFT):
+        true = {entry["truth"]: float(entry["gap_over_noise"])}
+    said = {**diagnosis["inclusion"], UNKNOWN: diagnosis["remainder"]}
+    total = sum(true.values())
+    return tuple(
+        CauseAnswer(
+            name,
+            float(said.get(name, {}).get("probability", 0.0)),
+            true.get(name, 0.0),
+            true.get(name, 0.0) / total if total else 0.0,
+            tuple(said.get(name, {}).get("share_interval", (0.0, 0.0))),
+        )
+        for name in dict.fromkeys([*said, *true])
+    )
 
 
 def _told_apart(entry: Mapping[str, Any]) -> float | None:

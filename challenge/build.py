@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,14 +21,17 @@ type Array = NDArray[np.float64]
 type AtStrength = Callable[[float], Reality]
 type Kinds = tuple[EffectKind, ...]
 
-SMALLEST_GAP, LARGEST_GAP = 2.0, 6.0
+# Noise sds, by tier.
+SMALLEST_GAP: Mapping[Tier, float] = {"easy": 2.0, "hard": 2.0, "large": 5.0}
+LARGEST_GAP: Mapping[Tier, float] = {"easy": 6.0, "hard": 6.0, "large": 30.0}
+# Of each of several effects, beside the others.
 OWN_GAP = 1.0
 # One effect alone is drawn with a little more than the smallest gap, each of two with less and
 # over a part of the range, the second's place in it near the first's.
-SINGLE_FLOOR, PAIR_FLOOR = 1.06 * SMALLEST_GAP, 1.3 * OWN_GAP
+SINGLE_FLOOR, PAIR_FLOOR = 1.06, 1.3 * OWN_GAP
 PAIR_SPAN, PAIR_SPREAD = 0.85, 0.3
 ISOLABLE_NATS, ABSORBABLE_NATS, RIVAL_NATS = 6.0, 2.0, 2.0
-UNLISTED_NATS = {"easy": 12.0, "hard": 8.0}
+UNLISTED_NATS = {"easy": 12.0, "hard": 8.0, "large": 8.0}
 DENSITY_ODDITY = 0.4
 CLOSE = 0.04
 
@@ -49,6 +52,8 @@ class DrawnCase:
         Rms of the gap in noise sd.
     told : Identifiability
         What the gap allows to tell.
+    contributions : dict
+        Listed effect to the rms of what goes from the gap without it, in noise sd.
     """
 
     scenario: Scenario
@@ -58,6 +63,7 @@ class DrawnCase:
     fresh_truth: Readings
     gap_over_noise: float
     told: Identifiability
+    contributions: dict[str, float]
 
 
 def scale_to(
@@ -121,7 +127,8 @@ def _effect(
     def at(strength: float) -> Reality:
         return scenario.reality.with_mechanisms(family.at(sign * strength))
 
-    return scale_to(scenario, at, (family.low, family.high), low, LARGEST_GAP, place)
+    largest = LARGEST_GAP[scenario.design.tier]
+    return scale_to(scenario, at, (family.low, family.high), low, largest, place)
 
 
 def _shift(
@@ -133,16 +140,18 @@ def _shift(
         return shifted(scenario.reality, change, amount)
 
     amounts = SMALLEST_AMOUNT, LARGEST_AMOUNT
-    reality = scale_to(scenario, at, amounts, SINGLE_FLOOR, LARGEST_GAP, place)
+    tier = scenario.design.tier
+    low, high = SINGLE_FLOOR * SMALLEST_GAP[tier], LARGEST_GAP[tier]
+    reality = scale_to(scenario, at, amounts, low, high, place)
     return None if reality is None else (reality, sentence)
 
 
-def _pair(
+def _several(
     rng: np.random.Generator, scenario: Scenario, kinds: Kinds, place: float
 ) -> tuple[Reality, str] | None:
-    """Draw two effects that both matter: neither vanishes on its own nor beside the other."""
-    other = place + rng.uniform(-PAIR_SPREAD, PAIR_SPREAD)
-    places = (place, float(np.clip(other, 0.0, 1.0)))
+    """Draw effects that all matter: none vanishes on its own nor beside the others."""
+    others = [place + rng.uniform(-PAIR_SPREAD, PAIR_SPREAD) for _ in kinds[1:]]
+    places = (place, *(float(np.clip(other, 0.0, 1.0)) for other in others))
     singles = []
     for kind, each in zip(kinds, places, strict=True):
         single = _effect(rng, scenario, kind, PAIR_FLOOR, PAIR_SPAN * each)
@@ -151,11 +160,26 @@ def _pair(
         singles.append(single)
     mechanisms = tuple(single.mechanisms[0] for single in singles)
     both = scenario.reality.with_mechanisms(*mechanisms)
-    got = scenario.in_field(both)
-    beside = [rms(scenario.gap(got, scenario.in_field(single))) for single in singles]
-    if rms(scenario.gap(got)) < SMALLEST_GAP or min(beside) < OWN_GAP:
+    gap = rms(scenario.gap(scenario.in_field(both)))
+    if gap < SMALLEST_GAP[scenario.design.tier] or min(_beside(scenario, both)) < OWN_GAP:
         return None
     return both, "; ".join(mechanism.sentence for mechanism in mechanisms)
+
+
+def _beside(scenario: Scenario, reality: Reality) -> list[float]:
+    """Rms of what goes from the gap without each mechanism, in noise sd."""
+    got, all_of_them = scenario.in_field(reality), reality.mechanisms
+    return [
+        rms(
+            scenario.gap(
+                got,
+                scenario.in_field(
+                    scenario.reality.with_mechanisms(*(m for m in all_of_them if m is not gone))
+                ),
+            )
+        )
+        for gone in all_of_them
+    ]
 
 
 def _reality(
@@ -168,8 +192,9 @@ def _reality(
     if truth == SHIFT:
         return _shift(rng, scenario, place)
     if len(kinds) > 1:
-        return _pair(rng, scenario, kinds, place)
-    reality = _effect(rng, scenario, kinds[0], SINGLE_FLOOR, place)
+        return _several(rng, scenario, kinds, place)
+    floor = SINGLE_FLOOR * SMALLEST_GAP[scenario.design.tier]
+    reality = _effect(rng, scenario, kinds[0], floor, place)
     return None if reality is None else (reality, reality.mechanisms[0].sentence)
 
 
@@ -232,9 +257,9 @@ def try_case(
     rng : numpy.random.Generator
         Source of randomness.
     tier : str
-        ``easy`` or ``hard``.
+        ``easy``, ``hard`` or ``large``.
     truth : str
-        ``none``, ``unknown``, ``parameter_shift``, a listed effect or two joined by ``+``.
+        ``none``, ``unknown``, ``parameter_shift``, a listed effect or several joined by ``+``.
     unlisted : EffectKind, optional
         Which unlisted mechanism acts where the truth is ``unknown``; any by default.
 
@@ -263,4 +288,7 @@ def try_case(
     told = _telling(rng, scenario, gap, truth, kinds)
     if told is None:
         return None
-    return DrawnCase(scenario, truth, sentence, field, fresh, rms(gap), told)
+    named = [kind.name for kind in kinds] if truth != UNKNOWN else []
+    each = _beside(scenario, reality) if named else []
+    contributions = dict(zip(named, each, strict=True))
+    return DrawnCase(scenario, truth, sentence, field, fresh, rms(gap), told, contributions)

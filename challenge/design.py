@@ -13,10 +13,12 @@ from challenge.tyre import PSI_KPA
 
 type Array = NDArray[np.float64]
 
-Tier = Literal["easy", "hard"]
+Tier = Literal["easy", "hard", "large"]
+TIERS: tuple[Tier, ...] = ("easy", "hard", "large")
 
 PAPER_SLIPS = (0.0, 2.5, 5.0, 7.5, 10.0, 12.5, 15.0, 17.5, 20.0, 30.0, 40.0, 50.0, 60.0, 70.0)
 PAPER_KPA = tuple(round(psi * PSI_KPA, 3) for psi in (18.0, 30.0, 42.0))
+NOISES = ("normal", "heavy", "rounded", "autocorrelated")
 _EASY_ROWS = 36
 _HARD_ROWS = (14, 16, 20, 24, 28, 32, 36)
 
@@ -54,12 +56,30 @@ class Noise:
         Drawbar pull and density absolute, rut depth as a fraction of itself.
     growth : float
         Relative growth of the wheel's readings per unit of slip.
+    kind : {"normal", "heavy", "rounded", "autocorrelated"}
+        Of its law: normal; Student's t with four degrees of freedom, of the same sd; normal and
+        rounded to two sds; or with a correlation of 0.5 between successive runs.
     """
 
     drawbar_kn: float
     rut_fraction: float
     density_g_cm3: float
     growth: float
+    kind: str = "normal"
+
+    def draw(self, rng: np.random.Generator, sd: Array) -> Array:
+        """Draw the noise of successive readings, shape ``(N,)``."""
+        if self.kind == "heavy":
+            return np.asarray(sd * rng.standard_t(4.0, sd.size) / np.sqrt(2.0))
+        z = rng.standard_normal(sd.size)
+        if self.kind == "autocorrelated":
+            for i in range(1, sd.size):
+                z[i] = 0.5 * z[i - 1] + np.sqrt(0.75) * z[i]
+        return np.asarray(sd * z)
+
+    def step(self, sd: Array) -> float:
+        """Return what readings are rounded to; zero where that is finer than the noise."""
+        return 2.0 * float(np.median(sd)) if self.kind == "rounded" else 0.0
 
     def sd(self, output: str, reading: Array, slip: Array) -> Array:
         """Return the noise sd per row, shape ``(N,)``, for noise-free readings ``(N,)``."""
@@ -78,7 +98,7 @@ class Design:
     Attributes
     ----------
     tier : str
-        ``easy`` or ``hard``.
+        ``easy``, ``hard`` or ``large``.
     models : dict
         Output to the model that was calibrated, in the order of the case file.
     inflation_kpa, lab_slips : tuple of float
@@ -218,6 +238,7 @@ def _draw_noise(rng: np.random.Generator, tier: Tier) -> Noise:
         rut_fraction=float(rng.uniform(0.03, 0.055)),
         density_g_cm3=float(rng.uniform(0.008, 0.02)),
         growth=0.0 if tier == "easy" else float(rng.uniform(0.5, 3.0)),
+        kind=str(rng.choice(NOISES)) if tier == "large" else "normal",
     )
 
 
@@ -229,8 +250,9 @@ def draw_design(rng: np.random.Generator, tier: Tier, needs: Needs) -> Design:
     rng : numpy.random.Generator
         Source of randomness.
     tier : str
-        ``easy`` (36 field rows, independent covariates, even noise) or ``hard`` (14-36 rows,
-        covariates that move with slip, noise that grows with it).
+        ``easy`` (36 field rows, independent covariates, even noise), ``hard`` (14-36 rows,
+        covariates that move with slip, noise that grows with it) or ``large`` (as hard, and the
+        noise need not be normal or independent).
     needs : Needs
         What the case's effects ask for.
     """

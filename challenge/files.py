@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from challenge.build import DrawnCase
-from challenge.design import Design
+from challenge.design import Design, Noise
 from challenge.mechanism import DENSITY, DRAWBAR, RUT, Conditions, Readings
 from challenge.record import scenario_record
 from challenge.tyre import PSI_KPA, average_ground_pressure
@@ -80,10 +80,15 @@ def _table(columns: dict[str, list[str]]) -> str:
     return "\n".join([",".join(columns), *(",".join(row) for row in rows)]) + "\n"
 
 
-def _readings(rng: np.random.Generator, truth: Readings, sd: Readings) -> dict[str, list[str]]:
+def _readings(
+    rng: np.random.Generator, noise: Noise, truth: Readings, sd: Readings
+) -> dict[str, list[str]]:
     columns = {}
     for name, reading in truth.items():
-        noisy = reading + sd[name] * rng.standard_normal(reading.size)
+        noisy = reading + noise.draw(rng, sd[name])
+        step = noise.step(sd[name])
+        if step:
+            noisy = step * np.round(noisy / step)
         if name != DRAWBAR:
             # A ruler reads no negative rut and a cylinder no negative density.
             noisy = np.maximum(noisy, 0.05 * reading)
@@ -114,16 +119,17 @@ def case_files(rng: np.random.Generator, case: DrawnCase) -> CaseFiles:
     """
     scenario, design = case.scenario, case.scenario.design
     lab = _condition_columns(design, scenario.lab) | _readings(
-        rng, scenario.lab_readings, scenario.lab_sd
+        rng, design.noise, scenario.lab_readings, scenario.lab_sd
     )
     conditions = _condition_columns(design, scenario.field)
-    field = conditions | _readings(rng, case.field_truth, scenario.field_sd)
+    field = conditions | _readings(rng, design.noise, case.field_truth, scenario.field_sd)
     told = case.told
     key = {
         "tier": design.tier,
         "truth": case.truth,
         "mechanism": case.mechanism,
         "gap_over_noise": case.gap_over_noise,
+        "contributions": case.contributions,
         "isolable_gap": told.isolable_gap,
         "isolable_nats": told.isolable_nats,
         "rival": told.rival,

@@ -22,8 +22,8 @@ class Level:
         What it is, for people.
     direction : int
         1 where more is better, -1 where less is, 0 for a band.
-    easy, hard : tuple of float
-        Lower and upper limit in each tier.
+    easy, hard, large : tuple of float
+        Lower and upper limit in each tier; NaN where none is asked for.
     """
 
     name: str
@@ -31,10 +31,11 @@ class Level:
     direction: int
     easy: tuple[float, float]
     hard: tuple[float, float]
+    large: tuple[float, float] = (float("nan"), float("nan"))
 
     def limits(self, tier: str) -> tuple[float, float]:
         """Return the limits in a tier."""
-        return self.easy if tier == "easy" else self.hard
+        return {"easy": self.easy, "hard": self.hard, "large": self.large}[tier]
 
     def met(self, tier: str, value: float) -> bool:
         """Whether a value reaches the level; a missing value (NaN) does not."""
@@ -48,6 +49,8 @@ class Level:
         met by fewer than 10 whose interval reaches beyond it. Fewer than 5 miss nothing.
         """
         lower, upper = self.limits(tier)
+        if lower != lower:
+            return ""
         low, high = figure.interval
         if self.met(tier, figure.value):
             sure = figure.n >= _ENOUGH_TO_MEET or (lower <= low and high <= upper)
@@ -56,23 +59,28 @@ class Level:
         return "too few to tell" if few or figure.n < _ENOUGH else "MISSED"
 
 
-def _at_least(name: str, label: str, easy: float, hard: float) -> Level:
-    return Level(name, label, 1, (easy, 1.0), (hard, 1.0))
+def _at_least(name: str, label: str, *levels: float) -> Level:
+    return Level(name, label, 1, *((level, 1.0) for level in levels))
 
 
-def _at_most(name: str, label: str, easy: float, hard: float) -> Level:
-    return Level(name, label, -1, (0.0, easy), (0.0, hard))
+def _at_most(name: str, label: str, *levels: float) -> Level:
+    return Level(name, label, -1, *((0.0, level) for level in levels))
 
 
+_BAND = (0.85, 0.95)
 LEVELS: tuple[Level, ...] = (
-    _at_least("top_1", "right hypothesis first", 0.95, 0.75),
+    _at_least("top_1", "right hypothesis first", 0.97, 0.82, 0.95),
     _at_least("top_2", "right hypothesis among the first two", 0.98, 0.88),
     _at_least("truth_probability", "mean probability of the truth", 0.90, 0.65),
-    _at_most("false_alarm", "verdict other than none on nulls", 0.02, 0.03),
+    _at_most("false_alarm", "verdict other than none on nulls", 0.02, 0.02),
     _at_least("unlisted_recognised", "unlisted effect called unknown or ambiguous", 0.90, 0.75),
     _at_most("listed_called_unknown", "listed effect called unknown", 0.02, 0.08),
-    _at_most("confidently_wrong", "a wrong hypothesis at 0.9 or more", 0.01, 0.03),
+    _at_most("confidently_wrong", "a wrong hypothesis at 0.9 or more", 0.005, 0.02, 0.01),
+    _at_least("included", "an acting cause has inclusion of 0.5 or more", 0.98, 0.88, 0.97),
+    _at_most("wrongly_included", "an absent cause has inclusion of 0.5 or more", 0.01, 0.03, 0.03),
+    _at_most("inclusion_error", "calibration error of inclusion", 0.02, 0.03, 0.03),
+    Level("share_coverage", "90 % interval of a share covers", 0, _BAND, _BAND, _BAND),
     _at_least("localisation_auc", "localisation AUC, median", 0.95, 0.95),
-    Level("shrink_coverage", "90 % shrink interval covers", 0, (0.83, 0.96), (0.83, 0.96)),
+    Level("shrink_coverage", "90 % shrink interval covers", 0, _BAND, _BAND, _BAND),
     _at_least("actual_shrink", "actual shrink on fresh conditions, median", 0.75, 0.70),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from calib.batch.tasks import completed
 from calib.errors import CalibError
 from challenge.build import try_case, unlisted_order
-from challenge.design import Tier
+from challenge.design import TIERS, Tier
 from challenge.effects import LISTED, wheel_effects
 from challenge.files import CaseFiles, case_files
 from challenge.mechanism import NONE, SHIFT, UNKNOWN
@@ -22,8 +22,9 @@ type Progress = Callable[[int, int], None]
 type Job = tuple[np.random.SeedSequence, Tier, str]
 
 NULL_FRACTION, UNKNOWN_FRACTION, SHIFT_FRACTION = 1.0 / 3.0, 1.0 / 8.0, 1.0 / 10.0
-PAIR_FRACTION = 0.5  # of the hard tier's listed effects
-_TIERS: tuple[Tier, ...] = ("easy", "hard")
+# Of the listed effects' cases, those of two and of three at once.
+PAIR_FRACTION: Mapping[Tier, float] = {"easy": 0.0, "hard": 0.5, "large": 0.35}
+TRIPLE_FRACTION: Mapping[Tier, float] = {"easy": 0.0, "hard": 0.0, "large": 0.15}
 _TRIES = 60
 _FALLBACKS = 12
 
@@ -43,7 +44,7 @@ def plan(
     n_cases : int
         Number of cases, shared evenly among the tiers, the earlier tier first.
     tiers : tuple of str
-        ``easy``, ``hard`` or both.
+        Of `TIERS`.
     null_fraction : float
         Share of cases without any effect.
     """
@@ -56,26 +57,31 @@ def plan(
 
 
 def _truths(rng: np.random.Generator, count: int, tier: Tier, null_fraction: float) -> list[str]:
-    nulls = round(null_fraction * count)
-    unknown, shift = (round(part * count) for part in (UNKNOWN_FRACTION, SHIFT_FRACTION))
+    # No null is large, nor is a shift of plausible parameters.
+    nulls = 0 if tier == "large" else round(null_fraction * count)
+    shift = 0 if tier == "large" else round(SHIFT_FRACTION * count)
+    unknown = round(UNKNOWN_FRACTION * count)
     fixed = [NONE] * nulls + [UNKNOWN] * unknown + [SHIFT] * shift
     listed = count - len(fixed)
-    pairs = round(PAIR_FRACTION * listed) if tier == "hard" else 0
-    truths = fixed + [_draw_pair(rng) for _ in range(pairs)]
+    pairs, triples = (round(part[tier] * listed) for part in (PAIR_FRACTION, TRIPLE_FRACTION))
+    truths = fixed + [_draw_several(rng, 2) for _ in range(pairs)]
+    truths += [_draw_several(rng, 3) for _ in range(triples)]
     while len(truths) < count:
         truths += [str(name) for name in rng.permutation(list(LISTED))]
     return truths[:count]
 
 
-def _draw_pair(rng: np.random.Generator) -> str:
-    return "+".join(sorted(str(n) for n in rng.choice(wheel_effects(), size=2, replace=False)))
+def _draw_several(rng: np.random.Generator, count: int) -> str:
+    drawn = rng.choice(wheel_effects(), size=count, replace=False)
+    return "+".join(sorted(str(name) for name in drawn))
 
 
 def _draw_like(rng: np.random.Generator, truth: str) -> str:
     """Draw another truth of the same class, for one that no design seems to show."""
     if truth in (NONE, UNKNOWN, SHIFT):
         return truth
-    return _draw_pair(rng) if "+" in truth else str(rng.choice(list(LISTED)))
+    count = 1 + truth.count("+")
+    return _draw_several(rng, count) if count > 1 else str(rng.choice(list(LISTED)))
 
 
 def make_case(seed: np.random.SeedSequence, tier: Tier, truth: str) -> CaseFiles:
@@ -126,8 +132,8 @@ def case_jobs(
     """
     if n_cases < 1:
         raise CalibError(f"{n_cases} cases were asked for", allowed="1 or more")
-    if not tiers or not set(tiers) <= set(_TIERS):
-        raise CalibError(f"unknown tiers {tiers}", allowed=", ".join(_TIERS))
+    if not tiers or not set(tiers) <= set(TIERS):
+        raise CalibError(f"unknown tiers {tiers}", allowed=", ".join(TIERS))
     if not 0.0 <= null_fraction <= 0.7:
         raise CalibError(f"null_fraction is {null_fraction}", allowed="0 to 0.7")
     planning, *own = np.random.SeedSequence(seed).spawn(n_cases + 1)
@@ -147,7 +153,7 @@ def make(
     *,
     seed: int,
     n_cases: int,
-    tiers: tuple[Tier, ...] = _TIERS,
+    tiers: tuple[Tier, ...] = ("easy", "hard"),
     null_fraction: float = NULL_FRACTION,
     workers: int = 1,
     scheduler: str | None = None,
@@ -166,7 +172,7 @@ def make(
     n_cases : int
         Number of cases.
     tiers : tuple of str
-        ``easy``, ``hard`` or both.
+        Of `TIERS`.
     null_fraction : float
         Share of cases without any effect.
     workers, scheduler

@@ -7,13 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import beta
 
 from calib.errors import CalibError
-from challenge.answers import FAILED, CaseAnswer, read_answer
+from challenge.answers import FAILED, CaseAnswer, auc, read_answer
+from challenge.design import TIERS
 from challenge.mechanism import NONE, UNKNOWN
 from challenge.results import check_results
 from challenge.seal import open_key
+
+type Array = NDArray[np.float64]
 
 PAIR, OTHER_PAIR = "a pair", "another pair"
 _BINS = 10
@@ -134,6 +138,14 @@ class TierScore:
         Mean multi-class Brier score, 0 (best) to 2.
     reliability : tuple of ReliabilityBin
         Ten ranges of confidence.
+    included, wrongly_included : Proportion
+        Causes that act by 1.25 noise sds or more, and those that do not act at all, with a
+        probability to act of 0.5 or more. The remainder is none of either.
+    inclusion_auc, inclusion_brier, inclusion_error : Average
+        Of those probabilities: area under the ROC curve, mean squared miss, and expected
+        calibration error in ten bins.
+    share_coverage : Proportion
+        Of the acting, those whose 90 % interval of the share holds the true one.
     """
 
     tier: str
@@ -156,6 +168,12 @@ class TierScore:
     told_apart: Average
     brier: Average
     reliability: tuple[ReliabilityBin, ...]
+    included: Proportion
+    wrongly_included: Proportion
+    inclusion_auc: Average
+    inclusion_brier: Average
+    inclusion_error: Average
+    share_coverage: Proportion
 
 
 @dataclass(frozen=True)
@@ -212,6 +230,29 @@ def _average(values: list[float], statistic: Callable[..., np.ndarray]) -> Avera
     return Average(float(statistic(data)), (low, high), len(values))
 
 
+def _over(stated: Array, statistic: Callable[[Array], float]) -> Average:
+    """Return a statistic of columns (probability, outcome) with a bootstrap interval."""
+    n = stated.shape[1]
+    if not n:
+        return _average([], np.mean)
+    rng = np.random.default_rng(0)
+    again = [statistic(stated[:, rng.integers(0, n, n)]) for _ in range(400)]
+    low, high = (float(q) for q in np.nanquantile(again, [0.025, 0.975]))
+    return Average(statistic(stated), (low, high), n)
+
+
+def _auc(stated: Array) -> float:
+    found = auc(stated[0], stated[1] > 0.5)
+    return float("nan") if found is None else found
+
+
+def _calibration_error(stated: Array) -> float:
+    """Mean distance of stated probability and frequency over ten bins, weighted by their counts."""
+    place = np.minimum((stated[0] * _BINS).astype(int), _BINS - 1)
+    sums = [np.bincount(place, weights=s, minlength=_BINS) for s in stated]
+    return float(np.abs(sums[0] - sums[1]).sum() / stated.shape[1])
+
+
 def _reliability(answers: list[CaseAnswer]) -> tuple[ReliabilityBin, ...]:
     edges = np.linspace(0.0, 1.0, _BINS + 1)
     bins = []
@@ -239,6 +280,9 @@ def score_tier(tier: str, answers: list[CaseAnswer]) -> TierScore:
     listed = [a for a in gaps if a.truth != UNKNOWN]
     shrinks = [s for a in gaps for s in a.shrinks]
     stated = [s for s in shrinks if s.interval is not None]
+    causes = [c for a in answers for c in a.causes if c.name != UNKNOWN and c.acts is not None]
+    acting, absent = ([c for c in causes if c.acts is acts] for acts in (True, False))
+    stating = np.array([[c.probability for c in causes], [bool(c.acts) for c in causes]])
     return TierScore(
         tier=tier,
         n_cases=len(answers),
@@ -260,6 +304,12 @@ def score_tier(tier: str, answers: list[CaseAnswer]) -> TierScore:
         told_apart=_average([a.told_apart for a in gaps if a.told_apart is not None], np.mean),
         brier=_average([a.brier for a in answers], np.mean),
         reliability=_reliability([a for a in answers if a.ranked]),
+        included=Proportion(sum(c.probability >= 0.5 for c in acting), len(acting)),
+        wrongly_included=Proportion(sum(c.probability >= 0.5 for c in absent), len(absent)),
+        inclusion_auc=_over(stating, _auc),
+        inclusion_brier=_over(stating, lambda s: float(np.mean((s[0] - s[1]) ** 2))),
+        inclusion_error=_over(stating, _calibration_error),
+        share_coverage=Proportion(sum(c.covered for c in acting), len(acting)),
     )
 
 
@@ -315,7 +365,7 @@ def score(
                 f"no case measures {' and '.join(outputs)} alone", where=str(cases_dir),
                 allowed="; ".join(there), mend="name the outputs of some cases, or leave them out",
             )  # fmt: skip
-    tiers = {tier: [a for a in answers if a.tier == tier] for tier in ("easy", "hard")}
+    tiers = {tier: [a for a in answers if a.tier == tier] for tier in TIERS}
     tiers = {tier: part for tier, part in tiers.items() if part}
     return Score(
         tiers={tier: score_tier(tier, part) for tier, part in tiers.items()},

@@ -15,6 +15,8 @@ _EXTRA = (
     ("told_apart", "truth told from its nearest rival alone"),
     ("no_shrink_interval", "outputs with a gap without a shrink interval"),
     ("brier", "Brier score (0 best, 2 worst)"),
+    ("inclusion_auc", "inclusion, area under the ROC curve"),
+    ("inclusion_brier", "inclusion, mean squared miss"),
 )
 
 
@@ -26,6 +28,8 @@ def _figure(tier: TierScore, name: str) -> Proportion | Average:
 def asked(level: Level, tier: str) -> str:
     """Return a level in words."""
     low, high = level.limits(tier)
+    if low != low:
+        return "-"
     if level.direction == 0:
         return f"{low:.2f}-{high:.2f}"
     return f">= {low:.2f}" if level.direction > 0 else f"<= {high:.2f}"

@@ -33,7 +33,10 @@ def make(
     key: Annotated[Path, typer.Option(help="File for the sealed answers, outside it.")],
     seed: _Seed,
     cases: Annotated[int, typer.Option(help="How many.", min=1)] = 300,
-    tier: Annotated[Literal["both", "easy", "hard"], typer.Option(help="Difficulty.")] = "both",
+    tier: Annotated[
+        Literal["both", "easy", "hard", "large"],
+        typer.Option(help="Difficulty; large: gaps of 5 to 30 noise sds, up to three causes."),
+    ] = "both",
     workers: Workers = 2,
     scheduler: Scheduler = None,
 ) -> None:
