@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 
 from calib.errors import CalibError
 from calib.gap.ascent import Walk, together
-from calib.gap.case import Campaigns
+from calib.gap.case import Campaigns, OutputData
 from calib.gap.context import Context
 from calib.gap.discrepancy import Bases
 from calib.gap.effects import EFFECTS, Effect
@@ -59,6 +59,8 @@ _N_ADDED, _N_BEGUN_LARGER = 5, 2
 _N_LEADING, _N_LEADING_SETS = 5, 2
 # An effect that far out in its prior (sds) is fitted with a wider one as well.
 _FAR_OUT = 2.0
+# Draws of the prior by which a row is tried, and rows that are named.
+_N_TRIED, _SHOWN = 32, 5
 _IDLE = "it changes nothing that the models of this case predict"
 # A discrepancy or a pair that is so many nats (prior and all) behind the best hypothesis after a
 # truncated fit is given up. Of 1344 discrepancies and 2698 pairs (14 cases) those that ended
@@ -368,11 +370,29 @@ def calibrate_lab(data: Campaigns, seed: int) -> Lab:
     modes, noise = {}, {}
     for o in data.outputs:
         rng = generator(seed, "gap", "lab", o.name)
+        _check_defined(data, o, generator(seed, "gap", "defined", o.name))
         mode = find_mode(o.problem.log_prob, o.problem.priors, rng, n_climb=8)
         modes[o.name] = mode[:-1]
         sigma = float(o.problem.theta(mode[None])[0, -1])
         noise[o.name] = Noise(sigma, 0.0)
     return modes, noise
+
+
+def _check_defined(data: Campaigns, o: OutputData, rng: np.random.Generator) -> None:
+    """Refuse rows at which a simulator has no value, whatever its parameters."""
+    problem = o.problem
+    theta = o.priors.to_natural(o.priors.sample(rng, _N_TRIED))
+    with np.errstate(all="ignore"):
+        location = problem.bound.location(theta, problem.conditions)
+    empty = problem.table.lines[~np.isfinite(location).any(axis=0)]
+    if empty.size:
+        raise CalibError(
+            f"the model {problem.bound.model.name} has no value there",
+            where=f"{data.case.lab.source}, lines {', '.join(map(str, empty[:_SHOWN]))}"
+            + (f" and {empty.size - _SHOWN} more" if empty.size > _SHOWN else ""),
+            allowed="conditions at which the model is defined (see its page in the documentation)",
+            mend="leave these rows out, or choose another model",
+        )
 
 
 class _Worker:

@@ -82,7 +82,7 @@ def get_model(name: str) -> Model:
         raise CalibError(
             f"there is no model {name!r}",
             allowed=", ".join(MODELS),
-            mend="use one of these names, or name the file of your own models (--models FILE) or of "
+            mend="use one of these names, or name the file of your models (--models FILE) or of "
             "your simulator (--simulator FILE)",
         )
     return MODELS[name]

@@ -9,10 +9,11 @@ import pytest
 
 from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS
-from calib.gap.case import campaigns
+from calib.errors import CalibError
+from calib.gap.case import Case, campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import dependences
-from calib.gap.which import Odds, probabilities, rank
+from calib.gap.which import Odds, calibrate_lab, probabilities, rank
 from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
 
@@ -181,3 +182,25 @@ def test_prior_and_evidence_give_the_probabilities():
     assert {n: v / total for n, v in odds.items()} == pytest.approx(ranking.probability)
     assert ranking.prior["lug_thrust"] == pytest.approx(ranking.prior["force_offset"])
     assert ranking.prior["lug_thrust"] > ranking.prior["force_offset+lug_thrust"] > 0.0
+
+
+def test_rows_without_a_value_are_refused_by_line():
+    """A braked wheel (slip below zero) has no value in Wong and Reece's model."""
+    n = 12
+    slip = np.linspace(-0.05, 0.4, n)
+    columns = {
+        "slip_ratio": slip, "normal_load_kn": np.full(n, 2.0), "tyre_width_m": np.full(n, 0.2),
+        "tyre_diameter_m": np.full(n, 0.8), "drawbar_pull_kn": 0.6 * np.tanh(5.0 * slip),
+    }  # fmt: skip
+    lab = table_from_arrays(columns)
+    case = Case("braked", lab, table_from_arrays(columns | {"run_order": np.arange(n)}),
+                {"drawbar_pull": "wong_reece_pull"})  # fmt: skip
+    with pytest.raises(CalibError, match=r"wong_reece_pull has no value there") as error:
+        calibrate_lab(campaigns(replace(case, field=changed(case.field))), 1)
+    assert "lines 0" in error.value.where
+    assert "and" not in error.value.where
+
+
+def changed(table):
+    columns = {**table.columns, "drawbar_pull_kn": 1.1 * table["drawbar_pull_kn"]}
+    return table_from_arrays(columns)
