@@ -91,7 +91,7 @@ def read_cases(folder: Path = HERE) -> tuple[MeasuredCase, ...]:
 def _read(path: Path, data: Path) -> MeasuredCase:
     said: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
     with (data / said["data"]).open(encoding="utf-8", newline="") as file:
-        table = list(csv.DictReader(file))
+        table = [row for row in csv.DictReader(file) if _in_range(row, said.get("at_least", {}))]
     dropped = {_SERIES} | {c for output, c in OUTPUTS.items() if output not in said["models"]}
     if "split" in said:
         lab, field = _halves(_of(table, said["split"], path), said["seed"])
@@ -107,6 +107,10 @@ def _read(path: Path, data: Path) -> MeasuredCase:
         answer["cause"], answer["expected"], tuple(answer.get("defensible", ())),
         answer.get("size_sds", {}),
     )  # fmt: skip
+
+
+def _in_range(row: Mapping[str, str], at_least: Mapping[str, float]) -> bool:
+    return all(float(row[column]) >= least for column, least in at_least.items())
 
 
 def _of(table: Rows, series: Sequence[str], path: Path) -> Rows:
