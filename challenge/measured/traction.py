@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import numpy as np
 
-import calib
-from calib.models.base import Array, Conditions
+from calib.data.registry import register
+from calib.models.base import Array, Conditions, Model
 
 
 def predict(theta: Array, conditions: Conditions) -> Array:
@@ -61,21 +61,21 @@ reason = "Scatter of a pull reading, a few hundredths of the load"
 source = "Repeats of rigid wheels in sand (SOURCES.md, cmu-wheel)"
 """
 
-calib.register(
-    calib.Model(
-        name="janosi_traction",
-        title="Janosi-Hanamoto traction at one load",
-        output="drawbar_pull_kn",
-        conditions=("slip_ratio", "normal_load_kn"),
-        parameters=("friction", "scale", "resistance"),
-        predict=predict,
-        latex=(r"$P = W[\mu(1 - \exp(-s/k)) - r]$",),
-        letters="[$P] the pull (kN), [$W] the load (kN), [$s] the slip",
-        source="Janosi & Hanamoto (1961)",
-        example=(
-            "slip_ratio,normal_load_kn,drawbar_pull_kn\n0.0,5,-0.52\n0.05,5,0.27\n0.1,5,0.75\n"
-            "0.2,5,1.24\n0.4,5,1.45\n0.6,5,1.51\n"
-        ),
-        priors=_PRIORS,
-    )
+MODEL = Model(
+    name="janosi_traction",
+    title="Janosi-Hanamoto traction at one load",
+    output="drawbar_pull_kn",
+    conditions=("slip_ratio", "normal_load_kn"),
+    parameters=("friction", "scale", "resistance"),
+    predict=predict,
+    latex=(r"$P = W[\mu(1 - \exp(-s/k)) - r]$",),
+    letters="[$P] the pull (kN), [$W] the load (kN), [$s] the slip",
+    source="Janosi & Hanamoto (1961)",
+    example=(
+        "slip_ratio,normal_load_kn,drawbar_pull_kn\n0.0,5,-0.52\n0.05,5,0.27\n0.1,5,0.75\n"
+        "0.2,5,1.24\n0.4,5,1.45\n0.6,5,1.51\n"
+    ),
+    priors=_PRIORS,
 )
+
+register(MODEL)
