@@ -87,7 +87,8 @@ def markdown(marks: Sequence[Mark]) -> str:
     lines += [_score_line(*score) for score in scores]
     lines += [
         "", "| case | documented | size, sds | verdict, first explanation | documented cause "
-        "| other listed causes from 0.1 | unlisted besides |", "|---|---|---|---|---|---|---|",
+        "| other listed causes from 0.1 (of how many testable) | unlisted besides |",
+        "|---|---|---|---|---|---|---|",
         *(_case_line(m) for m in marks),
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
@@ -105,7 +106,7 @@ def _case_line(m: Mark) -> str:
     cause = "-" if m.case.expected == NONE else _shown("", m.cause)
     return (
         f"| {m.case.name} | {m.case.expected} | {sizes} | {m.verdict}, {m.first} | {cause} "
-        f"| {others} | {m.remainder:.2f} |"
+        f"| {others} ({len(m.inclusion)}) | {m.remainder:.2f} |"
     )
 
 
