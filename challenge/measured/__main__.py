@@ -1,0 +1,84 @@
+"""Diagnose the measured cases with the program, and mark what it wrote."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from calib.errors import CalibError
+from challenge.measured.cases import HERE, read_cases
+from challenge.measured.marks import mark, markdown
+
+# The bench knows what the program reads and writes, and imports none of the diagnosis.
+_PROGRAM = (sys.executable, "-c", "from calib.cli import main; main()")
+
+
+def run(out: Path, *, set_aside: bool = False, seed: int = 1, only: Sequence[str] = ()) -> str:
+    """Write cases, diagnoses and their marks to a folder.
+
+    Parameters
+    ----------
+    out : Path
+        A folder that is not there.
+    set_aside : bool
+        The third that is looked at once, and nothing else.
+    seed : int
+        Of the diagnoses.
+    only : sequence of str
+        Names of cases; all by default.
+
+    Returns
+    -------
+    str
+        The marks, Markdown.
+
+    Raises
+    ------
+    CalibError
+        If the folder is there, or no case has these names.
+    """
+    chosen = [c for c in read_cases() if c.set_aside == set_aside and (not only or c.name in only)]
+    if not chosen:
+        raise CalibError(
+            f"no such case: {', '.join(only)}", where="--only",
+            allowed=", ".join(c.name for c in read_cases() if c.set_aside == set_aside),
+            mend="correct the name",
+        )  # fmt: skip
+    if out.exists():
+        raise CalibError(
+            "the folder is there already", where=str(out), allowed="a new folder",
+            mend="name another one",
+        )  # fmt: skip
+    for case in chosen:
+        case.write(out / "cases" / case.name)
+    results = out / "results"
+    # A case that cannot be diagnosed is named by the program and marked as failed.
+    subprocess.run(
+        [*_PROGRAM, "challenge", "run", str(out / "cases"), "--out", str(results),
+         "--seed", str(seed), "--workers", "1", "--models", str(HERE / "traction.py")], check=False,
+    )  # fmt: skip
+    table = markdown([mark(case, results / case.name) for case in chosen])
+    (out / "measured.md").write_text(table, encoding="utf-8")
+    return table
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(prog="python -m challenge.measured", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="new folder for the results")
+    parser.add_argument("--set-aside", action="store_true", help="the cases that are set aside")
+    parser.add_argument("--only", nargs="*", default=(), metavar="CASE", help="these cases")
+    parser.add_argument("--seed", type=int, default=1, help="same seed, same numbers")
+    given = parser.parse_args()
+    try:
+        print(run(given.out, set_aside=given.set_aside, seed=given.seed, only=given.only))
+    except CalibError as error:
+        print(f"calib: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+if __name__ == "__main__":
+    main()
