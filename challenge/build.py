@@ -220,7 +220,7 @@ def _telling(
     """
     tier, named = scenario.design.tier, truth not in (NONE, SHIFT, UNKNOWN)
     if truth == NONE:
-        return Identifiability(0.0, 0.0, "", 0.0, 0.0)
+        return Identifiability(0.0, "", 0.0)
     absorbable = any(kind.name in ABSORBABLE for kind in kinds)
     needed = ABSORBABLE_NATS if absorbable else ISOLABLE_NATS
     if tier == "easy" and named and isolable_nats(scenario, gap) < needed:

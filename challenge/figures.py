@@ -1,4 +1,4 @@
-"""Figures of a scored blind test: confusion matrix, reliability diagram, levels."""
+"""Figures of a scored blind test: reliability diagram, levels."""
 
 from __future__ import annotations
 
@@ -8,36 +8,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from challenge.levels import LEVELS
-from challenge.score import Confusion, ReliabilityBin, TierScore
+from challenge.score import ReliabilityBin, TierScore
 
 # Okabe and Ito's colours, told apart with every common colour vision.
 _BLUE, _ORANGE, _GREEN, _GREY = "#0072B2", "#D55E00", "#009E73", "#999999"
-
-
-def confusion_figure(confusion: Confusion, title: str = "") -> Figure:
-    """Draw a confusion matrix: truth in rows, first hypothesis in columns, counts printed.
-
-    Parameters
-    ----------
-    confusion : Confusion
-        The counts.
-    title : str
-        Title.
-    """
-    counts = np.array(confusion.counts, dtype=float)
-    share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0)
-    size = 3.2 + 0.42 * len(confusion.calls), 2.6 + 0.36 * len(confusion.truths)
-    figure = Figure(figsize=size, layout="constrained")
-    axes = figure.subplots()
-    axes.imshow(share, cmap="cividis", vmin=0.0, vmax=1.0, aspect="auto")
-    for (i, j), count in np.ndenumerate(counts):
-        if count:
-            colour = "black" if share[i, j] > 0.5 else "white"
-            axes.text(j, i, f"{count:.0f}", ha="center", va="center", color=colour, fontsize=8)
-    axes.set_xticks(range(len(confusion.calls)), confusion.calls, rotation=60, ha="right")
-    axes.set_yticks(range(len(confusion.truths)), confusion.truths)
-    axes.set(xlabel="called first", ylabel="truth", title=title)
-    return figure
 
 
 def reliability_figure(bins: Sequence[ReliabilityBin], title: str = "") -> Figure:

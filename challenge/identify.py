@@ -21,8 +21,6 @@ class Identifiability:
 
     Attributes
     ----------
-    isolable_gap : float
-        What is left after the best smooth recalibration, whatever its size.
     isolable_nats : float
         Cost of explaining the gap by a recalibration of plausible size.
     rival : str
@@ -31,29 +29,11 @@ class Identifiability:
     rival_nats : float
         What the truth is ahead of that rival, the lab's parameter uncertainty allowed for;
         infinite without a rival.
-    rival_gap : float
-        The least that any listed effect together with a recalibration leaves.
     """
 
-    isolable_gap: float
     isolable_nats: float
     rival: str
     rival_nats: float
-    rival_gap: float
-
-
-def remaining(gap: Array, span: Array) -> float:
-    """Return the rms of a gap in noise sd that no combination of `span` removes.
-
-    Parameters
-    ----------
-    gap : array
-        Shape ``(M,)``.
-    span : array
-        Shape ``(K, M)``.
-    """
-    coefficients = np.linalg.lstsq(span.T, gap, rcond=1e-10)[0]
-    return rms(gap - coefficients @ span)
 
 
 def whitener(span: Array) -> Array:
@@ -114,7 +94,6 @@ def identify(
     isolable_nats = float(0.5 * gap @ whitener(span) @ gap)
     white = whitener(lab_uncertainty(scenario))
     rival, nats = ("", np.inf) if truth == SHIFT else (SHIFT, isolable_nats)
-    rival_gap = remaining(gap, span)
     for name, kind in LISTED.items():
         if not can_rival(scenario, kind, truth):
             continue
@@ -122,8 +101,7 @@ def identify(
         along, own = float(gap @ white @ signature), float(signature @ white @ signature)
         left = float(0.5 * (gap @ white @ gap)) - 0.5 * along**2 / max(own, 1e-12)
         rival, nats = (name, left) if left < nats else (rival, nats)
-        rival_gap = min(rival_gap, remaining(gap, np.vstack([span, signature])))
-    return Identifiability(remaining(gap, span), isolable_nats, rival, nats, rival_gap)
+    return Identifiability(isolable_nats, rival, nats)
 
 
 def isolable_nats(scenario: Scenario, gap: Array) -> float:

@@ -19,7 +19,6 @@ from challenge.seal import open_key
 
 type Array = NDArray[np.float64]
 
-PAIR, OTHER_PAIR = "a pair", "another pair"
 _BINS = 10
 
 
@@ -177,23 +176,6 @@ class TierScore:
 
 
 @dataclass(frozen=True)
-class Confusion:
-    """Truths against what was called first, pairs taken together.
-
-    Attributes
-    ----------
-    truths, calls : tuple of str
-        Labels of rows and columns; the column ``another pair`` is a pair called wrongly.
-    counts : tuple of tuple of int
-        Cases, ``[truth][call]``.
-    """
-
-    truths: tuple[str, ...]
-    calls: tuple[str, ...]
-    counts: tuple[tuple[int, ...], ...]
-
-
-@dataclass(frozen=True)
 class Score:
     """A scored blind test.
 
@@ -201,8 +183,6 @@ class Score:
     ----------
     tiers : dict
         Tier to its figures.
-    confusion : dict
-        Tier to its confusion matrix.
     answers : tuple of CaseAnswer
         Every case of the key, failed ones included.
     warnings : tuple of str
@@ -210,7 +190,6 @@ class Score:
     """
 
     tiers: dict[str, TierScore]
-    confusion: dict[str, Confusion]
     answers: tuple[CaseAnswer, ...]
     warnings: tuple[str, ...] = ()
 
@@ -313,25 +292,6 @@ def score_tier(tier: str, answers: list[CaseAnswer]) -> TierScore:
     )
 
 
-def _label(name: str) -> str:
-    return PAIR if "+" in name else name
-
-
-def _call_label(answer: CaseAnswer) -> str:
-    wrong_pair = "+" in answer.called and answer.called != answer.truth and "+" in answer.truth
-    return OTHER_PAIR if wrong_pair else _label(answer.called)
-
-
-def confusion(answers: list[CaseAnswer]) -> Confusion:
-    """Return the confusion matrix of some cases, its labels in alphabetical order."""
-    truths = sorted({_label(a.truth) for a in answers})
-    calls = truths + sorted({_call_label(a) for a in answers} - set(truths))
-    counts = np.zeros((len(truths), len(calls)), dtype=int)
-    for answer in answers:
-        counts[truths.index(_label(answer.truth)), calls.index(_call_label(answer))] += 1
-    return Confusion(tuple(truths), tuple(calls), tuple(tuple(map(int, row)) for row in counts))
-
-
 def score(
     cases_dir: Path, results_dir: Path, key_path: Path, outputs: Collection[str] = ()
 ) -> Score:
@@ -369,7 +329,6 @@ def score(
     tiers = {tier: part for tier, part in tiers.items() if part}
     return Score(
         tiers={tier: score_tier(tier, part) for tier, part in tiers.items()},
-        confusion={tier: confusion(part) for tier, part in tiers.items()},
         answers=tuple(answers),
         warnings=warnings,
     )

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
-from challenge.answers import CaseAnswer
 from challenge.levels import LEVELS, Level
-from challenge.mechanism import NONE
 from challenge.score import Average, Proportion, Score, TierScore
 
 _EXTRA = (
@@ -66,31 +62,6 @@ def tier_table(tier: TierScore) -> str:
     return "\n".join(line.rstrip() for line in lines)
 
 
-def outputs_table(answers: Iterable[CaseAnswer]) -> str:
-    """Return how the truth fared where there is a gap, by the outputs that are measured.
-
-    Parameters
-    ----------
-    answers : iterable of CaseAnswer
-    """
-    parts: dict[tuple[str, tuple[str, ...]], list[CaseAnswer]] = {}
-    for answer in answers:
-        if answer.truth != NONE:
-            parts.setdefault((answer.tier, answer.outputs), []).append(answer)
-    lines = [f"  {'':<47} {'first':>16} {'first two':>16} {'mean p':>7}"]
-    for (tier, outputs), part in sorted(
-        parts.items(), key=lambda item: (item[0][0], -len(item[1]))
-    ):
-        label = f"{tier}, {' and '.join(name.replace('_', ' ') for name in outputs)}"
-        cells = []
-        for count in (1, 2):
-            right = sum(a.among_first(count) for a in part)
-            cells.append(f"{right / len(part):8.3f} {f'{right}/{len(part)}':>7}")
-        mean = sum(a.truth_probability for a in part) / len(part)
-        lines.append(f"  {label:<47} {' '.join(cells)} {mean:7.3f}")
-    return "\n".join(lines)
-
-
 def text_table(score: Score) -> str:
     """Return the table of all tiers, and the cases that failed.
 
@@ -100,8 +71,6 @@ def text_table(score: Score) -> str:
         From `challenge.score.score`.
     """
     parts = [tier_table(tier) for tier in score.tiers.values()]
-    if len({a.outputs for a in score.answers if a.truth != NONE}) > 1:
-        parts.append("cases with a gap, by what is measured:\n" + outputs_table(score.answers))
     failed = [f"  {a.case}: {a.problem}" for a in score.answers if a.problem]
     if failed:
         parts.append("\n".join(["without a readable diagnosis, counted as wrong:", *failed]))

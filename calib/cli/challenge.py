@@ -121,7 +121,7 @@ def score(
 ) -> None:
     """Compare diagnoses with the sealed answers."""
     with from_the_bench("calib challenge score"):
-        from challenge.figures import confusion_figure, levels_figure, reliability_figure
+        from challenge.figures import levels_figure, reliability_figure
         from challenge.score import score as score_all
         from challenge.table import text_table
     from calib.batch.folders import check_folder, fresh_folder
@@ -138,9 +138,7 @@ def score(
     with fresh_folder(out, overwrite=overwrite) as scratch:
         (scratch / "score.txt").write_text(table + "\n", encoding="utf-8")
         levels_figure(list(found.tiers.values())).savefig(scratch / "levels.png", dpi=150)
-        for tier, confusion in found.confusion.items():
-            figure = confusion_figure(confusion, f"{tier} cases")
-            figure.savefig(scratch / f"confusion_{tier}.png", dpi=150)
+        for tier in found.tiers:
             bins = found.tiers[tier].reliability
             reliability_figure(bins, f"{tier} cases").savefig(
                 scratch / f"reliability_{tier}.png", dpi=150

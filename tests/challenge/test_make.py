@@ -14,6 +14,7 @@ import pytest
 
 from calib.errors import CalibError
 from challenge.build import try_case
+from challenge.design import NOISES, Noise
 from challenge.effects import LISTED
 from challenge.files import OUTPUT_COLUMNS
 from challenge.make import make, make_case, plan
@@ -161,6 +162,36 @@ def test_plan_has_the_promised_shares() -> None:
         pairs = [name for name in truths if "+" in name]
         assert bool(pairs) == (tier == "hard")
         assert all(name == "+".join(sorted(name.split("+"))) for name in pairs)
+
+
+def test_large_gaps_have_no_nulls_and_up_to_three_causes() -> None:
+    planned = plan(np.random.default_rng(0), 80, ("large",))
+    truths = Counter(truth for _, truth in planned)
+    assert not truths["none"]
+    assert not truths["parameter_shift"]
+    assert {name.count("+") for name in truths} == {0, 1, 2}
+
+
+def test_the_key_says_what_each_of_several_causes_adds() -> None:
+    """A large gap; each contribution is what goes from it without that cause."""
+    truth = "force_offset+lug_thrust+sensor_drift"
+    made = make_case(np.random.SeedSequence([5, 1]), "large", truth).key
+    assert made["gap_over_noise"] >= 5.0
+    assert sorted(made["contributions"]) == sorted(made["truth"].split("+"))
+    assert min(made["contributions"].values()) >= 1.0
+
+
+@pytest.mark.parametrize("kind", NOISES)
+def test_every_noise_has_its_sd_and_nothing_else_is_the_same(kind: str) -> None:
+    sd, rng = np.full(40_000, 0.3), np.random.default_rng(1)
+    noise = Noise(0.3, 0.05, 0.01, 0.0, kind)
+    drawn = noise.draw(rng, sd)
+    assert drawn.std() == pytest.approx(0.3, rel=0.05)
+    successive = float(np.corrcoef(drawn[1:], drawn[:-1])[0, 1])
+    assert successive == pytest.approx(0.5 if kind == "autocorrelated" else 0.0, abs=0.03)
+    far = float(np.mean(np.abs(drawn) > 1.2))
+    assert (far > 0.004) == (kind == "heavy")
+    assert noise.step(sd) == (0.6 if kind == "rounded" else 0.0)
 
 
 def test_key_is_never_among_the_cases(tmp_path: Path) -> None:
