@@ -116,6 +116,7 @@ def _model(simulator: Simulator, output: Output) -> Model:
         response="log" if log else "identity",
         source=simulator.source,
         parametrisation="The parameters of the simulator are sampled.",
+        slow=simulator.emulate,
         priors=f'model = "{name}"\n\n{simulator.priors}\n{output.sigma}',
     )
 

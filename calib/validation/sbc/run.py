@@ -43,7 +43,7 @@ def run_sbc(
     out : Path
         Its folder ``replicates`` gets one JSON file for each replicate.
     models : sequence of str
-        All by default.
+        By default all that are not slow.
     simulations : int
         Of each model.
     seed : int
@@ -56,7 +56,9 @@ def run_sbc(
     CalibError
         If there is no such model, or the folder holds a run of another seed or other settings.
     """
-    names = [get_model(name).name for name in models] or list(MODELS)
+    names = [get_model(name).name for name in models] or [
+        m.name for m in MODELS.values() if not m.slow
+    ]
     _claim(out, {"seed": seed, "settings": asdict(settings)})
     items = {
         f"{model}-{i:04d}": Item(model, i, seed, settings)

@@ -25,7 +25,9 @@ class SbcSection(Section):
         ge=0, description="0 or a positive whole number: which campaigns are drawn"
     )
     models: list[str] = Field(
-        default=list(MODELS), min_length=1, description="a list of models, see `calib models`"
+        default=[m.name for m in MODELS.values() if not m.slow],
+        min_length=1,
+        description="a list of models, see `calib models`; all but slow ones if none",
     )
 
 
