@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -28,11 +29,19 @@ from calib.inference.io import run_problem
 from calib.inference.problem import Problem
 from calib.report.comparison import FIGURE, FILE, HELD_OUT, PAGE, document, page, write_comparison
 from calib.report.study import Progress
-from calib.validation.comparison import Comparison, Difference, compare_problems, sentence
+from calib.validation.comparison import (
+    Comparison,
+    compare_problems,
+    difference,
+    sentence,
+    stacking_weights,
+)
 
 __all__ = ["check_comparison"]
 
 _GROUP = "comparison"
+# Of what follows from rows by arithmetic; weights by iterations that stop at a billionth.
+_ROUNDING = 1e-6
 # Of the file itself, and what was taken over from it.
 _NOT_COMPARED = ("files", "command", "settings", "versions", "machine", "code")
 
@@ -139,23 +148,16 @@ def _held_out(
 
 
 def _follows(record: ComparisonRecord, folder: Path, *, same_program: bool) -> list[Item]:
-    """Check that what is read off numbers follows from them, and the page from all of them."""
-    clear = {
-        name: Difference(m.below_best, m.below_best_se).clear for name, m in record.models.items()
-    }
-    stated = {
-        "verdict": record.document.get("verdict"),
-        **{f"{name}.told_apart": m.told_apart for name, m in record.models.items()},
-    }
-    follows = {
-        "verdict": sentence(clear, record.unsound),
-        **{f"{name}.told_apart": value for name, value in clear.items()},
-    }
-    items = [
-        Item(_GROUP, f"{FILE}: {what} of its own numbers",
-             Status.IDENTICAL if stated[what] == value else Status.DIFFERENT, stated[what], value)
-        for what, value in follows.items()
-    ]  # fmt: skip
+    """Check that all that is said follows from the rows, and the page from all of it."""
+    items = []
+    for path, value in _derived(record).items():
+        stated = _at(record.document, path)
+        same = math.isclose(stated, value, rel_tol=_ROUNDING, abs_tol=_ROUNDING) if (
+            isinstance(value, float) and isinstance(stated, int | float)
+        ) else stated == value  # fmt: skip
+        status = Status.IDENTICAL if same else Status.DIFFERENT
+        name = f"{FILE}: {'.'.join(path)}, as its elpd_rows give it"
+        items.append(Item(_GROUP, name, status, stated, value))
     try:
         image, text = (folder / FIGURE).read_bytes(), (folder / PAGE).read_text(encoding="utf-8")
         expected = page(record.document, image)
@@ -167,6 +169,35 @@ def _follows(record: ComparisonRecord, folder: Path, *, same_program: bool) -> l
     status = Status.DIFFERENT if same_program else Status.UNJUDGED
     note = differing_lines(text.splitlines(), expected.splitlines())
     return [*items, Item(TEXT, PAGE, status, note=note)]
+
+
+def _derived(record: ComparisonRecord) -> dict[Place, Any]:
+    """Work out from the rows of all models what is stated of them, by path."""
+    rows = {name: np.array(m.elpd_rows) for name, m in record.models.items()}
+    if len({r.size for r in rows.values()}) > 1:
+        return {("rows",): "the same number for all models"}
+    best = next(iter(rows))
+    below = {name: difference(rows[best] - r) for name, r in rows.items()}
+    weights = stacking_weights(np.stack(list(rows.values()), axis=1))
+    found: dict[Place, Any] = {
+        ("verdict",): sentence({name: d.clear for name, d in below.items()}, record.unsound),
+        ("rows",): rows[best].size,
+    }
+    for (name, d), weight in zip(below.items(), weights, strict=True):
+        found |= {
+            ("models", name, "elpd"): float(rows[name].sum()),
+            ("models", name, "below_best"): d.elpd,
+            ("models", name, "below_best_se"): d.se,
+            ("models", name, "told_apart"): d.clear,
+            ("models", name, "weight"): float(weight),
+        }
+    return found
+
+
+def _at(document: Any, path: Place) -> Any:
+    for key in path:
+        document = document.get(key) if isinstance(document, Mapping) else None
+    return document
 
 
 def _numbers(

@@ -18,20 +18,16 @@ from calib.check.montecarlo import (
     scaled,
     validation_errors,
 )
-from calib.inference.random import generator
 from calib.models.base import Array
-from calib.validation.comparison import Candidate, Comparison, stacking_weights
+from calib.validation.comparison import Candidate, Comparison
 
 __all__ = ["count_compared", "drawn_in_comparison"]
-
-# Stacking weights: how often they are found again, and how far iterations stop from where they go.
-_WEIGHTS, _FLAT = 12, 1e-4
 
 
 def count_compared(comparison: Comparison) -> int:
     """Return how many numbers of a comparison follow from posterior draws, those of runs too."""
     held = sum(4 for c in comparison.candidates if c.held is not None)
-    return held + sum(9 + count_drawn(c.calibration) for c in comparison.candidates)
+    return held + sum(8 + c.rows.size + count_drawn(c.calibration) for c in comparison.candidates)
 
 
 def drawn_in_comparison(
@@ -51,55 +47,47 @@ def drawn_in_comparison(
     -------
     dict
         By paths below ``models``.
-
-    Notes
-    -----
-    The weights follow from all rows of all models; they are found again from rows that are moved
-    by their errors.
     """
     moved = {c.model: _RowErrors.of(c) for c in comparison.candidates}
     first = next(c for c in comparison.candidates if c.model == best)
     n, found = count_compared(comparison), dict[Place, float | None]()
-    for c, weight in zip(comparison.candidates, _weight_errors(comparison, moved), strict=True):
+    for c in comparison.candidates:
         times = multiple(n) * of_difference(c.calibration, steps.get(c.model))
         of_sum = np.hypot(moved[c.model].of_sum(), moved[best].of_sum())
         spread = lever_of(first.rows - c.rows)
         of_spread = np.hypot(moved[c.model].along(spread), moved[best].along(spread))
-        errors = _scores(validation_errors(c.calibration, c.loo, times))
-        errors |= {
-            ("weight",): weight,
-            ("below_best",): float(of_sum), ("below_best_se",): float(of_spread),
-            ("log_evidence",): posterior_errors(c.calibration)["sampling", "log_evidence"],
-        }  # fmt: skip
+        errors = _scores(validation_errors(c.calibration, c.loo, times), moved[c.model].heavy)
+        errors["below_best",] = float(of_sum)
+        errors["below_best_se",] = float(of_spread)
+        errors["log_evidence",] = posterior_errors(c.calibration)["sampling", "log_evidence"]
+        for i, error in enumerate(moved[c.model].each.tolist()):
+            errors["elpd_rows", str(i)] = error
         if c.held is not None:
-            held = _scores(validation_errors(c.calibration, c.held, times))
+            held = _scores(validation_errors(c.calibration, c.held, times), 1.0)
             held["elpd",] = _held_error(c)
             errors |= {("held_out", *place): size for place, size in held.items()}
         found |= {(c.model, *k): size for k, size in scaled(errors, times).items()}
     return found
 
 
-def _scores(errors: Mapping[Place, float | None]) -> dict[Place, float | None]:
-    """Those of a validation's errors that a comparison states, as it names them."""
+def _scores(errors: Mapping[Place, float | None], heavy: float) -> dict[Place, float | None]:
+    """Those of a validation's errors that a comparison states, as it names them.
+
+    Parameters
+    ----------
+    errors : mapping
+    heavy : float
+        How many times as large errors are as those of draws that all weigh the same.
+    """
     found: dict[Place, float | None] = {
-        (name,): errors["validation", name]
-        for name in ("rmse", "crps", "elpd", "elpd_se")
+        (name,): errors["validation", name] for name in ("elpd", "elpd_se")
         if ("validation", name) in errors
-    }
+    }  # fmt: skip
+    for name in ("rmse", "crps"):
+        error = errors["validation", name]
+        found[name,] = None if error is None else heavy * error
     found["coverage_90",] = errors["validation", "coverage", "90"]
     return found
-
-
-def _weight_errors(comparison: Comparison, moved: Mapping[str, _RowErrors]) -> list[float]:
-    rng = generator(comparison.seed, "check", "weights")
-    rows = np.stack([c.rows for c in comparison.candidates], axis=1)
-    weights = stacking_weights(rows)
-    others = []
-    for _ in range(_WEIGHTS):
-        off = [moved[c.model].drawn(rng) for c in comparison.candidates]
-        others.append(stacking_weights(rows + np.stack(off, axis=1)))
-    apart = np.sqrt(np.square(np.stack(others) - weights).mean(axis=0))
-    return [float(x) + _FLAT for x in apart]
 
 
 def _held_error(c: Candidate) -> float:
@@ -136,6 +124,16 @@ class _RowErrors:
         """Of a compared model."""
         return cls(left_out(c.calibration)[0], float(np.sqrt(_least_ess(c))))
 
+    @property
+    def each(self) -> Array:
+        """Of each row, shape (n,)."""
+        return np.asarray(self.influence.std(axis=0) / self.root)
+
+    @property
+    def heavy(self) -> float:
+        """Root of the draws over those that they are worth for the row of the fewest."""
+        return float(np.sqrt(1.0 + np.square(self.influence).mean(axis=0).max()))
+
     def of_sum(self) -> float:
         """Of the sum over the rows."""
         return self.along(np.ones(self.influence.shape[1]))
@@ -143,8 +141,3 @@ class _RowErrors:
     def along(self, lever: Array) -> float:
         """Of the rows times a lever, summed."""
         return float((self.influence @ lever).std() / self.root)
-
-    def drawn(self, rng: np.random.Generator) -> Array:
-        """Errors as they may be, those of rows that hang together moving together."""
-        draws = len(self.influence)
-        return np.asarray(rng.standard_normal(draws) @ self.influence / (draws**0.5 * self.root))

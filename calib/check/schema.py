@@ -156,9 +156,7 @@ class RunRecord(_Made):
 class _Compared(_Record):
     """What is said of a model that was compared."""
 
-    below_best: float
-    below_best_se: float
-    told_apart: bool
+    elpd_rows: Annotated[tuple[float, ...], Field(min_length=2)]
     converged: bool
     refits_not_converged: int
 

@@ -69,6 +69,7 @@ def _model(comparison: Comparison, c: Candidate, best: Candidate) -> dict[str, A
         "below_best": below.elpd,
         "below_best_se": below.se,
         "told_apart": below.clear,
+        "elpd_rows": c.rows.tolist(),
         "converged": c.calibration.converged,
         "pareto_k_max": None if loo.pareto_k is None else _finite(float(loo.pareto_k.max())),
         "pareto_k_limit": PARETO_K_MAX,
