@@ -156,6 +156,21 @@ class Emulator:
         means, variances = self._evaluate(theta, variance=True)
         return means, np.zeros_like(means) if variances is None else variances
 
+    @cached_property
+    def typical_variances(self) -> Array:
+        """Variances of the coefficients where posteriors lie, shape (j,).
+
+        Means over each region's middle and the points one sd from it along each axis.
+        """
+        points = [np.zeros((0, self.axes.loc.size))]
+        for region in self.regions:
+            points += [region.centre[None], region.centre + region.root.T,
+                       region.centre - region.root.T]  # fmt: skip
+        theta = self.axes.natural(np.concatenate(points))
+        means, variances = self.with_variance(theta)
+        there = variances[np.isfinite(means).all(axis=1)]
+        return np.asarray(there.mean(axis=0)) if len(there) else np.zeros(len(self.functions))
+
     def _evaluate(self, theta: Array, *, variance: bool) -> tuple[Array, Array | None]:
         z = self.axes.of(np.atleast_2d(theta))
         known = np.isfinite(z).all(axis=1)
