@@ -37,9 +37,9 @@ def sbc(
     from calib.models import MODELS
     from calib.report.page.sbc import text_table
     from calib.report.sbc import write_sbc
-    from calib.validation.sbc.run import SETTINGS, run_sbc
+    from calib.validation.sbc.run import SETTINGS, chosen_models, run_sbc
 
-    slow = [m.name for m in MODELS.values() if m.slow]
+    slow = [name for name in MODELS if name not in chosen_models()]
     if slow and not model:
         announce(
             f"left out: {', '.join(slow)}, of which each campaign takes minutes; name them with "
