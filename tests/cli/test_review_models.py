@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS, example_csv
 from calib.validation.sbc.run import run_sbc
@@ -66,7 +67,8 @@ def test_a_model_through_every_verb(calib: Calib, model: str) -> None:
     reported = calib("report", "my.csv", "--model", model, "--out", "report", *FEW)
     assert reported.code in (0, 3), reported.err
     assert MODELS[model].title in Path("report/index.html").read_text()
-    settings = SamplerSettings(steps=100, max_steps=100)
+    gate = Gate(rhat_max=2.0, ess_min=10.0, taus_min=1.0)
+    settings = SamplerSettings(steps=100, max_steps=100, gate=gate)
     score = run_sbc(Path("sbc"), models=[model], simulations=2, seed=1, settings=settings)
     assert [m.failed for m in score.models] == [{}]
     if model not in BESIDE:
