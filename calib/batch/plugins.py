@@ -18,6 +18,8 @@ __all__ = ["PLUGINS", "inherit", "load_files", "load_installed", "loaded_files",
 
 # Entry points of packages that register several things.
 PLUGINS = "terracalib.plugins"
+# What the names of modules begin with that were loaded by their paths.
+USER_MODULE = "calib_user_"
 _LOADED: set[str] = set()
 # Worker processes find here what this one has loaded.
 _VARIABLE = "CALIB_MODELS"
@@ -38,7 +40,7 @@ def run_file(path: Path, what: str) -> ModuleType:
         If it cannot be read or does not run, with the line.
     """
     path = Path(path).resolve()
-    name = f"calib_user_{path.stem}"
+    name = f"{USER_MODULE}{path.stem}"
     known = sys.modules.get(name)
     if known is not None and known.__file__ == str(path):
         return known

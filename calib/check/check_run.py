@@ -24,7 +24,7 @@ from calib.inference.io import describe_estimates, run_problem
 from calib.inference.problem import Problem
 from calib.report.study import Progress
 
-__all__ = ["check_run"]
+__all__ = ["check_run", "compare_run", "consistent_run", "estimates_of_run", "verify_run"]
 
 _RECORD, _POSTERIOR, _PRIORS, _DATA = "run.json", "posterior.nc", "priors.toml", "data.csv"
 _FILES = (_POSTERIOR, _PRIORS, _DATA)
@@ -53,30 +53,51 @@ def check_run(
     quick : bool
         Skip the sampling.
     """
+    items = verify_run(record, folder)
+    allowed = ""
+    with not_computed(items, folder, _RECORD):
+        problem = run_problem(record.document, folder / _DATA)
+        items += consistent_run(record, folder, problem)
+        if quick:
+            items += estimates_of_run(record, folder, problem)
+        else:
+            calibration = recompute_run(record, problem, scratch / "again", progress)
+            allowed = describe(count_drawn(calibration))
+            items += compare_run(record, calibration, folder, scratch / "again")
+    return items, allowed
+
+
+def verify_run(record: RunRecord, folder: Path) -> list[Item]:
+    """Hold the files of a run against their hashes."""
     items = verify_files(folder, record.sha256, _RECORD, {})
-    items += [
+    return items + [
         Item(INPUTS, name, Status.DIFFERENT, note="run.json has no hash of it")
         for name in _FILES
         if name not in record.sha256
     ]
-    allowed = ""
-    with not_computed(items, folder, _RECORD):
-        problem = run_problem(record.document, folder / _DATA)
-        items += _consistent(record, folder, problem)
-        if quick:
-            again = {"estimates": describe_estimates(estimate_again(record, problem))}
-            recorded = {"estimates": record.document["estimates"]}
-            old, new = _entries(recorded, folder), _entries(again, folder)
-            points = compare_entries(old, new, _group)
-            items += [item for item in points if item.group == "estimates"]
-        else:
-            calibration = recompute_run(record, problem, scratch / "again", progress)
-            allowed = describe(count_drawn(calibration))
-            items += _compare(record, calibration, folder, scratch / "again")
-    return items, allowed
 
 
-def _compare(record: RunRecord, calibration: Calibration, folder: Path, made: Path) -> list[Item]:
+def estimates_of_run(record: RunRecord, folder: Path, problem: Problem) -> list[Item]:
+    """Compare the point estimates alone, computed again without sampling."""
+    again = {"estimates": describe_estimates(estimate_again(record, problem))}
+    recorded = {"estimates": record.document["estimates"]}
+    old, new = _entries(recorded, folder), _entries(again, folder)
+    return [item for item in compare_entries(old, new, _group) if item.group == "estimates"]
+
+
+def compare_run(
+    record: RunRecord, calibration: Calibration, folder: Path, made: Path
+) -> list[Item]:
+    """Compare a run with the same sampled and written again.
+
+    Parameters
+    ----------
+    record : RunRecord
+    calibration : Calibration
+        As it was sampled again.
+    folder, made : Path
+        The run, and the one made again.
+    """
     again = json.loads((made / _RECORD).read_text(encoding="utf-8"))
     recorded, found = _entries(record.document, folder), _entries(again, made)
     if not any(path[1] == "posterior" for path in recorded):  # unreadable, which has been said
@@ -89,7 +110,7 @@ def _compare(record: RunRecord, calibration: Calibration, folder: Path, made: Pa
     return items + _blame(items)
 
 
-def _consistent(record: RunRecord, folder: Path, problem: Problem) -> list[Item]:
+def consistent_run(record: RunRecord, folder: Path, problem: Problem) -> list[Item]:
     """Hold the parts of the folder against each other, without computing anything again."""
     items = [verify_label(_DATA, problem.table, record.data_label)]
     priors = folder / _PRIORS

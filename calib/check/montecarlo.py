@@ -17,7 +17,8 @@ from calib.validation.validate import Validation
 
 __all__ = [
     "MONTE_CARLO", "Place", "count_drawn", "describe", "drawn_in_output", "drawn_in_run",
-    "posterior_errors", "validation_errors",
+    "left_out", "lever_of", "multiple", "of_difference", "posterior_errors", "scaled",
+    "validation_errors",
 ]  # fmt: skip
 
 MONTE_CARLO = "Monte Carlo"
@@ -79,22 +80,37 @@ def drawn_in_output(
     steps : object
         Recorded length of the other run.
     """
-    times = multiple(n) * _of_difference(calibration, steps)
+    times = multiple(n) * of_difference(calibration, steps)
     errors = posterior_errors(calibration)
     errors |= validation_errors(calibration, validation, times)
-    return _scaled(errors, times)
+    return scaled(errors, times)
 
 
 def drawn_in_run(calibration: Calibration, steps: object) -> dict[Place, float | None]:
     """Return the same for a run, and the posterior sds that its mode is judged by."""
     errors = posterior_errors(calibration)
     errors["log_evidence",] = errors.pop(("sampling", "log_evidence"))
-    times = multiple(count_drawn(calibration)) * _of_difference(calibration, steps)
+    times = multiple(count_drawn(calibration)) * of_difference(calibration, steps)
     sds = enumerate(calibration.draws.flat.std(axis=0).tolist())
-    return _scaled(errors, times) | {("mode", str(j)): sd for j, sd in sds}
+    return scaled(errors, times) | {("mode", str(j)): sd for j, sd in sds}
 
 
-def _of_difference(calibration: Calibration, steps: object) -> float:
+def left_out(calibration: Calibration) -> tuple[Array, Array]:
+    """Influence of each draw on -ln E[1/p(y_i | theta)], (draws, n), and that itself, (n,)."""
+    rows = calibration.problem.log_likelihood_rows(calibration.draws.flat)
+    inverse = np.exp(rows.min(axis=0) - rows)
+    influence = inverse / inverse.mean(axis=0) - 1.0
+    return influence, rows.min(axis=0) - np.log(inverse.mean(axis=0))
+
+
+def lever_of(elpd: Array) -> Array:
+    """Derivatives of sqrt(n var) of some rows by each of them."""
+    n = elpd.size
+    spread = float(np.sqrt(n * elpd.var(ddof=1)))
+    return n * (elpd - elpd.mean()) / ((n - 1) * spread) if spread > 0.0 else np.zeros(n)
+
+
+def of_difference(calibration: Calibration, steps: object) -> float:
     """Error of the difference of two runs over that of this one, should the other be shorter."""
     ratio = 1.0
     if isinstance(steps, int | float) and steps > 0:
@@ -102,7 +118,8 @@ def _of_difference(calibration: Calibration, steps: object) -> float:
     return float(np.sqrt(1.0 + np.clip(ratio, 1.0, 4.0)))
 
 
-def _scaled(errors: dict[Place, float | None], times: float) -> dict[Place, float | None]:
+def scaled(errors: dict[Place, float | None], times: float) -> dict[Place, float | None]:
+    """Return so many times the errors, of those that exist."""
     return {place: None if error is None else times * error for place, error in errors.items()}
 
 
@@ -220,13 +237,8 @@ def _crps_influence(draws: Array, observed: Array) -> float:
 
 def _elpd_errors(calibration: Calibration, ess: float) -> dict[Place, float | None]:
     """Of the sum over rows of -ln E[1/p(y_i | theta)] and of its spread, by their influence."""
-    rows = calibration.problem.log_likelihood_rows(calibration.draws.flat)
-    inverse = np.exp(rows.min(axis=0) - rows)
-    influence = inverse / inverse.mean(axis=0) - 1.0
-    elpd = rows.min(axis=0) - np.log(inverse.mean(axis=0))
-    n = elpd.size
-    spread = float(np.sqrt(n * elpd.var(ddof=1)))
-    lever = n * (elpd - elpd.mean()) / ((n - 1) * spread) if spread > 0.0 else np.zeros(n)
+    influence, elpd = left_out(calibration)
+    lever = lever_of(elpd)
     root = np.sqrt(ess)
     return {
         ("validation", "elpd"): float(influence.sum(axis=1).std() / root),

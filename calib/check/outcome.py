@@ -24,7 +24,7 @@ class Outcome:
     ----------
     folder : str
         As it was given.
-    kind : {"report", "run"}
+    kind : {"report", "run", "comparison"}
     quick : bool
         Whether sampling was skipped.
     items : tuple of Item
@@ -37,7 +37,7 @@ class Outcome:
     """
 
     folder: str
-    kind: Literal["report", "run"]
+    kind: Literal["report", "run", "comparison"]
     quick: bool
     items: tuple[Item, ...]
     environment: Mapping[str, tuple[str, str]]

@@ -1,9 +1,12 @@
-"""What a folder says of itself: `manifest.json` of a report and `run.json` of a run, checked."""
+"""What a folder says of itself, checked.
+
+`manifest.json` of a report, `run.json` of a run, `comparison.json` of a comparison.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any, Literal
 
@@ -23,10 +26,14 @@ from calib.errors import CalibError
 from calib.inference.io import SCHEMA as RUN_SCHEMA
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS
+from calib.report.comparison import FILE as COMPARISON
+from calib.report.comparison import SCHEMA as COMPARISON_SCHEMA
 from calib.report.manifest import SCHEMA as REPORT_SCHEMA
 from calib.report.sections import SECTIONS
 
-__all__ = ["Manifest", "RunRecord", "TaskRecord", "read_folder"]
+__all__ = [
+    "ComparisonRecord", "Manifest", "RunRecord", "TaskRecord", "read_folder", "read_run",
+]  # fmt: skip
 
 
 def _inside(path: str) -> str:
@@ -146,28 +153,84 @@ class RunRecord(_Made):
     """The whole file."""
 
 
-def read_folder(folder: Path) -> Manifest | RunRecord:
+class _Compared(_Record):
+    """What is said of a model that was compared."""
+
+    elpd_rows: Annotated[tuple[float, ...], Field(min_length=2)]
+    converged: bool
+    refits_not_converged: int
+
+
+class ComparisonRecord(_Made):
+    """`comparison.json` of a comparison folder."""
+
+    schema_: Literal["calib/comparison/2"] = Field(alias="schema")
+    seed: _Seed
+    settings: SamplerSettings
+    held_out: str
+    command: tuple[str, ...]
+    models: Annotated[dict[_Model, _Compared], Field(min_length=2)]
+    files: dict[_File, _Hash]
+    document: dict[str, JsonValue]
+    """The whole file."""
+
+    @property
+    def unsound(self) -> tuple[str, ...]:
+        """Models of which a posterior is recorded as one that did not pass the gate."""
+        return tuple(
+            name for name, m in self.models.items() if not m.converged or m.refits_not_converged
+        )
+
+
+type Record = Manifest | RunRecord | ComparisonRecord
+
+
+def read_folder(folder: Path) -> Record:
     """Read what a folder says of itself.
 
     Raises
     ------
     CalibError
-        If it is neither a report nor a run, or its record is damaged or of an earlier version.
+        If it is none that can be checked, or its record is damaged or of an earlier version.
     """
-    found = [name for name in ("manifest.json", "run.json") if (folder / name).is_file()]
+    readers: dict[str, Callable[[Any, Path], Record]] = {
+        "manifest.json": _manifest, "run.json": _run, COMPARISON: _comparison,
+    }  # fmt: skip
+    found = [name for name in readers if (folder / name).is_file()]
     if not found:
         raise CalibError(
-            "this is neither a report nor a run folder (no manifest.json or run.json in it)",
+            f"this is no folder that can be checked (no {', '.join(readers)} in it)",
             where=str(folder),
-            allowed="a folder written by `calib report` or `calib fit`",
+            allowed="a folder written by `calib report`, `calib fit` or `calib compare`",
             mend="give the folder that --out named",
         )
-    path = folder / found[0]
+    return readers[found[0]](_content(folder / found[0]), folder / found[0])
+
+
+def read_run(folder: Path) -> RunRecord:
+    """Read what a run folder inside another says of itself.
+
+    Raises
+    ------
+    CalibError
+        If it is damaged, missing or of an earlier version.
+    """
+    return _run(_content(folder / "run.json"), folder / "run.json")
+
+
+def _content(path: Path) -> Any:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise _damaged(path, f"it cannot be read ({type(error).__name__})") from None
-    return _manifest(content, path) if path.name == "manifest.json" else _run(content, path)
+
+
+def _comparison(content: Any, path: Path) -> ComparisonRecord:
+    _check_schema(content, COMPARISON_SCHEMA, path)
+    try:
+        return ComparisonRecord.model_validate({**content, "document": content})
+    except ValidationError as error:
+        raise _damaged(path, _first(error)) from None
 
 
 def _manifest(content: Any, path: Path) -> Manifest:

@@ -153,6 +153,14 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     ("summary.json/models/*/prior_sensitivity/parameters/*/contraction",
      Tolerance(MONTE_CARLO, 0.7, Of.REST)),
     ("summary.json/models/*/prior_sensitivity/parameters/*/{identified,reading}", _READ_OFF),
+    # Models compared. Weights and what is read off differences are held against the rows that they
+    # follow from (check_comparison); of two models much alike either may take all the weight.
+    ("comparison.json/models/*/{told_apart,refitted_rows,refits_not_converged}", _SIDES),
+    ("comparison.json/verdict", _SIDES),
+    ("comparison.json/models/*/weight", _JUMPS),
+    ("comparison.json/models/*/pareto_k_max", Tolerance(MONTE_CARLO, 1.0, Of.ONE)),
+    ("comparison.json/models/*/{elpd,elpd_rows/*,elpd_se,below_best,below_best_se,rmse,crps,"
+     "coverage_90,log_evidence}", _DRAWN),
     # The source's gaps. What is drawn there rests on 1200 draws, and has seven Monte Carlo errors
     # of a difference: of an end of a 90 % band 0.2 of its width, of a gap 0.3 of its sd. Eight
     # seeds moved probabilities by 0.025 at the most, rounding by 0.002.

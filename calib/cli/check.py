@@ -1,4 +1,4 @@
-"""The verb that checks a report or a run: everything computed again, and a verdict."""
+"""The verb that checks a folder: everything computed again, and a verdict."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def register(app: typer.Typer) -> None:
 
 
 def check(
-    folder: Annotated[Path, typer.Argument(help="Folder of `calib report` or `calib fit`.")],
+    folder: Annotated[Path, typer.Argument(help="Folder of `calib report`, `fit` or `compare`.")],
     quick: Annotated[
         bool, typer.Option("--quick", help="Skip the sampling: hashes, inputs and estimates only.")
     ] = False,
@@ -34,7 +34,7 @@ def check(
     plugins: Models = None,
     simulator: Simulators = None,
 ) -> None:
-    """Compute a report or a run again from its own folder and compare everything.
+    """Compute a folder's results again from that folder alone and compare everything.
 
     Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
     """
@@ -48,7 +48,7 @@ def check(
     load_files(sorted((folder / "emulators").glob("*.npz")))
     try:
         with pool(1 if quick else workers) as side, progress_bars() as tell:
-            outcome = find(folder, quick=quick, progress=tell, pool=side)
+            outcome = find(folder, quick=quick, progress=tell, pool=side, workers=workers)
     except CalibError as error:
         if json_to is not None:
             document = {"folder": str(folder), "verdict": "cannot be checked", "reason": str(error),

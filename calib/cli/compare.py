@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import CORES, Models, Workers
+from calib.cli.parallel import CORES, Models, Simulators, Workers
 
 __all__ = ["register"]
 
@@ -32,13 +32,16 @@ def compare(
     max_steps: Annotated[int, typer.Option(help="Where extending the chains stops.")] = 25_600,
     workers: Workers = CORES,
     plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Say which of several models the same data prefer, and what they cannot tell."""
     from calib.batch.folders import check_folder, fresh_folder
     from calib.cli.display import progress_bars
+    from calib.cli.simulators import say
     from calib.data import hold_out as split
     from calib.data import read_for_model
     from calib.data.labels import labelled
+    from calib.inference.emulation.prepared import prepare
     from calib.inference.prior_files import prior_file_model
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import get_model
@@ -56,15 +59,24 @@ def compare(
     table = labelled(read_for_model(Path(file), sorted(needed)))
     kept = None if hold_out is None else HoldOut.parse(hold_out)
     fitted, held = split(table, kept.column, kept.value) if kept else (table, None)
+    elsewhere = [] if held is None else [held]
+    given = {prior_file_model(path): path for path in priors or ()}
     with progress_bars() as tell:
+        emulations = {
+            name: prepare(
+                name, fitted, seed, priors=given.get(name), elsewhere=elsewhere, workers=workers,
+                progress=tell,
+            )
+            for name in models
+        }  # fmt: skip
         found = find(
-            fitted, models, seed, held_out=held,
-            priors={prior_file_model(path): path for path in priors or ()},
+            fitted, models, seed, held_out=held, priors=given,
             settings=SamplerSettings(max_steps=max_steps), progress=tell, workers=workers,
         )  # fmt: skip
+    good = [say(name, emulation) for name, emulation in emulations.items()]
     with fresh_folder(out, overwrite=overwrite) as folder:
         written = write_comparison(found, folder, ["calib", *sys.argv[1:]], hold_out or "")
     print(text(written))
     print(out / "index.html")
-    if not found.sound:
+    if not (found.sound and all(good)):
         raise typer.Exit(3)

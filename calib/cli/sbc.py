@@ -21,7 +21,7 @@ def register(app: typer.Typer) -> None:
 def sbc(
     out: Annotated[Path, typer.Option(help="Folder to write; a run there is resumed.")],
     model: Annotated[
-        list[str] | None, typer.Option(help="Model to test, all by default; repeatable.")
+        list[str] | None, typer.Option(help="Model to test; all but slow ones if none; repeatable.")
     ] = None,
     simulations: Annotated[int, typer.Option(help="Campaigns per model.", min=10)] = 300,
     seed: Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)] = 2019,
@@ -34,10 +34,17 @@ def sbc(
     from dataclasses import asdict
 
     from calib.cli.display import progress_bars
+    from calib.models import MODELS
     from calib.report.page.sbc import text_table
     from calib.report.sbc import write_sbc
-    from calib.validation.sbc.run import SETTINGS, run_sbc
+    from calib.validation.sbc.run import SETTINGS, chosen_models, run_sbc
 
+    slow = [name for name in MODELS if name not in chosen_models()]
+    if slow and not model:
+        announce(
+            f"left out: {', '.join(slow)}, of which each campaign takes minutes; name them with "
+            "--model"
+        )
     with progress_bars() as tell:
         score = run_sbc(
             out, models=model or (), simulations=simulations, seed=seed, workers=workers,

@@ -82,7 +82,11 @@ class Forward:
             name: _append(entries, s.priors) for name, s in self._simulated.items()
         }
         self.misfit_slices = {
-            name: _append(entries, [_normal(f"{name}.misfit", MISFIT * noise[name])] * s.n_bends)
+            name: _append(
+                entries,
+                [_normal(f"{name}.misfit", MISFIT * noise[name])] * s.n_bends
+                + [_normal(f"{name}.emulator", 1.0)] * s.n_errors,
+            )
             for name, s in self._simulated.items()
         }
         self.phi_slices = [

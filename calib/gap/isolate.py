@@ -164,7 +164,7 @@ def _signatures(
     for o in data.outputs:
         psi[:, forward.theta_slices[o.name]] = lab_mode[o.name]
     # All draws have the simulators in common but for their inadequacy, of which few have any.
-    alike = not any(s.n_bends for s in data.simulated.values())
+    alike = not any(s.n_bends + s.n_errors for s in data.simulated.values())
     once = forward.simulator(psi[:1] if alike else psi, data.view)
     plain = {o: np.broadcast_to(values, (_N_SIZES, values.shape[1])) for o, values in once.items()}
     full = forward.departed(psi, data.view, plain)

@@ -14,6 +14,7 @@ import numpy as np
 from calib.data.quantities import QUANTITIES
 from calib.gap.effects import View
 from calib.models.base import Array
+from calib.models.simulators.emulator.model import emulator_of
 
 if TYPE_CHECKING:
     from calib.gap.case import OutputData
@@ -22,6 +23,8 @@ __all__ = ["Simulated"]
 
 # Physical roles of the outputs whose simulators may be bent over their conditions.
 _BENT = ("density",)
+# Axes of an emulator's error below so many times what it neglects itself are left out.
+_FEWER = 3.0
 
 
 class Simulated:
@@ -43,6 +46,11 @@ class Simulated:
         Of the free parameters, named after the output.
     n_bends : int
         Coefficients of the inadequacy.
+    n_errors : int
+        Coefficients of an emulator's error, standard normal beforehand, which lab and field share.
+        With them the likelihood is that of the calibration (`calib.inference.uncertain`), but
+        that the error's size is everywhere that where the posteriors lie: worked out for each of
+        a million parameter vectors it would cost more than all the rest.
     """
 
     def __init__(self, o: OutputData, view: View, pressures: tuple[float, float]) -> None:
@@ -54,6 +62,9 @@ class Simulated:
         self.lab = o.problem.conditions
         self.field = self._bound.model.select(view.conditions)
         self.both = {k: np.concatenate([self.lab[k], v]) for k, v in self.field.items()}
+        self._emulator = emulator_of(self._bound.model)
+        self._mix = self._error_of(self.both)
+        self.n_errors = self._mix.shape[1]
         self._known = [
             (c, (self._bound.prepare(c), self._bends(c))) for c in (self.lab, self.field, self.both)
         ]
@@ -71,8 +82,8 @@ class Simulated:
         ----------
         t : ndarray, shape (k, d)
             Internal parameters.
-        misfit : ndarray, shape (k, n_bends)
-            In the unit of the response.
+        misfit : ndarray, shape (k, n_bends + n_errors)
+            The former in the unit of the response.
         conditions : mapping of str to ndarray, shape (n,) or (k, n)
         """
         prepared = (found for known, found in self._known if known is conditions)
@@ -106,17 +117,33 @@ class Simulated:
         location, at_low, at_high = np.split(self.predict(t, misfit, thrice), 3, axis=1)
         return np.asarray(location + (at_high - at_low) * beyond)
 
+    def _error_of(self, conditions: Mapping[str, Array]) -> Array:
+        """What the coefficients of the error make of an emulator's curves, shape (j, n_errors)."""
+        if self._emulator is None:
+            return np.zeros((0, 0))
+        root = np.sqrt(self._emulator.typical_variances)
+        at = self._emulator.curves_at(conditions)[:, 1:] * root
+        at = at[np.isfinite(at).all(axis=1)]
+        _, size, axes = np.linalg.svd(at, full_matrices=False)
+        # What stays below is less than is ever looked into, of which each axis has its cost.
+        kept = size > _FEWER * self._emulator.negligible * np.sqrt(max(len(at), 1))
+        return np.asarray(root[:, None] * axes[kept].T)
+
     def _bends(self, conditions: Mapping[str, Array]) -> list[Array]:
-        """What the coefficients of the inadequacy multiply, (n,) or (k, n) each."""
+        """What the coefficients of the inadequacy and the error multiply, (n,) or (k, n) each."""
         scaled = [
             np.clip((_even(name, conditions[name]) - mid) / half, -2.5, 2.5)
             for name, mid, half in self._ranges
         ]
-        return [
+        bends = [
             u * v - (1.0 / 3.0 if i == j else 0.0)
             for i, u in enumerate(scaled)
             for j, v in enumerate(scaled[: i + 1])
         ]
+        if self._emulator is None or not self.n_errors:
+            return bends
+        errors = self._emulator.curves_at(conditions)[..., 1:] @ self._mix
+        return bends + [errors[..., j] for j in range(self.n_errors)]
 
 
 def _even(column: str, values: Array) -> Array:

@@ -240,6 +240,8 @@ class Model:
     prepare : callable
         ``(conditions, references) -> rows``: what `location` needs of the conditions, worked out
         once for any number of parameter vectors.
+    slow : bool
+        Whether its posterior takes minutes: `calib sbc` asks for many, and for this one by name.
     uncertain : callable, optional
         Of a prediction that is known with an error of its own (an emulator's): ``(theta (k, d),
         conditions (n,)) -> prediction (k, n), variances (k, j), curves (n, j)`` on the scale of
@@ -272,6 +274,7 @@ class Model:
     theta_from_reported: Callable[[Mapping[str, float], References], Array] = not_given
     bind_references: Callable[[Conditions], dict[str, float]] = _no_references
     prepare: Callable[[Conditions, References], Rows] = _as_they_are
+    slow: bool = False
     uncertain: Callable[[Array, Conditions], tuple[Array, Array, Array]] | None = None
 
     def __post_init__(self) -> None:

@@ -1,32 +1,54 @@
-"""What a comparison leaves: `comparison.json`, the figure, a page, and a run folder per model."""
+"""What a comparison leaves: `comparison.json`, the figure, a page, and a run folder per model.
+
+With the rows that were held out and a hash of every file, so that it can be computed again.
+"""
 
 from __future__ import annotations
 
 import base64
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from calib.batch.environment import Environment
+from calib.data import write_table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.io import load_calibration, save_calibration
 from calib.report.figures.comparison import comparison_figure
 from calib.report.figures.export import png_bytes
+from calib.report.manifest import file_hashes
 from calib.report.page.comparison import render
-from calib.validation.comparison import Candidate, Comparison
+from calib.validation.comparison import Candidate, Comparison, difference
 from calib.validation.prediction import N_DRAWS
 from calib.validation.validate import PARETO_K_MAX
 
-__all__ = ["FILE", "SCHEMA", "document", "load_stack", "write_comparison"]
+__all__ = [
+    "FIGURE", "FILE", "HELD_OUT", "PAGE", "SCHEMA", "document", "load_stack", "page",
+    "write_comparison",
+]  # fmt: skip
 
-SCHEMA = "calib/comparison/1"
-FILE = "comparison.json"
+SCHEMA = "calib/comparison/2"
+FILE, PAGE, FIGURE, HELD_OUT = (
+    "comparison.json", "index.html", "figures/bands.png", "held_out.csv"
+)  # fmt: skip
 
 
-def document(comparison: Comparison, hold_out: str = "") -> dict[str, Any]:
-    """Return every number of a comparison as plain dictionaries."""
+def document(comparison: Comparison, hold_out: str = "", best: str | None = None) -> dict[str, Any]:
+    """Return every number of a comparison as plain dictionaries.
+
+    Parameters
+    ----------
+    comparison : Comparison
+    hold_out : str
+        What was held out, in words; empty for nothing.
+    best : str, optional
+        The model that differences are from, where another comparison had it for the best.
+    """
+    first = next(c for c in comparison.candidates if best in (None, c.model))
     return {
         "schema": SCHEMA,
         "seed": comparison.seed,
@@ -34,19 +56,20 @@ def document(comparison: Comparison, hold_out: str = "") -> dict[str, Any]:
         "held_out": hold_out,
         "converged": comparison.sound,
         "verdict": comparison.sentence,
-        "models": {c.model: _model(comparison, c) for c in comparison.candidates},
+        "models": {c.model: _model(comparison, c, first) for c in comparison.candidates},
     }
 
 
-def _model(comparison: Comparison, c: Candidate) -> dict[str, Any]:
-    difference, loo = comparison.differences[c.model], c.loo
+def _model(comparison: Comparison, c: Candidate, best: Candidate) -> dict[str, Any]:
+    below, loo = difference(best.rows - c.rows), c.loo
     found: dict[str, Any] = {
         "weight": comparison.weights[c.model],
         "elpd": loo.elpd,
         "elpd_se": loo.elpd_se,
-        "below_best": difference.elpd,
-        "below_best_se": difference.se,
-        "told_apart": difference.clear,
+        "below_best": below.elpd,
+        "below_best_se": below.se,
+        "told_apart": below.clear,
+        "elpd_rows": c.rows.tolist(),
         "converged": c.calibration.converged,
         "pareto_k_max": None if loo.pareto_k is None else _finite(float(loo.pareto_k.max())),
         "pareto_k_limit": PARETO_K_MAX,
@@ -72,8 +95,19 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
+def page(found: Mapping[str, Any], image: bytes) -> str:
+    """Return the page of a comparison, from the content of `comparison.json` and the figure."""
+    uri = f"data:image/png;base64,{base64.b64encode(image).decode()}"
+    return render(found, uri, found["command"])
+
+
 def write_comparison(
-    comparison: Comparison, folder: Path, command: Sequence[str], hold_out: str = ""
+    comparison: Comparison,
+    folder: Path,
+    command: Sequence[str],
+    hold_out: str = "",
+    *,
+    environment: Environment | None = None,
 ) -> dict[str, Any]:
     """Write a comparison into an empty folder and return what `comparison.json` holds.
 
@@ -85,18 +119,29 @@ def write_comparison(
         The command line, for the page.
     hold_out : str
         What was held out, in words; empty for nothing.
+    environment : Environment, optional
+        Where it says that it was made: in that of this process by default.
     """
-    found = document(comparison, hold_out)
+    here = environment or Environment.here()
+    first = comparison.candidates[0]
+    found = {
+        **document(comparison, hold_out),
+        "command": list(command),
+        "settings": json.loads(json.dumps(asdict(first.calibration.settings))),
+        **here.document(),
+    }
     image = png_bytes(comparison_figure(comparison))
     (folder / "figures").mkdir()
-    (folder / "figures" / "bands.png").write_bytes(image)
-    (folder / FILE).write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
-    uri = f"data:image/png;base64,{base64.b64encode(image).decode()}"
-    (folder / "index.html").write_text(render(found, uri, command), encoding="utf-8")
+    (folder / FIGURE).write_bytes(image)
+    (folder / PAGE).write_text(page(found, image), encoding="utf-8")
+    if first.held is not None:
+        write_table(folder / HELD_OUT, first.held.table.columns)
     for c in comparison.candidates:
         run = folder / "runs" / c.model
         run.mkdir(parents=True)
-        save_calibration(c.calibration, run)
+        save_calibration(c.calibration, run, environment=here)
+    found["files"] = file_hashes(folder)
+    (folder / FILE).write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
     return found
 
 

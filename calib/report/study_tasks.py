@@ -136,10 +136,19 @@ def plan_tasks(
     Raises
     ------
     CalibError
-        If no table has an output, two have the same, none has the rows to hold out, a table is
-        too long for a report, or a name is unknown.
+        If no table has an output, two tables or two models have the same, none has the rows to
+        hold out, a table is too long for a report, or a name is unknown.
     """
-    wanted = {get_model(name).output: name for name in models}
+    wanted: dict[str, str] = {}
+    for name in models:
+        other = wanted.setdefault(get_model(name).output, name)
+        if other != name:
+            raise CalibError(
+                f"two models are given for the same output: {other}, {name}",
+                allowed="one model for each output",
+                mend=f"report one of them; `calib compare {other} {name} FILE` tells which of them "
+                "the data prefer",
+            )
     priors = {prior_file_model(path): path for path in prior_paths}
     for name in only:
         if name not in OUTPUTS:

@@ -19,7 +19,7 @@ from calib.data import Table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
-from calib.inference.problem import build_problem
+from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
@@ -27,7 +27,8 @@ from calib.models.base import Array
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
 __all__ = [
-    "Candidate", "Comparison", "Difference", "check_comparable", "compare", "stacking_weights",
+    "Candidate", "Comparison", "Difference", "check_comparable", "compare", "compare_problems",
+    "difference", "sentence", "stacking_weights",
 ]  # fmt: skip
 
 # Differences of less are small whatever their standard error, which few rows then underestimate.
@@ -115,34 +116,50 @@ class Comparison:
     def differences(self) -> dict[str, Difference]:
         """Of each model from the best; zero for that itself."""
         best = self.candidates[0].rows
-        return {c.model: _difference(best - c.rows) for c in self.candidates}
+        return {c.model: difference(best - c.rows) for c in self.candidates}
 
     @property
     def sentence(self) -> str:
         """What the data prefer, and what they cannot tell, in plain words."""
-        if not self.sound:
-            bad = [c.model for c in self.candidates if not c.sound]
-            return (
-                f"No preference is stated: {_joined(bad)} did not converge. Raise --max-steps, or "
-                "give tighter priors."
-            )
-        best, *others = (c.model for c in self.candidates)
-        told = [m for m in others if self.differences[m].clear]
-        untold = [m for m in others if not self.differences[m].clear]
-        parts = []
-        if told:
-            parts.append(f"The data prefer {best} to {_joined(told)}.")
-        if untold:
-            parts.append(f"They cannot tell {best} from {_joined(untold)}." if told else
-                         f"The data cannot tell {_joined([best, *untold])} apart.")  # fmt: skip
-        return " ".join(parts)
+        return sentence(
+            {c.model: self.differences[c.model].clear for c in self.candidates},
+            [c.model for c in self.candidates if not c.sound],
+        )
+
+
+def sentence(told_apart: Mapping[str, bool], unsound: Sequence[str]) -> str:
+    """Say what data prefer, and what they cannot tell.
+
+    Parameters
+    ----------
+    told_apart : mapping of str to bool
+        Models, the best first: whether the data tell each from the best.
+    unsound : sequence of str
+        Those that did not converge.
+    """
+    if unsound:
+        return (
+            f"No preference is stated: {_joined(unsound)} did not converge. Raise --max-steps, or "
+            "give tighter priors."
+        )
+    best, *others = told_apart
+    told = [m for m in others if told_apart[m]]
+    untold = [m for m in others if not told_apart[m]]
+    parts = []
+    if told:
+        parts.append(f"The data prefer {best} to {_joined(told)}.")
+    if untold:
+        parts.append(f"They cannot tell {best} from {_joined(untold)}." if told else
+                     f"The data cannot tell {_joined([best, *untold])} apart.")  # fmt: skip
+    return " ".join(parts)
 
 
 def _joined(words: Sequence[str]) -> str:
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
-def _difference(rows: Array) -> Difference:
+def difference(rows: Array) -> Difference:
+    """Sum up by how much the rows of one model are more probable than those of another."""
     return Difference(float(rows.sum()), float(np.sqrt(rows.size * rows.var(ddof=1))))
 
 
@@ -187,14 +204,27 @@ def compare(
     (2018), doi:10.1214/17-BA1091; Sivula, Magnusson, Matamoros & Vehtari (2020), arXiv:2008.10296.
     """
     check_comparable(models)
-    tell = progress or (lambda what, done, planned: None)
     given = priors or {}
-    found = [
-        _candidate(name, table, held_out, given.get(name), seed, settings, tell, workers)
-        for name in models
-    ]
+    return compare_problems(
+        [build_problem(name, table, given.get(name)) for name in models], seed, held_out=held_out,
+        settings=settings, progress=progress, workers=workers,
+    )  # fmt: skip
+
+
+def compare_problems(
+    problems: Sequence[Problem],
+    seed: int,
+    *,
+    held_out: Table | None = None,
+    settings: SamplerSettings | None = None,
+    progress: Progress | None = None,
+    workers: int = 1,
+) -> Comparison:
+    """Compare as `compare` does models that are bound to the same rows already."""
+    tell = progress or (lambda what, done, planned: None)
+    found = [_candidate(p, held_out, seed, settings, tell, workers) for p in problems]
     weights = stacking_weights(np.stack([c.rows for c in found], axis=1))
-    named = dict(zip(models, map(float, weights), strict=True))
+    named = {c.model: float(w) for c, w in zip(found, weights, strict=True)}
     ranked = tuple(sorted(found, key=lambda c: -c.loo.elpd))
     return Comparison(ranked, {c.model: named[c.model] for c in ranked}, seed)
 
@@ -224,10 +254,10 @@ def check_comparable(models: Sequence[str]) -> None:
 
 
 def _candidate(
-    name: str, table: Table, held_out: Table | None, priors: Path | None, seed: int,
-    settings: SamplerSettings | None, tell: Progress, workers: int,
+    problem: Problem, held_out: Table | None, seed: int, settings: SamplerSettings | None,
+    tell: Progress, workers: int,
 ) -> Candidate:  # fmt: skip
-    problem = build_problem(name, table, priors)
+    name = problem.bound.model.name
     start = estimate(problem, "least_squares", generator(seed, name, "least_squares"))
     calibration = calibrate(
         problem, seed, label=name, estimates=(start,), settings=settings,

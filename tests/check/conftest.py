@@ -1,4 +1,4 @@
-"""A small report, a whole one and a run, and copies of them to tamper with.
+"""A small report, a whole one, a run and a comparison, and copies of them to tamper with.
 
 They are made in processes that round as another processor would; what is tampered with is to be
 found there as here. ``CALIB_MADE_UNDER`` names another setting (`kernels.Setting`).
@@ -62,6 +62,12 @@ def original_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return original_of("run", tmp_path_factory)
 
 
+@pytest.fixture(scope="package")
+def original_comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A comparison as `calib compare` makes it."""
+    return original_of("comparison", tmp_path_factory)
+
+
 @pytest.fixture(autouse=True)
 def _few_figures() -> Any:
     with patch("calib.report.writer.plates", made.two_plates):
@@ -92,6 +98,11 @@ def whole(original_whole: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def run(original_run: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(original_run, tmp_path / "run"))
+
+
+@pytest.fixture
+def compared(original_comparison: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(original_comparison, tmp_path / "compared"))
 
 
 @pytest.fixture(scope="package")

@@ -1,4 +1,6 @@
-"""A small report, a whole one and a run, made in a process of its own as another processor would.
+"""A small report, a whole one, a run and a comparison, made as another processor would.
+
+In a process of its own.
 
 As a program: python -m tests.check.made KIND FOLDER.
 """
@@ -11,6 +13,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
+from calib.data import hold_out, read_table
 from calib.he2019.audit import Seeds
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.gaps.cases import paper_gaps
@@ -23,6 +26,8 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings
+from calib.models import example_csv
+from calib.report.comparison import write_comparison
 from calib.report.contents import work_out
 from calib.report.figures import Plate
 from calib.report.figures.bands import bands_plate
@@ -32,6 +37,7 @@ from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult, Study, run_study
 from calib.report.study_tasks import Task
 from calib.report.writer import write_report
+from calib.validation.comparison import compare
 from tests.check.kernels import Setting, skip_what_crashes
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -86,6 +92,17 @@ def run(out: Path) -> Path:
     return out
 
 
+def comparison(out: Path, seed: int = 2019) -> Path:
+    """Two models of plates as `calib compare` compares them, one width held out."""
+    path = out.with_suffix(".csv")
+    path.write_text(example_csv("reece"))
+    fitted, held = hold_out(read_table(path), "plate_width_mm", 80.0)
+    found = compare(fitted, ["bekker_plate", "bekker"], seed, held_out=held, settings=SETTINGS)
+    out.mkdir()
+    write_comparison(found, out, ["calib", "compare"], "plate_width_mm=80")
+    return out
+
+
 def fitted_run(problem: Problem, seed: int) -> Calibration:
     rng = generator(seed, problem.bound.model.name, "least_squares")
     point = estimate(problem, "least_squares", rng)
@@ -103,4 +120,5 @@ def elsewhere(kind: str, out: Path, setting: Setting) -> Path:
 
 
 if __name__ == "__main__":
-    {"report": report, "whole": whole, "run": run}[sys.argv[1]](Path(sys.argv[2]))
+    kinds = {"report": report, "whole": whole, "run": run, "comparison": comparison}
+    kinds[sys.argv[1]](Path(sys.argv[2]))

@@ -518,9 +518,9 @@ def test_a_damaged_manifest_cannot_be_checked(report: Path, content: bytes) -> N
 
 
 def test_another_folder_cannot_be_checked(tmp_path: Path) -> None:
-    with pytest.raises(CalibError, match="neither a report nor a run"):
+    with pytest.raises(CalibError, match="no folder that can be checked"):
         check(tmp_path)
-    with pytest.raises(CalibError, match="neither a report nor a run"):
+    with pytest.raises(CalibError, match="no folder that can be checked"):
         check(tmp_path / "absent")
 
 

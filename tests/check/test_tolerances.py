@@ -30,13 +30,15 @@ def documents() -> list[str]:
 
 
 def test_every_row_of_the_table_is_used() -> None:
-    """By the embedded data's report, or by what a run has."""
+    """By the embedded data's report, or by what a run or a comparison has."""
     paths = ["/".join(path) for name in documents() for path in entries(name)]
     paths += [
         "run.json/estimates/0/cost", "run.json/estimates/0/reported/n0",
         "run.json/estimates/0/theta/1", "run.json/shape/0",
         "summary.json/models/rut_depth/sampling/reasons/0",
-        "summary.json/models/bulk_density/validation/refitted/0",
+        "summary.json/models/bulk_density/validation/refitted/0", "comparison.json/verdict",
+        *(f"comparison.json/models/reece/{x}" for x in ("elpd", "pareto_k_max", "weight")),
+        "comparison.json/models/reece/told_apart",
     ]  # fmt: skip
     first = {next((i for i, (p, _) in enumerate(_PATTERNS) if p.fullmatch(x)), None) for x in paths}
     unused = [TABLE[i][0] for i in range(len(TABLE)) if i not in first]

@@ -74,7 +74,7 @@ def test_what_cannot_be_checked_ends_with_2(calib: Calib, run: Path) -> None:  #
     for folder in ("absent", "data"):
         refused = calib("check", folder, "--json", "check.json")
         assert refused.code == 2
-        assert "neither a report nor a run folder" in refused.err
+        assert "no folder that can be checked" in refused.err
         assert "to mend:" in refused.err
         document = json.loads(Path("check.json").read_text())
         assert (document["verdict"], document["exit_code"]) == ("cannot be checked", 2)

@@ -142,6 +142,24 @@ def test_a_report_and_its_check(run: Calib) -> None:
     assert checked.out.startswith("SAME")
 
 
+@pytest.mark.slow
+def test_simulators_are_compared(run: Calib) -> None:
+    """Two that say the same of other parameters cannot be told apart."""
+    own: list[object] = []
+    for name, extra in (("wheel", ""), ("twin", "p['s0'] *= 2")):
+        Path(name).mkdir()
+        own += ["--simulator", write_program(Path(name), name=f'"{name}"', extra=extra)]
+    write_table("lab.csv", lab(np.random.default_rng(1)))
+    made = run("compare", "wheel", "twin", "lab.csv", *own, "--out", "c", "--workers", 1, *FEW)
+    assert made.code == 0, made.err
+    assert "twin: emulated from" in made.out
+    assert "The data cannot tell" in made.out
+    checked = run("check", "c", *own, "--workers", 1)
+    assert checked.code == 0, checked.out
+    told = run("predict", "c", "--at", "lab.csv", *own, "--out", "bands.csv")
+    assert told.code == 0, told.err
+
+
 def test_a_data_folder_runs_no_command(run: Calib) -> None:
     Path("case").mkdir()
     write_program(Path("case"), extra="open('/dev/null'); open('ran', 'w')")

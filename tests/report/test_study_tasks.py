@@ -120,6 +120,9 @@ def test_a_model_can_be_chosen_for_its_output() -> None:
     table = load_he2019("rut_depth")
     assert plan_tasks([table])[0].model == "modified_bekker"
     assert plan_tasks([table], models=["bekker"])[0].model == "bekker"
+    with pytest.raises(CalibError, match="two models are given for the same output") as caught:
+        plan_tasks([table], models=["bekker", "modified_bekker"])
+    assert "`calib compare bekker modified_bekker FILE`" in str(caught.value)
 
 
 def test_a_prior_file_goes_to_the_model_it_names(tmp_path: Path) -> None:

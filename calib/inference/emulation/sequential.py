@@ -20,7 +20,6 @@ import numpy as np
 from scipy.stats import qmc
 
 from calib.batch.threads import one_thread
-from calib.errors import CalibError
 from calib.inference.emulation.judge import WORTH, held_out, judged
 from calib.inference.emulation.nodes import choose_nodes
 from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut
@@ -72,7 +71,8 @@ def emulate(
     Raises
     ------
     CalibError
-        If fewer than half of the first runs have a value, with what the others printed.
+        If fewer than half of the first runs have a value, or none where the data are: with where
+        the others failed and what they printed.
     """
     chosen = settings or EmulationSettings()
     recorded = [problem.conditions, *(problem.bound.model.select(e) for e in elsewhere)]
@@ -135,6 +135,8 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
         state.learn(theta, values)
     measured = _check(state, z, checks, len(history)) if checks else None
     state.rebuild()
+    if not state.holds(z).any():
+        raise state.without_value("no parameters are left for the data")
     return judged(state, z, chosen, measured, own_noise, history)
 
 
@@ -166,7 +168,7 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
     values = state.carry_out(theta)
     ok = np.isfinite(values).all(axis=1)
     if ok.mean() < _LEAST_OK:
-        raise _hardly_any(state, int(ok.sum()))
+        raise state.without_value("the simulator fails in most of its prior")
     state.learn(theta, values)
     repeats = np.flatnonzero(ok)[: 1 if state.keeper.simulator.deterministic else 5]
     times = [1] if state.keeper.simulator.deterministic else [1, 2]
@@ -195,18 +197,6 @@ def prior_design(problem: Problem, count: int, seed: int, *, latin: bool = False
         u = qmc.Sobol(d, scramble=True, rng=rng).random_base2(bits)[:count]
     t = problem.priors.ppf(_TRIMMED + (1.0 - 2.0 * _TRIMMED) * u)
     return problem.theta(t)[:, :-1]
-
-
-def _hardly_any(state: State, ok: int) -> CalibError:
-    first = next(run.failure for run in state.runs if run.failure is not None)
-    printed = f"; it printed: {first.printed.strip()}" if first.printed.strip() else ""
-    return CalibError(
-        f"only {ok} of the {len(state.runs)} first runs have a value ({first.kind}: "
-        f"{first.reason}{printed})",
-        where=f"simulator {state.keeper.simulator.name}",
-        allowed="a simulator with values in at least half of its prior",
-        mend="correct the simulator, its limit of time, or priors that reach where it has none",
-    )
 
 
 def _next(state: State, z: Array, count: int, step: int) -> Array:

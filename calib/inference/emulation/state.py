@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.errors import CalibError
 from calib.inference.problem import Problem
 from calib.inference.random import stream
 from calib.inference.sampling.mode import prior_widths
@@ -106,9 +107,12 @@ class State:
     def sample(self, step: int) -> Array:
         """Draw from the posterior under the emulator; return z of the draws, shape (k, d)."""
         starts = None if self.mode is None else self.mode[None]
-        draws = sample_posterior(
-            self.emulated, stream(self.seed, self.label, step), starts=starts, settings=_ROUGH
-        )
+        try:
+            draws = sample_posterior(
+                self.emulated, stream(self.seed, self.label, step), starts=starts, settings=_ROUGH
+            )
+        except CalibError as error:
+            raise self.without_value("no parameters are left for the data") from error
         self.mode = draws.mode
         picked = np.linspace(0, len(draws.flat) - 1, _DRAWS).round().astype(int)
         natural = self.emulated.theta(draws.flat[picked])
@@ -117,10 +121,43 @@ class State:
         self.region = _region(z, self.free)
         return z
 
+    def without_value(self, why: str) -> CalibError:
+        """Return what to say where runs that failed are in the way."""
+        failures = [run.failure for run in self.runs if run.failure is not None]
+        if not failures:
+            return CalibError(
+                f"{why}, although every run has a value", where=self._where,
+                mend="check that the data's units and the priors' scales fit each other",
+            )  # fmt: skip
+        first, names = failures[0], self.keeper.simulator.parameters
+        ok = np.array([run.ok for run in self.runs])
+        theta = np.stack([run.theta for run in self.runs])
+        at = f", at {_ranges(names, theta[~ok])}"
+        at += f"; those with a value are at {_ranges(names, theta[ok])}" if ok.any() else ""
+        printed = f"; it printed: {first.printed.strip()}" if first.printed.strip() else ""
+        return CalibError(
+            f"{why}: only {ok.sum()} of the {ok.size} runs have a value "
+            f"({first.kind}: {first.reason}{printed}){at}",
+            where=self._where,
+            allowed="a simulator with values in at least half of its prior, and where the data are",
+            mend="correct the simulator or its limit of time where it fails, or give priors that "
+            "do not reach there",
+        )  # fmt: skip
+
+    @property
+    def _where(self) -> str:
+        return f"simulator {self.keeper.simulator.name}"
+
     def error(self, z: Array) -> float:
         """The emulator's expected error at draws, rms over the rows, in sds of the noise."""
         rows = self.problem.response.size
         return float(np.sqrt(self.row_variance(z).mean() / rows)) / self.sigma
+
+    def holds(self, z: Array) -> NDArray[np.bool_]:
+        """Whether there is a value at draws, as far as is known."""
+        if self.emulator is None:
+            return np.zeros(len(z), dtype=bool)
+        return self.emulator.holds(z)
 
     def row_variance(self, z: Array) -> Array:
         """Sum over the data's rows of the emulator's variance, shape (k,)."""
@@ -129,6 +166,13 @@ class State:
         _, variances = self.emulator.with_variance(self.axes.natural(z))
         curves = self.emulator.curves_at(self.problem.conditions)[:, 1:]
         return np.asarray(variances @ (curves**2).sum(axis=0))
+
+
+def _ranges(names: Sequence[str], theta: Array) -> str:
+    low, high = theta.min(axis=0), theta.max(axis=0)
+    return ", ".join(
+        f"{n} {a:.4g} to {b:.4g}" for n, a, b in zip(names, low, high, strict=True)
+    )  # fmt: skip
 
 
 def _axes(problem: Problem) -> Axes:

@@ -10,6 +10,9 @@ from calib.models.base import Array
 
 __all__ = ["hessian_scale"]
 
+# Of curvatures over that of the prior.
+_NARROWEST = 1e13
+
 type LogProb = Callable[[Array], Array]
 
 
@@ -50,8 +53,8 @@ def hessian_scale(log_prob: LogProb, mode: Array, width: Array) -> Array:
             position += 4
     scaled = -hessian * np.outer(width, width)
     eigenvalues, vectors = np.linalg.eigh(scaled)
-    # No direction is wider than its prior allows.
-    inverse = (vectors / np.maximum(eigenvalues, 1.0)) @ vectors.T
+    # No direction is wider than its prior allows, none so narrow that rounding hides it.
+    inverse = (vectors / np.clip(eigenvalues, 1.0, _NARROWEST)) @ vectors.T
     return np.asarray(inverse * np.outer(width, width))
 
 

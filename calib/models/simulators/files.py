@@ -223,7 +223,9 @@ def _callable(file: _File, path: Path) -> CallableWay:
             f"there is no function {name!r} in {script}", where=f"{path}, python",
             allowed='python = "file.py:function"', mend="correct the name",
         )  # fmt: skip
-    return CallableWay(function, tuple(file.outputs), file.batched)
+    # In a process of its own only where a limit is asked for: starting one takes time.
+    limit = file.limit if "limit" in file.model_fields_set else None
+    return CallableWay(function, tuple(file.outputs), file.batched, limit)
 
 
 def _umbridge(file: _File, path: Path) -> UmbridgeWay:

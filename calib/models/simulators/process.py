@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
+from calib.batch.plugins import USER_MODULE
 from calib.errors import CalibError
 from calib.models.simulators.base import Failure, tail
 
-__all__ = ["run_program"]
+__all__ = ["call_function", "run_program"]
 
 _PRINTED = ".printed"
 
@@ -69,6 +73,63 @@ def run_program(arguments: Sequence[str], folder: Path, limit: float) -> Failure
     if code:
         return Failure("exit", _ended(code), tail(text))
     return text
+
+
+def call_function(function: Callable[..., Any], arguments: Sequence[Any], limit: float) -> Any:
+    """Call a Python function in a process of its own, which is ended when the limit has passed.
+
+    Parameters
+    ----------
+    function : callable
+        Handed over with whatever it refers to, as it is now: what it changes is lost.
+    arguments : sequence
+    limit : float
+        Seconds, the start of the process (a third of one, and what the function imports) included.
+
+    Returns
+    -------
+    object or Failure
+        What it returned, or why there is nothing.
+
+    Raises
+    ------
+    CalibError
+        If it cannot be handed over.
+    """
+    with tempfile.TemporaryDirectory(prefix="calib-run-", ignore_cleanup_errors=True) as name:
+        scratch = Path(name)
+        given, taken = scratch / "call", scratch / "result"
+        given.write_bytes(
+            pickle.dumps((str(Path.cwd()), sys.path, _handed_over(function, arguments)))
+        )
+        child = Path(__file__).with_name("child.py")
+        started = [sys.executable, "-P", str(child), str(given), str(taken)]
+        printed = run_program(started, scratch, limit)
+        if isinstance(printed, Failure):
+            return printed
+        found, raised = pickle.loads(taken.read_bytes())
+    return found if raised is None else Failure("error", raised, tail(printed))
+
+
+def _handed_over(function: Callable[..., Any], arguments: Sequence[Any]) -> bytes:
+    import cloudpickle
+
+    # Of a file that was loaded by its path another process knows nothing.
+    module = sys.modules.get(getattr(function, "__module__", ""))
+    by_path = module is not None and module.__name__.startswith(USER_MODULE)
+    try:
+        if by_path:
+            cloudpickle.register_pickle_by_value(module)
+        return bytes(cloudpickle.dumps((function, tuple(arguments))))
+    except (TypeError, pickle.PicklingError) as error:
+        raise CalibError(
+            f"the function cannot be handed to a process of its own ({error})",
+            where=getattr(function, "__qualname__", repr(function)),
+            mend="open files and connections inside it, or give no limit of time",
+        ) from None
+    finally:
+        if by_path:
+            cloudpickle.unregister_pickle_by_value(module)
 
 
 def _ended(code: int) -> str:

@@ -116,6 +116,7 @@ def _model(simulator: Simulator, output: Output) -> Model:
         response="log" if log else "identity",
         source=simulator.source,
         parametrisation="The parameters of the simulator are sampled.",
+        slow=simulator.emulate,
         priors=f'model = "{name}"\n\n{simulator.priors}\n{output.sigma}',
     )
 
@@ -131,6 +132,7 @@ def from_callable(
     emulate: bool = False,
     folder: Path | None = None,
     deterministic: bool = True,
+    limit: float | None = None,
     **budget: float,
 ) -> Simulated:
     """Make a simulator of a Python function; `calib.register` makes its models known.
@@ -158,6 +160,10 @@ def from_callable(
         Where runs are kept, if it is emulated.
     deterministic : bool
         Whether equal input gives equal output.
+    limit : float, optional
+        Seconds that a run may take if it is emulated. It is then made in a process of its own,
+        which is ended with what it has started when they have passed; without a limit, in this
+        process, for as long as it takes.
     **budget
         ``runs``, ``first``, ``checks``, ``tolerance``, ``nodes``: see
         `calib.inference.emulation.EmulationSettings`.
@@ -175,9 +181,9 @@ def from_callable(
     taken = dict(conditions) if isinstance(conditions, Mapping) else {c: c for c in conditions}
     return declare(
         name or getattr(f, "__name__", "simulator"),
-        CallableWay(f, tuple(named), batched),
+        CallableWay(f, tuple(named), batched, limit),
         parameters, taken, named, folder=folder, emulate=emulate, deterministic=deterministic,
-        budget=budget,
+        budget=budget, **({} if limit is None else {"limit": limit}),
     )  # fmt: skip
 
 

@@ -21,7 +21,7 @@ from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Result, tail
 from calib.models.simulators.exchange import filled, input_csv, input_json, output_of_text
-from calib.models.simulators.process import run_program
+from calib.models.simulators.process import call_function, run_program
 
 __all__ = ["CallableWay", "CommandWay", "TableWay", "UmbridgeWay"]
 
@@ -39,11 +39,14 @@ class CallableWay:
     columns : tuple of str
         The outputs.
     batched : bool
+    limit : float, optional
+        Seconds for a run, which is then made in a process of its own; without one, in this.
     """
 
     function: Callable[[Array, Mapping[str, Array]], Any]
     columns: tuple[str, ...]
     batched: bool = True
+    limit: float | None = None
 
     @property
     def identity(self) -> str:
@@ -62,15 +65,25 @@ class CallableWay:
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
         """Call it for one parameter vector."""
         theta = np.array(list(parameters.values()))
+        arguments = (theta[None] if self.batched else theta, conditions)
         try:
-            found = self.call(theta[None] if self.batched else theta, conditions)
+            if self.limit is None:
+                found = self.function(*arguments)
+            else:
+                found = call_function(self.function, arguments, self.limit)
+            if isinstance(found, Failure):
+                return found
+            return {name: values.ravel() for name, values in self._named(found).items()}
+        except CalibError:
+            raise
         except Exception as error:
             return Failure("error", f"{type(error).__name__}: {error}")
-        return {name: values.ravel() for name, values in found.items()}
 
     def call(self, theta: Array, conditions: Mapping[str, Array]) -> dict[str, Array]:
-        """Call it, and name what it returns."""
-        found = self.function(theta, conditions)
+        """Call it here and now, and name what it returns."""
+        return self._named(self.function(theta, conditions))
+
+    def _named(self, found: Any) -> dict[str, Array]:
         if not isinstance(found, Mapping):
             found = dict.fromkeys(self.columns[:1], found)
         return {name: np.asarray(v, dtype=np.float64) for name, v in found.items()}

@@ -15,7 +15,7 @@ from calib.models import MODELS, get_model
 from calib.validation.sbc.replicate import Item, replicate
 from calib.validation.sbc.score import SbcScore, score
 
-__all__ = ["SETTINGS", "read_records", "run_sbc"]
+__all__ = ["SETTINGS", "chosen_models", "read_records", "run_sbc"]
 
 # As for a report, but a chain is extended to 3200 steps, not 25,600, before it counts as one that
 # did not converge: simulated campaigns are many, and some tell next to nothing.
@@ -43,7 +43,7 @@ def run_sbc(
     out : Path
         Its folder ``replicates`` gets one JSON file for each replicate.
     models : sequence of str
-        All by default.
+        By default all that are not slow.
     simulations : int
         Of each model.
     seed : int
@@ -56,7 +56,7 @@ def run_sbc(
     CalibError
         If there is no such model, or the folder holds a run of another seed or other settings.
     """
-    names = [get_model(name).name for name in models] or list(MODELS)
+    names = chosen_models(models)
     _claim(out, {"seed": seed, "settings": asdict(settings)})
     items = {
         f"{model}-{i:04d}": Item(model, i, seed, settings)
@@ -68,6 +68,18 @@ def run_sbc(
         progress=progress, announce=announce,
     )  # fmt: skip
     return score(read_records(out, outcome.done), seed, simulations, outcome.failed)
+
+
+def chosen_models(models: Sequence[str] = ()) -> list[str]:
+    """Return the names of models; of all that are not slow if none is given.
+
+    Raises
+    ------
+    CalibError
+        If there is no such model.
+    """
+    named = [get_model(name).name for name in models]
+    return named or [m.name for m in MODELS.values() if not m.slow]
 
 
 def read_records(out: Path, names: Sequence[str]) -> list[dict[str, Any]]:

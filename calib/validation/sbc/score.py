@@ -19,6 +19,8 @@ __all__ = ["LEVEL", "BandCoverage", "ModelScore", "Quantity", "SbcScore", "score
 
 # Chance of a false alarm in all quantities and bands of a run together.
 LEVEL = 0.05
+# Of a single rank there is no distribution.
+_FEWEST = 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +161,7 @@ def score(
     Raises
     ------
     CalibError
-        If there is no record at all.
+        If there is no record at all, or too few posteriors of a model converged.
     """
     models = dict.fromkeys(r["model"] for r in records)
     errors = failed or {}
@@ -184,6 +186,12 @@ def score_model(
     """Score the records of one model."""
     model, seed = records[0]["model"], records[0]["seed"]
     good = [r for r in records if r["converged"]]
+    if len(good) < _FEWEST:
+        raise CalibError(
+            f"{len(good)} of {len(records)} posteriors of {model} converged: nothing can be told",
+            allowed=f"{_FEWEST} or more that converged",
+            mend="simulate more campaigns, or leave the model out; those that are done are kept",
+        )
     names = dict.fromkeys(name for r in records for name in r["ranks"])
     return ModelScore(
         model=model,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.emulation.prepared import prepare, write_failed
 from calib.models import MODELS
+from calib.models.simulators.base import Failure
 from calib.models.simulators.registered import SIMULATED, Simulated
 from tests.models.simulators.examples import PRIORS, lab, pull
 
@@ -103,11 +105,99 @@ def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> N
     assert "the mesh folds" in lines[1]
 
 
+CRASHES: dict[str, Callable[[float, float], bool]] = {
+    "at the posterior's edge": lambda mu, s0: mu > 0.6,
+    "on the posterior and beyond": lambda mu, s0: mu > 0.52,
+    "in half of the prior": lambda mu, s0: s0 < 0.085,
+    "on the posterior alone": lambda mu, s0: (
+        abs(np.log(mu / 0.6)) < 0.1 and abs(np.log(s0 / 0.08)) < 0.15
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("where", CRASHES)
+@pytest.mark.parametrize("seed", range(5))
+def test_whatever_fails_the_end_is_a_fit_or_what_to_do(where: str, seed: int) -> None:
+    def crashing(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        if CRASHES[where](*theta[0]):
+            raise RuntimeError("the mesh folds")
+        return pull(theta, x)
+
+    declared(crashing, "crashing", emulate=True)
+    told = ""
+    try:
+        emulation = calib.emulated(calib.build_problem("crashing", table()), seed=seed)
+    except CalibError as error:
+        told = str(error)
+    if told:
+        for words in ("runs have a value", "the mesh folds", ", at mu ", "priors that do not"):
+            assert words in told
+        return
+    found = calib.calibrate(emulation.problem, seed=seed)
+    assert found.converged
+    theta = found.natural.reshape(-1, 3)[::50]
+    # To the distance between runs, draws keep to where there are values.
+    assert np.mean([CRASHES[where](*t[:2]) for t in theta]) < 0.5
+
+
+def test_where_runs_fail_and_what_to_do_is_told_if_nothing_is_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def crashing(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        if theta[0, 0] > 0.7:
+            print("folded")
+            raise RuntimeError("the mesh folds")
+        return pull(theta, x)
+
+    def nothing(*_: object, **__: object) -> None:
+        raise CalibError("no parameter values of positive probability were found")
+
+    monkeypatch.setattr("calib.inference.emulation.state.sample_posterior", nothing)
+    declared(crashing, "crashing", emulate=True)
+    with pytest.raises(CalibError) as caught:
+        calib.emulated(calib.build_problem("crashing", table()), seed=1)
+    text = str(caught.value)
+    for words in (
+        "no parameters are left for the data", "of the 21 runs have a value",
+        "RuntimeError: the mesh folds", ", at mu 0.7", "those with a value are at mu 0.",
+        "simulator crashing", "priors that do not reach there",
+    ):  # fmt: skip
+        assert words in text
+
+
 def test_a_simulator_that_never_runs_is_refused() -> None:
     declared(lambda t, x: 1 / 0, "broken", emulate=True)
-    with pytest.raises(CalibError, match="only 0 of the 20 first runs") as caught:
+    with pytest.raises(CalibError, match="only 0 of the 20 runs") as caught:
         calib.emulated(calib.build_problem("broken", table()), seed=1)
     assert "ZeroDivisionError" in str(caught.value)
+
+
+def test_far_from_all_runs_there_is_no_value() -> None:
+    """Else a posterior that a crash leaves no room flees there."""
+    declared(pull, "slow", emulate=True, runs=20, checks=0)
+    emulator = calib.emulated(calib.build_problem("slow", table()), seed=1).emulator
+    z = emulator.axes.of(emulator.training.theta)
+    far = np.stack([z.max(axis=0) + 0.9, z.max(axis=0) + 1.1, z.min(axis=0) - 1.1])
+    assert emulator.holds(far).tolist() == [True, False, False]
+    assert np.isnan(emulator.coefficients(emulator.axes.natural(far))[1:]).all()
+
+
+def test_a_limit_of_time_is_for_each_run() -> None:
+    def now_and_then(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        import time
+
+        if theta[0, 0] > 0.9:
+            time.sleep(60)
+        return pull(theta, x)
+
+    found = declared(now_and_then, "hanging", emulate=True, limit=2.0).simulator
+    assert found.limit == 2.0
+    x = {name: np.array([0.1, 0.2]) * (1 if name == "slip_ratio" else 30) for name in CONDITIONS}
+    assert not isinstance(found.run(np.array([0.5, 0.1]), x), Failure)
+    late = replace(found, retries=0).run(np.array([1.0, 0.1]), x)
+    assert isinstance(late, Failure)
+    assert late.kind == "time"
 
 
 @pytest.mark.slow

@@ -6,7 +6,7 @@ import json
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
@@ -71,6 +71,77 @@ def test_a_run_without_value_says_why(gives: object, kind: str, word: str) -> No
     found = failure(simulator(CallableWay(gives, ("pull",))).run(THETA, X))  # type: ignore[arg-type]
     assert found.kind == kind
     assert word in found.reason
+
+
+def test_a_callable_with_a_limit_gives_the_same_from_a_process_of_its_own() -> None:
+    found = simulator(CallableWay(in_percent, ("pull",), limit=60.0)).run(THETA, X)
+    assert not isinstance(found, Failure)
+    np.testing.assert_allclose(found["drawbar_pull_kn"], EXACT)
+
+
+def hangs(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+    import subprocess
+
+    subprocess.run([sys.executable, "-c", "import time; time.sleep(60)"], check=True)
+    return in_percent(theta, x)["pull"]
+
+
+def raises(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+    print("meshing")
+    raise RuntimeError("the mesh folds")
+
+
+def ends(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+    import os
+
+    os._exit(7)
+
+
+@pytest.mark.parametrize(
+    ("gives", "limit", "kind", "reason", "printed"),
+    [
+        (hangs, 1.0, "time", "it took longer than 1 s", ""),
+        (raises, 60.0, "error", "RuntimeError: the mesh folds", "meshing"),
+        (ends, 60.0, "exit", "exit code 7", ""),
+    ],
+)
+def test_a_callable_that_hangs_or_dies_is_a_failed_run(
+    gives: Callable, limit: float, kind: str, reason: str, printed: str
+) -> None:
+    found = failure(simulator(CallableWay(gives, ("pull",), limit=limit)).run(THETA, X))
+    assert found.kind == kind
+    assert reason in found.reason
+    assert printed in found.printed
+
+
+def test_what_cannot_be_handed_over_is_told() -> None:
+    lock = threading.Lock()
+
+    def locked(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        with lock:
+            return in_percent(theta, x)["pull"]
+
+    with pytest.raises(CalibError, match="cannot be handed to a process of its own"):
+        simulator(CallableWay(locked, ("pull",), limit=60.0)).run(THETA, X)
+
+
+def test_a_function_of_a_file_has_the_limit_that_the_file_gives(tmp_path: Path) -> None:
+    """The module of the file has no name that another process could import."""
+    (tmp_path / "own.py").write_text(
+        "import numpy as np\nSCALE = 1000.0\ndef pull(theta, x):\n"
+        "    return SCALE * x['w'] * theta[:, :1] * (1 - np.exp(-x['s'] / 100 / theta[:, 1:2]))\n"
+    )
+    file = write_program(tmp_path, run="", python='"own.py:pull"', limit="60")
+    way = read_simulator(file).simulator.way
+    assert isinstance(way, CallableWay)
+    assert way.limit == 60.0
+    found = simulator(way).run(THETA, X)
+    assert not isinstance(found, Failure)
+    np.testing.assert_allclose(found["drawbar_pull_kn"], EXACT)
+    file = write_program(tmp_path, run="", python='"own.py:pull"')
+    way = read_simulator(file).simulator.way
+    assert isinstance(way, CallableWay)
+    assert way.limit is None
 
 
 def test_a_failed_run_is_tried_again() -> None:

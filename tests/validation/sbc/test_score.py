@@ -46,3 +46,10 @@ def test_without_rows_there_is_nothing_to_judge():
 def test_a_run_of_which_all_failed_says_why():
     with pytest.raises(CalibError, match="could be calibrated: no disk"):
         score([], 1, 10, {"bekker-0000": "no disk"})
+
+
+def test_without_posteriors_that_converged_nothing_is_told() -> None:
+    record = {"model": "bekker", "seed": 1, "converged": False, "ranks": {}}
+    with pytest.raises(CalibError, match="0 of 3 posteriors of bekker converged") as caught:
+        score([{**record, "index": i} for i in range(3)], 1, 3)
+    assert "those that are done are kept" in str(caught.value)

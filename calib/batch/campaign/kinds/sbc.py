@@ -10,9 +10,9 @@ from pydantic import Field
 
 from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
 from calib.batch.campaign.place import Place
-from calib.models import MODELS, get_model
+from calib.models import get_model
 from calib.validation.sbc.replicate import Item, replicate
-from calib.validation.sbc.run import SETTINGS
+from calib.validation.sbc.run import SETTINGS, chosen_models
 
 __all__ = ["Sbc", "SbcSection"]
 
@@ -25,8 +25,9 @@ class SbcSection(Section):
         ge=0, description="0 or a positive whole number: which campaigns are drawn"
     )
     models: list[str] = Field(
-        default=list(MODELS), min_length=1, description="a list of models, see `calib models`"
-    )
+        default=chosen_models(), min_length=1,
+        description="a list of models, see `calib models`; by default all that are not slow",
+    )  # fmt: skip
 
 
 class Sbc(Kind[SbcSection, Item]):

@@ -37,6 +37,8 @@ _MOST_CURVES = 14
 _LEFT_OUT = (1.0, 20.0)
 # Runs whose curves the length scales over conditions are found from.
 _CURVES = 12
+# So many prior sds beyond the runs that have a value the emulator has one as well.
+_BEYOND = 1.0
 # Fewer runs in a region do not tell what matters there.
 _FEW = 8
 
@@ -154,6 +156,21 @@ class Emulator:
         means, variances = self._evaluate(theta, variance=True)
         return means, np.zeros_like(means) if variances is None else variances
 
+    @cached_property
+    def typical_variances(self) -> Array:
+        """Variances of the coefficients where posteriors lie, shape (j,).
+
+        Means over each region's middle and the points one sd from it along each axis.
+        """
+        points = [np.zeros((0, self.axes.loc.size))]
+        for region in self.regions:
+            points += [region.centre[None], region.centre + region.root.T,
+                       region.centre - region.root.T]  # fmt: skip
+        theta = self.axes.natural(np.concatenate(points))
+        means, variances = self.with_variance(theta)
+        there = variances[np.isfinite(means).all(axis=1)]
+        return np.asarray(there.mean(axis=0)) if len(there) else np.zeros(len(self.functions))
+
     def _evaluate(self, theta: Array, *, variance: bool) -> tuple[Array, Array | None]:
         z = self.axes.of(np.atleast_2d(theta))
         known = np.isfinite(z).all(axis=1)
@@ -168,9 +185,20 @@ class Emulator:
         means[~known] = np.nan
         return means, variances
 
+    @cached_property
+    def _box(self) -> tuple[Array, Array]:
+        z = self.axes.of(self.training.theta[self.training.ok])
+        return z.min(axis=0) - _BEYOND, z.max(axis=0) + _BEYOND
+
     def holds(self, z: Array) -> NDArray[np.bool_]:
-        """Whether the simulator has a value at z, in units of the prior's sds; (k, d) to (k,)."""
-        return np.asarray(self.from_edge(z) >= 0.0)
+        """Whether the simulator has a value at z, in units of the prior's sds; (k, d) to (k,).
+
+        Far from all runs that have one nothing is known: a posterior that no value is left for
+        where it belongs would flee there, into whatever the trend has gone on to.
+        """
+        low, high = self._box
+        near = ((z >= low) & (z <= high)).all(axis=1)
+        return np.asarray(near & (self.from_edge(z) >= 0.0))
 
     def from_edge(self, z: Array) -> Array:
         """Return what is zero where a value is as likely as none, and grows inside, (k,)."""

@@ -1,0 +1,155 @@
+"""Folders of `calib compare`: made again, and whatever is tampered with is found and named."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import pytest
+
+from calib.batch.environment import sha256
+from calib.check.check import check
+from calib.check.items import Status
+from calib.errors import CalibError
+from calib.report.comparison import page
+from tests.check.conftest import different, edit_json, findings, seal_run
+
+from . import made
+
+FILE = "comparison.json"
+
+
+def seal(folder: Path) -> None:
+    """Make hashes and page agree with what is there, as a thorough forger would."""
+    for run in (folder / "runs").iterdir():
+        seal_run(run)
+    found = json.loads((folder / FILE).read_text())
+    (folder / "index.html").write_text(page(found, (folder / "figures/bands.png").read_bytes()))
+    edit_json(folder / FILE, lambda m: m.update(
+        files={n: sha256((folder / n).read_bytes()) for n in m["files"]}))  # fmt: skip
+
+
+def test_an_untouched_comparison_is_the_same_bit_for_bit(tmp_path: Path) -> None:
+    outcome = check(made.comparison(tmp_path / "c"))
+    assert {item.status for item in outcome.items} == {Status.IDENTICAL}
+    assert outcome.verdict.startswith("SAME, bit for bit")
+    assert outcome.document()["kind"] == "comparison"
+    names = {item.name for item in outcome.items}
+    assert {
+        "comparison.json: models.bekker.elpd", "comparison.json: models.bekker.held_out.crps",
+        "comparison.json: models.bekker.weight, as its elpd_rows give it", "figures/bands.png",
+        "runs/bekker_plate/run.json: posterior.n.mean", "runs/bekker/posterior.nc", "index.html",
+    } <= names  # fmt: skip
+
+
+def test_a_comparison_of_other_draws_is_the_same_within_their_error(tmp_path: Path) -> None:
+    """Another seed stands for another processor: it says a seed that it was not made with."""
+    folder = made.comparison(tmp_path / "c", seed=5)
+    edit_json(folder / FILE, lambda m: m.update(seed=2019))
+    for run in (folder / "runs").iterdir():
+        edit_json(run / "run.json", lambda m: m.update(seed=2019))
+    seal(folder)
+    outcome = check(folder)
+    assert different(outcome) == {}
+    assert outcome.verdict.startswith("SAME within Monte Carlo error")
+
+
+def of_model(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
+    return lambda folder: edit_json(folder / FILE, lambda m: change(m["models"]["bekker"]))
+
+
+def change_draws(folder: Path) -> None:
+    with h5py.File(folder / "runs/bekker/posterior.nc", "a") as file:
+        file["posterior/n"][:] = file["posterior/n"][:] * 1.001
+
+
+def change_rows_of_one(folder: Path) -> None:
+    path = folder / "runs/bekker/data.csv"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join([lines[0], *reversed(lines[1:])]) + "\n")
+
+
+def exchange_bands(folder: Path) -> None:
+    from PIL import Image, ImageOps
+
+    path = folder / "figures/bands.png"
+    with Image.open(path) as image:
+        other = ImageOps.invert(image.convert("RGB"))
+    other.save(path)
+
+
+RAW = "comparison.json: models.bekker"
+QUICK: dict[str, tuple[Callable[[Path], None], str]] = {
+    "a weight": (of_model(lambda m: m.update(weight=m["weight"] + 0.01)),
+                 f"{RAW}.weight, as its elpd_rows give it"),
+    "a difference": (of_model(lambda m: m.update(below_best=1.0)),
+                     f"{RAW}.below_best, as its elpd_rows give it"),
+    "what is told apart": (of_model(lambda m: m.update(told_apart=not m["told_apart"])),
+                           f"{RAW}.told_apart, as its elpd_rows give it"),
+    "the verdict": (lambda f: edit_json(f / FILE, lambda m: m.update(verdict="Bekker is right.")),
+                    "comparison.json: verdict, as its elpd_rows give it"),
+    "draws": (change_draws, "runs/bekker/posterior.nc"),
+    "the order of rows": (change_rows_of_one, "runs/*/data.csv"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("what", QUICK)
+def test_what_does_not_hang_together_is_named_without_sampling(compared: Path, what: str) -> None:
+    tamper, name = QUICK[what]
+    tamper(compared)
+    seal(compared)
+    assert name in findings(compared, quick=True)
+
+
+def test_what_only_sampling_tells_is_named(compared: Path) -> None:
+    def change(m: dict[str, Any]) -> None:
+        best = next(iter(m["models"].values()))
+        best["held_out"]["elpd"] += 1.0
+        best["rmse"] *= 2.0
+
+    edit_json(compared / FILE, change)
+    exchange_bands(compared)
+    path = compared / "runs/bekker/run.json"
+    edit_json(path, lambda m: m.update(log_evidence=m["log_evidence"] + 0.5))
+    seal(compared)
+    assert findings(compared, quick=True) == {}
+    first = next(iter(json.loads((compared / FILE).read_text())["models"]))
+    best = f"{FILE}: models.{first}"
+    assert findings(compared).keys() == {
+        f"{best}.held_out.elpd", f"{best}.rmse", "runs/bekker/run.json: log_evidence",
+        "figures/bands.png",
+    }  # fmt: skip
+
+
+def test_files_and_pages_are_held_against_the_record(compared: Path) -> None:
+    (compared / "notes.txt").write_text("mine")
+    (compared / "held_out.csv").write_text("a\n1\n")
+    text = (compared / "index.html").read_text()
+    (compared / "index.html").write_text(text.replace("prefer", "love"))
+    found = findings(compared, quick=True)
+    assert found["notes.txt"] == "not listed"
+    assert found["held_out.csv"] == "changed"
+    assert "index.html" in found
+    (compared / "runs/bekker/run.json").unlink()
+    assert findings(compared, quick=True)["runs/bekker/run.json"] == "missing"
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda m: m.pop("settings"), "settings"),
+        (lambda m: m.update(schema="calib/comparison/1"), "calib/comparison/2"),
+        (lambda m: m["models"].pop("bekker"), "models"),
+        (lambda m: m["models"].update(pacejka=m["models"]["bekker"]), "models"),
+        (lambda m: m["models"]["bekker"].update(elpd_rows=["x", "y"]), "elpd_rows"),
+    ],
+)
+def test_a_record_that_makes_no_sense_cannot_be_checked(
+    compared: Path, change: Callable[[dict[str, Any]], object], words: str
+) -> None:
+    edit_json(compared / FILE, change)
+    with pytest.raises(CalibError, match=words):
+        check(compared)

@@ -1,0 +1,93 @@
+"""The models of the review, each from its template through every verb."""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+
+import pytest
+
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.models import MODELS, example_csv
+from calib.validation.sbc.replicate import Item, replicate
+from tests.cli.test_cli import Calib
+from tests.cli.test_cli import calib as calib
+
+# Too few steps to pass the gate: what is tried is that every verb comes to its end.
+FEW = ["--max-steps", 100, "--workers", 1]
+QUICK = [
+    "wismer_luth", "brixius", "reece", "bekker_plate", "lyasko", "janosi_hanamoto",
+]  # fmt: skip
+SLOW = ["wong_reece_pull", "wong_reece_torque", "wong_reece_sinkage"]
+# Beside which a model is compared; torque and shear stress have one model each.
+BESIDE = {
+    "wismer_luth": "brixius", "brixius": "wismer_luth", "reece": "bekker_plate",
+    "bekker_plate": "bekker", "lyasko": "modified_bekker", "wong_reece_pull": "wismer_luth",
+    "wong_reece_sinkage": "lyasko",
+}  # fmt: skip
+
+
+def fitted_and_checked(calib: Calib, model: str) -> None:
+    written = calib("template", model, "--out", "my.csv")
+    assert written.code == 0, written.err
+    fitted = calib("fit", "my.csv", "--model", model, "--out", "run", *FEW)
+    assert fitted.code in (0, 3), fitted.err
+    told = calib("predict", "run", "--at", "my.csv", "--out", "bands.csv")
+    assert told.code == fitted.code, told.err
+    lines = Path("bands.csv").read_text().splitlines()
+    assert len(lines) == len(example_csv(model).splitlines())
+    assert f"{MODELS[model].output}_predictive_90_lower" in lines[0]
+
+
+@pytest.mark.parametrize("model", QUICK)
+def test_a_model_from_template_to_bands(calib: Calib, model: str) -> None:
+    fitted_and_checked(calib, model)
+
+
+def both_columns(model: str, other: str) -> str:
+    """The example of a model, with the conditions that another needs besides, each the same."""
+    rows = list(csv.DictReader(io.StringIO(example_csv(model))))
+    more = next(csv.DictReader(io.StringIO(example_csv(other))))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list({**rows[0], **more}), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({**more, **row} for row in rows)
+    return text.getvalue()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", [*QUICK, *SLOW])
+def test_a_model_through_every_verb(calib: Calib, model: str) -> None:
+    fitted_and_checked(calib, model)
+    checked = calib("check", "run", "--workers", 1)
+    assert checked.code == 0, checked.out
+    assert checked.out.startswith("SAME, bit for bit")
+    reported = calib("report", "my.csv", "--model", model, "--out", "report", *FEW)
+    assert reported.code in (0, 3), reported.err
+    assert MODELS[model].title in Path("report/index.html").read_text()
+    few = SamplerSettings(steps=100, max_steps=100)
+    for i in range(2):
+        record = replicate(Item(model, i, 1, few))
+        assert set(MODELS[model].parameters) <= set(record["ranks"])
+        assert record["rows"] + record["no_band"] > 0
+    if model not in BESIDE:
+        return
+    other = BESIDE[model]
+    Path("both.csv").write_text(both_columns(model, other))
+    compared = calib("compare", model, other, "both.csv", "--out", "compared", *FEW)
+    assert compared.code in (0, 3), compared.err
+    again = calib("check", "compared", "--workers", 1)
+    assert again.code == 0, again.out
+    stacked = calib("predict", "compared", "--at", "both.csv", "--out", "stacked.csv")
+    assert stacked.code == compared.code, stacked.err
+
+
+def test_slow_models_are_left_out_of_sbc_unless_named(calib: Calib) -> None:
+    from calib.batch.campaign.kinds.sbc import SbcSection
+    from calib.validation.sbc.run import chosen_models
+
+    assert [m for m in MODELS if MODELS[m].slow] == SLOW
+    assert set(chosen_models()) == set(MODELS) - set(SLOW)
+    assert chosen_models(SLOW[:1]) == SLOW[:1]
+    assert SbcSection(name="ranks", simulations=1, draw_seed=1).models == chosen_models()
