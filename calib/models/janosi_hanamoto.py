@@ -56,41 +56,4 @@ normal_stress_kpa,shear_displacement_mm,shear_stress_kpa
 50,30,29.45
 50,60,30.8
 """,
-    priors="""\
-model = "janosi_hanamoto"
-
-[parameters.c]
-dist = "lognormal"
-median = 1.5
-sd_log = 1.0
-unit = "kPa"
-reason = "Cohesion of mineral soils: 0.2 (dry sand) to 10 kPa and more (clay)"
-source = "Wong (2008), Table 2.3"
-
-[parameters.phi]
-dist = "normal"
-mean = 29.0
-sd = 8.0
-lower = 3.0
-upper = 50.0
-unit = "degree"
-reason = "Friction angles of mineral soils: 6 (wet clay) to 40 degrees (dense sand)"
-source = "Wong (2008), Table 2.3"
-
-[parameters.K]
-dist = "lognormal"
-median = 14.0
-sd_log = 0.6
-unit = "mm"
-reason = "Shear deformation moduli of mineral soils: 6-30 mm"
-source = "Wong (2008); Janosi & Hanamoto (1961)"
-
-[parameters.sigma]
-dist = "lognormal"
-median = 0.7
-sd_log = 1.2
-unit = "kPa"
-reason = "Scatter of shear stresses: some percent of the 1-100 kPa measured"
-source = "This project: order of magnitude for shear boxes and rings, not read off data"
-""",
 )

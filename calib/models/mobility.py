@@ -92,51 +92,6 @@ slip_ratio,cone_index_kpa,normal_load_kn,tyre_width_m,tyre_diameter_m,drawbar_pu
 0.25,1100,10,0.42,1.4,6.756
 0.4,1100,10,0.42,1.4,6.753
 """,
-    priors="""\
-model = "wismer_luth"
-
-[parameters.c1]
-dist = "lognormal"
-median = 0.75
-sd_log = 0.3
-unit = "1"
-reason = "Largest gross traction over load; soils differ by a third"
-source = "Wismer & Luth (1973), its coefficient is the median; read in two secondary sources"
-
-[parameters.c2]
-dist = "lognormal"
-median = 0.3
-sd_log = 0.5
-unit = "1"
-reason = "How soon traction is mobilised; tyres and soils differ by a factor of about 2.7"
-source = "Wismer & Luth (1973), its coefficient is the median; read in two secondary sources"
-
-[parameters.c3]
-dist = "lognormal"
-median = 1.2
-sd_log = 0.5
-unit = "1"
-reason = "Resistance of soft ground; within a factor of about 2.7"
-source = "Wismer & Luth (1973), its coefficient is the median; read in two secondary sources"
-
-[parameters.c4]
-dist = "lognormal"
-median = 0.04
-sd_log = 0.5
-unit = "1"
-reason = "Rolling resistance on hard ground: 0.015-0.1"
-source = "Wismer & Luth (1973), its coefficient is the median; read in two secondary sources"
-
-[parameters.sigma]
-dist = "lognormal"
-median = 0.02
-sd_log = 1.0
-relative_to = "normal_load_kn"
-default_reference = 5.0
-unit = "kN"
-reason = "Load cells and uneven ground scatter pulls by some percent of the load"
-source = "This project: order of magnitude for single-wheel testers, not read off data"
-""",
 )  # fmt: skip
 
 BRIXIUS = Model(
@@ -185,58 +140,5 @@ slip_ratio,cone_index_kpa,normal_load_kn,tyre_width_m,tyre_diameter_m,tyre_defle
 0.15,1100,10,0.42,1.4,50,260,5.654
 0.25,1100,10,0.42,1.4,50,260,7.102
 0.4,1100,10,0.42,1.4,50,260,8.107
-""",
-    priors="""\
-model = "brixius"
-
-[parameters.c1]
-dist = "lognormal"
-median = 0.88
-sd_log = 0.3
-unit = "1"
-reason = "Largest gross traction over load; soils differ by a third"
-source = "Brixius (1987), bias-ply tyres: the median; read in two secondary sources"
-
-[parameters.c2]
-dist = "lognormal"
-median = 0.1
-sd_log = 0.5
-unit = "1"
-reason = "How soon firmer soil gives more; within a factor of about 2.7"
-source = "Brixius (1987), bias-ply tyres: the median; read in two secondary sources"
-
-[parameters.c3]
-dist = "lognormal"
-median = 7.5
-sd_log = 0.4
-unit = "1"
-reason = "How soon slip mobilises traction: 7.5 for bias-ply, 9.5 or 10.5 for radial tyres"
-source = "Brixius (1987), bias-ply tyres: the median; read in two secondary sources"
-
-[parameters.c4]
-dist = "lognormal"
-median = 1.0
-sd_log = 0.5
-unit = "1"
-reason = "Resistance of soft ground: 1 for bias-ply, 0.9 for radial tyres"
-source = "Brixius (1987), bias-ply tyres: the median; read in two secondary sources"
-
-[parameters.c5]
-dist = "lognormal"
-median = 0.5
-sd_log = 0.7
-unit = "1"
-reason = "Resistance that slip adds; within a factor of four"
-source = "Brixius (1987), bias-ply tyres: the median; read in two secondary sources"
-
-[parameters.sigma]
-dist = "lognormal"
-median = 0.02
-sd_log = 1.0
-relative_to = "normal_load_kn"
-default_reference = 5.0
-unit = "kN"
-reason = "Load cells and uneven ground scatter pulls by some percent of the load"
-source = "This project: order of magnitude for single-wheel testers, not read off data"
 """,
 )  # fmt: skip

@@ -143,41 +143,6 @@ average_ground_pressure_kpa,plate_width_mm,rut_depth_mm
 20,100,11.93
 40,100,21.54
 """,
-    priors="""\
-model = "bekker_plate"
-
-[parameters.z_ref]
-dist = "lognormal"
-median = 25.0
-sd_log = 1.0
-unit = "mm"
-reason = "Sinkages of plates and light wheels on tilled or sandy soil: 3-200 mm"
-source = "Saarilahti (2002), Soil interaction model, rut depth data"
-
-[parameters.n]
-dist = "lognormal"
-median = 1.0
-sd_log = 0.5
-unit = "1"
-reason = "Sinkage exponents of mineral soils: 0.5 (clay) to 1.6 (dense sand)"
-source = "Wong (2008), Table 2.3"
-
-[parameters.share]
-dist = "uniform"
-lower = 0.0
-upper = 1.0
-unit = "1"
-reason = "The part of Bekker's modulus that is due to cohesion at the mean width: the data must say"
-source = "By definition between none and all"
-
-[parameters.sigma]
-dist = "lognormal"
-median = 0.1
-sd_log = 0.8
-unit = "1"
-reason = "Relative scatter of sinkage readings: 2-50 %"
-source = "This project: order of magnitude for repeated readings, not read off data"
-""",
 )
 
 REECE = Model(
@@ -222,41 +187,6 @@ average_ground_pressure_kpa,plate_width_mm,rut_depth_mm
 20,100,18.59
 40,100,38.85
 """,
-    priors="""\
-model = "reece"
-
-[parameters.z_ref]
-dist = "lognormal"
-median = 25.0
-sd_log = 1.0
-unit = "mm"
-reason = "Sinkages of plates and light wheels on tilled or sandy soil: 3-200 mm"
-source = "Saarilahti (2002), Soil interaction model, rut depth data"
-
-[parameters.n]
-dist = "lognormal"
-median = 1.0
-sd_log = 0.5
-unit = "1"
-reason = "Sinkage exponents of mineral soils: 0.5 (clay) to 1.6 (dense sand)"
-source = "Wong (2008), Table 2.3"
-
-[parameters.share]
-dist = "uniform"
-lower = 0.0
-upper = 1.0
-unit = "1"
-reason = "The part of Reece's modulus that is due to friction at the mean width: the data must say"
-source = "By definition between none and all"
-
-[parameters.sigma]
-dist = "lognormal"
-median = 0.1
-sd_log = 0.8
-unit = "1"
-reason = "Relative scatter of sinkage readings: 2-50 %"
-source = "This project: order of magnitude for repeated readings, not read off data"
-""",
 )
 
 LYASKO = Model(
@@ -296,42 +226,5 @@ average_ground_pressure_kpa,slip_ratio,rut_depth_mm
 190,0,45.35
 190,0.15,58.93
 190,0.3,63.3
-""",
-    priors="""\
-model = "lyasko"
-
-[parameters.z_ref]
-dist = "lognormal"
-median = 25.0
-sd_log = 1.0
-unit = "mm"
-reason = "Sinkages of plates and light wheels on tilled or sandy soil: 3-200 mm"
-source = "Saarilahti (2002), Soil interaction model, rut depth data"
-
-[parameters.n]
-dist = "lognormal"
-median = 1.0
-sd_log = 0.5
-unit = "1"
-reason = "Sinkage exponents of mineral soils: 0.5 (clay) to 1.6 (dense sand)"
-source = "Wong (2008), Table 2.3"
-
-[parameters.a]
-dist = "normal"
-mean = 0.5
-sd = 0.4
-lower = -1.0
-upper = 1.0
-unit = "1"
-reason = "How slip digs beyond its own share: the published coefficient is 0.5"
-source = "Lyasko (2010), 0.5, read in one secondary source only, not confirmed: a wide prior"
-
-[parameters.sigma]
-dist = "lognormal"
-median = 0.1
-sd_log = 0.8
-unit = "1"
-reason = "Relative scatter of sinkage readings: 2-50 %"
-source = "This project: order of magnitude for repeated readings, not read off data"
 """,
 )

@@ -41,80 +41,6 @@ _STRESS = (
     r"$\theta_\mathrm{m} = (c_1 + c_2 s)\theta_1$",
     r"$W = r b \int (\sigma_\mathrm{n} \cos\theta + \tau \sin\theta) d\theta$",
 )
-_SOIL = """\
-[parameters.k1]
-dist = "lognormal"
-median = 20.0
-sd_log = 1.3
-unit = "kPa"
-reason = "Reece's cohesive modulus, c kc': from almost none to 200 kPa"
-source = "This project: orders of magnitude of sands to firm loams, wide on purpose"
-
-[parameters.k2]
-dist = "lognormal"
-median = 1000.0
-sd_log = 1.2
-unit = "kPa/m"
-reason = "Reece's frictional modulus, gamma kphi': 100 to 10000 kPa/m"
-source = "This project: orders of magnitude of sands to firm loams, wide on purpose"
-
-[parameters.n]
-dist = "lognormal"
-median = 0.9
-sd_log = 0.4
-lower = 0.2
-upper = 2.0
-unit = "1"
-reason = "Sinkage exponents of mineral soils: 0.5 (clay) to 1.6 (dense sand)"
-source = "Wong (2008), Table 2.3"
-
-[parameters.c]
-dist = "lognormal"
-median = 1.5
-sd_log = 1.0
-unit = "kPa"
-reason = "Cohesion of mineral soils: 0.2 (dry sand) to 10 kPa and more (clay)"
-source = "Wong (2008), Table 2.3"
-
-[parameters.phi]
-dist = "normal"
-mean = 29.0
-sd = 8.0
-lower = 3.0
-upper = 50.0
-unit = "degree"
-reason = "Friction angles of mineral soils: 6 (wet clay) to 40 degrees (dense sand)"
-source = "Wong (2008), Table 2.3"
-
-[parameters.K]
-dist = "lognormal"
-median = 14.0
-sd_log = 0.6
-unit = "mm"
-reason = "Shear deformation moduli of mineral soils: 6-30 mm"
-source = "Wong (2008); Janosi & Hanamoto (1961)"
-
-[parameters.c1]
-dist = "normal"
-mean = 0.3
-sd = 0.12
-lower = 0.0
-upper = 0.8
-unit = "1"
-reason = "Where the stress is largest, at no slip: 0.43 (compact sand), 0.18 (loose sand)"
-source = "Wong & Reece (1967), Table 1, read in two secondary sources"
-
-[parameters.c2]
-dist = "normal"
-mean = 0.32
-sd = 0.1
-lower = 0.0
-upper = 0.8
-unit = "1"
-reason = "How slip moves it forward: 0.32 for both sands"
-source = "Wong & Reece (1967), Table 1, read in two secondary sources"
-
-"""
 
 _model = partial(
     Model,
@@ -159,19 +85,6 @@ slip_ratio,normal_load_kn,tyre_width_m,tyre_diameter_m,drawbar_pull_kn
 0.35,6,0.3,1.2,1.487
 0.5,6,0.3,1.2,1.585
 """,
-    priors='model = "wong_reece_pull"\n\n'
-    + _SOIL
-    + """\
-[parameters.sigma]
-dist = "lognormal"
-median = 0.02
-sd_log = 1.0
-relative_to = "normal_load_kn"
-default_reference = 5.0
-unit = "kN"
-reason = "Load cells and uneven ground scatter pulls by some percent of the load"
-source = "This project: order of magnitude for single-wheel testers, not read off data"
-""",
 )
 
 WONG_REECE_TORQUE = _model(
@@ -200,19 +113,6 @@ slip_ratio,normal_load_kn,tyre_width_m,tyre_diameter_m,driving_torque_knm
 0.35,6,0.3,1.2,1.855
 0.5,6,0.3,1.2,1.818
 """,
-    priors='model = "wong_reece_torque"\n\n'
-    + _SOIL
-    + """\
-[parameters.sigma]
-dist = "lognormal"
-median = 0.01
-sd_log = 1.0
-relative_to = "normal_load_kn"
-default_reference = 5.0
-unit = "kN m"
-reason = "Load cells and uneven ground scatter pulls by some percent of the load"
-source = "This project: order of magnitude for single-wheel testers, not read off data"
-""",
 )
 
 WONG_REECE_SINKAGE = _model(
@@ -240,16 +140,5 @@ slip_ratio,normal_load_kn,tyre_width_m,tyre_diameter_m,rut_depth_mm
 0.2,6,0.3,1.2,75.05
 0.35,6,0.3,1.2,90.03
 0.5,6,0.3,1.2,81.4
-""",
-    priors='model = "wong_reece_sinkage"\n\n'
-    + _SOIL
-    + """\
-[parameters.sigma]
-dist = "lognormal"
-median = 0.1
-sd_log = 0.8
-unit = "1"
-reason = "Relative scatter of sinkage readings: 2-50 %"
-source = "This project: order of magnitude for repeated readings, not read off data"
 """,
 )
