@@ -58,7 +58,10 @@ def both_columns(model: str, other: str) -> str:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("model", [*QUICK, *SLOW])
-def test_a_model_through_every_verb(calib: Calib, model: str) -> None:
+def test_a_model_through_every_verb(
+    calib: Calib, model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(SamplerSettings, "n_walkers", lambda self, n_dim: 2 * (n_dim + 1))
     fitted_and_checked(calib, model)
     checked = calib("check", "run", "--workers", 1)
     assert checked.code == 0, checked.out
