@@ -6,13 +6,14 @@ import json
 from pathlib import Path
 
 from calib.models import example_csv
+from tests.browser import Browser, faults
 from tests.cli.test_cli import Calib
 from tests.cli.test_cli import calib as calib
 
 FEW = ["--max-steps", 800, "--workers", 1]
 
 
-def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
+def test_models_are_compared_and_the_stack_predicts(calib: Calib, browser: Browser) -> None:
     Path("plates.csv").write_text(example_csv("reece"))
     made = calib("compare", "reece", "bekker_plate", "plates.csv", "--out", "c", *FEW,
                  "--hold-out", "plate_width_mm=80")  # fmt: skip
@@ -23,6 +24,7 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
     assert abs(sum(m["weight"] for m in found["models"].values()) - 1.0) < 1e-9
     assert all(m["held_out"]["rows"] == 4 for m in found["models"].values())
     assert "figures/bands.png" in {p.relative_to("c").as_posix() for p in Path("c").rglob("*")}
+    assert faults(browser, Path("c/index.html")) == []
     told = calib("predict", "c", "--at", "plates.csv", "--out", "bands.csv")
     assert told.code == (0 if found["converged"] else 3), told.err
     assert "rut_depth_mm_predictive_90_lower" in Path("bands.csv").read_text()
