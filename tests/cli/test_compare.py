@@ -13,7 +13,7 @@ from tests.cli.test_cli import calib as calib
 FEW = ["--max-steps", 800, "--workers", 1]
 
 
-def test_models_are_compared_and_the_stack_predicts(calib: Calib, browser: Browser) -> None:
+def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
     Path("plates.csv").write_text(example_csv("reece"))
     made = calib("compare", "reece", "bekker_plate", "plates.csv", "--out", "c", *FEW,
                  "--hold-out", "plate_width_mm=80")  # fmt: skip
@@ -24,7 +24,6 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib, browser: Brows
     assert abs(sum(m["weight"] for m in found["models"].values()) - 1.0) < 1e-9
     assert all(m["held_out"]["rows"] == 4 for m in found["models"].values())
     assert "figures/bands.png" in {p.relative_to("c").as_posix() for p in Path("c").rglob("*")}
-    assert faults(browser, Path("c/index.html")) == []
     told = calib("predict", "c", "--at", "plates.csv", "--out", "bands.csv")
     assert told.code == (0 if found["converged"] else 3), told.err
     assert "rut_depth_mm_predictive_90_lower" in Path("bands.csv").read_text()
@@ -35,6 +34,13 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib, browser: Brows
     broken = calib("predict", "c", "--at", "plates.csv")
     assert broken.code == 2
     assert "run `calib compare` again" in broken.err
+
+
+def test_the_page_holds_in_a_browser(calib: Calib, browser: Browser) -> None:
+    Path("plates.csv").write_text(example_csv("reece"))
+    made = calib("compare", "reece", "bekker_plate", "plates.csv", "--out", "c", *FEW)
+    assert made.code in (0, 3), made.err
+    assert faults(browser, Path("c/index.html")) == []
 
 
 def test_what_cannot_be_compared_is_refused(calib: Calib) -> None:
