@@ -1,7 +1,7 @@
 """Pages in a real browser: Chromium without a window, driven by Selenium; axe-core looks on.
 
-`make browser` installs both. Without Chromium the tests are skipped and say so; without axe-core they
-are done without its findings, and the test that it finds something is skipped.
+`make browser` installs both. Without Chromium the tests are skipped and say so; without axe-core
+they are done without its findings, and the test that it finds something is skipped.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from calib.cli.machine import Json, finish
 from calib.cli.parallel import CORES, Models, Workers
 
 __all__ = ["register"]
@@ -32,6 +33,7 @@ def compare(
     max_steps: Annotated[int, typer.Option(help="Where extending the chains stops.")] = 25_600,
     workers: Workers = CORES,
     plugins: Models = None,
+    json: Json = False,
 ) -> None:
     """Say which of several models the same data prefer, and what they cannot tell."""
     from calib.batch.folders import check_folder, fresh_folder
@@ -66,5 +68,4 @@ def compare(
         written = write_comparison(found, folder, ["calib", *sys.argv[1:]], hold_out or "")
     print(text(written))
     print(out / "index.html")
-    if not found.sound:
-        raise typer.Exit(3)
+    finish(0 if found.sound else 3, written, folder=str(out))
