@@ -8,7 +8,7 @@ OUT ?= out/he2019
 # Small matrices: threads of the linear algebra would only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: report reference test test-slow docs bench lint format clean
+.PHONY: report reference test test-slow browser docs bench lint format clean
 
 report: $(READY)
 	$(BIN)/calib report --out $(OUT) --overwrite
@@ -23,6 +23,12 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+# What tests open pages in, and what looks at them there; they are left out without. As root, on Debian.
+browser:
+	@command -v chromium chromedriver >/dev/null || \
+	  { apt-get update -qq && apt-get install -yqq chromium chromium-driver >/dev/null; }
+	@npm install --no-save --no-package-lock --no-audit --no-fund --silent axe-core@4.14.1
 
 # Static pages in out/docs, made from docs/ and the declarations; warnings are errors.
 docs: $(VENV)/.docs

@@ -25,18 +25,28 @@ myst_heading_anchors = 3
 html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "calib"
-html_static_path = ["_static"]
+html_static_path = ["_static", "../calib/report/page/page.js"]
 html_css_files = ["tables.css"]
+html_js_files = [("page.js", {"defer": ""})]  # tables sort as those of a report do
 html_copy_source = False
 html_show_sourcelink = False
 html_theme_options = {"navigation_with_keys": True}
 # What the pages show is what they were made from, not when.
 html_last_updated_fmt = None
-pygments_style = "friendly"
-pygments_dark_style = "monokai"
+pygments_style = "a11y-high-contrast-light"
+pygments_dark_style = "a11y-high-contrast-dark"
 nitpicky = True
 
 
 def setup(app: Any) -> None:
     """Draw commands as commands: without a prompt they would be taken for output."""
     app.add_lexer("console", BashLexer)
+    # After the theme, which puts the navigation there.
+    app.connect("html-page-context", say_levels, priority=900)
+
+
+def say_levels(app: Any, page: str, template: str, context: dict[str, Any], doctree: Any) -> None:
+    """Give the captions of contents the level without which a reader of screens is lost."""
+    for part in ("body", "furo_navigation_tree"):
+        if part in context:
+            context[part] = context[part].replace('role="heading"', 'role="heading" aria-level="2"')

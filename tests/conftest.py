@@ -14,6 +14,7 @@ from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
 from tests.blind import blind_test  # noqa: F401
+from tests.browser import browser  # noqa: F401
 from tests.report.figures.fixtures import (  # noqa: F401
     all_plates,
     density,

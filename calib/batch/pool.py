@@ -6,12 +6,19 @@ outlive a kill are for `calib.batch.tasks.run_tasks`.
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing import get_all_start_methods, get_context
+from contextlib import contextmanager, suppress
+from multiprocessing import (
+    forkserver,
+    get_all_start_methods,
+    get_context,
+    parent_process,
+    resource_tracker,
+)
 from pathlib import Path
 from threading import Thread
 from typing import Protocol
@@ -119,17 +126,52 @@ def pool(workers: int, modules: Sequence[str] = _REPORT) -> Iterator[Pool]:
         workers, mp_context=context, initializer=_begin, initargs=(loaded_files(),)
     )
     # A first process starts now, not when there is work for it; it starts where it can wait.
-    Thread(target=executor.submit, args=(_begun,), daemon=True).start()
+    Thread(target=_start, args=(executor,), daemon=True).start()
     try:
         yield Pool(executor)
+    except BaseException:
+        _stop(executor)  # nobody waits for the pieces
+        raise
     finally:
         executor.shutdown(wait=False, cancel_futures=True)
+
+
+def _start(executor: ProcessPoolExecutor) -> None:
+    """Start the server and a first process where an interruption does not reach them.
+
+    It is for the process that waits for the pieces; they would end with tracebacks.
+    """
+    if hasattr(signal, "pthread_sigmask"):
+        # Started before: what starts it lets interruptions through again.
+        resource_tracker.ensure_running()
+        # Of this thread alone, and inherited by what it starts.
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    with suppress(EOFError, OSError, RuntimeError):  # stopped meanwhile
+        executor.submit(_begun)
+
+
+def _stop(executor: ProcessPoolExecutor) -> None:
+    """End processes at once, and the server that may just be importing what they need."""
+    server = getattr(forkserver._forkserver, "_forkserver_pid", None)
+    if server is not None:
+        os.kill(server, signal.SIGTERM)
+    for process in list((executor._processes or {}).values()):
+        process.terminate()
 
 
 def _begin(files: Sequence[Path]) -> None:
     """Leave an interruption to the process that waits for the pieces; know what it knows."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    Thread(target=_leave_with_parent, daemon=True).start()
     load_files(files)
+
+
+def _leave_with_parent() -> None:
+    """End when the process that waits for the pieces does, however it ends."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _begun() -> None:

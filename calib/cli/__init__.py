@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from calib.cli import (
     audit,
@@ -19,11 +21,39 @@ from calib.cli import (
     gap,
     sbc,
 )
+from calib.cli.examples import add_examples
 
 __all__ = ["app", "main"]
 
+
+class _Verbs(TyperGroup):
+    """All verbs: what the user can mend, or stops, ends with a line and no traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        from calib.errors import CalibError
+
+        try:
+            return super().invoke(ctx)
+        except CalibError as error:
+            if ctx.params["verbose"]:
+                import traceback
+
+                traceback.print_exc()
+            print(f"calib: {error}", file=sys.stderr)
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt as stop:
+            print(f"calib: {str(stop) or _STOPPED}", file=sys.stderr)
+            raise typer.Exit(130) from None
+
+
+_STOPPED = (
+    "interrupted; nothing was written. Start the same command again; what a simulator has run "
+    "is kept and not run again"
+)
+
 app = typer.Typer(
     name="calib",
+    cls=_Verbs,
     help="Probabilistic calibration of tyre-soil models.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
@@ -39,12 +69,38 @@ audit.register(app)
 campaign.register(app)
 sbc.register(app)
 doctor.register(app)
+add_examples(app)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"calib {version('terracalib')}")
+        raise typer.Exit
+
+
+@app.callback()
+def start(
+    ctx: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", help="Say which, and stop.", callback=_version,
+                           is_eager=True)
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Say on the error output with what versions, "
+                           "what was read and how long it took; where an error came from.")
+    ] = False,
+) -> None:  # fmt: skip
+    """Probabilistic calibration of tyre-soil models."""
+    if verbose:
+        from calib.cli.display import told
+
+        ctx.with_resource(told())
 
 
 def main() -> None:
-    """Run the command line: what the user can mend ends with exit code 2 and no traceback."""
-    from calib.errors import CalibError
-
+    """Run the command line."""
     # A figure is never shown on a screen: no display, no toolkit.
     os.environ.setdefault("MPLBACKEND", "Agg")
     # The matrices are small: threads of the linear algebra would only wait for each other.
@@ -53,12 +109,6 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         app(prog_name="calib")
-    except CalibError as error:
-        print(f"calib: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        print("calib: interrupted; nothing was written", file=sys.stderr)
-        raise SystemExit(130) from None
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0) from None

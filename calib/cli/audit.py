@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import sys
+from json import loads
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from calib.cli.machine import Json, finish
 
 if TYPE_CHECKING:
     from calib.he2019.audit import Audit
@@ -23,9 +26,7 @@ def audit(
     out: Annotated[
         Path | None, typer.Option(help="Folder for audit.json, audit.csv, figures and a page.")
     ] = None,
-    json: Annotated[
-        bool, typer.Option("--json", help="Print JSON in the place of a table.")
-    ] = False,
+    json: Json = False,
     seed: Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)] = 2019,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Replace an earlier result.")
@@ -47,12 +48,10 @@ def audit(
             with fresh_folder(out, overwrite=overwrite) as folder:
                 write_audit_page(found, folder, ["calib", *sys.argv[1:]])
             tell("drawing figures", 1, 1)
-    if json:
-        sys.stdout.write(audit_json(found))
-        return
     _print(found)
     if out is not None:
         print(out / "index.html")
+    finish(0, loads(audit_json(found)))
 
 
 def _print(found: Audit) -> None:

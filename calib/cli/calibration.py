@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calib.cli.machine import Json, finish
 from calib.cli.parallel import CORES, Models, Simulators, Workers
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from calib.report.sections import Section
     from calib.report.study_tasks import HoldOut
@@ -59,6 +60,7 @@ def report(
     workers: Workers = CORES,
     plugins: Models = None,
     simulator: Simulators = None,
+    json: Json = False,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from calib.batch.folders import check_folder
@@ -127,10 +129,9 @@ def report(
     for key, failure in study.failures.items():
         print(f"{key}: FAILED: {failure.error}", file=sys.stderr)
     print(page)
-    if study.failures:
-        raise typer.Exit(1)
-    if not all(r.calibration.converged for r in study.successes.values()) or not all(good):
-        raise typer.Exit(3)
+    converged = all(r.calibration.converged for r in study.successes.values())
+    code = 1 if study.failures else 0 if converged and all(good) else 3
+    finish(code, out / "summary.json", folder=str(out))
 
 
 def fit(
@@ -145,8 +146,11 @@ def fit(
     workers: Workers = CORES,
     plugins: Models = None,
     simulator: Simulators = None,
+    json: Json = False,
 ) -> None:
     """Calibrate one model on one file and save the posterior."""
+    from dataclasses import asdict
+
     from calib.batch.folders import check_folder, fresh_folder
     from calib.cli.display import posterior_table, progress_bars, verdict_line
     from calib.cli.simulators import say
@@ -186,8 +190,13 @@ def fit(
     posterior_table(calibration)
     print(verdict_line(calibration))
     good = say(model, emulation)
-    for note in (*problem.notes, *outlying_notes(problem, calibration.draws.mode)):
+    notes = [*problem.notes, *outlying_notes(problem, calibration.draws.mode)]
+    for note in notes:
         print(f"note: {note}", file=sys.stderr)
+    found: dict[str, Any] = {
+        "folder": str(out), "notes": notes,
+        "posterior": {name: asdict(s) for name, s in calibration.summary.items()},
+    }  # fmt: skip
     if held is not None:
         scores = validate_held_out(calibration, held).scores
         ninety = scores.coverage[0.9]
@@ -195,9 +204,12 @@ def fit(
             f"held out ({kept}): 90 % band covers {ninety.hits} of {ninety.n}, "
             f"RMSE {format_number(scores.rmse)}, CRPS {format_number(scores.crps)}"
         )
+        found["held_out"] = {
+            "what": str(kept), "rows": ninety.n, "covered_90": ninety.hits,
+            "rmse": scores.rmse, "crps": scores.crps,
+        }  # fmt: skip
     print(f"run folder: {out}")
-    if not (calibration.converged and good):
-        raise typer.Exit(3)
+    finish(0 if calibration.converged and good else 3, out / "run.json", **found)
 
 
 def predict(
@@ -212,6 +224,7 @@ def predict(
     overwrite: _Overwrite = False,
     plugins: Models = None,
     simulator: Simulators = None,
+    json: Json = False,
 ) -> None:
     """Predict at new conditions: with 50, 90 and 95 % bands; a diagnosis with 90 % bands."""
     if out is not None and out.exists() and not overwrite:
@@ -220,7 +233,7 @@ def predict(
             where=str(out),
             mend="choose another --out, or pass --overwrite",
         )
-    from calib.data import read_for_model, write_table
+    from calib.data import read_for_model
     from calib.inference.io import load_calibration
     from calib.validation.prediction import predict as predict_at
     from calib.validation.prediction import predict_stacked, prediction_columns
@@ -253,23 +266,16 @@ def predict(
     if not converged:
         columns["converged"] = ["no"] * len(table)
     outside = sum(bool(flags) for flags in prediction.outside)
-    if out is not None:
-        write_table(out, columns)
-        print(f"{len(table)} rows written to {out}; {outside} outside the calibrated range")
-    else:
-        print(",".join(columns))
-        for row in zip(*columns.values(), strict=True):
-            print(",".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in row))
-        if outside:
-            print(f"calib: {outside} rows lie outside the calibrated range", file=sys.stderr)
-    if not converged:
-        raise typer.Exit(3)
+    if outside:
+        print(f"calib: {outside} rows lie outside the calibrated range", file=sys.stderr)
+    _give(columns, out)
+    finish(0 if converged else 3, {"columns": _lists(columns)}, outside=outside)
 
 
 def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | None) -> None:
     """Predict with the corrected model of a diagnosis, beside the calibrated simulator."""
     from calib.batch.plugins import load_files
-    from calib.data import read_for_model, write_table
+    from calib.data import read_for_model
     from calib.gap.corrected import conditions_outside, load_corrected, predict_columns
     from calib.gap.effects import EFFECTS
     from calib.gap.effects.load import load_effects
@@ -287,13 +293,33 @@ def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | No
     if beyond:
         told = ", ".join(f"{name} in {count} rows" for name, count in beyond.items())
         print(f"calib: outside what either campaign covered: {told}", file=sys.stderr)
+    _give(columns, out)
+    finish(0, {"columns": _lists(columns)}, outside=beyond)
+
+
+def _give(columns: Mapping[str, Any], out: Path | None) -> None:
+    """Write columns to a file, or print them."""
+    from calib.data import write_table
+
     if out is not None:
         write_table(out, columns)
-        print(out)
+        print(f"{len(next(iter(columns.values())))} rows written to {out}")
         return
     print(",".join(columns))
     for row in zip(*columns.values(), strict=True):
-        print(",".join(v if isinstance(v, str) else f"{v:.6g}" for v in row))
+        print(",".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in row))
+
+
+def _lists(columns: Mapping[str, Any]) -> dict[str, list[float | str]]:
+    return {name: [_number(cell) for cell in column] for name, column in columns.items()}
+
+
+def _number(cell: Any) -> float | str:
+    """Return a cell, which may be the user's own text, as a number if it is one."""
+    try:
+        return float(cell)
+    except ValueError:
+        return str(cell)
 
 
 def data(
@@ -363,13 +389,15 @@ def priors(
     _emit(default_priors(get_model(model).name).read_text(encoding="utf-8"), out)
 
 
-def models(plugins: Models = None, simulator: Simulators = None) -> None:
+def models(plugins: Models = None, simulator: Simulators = None, json: Json = False) -> None:
     """List the models with their equations and columns."""
     from calib.models import MODELS
 
     for model in MODELS.values():
         print(f"{model.name}: {model.title}\n  {model.equation}")
         print(f"  needs {', '.join(model.conditions)}; gives {model.output}")
+    facts = ("title", "equation", "conditions", "output", "parameters")
+    finish(0, {"models": {m.name: {f: getattr(m, f) for f in facts} for m in MODELS.values()}})
 
 
 def _emit(text: str, out: Path | None) -> None:

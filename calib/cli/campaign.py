@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from calib.cli.parallel import Models, Scheduler, Simulators, Workers, announce, resumable
+from calib.cli.machine import Json, finish
+from calib.cli.parallel import Models, Scheduler, Simulators, Workers, announce
 
 __all__ = ["register"]
 
@@ -33,6 +34,7 @@ def campaign(
     ] = False,
     plugins: Models = None,
     simulator: Simulators = None,
+    json: Json = False,
 ) -> None:
     """Run many fits, diagnoses, challenge cases or SBC replicates as tasks; run again to resume."""
     from calib.batch.campaign import read_plan, run_campaign
@@ -41,8 +43,9 @@ def campaign(
     planned = read_plan(plan)
     if only_list:
         print("\n".join(planned.tasks))
+        finish(0, {"tasks": list(planned.tasks)})
         return
-    with resumable(), progress_bars() as tell:
+    with progress_bars() as tell:
         summary = run_campaign(
             planned, out, workers=workers, scheduler=scheduler, overwrite=overwrite,
             progress=lambda done, n: tell("tasks", done, n), announce=announce,
@@ -54,7 +57,4 @@ def campaign(
     if summary.unconverged:
         print(f"NOT CONVERGED, not to be used: {', '.join(summary.unconverged)}")
     print(out / "summary.json")
-    if summary.failed:
-        raise typer.Exit(1)
-    if summary.unconverged:
-        raise typer.Exit(3)
+    finish(1 if summary.failed else 3 if summary.unconverged else 0, out / "summary.json")

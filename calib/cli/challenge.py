@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from calib.batch.bench import from_the_bench
-from calib.cli.parallel import Models, Scheduler, Workers, announce, resumable
+from calib.cli.parallel import Models, Scheduler, Workers, announce
 
 __all__ = ["register"]
 
@@ -67,7 +67,7 @@ def run(
     from calib.gap.batch import case_folders, diagnose_cases
 
     cases = case_folders(folder)
-    with resumable(), progress_bars() as tell:
+    with progress_bars() as tell:
         failed = diagnose_cases(
             cases, out, seed, workers=workers, scheduler=scheduler, announce=announce,
             progress=lambda done, n: tell("diagnosing", done, n),

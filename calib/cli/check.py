@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from calib.cli.machine import Json, finish
 from calib.cli.parallel import CORES, Models, Simulators, Workers
 from calib.errors import CalibError
 
@@ -27,12 +27,10 @@ def check(
     every: Annotated[
         bool, typer.Option("--all", help="List every number, not only what is not the same.")
     ] = False,
-    json_to: Annotated[
-        Path | None, typer.Option("--json", help="File for machines to read; - prints it.")
-    ] = None,
     workers: Workers = CORES,
     plugins: Models = None,
     simulator: Simulators = None,
+    json: Json = False,
 ) -> None:
     """Compute a folder's results again from that folder alone and compare everything.
 
@@ -50,27 +48,8 @@ def check(
         with pool(1 if quick else workers) as side, progress_bars() as tell:
             outcome = find(folder, quick=quick, progress=tell, pool=side, workers=workers)
     except CalibError as error:
-        if json_to is not None:
-            document = {"folder": str(folder), "verdict": "cannot be checked", "reason": str(error),
-                        "exit_code": 2}  # fmt: skip
-            _write(json.dumps(document, indent=1), json_to)
+        finish(0, {"folder": str(folder), "verdict": "cannot be checked", "reason": str(error),
+                   "exit_code": 2})  # fmt: skip
         raise
-    if json_to is not None:
-        _write(json.dumps(outcome.document(), indent=1), json_to)
-    if json_to is None or str(json_to) != "-":
-        show(outcome, every=every)
-    if outcome.exit_code:
-        raise typer.Exit(outcome.exit_code)
-
-
-def _write(text: str, path: Path) -> None:
-    if str(path) == "-":
-        print(text)
-        return
-    try:
-        path.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise CalibError(
-            f"the file cannot be written ({error.strerror})", where=str(path),
-            mend="choose another file with --json",
-        ) from None  # fmt: skip
+    show(outcome, every=every)
+    finish(outcome.exit_code, outcome.document())

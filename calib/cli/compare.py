@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from calib.cli.machine import Json, finish
 from calib.cli.parallel import CORES, Models, Simulators, Workers
 
 __all__ = ["register"]
@@ -33,6 +34,7 @@ def compare(
     workers: Workers = CORES,
     plugins: Models = None,
     simulator: Simulators = None,
+    json: Json = False,
 ) -> None:
     """Say which of several models the same data prefer, and what they cannot tell."""
     from calib.batch.folders import check_folder, fresh_folder
@@ -78,5 +80,4 @@ def compare(
         written = write_comparison(found, folder, ["calib", *sys.argv[1:]], hold_out or "")
     print(text(written))
     print(out / "index.html")
-    if not (found.sound and all(good)):
-        raise typer.Exit(3)
+    finish(0 if found.sound and all(good) else 3, written, folder=str(out))

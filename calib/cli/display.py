@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,7 +10,28 @@ from contextlib import contextmanager
 from calib.inference.calibration import Calibration
 from calib.report.posterior_text import centre_text, interval_text
 
-__all__ = ["posterior_table", "progress_bars", "verdict_line"]
+__all__ = ["posterior_table", "progress_bars", "told", "verdict_line"]
+
+_log = logging.getLogger("calib")
+
+
+@contextmanager
+def told() -> Iterator[None]:
+    """Send what is logged to the error output, versions and processor first."""
+    from calib.batch.environment import Environment
+
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("calib: %(message)s"))
+    _log.addHandler(handler)
+    _log.setLevel(logging.INFO)
+    try:
+        here = Environment.here()
+        for facts in (here.versions, here.machine):
+            _log.info(", ".join(f"{name} {value}" for name, value in facts.items()))
+        yield
+    finally:
+        _log.removeHandler(handler)
+        _log.setLevel(logging.NOTSET)
 
 
 @contextmanager
@@ -52,6 +74,8 @@ def progress_bars() -> Iterator[Callable[[str, int, int], None]]:
     finally:
         if tasks:
             bars.stop()
+        for t in bars.tasks:
+            _log.info("%s: %g of %g, %.1f s", t.description, t.completed, t.total, t.elapsed)
 
 
 def posterior_table(calibration: Calibration) -> None:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from calib.cli.machine import Json, finish
 
 __all__ = ["register"]
 
@@ -29,7 +30,7 @@ def doctor(
         typer.Option(help="Report to check; reports/he2019 of a checkout by default."),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Check it without the sampling.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="For machines to read.")] = False,
+    json: Json = False,
 ) -> None:
     """Say what is installed, on which processor, and whether the shipped report checks here.
 
@@ -45,9 +46,8 @@ def doctor(
         "registered": _registered(),
         "report": None if folder is None else _checked(folder, quick=quick),
     }
-    print(json.dumps(found, indent=1) if as_json else _text(found))
-    if found["report"] is not None and found["report"]["exit_code"]:
-        raise typer.Exit(found["report"]["exit_code"])
+    print(_text(found))
+    finish(0 if found["report"] is None else found["report"]["exit_code"], found)
 
 
 def _installed(package: str) -> str | None:

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from calib.cli.machine import Json, finish
 from calib.cli.parallel import CORES, Models, Simulators, Workers
 from calib.errors import CalibError
 
@@ -33,6 +34,7 @@ def diagnose(
     workers: Workers = CORES,
     plugins: Models = None,
     simulator: Simulators = None,
+    json: Json = False,
 ) -> None:
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
     from calib.batch.folders import check_folder, fresh_folder
@@ -96,5 +98,7 @@ def diagnose(
             f"{100 * high:.0f} %), noise sd {format_number(s.noise_floor)} {unit}"
         )
     print(out / "index.html")
-    if not all(told):
-        raise typer.Exit(3)
+    finish(
+        0 if all(told) else 3, out / "diagnosis.json", folder=str(out),
+        warnings=list(found.warnings),
+    )  # fmt: skip

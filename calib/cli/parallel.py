@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-__all__ = ["CORES", "Models", "Scheduler", "Simulators", "Workers", "announce", "resumable"]
+__all__ = ["CORES", "Models", "Scheduler", "Simulators", "Workers", "announce"]
 
 # As many processes as there are cores, of which two bring most of what there is to gain.
 CORES = min(2, os.cpu_count() or 1)
@@ -50,16 +48,6 @@ Simulators = Annotated[
         is_eager=True,
     ),
 ]
-
-
-@contextmanager
-def resumable() -> Iterator[None]:
-    """Say what an interruption leaves."""
-    try:
-        yield
-    except KeyboardInterrupt as stop:
-        print(f"calib: {stop or 'interrupted'}", file=sys.stderr)
-        raise typer.Exit(130) from None
 
 
 def announce(line: str) -> None:

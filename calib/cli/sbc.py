@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from calib.cli.machine import Json, finish
 from calib.cli.parallel import Models, Scheduler, Simulators, Workers, announce
 
 __all__ = ["register"]
@@ -29,6 +30,7 @@ def sbc(
     scheduler: Scheduler = None,
     plugins: Models = None,
     simulator: Simulators = None,
+    json: Json = False,
 ) -> None:
     """Prove posteriors and bands calibrated on simulated data whose truth is known."""
     from dataclasses import asdict
@@ -57,5 +59,5 @@ def sbc(
         for name, error in of_model.failed.items():
             print(f"calib: {name} failed: {error}", file=sys.stderr)
     print(page)
-    if score.alarms or any(m.failed for m in score.models):
-        raise typer.Exit(1)
+    bad = score.alarms or any(m.failed for m in score.models)
+    finish(1 if bad else 0, out / "sbc.json", folder=str(out))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 from collections.abc import Collection, Mapping, Sequence
 from itertools import batched
@@ -24,6 +25,8 @@ __all__ = [
 ]  # fmt: skip
 
 _BATCH = 65_536
+
+_log = logging.getLogger(__name__)
 
 
 def read_table(
@@ -70,6 +73,7 @@ def read_table(
             "there are column names but no rows", where=file.source,
             allowed="at least one row below the column names", mend="add the measurements",
         )  # fmt: skip
+    _log.info("%s: %d rows of %s", file.source, len(parts.lines), ", ".join(values))
     return Table(
         values, file.source, np.array(parts.lines), file.header, tuple(parts.text), file.sha256,
         label, ignored,

@@ -25,9 +25,16 @@ def _command(name: str, command: Any) -> str:
     if hasattr(command, "commands"):
         return "\n".join(_command(f"{name} {n}", c) for n, c in command.commands.items())
     rows = [_parameter(p) for p in command.params if p.name != "help"]
-    return f"## calib {name}\n\n{words(command.help or '')}\n\n" + table(
+    about = f"{words(command.help or '')}\n\n{_example(command)}"
+    return f"## calib {name}\n\n{about}\n\n" + table(
         ("argument or option", "default", "what"), rows
     )
+
+
+def _example(command: Any) -> str:
+    """Return the example of a command as it is typed."""
+    typed = (command.epilog or "").removeprefix("Example: ")
+    return f"```console\n{typed}\n```"
 
 
 def _default(p: Any) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+from multiprocessing import active_children
 from pathlib import Path
 
 import pytest
@@ -45,6 +46,18 @@ def test_one_worker_is_this_process_and_works_when_the_piece_is_wanted(tmp_path:
         piece.result()
         assert (tmp_path / "file").exists()
         assert side.submit(square, 3).result() == (9, os.getpid())
+
+
+def test_an_interruption_ends_the_processes_at_their_work() -> None:
+    with pytest.raises(KeyboardInterrupt), pool(2) as side:  # noqa: PT012
+        side.submit(square, 2).result()
+        side.submit(time.sleep, 600.0)
+        working = active_children()
+        raise KeyboardInterrupt
+    assert working
+    for process in working:
+        process.join(60.0)
+        assert process.exitcode
 
 
 @pytest.mark.parametrize("workers", [1, 2])

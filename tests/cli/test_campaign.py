@@ -110,6 +110,6 @@ def test_control_c_says_what_is_kept_and_nothing_else(tmp_path):
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
-    assert "interrupted; letting go of the workers" in err
+    assert "the same command does the others; letting go of the workers" in err
     assert "of 400 results are kept in out/results" in err
     assert "Traceback" not in err

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from calib.models import example_csv
+from tests.browser import Browser, faults
 from tests.cli.test_cli import Calib
 from tests.cli.test_cli import calib as calib
 
@@ -33,6 +34,13 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
     broken = calib("predict", "c", "--at", "plates.csv")
     assert broken.code == 2
     assert "run `calib compare` again" in broken.err
+
+
+def test_the_page_holds_in_a_browser(calib: Calib, browser: Browser) -> None:
+    Path("plates.csv").write_text(example_csv("reece"))
+    made = calib("compare", "reece", "bekker_plate", "plates.csv", "--out", "c", *FEW)
+    assert made.code in (0, 3), made.err
+    assert faults(browser, Path("c/index.html")) == []
 
 
 def test_what_cannot_be_compared_is_refused(calib: Calib) -> None:

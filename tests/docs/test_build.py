@@ -17,6 +17,7 @@ import pytest
 from calib.data.quantities import QUANTITIES
 from calib.gap.effects import EFFECTS
 from calib.models import MODELS
+from tests.browser import Browser, faults
 from tests.docs.pages import DOCS, ROOT
 
 ABSENT = [name for name in ("sphinx", "myst_parser", "furo") if find_spec(name) is None]
@@ -36,7 +37,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("checkout")
     ignored = shutil.ignore_patterns("declared", "__pycache__")
     shutil.copytree(DOCS, root / "docs", ignore=ignored)
-    for beside in ("tests", "reports"):
+    for beside in ("calib", "tests", "reports"):
         (root / beside).symlink_to(ROOT / beside)
     done = subprocess.run(
         [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html",
@@ -83,6 +84,17 @@ def test_no_page_asks_for_anything_outside(built: Path) -> None:
         text = path.read_text(encoding="utf-8")
         fetched = re.findall(r"url\(\s*['\"]?([^'\")]+)|@import\s+['\"]([^'\"]+)", text)
         assert [a + b for a, b in fetched if outside(a + b)] == [], path
+
+
+def test_pages_hold_in_a_browser(built: Path, browser: Browser) -> None:
+    for page in ("index", "formats/inputs", "declared/quantities/index"):
+        assert faults(browser, built / f"{page}.html") == [], page
+
+
+@pytest.mark.slow
+def test_all_pages_hold_in_a_browser(built: Path, browser: Browser) -> None:
+    for page in built.rglob("*.html"):
+        assert faults(browser, page) == [], page
 
 
 def test_what_is_outside_is_seen() -> None:

@@ -16,6 +16,7 @@ from calib.report.manifest import file_hashes
 from calib.report.publish import publication
 from calib.report.study import Study
 from calib.report.writer import write_report
+from tests.browser import faults
 
 
 class Links(HTMLParser):
@@ -70,6 +71,10 @@ def test_every_link_of_the_page_leads_somewhere(report):
     assert {link[1:] for link in links.found if link.startswith("#")} <= links.ids
     tables = {p.relative_to(report).as_posix() for p in (report / "tables").iterdir()}
     assert tables <= set(local)
+
+
+def test_it_holds_in_a_browser(report, browser):
+    assert faults(browser, report / "index.html") == []
 
 
 def test_the_page_quotes_the_methods(report):

@@ -159,12 +159,14 @@ def _run[I, R, C](
                     failed[task.name] = task.error
                 tell(len(found) + len(failed), len(items))
         except KeyboardInterrupt:
-            if announce is not None and (workers > 1 or scheduler is not None):
-                announce("interrupted; letting go of the workers, which takes some seconds")
-            raise KeyboardInterrupt(
+            kept = (
                 f"interrupted; {len(found)} of {len(items)} results are kept in {landing.folder}, "
                 "and the same command does the others"
-            ) from None
+            )
+            if announce is not None and (workers > 1 or scheduler is not None):
+                announce(f"{kept}; letting go of the workers takes some seconds")
+                kept = "interrupted"
+            raise KeyboardInterrupt(kept) from None
         finally:
             failed = {name: failed[name] for name in items if name in failed}
             _list(failed, landing.folder / FAILED)

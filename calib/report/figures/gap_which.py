@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +54,7 @@ def which_plate(found: Diagnosis) -> Plate:
     names += [n for n in _SPECIAL if n in p and n not in names]
     tied = in_play(found)
     fig, axes = panels(
-        1, 1, height=5.2 * len(names) + 3.0, left=62.0, right=16.0, top=3.0, bottom=10.0
+        1, 1, height=5.2 * len(names) + 3.0, left=66.0, right=16.0, top=3.0, bottom=10.0
     )
     ax = axes[0, 0]
     y = np.arange(len(names))[::-1]
@@ -68,7 +69,8 @@ def which_plate(found: Diagnosis) -> Plate:
             p[name] + 0.01, yi, probability_text(p[name]), va="center", fontsize=7.0,
             fontweight="bold" if leading else "normal",
         )  # fmt: skip
-    ax.set_yticks(y, [short_name(n) for n in names])
+    # As wide as the margin: longer names, of several causes at once, take two lines.
+    ax.set_yticks(y, [textwrap.fill(short_name(n), 38) for n in names], linespacing=0.95)
     ax.set_ylim(-0.6, len(names) - 0.4)
     ax.set_xlim(0.0, 1.0)
     ax.axvline(0.5, color=GREY, lw=0.7, ls=(0, (4, 2)), zorder=0)

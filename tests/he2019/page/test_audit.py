@@ -11,6 +11,7 @@ from calib.he2019.audit import Verdict
 from calib.he2019.page.audit import AUDIT_MARKS, audit_section, write_audit_page
 from calib.report.figures.plate import Plate
 from calib.report.sections import Written
+from tests.browser import faults
 from tests.report.page.test_page import PNG, Reader, page
 
 
@@ -26,6 +27,10 @@ def written(audit, tmp_path_factory):
     folder = tmp_path_factory.mktemp("audit")
     write_audit_page(audit, folder, ["calib", "audit", "--out", "a folder"])
     return folder
+
+
+def test_it_holds_in_a_browser(written, browser):
+    assert faults(browser, written / "index.html") == []
 
 
 def read(html: str) -> Reader:

@@ -19,6 +19,7 @@ from calib.report.labels import short
 from calib.report.manifest import file_hashes
 from calib.report.study import Study
 from calib.report.writer import write_report
+from tests.browser import faults
 from tests.report.page.test_page import Reader
 
 NOTHING = Study({}, 2019, 0.0)
@@ -44,6 +45,12 @@ def page(report) -> Reader:
     reader.feed((report / "index.html").read_text(encoding="utf-8"))
     assert not reader.open
     return reader
+
+
+def test_they_hold_in_a_browser(report, browser):
+    assert faults(browser, report / "index.html") == []
+    for page in report.glob("gaps/*/index.html"):
+        assert faults(browser, page) == [], page
 
 
 def flat(text: str) -> str:

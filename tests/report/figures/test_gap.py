@@ -9,10 +9,17 @@ import numpy as np
 import pytest
 from matplotlib.collections import PathCollection
 
+from calib.gap.effects import EFFECTS
 from calib.gap.where import Region
 from calib.report.figures import gap as collect
 from calib.report.figures.gap import gap_plates
-from calib.report.figures.gap_which import in_play, placebo_plate, placebos, probability_text
+from calib.report.figures.gap_which import (
+    in_play,
+    placebo_plate,
+    placebos,
+    probability_text,
+    which_plate,
+)
 from calib.report.gap_rows import (
     EVERYWHERE,
     best_fit,
@@ -126,11 +133,23 @@ def test_captions_count_what_the_records_say(found, drawn):
 def test_bars_have_the_probabilities(found, drawn):
     ax = drawn["which"].figure.axes[0]
     widths = [bar.get_width() for bar in ax.patches]
-    labels = [t.get_text() for t in ax.get_yticklabels()]
+    labels = [t.get_text().replace("\n", " ") for t in ax.get_yticklabels()]
     expected = {short_name(n): p for n, p in found.ranking.probability.items()}
     assert {"none (noise)", "unknown effect", "parameter shift"} <= set(labels)
     for label, width in zip(labels, widths, strict=True):
         assert width == pytest.approx(expected[label])
+
+
+def test_the_longest_names_stay_on_the_paper(found):
+    longest = "+".join([*sorted(EFFECTS, key=len)[-2:], "unknown"])
+    p = found.ranking.probability | {longest: 1.0}
+    fits = found.ranking.fits | {longest: found.ranking.fits[found.ranking.order[0]]}
+    other = replace(found, ranking=replace(found.ranking, probability=p, fits=fits))
+    figure = which_plate(other).figure
+    figure.draw_without_rendering()
+    label = figure.axes[0].get_yticklabels()[0]
+    assert label.get_text().replace("\n", " ") == short_name(longest)
+    assert label.get_window_extent().x0 >= 0.0
 
 
 def test_a_tie_is_said_and_hatched(found):

@@ -33,6 +33,7 @@ from calib.report.page.gap_tables import (
     parameter_text,
     prior_text,
 )
+from tests.browser import faults
 from tests.gap.cases import diagnosis_of, pull_diagnosis
 from tests.report.page.test_page import Reader
 
@@ -224,7 +225,10 @@ def test_it_is_well_formed_and_makes_no_request(page):
     assert reader.open == []
     assert not re.search(r"https?://|@import|url\(", html)
     assert all(a.startswith(("#", "data:")) for a in reader.addresses)
-    assert "script" not in reader.tags
+
+
+def test_it_holds_in_a_browser(page, browser):
+    assert faults(browser, page[0] / "index.html") == []
 
 
 def test_every_link_has_its_target_and_ids_are_unique(page):

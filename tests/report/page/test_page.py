@@ -64,8 +64,8 @@ class Reader(HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data):
-        if "style" not in self.open:
-            self.text += data
+        if not {"style", "script"} & set(self.open):
+            self.text += data.replace("\N{NO-BREAK SPACE}", " ")
 
 
 def page(results, **kwargs) -> tuple[str, Reader]:
@@ -94,7 +94,6 @@ def test_it_is_well_formed_and_makes_no_request(whole):
     assert reader.open == []
     assert not re.search(r"https?://|@import|url\(", html)
     assert all(a.startswith(("#", "data:")) for a in reader.addresses)
-    assert "script" not in reader.tags
 
 
 def test_every_link_has_its_target_and_ids_are_unique(whole):

@@ -14,6 +14,7 @@ from calib.errors import CalibError
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.page.sbc import text_table, verdict
 from calib.validation.sbc.run import run_sbc
+from tests.browser import Browser, faults
 
 MODELS = ("bekker", "modified_bekker")
 QUICK = SamplerSettings(steps=100, max_steps=400)
@@ -53,6 +54,10 @@ def test_the_page_makes_no_request_and_has_its_figures_inside(out: Path) -> None
     assert not re.search(r"https?://|@import|url\(", html)
     assert html.count('src="data:image/png;base64,') == 2
     assert "calib" in html
+
+
+def test_the_page_holds_in_a_browser(out: Path, browser: Browser) -> None:
+    assert faults(browser, out / "index.html") == []
 
 
 def test_a_run_is_resumed_and_extended(out: Path, tmp_path: Path) -> None:

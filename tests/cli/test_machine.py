@@ -1,0 +1,139 @@
+"""What programs read, what helps people, and what an interruption leaves."""
+
+from __future__ import annotations
+
+import json
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+import typer
+
+from calib.cli import app
+from calib.cli.examples import EXAMPLES
+from calib.models import MODELS, example_csv
+from tests.cli.test_cli import Calib
+from tests.cli.test_cli import calib as calib
+
+FEW = ("--max-steps", 800)
+
+
+@pytest.fixture
+def run(calib: Calib) -> Path:
+    Path("my.csv").write_text(example_csv("modified_bekker"))
+    made = calib("fit", "my.csv", "--model", "modified_bekker", "--out", "run", *FEW)
+    assert made.code in (0, 3), made.err
+    return Path("run")
+
+
+def test_a_fit_prints_its_run_and_what_was_held_out(calib: Calib) -> None:
+    Path("my.csv").write_text(example_csv("modified_bekker"))
+    ran = calib("fit", "my.csv", "--model", "modified_bekker", "--json", *FEW,
+                "--hold-out", "average_ground_pressure_kpa=141")  # fmt: skip
+    found = json.loads(ran.out)
+    assert found["exit_code"] == ran.code
+    assert found["folder"] == "calib-run"
+    assert found["held_out"]["rows"] > 0
+    written = json.loads(Path("calib-run/run.json").read_text())
+    assert found["gate"] == written["gate"]
+    assert set(found["posterior"]) >= {"z_ref", "sigma"}
+    assert found["posterior"]["sigma"]["mean"] > 0.0
+
+
+def test_a_prediction_prints_columns_of_numbers(calib: Calib, run: Path) -> None:
+    Path("at.csv").write_text("slip_ratio,average_ground_pressure_kpa\n0.05,140\n0.10,999\n")
+    ran = calib("predict", run, "--at", "at.csv", "--json")
+    found = json.loads(ran.out)
+    assert (found["exit_code"], found["outside"]) == (ran.code, 1)
+    assert found["columns"]["slip_ratio"] == [0.05, 0.1]
+    assert all(isinstance(v, float) for v in found["columns"]["rut_depth_mm_median"])
+    assert "1 rows lie outside" in ran.err
+    printed = calib("predict", run, "--at", "at.csv")
+    assert printed.out.splitlines()[0].split(",") == list(found["columns"])
+
+
+def test_models_are_listed_for_programs(calib: Calib) -> None:
+    found = json.loads(calib("models", "--json").out)["models"]
+    assert set(found) == set(MODELS)
+    assert found["bekker"]["output"] == MODELS["bekker"].output
+
+
+def test_a_comparison_and_sbc_print_the_files_they_write(calib: Calib) -> None:
+    Path("plates.csv").write_text(example_csv("reece"))
+    ran = calib("compare", "reece", "bekker_plate", "plates.csv", "--json", "--workers", 1, *FEW)
+    found = json.loads(ran.out)
+    assert set(found["models"]) == {"reece", "bekker_plate"}
+    assert (found.pop("exit_code"), found.pop("folder")) == (ran.code, "calib-comparison")
+    assert found == json.loads(Path("calib-comparison/comparison.json").read_text())
+
+
+def test_an_error_leaves_the_output_empty(calib: Calib) -> None:
+    ran = calib("predict", "absent", "--at", "at.csv", "--json")
+    assert (ran.code, ran.out) == (2, "")
+    assert "this is not a run folder" in ran.err
+
+
+def test_what_is_not_finite_is_null(capsys: pytest.CaptureFixture[str]) -> None:
+    from contextlib import redirect_stdout
+    from sys import stdout
+
+    from calib.cli.machine import _Aside, finish
+
+    with redirect_stdout(_Aside(stdout)):
+        print("for people")
+        with pytest.raises(typer.Exit):
+            finish(3, {"a": [float("nan"), {"b": (float("inf"), 1.0)}]})
+    assert json.loads(capsys.readouterr().out) == {"exit_code": 3, "a": [None, {"b": [None, 1.0]}]}
+
+
+def verbs() -> dict[str, typer.core.TyperCommand]:
+    group = typer.main.get_command(app)
+    found = {}
+    for name, command in group.commands.items():
+        found |= (
+            {f"{name} {n}": c for n, c in command.commands.items()}
+            if hasattr(command, "commands")
+            else {name: command}
+        )
+    return found
+
+
+@pytest.mark.parametrize("verb", verbs())
+def test_every_help_has_an_example_that_is_understood(verb: str) -> None:
+    command = verbs()[verb]
+    typed = command.epilog.removeprefix("Example: ").partition(" > ")[0]
+    assert typed.startswith(f"calib {verb} ")
+    with command.make_context(verb, typed.removeprefix(f"calib {verb} ").split()):
+        pass
+
+
+def test_no_example_is_of_nothing() -> None:
+    assert {verb.split()[-1] for verb in verbs()} == set(EXAMPLES)
+
+
+def test_the_version(calib: Calib) -> None:
+    assert calib("--version").out == f"calib {version('terracalib')}\n"
+
+
+def test_more_is_said_when_asked_for(calib: Calib, run: Path) -> None:
+    Path("at.csv").write_text("slip_ratio,average_ground_pressure_kpa\n0.05,140\n")
+    quiet, more = calib("predict", run, "--at", "at.csv"), calib("-v", "predict", run, "--at", "at.csv")  # fmt: skip  # noqa: E501
+    assert more.out == quiet.out
+    assert f"numpy {version('numpy')}" in more.err
+    assert "at.csv: 1 rows of slip_ratio, average_ground_pressure_kpa" in more.err
+    failed = calib("-v", "predict", "absent", "--at", "at.csv")
+    assert failed.code == 2
+    assert "Traceback" in failed.err
+    assert "at.csv" not in calib("predict", run, "--at", "at.csv").err
+
+
+def test_an_interruption_says_how_to_go_on(calib: Calib, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stopped(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("calib.inference.calibration.calibrate", stopped)
+    Path("my.csv").write_text(example_csv("bekker"))
+    ran = calib("fit", "my.csv", "--model", "bekker")
+    assert ran.code == 130
+    assert "nothing was written. Start the same command again" in ran.err
+    assert not Path("calib-run").exists()
