@@ -336,6 +336,7 @@ def _output(case: Case, name: str, model: str) -> OutputData:
         _check_conditions(table, {name: model})
     lab = case.lab.take(np.isfinite(case.lab[column]))
     problem = build_problem(model, lab)
+    problem.noise.must_be_usual(problem.priors.source, "a diagnosis")
     rows = np.flatnonzero(np.isfinite(case.field[column]))
     _check_field(case, name, column, rows)
     response = problem.bound.to_response(case.field[column][rows])

@@ -10,6 +10,7 @@ import numpy as np
 
 from calib.inference.calibration import Calibration
 from calib.inference.estimators import PointEstimate
+from calib.inference.noise import Noise
 from calib.models.base import Array
 from calib.report.study import OutputResult, Study
 from calib.validation.scores import Scores
@@ -55,6 +56,7 @@ def _output(result: OutputResult) -> dict[str, Any]:
             "held_out": None if result.task.held_out is None else str(result.task.held_out),
         },
         "references": dict(problem.bound.references),
+        **_noise(problem.noise),
         **summarise_estimates(result.estimates, result.by_pressure),
         "priors": {
             p.name: {
@@ -69,6 +71,16 @@ def _output(result: OutputResult) -> dict[str, Any]:
         "prior_sensitivity": _sensitivity(result),
         "validation": _validation(result),
         "sampling": _sampling(result.calibration),
+    }
+
+
+def _noise(noise: Noise) -> dict[str, Any]:
+    """What the prior file asks for beyond normal noise of one standard deviation."""
+    if noise.usual:
+        return {}
+    depends = {"column": noise.column, "centre": noise.centre, "spread": noise.spread}
+    return {
+        "noise": {"family": noise.choice.family, "depends_on": depends if noise.column else None}
     }
 
 

@@ -150,9 +150,10 @@ def leave_one_out(
             elpd[i] = _log_mean(np.where(defined, held, -np.inf), np.zeros_like(held))
             sample = sample[np.resize(np.flatnonzero(defined), N_DRAWS)]
         natural = problem.theta(sample)
-        location = problem.bound.location(natural[:, :-1], problem.bound.model.select(row.columns))
-        noisy = location[:, 0] + natural[:, -1] * rng.standard_normal(N_DRAWS)
-        drawn[:, i] = problem.bound.from_response(noisy)
+        here = problem.bound.model.select(row.columns)
+        location = problem.bound.location(problem.of_model(natural), here)
+        noisy = location + problem.noise.draw(natural, here, rng, 1)
+        drawn[:, i] = problem.bound.from_response(noisy)[:, 0]
     if progress is not None and not refits:
         progress(n, n)
     return Validation(

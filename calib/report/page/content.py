@@ -97,7 +97,7 @@ def section(
         "label": problem.table.label,
         "facts": _card_facts(result, evidence),
         "equation": equation(bound),
-        "likelihood": prose(likelihood(bound, axis_of(bound.model.output).name.lower()), names),
+        "likelihood": prose(likelihood(problem, axis_of(bound.model.output).name.lower()), names),
         "parametrisation": prose(parametrisation(bound), names),
         "data": _data_facts(result),
         "assumed": [prose(note, names) for note in evidence.notes],
