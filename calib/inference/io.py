@@ -76,10 +76,10 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     prior = problem.theta(
         problem.priors.sample(generator(calibration.seed, calibration.label, "prior"), N_PRIOR)
     )
+    with np.errstate(over="ignore"):
+        measured = problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
     by_row = {
-        "posterior_predictive": {
-            output: problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
-        },
+        "posterior_predictive": {output: measured},
         "log_likelihood": {output: problem.log_likelihood_rows(internal).reshape(shape)},
     }
     if kept == 0:

@@ -100,6 +100,11 @@ class Problem:
     def _sum_ln_jacobian(self) -> float:
         return float(self._ln_jacobian.sum())
 
+    @property
+    def heavy(self) -> bool:
+        """Whether a measurement has no mean: a Student-t logarithm, of whatever degrees."""
+        return self.noise.student and self.bound.model.response == "log"
+
     @cached_property
     def squares(self) -> Squares:
         """Sums of squared residuals, on the scale of the response, of natural parameters."""

@@ -25,6 +25,7 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.study_tasks import Task, fitted_rows
+from calib.validation.noise_preference import NoisePreference, noise_preference
 from calib.validation.prediction import predictive_draws
 from calib.validation.sensitivity import Sensitivity, prior_sensitivity
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
@@ -59,6 +60,8 @@ class OutputResult:
         Of each stage.
     sensitivity : mapping of str to Sensitivity
         Of each parameter to prior and data.
+    preference : NoisePreference, optional
+        Of the noise that the prior file asks for over the usual one.
     """
 
     task: Task
@@ -70,6 +73,7 @@ class OutputResult:
     posterior_predictive: Array
     seconds: Mapping[str, float] = field(default_factory=dict)
     sensitivity: Mapping[str, Sensitivity] = field(default_factory=dict)
+    preference: NoisePreference | None = None
 
 
 @dataclass(frozen=True)
@@ -208,6 +212,10 @@ def _work_out(
             progress=lambda done, n: progress(f"{task.output}: leaving rows out", done, n),
             workers=workers,
         )
+    preference = noise_preference(
+        calibration, loo=validation if held is None else None, settings=settings, workers=workers,
+        progress=lambda done, n: progress(f"{task.output}: with normal noise", done, n),
+    )  # fmt: skip
     seconds["validate"] = time.perf_counter() - clock
     _, replicated = predictive_draws(
         calibration, problem.conditions, generator(seed, task.output, "replicate")
@@ -222,6 +230,7 @@ def _work_out(
         replicated,
         seconds,
         prior_sensitivity(calibration),
+        preference,
     )
 
 

@@ -13,6 +13,8 @@ from calib.inference.estimators import PointEstimate
 from calib.inference.noise import Noise
 from calib.models.base import Array
 from calib.report.study import OutputResult, Study
+from calib.validation.assumptions import warnings_of
+from calib.validation.noise_preference import NoisePreference
 from calib.validation.scores import Scores
 from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 
@@ -56,7 +58,8 @@ def _output(result: OutputResult) -> dict[str, Any]:
             "held_out": None if result.task.held_out is None else str(result.task.held_out),
         },
         "references": dict(problem.bound.references),
-        **_noise(problem.noise),
+        **_noise(problem.noise, result.preference),
+        **_warnings(result.calibration),
         **summarise_estimates(result.estimates, result.by_pressure),
         "priors": {
             p.name: {
@@ -74,14 +77,28 @@ def _output(result: OutputResult) -> dict[str, Any]:
     }
 
 
-def _noise(noise: Noise) -> dict[str, Any]:
+def _noise(noise: Noise, preference: NoisePreference | None) -> dict[str, Any]:
     """What the prior file asks for beyond normal noise of one standard deviation."""
-    if noise.usual:
+    if noise.usual or preference is None:
         return {}
     depends = {"column": noise.column, "centre": noise.centre, "spread": noise.spread}
     return {
-        "noise": {"family": noise.choice.family, "depends_on": depends if noise.column else None}
+        "noise": {
+            "family": noise.choice.family,
+            "depends_on": depends if noise.column else None,
+            "against_normal": {
+                "elpd_difference": preference.elpd,
+                "se": preference.se,
+                "preferred": preference.preferred,
+                "sentence": preference.sentence,
+            },
+        }
     }
+
+
+def _warnings(calibration: Calibration) -> dict[str, Any]:
+    found = warnings_of(calibration.problem, calibration.draws.mode)
+    return {"warnings": list(found)} if found else {}
 
 
 def summarise_estimates(

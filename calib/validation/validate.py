@@ -97,7 +97,8 @@ def validate_held_out(calibration: Calibration, held_out: Table) -> Validation:
             mend="hold out rows inside the range of the others",
         )
     observed = held_out[model.output]
-    return Validation("held_out", held_out, observed, draws, score(draws, observed))
+    scores = score(draws, observed, heavy=calibration.problem.heavy)
+    return Validation("held_out", held_out, observed, draws, scores)
 
 
 @one_thread()
@@ -157,8 +158,9 @@ def leave_one_out(
     if progress is not None and not refits:
         progress(n, n)
     return Validation(
-        "leave_one_out", problem.table, problem.observed, drawn, score(drawn, problem.observed),
-        k, tuple(refits), float(elpd.sum()), float(np.sqrt(n * elpd.var(ddof=1))),
+        "leave_one_out", problem.table, problem.observed, drawn,
+        score(drawn, problem.observed, heavy=problem.heavy), k, tuple(refits),
+        float(elpd.sum()), float(np.sqrt(n * elpd.var(ddof=1))),
         tuple(i for i, refit in refits.items() if not refit.passed), elpd,
     )  # fmt: skip
 

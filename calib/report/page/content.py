@@ -26,7 +26,7 @@ from calib.report.page.tables import (
 from calib.report.page.verdict import Evidence, Level, gather, judge_evidence
 from calib.report.reference import reference_of
 from calib.report.study import Failure, OutputResult
-from calib.validation.outliers import outlying_notes
+from calib.validation.assumptions import warnings_of
 
 __all__ = ["MARKS", "failed_section", "section"]
 
@@ -101,7 +101,7 @@ def section(
         "parametrisation": prose(parametrisation(bound), names),
         "data": _data_facts(result),
         "assumed": [prose(note, names) for note in evidence.notes],
-        "outlying": [prose(n, names) for n in outlying_notes(problem, calibration.draws.mode)],
+        "warnings": [prose(n, names) for n in warnings_of(problem, calibration.draws.mode)],
         "priors": prior_rows(result),
         "prior_source": PurePath(problem.priors.source).name,
         "estimates": estimates_grid(result, reference=reference),
@@ -111,6 +111,7 @@ def section(
         "sampling": sampling_facts(result),
         "validation": validation_facts(result, evidence.effective, evidence.low_coverage_p),
         "validation_title": _validation_title(result),
+        "noise": result.preference and prose(result.preference.sentence, ()),
         "figures": {p.name: _figure(key, p, images, names) for p in plates},
         "converged": calibration.converged,
     }

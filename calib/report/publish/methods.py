@@ -87,7 +87,7 @@ def _genetic(settings: Mapping[str, Any]) -> str:
 
 
 def _output(o: Output) -> list[str]:
-    return [*_model(o), *_data(o), *_inference(o), *_sampling(o), *_validation(o)]
+    return [*_model(o), *_data(o), *_inference(o), *_sampling(o), *_validation(o), *_against(o)]
 
 
 def _model(o: Output) -> list[str]:
@@ -200,6 +200,12 @@ def _validation(o: Output) -> list[str]:
             "(standard error)"
         )
     return [f"{text}."]
+
+
+def _against(o: Output) -> list[str]:
+    """Of another noise than the usual: whether the rows prefer it."""
+    against = o.found.get("noise", {}).get("against_normal")
+    return [] if against is None else [against["sentence"]]
 
 
 def _four(value: float | None) -> str:
