@@ -112,7 +112,7 @@ class Noise:
         if not self.usual:
             raise CalibError(
                 f"{what} takes normal noise of one standard deviation only",
-                where=f"{source}, [likelihood]", mend="take this table out of the prior file",
+                where=f"{source}, [likelihood]", mend="take this table out, and fit again where a fit was made with it",
             )  # fmt: skip
 
     @property

@@ -140,6 +140,8 @@ def _from_the_rest(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple
 def linear(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, int]:
     """Residuals, and the model made linear at a fit, in coordinates orthonormal over rows used.
 
+    Where the noise depends on a condition, over its scale there in units of sigma.
+
     Returns
     -------
     residual : ndarray, shape (n,)
@@ -149,7 +151,9 @@ def linear(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, 
     """
     steps = _STEP * np.maximum(np.abs(t), 1.0)
     moved = np.concatenate([t[None], t + np.diag(steps), t - np.diag(steps)])
-    residuals = problem.residuals(problem.theta(moved))
+    natural = problem.theta(moved)
+    relative = problem.noise.scale(natural[:1], problem.conditions) / natural[0, -1]
+    residuals = problem.residuals(natural) / relative
     d = t.size
     jacobian = ((residuals[1 + d :] - residuals[1 : 1 + d]) / (2.0 * steps)[:, None]).T
     _, sizes, directions = np.linalg.svd(jacobian[used], full_matrices=False)

@@ -9,17 +9,20 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from calib.data import Table, table_from_arrays
+from calib.data import Table, read_for_model, table_from_arrays
 from calib.errors import CalibError
+from calib.gap.case import campaigns, case_from_run
 from calib.inference.calibration import Calibration, calibrate
-from calib.inference.estimators import estimate
+from calib.inference.emulation.prepared import emulated
+from calib.inference.estimators import estimate, methods_for
 from calib.inference.io import load_calibration, save_calibration
 from calib.inference.noise import Noise, NoiseChoice
 from calib.inference.prior_files import default_priors, parse_priors
 from calib.inference.problem import Problem, build_problem
-from calib.models import get_model
+from calib.models import MODELS, example_csv, get_model
 from calib.validation.prediction import predict, predictive_draws
 from tests.conftest import SEED, he2019_table
+from tests.gap.cases import make_case
 
 STUDENT = '[likelihood]\nfamily = "student_t"\n'
 SLIP = '[likelihood]\nnoise_depends_on = "slip"\n'
@@ -177,6 +180,8 @@ def test_a_run_is_loaded_with_its_noise(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     folder.mkdir()
     save_calibration(found, folder)
+    with pytest.raises(CalibError, match="a diagnosis takes normal noise"):
+        case_from_run(folder, tmp_path / "field.csv")
     loaded = load_calibration(folder)
     assert loaded.problem.noise == found.problem.noise
     assert loaded.problem.names == found.problem.names
@@ -237,3 +242,53 @@ def test_a_noise_cannot_depend_on_what_is_the_same_everywhere(tmp_path: Path) ->
 def test_an_effect_has_no_likelihood() -> None:
     with pytest.raises(CalibError, match="an effect has no likelihood"):
         parse_priors(f'model = "an_effect"\n{STUDENT}', "my.toml", "an_effect", ("size",), {})
+
+
+@pytest.mark.parametrize("name", sorted(MODELS))
+def test_every_model_and_estimator_takes_another_noise(name: str, tmp_path: Path) -> None:
+    model = MODELS[name]
+    path = tmp_path / "rows.csv"
+    path.write_text(example_csv(name), encoding="utf-8")
+    table = read_for_model(path, (*model.conditions, model.output))
+    varying = next(c for c in model.conditions if np.ptp(table[c]) > 0.0)
+    chosen = STUDENT + f'noise_depends_on = "{varying}"\n'
+    problem, usual = problem_with(tmp_path, chosen, table, name), build_problem(name, table)
+    assert problem.names == (*usual.names[:-1], "nu", "sigma_slope", "sigma")
+    assert np.isfinite(problem.log_prob(drawn(problem, 3))).all()
+    # Least squares know no noise. The population methods search as they do, from the same space.
+    for method in set(methods_for(name)) - {"genetic", "differential_evolution"}:
+        try:
+            expected = estimate(usual, method, np.random.default_rng(1))
+        except CalibError:  # a method that reads features off curves needs more rows
+            continue
+        found = estimate(problem, method, np.random.default_rng(1))
+        np.testing.assert_allclose(found.theta, expected.theta)
+
+
+def test_population_methods_search_the_models_parameters_alone(tmp_path: Path) -> None:
+    model = MODELS["magic_formula"]
+    path = tmp_path / "rows.csv"
+    path.write_text(example_csv("magic_formula"), encoding="utf-8")
+    table = read_for_model(path, (*model.conditions, model.output))
+    problem = problem_with(tmp_path, BOTH, table, "magic_formula")
+    usual = build_problem("magic_formula", table)
+    found, expected = (
+        estimate(p, "differential_evolution", np.random.default_rng(1)) for p in (problem, usual)
+    )
+    np.testing.assert_allclose(found.theta, expected.theta)
+    np.testing.assert_allclose(found.rmse, expected.rmse)
+
+
+def test_an_emulator_and_a_diagnosis_refuse_another_noise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    problem = problem_with(tmp_path, STUDENT, he2019_table("rut_depth"))
+    with pytest.raises(CalibError, match="an emulator takes normal noise"):
+        emulated(problem, 1)
+    monkeypatch.setattr("calib.gap.case.build_problem", lambda model, lab: problem)
+    with pytest.raises(CalibError, match="a diagnosis takes normal noise"):
+        campaigns(make_case())
+    uncertain = replace(problem.bound.model, uncertain=lambda theta, conditions: None)
+    monkeypatch.setattr("calib.inference.problem.get_model", lambda name: uncertain)
+    with pytest.raises(CalibError, match="the emulator modified_bekker takes normal noise"):
+        build_problem("modified_bekker", problem.table, tmp_path / "priors.toml")
