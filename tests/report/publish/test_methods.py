@@ -184,7 +184,7 @@ def test_another_noise_is_described_and_what_the_data_prefer(he2019):
     }
     text = text_of(manifest, told)
     assert (
-        "Student-t about the model with unknown degrees of freedom \N{GREEK SMALL LETTER NU} with an "
+        "Student-t about the model with unknown degrees of freedom \N{GREEK SMALL LETTER NU} and an "
         "unknown scale whose logarithm is linear in slip: that of \N{GREEK SMALL LETTER SIGMA} at 25 %"
     ) in text
     assert "_slope more for each 12.5 %." in text
