@@ -112,8 +112,9 @@ class Noise:
         if not self.usual:
             raise CalibError(
                 f"{what} takes normal noise of one standard deviation only",
-                where=f"{source}, [likelihood]", mend="take this table out, and fit again where a fit was made with it",
-            )  # fmt: skip
+                where=f"{source}, [likelihood]",
+                mend="take this table out, and fit again what was fitted with it",
+            )
 
     @property
     def student(self) -> bool:

@@ -152,9 +152,9 @@ def _noise(o: Output) -> str:
         return f"{law} {'and' if student else 'with'} one unknown {scale} [$sigma]"
     axis = axis_of(depends["column"])
     return (
-        f"{law} {'and' if student else 'with'} an unknown {scale} whose logarithm is linear in {_lower(axis.name)}: that of "
-        f"[$sigma] at {axis.value_text(depends['centre'])} {axis.unit}, and [$sigma_slope] more "
-        f"for each {axis.value_text(depends['spread'])} {axis.unit}"
+        f"{law} {'and' if student else 'with'} an unknown {scale} whose logarithm is linear in "
+        f"{_lower(axis.name)}: that of [$sigma] at {axis.value_text(depends['centre'])} "
+        f"{axis.unit}, and [$sigma_slope] more for each {axis.value_text(depends['spread'])} {axis.unit}"
     )
 
 

@@ -183,10 +183,9 @@ def test_another_noise_is_described_and_what_the_data_prefer(he2019):
         "against_normal": {"sentence": "The data prefer Student-t noise that depends on slip."},
     }
     text = text_of(manifest, told)
-    assert (
-        "Student-t about the model with unknown degrees of freedom \N{GREEK SMALL LETTER NU} and an "
-        "unknown scale whose logarithm is linear in slip: that of \N{GREEK SMALL LETTER SIGMA} at 25 %"
-    ) in text
+    nu, sigma = "\N{GREEK SMALL LETTER NU}", "\N{GREEK SMALL LETTER SIGMA}"
+    assert f"Student-t about the model with unknown degrees of freedom {nu} and an unknown" in text
+    assert f"scale whose logarithm is linear in slip: that of {sigma} at 25 %" in text
     assert "_slope more for each 12.5 %." in text
     assert "The data prefer Student-t noise that depends on slip." in text
     del told["models"]["rut_depth"]["noise"]["depends_on"]
