@@ -154,7 +154,8 @@ def _noise(o: Output) -> str:
     return (
         f"{law} {'and' if student else 'with'} an unknown {scale} whose logarithm is linear in "
         f"{_lower(axis.name)}: that of [$sigma] at {axis.value_text(depends['centre'])} "
-        f"{axis.unit}, and [$sigma_slope] more for each {axis.value_text(depends['spread'])} {axis.unit}"
+        f"{axis.unit}, and [$sigma_slope] more for each {axis.value_text(depends['spread'])} "
+        f"{axis.unit}"
     )
 
 
