@@ -74,7 +74,6 @@ def report(
     from calib.report.emulators import EmulatorSection
     from calib.report.study_tasks import fitted_rows, plan_tasks
     from calib.report.writer import write_report
-    from calib.validation.assumptions import warnings_of
 
     check_folder(out, overwrite=overwrite)
     if files:
@@ -122,7 +121,7 @@ def report(
         ninety = result.validation.scores.coverage[0.9]
         state = "converged" if result.calibration.converged else "NOT CONVERGED"
         print(f"{key}: {state}; 90 % band covers {ninety.hits} of {ninety.n} rows not fitted")
-        for warning in warnings_of(result.calibration.problem, result.calibration.draws.mode):
+        for warning in result.warnings:
             print(f"warning: {warning}", file=sys.stderr)
     for key, failure in study.failures.items():
         print(f"{key}: FAILED: {failure.error}", file=sys.stderr)

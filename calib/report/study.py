@@ -25,6 +25,7 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.study_tasks import Task, fitted_rows
+from calib.validation.assumptions import warnings_of
 from calib.validation.noise_preference import NoisePreference, noise_preference
 from calib.validation.prediction import predictive_draws
 from calib.validation.sensitivity import Sensitivity, prior_sensitivity
@@ -62,6 +63,8 @@ class OutputResult:
         Of each parameter to prior and data.
     preference : NoisePreference, optional
         Of the noise that the prior file asks for over the usual one.
+    warnings : tuple of str
+        Where the rows are not as the likelihood has them.
     """
 
     task: Task
@@ -74,6 +77,7 @@ class OutputResult:
     seconds: Mapping[str, float] = field(default_factory=dict)
     sensitivity: Mapping[str, Sensitivity] = field(default_factory=dict)
     preference: NoisePreference | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -231,6 +235,7 @@ def _work_out(
         seconds,
         prior_sensitivity(calibration),
         preference,
+        warnings_of(problem, calibration.draws.mode),
     )
 
 

@@ -13,7 +13,6 @@ from calib.inference.estimators import PointEstimate
 from calib.inference.noise import Noise
 from calib.models.base import Array
 from calib.report.study import OutputResult, Study
-from calib.validation.assumptions import warnings_of
 from calib.validation.noise_preference import NoisePreference
 from calib.validation.scores import Scores
 from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
@@ -59,7 +58,7 @@ def _output(result: OutputResult) -> dict[str, Any]:
         },
         "references": dict(problem.bound.references),
         **_noise(problem.noise, result.preference),
-        **_warnings(result.calibration),
+        **({"warnings": list(result.warnings)} if result.warnings else {}),
         **summarise_estimates(result.estimates, result.by_pressure),
         "priors": {
             p.name: {
@@ -94,11 +93,6 @@ def _noise(noise: Noise, preference: NoisePreference | None) -> dict[str, Any]:
             },
         }
     }
-
-
-def _warnings(calibration: Calibration) -> dict[str, Any]:
-    found = warnings_of(calibration.problem, calibration.draws.mode)
-    return {"warnings": list(found)} if found else {}
 
 
 def summarise_estimates(

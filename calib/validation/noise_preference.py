@@ -26,7 +26,8 @@ class NoisePreference:
     elpd, se : float
         Difference of the expected log predictive densities, and its standard error.
     sound : bool
-        Whether both calibrations, and all without a row, passed the gate.
+        Whether both calibrations, and all without a row, passed the gate, and every row has a
+        density.
     line : int
         Of the row in the file that makes more than half of the difference; 0 if none does.
     """
@@ -53,7 +54,7 @@ class NoisePreference:
         if self.preferred == "unknown":
             return (
                 f"Whether {chosen} is preferred to {usual} cannot be said: one of the posteriors "
-                "that this rests on did not converge."
+                "that this rests on did not converge, or gives a row that was left out no density."
             )
         said = {
             "neither": f"The data cannot tell {chosen} from {usual}",
@@ -126,6 +127,8 @@ def noise_preference(
         for c, done in ((calibration, loo), (usual, None))
     ]  # fmt: skip
     rows = [np.full(p.observed.size, np.nan) if p.elpd_rows is None else p.elpd_rows for p in parts]
+    if not all(np.isfinite(r).all() for r in rows):
+        return NoisePreference(problem.noise, float("nan"), float("nan"), sound=False)
     difference = rows[0] - rows[1]
     sound = all(c.converged for c in (calibration, usual)) and not any(p.unconverged for p in parts)
     se = float(np.sqrt(difference.size * difference.var(ddof=1)))

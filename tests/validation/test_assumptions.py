@@ -118,7 +118,8 @@ def test_noise_that_depends_on_a_condition_is_noticed_and_the_remedy_works(
     entries = problem.priors.entries
     priors = Priors((*entries[:-1], normal("sigma_slope", 0.0, 0.5), entries[-1]))
     mended = replace(problem, noise=noise, priors=priors)
-    t = np.array([*fitted_line(SLIP, pull)[:2], 0.5 * slope, np.log(0.05)])
+    b, a = np.polyfit(SLIP, pull, 1, w=np.exp(-0.5 * slope * z))
+    t = np.array([a, b, 0.5 * slope, np.log(0.05)])
     assert residual_notes(mended, t) == ()
 
 
@@ -226,3 +227,20 @@ def test_a_linear_models_residuals_are_those_of_least_squares() -> None:
     assert rank == 2
     np.testing.assert_allclose(design.T @ design, np.eye(2), atol=1e-9)
     np.testing.assert_allclose(design.T @ residual, 0.0, atol=1e-9)
+
+
+def test_of_uneven_noise_least_squares_are_weighted() -> None:
+    rng = np.random.default_rng(2)
+    z = (SLIP - SLIP.mean()) / SLIP.std()
+    problem = line_problem(SLIP, SLIP + rng.standard_normal(40))
+    noise = Noise(NoiseChoice("normal", "slip"), "slip_ratio", SLIP.mean(), SLIP.std())
+    entries = problem.priors.entries
+    priors = Priors((*entries[:-1], normal("sigma_slope", 0.0, 0.5), entries[-1]))
+    t = np.array([0.1, 0.9, 0.7, -1.0])
+    residual, design, _ = linear(
+        replace(problem, noise=noise, priors=priors), t, np.ones(40, dtype=bool)
+    )
+    plain = problem.response - 0.1 - 0.9 * SLIP
+    np.testing.assert_allclose(residual, plain / np.exp(0.7 * z), rtol=1e-9)
+    weighted = np.column_stack([np.ones(40), SLIP]) / np.exp(0.7 * z)[:, None]
+    np.testing.assert_allclose(design @ design.T, weighted @ np.linalg.pinv(weighted), atol=1e-6)

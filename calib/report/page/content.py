@@ -26,7 +26,6 @@ from calib.report.page.tables import (
 from calib.report.page.verdict import Evidence, Level, gather, judge_evidence
 from calib.report.reference import reference_of
 from calib.report.study import Failure, OutputResult
-from calib.validation.assumptions import warnings_of
 
 __all__ = ["MARKS", "failed_section", "section"]
 
@@ -101,7 +100,7 @@ def section(
         "parametrisation": prose(parametrisation(bound), names),
         "data": _data_facts(result),
         "assumed": [prose(note, names) for note in evidence.notes],
-        "warnings": [prose(n, names) for n in warnings_of(problem, calibration.draws.mode)],
+        "warnings": [prose(warning, names) for warning in result.warnings],
         "priors": prior_rows(result),
         "prior_source": PurePath(problem.priors.source).name,
         "estimates": estimates_grid(result, reference=reference),
