@@ -190,8 +190,9 @@ def validation_errors(
     median = 0.5 * part * slope
     errors: dict[Place, float | None] = {
         ("validation", "rmse"): part * _rmse_influence(draws, observed, slope, scores.rmse),
-        ("validation", "crps"): part * _crps_influence(draws, observed),
     }
+    if np.isfinite(scores.crps):
+        errors["validation", "crps"] = part * _crps_influence(draws, observed)
     errors |= {("validation", "pit", str(i)): float(pit[i]) for i in range(n)}
     large = np.abs(observed) > RELATIVE_ERROR_FLOOR * np.abs(observed).max()
     relative = median[large] / np.abs(observed[large])

@@ -124,7 +124,7 @@ def verify_density(name: str, file: DrawsFile, problem: Problem) -> Item:
     )
     with np.errstate(all="ignore"):
         t = problem.priors.to_internal(natural, margin=0.0)
-        derived = problem.bound.report(natural[:, :-1])
+        derived = problem.bound.report(problem.of_model(natural))
     for key, values in derived.items():
         said = file.draws.get(key, values)
         if not np.allclose(said.reshape(-1), values, rtol=_ROUNDING, atol=0.0, equal_nan=True):

@@ -76,7 +76,6 @@ def report(
     from calib.report.emulators import EmulatorSection
     from calib.report.study_tasks import fitted_rows, plan_tasks
     from calib.report.writer import write_report
-    from calib.validation.outliers import outlying_notes
 
     check_folder(out, overwrite=overwrite)
     if files:
@@ -124,8 +123,8 @@ def report(
         ninety = result.validation.scores.coverage[0.9]
         state = "converged" if result.calibration.converged else "NOT CONVERGED"
         print(f"{key}: {state}; 90 % band covers {ninety.hits} of {ninety.n} rows not fitted")
-        for note in outlying_notes(result.calibration.problem, result.calibration.draws.mode):
-            print(f"note: {note}", file=sys.stderr)
+        for warning in result.warnings:
+            print(f"warning: {warning}", file=sys.stderr)
     for key, failure in study.failures.items():
         print(f"{key}: FAILED: {failure.error}", file=sys.stderr)
     print(page)
@@ -166,11 +165,13 @@ def fit(
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import get_model
     from calib.report.numbers import format_number
-    from calib.validation.outliers import outlying_notes
+    from calib.validation.assumptions import warnings_of
+    from calib.validation.noise_preference import noise_preference
     from calib.validation.validate import validate_held_out
 
     chosen = get_model(model)
     check_folder(out, overwrite=overwrite)
+    settings = SamplerSettings(max_steps=max_steps)
     table = labelled(read_for_model(file, (*chosen.conditions, chosen.output)))
     kept = _parse_hold_out(hold_out)
     fitted, held = split(table, kept.column, kept.value) if kept else (table, None)
@@ -182,21 +183,31 @@ def fit(
         problem = build_problem(model, fitted, priors)
         point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
         calibration = calibrate(
-            problem, seed, estimates=(point,), settings=SamplerSettings(max_steps=max_steps),
+            problem, seed, estimates=(point,), settings=settings,
             progress=lambda done, planned: tell("sampling", done, planned),
+        )  # fmt: skip
+        preference = noise_preference(
+            calibration, settings=settings, workers=workers,
+            progress=lambda done, planned: tell("leaving rows out", done, planned),
         )  # fmt: skip
     with fresh_folder(out, overwrite=overwrite) as folder:
         save_calibration(calibration, folder)
     posterior_table(calibration)
     print(verdict_line(calibration))
     good = say(model, emulation)
-    notes = [*problem.notes, *outlying_notes(problem, calibration.draws.mode)]
-    for note in notes:
+    if preference is not None:
+        print(preference.sentence)
+    told = warnings_of(problem, calibration.draws.mode)
+    for note in problem.notes:
         print(f"note: {note}", file=sys.stderr)
+    for warning in told:
+        print(f"warning: {warning}", file=sys.stderr)
     found: dict[str, Any] = {
-        "folder": str(out), "notes": notes,
+        "folder": str(out), "notes": list(problem.notes), "warnings": list(told),
         "posterior": {name: asdict(s) for name, s in calibration.summary.items()},
     }  # fmt: skip
+    if preference is not None:
+        found["preference"] = asdict(preference)
     if held is not None:
         scores = validate_held_out(calibration, held).scores
         ninety = scores.coverage[0.9]

@@ -26,6 +26,9 @@ def sbc(
     ] = None,
     simulations: Annotated[int, typer.Option(help="Campaigns per model.", min=10)] = 300,
     seed: Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)] = 2019,
+    priors: Annotated[
+        list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")
+    ] = None,
     workers: Workers = 2,
     scheduler: Scheduler = None,
     plugins: Models = None,
@@ -49,8 +52,8 @@ def sbc(
         )
     with progress_bars() as tell:
         score = run_sbc(
-            out, models=model or (), simulations=simulations, seed=seed, workers=workers,
-            scheduler=scheduler, announce=announce,
+            out, models=model or (), simulations=simulations, seed=seed, priors=priors or (),
+            workers=workers, scheduler=scheduler, announce=announce,
             progress=lambda done, n: tell("simulating and calibrating", done, n),
         )  # fmt: skip
     page = write_sbc(score, out, asdict(SETTINGS), ["calib", *sys.argv[1:]])

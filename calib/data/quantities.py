@@ -122,6 +122,8 @@ class Quantity:
     of_factors : bool
         Whether factors of it count, not differences, so that what depends on it is even on its
         logarithm.
+    usual : tuple of (float, float), optional
+        Where values usually lie, in the canonical unit; others are read, with a warning.
     suffixes : mapping of str to str, optional
         Accepted unit suffixes of a header and the pint units they mean, for a dimension that is
         not in `UNITS`.
@@ -142,6 +144,7 @@ class Quantity:
     shown: tuple[str, float] | None = None
     physical: str = ""
     of_factors: bool = False
+    usual: tuple[float, float] | None = None
     suffixes: Mapping[str, str] | None = None
 
     def __post_init__(self) -> None:
@@ -221,7 +224,8 @@ QUANTITIES: Registry[Quantity] = Registry(
     Quantity("nominal_slip", "nominal_slip_ratio", "slip", _ONE, "bookkeeping",
              "slip before its zero was redefined", _SLIP, shown=("%", 100.0)),
     Quantity("inflation_pressure", "inflation_pressure_psi", "pressure", "psi", "condition",
-             "tyre inflation (gauge) pressure", _POSITIVE, physical="pressure"),
+             "tyre inflation (gauge) pressure", _POSITIVE, physical="pressure",
+             usual=(6.0, 150.0)),
     Quantity("average_ground_pressure", "average_ground_pressure_kpa", "pressure", "kPa",
              "condition", "load over contact area", _POSITIVE, title="Ground pressure",
              physical="ground_pressure"),

@@ -319,6 +319,7 @@ def case_from_run(run: Path, field: Path) -> Case:
     """
     # Needs what writes and reads run folders, and that a sampler: no other case does.
     problem = import_module("calib.inference.io").load_calibration(run).problem
+    problem.noise.must_be_usual(str(Path(run) / "priors.toml"), "a diagnosis")
     model = problem.bound.model
     output = output_of(model.output)
     table = read_table(field, allow_missing=tuple(OUTPUTS.values()))
@@ -375,6 +376,7 @@ def _output(case: Case, name: str, model: str) -> OutputData:
         _check_conditions(table, {name: model})
     lab = case.lab.take(np.isfinite(case.lab[column]))
     problem = build_problem(model, lab, case.priors.get(name))
+    problem.noise.must_be_usual(problem.priors.source, "a diagnosis")
     rows = np.flatnonzero(np.isfinite(case.field[column]))
     _check_field(case, name, column, rows)
     response = problem.bound.to_response(case.field[column][rows])

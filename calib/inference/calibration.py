@@ -90,7 +90,7 @@ class Calibration:
     @cached_property
     def reported(self) -> Mapping[str, Array]:
         """Draws of the published parameters, each of shape (chains, draws)."""
-        flat = self.natural.reshape(-1, self.natural.shape[-1])[:, :-1]
+        flat = self.problem.of_model(self.natural.reshape(-1, self.natural.shape[-1]))
         values = self.problem.bound.report(flat)
         return {name: v.reshape(self.natural.shape[:2]) for name, v in values.items()}
 
@@ -215,5 +215,5 @@ def calibrate(
 
 
 def _starts(problem: Problem, estimates: tuple[PointEstimate, ...]) -> Array:
-    natural = [np.append(e.theta, max(e.rmse, 1e-12)) for e in estimates]
+    natural = [problem.completed(e.theta, max(e.rmse, 1e-12)) for e in estimates]
     return problem.priors.to_internal(np.array(natural))

@@ -27,6 +27,7 @@ from calib.data import read_for_model, write_table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.estimators import PointEstimate
+from calib.inference.noise import noise_of
 from calib.inference.prior_files import parse_priors, prior_references, relative_columns
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem
@@ -69,16 +70,16 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     shape = (chains, kept, problem.response.size)
     natural = calibration.natural[:, picked].reshape(-1, calibration.natural.shape[-1])
     internal = draws.t.reshape(chains, steps, -1)[:, picked].reshape(-1, draws.t.shape[-1])
-    location = problem.bound.location(natural[:, :-1], problem.conditions)
+    location = problem.bound.location(problem.of_model(natural), problem.conditions)
     rng = generator(calibration.seed, calibration.label, "posterior_predictive")
-    noisy = location + natural[:, -1:] * rng.standard_normal(location.shape)
+    noisy = location + problem.noise.draw(natural, problem.conditions, rng, problem.response.size)
     prior = problem.theta(
         problem.priors.sample(generator(calibration.seed, calibration.label, "prior"), N_PRIOR)
     )
+    with np.errstate(over="ignore"):
+        measured = problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
     by_row = {
-        "posterior_predictive": {
-            output: problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
-        },
+        "posterior_predictive": {output: measured},
         "log_likelihood": {output: problem.log_likelihood_rows(internal).reshape(shape)},
     }
     if kept == 0:
@@ -114,7 +115,7 @@ def _prior_group(calibration: Calibration, natural: Array) -> dict[str, Array]:
     problem = calibration.problem
     named = {p.name: natural[:, i] for i, p in enumerate(problem.priors.entries) if not p.fixed}
     with np.errstate(all="ignore"):
-        derived = problem.bound.report(natural[:, :-1])
+        derived = problem.bound.report(problem.of_model(natural))
     both = {name: v for name, v in derived.items() if name in calibration.parameters} | named
     return {name: both[name][None] for name in calibration.parameters}
 
@@ -292,7 +293,9 @@ def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
     table = read_for_model(data, (*model.conditions, model.output))
     # What is reconstructed stays labelled so.
     table = replace(table, source=meta["data_source"], label=meta["data_label"])
-    return Problem(BoundModel(model, meta["references"]), table, priors)
+    # A run holds the rows that it was calibrated on: those that the noise is measured by.
+    noise = noise_of(priors.noise, model.select(table.columns), meta["prior_file"])
+    return Problem(BoundModel(model, meta["references"]), table, priors, noise=noise)
 
 
 def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple[Array, Array]:

@@ -12,9 +12,11 @@ from typing import Annotated, Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from scipy.special import digamma, polygamma
 
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
+from calib.inference.noise import DEFAULT_PRIORS, USUAL, Family, NoiseChoice
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
 
@@ -74,23 +76,39 @@ class _Uniform(_Entry):
     upper: _Number
 
 
+class _Gamma(_Entry):
+    dist: Literal["gamma"]
+    shape: _Positive
+    rate: _Positive
+    lower: _Positive | None = None
+    upper: _Positive | None = None
+
+
 class _Fixed(_Entry):
     dist: Literal["fixed"]
     value: _Number
 
 
 type _AnyEntry = Annotated[
-    _Normal | _LogNormal | _HalfNormal | _Uniform | _Fixed, Field(discriminator="dist")
+    _Normal | _LogNormal | _HalfNormal | _Uniform | _Gamma | _Fixed, Field(discriminator="dist")
 ]
+
+
+class _Likelihood(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+    family: Family = "normal"
+    noise_depends_on: str = ""
 
 
 class _File(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     model: str
+    likelihood: _Likelihood = _Likelihood()
     parameters: dict[str, _AnyEntry]
 
 
 _FILE: TypeAdapter[_File] = TypeAdapter(_File)
+_NOISE = TypeAdapter(dict[str, _AnyEntry]).validate_python(tomllib.loads(DEFAULT_PRIORS))
 
 
 def json_schema() -> dict[str, Any]:
@@ -185,7 +203,8 @@ def read_priors(
     model_name : str
         The model it must be for.
     parameters : sequence of str
-        The parameters it must give, in order; the noise scale ``sigma`` among them.
+        The parameters it must give, in order; of a model the noise scale ``sigma`` last. Those of
+        the noise that the file chooses are put before it, and have default priors.
     references : mapping of str to float
         Values of the columns that priors may be relative to, as `prior_references` returns them.
 
@@ -251,19 +270,66 @@ def parse_priors(
             f"the prior file is not valid TOML: {error}", where=source, mend="correct that line"
         ) from None
     # A misspelt name is reported before its content: it is the likelier mistake.
-    _check_names(content, source, model_name, parameters)
+    noise = _noise_choice(content, source, parameters)
+    _check_names(content, source, model_name, parameters, noise.parameters)
     try:
         file = _FILE.validate_python(content)
     except ValidationError as error:
         raise _explain(error, source) from None
     _check_units(file, source, model_name)
-    entries = tuple(_prior(name, file.parameters[name], source, references) for name in parameters)
-    return Priors(entries, text, source)
+    given = _NOISE | file.parameters
+    names = (*parameters[:-1], *noise.parameters, *parameters[-1:])
+    entries = tuple(_prior(name, given[name], source, references) for name in names)
+    if noise.family == "student_t":
+        _check_nu(entries[len(parameters) - 1], source)
+    return Priors(entries, text, source, noise)
+
+
+def _check_nu(nu: Prior, source: str) -> None:
+    lowest = nu.loc if nu.fixed else nu.lower
+    if not nu.log and not lowest > 0.0:
+        raise CalibError(
+            f"degrees of freedom of {lowest:g} are admitted",
+            where=f"{source}, parameters.nu",
+            allowed="a prior of what is above 0: gamma, lognormal, or with a lower bound > 0",
+            mend="correct this entry",
+        )
+
+
+def _noise_choice(
+    content: Mapping[str, Any], source: str, parameters: Sequence[str]
+) -> NoiseChoice:
+    """Return what the table ``[likelihood]`` says."""
+    if "likelihood" not in content:
+        return USUAL
+    where = f"{source}, [likelihood]"
+    if parameters[-1] != "sigma":
+        raise CalibError(
+            "an effect has no likelihood of its own", where=where, mend="take the table out"
+        )
+    try:
+        chosen = _Likelihood.model_validate(content["likelihood"])
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CalibError(
+            f"{'.'.join(map(str, first['loc']))}: {first['msg']}", where=where,
+            allowed='family = "normal" or "student_t", noise_depends_on = "slip" or another '
+            "condition of the model", mend="correct this entry",
+        ) from None  # fmt: skip
+    noise = NoiseChoice(chosen.family, chosen.noise_depends_on)
+    taken = [name for name in noise.parameters if name in parameters]
+    if taken:
+        raise CalibError(
+            f"the model has a parameter {taken[0]}, which is the noise's name for one of its own",
+            where=where, mend="rename it in the model, or take the table out",
+        )  # fmt: skip
+    return noise
 
 
 def _check_names(
-    content: Mapping[str, Any], source: str, model_name: str, parameters: Sequence[str]
-) -> None:
+    content: Mapping[str, Any], source: str, model_name: str, parameters: Sequence[str],
+    of_noise: Sequence[str],
+) -> None:  # fmt: skip
     if content.get("model") != model_name:
         raise CalibError(
             f"the priors are for model {content.get('model')!r}, not {model_name!r}",
@@ -273,7 +339,7 @@ def _check_names(
         )
     given = content.get("parameters")
     given = given if isinstance(given, Mapping) else {}
-    unknown = [name for name in given if name not in parameters]
+    unknown = [name for name in given if name not in (*parameters, *of_noise)]
     missing = [name for name in parameters if name not in given]
     if unknown or missing:
         found = "; ".join(
@@ -297,7 +363,7 @@ def _check_units(file: _File, source: str, model_name: str) -> None:
     units = {
         name: entry.get("unit")
         for name, entry in tomllib.loads(shipped.read_text(encoding="utf-8"))["parameters"].items()
-    }
+    } | {name: entry.unit for name, entry in _NOISE.items()}
     for name, entry in file.parameters.items():
         if name in units and entry.unit != units[name]:
             raise CalibError(
@@ -315,7 +381,8 @@ def _explain(error: ValidationError, source: str) -> CalibError:
         f"{first['msg']} (found {first.get('input')!r})",
         where=f"{source}, {place}",
         allowed="dist = normal (mean, sd > 0), lognormal (median > 0, sd_log > 0), half_normal "
-        "(sd > 0), uniform (lower < upper) or fixed (value); each with unit, reason, source",
+        "(sd > 0), uniform (lower < upper) or fixed (value); of nu also gamma (shape > 0, "
+        "rate > 0); each with unit, reason, source",
         mend="correct this entry",
     )
 
@@ -328,6 +395,13 @@ def _prior(name: str, entry: _AnyEntry, source: str, references: Mapping[str, fl
         reference = references.get(entry.relative_to, entry.default_reference)
         suffix = f" x {reference:g} ({entry.relative_to})"
     log, loc, scale, lower, upper, text = _internal(entry, reference)
+    gamma = (entry.shape, entry.rate) if isinstance(entry, _Gamma) else None
+    if gamma is not None and name != "nu":
+        raise CalibError(
+            'dist = "gamma" is for the degrees of freedom nu of a Student-t likelihood',
+            where=f"{source}, parameters.{name}", allowed="normal, lognormal, half_normal, uniform "
+            "or fixed", mend="choose one of these",
+        )  # fmt: skip
     if not lower < upper:
         raise CalibError(
             f"lower bound {lower:g} is not below upper bound {upper:g}",
@@ -335,8 +409,9 @@ def _prior(name: str, entry: _AnyEntry, source: str, references: Mapping[str, fl
             mend="give lower < upper",
         )
     return Prior(
-        name, entry.unit, entry.reason, entry.source, text + suffix, log, loc, scale, lower, upper
-    )
+        name, entry.unit, entry.reason, entry.source, text + suffix, log, loc, scale, lower, upper,
+        gamma,
+    )  # fmt: skip
 
 
 def _check_relative(name: str, column: str, source: str) -> None:
@@ -368,6 +443,12 @@ def _internal(entry: _AnyEntry, reference: float) -> tuple[bool, float, float, f
         case _Uniform(lower=lower, upper=upper):
             low, high = lower * reference, upper * reference
             return False, 0.5 * (low + high), inf, low, high, f"uniform({lower:g}, {upper:g})"
+        case _Gamma(shape=shape, rate=rate, lower=lower, upper=upper):
+            low = -inf if lower is None else float(np.log(lower))
+            high = inf if upper is None else float(np.log(upper))
+            text = f"gamma({shape:g}, {rate:g})" + _bounds_text(lower, upper)
+            mean, variance = float(digamma(shape) - np.log(rate)), float(polygamma(1, shape))
+            return True, mean, float(np.sqrt(variance)), low, high, text
         case _Fixed(value=value):
             fixed = value * reference
             return False, fixed, 0.0, -inf, inf, f"fixed({value:g})"

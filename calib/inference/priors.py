@@ -2,8 +2,9 @@
 
 Every distribution on offer is a (truncated) normal or a uniform, on the parameter or on its
 logarithm. That is enough for physical priors, and it lets one array expression evaluate all
-parameters. Sampling happens in *internal* coordinates: the logarithm for log-normal parameters,
-the parameter itself otherwise. `calib.inference.prior_files` reads them from TOML.
+parameters; one of the noise may have a gamma distribution. Sampling happens in *internal*
+coordinates: the logarithm for log-normal parameters and that one, the parameter itself otherwise.
+`calib.inference.prior_files` reads them from TOML.
 """
 
 from __future__ import annotations
@@ -14,9 +15,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtr, ndtri
+from scipy.special import gammainc, gammaincinv, gammaln, log_ndtr, ndtr, ndtri
 
 from calib.errors import CalibError
+from calib.inference.noise import USUAL, NoiseChoice
 from calib.models.base import Array
 
 __all__ = ["Prior", "Priors"]
@@ -38,6 +40,9 @@ class Prior:
         Of the normal; an infinite scale makes it uniform between the bounds, zero fixes it.
     lower, upper : float
         Bounds of the internal coordinate.
+    gamma : tuple of (float, float), optional
+        Shape and rate of a gamma distribution, whose internal coordinate is the logarithm; `loc`
+        and `scale` are then the mean and sd of that.
     """
 
     name: str
@@ -50,6 +55,7 @@ class Prior:
     scale: float
     lower: float = -np.inf
     upper: float = np.inf
+    gamma: tuple[float, float] | None = None
 
     @property
     def fixed(self) -> bool:
@@ -69,11 +75,14 @@ class Priors:
         The TOML it was read from.
     source : str
         The file's name.
+    noise : NoiseChoice
+        What it says of the noise.
     """
 
     entries: tuple[Prior, ...]
     text: str = ""
     source: str = ""
+    noise: NoiseChoice = USUAL
     free: tuple[Prior, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -89,22 +98,30 @@ class Priors:
         loc, scale, lower, upper = (
             np.array([getattr(p, a) for p in self.free]) for a in ("loc", "scale", "lower", "upper")
         )
-        normal = np.isfinite(scale)
+        normal = np.isfinite(scale) & np.array([p.gamma is None for p in self.free], bool)
         precision = np.where(normal, 1.0 / scale, 0.0)
         return loc, scale, lower, upper, precision
+
+    @cached_property
+    def _gammas(self) -> tuple[tuple[int, float, float], ...]:
+        """Place, shape and rate of the gamma distributions."""
+        return tuple((j, *p.gamma) for j, p in enumerate(self.free) if p.gamma is not None)
 
     @cached_property
     def _log_normaliser(self) -> float:
         loc, scale, lower, upper, precision = self._arrays
         normal = precision > 0.0
-        a, b = (lower - loc) * precision, (upper - loc) * precision
-        # The mass between the bounds, in the tail where it is accurate.
-        swap = a > 0.0
-        a, b = np.where(swap, -b, a), np.where(swap, -a, b)
         with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (lower - loc) * precision, (upper - loc) * precision
+            # The mass between the bounds, in the tail where it is accurate.
+            swap = a > 0.0
+            a, b = np.where(swap, -b, a), np.where(swap, -a, b)
             mass = log_ndtr(b) + np.log1p(-np.exp(log_ndtr(a) - log_ndtr(b)))
             normals = -np.log(scale) - 0.5 * np.log(2.0 * np.pi) - mass
             uniforms = -np.log(upper - lower)
+        for j, shape, rate in self._gammas:
+            low, high = gammainc(shape, rate * np.exp([lower[j], upper[j]]))
+            uniforms[j] = shape * np.log(rate) - gammaln(shape) - np.log(high - low)
         return float(np.where(normal, normals, uniforms).sum())
 
     def log_prob(self, t: Array) -> Array:
@@ -123,22 +140,29 @@ class Priors:
         z = (t - loc) * precision
         inside = ((t >= lower) & (t <= upper)).all(axis=1)
         value = -0.5 * np.einsum("kd,kd->k", z, z) + self._log_normaliser
+        for j, shape, rate in self._gammas:
+            value += shape * t[:, j] - rate * np.exp(np.minimum(t[:, j], 700.0))
         return np.where(inside, value, -np.inf)
 
     def ppf(self, u: Array) -> Array:
         """Map the unit cube to internal coordinates, shape (k, d) to (k, d)."""
         loc, scale, lower, upper, precision = self._arrays
         normal = precision > 0.0
-        a, b = (lower - loc) * precision, (upper - loc) * precision
-        # In the tail where the normal's mass is accurate, as for the normaliser.
-        swap = a > 0.0
-        a, b = np.where(swap, -b, a), np.where(swap, -a, b)
-        below, above = ndtr(a), ndtr(b)
-        z = ndtri(below + np.where(swap, 1.0 - u, u) * (above - below))
         with np.errstate(invalid="ignore"):
+            a, b = (lower - loc) * precision, (upper - loc) * precision
+            # In the tail where the normal's mass is accurate, as for the normaliser.
+            swap = a > 0.0
+            a, b = np.where(swap, -b, a), np.where(swap, -a, b)
+            below, above = ndtr(a), ndtr(b)
+            z = ndtri(below + np.where(swap, 1.0 - u, u) * (above - below))
             normals = loc + scale * np.where(swap, -z, z)
             uniforms = lower + u * (upper - lower)
-        return np.asarray(np.clip(np.where(normal, normals, uniforms), lower, upper))
+            values = np.where(normal, normals, uniforms)
+        for j, shape, rate in self._gammas:
+            low, high = gammainc(shape, rate * np.exp([lower[j], upper[j]]))
+            x = gammaincinv(shape, low + u[:, j] * (high - low)) / rate
+            values[:, j] = np.log(np.maximum(x, 1e-300))
+        return np.asarray(np.clip(values, lower, upper))
 
     def sample(self, rng: np.random.Generator, size: int) -> Array:
         """Draw internal coordinates, shape (size, d)."""
@@ -197,4 +221,5 @@ class Priors:
             ),
             self.text,
             self.source,
+            self.noise,
         )  # fmt: skip

@@ -6,7 +6,8 @@ deviation sigma,
 
     ln L = -n ln sigma - SSE(theta)/(2 sigma^2) - (n/2) ln 2 pi  [- sum ln y for a log response],
 
-the bracket making it a density of the output itself, so that models can be compared. Where the
+the bracket making it a density of the output itself, so that models can be compared. A prior file
+may ask for other noise (`calib.inference.noise`), which is evaluated row by row. Where the
 prediction has an error of its own, that of an emulator, its covariance over the rows is added to
 that of the noise (`calib.inference.uncertain`).
 """
@@ -22,6 +23,7 @@ import numpy as np
 from calib.data import Table, check_enough, check_varies
 from calib.errors import CalibError
 from calib.inference.likelihood import Squares
+from calib.inference.noise import NORMAL, Noise, noise_of
 from calib.inference.prior_files import (
     PriorFile,
     default_priors,
@@ -36,6 +38,8 @@ from calib.models import Array, BoundModel, get_model
 __all__ = ["Problem", "build_problem"]
 
 _HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))
+# Rows times vectors that are worked out at once where each row has a density of its own.
+_CELLS = 200_000
 
 
 @dataclass(frozen=True)
@@ -49,15 +53,18 @@ class Problem:
     table : Table
         The calibration data.
     priors : Priors
-        Of the model's parameters and the noise scale ``sigma``, in this order.
+        Of the model's parameters, others of the noise and its scale ``sigma``, in this order.
     notes : tuple of str
         What a reader must know about how the problem was set up.
+    noise : Noise
+        How a measurement scatters; normal of one standard deviation by default.
     """
 
     bound: BoundModel
     table: Table
     priors: Priors
     notes: tuple[str, ...] = ()
+    noise: Noise = NORMAL
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -93,6 +100,11 @@ class Problem:
     def _sum_ln_jacobian(self) -> float:
         return float(self._ln_jacobian.sum())
 
+    @property
+    def heavy(self) -> bool:
+        """Whether a measurement has no mean: a Student-t logarithm, of whatever degrees."""
+        return self.noise.student and self.bound.model.response == "log"
+
     @cached_property
     def squares(self) -> Squares:
         """Sums of squared residuals, on the scale of the response, of natural parameters."""
@@ -102,19 +114,33 @@ class Problem:
         """Natural parameters, sigma last, of internal ones: (k, n_dim) to (k, d_all)."""
         return self.priors.to_natural(t)
 
+    def of_model(self, natural: Array) -> Array:
+        """Return the model's part of natural parameters, shape (k, d_model)."""
+        return natural[:, : len(self.bound.model.parameters)]
+
+    def completed(self, theta: Array, sigma: float) -> Array:
+        """Return natural parameters (d_all,) of the model's and a scale of the noise.
+
+        What else the noise has is taken where its prior is.
+        """
+        prior = self.priors.to_natural(np.array([[p.loc for p in self.priors.free]]))[0]
+        return np.concatenate([theta, prior[theta.size : -1], [sigma]])
+
     def residuals(self, natural: Array) -> Array:
         """Observed minus predicted on the scale of the response, shape (k, n)."""
-        return self.response - self.bound.location(natural[:, :-1], self.conditions)
+        return self.response - self.bound.location(self.of_model(natural), self.conditions)
 
     def log_likelihood(self, t: Array) -> Array:
         """Log likelihood of internal coordinates, shape (k,); ``-inf`` where undefined."""
         natural = self.theta(t)
         if self.bound.model.uncertain is not None:
             return self._uncertain_log_likelihood(natural)
+        if not self.noise.usual:
+            return self._log_likelihood_by_row(natural)
         n, sigma = self.response.size, natural[:, -1]
         # A prior may admit sigma <= 0 or predictions beyond all bounds: they become -inf below.
         with np.errstate(all="ignore"):
-            sse = self.squares(natural[:, :-1])
+            sse = self.squares(self.of_model(natural))
             value = -n * (np.log(sigma) + _HALF_LN_2PI) - 0.5 * sse / sigma**2
         value += self._sum_ln_jacobian
         return np.where(np.isfinite(value), value, -np.inf)
@@ -125,7 +151,7 @@ class Problem:
         if uncertain is None:
             none = np.zeros((len(natural), 0)), np.zeros((self.response.size, 0))
             return self.residuals(natural), *none
-        location, variances, curves = uncertain(natural[:, :-1], self.conditions)
+        location, variances, curves = uncertain(self.of_model(natural), self.conditions)
         return self.response - location, variances, curves
 
     def _uncertain_log_likelihood(self, natural: Array) -> Array:
@@ -135,9 +161,22 @@ class Problem:
         value += self._sum_ln_jacobian
         return np.where(np.isfinite(value), value, -np.inf)
 
+    def _log_likelihood_by_row(self, natural: Array) -> Array:
+        at_once = max(1, _CELLS // self.response.size)
+        value = np.empty(len(natural))
+        for i in range(0, len(natural), at_once):
+            some = natural[i : i + at_once]
+            rows = self.noise.log_density(self.residuals(some), some, self.conditions)
+            value[i : i + at_once] = rows.sum(axis=1)
+        value += self._sum_ln_jacobian
+        return np.where(np.isfinite(value), value, -np.inf)
+
     def log_likelihood_rows(self, t: Array) -> Array:
         """Log likelihood of every row by itself, shape (k, n)."""
         natural = self.theta(t)
+        if not self.noise.usual:
+            density = self.noise.log_density(self.residuals(natural), natural, self.conditions)
+            return density + self._ln_jacobian
         residuals, variances, curves = self._predicted(natural)
         sigma = np.sqrt(natural[:, -1:] ** 2 + variances @ (curves**2).T)
         z = residuals / sigma
@@ -156,7 +195,7 @@ class Problem:
 
     def with_table(self, table: Table) -> Problem:
         """Return the same problem, reference conditions included, with other rows."""
-        return Problem(self.bound, table, self.priors, self.notes)
+        return replace(self, table=table)
 
     def with_fixed(self, values: Mapping[str, float]) -> Problem:
         """Return the problem with some natural parameters held fixed."""
@@ -223,5 +262,8 @@ def build_problem(
         for name, value in relative_columns(priors.text).items()
         if name not in references
     )
-    problem = Problem(bound, table, priors, notes)
+    noise = noise_of(priors.noise, model.select(table.columns), priors.source)
+    if model.uncertain is not None:
+        noise.must_be_usual(priors.source, f"the emulator {model.name}")
+    problem = Problem(bound, table, priors, notes, noise)
     return problem.with_fixed(fixed) if fixed else problem

@@ -372,8 +372,9 @@ class BoundModel:
         return np.log(output) if self.model.response == "log" else np.asarray(output)
 
     def from_response(self, location: Array) -> Array:
-        """Map the scale of the response back to the output."""
-        return np.exp(location) if self.model.response == "log" else location
+        """Map the scale of the response back to the output; infinite where no float holds it."""
+        with np.errstate(over="ignore"):
+            return np.exp(location) if self.model.response == "log" else location
 
     def report(self, theta: Array) -> dict[str, Array]:
         """Return the published parameters of each vector, each of shape (k,)."""

@@ -76,7 +76,7 @@ def _model(comparison: Comparison, c: Candidate, best: Candidate) -> dict[str, A
         "refitted_rows": len(loo.refitted),
         "refits_not_converged": len(loo.unconverged),
         "rmse": loo.scores.rmse,
-        "crps": loo.scores.crps,
+        "crps": _finite(loo.scores.crps),
         "coverage_90": loo.scores.coverage[0.9].proportion,
         "log_evidence": _finite(c.calibration.draws.log_evidence),
     }
@@ -85,7 +85,7 @@ def _model(comparison: Comparison, c: Candidate, best: Candidate) -> dict[str, A
             "rows": c.held.scores.n,
             "elpd": _finite(c.held_elpd),
             "rmse": c.held.scores.rmse,
-            "crps": c.held.scores.crps,
+            "crps": _finite(c.held.scores.crps),
             "coverage_90": c.held.scores.coverage[0.9].proportion,
         }
     return found

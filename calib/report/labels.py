@@ -19,12 +19,13 @@ __all__ = [
 NO_UNIT = NOTHING
 MINUS = "\N{MINUS SIGN}"
 
-_GREEK = {"sigma": r"\sigma", "gamma": r"\gamma", "theta": r"\theta"}
+_GREEK = {"sigma": r"\sigma", "gamma": r"\gamma", "nu": r"\nu", "theta": r"\theta"}
 
 
 _GREEK_PLAIN = {
     "sigma": "\N{GREEK SMALL LETTER SIGMA}",
     "gamma": "\N{GREEK SMALL LETTER GAMMA}",
+    "nu": "\N{GREEK SMALL LETTER NU}",
     "theta": "\N{GREEK SMALL LETTER THETA}",
 }
 

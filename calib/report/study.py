@@ -27,6 +27,8 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.study_tasks import Task, fitted_rows
+from calib.validation.assumptions import warnings_of
+from calib.validation.noise_preference import NoisePreference, noise_preference
 from calib.validation.prediction import predictive_draws
 from calib.validation.sensitivity import Sensitivity, prior_sensitivity
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
@@ -61,6 +63,10 @@ class OutputResult:
         Of each step of the work.
     sensitivity : mapping of str to Sensitivity
         Of each parameter to prior and data.
+    preference : NoisePreference, optional
+        Of the noise that the prior file asks for over the usual one.
+    warnings : tuple of str
+        Where the rows are not as the likelihood has them.
     """
 
     task: Task
@@ -72,6 +78,8 @@ class OutputResult:
     posterior_predictive: Array
     seconds: Mapping[str, float] = field(default_factory=dict)
     sensitivity: Mapping[str, Sensitivity] = field(default_factory=dict)
+    preference: NoisePreference | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -210,6 +218,10 @@ def _work_out(
             progress=lambda done, n: progress(f"{task.output}: leaving rows out", done, n),
             workers=workers,
         )
+    preference = noise_preference(
+        calibration, loo=validation if held is None else None, settings=settings, workers=workers,
+        progress=lambda done, n: progress(f"{task.output}: with normal noise", done, n),
+    )  # fmt: skip
     seconds["validate"] = time.perf_counter() - clock
     _, replicated = predictive_draws(
         calibration, problem.conditions, generator(seed, task.output, "replicate")
@@ -224,6 +236,8 @@ def _work_out(
         replicated,
         seconds,
         prior_sensitivity(calibration),
+        preference,
+        warnings_of(problem, calibration.draws.mode),
     )
 
 
@@ -314,6 +328,6 @@ def _each_alone(task: Task, seed: int) -> dict[float, tuple[PointEstimate, ...]]
 
 def _prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
     natural = problem.theta(problem.priors.sample(rng, N_PRIOR_PREDICTIVE))
-    location = problem.bound.location(natural[:, :-1], problem.conditions)
-    noise = natural[:, -1:] * rng.standard_normal(location.shape)
+    location = problem.bound.location(problem.of_model(natural), problem.conditions)
+    noise = problem.noise.draw(natural, problem.conditions, rng, location.shape[1])
     return problem.bound.from_response(location + noise)

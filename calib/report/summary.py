@@ -10,8 +10,10 @@ import numpy as np
 
 from calib.inference.calibration import Calibration
 from calib.inference.estimators import PointEstimate
+from calib.inference.noise import Noise
 from calib.models.base import Array
 from calib.report.study import OutputResult, Study
+from calib.validation.noise_preference import NoisePreference
 from calib.validation.scores import Scores
 from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 
@@ -55,6 +57,8 @@ def _output(result: OutputResult) -> dict[str, Any]:
             "held_out": None if result.task.held_out is None else str(result.task.held_out),
         },
         "references": dict(problem.bound.references),
+        **_noise(problem.noise, result.preference),
+        **({"warnings": list(result.warnings)} if result.warnings else {}),
         **summarise_estimates(result.estimates, result.by_pressure),
         "priors": {
             p.name: {
@@ -69,6 +73,25 @@ def _output(result: OutputResult) -> dict[str, Any]:
         "prior_sensitivity": _sensitivity(result),
         "validation": _validation(result),
         "sampling": _sampling(result.calibration),
+    }
+
+
+def _noise(noise: Noise, preference: NoisePreference | None) -> dict[str, Any]:
+    """What the prior file asks for beyond normal noise of one standard deviation."""
+    if noise.usual or preference is None:
+        return {}
+    depends = {"column": noise.column, "centre": noise.centre, "spread": noise.spread}
+    return {
+        "noise": {
+            "family": noise.choice.family,
+            "depends_on": depends if noise.column else None,
+            "against_normal": {
+                "elpd_difference": preference.elpd,
+                "se": preference.se,
+                "preferred": preference.preferred,
+                "sentence": preference.sentence,
+            },
+        }
     }
 
 

@@ -15,7 +15,7 @@ from calib.inference.problem import Problem
 from calib.inference.sampling.mode import find_modes
 from calib.models.base import Array
 
-__all__ = ["OutlyingRow", "outlying_notes", "outlying_rows"]
+__all__ = ["OutlyingRow", "linear", "outlying_notes", "outlying_rows"]
 
 # Probability of naming any row of data that are as the likelihood says.
 LEVEL = 1e-3
@@ -102,10 +102,13 @@ def outlying_notes(problem: Problem, t: Array) -> Sequence[str]:
     """Say which rows are outlying, for a reader who may mend them."""
     rows = outlying_rows(problem, t)
     # Not the path: the page goes to others.
+    weight = "for one such row moves the posterior and widens it"
+    if problem.noise.student:
+        weight = "to which Student-t noise gives little weight"
     output, source = problem.bound.model.output, PurePath(problem.table.source).name
     said = [
         f"{source}, line {row.line}: {output} = {row.value:.4g} is {row.sds:.1f} sds from what the "
-        "other rows say; check the reading, for one such row moves the posterior and widens it"
+        f"other rows say; check the reading, {weight}"
         for row in rows[:_MOST_NAMED]
     ]
     more = len(rows) - _MOST_NAMED
@@ -114,7 +117,7 @@ def outlying_notes(problem: Problem, t: Array) -> Sequence[str]:
 
 def _studentised(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, int]:
     """Externally studentised residuals of the rows used, and the variance's degrees of freedom."""
-    residual, design, rank = _linear(problem, t, used)
+    residual, design, rank = linear(problem, t, used)
     leverage = np.sum(design**2, axis=1)
     left = int(used.sum()) - rank - 1
     # A row that a parameter of its own fits exactly cannot be judged.
@@ -128,14 +131,16 @@ def _studentised(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[A
 
 def _from_the_rest(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, int]:
     """Distances from a fit to the rows used, in sds of a new row's, and degrees of freedom."""
-    residual, design, rank = _linear(problem, t, used)
+    residual, design, rank = linear(problem, t, used)
     left = int(used.sum()) - rank
     variance = max(float(np.sum(residual[used] ** 2)) / left, 1e-300)
     return np.abs(residual) / np.sqrt(variance * (1.0 + np.sum(design**2, axis=1))), left
 
 
-def _linear(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, int]:
+def linear(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, int]:
     """Residuals, and the model made linear at a fit, in coordinates orthonormal over rows used.
+
+    Where the noise depends on a condition, over its scale there in units of sigma.
 
     Returns
     -------
@@ -146,7 +151,9 @@ def _linear(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array,
     """
     steps = _STEP * np.maximum(np.abs(t), 1.0)
     moved = np.concatenate([t[None], t + np.diag(steps), t - np.diag(steps)])
-    residuals = problem.residuals(problem.theta(moved))
+    natural = problem.theta(moved)
+    relative = problem.noise.scale(natural[:1], problem.conditions) / natural[0, -1]
+    residuals = problem.residuals(natural) / relative
     d = t.size
     jacobian = ((residuals[1 + d :] - residuals[1 : 1 + d]) / (2.0 * steps)[:, None]).T
     _, sizes, directions = np.linalg.svd(jacobian[used], full_matrices=False)

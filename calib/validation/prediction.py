@@ -77,8 +77,8 @@ def predictive_draws(
     """Draw the mean output and a measurement, both of shape (size, n)."""
     problem = calibration.problem
     natural = problem.theta(calibration.subset(size))
-    location = problem.bound.location(natural[:, :-1], conditions)
-    noise = natural[:, -1:] * rng.standard_normal(location.shape)
+    location = problem.bound.location(problem.of_model(natural), conditions)
+    noise = problem.noise.draw(natural, conditions, rng, location.shape[1])
     from_response = problem.bound.from_response
     return from_response(location), from_response(location + noise)
 
@@ -148,16 +148,17 @@ def predict(calibration: Calibration, table: Table) -> Prediction:
     natural = problem.theta(calibration.subset(N_DRAWS))
     # The same noise draws for every row: its bands do not depend on the other rows.
     rng = generator(calibration.seed, calibration.label, "predict")
-    noises = [natural[:, -1:] * z for z in _stratified_normals(rng, natural.shape[0])]
+    normals = tuple(_stratified_normals(rng, natural.shape[0]))
     parts = []
     for start in range(0, len(table), _ROWS_AT_ONCE):
         rows = {name: v[start : start + _ROWS_AT_ONCE] for name, v in conditions.items()}
-        location = problem.bound.location(natural[:, :-1], rows)
+        location = problem.bound.location(problem.of_model(natural), rows)
         share = np.isfinite(location).mean(axis=0)
         # Where many plausible parameters give the equation no value (a quadratic in pressure
         # extrapolated below zero), the rest are no sample of anything: no value is better.
         location = np.where(share >= MIN_DEFINED, location, np.nan)
         back = problem.bound.from_response
+        noises = (problem.noise.of_normal(natural, rows, z) for z in normals)
         measured = np.concatenate([back(location + noise) for noise in noises])
         parts.append((bands(back(location)), bands(measured), share))
     return Prediction(

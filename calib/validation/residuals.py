@@ -21,6 +21,8 @@ _N_DRAWS = 1000
 class Standardised:
     """Residuals over the noise scale, posterior means, of some rows.
 
+    Where the noise is Student's, normal scores: standard normal values of the same quantile.
+
     Parameters
     ----------
     residual, predicted : ndarray, shape (n,)
@@ -41,8 +43,11 @@ def standardise(calibration: Calibration, problem: Problem) -> Standardised:
         Its rows: the calibrated ones or, by ``with_table``, others.
     """
     natural = problem.theta(calibration.subset(_N_DRAWS))
-    location = problem.bound.location(natural[:, :-1], problem.conditions)
-    residual = np.nanmean((problem.response - location) / natural[:, -1:], axis=0)
+    location = problem.bound.location(problem.of_model(natural), problem.conditions)
+    residual = np.nanmean(
+        problem.noise.normal_scores(problem.response - location, natural, problem.conditions),
+        axis=0,
+    )
     return Standardised(residual, problem.bound.from_response(np.nanmedian(location, axis=0)))
 
 

@@ -45,7 +45,8 @@ class Scores:
     rmse : float
         Of the predictive median, in the unit of the output.
     crps : float
-        Mean continuous ranked probability score, in the unit of the output.
+        Mean continuous ranked probability score, in the unit of the output; NaN where the
+        predictive distribution's tail is so heavy that it has none.
     relative_error : ndarray, shape (n,)
         (median - observed)/observed; NaN where the observation is below a twentieth of the
         largest.
@@ -101,13 +102,15 @@ def coverage(draws: Array, observed: Array, level: float) -> Coverage:
     return Coverage(level, hits, n, lower, upper)
 
 
-def score(draws: Array, observed: Array) -> Scores:
+def score(draws: Array, observed: Array, *, heavy: bool = False) -> Scores:
     """Score predictive draws.
 
     Parameters
     ----------
     draws : ndarray, shape (n_draws, n)
     observed : ndarray, shape (n,)
+    heavy : bool
+        Whether they are of a distribution that has no CRPS.
     """
     median = np.median(draws, axis=0)
     large = np.abs(observed) > RELATIVE_ERROR_FLOOR * np.abs(observed).max()
@@ -116,7 +119,7 @@ def score(draws: Array, observed: Array) -> Scores:
     return Scores(
         n=int(observed.size),
         rmse=float(np.sqrt(np.mean(np.square(median - observed)))),
-        crps=float(crps(draws, observed).mean()),
+        crps=float("nan") if heavy else float(crps(draws, observed).mean()),
         relative_error=relative,
         coverage={level: coverage(draws, observed, level) for level in LEVELS},
         pit=pit(draws, observed),

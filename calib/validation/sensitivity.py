@@ -132,12 +132,14 @@ def _prior_draws(calibration: Calibration) -> Mapping[str, Array]:
     natural = problem.theta(problem.priors.sample(rng, _N_PRIOR))
     at_once = max(1, _CELLS // len(problem.table))
     defined = [
-        np.isfinite(problem.bound.location(natural[i : i + at_once, :-1], problem.conditions))
+        np.isfinite(
+            problem.bound.location(problem.of_model(natural[i : i + at_once]), problem.conditions)
+        )
         for i in range(0, _N_PRIOR, at_once)
     ]
     natural = natural[np.concatenate([part.all(axis=1) for part in defined])]
     with np.errstate(all="ignore"):
-        return problem.bound.report(natural[:, :-1])
+        return problem.bound.report(problem.of_model(natural))
 
 
 def _score_contraction(prior: Array, posterior: Array) -> float:

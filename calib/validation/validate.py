@@ -97,7 +97,8 @@ def validate_held_out(calibration: Calibration, held_out: Table) -> Validation:
             mend="hold out rows inside the range of the others",
         )
     observed = held_out[model.output]
-    return Validation("held_out", held_out, observed, draws, score(draws, observed))
+    scores = score(draws, observed, heavy=calibration.problem.heavy)
+    return Validation("held_out", held_out, observed, draws, scores)
 
 
 @one_thread()
@@ -150,14 +151,16 @@ def leave_one_out(
             elpd[i] = _log_mean(np.where(defined, held, -np.inf), np.zeros_like(held))
             sample = sample[np.resize(np.flatnonzero(defined), N_DRAWS)]
         natural = problem.theta(sample)
-        location = problem.bound.location(natural[:, :-1], problem.bound.model.select(row.columns))
-        noisy = location[:, 0] + natural[:, -1] * rng.standard_normal(N_DRAWS)
-        drawn[:, i] = problem.bound.from_response(noisy)
+        here = problem.bound.model.select(row.columns)
+        location = problem.bound.location(problem.of_model(natural), here)
+        noisy = location + problem.noise.draw(natural, here, rng, 1)
+        drawn[:, i] = problem.bound.from_response(noisy)[:, 0]
     if progress is not None and not refits:
         progress(n, n)
     return Validation(
-        "leave_one_out", problem.table, problem.observed, drawn, score(drawn, problem.observed),
-        k, tuple(refits), float(elpd.sum()), float(np.sqrt(n * elpd.var(ddof=1))),
+        "leave_one_out", problem.table, problem.observed, drawn,
+        score(drawn, problem.observed, heavy=problem.heavy), k, tuple(refits),
+        float(elpd.sum()), float(np.sqrt(n * elpd.var(ddof=1))),
         tuple(i for i, refit in refits.items() if not refit.passed), elpd,
     )  # fmt: skip
 

@@ -78,7 +78,25 @@ PULL = example_csv("magic_formula_pressure")
 # Other rows of the same kind.
 FIELD = "\n".join(line.replace("5", "6") for line in PULL.splitlines()) + "\n"
 CSVS = tuple(example_csv(name) for name in sorted(MODELS))
+# With what every prior file may ask for of the noise.
+NOISE = """
+[likelihood]
+family = "student_t"
+noise_depends_on = "slip"
+
+[parameters.nu]
+dist = "gamma"
+shape = 2.0
+rate = 0.1
+lower = 1.0
+unit = "1"
+reason = "r"
+source = "s"
+"""
 PRIORS = {name: default_priors(name).read_text(encoding="utf-8") for name in sorted(MODELS)}
+WITH_NOISE = tuple(
+    text + NOISE for name, text in PRIORS.items() if "slip_ratio" in MODELS[name].conditions
+)
 PLAN = """seed = 3
 [[fit]]
 name = "ruts"
@@ -168,7 +186,7 @@ def try_case(toml: str, lab: str, field: str) -> str:
 
 KINDS: dict[str, tuple[Callable[..., str], tuple[Sequence[str], ...]]] = {
     "csv": (try_csv, (CSVS,)),
-    "priors": (try_priors, (tuple(PRIORS.values()),)),
+    "priors": (try_priors, ((*PRIORS.values(), *WITH_NOISE),)),
     "plan": (try_plan, ((PLAN,),)),
     "case": (try_case, ((CASE,), (PULL,), (FIELD,))),
 }

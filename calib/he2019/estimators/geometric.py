@@ -52,7 +52,7 @@ def estimate_geometric(
     return goodness(
         problem,
         "geometric",
-        natural[0, :-1],
+        problem.of_model(natural)[0],
         n_fitted=len(set(values) & set(problem.names)),
         n_evaluations=1,
         seconds=time.perf_counter() - clock,

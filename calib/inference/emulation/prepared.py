@@ -56,6 +56,7 @@ def emulated(
     CalibError
         If the model is no simulator's.
     """
+    problem.noise.must_be_usual(problem.priors.source, "an emulator")
     found = _simulated(problem.bound.model.name)
     settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
     if isinstance(found.simulator.way, TableWay):

@@ -73,7 +73,7 @@ def residuals(problem: Problem, natural: Array) -> Array:
     Parameters
     ----------
     problem : Problem
-    natural : ndarray, shape (k, d_model + 1)
+    natural : ndarray, shape (k, d_all)
         Natural parameters, the noise scale last.
 
     Returns
@@ -97,10 +97,10 @@ def sum_of_squares(problem: Problem, natural: Array) -> Array:
     Parameters
     ----------
     problem : Problem
-    natural : ndarray, shape (k, d_model + 1)
+    natural : ndarray, shape (k, d_all)
         Natural parameters, the noise scale last.
     """
-    cost = problem.squares(natural[:, :-1])
+    cost = problem.squares(problem.of_model(natural))
     cost[np.isnan(cost)] = np.inf
     return cost
 
@@ -130,8 +130,7 @@ def goodness(
     notes : sequence of str
         Joined to the note; empty ones are left out.
     """
-    natural = np.append(theta, 1.0)[None]
-    cost = float(sum_of_squares(problem, natural)[0])
+    cost = float(sum_of_squares(problem, theta[None])[0])
     y = problem.response
     spread = float(np.square(y - y.mean()).sum())
     freedom = y.size - n_fitted

@@ -62,7 +62,7 @@ def representative_rows(problem: Problem, most: int = 4000) -> Problem:
 
 
 def hold_unidentified(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
-    """Hold the noise scale and every parameter that the data do not determine.
+    """Hold the noise's parameters and every parameter that the data do not determine.
 
     The rank of the Jacobian of the predictions is taken at the prior's centre and at a few points
     around it; a parameter is given up only if it is flat, or imitated by the others, at all.
@@ -78,8 +78,9 @@ def hold_unidentified(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     held : tuple of str
         Names of the parameters held at their prior location.
     """
-    if "sigma" in problem.names:
-        problem = problem.with_fixed({"sigma": 1.0})
+    entries = problem.priors.entries[len(problem.bound.model.parameters) :]
+    # Their values do not enter a sum of squares.
+    problem = problem.with_fixed({p.name: 1.0 for p in entries if not p.fixed})
     if not problem.names:
         return problem, ()
     flat = min(_flat_at_points(representative_rows(problem)), key=len, default=())

@@ -102,7 +102,7 @@ def estimate_least_squares(
     clock = time.perf_counter()
     reduced, held = hold_unidentified(problem)
     if not reduced.names:
-        theta = reduced.theta(np.empty((1, 0)))[0, :-1]
+        theta = reduced.of_model(reduced.theta(np.empty((1, 0))))[0]
         return goodness(
             problem,
             "least_squares",
@@ -126,7 +126,7 @@ def estimate_least_squares(
     return goodness(
         problem,
         "least_squares",
-        reduced.theta(x[None])[0, :-1],
+        reduced.of_model(reduced.theta(x[None]))[0],
         n_fitted=len(reduced.names),
         n_evaluations=rough.n_evaluations + (fine.n_evaluations if fine is not rough else 0),
         seconds=time.perf_counter() - clock,

@@ -195,7 +195,7 @@ def search_in_box(
     return goodness(
         problem,
         method,
-        space.natural(found.x[None])[0, :-1],
+        problem.of_model(space.natural(found.x[None]))[0],
         n_fitted=len(space.names),
         n_evaluations=found.n_evaluations,
         seconds=time.perf_counter() - clock,

@@ -199,7 +199,8 @@ def by_pressure_plate(result: OutputResult, *, reference: Reference = NOTHING) -
         return None
     calibration = result.calibration
     joint = coefficients_at(
-        calibration.problem.theta(calibration.subset(1000))[:, :-1], np.array(pressures),
+        calibration.problem.of_model(calibration.problem.theta(calibration.subset(1000))),
+        np.array(pressures),
         calibration.problem.bound.references,
     )  # fmt: skip
     fig, axes = panels(1, 4, height=46.0, left=14.0, bottom=24.0, gap_x=15.0, top=4.0)

@@ -118,6 +118,9 @@ def _range(prior: Prior, t: Array) -> tuple[float, float]:
 
 def _prior_density(prior: Prior, x: Array) -> Array:
     inside = (x >= prior.lower) & (x <= prior.upper)
+    if prior.gamma is not None:
+        shape, rate = prior.gamma
+        return np.where(inside, np.exp(shape * (x - prior.loc) - rate * np.exp(x)), 0.0)
     z = (x - prior.loc) / prior.scale if np.isfinite(prior.scale) else np.zeros_like(x)
     return np.where(inside, np.exp(-0.5 * z * z), 0.0)
 

@@ -152,8 +152,10 @@ def _caption(result: OutputResult, fitted: Standardised, held: Standardised | No
     n, large = fitted.residual.size, int((np.abs(fitted.residual) > 2.0).sum())
     p = float(shapiro(fitted.residual).pvalue) if n >= 3 else float("nan")
     runs, pairs = signs_along(result, fitted.residual)
+    beyond = "As normal scores, b" if result.calibration.problem.noise.student else "B"
     text = (
-        f"Beyond 2 noise sds lie {large} of {n} residuals ({short(0.046 * n)} expected); they "
+        f"{beyond}eyond 2 noise sds lie {large} of {n} residuals ({short(0.046 * n)} expected); "
+        "they "
         f"{'are compatible with' if p > 0.05 else 'depart from'} a normal law (Shapiro-Wilk p = "
         f"{short(p)}) and change sign {runs} times along {axis_of(x_column(result)).name.lower()} "
         f"where independent ones would do so about {0.5 * pairs:.0f} times."
@@ -162,7 +164,10 @@ def _caption(result: OutputResult, fitted: Standardised, held: Standardised | No
     if sigma is not None:
         unit = "" if sigma.unit == "1" else f" {unit_plain(sigma.unit)}"
         scale = " of ln output" if result.calibration.problem.bound.model.response == "log" else ""
-        text += f" One noise sd {plain('sigma')} is {centre_text(sigma)}{unit}{scale}."
+        noise = result.calibration.problem.noise
+        what = "The noise scale" if noise.student else "One noise sd"
+        where = f" at the mean {axis_of(noise.column).name.lower()}" if noise.column else ""
+        text += f" {what} {plain('sigma')}{where} is {centre_text(sigma)}{unit}{scale}."
     text += _spread_words(result, fitted)
     if held is not None:
         mean = float(held.residual.mean())
@@ -173,9 +178,9 @@ def _caption(result: OutputResult, fitted: Standardised, held: Standardised | No
 
 def _spread_words(result: OutputResult, fitted: Standardised) -> str:
     """Say whether the noise differs between pressures; empty where too few rows would tell."""
-    if role_of(group_column(result) or "") != "pressure":
-        return ""
     problem = result.calibration.problem
+    if role_of(group_column(result) or "") != "pressure" or problem.noise.column:
+        return ""
     log = problem.bound.model.response == "log"
     raw = problem.response - problem.bound.to_response(fitted.predicted)
     found = [(g.title, raw[g.fitted]) for g in groups(result, most=False)]

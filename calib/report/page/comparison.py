@@ -34,7 +34,8 @@ def _row(name: str, m: Mapping[str, Any]) -> list[str]:
     held = m.get("held_out")
     if held:
         density = "none" if held["elpd"] is None else f"{held['elpd']:.1f}"
-        cells += [density, format_number(held["rmse"]), format_number(held["crps"]),
+        crps = "none" if held["crps"] is None else format_number(held["crps"])
+        cells += [density, format_number(held["rmse"]), crps,
                   f"{100 * held['coverage_90']:.0f} %"]  # fmt: skip
     return cells
 

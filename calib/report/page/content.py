@@ -26,7 +26,6 @@ from calib.report.reference import reference_of
 from calib.report.rows import held_table
 from calib.report.study import Failure, OutputResult
 from calib.report.verdict import Evidence, Level, gather, judge_evidence
-from calib.validation.outliers import outlying_notes
 
 __all__ = ["MARKS", "failed_section", "section"]
 
@@ -97,11 +96,11 @@ def section(
         "label": problem.table.label,
         "facts": _card_facts(result, evidence),
         "equation": equation(bound),
-        "likelihood": prose(likelihood(bound, axis_of(bound.model.output).name.lower()), names),
+        "likelihood": prose(likelihood(problem, axis_of(bound.model.output).name.lower()), names),
         "parametrisation": prose(parametrisation(bound), names),
         "data": _data_facts(result),
         "assumed": [prose(note, names) for note in evidence.notes],
-        "outlying": [prose(n, names) for n in outlying_notes(problem, calibration.draws.mode)],
+        "warnings": [prose(warning, names) for warning in result.warnings],
         "priors": prior_rows(result),
         "prior_source": PurePath(problem.priors.source).name,
         "estimates": estimates_grid(result, reference=reference),
@@ -111,6 +110,7 @@ def section(
         "sampling": sampling_facts(result),
         "validation": validation_facts(result, evidence.effective, evidence.low_coverage_p),
         "validation_title": _validation_title(result),
+        "noise": result.preference and prose(result.preference.sentence, ()),
         "figures": {p.name: _figure(key, p, images, names) for p in plates},
         "converged": calibration.converged,
     }

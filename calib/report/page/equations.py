@@ -8,15 +8,17 @@ from string import ascii_letters
 
 from markupsafe import Markup, escape
 
+from calib.inference.problem import Problem
 from calib.models import BoundModel
 from calib.models.latex import html
-from calib.report.labels import MINUS, plain, stem_and_subscript, unbroken
+from calib.report.labels import MINUS, axis_of, plain, stem_and_subscript, unbroken
 
 __all__ = [
     "equation", "likelihood", "parametrisation", "prose", "symbol_html", "unit_html",
 ]  # fmt: skip
 
-_GREEK = {"sigma": Markup("&sigma;"), "gamma": Markup("&gamma;"), "theta": Markup("&theta;")}
+_GREEK = {"sigma": Markup("&sigma;"), "gamma": Markup("&gamma;"),
+          "nu": Markup("&nu;"), "theta": Markup("&theta;")}  # fmt: skip
 
 
 def symbol_html(name: str) -> Markup:
@@ -61,12 +63,21 @@ def equation(bound: BoundModel) -> Markup:
     return Markup("{}{}").format(written, mark)
 
 
-def likelihood(bound: BoundModel, output: str) -> str:
+def likelihood(problem: Problem, output: str) -> str:
     """Say what the likelihood is."""
-    what = f"the logarithm of {output}" if bound.model.response == "log" else output
+    noise = problem.noise
+    what = f"the logarithm of {output}" if problem.bound.model.response == "log" else output
+    law, scale = ("normal", "standard deviation")
+    if noise.student:
+        law, scale = "Student-t, of unknown degrees of freedom nu,", "scale"
+    text = f"Rows are independent; {what} is {law} about the prediction, with "
+    if not noise.column:
+        return f"{text}one unknown {scale} sigma for all rows."
+    column = axis_of(noise.column)
     return (
-        f"Rows are independent; {what} is normal about the prediction, with one unknown standard "
-        "deviation sigma for all rows."
+        f"{text}a {scale} that is sigma at the mean {column.name.lower()} of the rows, "
+        f"{column.value_text(noise.centre)} {column.unit}, and whose logarithm changes by "
+        f"sigma_slope for each sd of it, {column.value_text(noise.spread)} {column.unit}."
     )
 
 

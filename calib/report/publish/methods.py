@@ -87,7 +87,7 @@ def _genetic(settings: Mapping[str, Any]) -> str:
 
 
 def _output(o: Output) -> list[str]:
-    return [*_model(o), *_data(o), *_inference(o), *_sampling(o), *_validation(o)]
+    return [*_model(o), *_data(o), *_inference(o), *_sampling(o), *_validation(o), *_against(o)]
 
 
 def _model(o: Output) -> list[str]:
@@ -127,8 +127,7 @@ def _inference(o: Output) -> list[str]:
     sampled = [name for name, p in o.found["posterior"].items()
                if p["posterior_to_prior_sd"] is not None]  # fmt: skip
     sentences = [
-        f"The likelihood takes the rows as independent and {what} as normal about the model with "
-        "one unknown standard deviation [$sigma].",
+        f"The likelihood takes the rows as independent and {what} as {_noise(o)}.",
         f"The sampled parameters are {joined_symbols(sampled)}; their priors, with reasons and "
         f"sources, are those of `{priors['source']}` (SHA-256 `{priors['sha256'][:_HASH]}`).",
     ]
@@ -140,6 +139,24 @@ def _inference(o: Output) -> list[str]:
             "the mode from which sampling began."
         )
     return sentences
+
+
+def _noise(o: Output) -> str:
+    chosen = o.found.get("noise", {})
+    student, depends = chosen.get("family") == "student_t", chosen.get("depends_on")
+    scale = "scale" if student else "standard deviation"
+    law = "normal about the model"
+    if student:
+        law = "Student-t about the model with unknown degrees of freedom [$nu]"
+    if not depends:
+        return f"{law} {'and' if student else 'with'} one unknown {scale} [$sigma]"
+    axis = axis_of(depends["column"])
+    return (
+        f"{law} {'and' if student else 'with'} an unknown {scale} whose logarithm is linear in "
+        f"{_lower(axis.name)}: that of [$sigma] at {axis.value_text(depends['centre'])} "
+        f"{axis.unit}, and [$sigma_slope] more for each {axis.value_text(depends['spread'])} "
+        f"{axis.unit}"
+    )
 
 
 def _sampling(o: Output) -> list[str]:
@@ -184,6 +201,12 @@ def _validation(o: Output) -> list[str]:
             "(standard error)"
         )
     return [f"{text}."]
+
+
+def _against(o: Output) -> list[str]:
+    """Of another noise than the usual: whether the rows prefer it."""
+    against = o.found.get("noise", {}).get("against_normal")
+    return [] if against is None else [against["sentence"]]
 
 
 def _four(value: float | None) -> str:

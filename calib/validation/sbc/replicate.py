@@ -14,6 +14,7 @@ import numpy as np
 from calib.data import table_from_arrays
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
+from calib.inference.prior_files import PriorFile
 from calib.inference.problem import build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import Draws, SamplerSettings
@@ -44,12 +45,15 @@ class Item:
     seed : int
         Of the whole run.
     settings : SamplerSettings
+    priors : PriorFile, optional
+        The shipped ones by default.
     """
 
     model: str
     index: int
     seed: int
     settings: SamplerSettings = field(default_factory=SamplerSettings)
+    priors: PriorFile | None = None
 
 
 def replicate(item: Item) -> dict[str, Any]:
@@ -80,7 +84,7 @@ def replicate(item: Item) -> dict[str, Any]:
 def simulated(item: Item) -> Simulated:
     """Return the campaign of an item."""
     design = design_of(item.model)
-    template = build_problem(item.model, design.table)
+    template = build_problem(item.model, design.table, item.priors)
     return simulate(template, design, generator(item.seed, "sbc", item.model, item.index))
 
 
@@ -119,10 +123,12 @@ def ranks(case: Simulated, calibration: Calibration, watched: int) -> dict[str, 
     drawn = _quantities(calibration, _thinned(calibration.draws), case, watched)
     true = _quantities(calibration, case.truth[None], case, watched)
     rng = generator(calibration.seed, calibration.label, "measurement")
-    sigma = calibration.problem.theta(_thinned(calibration.draws))[:, -1]
+    natural = calibration.problem.theta(_thinned(calibration.draws))
+    row = _row(case, watched)
     response = calibration.problem.bound.to_response
     with np.errstate(all="ignore"):
-        noisy = response(drawn["prediction"]) + sigma * rng.standard_normal(sigma.size)
+        noise = calibration.problem.noise.draw(natural, row, rng, 1)[:, 0]
+        noisy = response(drawn["prediction"]) + noise
         drawn["measurement"] = calibration.problem.bound.from_response(noisy)
     true["measurement"] = case.measured[watched : watched + 1]
     found = {}
@@ -149,15 +155,19 @@ def _quantities(
     """Everything that is ranked but the measurement, of internal coordinates (k, d): (k,) each."""
     problem = calibration.problem
     natural = problem.theta(t)
-    reported: Mapping[str, Array] = problem.bound.report(natural[:, :-1])
+    theta = problem.of_model(natural)
+    reported: Mapping[str, Array] = problem.bound.report(theta)
     entries = {p.name: natural[:, i] for i, p in enumerate(problem.priors.entries)}
     known = {**reported, **entries}
-    row = {name: v[watched : watched + 1] for name, v in case.held.items()}
     return {
         **{name: known[name] for name in calibration.parameters},
         "log_likelihood": problem.log_likelihood(t),
-        "prediction": problem.bound.predict(natural[:, :-1], row)[:, 0],
+        "prediction": problem.bound.predict(theta, _row(case, watched))[:, 0],
     }
+
+
+def _row(case: Simulated, watched: int) -> dict[str, Array]:
+    return {name: v[watched : watched + 1] for name, v in case.held.items()}
 
 
 def _coverage(case: Simulated, calibration: Calibration) -> dict[str, Any]:

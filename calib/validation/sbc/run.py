@@ -10,6 +10,7 @@ from typing import Any
 
 from calib.batch.tasks import run_tasks
 from calib.errors import CalibError
+from calib.inference.prior_files import DeclaredPriors, prior_file_model
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS, get_model
 from calib.validation.sbc.replicate import Item, replicate
@@ -31,6 +32,7 @@ def run_sbc(
     simulations: int = 300,
     seed: int,
     settings: SamplerSettings = SETTINGS,
+    priors: Sequence[Path] = (),
     workers: int = 1,
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -48,6 +50,8 @@ def run_sbc(
         Of each model.
     seed : int
     settings : SamplerSettings
+    priors : sequence of Path
+        Prior files in the place of the shipped ones; each says which model it is for.
     workers, scheduler, progress, announce
         As for `calib.batch.tasks.run_tasks`.
 
@@ -57,9 +61,17 @@ def run_sbc(
         If there is no such model, or the folder holds a run of another seed or other settings.
     """
     names = chosen_models(models)
-    _claim(out, {"seed": seed, "settings": asdict(settings)})
+    # As text: replicates may run where the files are not.
+    given = {prior_file_model(p): DeclaredPriors(p.name, p.read_text("utf-8")) for p in priors}
+    if unused := [model for model in given if model not in names]:
+        raise CalibError(
+            f"there are priors of {', '.join(unused)}, which is not among the models",
+            allowed=", ".join(names), mend="name it with --model, or leave its priors out",
+        )  # fmt: skip
+    said = {"priors": {model: p.text for model, p in given.items()}} if given else {}
+    _claim(out, {"seed": seed, "settings": asdict(settings), **said})
     items = {
-        f"{model}-{i:04d}": Item(model, i, seed, settings)
+        f"{model}-{i:04d}": Item(model, i, seed, settings, given.get(model))
         for model in names
         for i in range(simulations)
     }
@@ -95,7 +107,7 @@ def _claim(out: Path, run: dict[str, Any]) -> None:
         if path.exists():
             if path.read_text(encoding="utf-8") != text:
                 raise CalibError(
-                    "the folder holds replicates of another seed or of other sampler settings",
+                    "the folder holds replicates of another seed, other sampler settings or priors",
                     where=str(path),
                     mend="choose another --out, or the seed that is there",
                 )

@@ -88,8 +88,8 @@ def _noisy(
     problem: Problem, natural: Array, conditions: dict[str, Array], rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Output at some conditions and a measurement of it, each of shape (n,)."""
-    location = problem.bound.location(natural[:, :-1], conditions)[0]
-    noise = natural[0, -1] * rng.standard_normal(location.size)
+    location = problem.bound.location(problem.of_model(natural), conditions)[0]
+    noise = problem.noise.draw(natural, conditions, rng, location.size)[0]
     with np.errstate(over="ignore"):
         back = problem.bound.from_response
         return back(location), back(location + noise)

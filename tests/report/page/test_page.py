@@ -11,12 +11,20 @@ import pytest
 from matplotlib.figure import Figure
 
 from calib.he2019.figures.reference import HE2019
+from calib.inference.noise import Noise, NoiseChoice
 from calib.models import MODELS
 from calib.models.base import BoundModel
 from calib.report.figures import Plate
 from calib.report.figures.export import png_size
 from calib.report.page.content import failed_section
-from calib.report.page.equations import equation, parametrisation, prose, symbol_html, unit_html
+from calib.report.page.equations import (
+    equation,
+    likelihood,
+    parametrisation,
+    prose,
+    symbol_html,
+    unit_html,
+)
 from calib.report.page.facts import repeats_words, validation_facts
 from calib.report.page.render import render_page
 from calib.report.page.tables import (
@@ -27,6 +35,7 @@ from calib.report.page.tables import (
 )
 from calib.report.sections import Written
 from calib.report.study import Failure, Study
+from calib.validation.assumptions import warnings_of
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\x00\x02\x00\x00\x00\x03\x08\x06\x00\x00\x00rest"
 MANIFEST = {
@@ -177,14 +186,27 @@ def test_notes_of_a_problem_are_shown(rut):
     assert "Assumed" not in page({"rut_depth": rut})[1].text
 
 
+def test_the_likelihood_is_that_of_the_prior_file(rut):
+    problem = rut.calibration.problem
+    assert likelihood(problem, "rut depth") == (
+        "Rows are independent; the logarithm of rut depth is normal about the prediction, with one "
+        "unknown standard deviation sigma for all rows."
+    )
+    noise = Noise(NoiseChoice("student_t", "slip"), "slip_ratio", 0.25, 0.125)
+    text = likelihood(replace(problem, noise=noise), "rut depth")
+    assert "is Student-t, of unknown degrees of freedom nu, about the prediction" in text
+    assert "sigma at the mean slip of the rows, 25 %" in text
+    assert "by sigma_slope for each sd of it, 12.5 %" in text
+
+
 def test_readings_far_off_are_named(rut):
     table = rut.calibration.problem.table
     columns = dict(table.columns) | {"rut_depth_mm": table["rut_depth_mm"].copy()}
     columns["rut_depth_mm"][4] *= 30.0
     problem = rut.calibration.problem.with_table(replace(table, columns=columns))
-    told = replace(rut, calibration=replace(rut.calibration, problem=problem))
+    told = replace(rut, warnings=warnings_of(problem, rut.calibration.draws.mode))
     assert f"line {table.lines[4]}: " in page({"rut_depth": told})[1].text
-    assert "Far off" not in page({"rut_depth": rut})[1].text
+    assert "Warning:" not in page({"rut_depth": rut})[1].text
 
 
 def test_repeats_that_stay_in_are_named(plate):

@@ -172,3 +172,21 @@ def test_text_and_latex_files(published):
     assert "References" in text
     check(published.files["methods.tex"])
     assert r"\paragraph{Drawbar pull.}" in published.files["methods.tex"]
+
+
+def test_another_noise_is_described_and_what_the_data_prefer(he2019):
+    manifest, summary = he2019
+    told = copy.deepcopy(summary)
+    told["models"]["rut_depth"]["noise"] = {
+        "family": "student_t",
+        "depends_on": {"column": "slip_ratio", "centre": 0.25, "spread": 0.125},
+        "against_normal": {"sentence": "The data prefer Student-t noise that depends on slip."},
+    }
+    text = text_of(manifest, told)
+    nu, sigma = "\N{GREEK SMALL LETTER NU}", "\N{GREEK SMALL LETTER SIGMA}"
+    assert f"Student-t about the model with unknown degrees of freedom {nu} and an unknown" in text
+    assert f"scale whose logarithm is linear in slip: that of {sigma} at 25 %" in text
+    assert "_slope more for each 12.5 %." in text
+    assert "The data prefer Student-t noise that depends on slip." in text
+    del told["models"]["rut_depth"]["noise"]["depends_on"]
+    assert "and one unknown scale" in text_of(manifest, told)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from calib.inference.calibration import Calibration
+from calib.inference.prior_files import DeclaredPriors, default_priors
 from calib.models import MODELS
 from calib.validation.sbc.designs import design_of
 from calib.validation.sbc.replicate import DERIVED, Item, calibrated, measure, replicate, simulated
@@ -81,6 +82,22 @@ def test_three_hundred_posteriors_of_every_model_are_calibrated(model: str) -> N
     (only,) = found.models
     assert only.unconverged <= 15
     # Six models: the family-wise level of the whole test is six times this.
+    assert min(found.adjusted.values()) > 1e-3, found.alarms
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "likelihood", ['family = "student_t"', 'noise_depends_on = "slip"'], ids=["student_t", "uneven"]
+)
+def test_two_hundred_posteriors_of_another_noise_are_calibrated(likelihood: str) -> None:
+    model = "modified_bekker"
+    text = default_priors(model).read_text(encoding="utf-8")
+    priors = DeclaredPriors("mine.toml", f"{text}\n[likelihood]\n{likelihood}\n")
+    done = [replicate(Item(model, i, SEED, SETTINGS, priors)) for i in range(200)]
+    found = score(done, SEED, 200)
+    (only,) = found.models
+    assert only.unconverged <= 10
+    assert {"nu", "sigma_slope"} & {q.name for q in only.quantities}
     assert min(found.adjusted.values()) > 1e-3, found.alarms
 
 

@@ -11,6 +11,7 @@ from typer.testing import CliRunner
 
 from calib.cli import app
 from calib.errors import CalibError
+from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.page.sbc import text_table, verdict
 from calib.validation.sbc.run import run_sbc
@@ -135,3 +136,19 @@ def test_a_miscalibration_is_said_first(out: Path) -> None:
     spoilt = replace(model.quantities[0], p=1e-6)
     bad = replace(found, models=(replace(model, quantities=(spoilt, *model.quantities[1:])),))
     assert verdict(bad).startswith("MISCALIBRATED: k of bekker")
+
+
+def test_a_prior_file_chooses_the_noise_that_is_proved(tmp_path: Path) -> None:
+    path = tmp_path / "heavy.toml"
+    text = default_priors("modified_bekker").read_text(encoding="utf-8")
+    path.write_text(f'{text}\n[likelihood]\nfamily = "student_t"\nnoise_depends_on = "slip"\n')
+    options = {"simulations": 2, "seed": 1, "settings": QUICK}
+    found = run_sbc(tmp_path / "run", models=MODELS, priors=[path], **options)
+    named = {m.model: {q.name for q in m.quantities} for m in found.models}
+    assert {"nu", "sigma_slope", "sigma"} <= named["modified_bekker"]
+    assert "nu" not in named["bekker"]
+    # A run of other priors is another run.
+    with pytest.raises(CalibError, match="other sampler settings or priors"):
+        run_sbc(tmp_path / "run", models=MODELS, **options)
+    with pytest.raises(CalibError, match="priors of modified_bekker"):
+        run_sbc(tmp_path / "other", models=MODELS[:1], priors=[path], **options)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from itertools import product
+from math import isfinite
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -26,6 +27,7 @@ from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.report.study_tasks import HoldOut
+from calib.validation.assumptions import warnings_of
 from calib.validation.validate import validate_held_out
 
 __all__ = ["Fit", "FitItem", "FitSection"]
@@ -114,10 +116,13 @@ class Fit(Kind[FitSection, FitItem]):
         point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
         calibration = calibrate(problem, seed, estimates=(point,), settings=item.settings)
         numbers = _numbers(calibration)
+        if warnings := warnings_of(problem, calibration.draws.mode):
+            numbers["warnings"] = " | ".join(warnings)
         if item.held is not None:
             scores = validate_held_out(calibration, item.held).scores
             numbers["held_out"] = {
-                "rows": scores.n, "rmse": scores.rmse, "crps": scores.crps,
+                "rows": scores.n, "rmse": scores.rmse,
+                "crps": scores.crps if isfinite(scores.crps) else None,
                 "in_90_percent_band": scores.coverage[0.9].hits,
             }  # fmt: skip
         return Work(numbers, _run_folder(calibration) if item.posterior else {})

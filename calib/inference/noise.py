@@ -1,0 +1,214 @@
+"""How a measurement scatters about its prediction, where a prior file asks for other than usual.
+
+The usual is normal noise of one standard deviation sigma. A prior file may have instead or besides
+
+- Student-t noise: sigma is its scale, and the degrees of freedom nu are inferred beside it;
+- a noise that depends on a condition c: ln sigma(c) = ln sigma + sigma_slope (c - m)/s, with m and
+  s the mean and the sd of the condition over the rows that are calibrated on.
+
+Natural parameters are those of the model, then nu and sigma_slope if they are there, then sigma.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.special import gammaln, ndtr, ndtri, stdtr, stdtrit
+
+from calib.data.quantities import QUANTITIES
+from calib.errors import CalibError
+from calib.models.base import Array, Conditions
+
+__all__ = ["DEFAULT_PRIORS", "NORMAL", "USUAL", "Family", "Noise", "NoiseChoice", "noise_of"]
+
+type Family = Literal["normal", "student_t"]
+
+_HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))
+
+# Read where a prior file chooses a noise and says nothing of its parameters.
+DEFAULT_PRIORS = """
+[nu]
+dist = "gamma"
+shape = 2.0
+rate = 0.1
+lower = 1.0
+unit = "1"
+reason = "From tails as heavy as Cauchy's, below which a prediction has no mean, to nearly normal"
+source = "Juarez & Steel (2010), doi:10.1198/jbes.2009.07145"
+
+[sigma_slope]
+dist = "normal"
+mean = 0.0
+sd = 0.5
+unit = "1"
+reason = "Over conditions that are evenly spread, noise that changes by a factor of 1/6 to 6"
+source = "This project: weak, and as ready to fall as to grow"
+"""
+
+
+@dataclass(frozen=True)
+class NoiseChoice:
+    """What a prior file says of the noise.
+
+    Parameters
+    ----------
+    family : {"normal", "student_t"}
+    depends_on : str
+        A quantity or its canonical column; empty for one scale at all conditions.
+    """
+
+    family: Family = "normal"
+    depends_on: str = ""
+
+    @property
+    def parameters(self) -> tuple[str, ...]:
+        """Names of the noise's parameters beside sigma."""
+        student = ("nu",) if self.family == "student_t" else ()
+        return (*student, "sigma_slope") if self.depends_on else student
+
+    @property
+    def usual(self) -> bool:
+        """Whether it is normal of one standard deviation."""
+        return not self.parameters
+
+
+USUAL = NoiseChoice()
+
+
+@dataclass(frozen=True)
+class Noise:
+    """A choice of noise on some data.
+
+    Parameters
+    ----------
+    choice : NoiseChoice
+    column : str
+        The condition that the scale depends on, if any.
+    centre, spread : float
+        Its mean and sd over the rows that are calibrated on.
+    """
+
+    choice: NoiseChoice = USUAL
+    column: str = ""
+    centre: float = 0.0
+    spread: float = 1.0
+
+    @property
+    def usual(self) -> bool:
+        """Whether it is normal of one standard deviation."""
+        return self.choice.usual
+
+    def must_be_usual(self, source: str, what: str) -> None:
+        """Refuse any other noise for what is worked out for the usual one alone.
+
+        Raises
+        ------
+        CalibError
+            If it is another.
+        """
+        if not self.usual:
+            raise CalibError(
+                f"{what} takes normal noise of one standard deviation only",
+                where=f"{source}, [likelihood]",
+                mend="take this table out, and fit again what was fitted with it",
+            )
+
+    @property
+    def student(self) -> bool:
+        """Whether it is Student's."""
+        return self.choice.family == "student_t"
+
+    def scale(self, natural: Array, conditions: Mapping[str, Array]) -> Array:
+        """Return the scale at conditions: natural parameters (k, d_all) to (k, 1) or (k, n)."""
+        sigma = natural[:, -1:]
+        if not self.column:
+            return sigma
+        z = (conditions[self.column] - self.centre) / self.spread
+        # What exceeds all bounds is for the density to exclude.
+        with np.errstate(over="ignore", invalid="ignore"):
+            return np.asarray(sigma * np.exp(natural[:, -2:-1] * z))
+
+    def _nu(self, natural: Array) -> Array:
+        return natural[:, -3:-2] if self.column else natural[:, -2:-1]
+
+    def draw(
+        self, natural: Array, conditions: Mapping[str, Array], rng: np.random.Generator, n: int
+    ) -> Array:
+        """Draw the noise of n readings for each parameter vector, shape (k, n)."""
+        z = rng.standard_normal((natural.shape[0], n))
+        if self.student:
+            nu = self._nu(natural)
+            z *= np.sqrt(nu / rng.chisquare(np.broadcast_to(nu, z.shape)))
+        return self.scale(natural, conditions) * z
+
+    def of_normal(self, natural: Array, conditions: Mapping[str, Array], z: Array) -> Array:
+        """Return the noise at the quantiles of standard normals z, (k, 1) to (k, 1) or (k, n)."""
+        if self.student:
+            # From the tail, where a probability near one would be rounded to it.
+            z = -np.sign(z) * stdtrit(self._nu(natural), ndtr(-np.abs(z)))
+        return np.asarray(self.scale(natural, conditions) * z)
+
+    def log_density(
+        self, residuals: Array, natural: Array, conditions: Mapping[str, Array]
+    ) -> Array:
+        """Log density of residuals (k, n), each by itself; NaN where a residual is."""
+        with np.errstate(all="ignore"):
+            scale = self.scale(natural, conditions)
+            z = residuals / scale
+            if not self.student:
+                return np.asarray(-0.5 * z * z - np.log(scale) - _HALF_LN_2PI)
+            nu = self._nu(natural)
+            half = 0.5 * (nu + 1.0)
+            constant = gammaln(half) - gammaln(0.5 * nu) - 0.5 * np.log(np.pi * nu)
+            return np.asarray(constant - np.log(scale) - half * np.log1p(z * z / nu))
+
+    def normal_scores(
+        self, residuals: Array, natural: Array, conditions: Mapping[str, Array]
+    ) -> Array:
+        """Residuals (k, n) as they would stand in standard normal noise: of the same quantile."""
+        z = residuals / self.scale(natural, conditions)
+        if not self.student:
+            return np.asarray(z)
+        return np.asarray(-np.sign(z) * ndtri(stdtr(self._nu(natural), -np.abs(z))))
+
+
+NORMAL = Noise()
+
+
+def noise_of(choice: NoiseChoice, conditions: Conditions, source: str) -> Noise:
+    """Return a choice of noise on the rows that are calibrated on.
+
+    Parameters
+    ----------
+    choice : NoiseChoice
+    conditions : mapping of str to ndarray, shape (n,)
+        Of the model.
+    source : str
+        The prior file's name, for the message.
+
+    Raises
+    ------
+    CalibError
+        If the noise is to depend on what is no condition of the model, or does not vary.
+    """
+    if not choice.depends_on:
+        return Noise(choice)
+    stems = {QUANTITIES[name].stem: name for name in conditions}
+    column = ({name: name for name in conditions} | stems).get(choice.depends_on)
+    where = f"{source}, [likelihood] noise_depends_on"
+    if column is None:
+        raise CalibError(
+            f"the noise is to depend on {choice.depends_on!r}, which is no condition of the model",
+            where=where, allowed=", ".join(stems), mend="name one of these",
+        )  # fmt: skip
+    values = conditions[column]
+    spread = float(values.std())
+    if not spread > 1e-9 * float(np.abs(values).max()):
+        raise CalibError(
+            f"the noise is to depend on {column}, which is the same in all rows that are fitted",
+            where=where, allowed="a condition that varies", mend="leave noise_depends_on out",
+        )  # fmt: skip
+    return Noise(choice, column, float(values.mean()), spread)

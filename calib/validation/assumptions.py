@@ -1,0 +1,257 @@
+"""What a calibration assumes of its rows, tested: a warning for each assumption that fails.
+
+The likelihood takes rows as independent, and scattered as it says. Each test has the chance
+`LEVEL` of a false alarm on rows that are so; what depends on a file's contents alone has none, or
+one that is stated. `docs/statistics/likelihood.md` lists them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import PurePath
+
+import numpy as np
+from scipy import stats
+
+from calib.data import Table
+from calib.data.quantities import QUANTITIES, Quantity
+from calib.inference.problem import Problem
+from calib.models.base import Array
+from calib.validation.outliers import linear, outlying_notes
+
+__all__ = ["LEVEL", "durbin_watson_moments", "file_notes", "residual_notes", "warnings_of"]
+
+# Chance that a test of residuals warns of rows that are as the likelihood says.
+LEVEL = 1e-3
+# Chance that readings agree to the last digit, from which equal rows are taken for copies.
+_COPIED = 0.01
+_FEWEST, _FEWEST_FOR_TAILS = 8, 20
+# A psi is so many kPa; levels of a design that are so far apart to this part are no coincidence.
+_PSI, _NEAR, _FEW_LEVELS = 6.894757, 2e-3, 6
+_MOST_NAMED = 5
+
+
+def warnings_of(problem: Problem, t: Array) -> tuple[str, ...]:
+    """Say what a reader should mend, or know, before believing a calibration's width.
+
+    Parameters
+    ----------
+    problem : Problem
+    t : ndarray, shape (d,)
+        Internal coordinates of a fit to all rows, for instance the posterior's mode.
+    """
+    return (
+        *outlying_notes(problem, t), *file_notes(problem, _scatter(problem, t)),
+        *residual_notes(problem, t),
+    )  # fmt: skip
+
+
+def file_notes(problem: Problem, scatter: float) -> tuple[str, ...]:
+    """Say what is odd in the rows themselves: units, copies, conditions that do not vary.
+
+    Parameters
+    ----------
+    problem : Problem
+    scatter : float
+        Sd of a reading about the prediction, on the scale of the response.
+    """
+    found: list[str] = []
+    for name, values in problem.conditions.items():
+        quantity = QUANTITIES[name]
+        if np.unique(values).size == 1:
+            found.append(
+                f"{_source(problem.table)}: {quantity.word} is the same in all rows; what depends "
+                "on it comes from the prior, and predictions elsewhere with it"
+            )
+        found += _unusual(problem.table, quantity, values)
+        found += _mixed_units(problem.table, quantity, values)
+    return (*found, *_copies(problem, scatter))
+
+
+def _unusual(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
+    if quantity.usual is None:
+        return
+    low, high = quantity.usual
+    odd = (values < low) | (values > high)
+    if odd.any():
+        yield (
+            f"{_source(table)}, {_lines(table, odd)}: {quantity.word} is outside {low:g} to "
+            f"{high:g} {quantity.unit}, where it usually lies; check the unit in the column name"
+        )
+
+
+def _mixed_units(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
+    """Levels that are one number in psi and in kPa."""
+    levels = np.unique(values)
+    if quantity.kind != "pressure" or not 2 <= levels.size <= _FEW_LEVELS or levels[0] <= 0.0:
+        return
+    ratio = levels[None, :] / levels[:, None]
+    small = levels[(np.abs(ratio / _PSI - 1.0) < _NEAR).any(axis=1)]
+    if small.size:
+        yield (
+            f"{_source(table)}, {_lines(table, np.isin(values, small))}: {quantity.word} is 6.895 "
+            "times smaller than in other rows, as psi is that were typed as kPa; check the unit"
+        )
+
+
+def _copies(problem: Problem, scatter: float) -> Iterable[str]:
+    """Rows that repeat another one exactly, unless the readings are so coarse that some would."""
+    table = problem.table
+    at = np.stack([*problem.conditions.values()], axis=1)
+    _, place, count = np.unique(at, axis=0, return_inverse=True, return_counts=True)
+    rows = np.column_stack([place.ravel(), problem.observed])
+    _, first, whole = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    copied = first[whole.ravel()] != np.arange(len(table))
+    if not copied.any():
+        return
+    pairs = float((count * (count - 1) / 2.0).sum())
+    # Two readings at one condition differ by a normal of sd sqrt(2) sigma, whose density at zero
+    # times the last digit is the chance that they agree.
+    agree = _last_digit(problem) / (2.0 * np.sqrt(np.pi) * max(scatter, 1e-300))
+    if stats.poisson.sf(int(copied.sum()) - 1, pairs * min(agree, 1.0)) > _COPIED:
+        return
+    yield (
+        f"{_source(table)}, {_lines(table, copied)}: {_rows(int(copied.sum()))} another one "
+        "exactly; a copy counts as a measurement and narrows every width: delete it, unless it was "
+        "measured"
+    )
+
+
+def _last_digit(problem: Problem) -> float:
+    """Return the step of the readings, on the scale of the response; zero if there is none."""
+    y = problem.observed
+    size = float(np.abs(y).max())
+    for places in range(10):
+        if np.abs(y - np.round(y, places)).max() <= 1e-12 * size:
+            step = 10.0**-places
+            return float(step / np.median(y)) if problem.bound.model.response == "log" else step
+    return 0.0
+
+
+def residual_notes(problem: Problem, t: Array) -> tuple[str, ...]:
+    """Say where the residuals are not as the likelihood has them.
+
+    Parameters
+    ----------
+    problem : Problem
+    t : ndarray, shape (d,)
+        Internal coordinates of a fit to all rows.
+
+    Notes
+    -----
+    Residuals are those of the model made linear at the fit, over the noise's scale there (Student's
+    as normal scores), so that the moments of linear least squares hold.
+    """
+    residual, design, rank = linear(problem, t, np.ones(problem.response.size, dtype=bool))
+    left = residual.size - rank
+    if left < _FEWEST or not float(np.ptp(residual)) > 0.0:
+        return ()
+    natural = problem.theta(t[None])
+    raw = problem.residuals(natural)
+    score = problem.noise.normal_scores(raw, natural, problem.conditions)[0]
+    leverage = np.sum(design**2, axis=1)
+    judged = leverage < 1.0 - 1e-9
+    studentised = np.where(judged, score / np.sqrt(np.where(judged, 1.0 - leverage, 1.0)), 0.0)
+    return (
+        *_autocorrelated(problem.table, score, design),
+        *_uneven(problem, studentised[judged], judged),
+        *_heavy_tailed(problem, studentised[judged]),
+    )
+
+
+def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[str]:
+    """Durbin and Watson's (1951) test in the order of the file, by their beta approximation."""
+    n = residual.size
+    d = float(np.square(np.diff(residual)).sum() / np.square(residual).sum())
+    mean, variance = durbin_watson_moments(design)
+    # On (0, 4) as d is.
+    x, v = mean / 4.0, variance / 16.0
+    size = x * (1.0 - x) / v - 1.0
+    if not stats.beta.cdf(d / 4.0, x * size, (1.0 - x) * size) < LEVEL:
+        return
+    r = float(np.clip(1.0 - d / mean, 0.0, 0.99))
+    yield (
+        f"{_source(table)}: residuals of neighbouring rows are alike (correlation {r:.2f}), as in "
+        "rows of one continuous run, or where the curve misses a pattern; the rows are worth about "
+        f"{max(1.0, n * (1.0 - r) / (1.0 + r)):.0f} independent ones, not {n}, so that widths are "
+        "too narrow: thin them, or look at the residuals"
+    )
+
+
+def durbin_watson_moments(design: Array) -> tuple[float, float]:
+    """Mean and variance of Durbin and Watson's statistic under independent normal noise.
+
+    Parameters
+    ----------
+    design : ndarray, shape (n, k)
+        Orthonormal columns that span what was fitted.
+
+    Notes
+    -----
+    Of d = e'Ae/e'e with A the second difference they are exact: E = P/(n - k) and
+    2 (Q - P E)/((n - k)(n - k + 2)), with P and Q the traces of MA and (MA)^2, and M the
+    projection on what the design leaves (doi:10.1093/biomet/38.1-2.159).
+    """
+    n, rank = design.shape
+    left = n - rank
+    on_design = _second_difference(design)
+    gram = design.T @ on_design
+    p = 2.0 * (n - 1) - float(np.trace(gram))
+    q = 2.0 * (3 * n - 4) - 2.0 * float(np.square(on_design).sum()) + float(np.square(gram).sum())
+    mean = p / left
+    return mean, 2.0 * (q - p * mean) / (left * (left + 2.0))
+
+
+def _second_difference(x: Array) -> Array:
+    steps = np.diff(x, axis=0)
+    out = np.zeros_like(x)
+    out[:-1] -= steps
+    out[1:] += steps
+    return out
+
+
+def _uneven(problem: Problem, residual: Array, judged: np.ndarray) -> Iterable[str]:
+    """Spearman's rank correlation of the residuals' sizes with each condition that varies."""
+    varying = {k: v[judged] for k, v in problem.conditions.items() if np.ptp(v[judged]) > 0.0}
+    for name, values in varying.items():
+        found = stats.spearmanr(np.abs(residual), values)
+        if found.pvalue < LEVEL / len(varying):
+            word, stem = QUANTITIES[name].word, QUANTITIES[name].stem
+            grows = "grows" if found.statistic > 0.0 else "falls"
+            yield (
+                f"{_source(problem.table)}: the scatter {grows} with {word} (rank correlation "
+                f"{found.statistic:.2f}); one sigma is too wide at one end and too narrow at the "
+                f'other: noise_depends_on = "{stem}" in the prior file lets it change'
+            )
+
+
+def _heavy_tailed(problem: Problem, residual: Array) -> Iterable[str]:
+    """Anscombe and Glynn's (1983) test of the kurtosis, one-sided."""
+    if residual.size < _FEWEST_FOR_TAILS or problem.noise.student:
+        return
+    if stats.kurtosistest(residual, alternative="greater").pvalue < LEVEL:
+        yield (
+            f"{_source(problem.table)}: the residuals have heavier tails than normal noise (excess "
+            f"kurtosis {stats.kurtosis(residual):.1f}); single readings then weigh too much: "
+            'correct those that are wrong, or write family = "student_t" in the prior file'
+        )
+
+
+def _scatter(problem: Problem, t: Array) -> float:
+    return float(problem.theta(t[None])[0, -1])
+
+
+def _source(table: Table) -> str:
+    # Not the path: the page goes to others.
+    return PurePath(table.source).name
+
+
+def _lines(table: Table, rows: np.ndarray) -> str:
+    lines: Sequence[int] = table.lines[rows].tolist()
+    named = ", ".join(map(str, lines[:_MOST_NAMED]))
+    more = f" and {len(lines) - _MOST_NAMED} more" if len(lines) > _MOST_NAMED else ""
+    return f"{'line' if len(lines) == 1 else 'lines'} {named}{more}"
+
+
+def _rows(n: int) -> str:
+    return "this row repeats" if n == 1 else f"these {n} rows repeat"

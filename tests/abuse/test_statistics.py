@@ -1,0 +1,229 @@
+"""Rows that are not as the likelihood has them: an honest width and a warning, or a refusal."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from calib.cli import app
+from calib.data import read_for_model, table_from_arrays
+from calib.errors import CalibError
+from calib.inference.calibration import Calibration, calibrate
+from calib.inference.estimators import estimate
+from calib.inference.prior_files import default_priors
+from calib.inference.problem import build_problem
+from calib.models import get_model
+from calib.validation.assumptions import warnings_of
+
+MODEL = "modified_bekker"
+TRUTH = {"z_ref": 20.0, "n0": 1.0, "n1": 1.0}
+N = 48
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Ruts of a wheel at two ground pressures, in the order of a file."""
+
+    slip: np.ndarray
+    pressure: np.ndarray
+    rut: np.ndarray
+
+    @classmethod
+    def made(cls, noise: np.ndarray | None = None, seed: int = 1) -> Rows:
+        """Those of the true parameters, with a noise on the logarithm."""
+        slip = np.tile(np.linspace(0.02, 0.6, N // 2), 2)
+        pressure = np.repeat([90.0, 150.0], N // 2)
+        if noise is None:
+            noise = 0.05 * np.random.default_rng(seed).standard_normal(N)
+        problem = build_problem(MODEL, _table(slip, pressure, np.linspace(10.0, 20.0, N)))
+        theta = np.array([[TRUTH[name] for name in problem.bound.model.parameters]])
+        return cls(
+            slip, pressure, problem.bound.predict(theta, problem.conditions)[0] * np.exp(noise)
+        )
+
+    def take(self, rows: np.ndarray) -> Rows:
+        return Rows(self.slip[rows], self.pressure[rows], self.rut[rows])
+
+    def calibrated(self, likelihood: str = "", folder: Path | None = None) -> Calibration:
+        path = None
+        if folder is not None:
+            path = folder / "priors.toml"
+            path.write_text(default_priors(MODEL).read_text(encoding="utf-8") + likelihood)
+        problem = build_problem(MODEL, _table(self.slip, self.pressure, self.rut), path)
+        point = estimate(problem, "least_squares", np.random.default_rng(2))
+        return calibrate(problem, 2, estimates=(point,))
+
+
+def _table(slip: np.ndarray, pressure: np.ndarray, rut: np.ndarray):
+    columns = {"slip_ratio": slip, "average_ground_pressure_kpa": pressure, "rut_depth_mm": rut}
+    return table_from_arrays(columns, source="ruts.csv")
+
+
+def warned(calibration: Calibration) -> str:
+    return " | ".join(warnings_of(calibration.problem, calibration.draws.mode))
+
+
+def holds(calibration: Calibration) -> bool:
+    """Whether every true parameter is inside its interval of four sds."""
+    return all(
+        abs(calibration.summary[name].mean - value) < 4.0 * calibration.summary[name].sd
+        for name, value in TRUTH.items()
+    )
+
+
+@pytest.fixture(scope="module")
+def clean() -> Calibration:
+    return Rows.made().calibrated()
+
+
+def test_good_rows_are_not_warned_of(clean: Calibration) -> None:
+    assert holds(clean)
+    assert warned(clean) == ""
+
+
+@pytest.mark.parametrize("factor", [100.0, 0.01])
+def test_a_row_off_by_a_hundred_times(clean: Calibration, factor: float) -> None:
+    rows = Rows.made()
+    rows.rut[17] *= factor
+    found = rows.calibrated()
+    # It widens everything, and is named.
+    assert holds(found)
+    assert found.summary["sigma"].median > 5.0 * clean.summary["sigma"].median
+    assert f"line {found.problem.table.lines[17]}" in warned(found)
+    assert "check the reading" in warned(found)
+
+
+def test_psi_typed_as_kpa_in_some_rows() -> None:
+    rows = Rows.made()
+    rows.pressure[30:34] /= 6.894757
+    found = rows.calibrated()
+    lines = ", ".join(str(found.problem.table.lines[i]) for i in range(30, 34))
+    assert f"lines {lines}: average ground pressure is 6.895 times smaller" in warned(found)
+
+
+def test_duplicated_rows(clean: Calibration) -> None:
+    twice = Rows.made().take(np.tile(np.arange(N), 2))
+    found = twice.calibrated()
+    # Too narrow, by the square root of two: the warning says so.
+    assert found.summary["z_ref"].sd < 0.85 * clean.summary["z_ref"].sd
+    assert "these 48 rows repeat another one exactly" in warned(found)
+    assert "narrows every width" in warned(found)
+
+
+def test_a_condition_that_does_not_vary(clean: Calibration) -> None:
+    rows = Rows.made()
+    same = Rows(np.full(N, 0.2), rows.pressure, rows.rut)
+    found = same.calibrated()
+    assert "slip is the same in all rows" in warned(found)
+    # What only slip could tell is as wide as the prior.
+    ratio = max(found.summary["n0"].sd_ratio, found.summary["n1"].sd_ratio)
+    assert ratio > 0.5 > clean.summary["n0"].sd_ratio
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_fewer_rows_than_parameters(n: int) -> None:
+    rows = Rows.made().take(np.arange(n))
+    with pytest.raises(CalibError, match="cannot calibrate"):
+        rows.calibrated()
+
+
+def test_heavy_tails(tmp_path: Path) -> None:
+    noise = 0.03 * np.random.default_rng(4).standard_t(1.2, N)
+    rows = Rows.made(noise)
+    normal = rows.calibrated()
+    assert holds(normal)
+    assert "heavier tails" in warned(normal)
+    student = rows.calibrated('\n[likelihood]\nfamily = "student_t"\n', tmp_path)
+    assert holds(student)
+    assert student.summary["z_ref"].sd < normal.summary["z_ref"].sd
+    assert "tails" not in warned(student)
+
+
+def test_uneven_noise(tmp_path: Path) -> None:
+    slip = Rows.made().slip
+    noise = 0.01 * np.exp(5.0 * slip) * np.random.default_rng(5).standard_normal(N)
+    rows = Rows.made(noise)
+    assert "scatter grows with slip" in warned(rows.calibrated())
+    found = rows.calibrated('\n[likelihood]\nnoise_depends_on = "slip"\n', tmp_path)
+    assert holds(found)
+    assert "scatter" not in warned(found)
+    # ln sigma grows by 5 for a slip of one.
+    slope = found.summary["sigma_slope"]
+    assert abs(slope.mean - 5.0 * slip.std()) < 4.0 * slope.sd
+
+
+def test_rows_that_are_alike_along_a_run() -> None:
+    rng = np.random.default_rng(6)
+    noise = rng.standard_normal(N)
+    for i in range(1, N):
+        noise[i] = 0.9 * noise[i - 1] + np.sqrt(1.0 - 0.81) * noise[i]
+    found = warned(Rows.made(0.05 * noise).calibrated())
+    assert "neighbouring rows are alike" in found
+    assert "too narrow" in found
+
+
+def written(rows: Rows, path: Path) -> Path:
+    lines = ["slip_ratio,average_ground_pressure_kpa,rut_depth_mm"]
+    columns = zip(rows.slip, rows.pressure, rows.rut, strict=True)
+    path.write_text("\n".join([*lines, *(",".join(f"{v:.4f}" for v in r) for r in columns)]) + "\n")
+    return path
+
+
+@pytest.mark.slow
+def test_warnings_are_on_the_terminal_the_page_and_in_the_summary(tmp_path: Path) -> None:
+    rows = Rows.made()
+    rows.rut[17] *= 100.0
+    file = written(rows.take(np.append(np.arange(N), 5)), tmp_path / "ruts.csv")
+    run = CliRunner()
+    fit = run.invoke(
+        app, ["fit", str(file), "--model", MODEL, "--out", str(tmp_path / "run"), "--workers", "1"]
+    )
+    assert fit.exit_code == 0, fit.output
+    report = run.invoke(
+        app,
+        ["report", str(file), "--model", MODEL, "--out", str(tmp_path / "report"), "--workers", "1",
+         "--no-posteriors"],
+    )  # fmt: skip
+    assert report.exit_code == 0, report.output
+    page = (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
+    told = json.loads((tmp_path / "report" / "summary.json").read_text(encoding="utf-8"))
+    for text in (fit.stderr, report.stderr, page, "".join(told["models"]["rut_depth"]["warnings"])):
+        assert "line 19: rut_depth_mm" in text
+        assert "line 50: this row repeats another one exactly" in text
+
+
+@pytest.mark.slow
+def test_a_report_with_another_noise_checks_and_says_what_the_data_prefer(tmp_path: Path) -> None:
+    noise = 0.03 * np.random.default_rng(4).standard_t(1.2, N)
+    file = written(Rows.made(noise), tmp_path / "ruts.csv")
+    priors = tmp_path / "heavy.toml"
+    extra = '\n[likelihood]\nfamily = "student_t"\nnoise_depends_on = "slip"\n'
+    priors.write_text(default_priors(MODEL).read_text(encoding="utf-8") + extra, encoding="utf-8")
+    run, chosen = CliRunner(), ["--model", MODEL, "--priors", str(priors), "--workers", "1"]
+    fit = run.invoke(app, ["fit", str(file), *chosen, "--out", str(tmp_path / "run")])
+    assert fit.exit_code == 0, fit.output
+    said = "Student-t noise that depends on slip"
+    assert said in fit.output
+    report = run.invoke(app, ["report", str(file), *chosen, "--out", str(tmp_path / "report")])
+    assert report.exit_code == 0, report.output
+    told = json.loads((tmp_path / "report" / "summary.json").read_text(encoding="utf-8"))
+    found = told["models"]["rut_depth"]["noise"]
+    assert found["family"] == "student_t"
+    assert found["depends_on"]["column"] == "slip_ratio"
+    assert found["against_normal"]["elpd_difference"] > 0.0
+    assert said in (tmp_path / "report" / "index.html").read_text(encoding="utf-8")
+    for folder in ("run", "report"):
+        check = run.invoke(app, ["check", str(tmp_path / folder), "--workers", "1"])
+        assert check.exit_code == 0, check.output
+
+
+def test_the_file_is_read_as_it_was_written(tmp_path: Path) -> None:
+    model = get_model(MODEL)
+    rows = Rows.made()
+    table = read_for_model(written(rows, tmp_path / "ruts.csv"), (*model.conditions, model.output))
+    np.testing.assert_allclose(table["rut_depth_mm"], rows.rut, atol=1e-4)
