@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from calib.errors import CalibError
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS, example_csv
 from calib.validation.sbc.replicate import Item, replicate
@@ -86,7 +87,9 @@ def test_a_model_through_every_verb(
     assert stacked.code == compared.code, stacked.err
 
 
-def test_slow_models_are_left_out_of_sbc_unless_named(calib: Calib) -> None:
+def test_slow_models_are_left_out_of_sbc_unless_named(
+    calib: Calib, monkeypatch: pytest.MonkeyPatch
+) -> None:
     from calib.batch.campaign.kinds.sbc import SbcSection
     from calib.validation.sbc.run import chosen_models
 
@@ -94,3 +97,12 @@ def test_slow_models_are_left_out_of_sbc_unless_named(calib: Calib) -> None:
     assert set(chosen_models()) == set(MODELS) - set(SLOW)
     assert chosen_models(SLOW[:1]) == SLOW[:1]
     assert SbcSection(name="ranks", simulations=1, draw_seed=1).models == chosen_models()
+
+    def stop(*_: object, **__: object) -> None:
+        raise CalibError("begun")
+
+    monkeypatch.setattr("calib.validation.sbc.run.run_sbc", stop)
+    told = calib("sbc", "--out", "sbc").err
+    assert "begun" in told
+    assert f"left out: {', '.join(SLOW)}, of which each campaign takes minutes" in told
+    assert "left out" not in calib("sbc", "--out", "sbc", "--model", SLOW[0]).err
