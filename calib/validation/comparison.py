@@ -223,10 +223,25 @@ def compare_problems(
     """Compare as `compare` does models that are bound to the same rows already."""
     tell = progress or (lambda what, done, planned: None)
     found = [_candidate(p, held_out, seed, settings, tell, workers) for p in problems]
+    for one in found:
+        _check_possible(one)
     weights = stacking_weights(np.stack([c.rows for c in found], axis=1))
     named = {c.model: float(w) for c, w in zip(found, weights, strict=True)}
     ranked = tuple(sorted(found, key=lambda c: -c.loo.elpd))
     return Comparison(ranked, {c.model: named[c.model] for c in ranked}, seed)
+
+
+def _check_possible(found: Candidate) -> None:
+    """Refuse a model that has no density at a row: it would be infinitely worse."""
+    table = found.calibration.problem.table
+    empty = table.lines[~np.isfinite(found.rows)]
+    if empty.size:
+        raise CalibError(
+            f"{found.model} gives {empty.size} of {len(table)} rows no density",
+            where=f"{table.source}, line {empty[0]}",
+            allowed="rows that every model can have, however improbable",
+            mend="leave the model out, or the rows where it is not defined",
+        )
 
 
 def check_comparable(models: Sequence[str]) -> None:

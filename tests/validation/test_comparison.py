@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,13 @@ from calib.data import hold_out, table_from_arrays
 from calib.errors import CalibError
 from calib.models import MODELS
 from calib.report.comparison import document, load_stack, write_comparison
-from calib.validation.comparison import Comparison, compare, stacking_weights
+from calib.validation import comparison
+from calib.validation.comparison import (
+    Comparison,
+    compare,
+    compare_problems,
+    stacking_weights,
+)
 from calib.validation.prediction import N_DRAWS, predict, predict_stacked
 
 SHARED = Path(__file__).parents[2] / ".." / "shared"
@@ -150,3 +157,20 @@ def test_no_shipped_model_is_chosen_for_the_papers_tables_but_its_own() -> None:
     for task in he2019_tasks():
         assert choose_model(task.output, task.table) == task.model
         assert MODELS[task.model].cited == "He_2019"
+
+
+def test_a_model_that_gives_a_row_no_density_is_refused(
+    frictional: Comparison, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would be infinitely worse, and its weight a division by nothing."""
+    rows = np.array(frictional.candidates[1].rows)
+    rows[2] = -np.inf
+    impossible = replace(
+        frictional.candidates[1], loo=replace(frictional.candidates[1].loo, elpd_rows=rows)
+    )
+    given = iter([frictional.candidates[0], impossible])
+    monkeypatch.setattr(comparison, "_candidate", lambda *_: next(given))
+    problems = [c.calibration.problem for c in frictional.candidates]
+    with pytest.raises(CalibError, match="gives 1 of .* rows no density") as refused:
+        compare_problems(problems, 1)
+    assert f"line {problems[1].table.lines[2]}" in refused.value.where
