@@ -170,7 +170,7 @@ def test_a_model_that_gives_a_row_no_density_is_refused(
     )
     given = iter([frictional.candidates[0], impossible])
     monkeypatch.setattr(comparison, "_candidate", lambda *_: next(given))
-    problems = [c.calibration.problem for c in frictional.candidates]
-    with pytest.raises(CalibError, match="gives 1 of .* rows no density") as refused:
+    problems = [c.calibration.problem for c in frictional.candidates[:2]]
+    with pytest.raises(CalibError, match=r"gives 1 of \d+ rows no density") as refused:
         compare_problems(problems, 1)
     assert f"line {problems[1].table.lines[2]}" in refused.value.where
