@@ -20,7 +20,7 @@ _PACKAGES = (
     "terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-base", "arviz-stats", "xarray",
     "matplotlib", "corner", "pillow", "jinja2", "h5netcdf", "h5py",
 )  # fmt: skip
-_SOURCES = (".py", ".j2", ".css", ".toml")
+_SOURCES = (".py", ".j2", ".css", ".js", ".toml")
 
 
 @dataclass(frozen=True)

@@ -23,11 +23,11 @@ def told() -> Iterator[None]:
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("calib: %(message)s"))
     _log.addHandler(handler)
-    _log.setLevel(logging.INFO)
+    _log.setLevel(logging.DEBUG)
     try:
         here = Environment.here()
         for facts in (here.versions, here.machine):
-            _log.info(", ".join(f"{name} {value}" for name, value in facts.items()))
+            _log.debug(", ".join(f"{name} {value}" for name, value in facts.items()))
         yield
     finally:
         _log.removeHandler(handler)
@@ -75,7 +75,7 @@ def progress_bars() -> Iterator[Callable[[str, int, int], None]]:
         if tasks:
             bars.stop()
         for t in bars.tasks:
-            _log.info("%s: %g of %g, %.1f s", t.description, t.completed, t.total, t.elapsed)
+            _log.debug("%s: %g of %g, %.1f s", t.description, t.completed, t.total, t.elapsed)
 
 
 def posterior_table(calibration: Calibration) -> None:

@@ -73,7 +73,7 @@ def read_table(
             "there are column names but no rows", where=file.source,
             allowed="at least one row below the column names", mend="add the measurements",
         )  # fmt: skip
-    _log.info("%s: %d rows of %s", file.source, len(parts.lines), ", ".join(values))
+    _log.debug("%s: %d rows of %s", file.source, len(parts.lines), ", ".join(values))
     return Table(
         values, file.source, np.array(parts.lines), file.header, tuple(parts.text), file.sha256,
         label, ignored,

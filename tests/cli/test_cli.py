@@ -102,7 +102,8 @@ def test_fit_predict_and_read_the_numbers(calib: Calib, he2019: Path, tmp_path: 
 
     written = calib("predict", "run", "--at", "at.csv", "--out", "bands.csv")
     assert written.code == 0
-    assert "4 rows written to bands.csv; 1 outside the calibrated range" in written.out
+    assert written.out == "4 rows written to bands.csv\n"
+    assert "1 rows lie outside the calibrated range" in written.err
     assert Path("bands.csv").read_text().splitlines()[0].split(",") == header
 
 
