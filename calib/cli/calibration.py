@@ -277,9 +277,9 @@ def predict(
     if not converged:
         columns["converged"] = ["no"] * len(table)
     outside = sum(bool(flags) for flags in prediction.outside)
-    if outside and out is None:
+    if outside:
         print(f"calib: {outside} rows lie outside the calibrated range", file=sys.stderr)
-    _give(columns, out, f"; {outside} outside the calibrated range")
+    _give(columns, out)
     finish(0 if converged else 3, {"columns": _lists(columns)}, outside=outside)
 
 
@@ -308,13 +308,13 @@ def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | No
     finish(0, {"columns": _lists(columns)}, outside=beyond)
 
 
-def _give(columns: Mapping[str, Any], out: Path | None, told: str = "") -> None:
-    """Write columns to a file, saying so and something else, or print them."""
+def _give(columns: Mapping[str, Any], out: Path | None) -> None:
+    """Write columns to a file, or print them."""
     from calib.data import write_table
 
     if out is not None:
         write_table(out, columns)
-        print(f"{len(next(iter(columns.values())))} rows written to {out}{told}")
+        print(f"{len(next(iter(columns.values())))} rows written to {out}")
         return
     print(",".join(columns))
     for row in zip(*columns.values(), strict=True):
