@@ -285,7 +285,7 @@ def test_an_emulator_and_a_diagnosis_refuse_another_noise(
     problem = problem_with(tmp_path, STUDENT, he2019_table("rut_depth"))
     with pytest.raises(CalibError, match="an emulator takes normal noise"):
         emulated(problem, 1)
-    monkeypatch.setattr("calib.gap.case.build_problem", lambda model, lab: problem)
+    monkeypatch.setattr("calib.gap.case.build_problem", lambda model, lab, priors: problem)
     with pytest.raises(CalibError, match="a diagnosis takes normal noise"):
         campaigns(make_case())
     uncertain = replace(problem.bound.model, uncertain=lambda theta, conditions: None)

@@ -107,7 +107,8 @@ def test_a_stack_is_written_and_predicts(frictional: Comparison, tmp_path: Path)
     folder.mkdir()
     written = write_comparison(frictional, folder, ["calib", "compare"], "plate_width_mm=100")
     assert json.loads((folder / "comparison.json").read_text()) == written
-    assert written == document(frictional, "plate_width_mm=100")
+    numbers = document(frictional, "plate_width_mm=100")
+    assert {key: written[key] for key in numbers} == numbers
     page = (folder / "index.html").read_text()
     assert frictional.sentence in page
     assert "held-out elpd" in page
