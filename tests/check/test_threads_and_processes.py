@@ -86,6 +86,7 @@ def test_two_threads_of_linear_algebra_give_the_same_numbers(one_thread: str) ->
     assert in_a_process(2) == one_thread
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_numbers(one_thread: str) -> None:
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         found = dict(zip(OUTPUTS, pool.map(numbers, OUTPUTS), strict=True))
@@ -94,6 +95,7 @@ def test_two_processes_give_the_same_numbers(one_thread: str) -> None:
         assert json.loads(json.dumps(found[output][output])) == together[output]
 
 
+@pytest.mark.slow
 def test_two_workers_make_the_same_report(tmp_path: Path) -> None:
     """With a row that is so far off that leaving it out needs a fit of its own."""
     (task,) = (task for task in he2019_tasks() if task.output == "bulk_density")
@@ -113,6 +115,7 @@ def test_two_workers_make_the_same_report(tmp_path: Path) -> None:
     assert hashes[0] == hashes[1]
 
 
+@pytest.mark.slow
 def test_two_workers_simulate_the_same(tmp_path: Path) -> None:
     replicates = []
     for workers in (1, 2):

@@ -38,7 +38,11 @@ def test_every_row_of_the_table_is_used() -> None:
         "summary.json/models/rut_depth/sampling/reasons/0",
         "summary.json/models/bulk_density/validation/refitted/0", "comparison.json/verdict",
         *(f"comparison.json/models/reece/{x}" for x in ("elpd", "pareto_k_max", "weight")),
-        "comparison.json/models/reece/told_apart",
+        "comparison.json/models/reece/told_apart", "summary.json/models/rut_depth/warnings/0",
+        *(
+            f"summary.json/models/rut_depth/noise/against_normal/{x}"
+            for x in ("elpd_difference", "preferred", "sentence")
+        ),
     ]  # fmt: skip
     first = {next((i for i, (p, _) in enumerate(_PATTERNS) if p.fullmatch(x)), None) for x in paths}
     unused = [TABLE[i][0] for i in range(len(TABLE)) if i not in first]

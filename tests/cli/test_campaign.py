@@ -96,6 +96,7 @@ def test_what_can_be_mended_ends_with_two(calib):
     assert calib("seed = 1\n" + FIT, "--overwrite")[0] == 0
 
 
+@pytest.mark.slow
 def test_control_c_says_what_is_kept_and_nothing_else(tmp_path):
     (tmp_path / "plan.toml").write_text(RANKS)
     process = subprocess.Popen(

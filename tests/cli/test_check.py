@@ -84,6 +84,7 @@ def test_what_cannot_be_checked_ends_with_2(calib: Calib, run: Path) -> None:  #
     assert "run.json" in damaged.err
 
 
+@pytest.mark.slow
 def test_a_report_without_posteriors_is_whole(calib: Calib) -> None:  # noqa: F811
     """And one with an output that failed can be checked too."""
     embedded.write(Path("data"))

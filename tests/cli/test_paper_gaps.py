@@ -58,6 +58,7 @@ def test_a_folder_that_cannot_be_made_is_said_so(calib: Calib) -> None:  # noqa:
     assert_refused(refused, ["file/gaps", "cannot be written"])
 
 
+@pytest.mark.slow
 def test_the_report_of_the_embedded_data_has_the_section(
     calib: Calib,  # noqa: F811
     monkeypatch: pytest.MonkeyPatch,

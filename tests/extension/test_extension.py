@@ -102,6 +102,7 @@ def test_without_its_file_a_model_is_unknown(
     assert "--models FILE" in refused.err
 
 
+@pytest.mark.slow
 def test_a_traction_model_of_ones_own_is_simulated_and_reported(run: Calib) -> None:
     own = ["--models", HERE / "one_tyre.py"]
     Path("pull.csv").write_text(run("template", "one_tyre", *own).out)

@@ -242,6 +242,7 @@ umbridge.serve_models([Wheel()], PORT)
 """
 
 
+@pytest.mark.slow
 def test_a_model_behind_a_server(run: Calib) -> None:
     pytest.importorskip("umbridge", reason="there is no umbridge to serve a model with")
     port = _free_port()

@@ -13,7 +13,7 @@ from calib.data import table_from_arrays, write_table
 from calib.errors import CalibError
 from calib.gap.case import Case, campaigns, case_files, case_from_run, read_case
 from calib.gap.corrected import load_corrected, save_corrected
-from calib.gap.diagnose import diagnose
+from calib.gap.diagnose import diagnose_once
 from calib.gap.effects import EFFECTS
 from calib.gap.oddities import oddities
 from calib.gap.provenance import case_hashes, inputs_record
@@ -55,7 +55,8 @@ def test_units_in_column_names_are_converted(tmp_path):
         (
             'calibration = "lab.csv"\nfield = "field.csv"\nprdict = "fresh.csv"\n[models]\n'
             'rut_depth = "bekker"\n',
-            "unknown key prdict\n  allowed: calibration, field, predict, models, priors, context\n"
+            "unknown key prdict\n  allowed: calibration, field, predict, models, priors, "
+            "covariates, context\n"
             "  to mend: was predict meant?",
         ),
         (
@@ -205,7 +206,7 @@ def test_a_case_may_bring_the_priors_of_its_simulators(tmp_path):
     assert case_files(folder)[1]["priors.drawbar_pull"] == folder / "mine.toml"
     (output,) = campaigns(case).outputs
     assert output.problem.priors.text == text
-    found = diagnose(case, 1, effects={"force_offset": EFFECTS["force_offset"]})
+    found = diagnose_once(case, 1, effects={"force_offset": EFFECTS["force_offset"]})
     (tmp_path / "out").mkdir()
     save_corrected(found.corrected, tmp_path / "out")
     kept = load_corrected(tmp_path / "out").data.outputs[0].problem.priors

@@ -44,6 +44,7 @@ def test_a_clean_case_is_left_as_it_is():
     assert len(data.outputs[0].rows) == len(campaigns(case).outputs[0].rows)
 
 
+@pytest.mark.slow
 def test_many_rows_that_lie_off_are_no_outliers():
     case = make_case(None, models=PULL_ONLY)
     for row in range(0, 27, 3):

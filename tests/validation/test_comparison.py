@@ -127,6 +127,7 @@ def test_a_stack_is_written_and_predicts(frictional: Comparison, tmp_path: Path)
     )
 
 
+@pytest.mark.slow
 def test_measured_plates_prefer_the_law_without_width() -> None:
     """Sand of which the smaller plates sank deeper: neither width term can follow."""
     path = SHARED / "data" / "cmu_plate_sinkage.csv"

@@ -38,6 +38,7 @@ def test_density_from_penetration_resistance_says_little():
     assert 49 <= scores.coverage[0.9].hits <= 64
 
 
+@pytest.mark.slow
 @here
 def test_a_rigid_wheel_in_sand_has_no_peak_that_its_data_determine():
     calibration = fitted(SHARED / "cases" / "real-000" / "lab.csv", "magic_formula")

@@ -57,6 +57,7 @@ def test_two_workers_write_the_same_bytes(site, serial, tmp_path):
     assert content(tmp_path / "two") == content(serial)
 
 
+@pytest.mark.slow
 def test_a_killed_worker_and_a_killed_client_lose_nothing(site, serial, tmp_path):
     out = tmp_path / "out"
     client = start(site, out, "--workers", "2")

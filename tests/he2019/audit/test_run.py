@@ -70,6 +70,7 @@ def test_known_verdicts(audit):
     assert {key: audit[key].verdict for key in expected} == expected
 
 
+@pytest.mark.slow
 def test_a_misprint_changes_what_rests_on_it_and_nothing_else(audit, rut_calibration):
     wrong = flipped("Table 5: c2")
     found = run_audit(

@@ -51,6 +51,7 @@ def few() -> dict[float, list[dict]]:
     return records(CHEAP, FEW, (1.0, 0.5))
 
 
+@pytest.mark.slow
 def test_a_few_posteriors_of_the_cheapest_model_are_calibrated(few) -> None:
     found = score_model(few[1.0])
     assert found.unconverged == 0

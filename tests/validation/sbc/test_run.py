@@ -75,6 +75,7 @@ def test_a_run_is_resumed_and_extended(out: Path, tmp_path: Path) -> None:
         assert (path.stat().st_mtime_ns == changed) == (path != files[2])
 
 
+@pytest.mark.slow
 def test_two_processes_give_what_one_gives(tmp_path: Path) -> None:
     for workers in (1, 2):
         run_sbc(
