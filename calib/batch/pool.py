@@ -103,7 +103,9 @@ HERE = Pool()
 
 
 @contextmanager
-def pool(workers: int, modules: Sequence[str] = _REPORT) -> Iterator[Pool]:
+def pool(
+    workers: int, modules: Sequence[str] = _REPORT, files: Sequence[Path] = ()
+) -> Iterator[Pool]:
     """Yield a pool of some processes; of this one with a single worker.
 
     Parameters
@@ -112,6 +114,8 @@ def pool(workers: int, modules: Sequence[str] = _REPORT) -> Iterator[Pool]:
         A script that asks for more than one needs ``if __name__ == "__main__":``.
     modules : sequence of str, optional
         What the processes import while the caller still does: what a report needs by default.
+    files : sequence of Path, optional
+        Python files of the user's own that they run besides those that are loaded here.
     """
     if workers < 2:
         yield HERE
@@ -123,7 +127,7 @@ def pool(workers: int, modules: Sequence[str] = _REPORT) -> Iterator[Pool]:
         context.set_forkserver_preload(list(modules))
     # Handed over: a server that forks keeps the environment it was started with.
     executor = ProcessPoolExecutor(
-        workers, mp_context=context, initializer=_begin, initargs=(loaded_files(),)
+        workers, mp_context=context, initializer=_begin, initargs=([*loaded_files(), *files],)
     )
     # A first process starts now, not when there is work for it; it starts where it can wait.
     Thread(target=_start, args=(executor,), daemon=True).start()

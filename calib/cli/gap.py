@@ -73,7 +73,8 @@ def diagnose(
         emulations = prepare_case(given, run, seed, workers, tell)
     told = [say(what, emulation) for what, emulation in emulations]
     manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
-    with pool(workers, ["calib.report.page.diagnosis"]) as side:
+    own_files = [] if effects is None else [effects]
+    with pool(workers, ["calib.report.page.diagnosis"], own_files) as side:
         found = find(given, seed, effects={**EFFECTS, **own}, pool=side)
         from calib.report.page.diagnosis import write_page
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
-from calib.data.quantities import OUTPUTS, role_of
+from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
+from calib.data.units_check import mixed_units
 from calib.errors import CalibError
 from calib.gap.case import MAX_RATIO, Case
 from calib.models import get_model
@@ -61,7 +62,8 @@ def without_far_conditions(case: Case) -> tuple[Case, list[str]]:
             continue
         if case.covariates.get(name):  # a category has no distances
             continue
-        far = _far(np.concatenate([lab[name], field[name]]))
+        both = np.concatenate([lab[name], field[name]])
+        far = _far(both) | _in_another_unit(name, both)
         in_lab, in_field = (np.flatnonzero(part) for part in (far[: len(lab)], far[len(lab) :]))
         if in_lab.size:
             said.append(_said(lab, name, in_lab))
@@ -92,6 +94,15 @@ def _far(values: Array) -> NDArray[np.bool_]:
     return np.asarray((u < low - reach) | (u > high + reach))
 
 
+def _in_another_unit(name: str, values: Array) -> NDArray[np.bool_]:
+    """Which few rows hold another row's value in another unit."""
+    known = QUANTITIES.get(name)
+    if known is None:
+        return np.zeros(values.size, dtype=np.bool_)
+    odd, _ = mixed_units(known, values)
+    return odd & (odd.sum() <= max(1, int(_MOST * values.size)))
+
+
 def _blanked(table: Table, name: str, rows: NDArray[np.int64]) -> Table:
     columns = {column: np.array(values) for column, values in table.columns.items()}
     columns[name][rows] = np.median(np.delete(columns[name], rows))
@@ -104,6 +115,6 @@ def _blanked(table: Table, name: str, rows: NDArray[np.int64]) -> Table:
 def _said(table: Table, name: str, rows: NDArray[np.int64]) -> str:
     at = ", ".join(f"line {table.lines[row]} ({name} = {table[name][row]:.4g})" for row in rows)
     return (
-        f"{table.source}, {at}: far from all other rows of both campaigns; left out as a mistake "
-        "(if it is none, add rows between)"
+        f"{table.source}, {at}: far from all other rows of both campaigns, or as in another unit; "
+        "left out as a mistake (if it is none, add rows between)"
     )

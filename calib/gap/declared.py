@@ -22,7 +22,9 @@ from calib.data.table import MAX_TEXT_ROWS
 from calib.errors import CalibError
 from calib.models.base import Array
 
-__all__ = ["NUMBER", "cells", "declared_covariates", "with_declared"]
+__all__ = [
+    "NUMBER", "cells", "declared_covariates", "new_values", "with_declared", "words_of",
+]  # fmt: skip
 
 # What stands for the values of a column of numbers.
 NUMBER: tuple[str, ...] = ()
@@ -65,13 +67,13 @@ def declared_covariates(content: object, tables: tuple[Table, ...]) -> dict[str,
         if kind == "number":
             found[name] = NUMBER
             continue
-        seen = sorted({cell for table in tables for cell in _column(table, name)})
+        seen = sorted({cell for table in tables for cell in _column(table, name)} - {""})
         levels = tuple(dict.fromkeys(given or seen))
         if not 1 < len(levels) <= _MOST_LEVELS:
             raise _error(
                 f"{name} has {len(levels)} different values",
                 f"from 2 to {_MOST_LEVELS}",
-                "group them, or declare a number",
+                "group them, declare a number, or leave it out",
             )
         found[name] = levels
     return found
@@ -90,6 +92,26 @@ def with_declared(table: Table, covariates: Mapping[str, tuple[str, ...]]) -> Ta
     added = {name: _codes(table, name, levels) for name, levels in covariates.items()}
     ignored = tuple(name for name in table.ignored if name not in covariates)
     return replace(table, columns={**table.columns, **added}, ignored=ignored)
+
+
+def words_of(covariates: Mapping[str, tuple[str, ...]], name: str, low: float, high: float) -> str:
+    """Say in its own words which values of a category lie between two places; empty for numbers."""
+    return ", ".join(covariates.get(name, ())[int(round(low)) : int(round(high)) + 1])
+
+
+def new_values(covariates: Mapping[str, tuple[str, ...]], lab: Table, field: Table) -> list[str]:
+    """Say which values of categories the field has and the laboratory has not."""
+    said = []
+    for name, levels in covariates.items():
+        if not levels:
+            continue
+        new = [levels[int(j)] for j in np.setdiff1d(field[name], lab[name])]
+        if new:
+            said.append(
+                f"{name}: {', '.join(new)} in the field only; a constant difference of these rows "
+                "cannot be separated from anything else that all of them share"
+            )
+    return said
 
 
 def cells(
@@ -112,8 +134,9 @@ def _is_known(name: str) -> bool:
 def _column(table: Table, name: str) -> list[str]:
     if name not in table.header:
         raise CalibError(
-            f"there is no column {name!r}", where=table.source, allowed=", ".join(table.header),
-            mend="add it, or leave it out of [covariates] in case.toml",
+            f"there is no column {name!r}", where=table.source,
+            allowed="every column that the case declares in [covariates]",
+            mend="add it; before a diagnosis it can be left out of case.toml as well",
         )  # fmt: skip
     if not table.text:
         raise _error(
@@ -129,6 +152,8 @@ def _codes(table: Table, name: str, levels: tuple[str, ...]) -> Array:
     values = np.empty(len(table))
     for i, cell in enumerate(_column(table, name)):
         try:
+            if not cell:
+                raise ValueError
             values[i] = levels.index(cell) if levels else float(cell)
             if not np.isfinite(values[i]):
                 raise ValueError
@@ -136,8 +161,7 @@ def _codes(table: Table, name: str, levels: tuple[str, ...]) -> Array:
             raise CalibError(
                 f"{name} is {cell!r}", where=f"{table.source}, line {table.lines[i]}",
                 allowed=", ".join(levels) or "a number, with a decimal point",
-                mend="correct it, or list it among the values in [covariates] of case.toml"
-                if levels else "correct it, or delete the row",
+                mend="write one of these" if levels else "correct it, or delete the row",
             ) from None  # fmt: skip
     return values
 

@@ -13,6 +13,7 @@ from calib.batch.threads import one_thread
 from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns, read_case
 from calib.gap.context import Context
 from calib.gap.corrected import Corrected, conditions_outside
+from calib.gap.declared import new_values
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.hypotheses import dependences, inseparable
 from calib.gap.inclusion import UNLISTED, Inclusion, inclusion, inclusion_probability
@@ -162,7 +163,12 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
         seed,
         causes,
         _without_context(case, seed, effects),
-        (*case.notes, *oddities(case.lab, case.field, case.models), *said),
+        (
+            *case.notes,
+            *oddities(case.lab, case.field, case.models),
+            *new_values(case.covariates, case.lab, case.field),
+            *said,
+        ),
     )
 
 
@@ -215,12 +221,14 @@ def _beyond(corrected: Corrected, before: Mapping[str, Array]) -> list[str]:
 
 def _confounded(data: Campaigns, causes: Inclusion) -> list[str]:
     """Warn of causes that go with a condition which differs between the campaigns only."""
+    # What a user declared is of interest, however probable it is.
+    own = set(data.case.covariates)
     return [
         f"{name}: this condition is one value in the laboratory and another in the field; what "
         "depends on it cannot be separated from anything else that changed between them"
         for name, effect in dependences(data).items()
         if name in causes.causes
-        and causes.causes[name].probability >= _WORTH_SAYING
+        and (causes.causes[name].probability >= _WORTH_SAYING or own & set(effect.covariates))
         and inseparable(data, effect)
     ]
 

@@ -11,6 +11,7 @@ import numpy as np
 from calib.data import write_table
 from calib.data.quantities import OUTPUTS
 from calib.gap.corrected import save_corrected
+from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
 from calib.gap.inclusion import Included
@@ -77,7 +78,10 @@ def document(found: Diagnosis) -> dict[str, Any]:
         "next_measurement": [
             {
                 "separates": list(m.separates),
-                "conditions": dict(m.conditions),
+                "conditions": {
+                    name: words_of(found.data.case.covariates, name, value, value) or value
+                    for name, value in m.conditions.items()
+                },
                 "gain_nats": m.gain_nats,
             }
             for m in found.next_measurements

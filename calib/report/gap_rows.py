@@ -14,7 +14,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
 from calib.gap.where import Region
 from calib.models.base import Array
-from calib.report.labels import MINUS, Axis, axis_of
+from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of
 
 __all__ = [
     "EVERYWHERE", "OutputRows", "best_fit", "best_of", "output_axis",
@@ -58,7 +58,7 @@ def title_of(found: Diagnosis, name: str) -> str:
 
 def unit_after(axis: Axis) -> str:
     """Return a unit to be put after a number; nothing for counts."""
-    return "" if axis.unit == "number" else f" {axis.unit}"
+    return "" if axis.unit in ("number", NO_UNIT) else f" {axis.unit}"
 
 
 def region_text(found: Diagnosis, region: Region) -> str:

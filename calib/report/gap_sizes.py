@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from calib.data.quantities import physical_role, role_of
 from calib.gap.covariates import columns_over
+from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit
@@ -293,4 +294,6 @@ def _end(
     axis = axis_of(column)
     low, high = (axis.value_text(float(f(values[inside]))) for f in (np.min, np.max))
     span = low if low == high else f"{low} to {high}"
+    ends_at = float(values[inside].min()), float(values[inside].max())
+    span = words_of(found.data.case.covariates, column, *ends_at) or span
     return f"at {axis.name.lower()} {span}{unit_after(axis)}", inside

@@ -7,14 +7,14 @@ one that is stated. `docs/statistics/likelihood.md` lists them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from pathlib import PurePath
+from collections.abc import Iterable
 
 import numpy as np
 from scipy import stats
 
 from calib.data import Table
-from calib.data.quantities import QUANTITIES, Quantity
+from calib.data.quantities import QUANTITIES
+from calib.data.units_check import lines_of, source_of, unit_notes
 from calib.inference.problem import Problem
 from calib.models.base import Array
 from calib.validation.outliers import linear, outlying_notes
@@ -26,9 +26,6 @@ LEVEL = 1e-3
 # Chance that readings agree to the last digit, from which equal rows are taken for copies.
 _COPIED = 0.01
 _FEWEST, _FEWEST_FOR_TAILS = 8, 20
-# A psi is so many kPa; levels of a design that are so far apart to this part are no coincidence.
-_PSI, _NEAR, _FEW_LEVELS = 6.894757, 2e-3, 6
-_MOST_NAMED = 5
 
 
 def warnings_of(problem: Problem, t: Array) -> tuple[str, ...]:
@@ -60,38 +57,11 @@ def file_notes(problem: Problem, scatter: float) -> tuple[str, ...]:
         quantity = QUANTITIES[name]
         if np.unique(values).size == 1:
             found.append(
-                f"{_source(problem.table)}: {quantity.word} is the same in all rows; what depends "
-                "on it comes from the prior, and predictions elsewhere with it"
+                f"{source_of(problem.table)}: {quantity.word} is the same in all rows; what "
+                "depends on it comes from the prior, and predictions elsewhere with it"
             )
-        found += _unusual(problem.table, quantity, values)
-        found += _mixed_units(problem.table, quantity, values)
+        found += unit_notes(problem.table, quantity, values)
     return (*found, *_copies(problem, scatter))
-
-
-def _unusual(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
-    if quantity.usual is None:
-        return
-    low, high = quantity.usual
-    odd = (values < low) | (values > high)
-    if odd.any():
-        yield (
-            f"{_source(table)}, {_lines(table, odd)}: {quantity.word} is outside {low:g} to "
-            f"{high:g} {quantity.unit}, where it usually lies; check the unit in the column name"
-        )
-
-
-def _mixed_units(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
-    """Levels that are one number in psi and in kPa."""
-    levels = np.unique(values)
-    if quantity.kind != "pressure" or not 2 <= levels.size <= _FEW_LEVELS or levels[0] <= 0.0:
-        return
-    ratio = levels[None, :] / levels[:, None]
-    small = levels[(np.abs(ratio / _PSI - 1.0) < _NEAR).any(axis=1)]
-    if small.size:
-        yield (
-            f"{_source(table)}, {_lines(table, np.isin(values, small))}: {quantity.word} is 6.895 "
-            "times smaller than in other rows, as psi is that were typed as kPa; check the unit"
-        )
 
 
 def _copies(problem: Problem, scatter: float) -> Iterable[str]:
@@ -111,7 +81,7 @@ def _copies(problem: Problem, scatter: float) -> Iterable[str]:
     if stats.poisson.sf(int(copied.sum()) - 1, pairs * min(agree, 1.0)) > _COPIED:
         return
     yield (
-        f"{_source(table)}, {_lines(table, copied)}: {_rows(int(copied.sum()))} another one "
+        f"{source_of(table)}, {lines_of(table, copied)}: {_rows(int(copied.sum()))} another one "
         "exactly; a copy counts as a measurement and narrows every width: delete it, unless it was "
         "measured"
     )
@@ -171,10 +141,10 @@ def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[st
         return
     r = float(np.clip(1.0 - d / mean, 0.0, 0.99))
     yield (
-        f"{_source(table)}: residuals of neighbouring rows are alike (correlation {r:.2f}), as in "
-        "rows of one continuous run, or where the curve misses a pattern; the rows are worth about "
-        f"{max(1.0, n * (1.0 - r) / (1.0 + r)):.0f} independent ones, not {n}, so that widths are "
-        "too narrow: thin them, or look at the residuals"
+        f"{source_of(table)}: residuals of neighbouring rows are alike (correlation {r:.2f}), as "
+        "in rows of one continuous run, or where the curve misses a pattern; the rows are worth "
+        f"about {max(1.0, n * (1.0 - r) / (1.0 + r)):.0f} independent ones, not {n}, so that "
+        "widths are too narrow: thin them, or look at the residuals"
     )
 
 
@@ -219,7 +189,7 @@ def _uneven(problem: Problem, residual: Array, judged: np.ndarray) -> Iterable[s
             word, stem = QUANTITIES[name].word, QUANTITIES[name].stem
             grows = "grows" if found.statistic > 0.0 else "falls"
             yield (
-                f"{_source(problem.table)}: the scatter {grows} with {word} (rank correlation "
+                f"{source_of(problem.table)}: the scatter {grows} with {word} (rank correlation "
                 f"{found.statistic:.2f}); one sigma is too wide at one end and too narrow at the "
                 f'other: noise_depends_on = "{stem}" in the prior file lets it change'
             )
@@ -231,26 +201,14 @@ def _heavy_tailed(problem: Problem, residual: Array) -> Iterable[str]:
         return
     if stats.kurtosistest(residual, alternative="greater").pvalue < LEVEL:
         yield (
-            f"{_source(problem.table)}: the residuals have heavier tails than normal noise (excess "
-            f"kurtosis {stats.kurtosis(residual):.1f}); single readings then weigh too much: "
-            'correct those that are wrong, or write family = "student_t" in the prior file'
+            f"{source_of(problem.table)}: the residuals have heavier tails than normal noise "
+            f"(excess kurtosis {stats.kurtosis(residual):.1f}); single readings then weigh too "
+            'much: correct those that are wrong, or write family = "student_t" in the prior file'
         )
 
 
 def _scatter(problem: Problem, t: Array) -> float:
     return float(problem.theta(t[None])[0, -1])
-
-
-def _source(table: Table) -> str:
-    # Not the path: the page goes to others.
-    return PurePath(table.source).name
-
-
-def _lines(table: Table, rows: np.ndarray) -> str:
-    lines: Sequence[int] = table.lines[rows].tolist()
-    named = ", ".join(map(str, lines[:_MOST_NAMED]))
-    more = f" and {len(lines) - _MOST_NAMED} more" if len(lines) > _MOST_NAMED else ""
-    return f"{'line' if len(lines) == 1 else 'lines'} {named}{more}"
 
 
 def _rows(n: int) -> str:

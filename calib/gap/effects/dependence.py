@@ -15,6 +15,7 @@ y' = y exp(d_j) + a_j W, with none for the one that is most frequent in the labo
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -135,15 +136,19 @@ class DiffersBy(Effect):
         self.outputs = tuple(logs)
         self.covariates = (column,)
         self._levels = [j for j in range(len(levels)) if j != usual]
+        slug = {j: re.sub(r"\W+", "_", levels[j]).strip("_") or str(j) for j in self._levels}
+        if len(set(slug.values())) < len(slug):
+            slug = {j: f"{word}_{j}" for j, word in slug.items()}
         self._additive = tuple(o for o, log in logs.items() if not log and o in _FORCES)
         self.parameters = (
-            *(f"{output}_factor_{j}" for output in logs for j in self._levels),
-            *(f"{output}_offset_{j}" for output in self._additive for j in self._levels),
+            *(f"{output}_factor_{slug[j]}" for output in logs for j in self._levels),
+            *(f"{output}_offset_{slug[j]}" for output in self._additive for j in self._levels),
         )
+        reference = re.sub(r"\W+", " ", levels[usual]).strip()
         self.priors = f'model = "{self.name}"\n' + "".join(
-            f'\n[parameters.{p}]\ndist = "normal"\nmean = 0.0\n'
+            f'\n[parameters."{p}"]\ndist = "normal"\nmean = 0.0\n'
             f'sd = {0.02 if "_offset_" in p else 0.3}\nunit = "1"\n'
-            f'reason = "Difference of {column} number {p.rsplit("_", 1)[1]} from the usual one"\n'
+            f'reason = "How it differs from {reference}, the most frequent"\n'
             'source = "Of the order of the scatter between laboratories and operators"\n'
             for p in self.parameters
         )
