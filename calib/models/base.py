@@ -8,6 +8,7 @@ published coefficients, which are reported beside them.
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
@@ -103,7 +104,19 @@ class _Plain:
                 allowed="predict(theta (k, d), conditions) -> (k, n)",
                 mend="declare it with a function that predicts its output",
             )
-        found = np.asarray(self.model.predict(theta, rows), dtype=np.float64)
+        try:
+            found = np.asarray(self.model.predict(theta, rows), dtype=np.float64)
+        except CalibError:
+            raise
+        except Exception as error:  # of the user's own code
+            frame = traceback.extract_tb(error.__traceback__)[-1]
+            raise CalibError(
+                f"predict of the model {self.model.name} fails: {type(error).__name__}: {error}",
+                where=f"{frame.filename}, line {frame.lineno}",
+                allowed=f"conditions {', '.join(self.model.conditions)}; parameters in columns of "
+                f"theta (k, {len(self.model.parameters)})",
+                mend="correct the function",
+            ) from error
         n = n or next(iter(rows.values())).size
         if found.shape != (theta.shape[0], n):
             raise CalibError(

@@ -41,6 +41,17 @@ def test_a_mistyped_condition_is_set_aside_and_said_so(campaign):
     assert f"(average_ground_pressure_kpa = {typed:.4g}): far from all other rows" in said
 
 
+def test_one_pressure_in_the_other_unit_is_set_aside():
+    case = make_case(None, models=PULL_ONLY)
+    bad = changed(case, "field", "inflation_pressure_psi", [5], 6.894757)
+    found, (said,) = without_far_conditions(bad)
+    assert np.isnan(found.field["drawbar_pull_kn"][5])
+    assert "or as in another unit" in said
+    # Most rows of one campaign are no mistake of typing.
+    whole = changed(case, "field", "inflation_pressure_psi", slice(None), 6.894757)
+    assert without_far_conditions(whole) == (whole, [])
+
+
 def test_a_mistyped_condition_names_no_cause():
     bad = changed(make_case(None), "field", "average_ground_pressure_kpa", [5], 1000.0)
     few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")}

@@ -13,6 +13,7 @@ from calib.data import read_table
 from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.corrected import load_corrected, predict_columns, save_corrected
+from calib.gap.declared import new_values, words_of
 from calib.gap.diagnose import diagnose_once
 from calib.gap.effects import EFFECTS
 from calib.gap.provenance import case_hashes, inputs_record
@@ -76,6 +77,10 @@ def test_a_category_is_found_and_kept_by_its_names(tmp_path):
     found = diagnose_once(read_case(folder), 1, effects=FEW)
     assert found.data.case.covariates == {"operator": ("Berg", "Dahl", "Lind")}
     assert found.inclusion.causes["depends_on_operator"].probability > 0.9
+    (effect,) = found.ranking.best("depends_on_operator").forward.hypothesis.effects
+    assert set(effect.parameters) >= {"pull_factor_Dahl", "pull_offset_Dahl"}
+    assert words_of(found.data.case.covariates, "operator", 1.0, 1.0) == "Dahl"
+    assert words_of(found.data.case.covariates, "operator", 1.0, 2.0) == "Dahl, Lind"
     recorded = json.loads(inputs_record(found.data.case, 1))
     assert recorded["covariates"] == case_hashes(folder)["covariates"] == {"operator": "category"}
     again = saved(found, tmp_path)
@@ -103,6 +108,25 @@ def test_a_category_that_differs_between_the_campaigns_only_cannot_be_separated(
     assert any("site: this condition is one value" in w for w in found.warnings) or any(
         "depends_on_site" in w and "cannot be separated" in w for w in found.warnings
     )
+
+
+def test_an_empty_cell_is_no_value_of_a_category(tmp_path):
+    folder = case_with(tmp_path / "case", "operator", operators, operators, '"category"')
+    text = (folder / "field.csv").read_text().replace("Lind", "", 1)
+    (folder / "field.csv").write_text(text)
+    with pytest.raises(CalibError, match="operator is ''") as refused:
+        read_case(folder)
+    assert refused.value.allowed == "Berg, Dahl, Lind"
+
+
+def test_values_of_the_field_alone_are_named(tmp_path):
+    folder = case_with(
+        tmp_path / "case", "operator", lambda n: ["Berg", "Lind"] * (n // 2) + ["Lind"] * (n % 2),
+        operators, '"category"',
+    )  # fmt: skip
+    case = read_case(folder)
+    (said,) = new_values(case.covariates, case.lab, case.field)
+    assert said.startswith("operator: Dahl in the field only")
 
 
 @pytest.mark.parametrize(

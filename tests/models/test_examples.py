@@ -5,7 +5,7 @@ import pytest
 
 from calib.data import check_enough, check_varies, read_table
 from calib.errors import CalibError
-from calib.models import MODELS, example_csv
+from calib.models import MODELS, Model, example_csv
 
 
 @pytest.mark.parametrize("name", MODELS)
@@ -36,3 +36,19 @@ def test_a_model_says_when_it_applies(name: str) -> None:
     assert model.applies.endswith(".")
     assert model.latex
     assert model.source
+
+
+def test_a_mistake_in_ones_own_predict_is_told_by_its_line():
+    def predict(theta, conditions):
+        return theta[:, :1] * conditions["load"]
+
+    model = Model(
+        name="mistaken", title="Mistaken", output="drawbar_pull_kn", conditions=("slip_ratio",),
+        parameters=("a",), predict=predict, response="identity",
+    )  # fmt: skip
+    with pytest.raises(CalibError, match="predict of the model mistaken fails: KeyError") as told:
+        model.bind({"slip_ratio": np.array([0.1, 0.2])}).predict(
+            np.ones((1, 1)), {"slip_ratio": np.array([0.1, 0.2])}
+        )
+    assert "test_examples.py, line" in told.value.where
+    assert "slip_ratio" in told.value.allowed
