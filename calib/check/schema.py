@@ -52,7 +52,10 @@ def _name(text: str) -> str:
 
 def _known_model(name: str) -> str:
     if name not in MODELS:
-        raise ValueError(f"not one of {', '.join(MODELS)}")
+        raise ValueError(
+            f"{name} is not one of {', '.join(MODELS)}; of your own, pass the file that declares "
+            "it (--models FILE or --simulator FILE)"
+        )
     return name
 
 

@@ -254,8 +254,8 @@ def predict(
         return
     if effects is not None:
         raise CalibError(
-            "only a diagnosis has effects", where=str(run), allowed="a folder of `calib diagnose`",
-            mend="leave --effects out",
+            "there is no diagnosis, which alone has effects", where=str(run),
+            allowed="a folder of `calib diagnose`", mend="correct its name, or leave --effects out",
         )  # fmt: skip
     if (run / "comparison.json").exists():
         from calib.report.comparison import load_stack

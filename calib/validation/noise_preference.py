@@ -61,7 +61,11 @@ class NoisePreference:
             "chosen": f"The data prefer {chosen} to {usual}",
             "normal": f"The data prefer {usual} to {chosen}",
         }[self.preferred]
-        text = f"{said} (elpd by leave-one-out {self.elpd:+.1f}, standard error {self.se:.1f})."
+        places = 1 if self.se >= 0.1 else 2
+        text = (
+            f"{said} (elpd by leave-one-out {self.elpd:+.{places}f}, standard error "
+            f"{self.se:.{places}f})."
+        )
         if self.line and abs(self.elpd) > SMALL:
             text += (
                 f" More than half of that is line {self.line} of the file alone, so that the "
