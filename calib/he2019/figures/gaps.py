@@ -38,7 +38,7 @@ __all__ = ["gap_plate"]
 
 _BAND = "#e6e6e6"
 _Z_90 = 1.645
-_MOST = 6
+_MOST = 5
 _PRESSURES = (18.0, 30.0, 42.0)
 
 
@@ -58,7 +58,7 @@ def _plate(result: FoundGap) -> Plate:
     rows = 2 if result.gap.unfitted is not None else 1
     fig, axes = panels(1, 3, height=46.0, top=6.0, bottom=12.0 + 4.0 * rows)
     # The names of the hypotheses need the room beside the last panel.
-    for ax, left, width in zip(axes[0], (15.0, 70.0, 145.0), (52.0, 47.0, 32.0), strict=True):
+    for ax, left, width in zip(axes[0], (15.0, 70.0, 145.0), (52.0, 39.0, 32.0), strict=True):
         box = ax.get_position()
         ax.set_position((left / DOUBLE_MM, box.y0, width / DOUBLE_MM, box.height))
     before, after, which = axes[0]
