@@ -19,6 +19,7 @@ from multiprocessing import (
     parent_process,
     resource_tracker,
 )
+from multiprocessing.context import BaseContext
 from pathlib import Path
 from threading import Thread
 from typing import Protocol
@@ -26,10 +27,14 @@ from typing import Protocol
 from calib.batch.plugins import load_files, loaded_files
 from calib.errors import CalibError
 
-__all__ = ["HERE", "Later", "Pool", "pool"]
+__all__ = ["HERE", "Later", "Pool", "begin_imports", "pool"]
 
 _LOOK_SECONDS = 2.0
-_REPORT = ("calib.report.contents", "calib.report.writer")
+# What a report needs, and what its figures and files import when they are first made.
+_REPORT = (
+    "calib.report.contents", "calib.report.writer", "calib.report.figures.collect",
+    "calib.gap.diagnose", "arviz_base", "corner", "h5netcdf", "PIL.Image",
+)  # fmt: skip
 
 
 class Later[R](Protocol):
@@ -120,11 +125,7 @@ def pool(
     if workers < 2:
         yield HERE
         return
-    # Forked from a process that has imported what the work needs, and has no threads.
-    forked = "forkserver" in get_all_start_methods()
-    context = get_context("forkserver" if forked else "spawn")
-    if forked:
-        context.set_forkserver_preload(list(modules))
+    context = _context(modules)
     # Handed over: a server that forks keeps the environment it was started with.
     executor = ProcessPoolExecutor(
         workers, mp_context=context, initializer=_begin, initargs=([*loaded_files(), *files],)
@@ -140,8 +141,30 @@ def pool(
         executor.shutdown(wait=False, cancel_futures=True)
 
 
-def _start(executor: ProcessPoolExecutor) -> None:
-    """Start the server and a first process where an interruption does not reach them.
+def begin_imports(workers: int, modules: Sequence[str] = _REPORT) -> None:
+    """Have the processes of a `pool` to come import what they need while the caller does.
+
+    Parameters
+    ----------
+    workers : int
+        Of the pool.
+    modules : sequence of str, optional
+    """
+    if workers > 1 and _context(modules).get_start_method() == "forkserver":
+        Thread(target=_serve, daemon=True).start()
+
+
+def _context(modules: Sequence[str]) -> BaseContext:
+    """How processes start: forked from one that has imported these modules and has no threads."""
+    if "forkserver" not in get_all_start_methods():
+        return get_context("spawn")
+    context = get_context("forkserver")
+    context.set_forkserver_preload(list(modules))
+    return context
+
+
+def _serve() -> None:
+    """Start the server where an interruption does not reach it.
 
     It is for the process that waits for the pieces; they would end with tracebacks.
     """
@@ -150,6 +173,14 @@ def _start(executor: ProcessPoolExecutor) -> None:
         resource_tracker.ensure_running()
         # Of this thread alone, and inherited by what it starts.
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    with suppress(EOFError, OSError):  # stopped meanwhile
+        forkserver.ensure_running()
+
+
+def _start(executor: ProcessPoolExecutor) -> None:
+    """Start a first process, and what it is forked from."""
+    if "forkserver" in get_all_start_methods():
+        _serve()
     with suppress(EOFError, OSError, RuntimeError):  # stopped meanwhile
         executor.submit(_begun)
 

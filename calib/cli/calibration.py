@@ -64,7 +64,10 @@ def report(
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
     from calib.batch.folders import check_folder
-    from calib.batch.pool import pool
+    from calib.batch.pool import begin_imports, pool
+
+    check_folder(out, overwrite=overwrite)
+    begin_imports(workers)
     from calib.cli.display import progress_bars
     from calib.cli.simulators import say
     from calib.data import read_table
@@ -77,7 +80,6 @@ def report(
     from calib.report.study_tasks import fitted_rows, plan_tasks
     from calib.report.writer import write_report
 
-    check_folder(out, overwrite=overwrite)
     if files:
         tasks = plan_tasks(
             [labelled(read_table(f, allow_missing=tuple(OUTPUTS.values()))) for f in files],

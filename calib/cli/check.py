@@ -37,7 +37,9 @@ def check(
     Ends with 0 where all is the same, 1 where something differs, 2 where it cannot be checked.
     """
     from calib.batch.plugins import load_files
-    from calib.batch.pool import pool
+    from calib.batch.pool import begin_imports, pool
+
+    begin_imports(1 if quick else workers)
     from calib.check.check import check as find
     from calib.cli.check_display import show
     from calib.cli.display import progress_bars

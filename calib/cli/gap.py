@@ -14,6 +14,9 @@ from calib.errors import CalibError
 
 __all__ = ["register"]
 
+# What the processes that draw the page import.
+_PAGE = ("calib.report.page.diagnosis",)
+
 _Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
 _Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
 
@@ -38,7 +41,10 @@ def diagnose(
 ) -> None:
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
     from calib.batch.folders import check_folder, fresh_folder
-    from calib.batch.pool import pool
+    from calib.batch.pool import begin_imports, pool
+
+    check_folder(out, overwrite=overwrite)
+    begin_imports(workers, _PAGE)
     from calib.cli.display import progress_bars
     from calib.cli.simulators import keep_emulators, prepare_case, say
     from calib.data.quantities import OUTPUTS, QUANTITIES
@@ -52,7 +58,6 @@ def diagnose(
     from calib.report.gap_evidence import gap_verdict
     from calib.report.numbers import format_number
 
-    check_folder(out, overwrite=overwrite)
     if case is not None and run is None and field is None:
         given = read_case(case)
     elif case is None and run is not None and field is not None:
@@ -74,7 +79,7 @@ def diagnose(
     told = [say(what, emulation) for what, emulation in emulations]
     manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
     own_files = [] if effects is None else [effects]
-    with pool(workers, ["calib.report.page.diagnosis"], own_files) as side:
+    with pool(workers, _PAGE, own_files) as side:
         found = find(given, seed, effects={**EFFECTS, **own}, pool=side)
         from calib.report.page.diagnosis import write_page
 

@@ -17,6 +17,7 @@ from calib.gap.declared import new_values
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.hypotheses import dependences, inseparable
 from calib.gap.inclusion import UNLISTED, Inclusion, inclusion, inclusion_probability
+from calib.gap.isolate import Isolability
 from calib.gap.mixture import Truth, mixture
 from calib.gap.next_measurement import NextMeasurement, next_measurements
 from calib.gap.oddities import oddities
@@ -195,7 +196,7 @@ def with_unseen_rows(
     if not found.shrink or data.case.new_conditions is not None:
         return found
     before = found.corrected.calibrated(data.view.conditions)
-    predicted = _left_out(data, found.truth, found.seed, effects, pool)
+    predicted = _left_out(found, effects, pool)
     return replace(found, shrink=shrink(data, found.truth, before, predicted))
 
 
@@ -243,14 +244,13 @@ def _without_context(
     return {"none": probability["none"], **inclusion_probability(probability)}
 
 
-def _left_out(
-    data: Campaigns, truth: Truth, seed: int, effects: Mapping[str, Effect], pool: Pool
-) -> dict[str, Array]:
+def _left_out(found: Diagnosis, effects: Mapping[str, Effect], pool: Pool) -> dict[str, Array]:
     """Predict each field row by a diagnosis that has not seen it, hypotheses chosen anew.
 
     Without other conditions to predict, this is how far the correction carries beyond the rows it
     was found on. With too few rows to leave some out, the rows' own predictions stand.
     """
+    data, truth, seed, design = found.data, found.truth, found.seed, found.ranking.isolability
     n = len(data.case.field)
     order = generator(seed, "gap", "folds").permutation(n)
     folds = [order[fold::_FOLDS] for fold in range(_FOLDS)]
@@ -259,7 +259,7 @@ def _left_out(
         return truth.means
     lab = calibrate_lab(data, seed)  # whatever is left out of the field
     parts = [without_outputs(data.case, {o.name: rows for o in data.outputs}) for rows in folds]
-    pieces = [pool.submit(_unseen, p, data.view, seed, dict(effects), lab) for p in parts]
+    pieces = [pool.submit(_unseen, p, data.view, seed, dict(effects), lab, design) for p in parts]
     predicted = truth.means
     for rows, piece in zip(folds, pieces, strict=True):
         for name, values in piece.result().items():
@@ -269,11 +269,11 @@ def _left_out(
 
 @one_thread()
 def _unseen(
-    case: Case, view: View, seed: int, effects: Mapping[str, Effect], lab: Lab
+    case: Case, view: View, seed: int, effects: Mapping[str, Effect], lab: Lab, design: Isolability
 ) -> dict[str, Array]:
     """Predict all rows of a field campaign from those that a case still has."""
     part = campaigns(case)
-    ranking = rank(part, seed, effects=effects, lab=lab)
+    ranking = rank(part, seed, effects=effects, lab=lab, design=design)
     return mixture(part, ranking, seed).at(view).means
 
 

@@ -17,7 +17,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.data.quantities import columns_of, physical_role, role_of
+from calib.data.quantities import columns_of, role_of
 from calib.gap.case import Campaigns
 from calib.gap.discrepancy import THRESHOLDS, Bases, Discrepancy
 from calib.gap.effects import Effect, View
@@ -77,6 +77,10 @@ class Forward:
         self.hypothesis = hypothesis
         self.noise = noise
         self._simulated = data.simulated
+        self._roles = {o.name: o.role for o in data.outputs}
+        self._columns = {
+            name: {role_of(c): c for c in s.field} for name, s in self._simulated.items()
+        }
         entries: list[Prior] = []
         self.theta_slices = {
             name: _append(entries, s.priors) for name, s in self._simulated.items()
@@ -289,13 +293,13 @@ class Forward:
         plain: Array, form: Array,
     ) -> Array:  # fmt: skip
         """One output with the effects in it; effects with their natural parameters."""
-        role = physical_role(name)
+        role = self._roles[name]
         acting = [(effect, phi) for effect, phi in effects if role in effect.outputs]
         if not acting:
             return plain
         simulated = self._simulated[name]
         recorded = simulated.conditions(view)
-        columns = {role_of(column): column for column in recorded}
+        columns = self._columns[name]
         conditions = original = {known: recorded[column] for known, column in columns.items()}
         for effect, phi in acting:
             conditions = effect.on_conditions(phi, role, conditions, view)

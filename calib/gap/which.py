@@ -127,15 +127,31 @@ class Ranking:
 
 
 def rank(
-    data: Campaigns, seed: int, *, effects: Mapping[str, Effect] = EFFECTS, lab: Lab | None = None
+    data: Campaigns,
+    seed: int,
+    *,
+    effects: Mapping[str, Effect] = EFFECTS,
+    lab: Lab | None = None,
+    design: Isolability | None = None,
 ) -> Ranking:
-    """Fit every hypothesis and rank them; `lab` if `calibrate_lab` has been called before."""
+    """Fit every hypothesis and rank them.
+
+    Parameters
+    ----------
+    data : Campaigns
+    seed : int
+    effects : mapping of str to Effect, optional
+    lab : Lab, optional
+        If `calibrate_lab` has been called before.
+    design : Isolability, optional
+        What the design could show, if it is known from a campaign that has all of these rows.
+    """
     able, unable = split_testable(data, {**effects, **dependences(data)})
     lab_mode, noise = lab or calibrate_lab(data, seed)
     single = singles(data, able)
     beside = {h.name for h in single if covered(h.effects[0], able)}
     listed = [h for h in single if h.name not in beside]
-    design = isolability(data, listed, lab_mode, noise, seed)
+    design = design or isolability(data, listed, lab_mode, noise, seed)
     single = [h for h in single if h.name not in design.idle]
     unable |= dict.fromkeys(design.idle, _IDLE)
     single = [replace(h, share=COVERED) if h.name in beside else h for h in single]

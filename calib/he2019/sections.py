@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from calib.batch.pool import Pool
-from calib.he2019.audit.convergence import Seeds, begin_convergence
-from calib.he2019.audit.run import Audit, run_audit
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.audit.convergence import Seeds
+from calib.he2019.audit.run import Audit, begin_audit
 from calib.he2019.gaps.cases import PaperGap, paper_gaps
 from calib.he2019.gaps.find import FoundGap, begin_gaps
 from calib.he2019.gaps.summary import summarise_gaps
@@ -81,20 +80,12 @@ class AuditSection:
     seeds: Seeds = field(default_factory=Seeds)
 
     def begin(self, seed: int, pool: Pool) -> Callable[[Study, Progress], FoundAudit]:
-        """Ask for the genetic searches, which take longest."""
-        searches = begin_convergence(PUBLISHED, seed, self.seeds, pool)
+        """Ask for what takes long."""
+        begun = begin_audit(seed, self.seeds, pool)
 
         def finish(study: Study, tell: Progress) -> FoundAudit:
             rut = study.successes.get("rut_depth")
-            return FoundAudit(
-                run_audit(
-                    seed,
-                    seeds=self.seeds,
-                    rut_calibration=None if rut is None else rut.calibration,
-                    progress=tell,
-                    genetic=searches,
-                )
-            )
+            return FoundAudit(begun(None if rut is None else rut.calibration, tell))
 
         return finish
 

@@ -58,7 +58,8 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     sizes computed from the file are those of the gate. Groups: posterior, prior, log_prior,
     posterior_predictive, log_likelihood, sample_stats, observed_data, constant_data.
     """
-    import arviz as az
+    # Of ArviZ the part that lays out and reads: its plots take a second to import.
+    from arviz_base import from_dict
 
     problem = calibration.problem
     draws = calibration.draws
@@ -88,7 +89,7 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     with warnings.catch_warnings():
         # Walkers are chains, of which there are more than draws in a short run.
         warnings.filterwarnings("ignore", "Found chain dimension to be longer", UserWarning)
-        tree: xr.DataTree = az.from_dict(
+        tree: xr.DataTree = from_dict(
             {
                 "posterior": dict(calibration.parameters),
                 "prior": _prior_group(calibration, prior),
@@ -300,9 +301,7 @@ def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
 
 def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Return the internal coordinates, of a shape, and their log densities."""
-    import arviz as az
-
-    with az.from_netcdf(path, engine="h5netcdf") as tree:
+    with xr.open_datatree(path, engine="h5netcdf") as tree:
         posterior = tree["posterior"]
         natural = np.stack(
             [

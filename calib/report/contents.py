@@ -64,4 +64,6 @@ def work_out(
     )  # fmt: skip
     begun = [section.begin(seed, pool) for section in sections]
     studied = study(tell)
-    return Contents(studied, tuple(finish(studied, tell) for finish in begun))
+    # What was asked for last comes last; what its section has to do here is done meanwhile.
+    found = [finish(studied, tell) for finish in reversed(begun)]
+    return Contents(studied, tuple(reversed(found)))

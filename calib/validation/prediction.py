@@ -192,11 +192,13 @@ def bands(draws: Array) -> Bands:
         *(0.5 - level / 2.0 for level in LEVELS),
         *(0.5 + level / 2.0 for level in LEVELS),
     ]
-    # A parameter vector for which the equation has no value there is left out, not spread; where
-    # none has a value, neither have the bands.
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
-        quantiles = np.nanquantile(draws, edges, axis=0)
+    quantiles = np.quantile(draws, edges, axis=0)
+    if np.isnan(quantiles).any():
+        # A parameter vector for which the equation has no value there is left out, not spread;
+        # where none has a value, neither have the bands.
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "All-NaN slice", RuntimeWarning)
+            quantiles = np.nanquantile(draws, edges, axis=0)
     k = len(LEVELS)
     return Bands(
         quantiles[0],

@@ -74,8 +74,7 @@ def test_the_report_of_the_embedded_data_has_the_section(
 
     monkeypatch.setattr("calib.he2019.tasks.he2019_tasks", lambda: ())
     monkeypatch.setattr("calib.he2019.sections.begin_gaps", begin)
-    monkeypatch.setattr("calib.he2019.sections.begin_convergence", lambda *_: None)
-    monkeypatch.setattr("calib.he2019.sections.run_audit", lambda *_, **__: audit)
+    monkeypatch.setattr("calib.he2019.sections.begin_audit", lambda *_: lambda *_: audit)
     ran = calib("report", "--out", "rep", "--seed", 5)
     assert ran.code == 0, ran.err
     assert asked == [5]

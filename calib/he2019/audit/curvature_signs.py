@@ -16,6 +16,7 @@ from itertools import product
 import numpy as np
 from scipy.optimize import minimize
 
+from calib.batch.threads import one_thread
 from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
 from calib.he2019.audit.nearness import (
     ASSUMED_SLIPS,
@@ -108,6 +109,7 @@ class CurvatureStudy:
         return sorted(self.least, key=lambda signs: self.least[signs])
 
 
+@one_thread()
 def study_curvature_signs(published: Published, seed: int) -> CurvatureStudy:
     """Search the least cost of every reading."""
     readings: list[Signs] = [(a, b, c) for a, b, c in product((1, -1), repeat=3)]

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from calib.batch.threads import one_thread
 from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
 from calib.he2019.audit.intervals import Interval, printed
 from calib.he2019.audit.nearness import COEFFICIENTS, pressure_curves, printed_coefficients
@@ -45,6 +46,7 @@ class RoundingStudy:
     table4: Mapping[int, Interval]
 
 
+@one_thread()
 def study_rounding(published: Published, n: int = 151) -> RoundingStudy:
     """Propagate the rounding of Tables 4 and 5 to the pull at n slips up to 75 %."""
     slips = np.linspace(0.0, 75.0, n)

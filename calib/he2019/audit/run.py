@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from calib.batch.pool import HERE
+from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
 from calib.he2019.audit.convergence import (
     GeneticStudy,
@@ -28,12 +28,12 @@ from calib.he2019.audit.pressure_unit import pressure_unit
 from calib.he2019.audit.rounding import RoundingStudy, rounding_findings, study_rounding
 from calib.he2019.audit.rut_quality import QualityStudy, rut_quality_findings, study_quality
 from calib.he2019.audit.signs import signs
-from calib.he2019.audit.table5_cost import cost_findings
+from calib.he2019.audit.table5_cost import bounds, cost_findings
 from calib.he2019.audit.untested import untested
 from calib.he2019.datasets.published import PUBLISHED, Published
 from calib.inference.calibration import Calibration
 
-__all__ = ["Audit", "run_audit"]
+__all__ = ["Audit", "begin_audit", "run_audit"]
 
 type Progress = Callable[[str, int, int], None]
 
@@ -78,7 +78,6 @@ class Audit:
         return next(f for f in self.findings if f.key == key)
 
 
-@one_thread()
 def run_audit(
     seed: int = 2019,
     *,
@@ -86,7 +85,6 @@ def run_audit(
     seeds: Seeds | None = None,
     rut_calibration: Calibration | None = None,
     progress: Progress | None = None,
-    genetic: Callable[[Progress], GeneticStudy] | None = None,
 ) -> Audit:
     """Audit the published figures.
 
@@ -102,42 +100,53 @@ def run_audit(
         Of modified_bekker on the reconstructed 18 and 42 psi rows; made here if it is not at hand.
     progress : callable, optional
         Called with what is being done, steps done and steps planned.
-    genetic : callable, optional
-        Waits for the genetic searches, which have been asked for
-        (`calib.he2019.audit.convergence.begin_convergence`); they are done here by default.
 
     Returns
     -------
     Audit
     """
-    tell = progress or (lambda what, done, planned: None)
-    repeated = seeds or Seeds()
-    asked = genetic or begin_convergence(published, seed, repeated, HERE)
-    inverse = study_inverse(
-        published, seed, calibration=rut_calibration,
-        progress=lambda done, planned: tell("rut depth: sampling", done, planned),
-    )  # fmt: skip
-    tell("testing printed figures", 0, 2)
-    curvature = study_curvature_signs(published, seed)
-    tell("testing printed figures", 1, 2)
-    rounding, quality = study_rounding(published), study_quality(published)
-    searched = asked(tell)
-    findings = [
-        *density_findings(published),
-        *geometric_findings(published, searched.read_off),
-        *signs(published),
-        *curvature_signs(published, curvature),
-        pressure_unit(published),
-        *cost_findings(published, searched.joint.optimum),
-        *rounding_findings(published, rounding),
-        *convergence_findings(published, searched),
-        *rut_quality_findings(published, quality),
-        *inverse_findings(published, inverse),
-        untested(published),
-    ]
-    tell("testing printed figures", 2, 2)
-    order = list(Verdict)
-    ranked = sorted(findings, key=lambda f: order.index(f.verdict))
-    return Audit(
-        tuple(ranked), published, seed, rounding, curvature, quality, inverse, searched, repeated
-    )
+    finish = begin_audit(seed, seeds or Seeds(), HERE, published=published)
+    return finish(rut_calibration, progress or (lambda what, done, planned: None))
+
+
+def begin_audit(
+    seed: int, seeds: Seeds, pool: Pool, *, published: Published = PUBLISHED
+) -> Callable[[Calibration | None, Progress], Audit]:
+    """Ask for what takes long, the parameters as for `run_audit`; return what waits for it."""
+    searches = begin_convergence(published, seed, seeds, pool)
+    signs_asked = pool.submit(study_curvature_signs, published, seed)
+    bounds_asked = pool.submit(bounds, published)
+    rounding_asked = pool.submit(study_rounding, published)
+
+    @one_thread()
+    def finish(rut_calibration: Calibration | None, tell: Progress) -> Audit:
+        inverse = study_inverse(
+            published, seed, calibration=rut_calibration,
+            progress=lambda done, planned: tell("rut depth: sampling", done, planned),
+        )  # fmt: skip
+        searched, quality = searches(tell), study_quality(published)
+        tell("testing printed figures", 0, 2)
+        curvature, at_most = signs_asked.result(), bounds_asked.result()
+        tell("testing printed figures", 1, 2)
+        rounding = rounding_asked.result()
+        findings = [
+            *density_findings(published),
+            *geometric_findings(published, searched.read_off),
+            *signs(published),
+            *curvature_signs(published, curvature),
+            pressure_unit(published),
+            *cost_findings(published, searched.joint.optimum, at_most),
+            *rounding_findings(published, rounding),
+            *convergence_findings(published, searched),
+            *rut_quality_findings(published, quality),
+            *inverse_findings(published, inverse),
+            untested(published),
+        ]
+        tell("testing printed figures", 2, 2)
+        order = list(Verdict)
+        ranked = sorted(findings, key=lambda f: order.index(f.verdict))
+        return Audit(
+            tuple(ranked), published, seed, rounding, curvature, quality, inverse, searched, seeds
+        )
+
+    return finish

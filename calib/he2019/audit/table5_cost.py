@@ -8,9 +8,12 @@ largest distance over all slips in the place of the tested ones the bound needs 
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
+from calib.batch.threads import one_thread
 from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
 from calib.he2019.audit.nearness import (
     ASSUMED_SLIPS,
@@ -26,7 +29,8 @@ from calib.models.base import Array
 from calib.models.magic_formula import magic_formula
 
 __all__ = [
-    "any_slips_bound", "assumed_slips_bound", "cost_as_printed", "cost_findings", "joint_cost",
+    "Bounds", "any_slips_bound", "assumed_slips_bound", "bounds", "cost_as_printed",
+    "cost_findings", "joint_cost",
 ]  # fmt: skip
 
 _FAMILY = "Cost of Table 5"
@@ -131,12 +135,35 @@ def assumed_slips_bound(published: Published, *, optimal: bool) -> float:
     return min(sum(cost(r, float(C)) for r in known) for C in _common_C(published))
 
 
-def cost_findings(published: Published, reconstructed_optimum: float) -> list[Finding]:
+class Bounds(NamedTuple):
+    """Costs (kN^2) that the joint optimum cannot exceed.
+
+    Whatever the slips, at the assumed ones, and there if Table 4 is optimal.
+    """
+
+    anywhere: float
+    assumed: float
+    optimal: float
+
+
+@one_thread()
+def bounds(published: Published) -> Bounds:
+    """Bound the joint optimum, from Table 4 alone."""
+    return Bounds(
+        any_slips_bound(published),
+        assumed_slips_bound(published, optimal=False),
+        assumed_slips_bound(published, optimal=True),
+    )
+
+
+def cost_findings(
+    published: Published, reconstructed_optimum: float, at_most: Bounds
+) -> list[Finding]:
     """Judge the printed cost: as a minimum, and as that of the printed digits."""
-    return [joint_cost(published, reconstructed_optimum), cost_as_printed(published)]
+    return [joint_cost(published, reconstructed_optimum, at_most), cost_as_printed(published)]
 
 
-def joint_cost(published: Published, reconstructed_optimum: float) -> Finding:
+def joint_cost(published: Published, reconstructed_optimum: float, at_most: Bounds) -> Finding:
     """Judge whether the printed cost can be a minimum of Eq 16.
 
     Parameters
@@ -144,12 +171,13 @@ def joint_cost(published: Published, reconstructed_optimum: float) -> Finding:
     published : Published
     reconstructed_optimum : float
         The joint optimum on the reconstructed data, for comparison, kN^2.
+    at_most : Bounds
+        What `bounds` gives.
     """
     figure = published.pressure.quality["cost"]
     separate = [table.quality["cost"] for table in published.genetic.values()]
     floor = sum(f.value - f.half_unit for f in separate)
-    anywhere = any_slips_bound(published)
-    assumed, optimal = (assumed_slips_bound(published, optimal=o) for o in (False, True))
+    anywhere, assumed, optimal = at_most
     low, high = figure.value - figure.half_unit, figure.value + figure.half_unit
     if high < floor or low > anywhere:
         verdict, basis = Verdict.CONTRADICTED, Basis.PRINTED

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Any
 
 from calib.report.reference import Figure, FittedTable
 
@@ -80,6 +81,10 @@ class Published:
     pressure: FittedTable
     rut_depth: FittedTable
     setup: Setup
+
+    def __reduce__(self) -> str | tuple[Any, ...]:
+        # By its name: another process knows it, and mapping proxies do not travel.
+        return "PUBLISHED" if self is PUBLISHED else super().__reduce__()
 
 
 def printed_figures(published: Published) -> dict[str, Figure]:

@@ -160,7 +160,8 @@ def _pair(ax: Axes, cells: _Cells, i: int, j: int, draws: Array) -> None:
     hist2d(
         cells.x(j, draws[:, j]), y + cells.part(i, draws[:, i]), bins=24, ax=ax,
         levels=(0.5, 0.9), smooth=1.0, range=[(j, j + _FILL), (y, y + _FILL)],
-        plot_datapoints=False, plot_density=False, fill_contours=True, color=BLUE,
+        plot_datapoints=False, plot_density=False, fill_contours=True, no_fill_contours=True,
+        color=BLUE,
         contour_kwargs={"linewidths": 0.6},
     )  # fmt: skip
     # Smoothed contours reach a little beyond the range.
