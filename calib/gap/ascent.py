@@ -107,8 +107,9 @@ def climb(problem: Residuals, ascents: list[Ascent], steps: int) -> Walk[None]:
     for _ in range(steps):
         slope = yield from slopes(problem, going)
         gains = yield from _step(problem, going, slope)
-        for i, (ascent, gained) in enumerate(zip(going, gains, strict=True)):
-            noise = problem.update_noise(ascent.raw, slope.scaled[i], slope.hessian[i])
+        raw = np.stack([a.raw for a in going])
+        noises = problem.update_noises(raw, slope.scaled, slope.hessian)
+        for ascent, gained, noise in zip(going, gains, noises, strict=True):
             quiet = gained < _QUIET_GAIN and _change(ascent.noise, noise) < _QUIET_NOISE
             ascent.noise, ascent.quiet = noise, ascent.quiet + 1 if quiet else 0
         going = [a for a in going if a.quiet < 2]

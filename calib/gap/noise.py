@@ -112,20 +112,31 @@ def ln_prior(noise: Noise) -> float:
     return float(LN_RHO_PRIOR[rho] + LN_KAPPA_PRIOR[kappa])
 
 
-def most_probable(squared: Array, at: NoiseConditions) -> Noise:
+def most_probable(squared: Array, at: NoiseConditions) -> list[Noise]:
     """Maximise likelihood times prior over the grids of rho and kappa, sigma in closed form.
 
     Parameters
     ----------
-    squared : ndarray, shape (n,)
-        Squares of the residuals.
+    squared : ndarray, shape (m, n)
+        Squares of the residuals, of m guesses.
     at : NoiseConditions
+
+    Returns
+    -------
+    list of Noise, length m
     """
     growth, ln_growth = at.growths
-    variance = np.maximum((squared / growth**2).mean(axis=2), 1e-18)
-    value = -0.5 * squared.size * np.log(variance) - ln_growth
-    value += LN_RHO_PRIOR[:, None] + LN_KAPPA_PRIOR[: value.shape[1]]
-    if not np.isfinite(value).all():
-        return Noise(1.0)  # a model without a value somewhere says nothing about the noise
-    i, j = np.unravel_index(int(np.argmax(value)), value.shape)
-    return Noise(float(np.sqrt(variance[i, j])), float(RHO[i]), float(KAPPA[j]))
+    _, kappas, n = growth.shape
+    with np.errstate(invalid="ignore", over="ignore"):
+        variance = np.maximum(squared @ (growth**-2).reshape(-1, n).T / n, 1e-18)
+        prior = LN_RHO_PRIOR[:, None] + LN_KAPPA_PRIOR[:kappas]
+        value = -0.5 * n * np.log(variance) + (prior - ln_growth).ravel()
+    best = np.where(np.isfinite(value), value, -np.inf).argmax(axis=1).tolist()
+    # A model without a value somewhere says nothing about the noise.
+    known = np.isfinite(value).all(axis=1).tolist()
+    return [
+        Noise(float(np.sqrt(variance[i, j])), float(RHO[j // kappas]), float(KAPPA[j % kappas]))
+        if known[i]
+        else Noise(1.0)
+        for i, j in enumerate(best)
+    ]

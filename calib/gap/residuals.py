@@ -131,22 +131,23 @@ class Residuals:
         step = _DIFFERENCE * self.width
         return np.where(psi + step > self.upper, -step, step)
 
-    def update_noise(self, raw: Array, scaled: Array, hessian: Array) -> dict[str, Noise]:
+    def update_noises(self, raw: Array, scaled: Array, hessian: Array) -> list[dict[str, Noise]]:
         """Noise scales that maximise the marginal likelihood, parameters allowed for.
 
         Parameters
         ----------
-        raw : ndarray, shape (N,)
-        scaled : ndarray, shape (d, N)
+        raw : ndarray, shape (m, N)
+        scaled : ndarray, shape (m, d, N)
             Derivatives of the residuals over their sds.
-        hessian : ndarray, shape (d, d)
+        hessian : ndarray, shape (m, d, d)
         """
         inverse = np.linalg.inv(hessian + np.diag(1e-6 / self.width**2))
-        leverage = (scaled * (inverse @ scaled)).sum(axis=0)
+        leverage = (scaled * (inverse @ scaled)).sum(axis=1)
         # Each residual lost the part of its variance that the parameters took up.
-        corrected = np.square(raw) / np.clip(1.0 - leverage, 0.1, 1.0)
+        corrected = np.square(raw) / np.minimum(np.maximum(1.0 - leverage, 0.1), 1.0)
         at = self.data.at_rows
-        return {o: most_probable(corrected[part], at[o]) for o, part in self.parts.items()}
+        found = [most_probable(corrected[:, part], at[o]) for o, part in self.parts.items()]
+        return [dict(zip(self.parts, each, strict=True)) for each in zip(*found, strict=True)]
 
 
 def residuals_of_all(asked: Sequence[tuple[Residuals, Array]]) -> list[Array]:

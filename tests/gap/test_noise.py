@@ -48,7 +48,7 @@ def test_without_pressures_there_is_nothing_to_be_soft():
     bare = type(view)(conditions, view.lab, 5.0, 0.5, (0.0, 1.0))
     assert not noise_conditions(bare).softness.any()
     squared = np.random.default_rng(0).standard_normal(200) ** 2
-    assert most_probable(squared, at(200, pressures=False)).kappa == 0.0
+    assert most_probable(squared[None], at(200, pressures=False))[0].kappa == 0.0
 
 
 @pytest.mark.parametrize("rho", RHO.tolist())
@@ -56,7 +56,7 @@ def test_without_pressures_there_is_nothing_to_be_soft():
 def test_it_is_found_again(rho: float, kappa: float):
     rows, truth = at(4000), Noise(0.3, rho, kappa)
     squared = np.square(truth.sd(rows) * np.random.default_rng(2).standard_normal(4000))
-    found = most_probable(squared, rows)
+    (found,) = most_probable(squared[None], rows)
     assert (found.rho, found.kappa) == (rho, kappa)
     # sigma of 4000 residuals, 1.1 %.
     assert found.sigma == pytest.approx(0.3, rel=0.045)
@@ -70,6 +70,6 @@ def test_it_is_the_most_probable_of_all_it_could_be():
         sd = noise.sd(rows)
         return float(-np.log(sd).sum() - 0.5 * (squared / sd**2).sum()) + ln_prior(noise)
 
-    best = log_posterior(most_probable(squared, rows))
+    best = log_posterior(most_probable(squared[None], rows)[0])
     others = [Noise(s, r, k) for s in np.linspace(0.3, 3.0, 400) for r in RHO for k in KAPPA]
     assert best >= max(map(log_posterior, others)) - 1e-9
