@@ -6,6 +6,7 @@ outlive a kill are for `calib.batch.tasks.run_tasks`.
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
@@ -197,6 +198,7 @@ def _stop(executor: ProcessPoolExecutor) -> None:
 def _begin(files: Sequence[Path]) -> None:
     """Leave an interruption to the process that waits for the pieces; know what it knows."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    gc.freeze()  # what was imported stays: the garbage collector need not look at it again
     Thread(target=_leave_with_parent, daemon=True).start()
     load_files(files)
 

@@ -68,7 +68,6 @@ _RC: dict[Any, Any] = {
     "pdf.fonttype": 42,
     # Long tick labels would push the axis label off the figure: a common power of ten instead.
     "axes.formatter.limits": (-3, 4),
-    "axes.formatter.use_mathtext": True,
 }
 
 
