@@ -302,7 +302,7 @@ def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
 def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Return the internal coordinates, of a shape, and their log densities."""
     with xr.open_datatree(path, engine="h5netcdf") as tree:
-        posterior = tree["posterior"]
+        posterior = tree["posterior"].to_dataset()
         natural = np.stack(
             [
                 np.full(shape[:-1], p.loc)
@@ -312,7 +312,7 @@ def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple
             ],
             axis=-1,
         )
-        log_prob = np.asarray(tree["sample_stats"]["lp"].values.reshape(shape[:-1]))
+        log_prob = np.asarray(tree["sample_stats"].to_dataset()["lp"].values.reshape(shape[:-1]))
     t = priors.to_internal(natural.reshape(-1, natural.shape[-1]), margin=0.0).reshape(shape)
     return t, log_prob
 

@@ -60,8 +60,7 @@ def png_bytes(figure: Figure) -> bytes:
     width, height = (int(inches * _DPI) for inches in figure.get_size_inches())
     image = Image.frombytes("RGBA", (width, height), full.getvalue())
     # With its resolution, by which a text processor takes it over at its size in print.
-    palette = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
-    palette.save(small, format="png", dpi=(_DPI, _DPI))
+    image.convert("RGB").quantize(256).save(small, format="png", dpi=(_DPI, _DPI))
     return small.getvalue()
 
 
