@@ -43,7 +43,6 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
     Parameters
     ----------
-    out : Path
     overwrite : bool
         Replace an existing folder; only one that was written by this package.
 

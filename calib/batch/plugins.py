@@ -30,7 +30,6 @@ def run_file(path: Path, what: str) -> ModuleType:
 
     Parameters
     ----------
-    path : Path
     what : str
         What it holds, for messages: ``"effects"``.
 

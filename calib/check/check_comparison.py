@@ -60,11 +60,8 @@ def check_comparison(
 
     Parameters
     ----------
-    record : ComparisonRecord
     folder, scratch : Path
         The comparison, and an empty folder.
-    here : Environment
-    progress : callable
     quick : bool
         Skip the sampling.
     workers : int

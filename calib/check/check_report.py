@@ -52,11 +52,8 @@ def check_report(
 
     Parameters
     ----------
-    manifest : Manifest
     folder, scratch : Path
         The report, and an empty folder.
-    here : Environment
-    progress : callable
     quick : bool
         Skip the sampling.
     pool : Pool, optional

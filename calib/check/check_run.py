@@ -45,11 +45,8 @@ def check_run(
 
     Parameters
     ----------
-    record : RunRecord
     folder, scratch : Path
         The run, and an empty folder.
-    here : Environment
-    progress : callable
     quick : bool
         Skip the sampling.
     """
@@ -92,7 +89,6 @@ def compare_run(
 
     Parameters
     ----------
-    record : RunRecord
     calibration : Calibration
         As it was sampled again.
     folder, made : Path

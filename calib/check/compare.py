@@ -41,12 +41,10 @@ class Again:
 
     Parameters
     ----------
-    manifest : Manifest
     folder, made : Path
         The report, and the one made again.
     study : Study
         What the second shows.
-    here : Environment
     """
 
     manifest: Manifest

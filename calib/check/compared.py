@@ -37,7 +37,6 @@ def drawn_in_comparison(
 
     Parameters
     ----------
-    comparison : Comparison
     best : str
         The model that differences are from.
     steps : mapping of str to object
@@ -75,7 +74,6 @@ def _scores(errors: Mapping[Place, float | None], heavy: float) -> dict[Place, f
 
     Parameters
     ----------
-    errors : mapping
     heavy : float
         How many times as large errors are as those of draws that all weigh the same.
     """

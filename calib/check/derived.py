@@ -55,7 +55,6 @@ def verify_derived(
 
     Parameters
     ----------
-    folder : Path
     files : mapping of str to str
         The files that are listed.
     manifest, summary : mapping
@@ -130,7 +129,6 @@ def verify_gaps(folder: Path, summary: Mapping[str, Any], *, same_code: bool) ->
 
     Parameters
     ----------
-    folder : Path
     summary : mapping
         As recorded.
     same_code : bool

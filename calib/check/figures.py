@@ -44,7 +44,6 @@ def compare_figure(name: str, recorded: bytes, drawn: bytes, others: Mapping[str
     ----------
     name : str
         Its path in the folder.
-    recorded, drawn : bytes
     others : mapping of str to ndarray
         All figures drawn again, as `thumbnails` returns them.
     """

@@ -64,13 +64,7 @@ def _moved(item: Item) -> bool:
 
 
 def compare_files(again: Again, moved: Moved) -> list[Item]:
-    """Return an item for each file but the manifest, the summary and what follows from them.
-
-    Parameters
-    ----------
-    again : Again
-    moved : Moved
-    """
+    """Return an item for each file but the manifest, the summary and what follows from them."""
     made = {p.relative_to(again.made).as_posix() for p in again.made.rglob("*") if p.is_file()}
     own = {RECORD, SUMMARY, *derived_files(dict.fromkeys(made, ""))}
     made = {n for n in made - own if not is_document(n) and not n.endswith("corrected.json")}

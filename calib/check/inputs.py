@@ -24,7 +24,6 @@ def verify_files(
 
     Parameters
     ----------
-    folder : Path
     hashes : mapping of str to str
         Relative path to SHA-256.
     own : str
@@ -75,7 +74,6 @@ def verify_label(file: str, table: Table, label: str) -> Item:
     ----------
     file : str
         Where the rows are.
-    table : Table
     label : str
         What they are said to be.
     """

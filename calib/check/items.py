@@ -28,7 +28,6 @@ class Item:
         What it belongs to, such as ``"rut_depth: posterior"``.
     name : str
         The file, the path of the number in it, or the claim.
-    status : Status
     recorded, found : object
         In the folder, and computed again; None where there is no number to show.
     allowed : float, optional

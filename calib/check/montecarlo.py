@@ -73,8 +73,6 @@ def drawn_in_output(
 
     Parameters
     ----------
-    calibration : Calibration
-    validation : Validation
     n : int
         How many numbers follow from posterior draws, in the whole report.
     steps : object
@@ -126,10 +124,6 @@ def scaled(errors: dict[Place, float | None], times: float) -> dict[Place, float
 def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:
     """Return the Monte Carlo standard errors of a posterior summary.
 
-    Parameters
-    ----------
-    calibration : Calibration
-
     Returns
     -------
     dict
@@ -169,8 +163,6 @@ def validation_errors(
 
     Parameters
     ----------
-    calibration : Calibration
-    validation : Validation
     multiple : float
         How many errors will be allowed: so many decide which rows may cross the edge of a band.
 

@@ -27,7 +27,6 @@ class Outcome:
     kind : {"report", "run", "comparison"}
     quick : bool
         Whether sampling was skipped.
-    items : tuple of Item
     environment : mapping of str to (str, str)
         What differs between where it was made and here: pairs of there and here.
     allowed : str

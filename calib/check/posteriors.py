@@ -145,11 +145,6 @@ def compare_posterior(name: str, recorded: Path, drawn: Path) -> list[Item]:
 
     The draws themselves may be others. They are held against their summary and their density; all
     that goes with them may be apart by a part of its own sd.
-
-    Parameters
-    ----------
-    name : str
-    recorded, drawn : Path
     """
     if recorded.read_bytes() == drawn.read_bytes():
         return [Item(GROUP, name, Status.IDENTICAL)]

@@ -54,8 +54,6 @@ def report_tasks(manifest: Manifest, folder: Path, scratch: Path) -> tuple[Task,
 
     Parameters
     ----------
-    manifest : Manifest
-    folder : Path
     scratch : Path
         Where priors are copied to under their first names, which the page shows.
 

@@ -272,7 +272,6 @@ def natural_scale(
 
     Parameters
     ----------
-    of : Of
     place : tuple of str
         Path of the number, the file first.
     entries : mapping

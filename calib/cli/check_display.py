@@ -22,7 +22,6 @@ def show(outcome: Outcome, *, every: bool) -> None:
 
     Parameters
     ----------
-    outcome : Outcome
     every : bool
         List every number and file, not only those that are not the same.
     """

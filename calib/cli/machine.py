@@ -44,7 +44,6 @@ def finish(code: int, found: Mapping[str, Any] | Path, **more: Any) -> None:
 
     Parameters
     ----------
-    code : int
     found : mapping or Path
         A document, or the JSON file that holds it.
     **more

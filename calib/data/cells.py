@@ -120,7 +120,6 @@ class CellReader:
 
     Parameters
     ----------
-    column : Column
     problems : Problems
         Where complaints go.
     missing_ok : bool

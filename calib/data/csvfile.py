@@ -31,10 +31,8 @@ class CsvFile:
     ----------
     source : str
         Path as given.
-    header : tuple of str
     header_line : int
         Its line, counted from 1.
-    delimiter : str
     sha256 : str
         Of the bytes.
     rows : iterator of (int, list of str)

@@ -17,7 +17,6 @@ class KnownData:
 
     Parameters
     ----------
-    label : str
     words : str
         What it is, in a sentence.
     methods : str

@@ -154,7 +154,6 @@ def read_for_model(path: str | os.PathLike[str], used: Sequence[str]) -> Table:
 
     Parameters
     ----------
-    path : path-like
     used : sequence of str
         Canonical names of the columns that must be there, whole.
 

@@ -90,10 +90,6 @@ class Table:
         ----------
         rows : ndarray
             Mask of shape (n,), or row indices from 0 in the order wanted.
-
-        Returns
-        -------
-        Table
         """
         index = np.arange(len(self))[np.asarray(rows, dtype=None if len(rows) else np.int64)]
         return replace(
@@ -165,7 +161,6 @@ def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -
 
     Parameters
     ----------
-    table : Table
     n_parameters : int
         How many parameters are fitted, without the noise scale.
     model : str
@@ -192,7 +187,6 @@ def check_varies(table: Table, column: str) -> None:
 
     Parameters
     ----------
-    table : Table
     column : str
         Canonical name.
 

@@ -25,8 +25,6 @@ def unit_notes(table: Table, quantity: Quantity, values: Array) -> list[str]:
 
     Parameters
     ----------
-    table : Table
-    quantity : Quantity
     values : ndarray, shape (n,)
         Its column.
     """
@@ -50,7 +48,6 @@ def mixed_units(quantity: Quantity, values: Array) -> tuple[NDArray[np.bool_], s
 
     Parameters
     ----------
-    quantity : Quantity
     values : ndarray, shape (n,)
         Of a few levels; among many, ratios come about by chance.
     """

@@ -173,7 +173,6 @@ def hdi_error(batches: Array, prob: float) -> Array:
     ----------
     batches : ndarray, shape (g, m)
         The draws in g nearly independent parts.
-    prob : float
 
     Notes
     -----

@@ -51,8 +51,6 @@ class Squares:
 
     Parameters
     ----------
-    bound : BoundModel
-    tiles : tuple of _Tile
     n_distinct : int
         Distinct conditions.
     within : float

@@ -84,7 +84,6 @@ class Noise:
 
     Parameters
     ----------
-    choice : NoiseChoice
     column : str
         The condition that the scale depends on, if any.
     centre, spread : float
@@ -183,7 +182,6 @@ def noise_of(choice: NoiseChoice, conditions: Conditions, source: str) -> Noise:
 
     Parameters
     ----------
-    choice : NoiseChoice
     conditions : mapping of str to ndarray, shape (n,)
         Of the model.
     source : str

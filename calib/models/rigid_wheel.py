@@ -135,10 +135,6 @@ def _evaluate(entry: Array, wheel: Wheel) -> Contact:
 def contact(wheel: Wheel) -> Contact:
     """Find where each wheel carries its load, and what it then pulls.
 
-    Parameters
-    ----------
-    wheel : Wheel
-
     Returns
     -------
     Contact

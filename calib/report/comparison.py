@@ -42,7 +42,6 @@ def document(comparison: Comparison, hold_out: str = "", best: str | None = None
 
     Parameters
     ----------
-    comparison : Comparison
     hold_out : str
         What was held out, in words; empty for nothing.
     best : str, optional
@@ -113,8 +112,6 @@ def write_comparison(
 
     Parameters
     ----------
-    comparison : Comparison
-    folder : Path
     command : sequence of str
         The command line, for the page.
     hold_out : str

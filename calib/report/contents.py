@@ -20,7 +20,6 @@ class Contents:
 
     Parameters
     ----------
-    study : Study
     found : tuple of Found
         What the sections found, in their order on the page.
     """
@@ -43,10 +42,8 @@ def work_out(
 
     Parameters
     ----------
-    tasks : sequence of Task
     seed : int
         Same seed, same numbers.
-    settings : SamplerSettings, optional
     sections : sequence of Section
         What the report has beside its outputs.
     progress : callable, optional

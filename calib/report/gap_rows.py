@@ -102,8 +102,6 @@ class OutputRows:
 
     Parameters
     ----------
-    name : str
-    axis : Axis
     rows : ndarray of int, shape (n,)
     measured, before, after : ndarray, shape (n,)
         On the scale of the axis: the reading; the calibrated simulator; the corrected one.

@@ -52,7 +52,6 @@ def size_sentences(found: Diagnosis, name: str) -> list[str]:
 
     Parameters
     ----------
-    found : Diagnosis
     name : str
         Of a fitted hypothesis; ``none`` has no size.
     """

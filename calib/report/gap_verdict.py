@@ -106,10 +106,8 @@ class GapEvidence:
         What the best hypothesis amounts to.
     where : sequence of WhereFact
         One of each output that has any.
-    shrink : sequence of ShrinkFact
     unfitted : bool
         Whether the shrink was judged at conditions other than the fitted ones.
-    next_facts : sequence of NextFact
     alike : sequence of str
         Effects that look like the best one on this design, in words.
     smallest : float
@@ -162,7 +160,6 @@ class GapVerdict:
 
     Parameters
     ----------
-    tone : Tone
     rule : str
         Which rule decided.
     state : str

@@ -41,8 +41,6 @@ def build_manifest(
 
     Parameters
     ----------
-    study : Study
-    settings : SamplerSettings
     command : sequence of str
         The command line, program first.
     inputs : mapping

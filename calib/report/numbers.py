@@ -57,7 +57,6 @@ def format_value(mean: float, sd: float, mcse: float = 0.0) -> str:
 
     Parameters
     ----------
-    mean, sd : float
     mcse : float
         Monte Carlo standard error of the mean.
 
@@ -90,7 +89,6 @@ def format_interval(
 
     Parameters
     ----------
-    lower, upper : float
     uncertainty : float or pair of float
         Of both ends, or of each: the standard deviation of what lies in the interval, or an end's
         distance from its centre.

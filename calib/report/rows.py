@@ -35,7 +35,6 @@ class Group:
 
     Parameters
     ----------
-    title : str
     held : bool
         Whether its rows were held out.
     column : str or None
@@ -94,7 +93,6 @@ def groups(result: OutputResult, *, most: bool = True) -> list[Group]:
 
     Parameters
     ----------
-    result : OutputResult
     most : bool
         Whether to stop at six; otherwise every row is in a group.
     """
@@ -181,8 +179,6 @@ def smooth_bands(
 
     Parameters
     ----------
-    calibration : Calibration
-    conditions : mapping of str to ndarray
     prior : bool
         Of the prior instead of the posterior.
     """

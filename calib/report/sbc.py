@@ -75,7 +75,6 @@ def write_sbc(score: SbcScore, out: Path, settings: dict[str, Any], command: Seq
 
     Parameters
     ----------
-    score : SbcScore
     out : Path
         That of `calib.validation.sbc.run.run_sbc`; files of an earlier end of the run are replaced.
     settings : dict

@@ -25,10 +25,8 @@ class Written:
 
     Parameters
     ----------
-    anchor, heading : str
     badge : str
         Beside the heading: what its data are called; empty for none.
-    html : str
     """
 
     anchor: str

@@ -48,10 +48,8 @@ class OutputResult:
 
     Parameters
     ----------
-    task : Task
     calibration : Calibration
         On the rows that are not held out.
-    validation : Validation
     estimates : tuple of PointEstimate
         Every applicable method, on all rows the source fitted.
     by_pressure : mapping of float to tuple of PointEstimate
@@ -122,9 +120,6 @@ def run_study(
 
     Parameters
     ----------
-    tasks : sequence of Task
-    seed : int
-    settings : SamplerSettings, optional
     progress : callable, optional
         Called with what is being done, steps done and steps planned.
     workers : int
@@ -246,7 +241,6 @@ def judged(calibration: Calibration, validation: Validation) -> OutputResult:
 
     Parameters
     ----------
-    calibration : Calibration
     validation : Validation
         On rows that were held out, or left out in turn.
     """
@@ -270,12 +264,6 @@ def estimate_task(
     task: Task, seed: int, *, progress: Progress | None = None
 ) -> tuple[tuple[PointEstimate, ...], dict[float, tuple[PointEstimate, ...]]]:
     """Return the point estimates of a task, and those at each inflation pressure on its own.
-
-    Parameters
-    ----------
-    task : Task
-    seed : int
-    progress : callable, optional
 
     Raises
     ------

@@ -66,12 +66,10 @@ class Task:
     ----------
     output : str
         Key of `OUTPUTS`.
-    model : str
     table : Table
         All rows.
     held_out : HoldOut, optional
         Validation by held-out rows; by leave-one-out where there is none.
-    prior_path : Path, optional
     """
 
     output: str
@@ -124,8 +122,6 @@ def plan_tasks(
 
     Parameters
     ----------
-    tables : sequence of Table
-    held_out : HoldOut, optional
     models : sequence of str
         Models to use for their outputs, in the place of the ones the columns suggest.
     prior_paths : sequence of Path

@@ -62,7 +62,6 @@ class Evidence:
 
     Parameters
     ----------
-    converged : bool
     reasons : sequence of str
         Why not.
     held_out : bool
@@ -73,7 +72,6 @@ class Evidence:
         Probability of covering no more than that, were the bands right.
     effective : float
         Independent rows that would say as much.
-    rmse : float
     unit : str
         Of the output.
     max_relative_error : float

@@ -53,14 +53,12 @@ def write_report(
 
     Parameters
     ----------
-    study : Study
     out : Path
         Appears whole or not at all.
     settings : SamplerSettings
         Of the study, for the manifest.
     command : sequence of str
         The command line, for the manifest.
-    title : str
     sections : sequence of Found
         What it shows beside its outputs, in their order on the page.
     overwrite : bool
@@ -72,7 +70,6 @@ def write_report(
         Where the manifest says the report was made: that of this process by default.
     pdf : bool
         Whether every figure also comes as PDF, for print.
-    progress : callable, optional
     pool : Pool, optional
         Where figures are drawn.
 

@@ -33,7 +33,6 @@ def warnings_of(problem: Problem, t: Array) -> tuple[str, ...]:
 
     Parameters
     ----------
-    problem : Problem
     t : ndarray, shape (d,)
         Internal coordinates of a fit to all rows, for instance the posterior's mode.
     """
@@ -48,7 +47,6 @@ def file_notes(problem: Problem, scatter: float) -> tuple[str, ...]:
 
     Parameters
     ----------
-    problem : Problem
     scatter : float
         Sd of a reading about the prediction, on the scale of the response.
     """
@@ -103,7 +101,6 @@ def residual_notes(problem: Problem, t: Array) -> tuple[str, ...]:
 
     Parameters
     ----------
-    problem : Problem
     t : ndarray, shape (d,)
         Internal coordinates of a fit to all rows.
 

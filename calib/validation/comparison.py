@@ -46,7 +46,6 @@ class Candidate:
 
     Parameters
     ----------
-    calibration : Calibration
     loo : Validation
         By leave-one-out, on the fitted rows.
     held : Validation or None

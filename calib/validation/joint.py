@@ -32,7 +32,6 @@ def pit_half_width(draws: Array, level: float = 0.95) -> float:
     Parameters
     ----------
     draws : ndarray, shape (size, n)
-    level : float
     """
     return float(np.quantile(ks_distance(_pit_of_draws(draws)), level))
 

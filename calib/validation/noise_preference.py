@@ -22,7 +22,6 @@ class NoisePreference:
 
     Parameters
     ----------
-    noise : Noise
     elpd, se : float
         Difference of the expected log predictive densities, and its standard error.
     sound : bool

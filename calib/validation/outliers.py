@@ -50,7 +50,6 @@ def outlying_rows(problem: Problem, t: Array) -> tuple[OutlyingRow, ...]:
 
     Parameters
     ----------
-    problem : Problem
     t : ndarray, shape (d,)
         Internal coordinates of a fit to all rows, for instance the posterior's mode.
 

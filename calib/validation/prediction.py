@@ -212,7 +212,6 @@ def prediction_columns(prediction: Prediction, table: Table) -> dict[str, Array 
 
     Parameters
     ----------
-    prediction : Prediction
     table : Table
         The conditions.
     """

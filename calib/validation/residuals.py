@@ -38,7 +38,6 @@ def standardise(calibration: Calibration, problem: Problem) -> Standardised:
 
     Parameters
     ----------
-    calibration : Calibration
     problem : Problem
         Its rows: the calibrated ones or, by ``with_table``, others.
     """

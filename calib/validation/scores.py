@@ -50,7 +50,6 @@ class Scores:
     relative_error : ndarray, shape (n,)
         (median - observed)/observed; NaN where the observation is below a twentieth of the
         largest.
-    coverage : mapping of float to Coverage
     pit : ndarray, shape (n,)
         Probability integral transform.
     median : ndarray, shape (n,)

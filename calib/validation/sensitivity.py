@@ -44,7 +44,6 @@ class Sensitivity:
 
     Parameters
     ----------
-    name : str
     prior, likelihood : float
         Power-scaling sensitivities, per doubling of the power.
     contraction : float

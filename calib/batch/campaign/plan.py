@@ -26,7 +26,6 @@ class Plan:
 
     Parameters
     ----------
-    path : Path
     text : bytes
         As it was read.
     tasks : mapping of str to Task

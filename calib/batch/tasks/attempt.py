@@ -19,7 +19,6 @@ class Finished[R]:
 
     Parameters
     ----------
-    name : str
     result : object
         What the task returned; None where it failed.
     error : str, optional
@@ -39,8 +38,6 @@ def attempt[I, R](function: Callable[[I], R], name: str, item: Callable[[], I]) 
 
     Parameters
     ----------
-    function : callable
-    name : str
     item : callable
         Returns what `function` is called with.
     """

@@ -108,7 +108,6 @@ class _Sent:
 
     Parameters
     ----------
-    client : Client
     call : callable
         Called with a name and a sealed item.
     window : int

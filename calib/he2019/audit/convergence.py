@@ -102,7 +102,6 @@ class GeneticStudy:
         Table 2's.
     by_pressure : mapping of int to Search
         By inflation pressure in psi.
-    joint, printed_coordinates : Search
     read_off : mapping of int to PointEstimate
         The geometric method on the same data.
     """
@@ -138,9 +137,6 @@ def study_convergence(
 
     Parameters
     ----------
-    published : Published
-    seed : int
-    seeds : Seeds, optional
     progress : callable, optional
         Called with what is being done, runs done and runs planned.
     """

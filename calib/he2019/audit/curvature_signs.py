@@ -54,11 +54,8 @@ def least_cost(
 
     Parameters
     ----------
-    published : Published
-    signs : tuple of int
     slips : ndarray, shape (n,)
         In percent.
-    seed : int
     optimal : bool
         Whether Table 4 is taken for the optimum of each pressure.
     """
@@ -89,7 +86,6 @@ class CurvatureStudy:
 
     Parameters
     ----------
-    published_cost : float
     least : mapping of Signs to float
         At the assumed slips, Table 4 taken for the optimum.
     least_free : mapping of Signs to float

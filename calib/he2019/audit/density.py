@@ -35,7 +35,6 @@ def density_range(
 
     Parameters
     ----------
-    published : Published
     exponent : {1, -1}
         1 for the exponent of C1 as it is read, -1 for the other sign.
     C3_sign : {1, -1}

@@ -107,10 +107,8 @@ def rounded(
 
     Parameters
     ----------
-    name, unit : str
     interval : Interval
         Of one number, or of several: then from the least to the largest.
-    published : Figure, optional
     middle : bool
         Whether the midpoint is worth showing.
     """
@@ -137,13 +135,10 @@ class Finding:
         What is claimed, or how the figure is read.
     test : str
         How it was tested.
-    found : tuple of Quantity
-    verdict : Verdict
     evidence : str
         One sentence.
     stays_open : str
         What the test leaves undecided; empty where nothing is.
-    basis : Basis
     """
 
     key: str

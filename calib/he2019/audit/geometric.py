@@ -80,7 +80,6 @@ def geometric_findings(
 
     Parameters
     ----------
-    published : Published
     read_off : mapping of int to PointEstimate, optional
         The geometric method on the reconstructed data, by inflation pressure in psi.
     """

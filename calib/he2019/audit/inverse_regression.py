@@ -81,8 +81,6 @@ def simulate_inverse(
         Of the model modified_bekker; its conditions are used, not its ruts.
     truth : PointEstimate
         Parameters, and the noise of ln zt as its RMSE.
-    rng : Generator
-    size : int
     """
     pressure = problem.conditions["average_ground_pressure_kpa"]
     slip, y = problem.conditions["slip_ratio"], np.log(pressure)
@@ -108,11 +106,8 @@ def study_inverse(
 
     Parameters
     ----------
-    published : Published
-    seed : int
     calibration : Calibration, optional
         Of the modified Bekker model on the 18 and 42 psi rows, if it is at hand.
-    progress : callable, optional
     """
     fitted, held = hold_out(
         load_he2019("rut_depth"), "inflation_pressure_psi", float(published.setup.held_out_psi)

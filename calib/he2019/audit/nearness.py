@@ -131,7 +131,6 @@ def joint_bounds(
     Parameters
     ----------
     coefficients : ndarray, shape (k, 10)
-    known : tuple of Reference
     slips : ndarray, shape (n,)
     optimal : bool
         As for `Reference.bounds`.

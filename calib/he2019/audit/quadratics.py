@@ -71,7 +71,6 @@ def nearest(
 
     Parameters
     ----------
-    published : Published
     what : {"D", "BCD", "E"}
     signs : tuple of int, optional
         Of the three coefficients; as they are read by default.

@@ -73,7 +73,6 @@ def log_pressure_ratio(published: Published, n: Array, share: float = 0.5) -> In
 
     Parameters
     ----------
-    published : Published
     n : ndarray
         More than the number of parameters.
     share : float

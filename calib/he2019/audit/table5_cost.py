@@ -121,7 +121,6 @@ def assumed_slips_bound(published: Published, *, optimal: bool) -> float:
 
     Parameters
     ----------
-    published : Published
     optimal : bool
         Whether Table 4 is taken for the optimum of each pressure.
     """
@@ -168,7 +167,6 @@ def joint_cost(published: Published, reconstructed_optimum: float, at_most: Boun
 
     Parameters
     ----------
-    published : Published
     reconstructed_optimum : float
         The joint optimum on the reconstructed data, for comparison, kN^2.
     at_most : Bounds

@@ -65,7 +65,6 @@ def coefficients(features: Features, C_without_peak: float = 1.5) -> Coefficient
 
     Parameters
     ----------
-    features : Features
     C_without_peak : float
         C where the range holds no peak, so that the asymptote cannot be seen.
 
@@ -105,7 +104,6 @@ def read_features(
     Parameters
     ----------
     slip_percent, pull : ndarray, shape (n,)
-    slope_slip_percent : float
     find_zero : bool
         Do not force the line through the origin and count slips from where it is zero, as the
         source redefined its zero of slip.

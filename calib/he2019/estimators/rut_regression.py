@@ -116,7 +116,6 @@ def estimate_published_regression(
 
     Parameters
     ----------
-    problem : Problem
     rng : Generator, optional
         Not used.
     max_slip : float

@@ -25,10 +25,6 @@ _DRAWINGS: dict[str, Callable[[Audit], Plate]] = {
 def audit_plates(audit: Audit) -> list[Plate]:
     """Draw the figures of an audit.
 
-    Parameters
-    ----------
-    audit : Audit
-
     Returns
     -------
     list of Plate

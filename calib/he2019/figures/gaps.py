@@ -43,12 +43,7 @@ _PRESSURES = (18.0, 30.0, 42.0)
 
 
 def gap_plate(result: FoundGap) -> Plate:
-    """Draw errors over slip before and after the correction, and the probabilities.
-
-    Parameters
-    ----------
-    result : FoundGap
-    """
+    """Draw errors over slip before and after the correction, and the probabilities."""
     with style():
         return _plate(result)
 

@@ -48,12 +48,10 @@ class PaperGap:
     ----------
     name : str
         Of its folder.
-    title, question : str
     lab_rows, field_rows : str
         In words: the rows of the two campaigns.
     limits : str
         What a finding can mean and what it cannot, the data being reconstructed.
-    case : Case
     withheld : str, optional
         The effect that the field has and the laboratory has not, where the source names one.
     unfitted : Table, optional

@@ -29,7 +29,6 @@ class Check:
 
     Parameters
     ----------
-    name : str
     values : mapping of str to float
         All numbers in it, by name; units are in the names.
     """

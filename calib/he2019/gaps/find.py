@@ -37,8 +37,6 @@ class FoundGap:
 
     Parameters
     ----------
-    gap : PaperGap
-    found : Diagnosis
     variants : mapping of str to Diagnosis
         Of the same question asked otherwise.
     open_sd : ndarray, shape (n_field,)

@@ -18,7 +18,6 @@ def write_cases(gaps: Sequence[PaperGap], out: Path, *, overwrite: bool = False)
 
     Parameters
     ----------
-    gaps : sequence of PaperGap
     out : Path
         Gets a folder for each gap with ``case.toml``, ``lab.csv``, ``field.csv`` and, where rows
         were kept out, ``fresh.csv`` with their conditions and ``fresh_measured.csv`` with their

@@ -44,7 +44,6 @@ def write_audit(audit: Audit, folder: Path) -> str:
 
     Parameters
     ----------
-    audit : Audit
     folder : Path
         Gets ``audit.json``, ``audit.csv`` and ``figures/audit_*.png``.
 
@@ -68,10 +67,8 @@ def write_audit_page(audit: Audit, folder: Path, command: Sequence[str]) -> None
 
     Parameters
     ----------
-    audit : Audit
     folder : Path
         Gets ``index.html`` beside what `write_audit` writes.
-    command : sequence of str
     """
     page = template("audit_page.html.j2", "calib.he2019.page").render(
         title=_TITLE,
@@ -88,8 +85,6 @@ def audit_section(audit: Audit, plates: Sequence[Plate], images: Mapping[str, by
 
     Parameters
     ----------
-    audit : Audit
-    plates : sequence of Plate
     images : mapping of str to bytes
         PNG files by the name of their plate.
     """

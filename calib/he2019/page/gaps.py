@@ -49,7 +49,6 @@ def write_gaps(
 
     Parameters
     ----------
-    results : sequence of FoundGap
     folder : Path
         Has ``figures/``; gets ``figures/gap_NAME.png`` and ``gaps/NAME/``, each what
         `calib diagnose` writes, its figures inside the page only.
@@ -59,7 +58,6 @@ def write_gaps(
         Of the report, for the pages' versions.
     pdf : bool
         Whether each gap's figure also comes as PDF.
-    progress : callable, optional
 
     Returns
     -------

@@ -112,14 +112,8 @@ def prepare(
 
     Parameters
     ----------
-    model : str
     table : Table
         What it is calibrated on.
-    seed : int
-    priors : Path, optional
-    elsewhere : sequence of Table
-    workers : int
-    progress : callable, optional
 
     Returns
     -------
@@ -154,11 +148,8 @@ def prepare_field(
         One that is an emulator by now.
     field : Table
         Rows that have the output.
-    seed : int
     more : int
         Runs at most.
-    workers : int
-    progress : callable, optional
 
     Returns
     -------

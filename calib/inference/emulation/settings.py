@@ -51,7 +51,6 @@ class HeldOut:
 
     Parameters
     ----------
-    runs : int
     rmse : float
         Error over runs and rows, in sds of the noise.
     z : ndarray

@@ -37,10 +37,8 @@ class State:
     ----------
     problem : Problem
         Whose posterior the emulator is to serve.
-    keeper : RunKeeper
     nodes : mapping of str to ndarray, shape (m,)
         Conditions of every run.
-    seed : int
     label : str
         Names the random streams.
     """

@@ -72,7 +72,6 @@ def residuals(problem: Problem, natural: Array) -> Array:
 
     Parameters
     ----------
-    problem : Problem
     natural : ndarray, shape (k, d_all)
         Natural parameters, the noise scale last.
 
@@ -96,7 +95,6 @@ def sum_of_squares(problem: Problem, natural: Array) -> Array:
 
     Parameters
     ----------
-    problem : Problem
     natural : ndarray, shape (k, d_all)
         Natural parameters, the noise scale last.
     """
@@ -120,8 +118,6 @@ def goodness(
 
     Parameters
     ----------
-    problem : Problem
-    method : str
     theta : ndarray, shape (d_model,)
     n_fitted : int
         Number of parameters fitted: those held or fixed do not count.

@@ -34,8 +34,6 @@ def estimate_differential_evolution(
 
     Parameters
     ----------
-    problem : Problem
-    rng : Generator
     box : mapping of str to (lower, upper), optional
         As for `calib.inference.estimators.search.search_space`.
     polish : bool

@@ -53,7 +53,6 @@ class GeneticSettings:
         The run stops early once the costs of the whole population differ by no more than this
         part of the lowest for `patience` generations running. Any further generation could
         lower the cost by about as little.
-    patience : int
     """
 
     F: float = 0.4
@@ -133,7 +132,6 @@ def descendants(
     best : ndarray, shape (d,)
     draws : GeneticDraws
         Of this generation, without the leading axis.
-    F : float
     lower, upper : ndarray, shape (d,)
         The search box.
 

@@ -40,8 +40,6 @@ class GeneticResult(NamedTuple):
     Parameters
     ----------
     x : ndarray, shape (d,)
-    cost : float
-    n_evaluations : int
     history : ndarray, shape (generations + 1,)
         Lowest cost of the first population and after each generation.
     converged : bool
@@ -70,7 +68,6 @@ def minimise_genetic(
         ``(k, d) -> (k,)``, ``inf`` where it has no value; called once per generation.
     lower, upper : ndarray, shape (d,)
         The search box, in which the first population is drawn uniformly.
-    rng : Generator
     settings : GeneticSettings, optional
         Table 2 by default.
 
@@ -175,8 +172,6 @@ def estimate_genetic(
 
     Parameters
     ----------
-    problem : Problem
-    rng : Generator
     settings : GeneticSettings, optional
         Table 2 by default.
     box : mapping of str to (lower, upper), optional

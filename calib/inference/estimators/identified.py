@@ -67,10 +67,6 @@ def hold_unidentified(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     The rank of the Jacobian of the predictions is taken at the prior's centre and at a few points
     around it; a parameter is given up only if it is flat, or imitated by the others, at all.
 
-    Parameters
-    ----------
-    problem : Problem
-
     Returns
     -------
     held_problem : Problem

@@ -92,8 +92,6 @@ def estimate_least_squares(
 
     Parameters
     ----------
-    problem : Problem
-    rng : Generator
     n_screen : int
         Prior draws.
     n_polish : int

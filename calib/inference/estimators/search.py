@@ -170,8 +170,6 @@ def search_in_box(
 
     Parameters
     ----------
-    problem : Problem
-    method : str
     box : mapping of str to (lower, upper), optional
         As for `search_space`.
     minimise : callable

@@ -71,13 +71,11 @@ def adapt(
         ``(k, d) -> (k,)``, unnormalised.
     guesses : sequence of Guess
         One for each mode that is known.
-    rng : Generator
     planned : int
         Draws that the chains are to have at first.
 
     Returns
     -------
-    Proposal
     Assessment
         By the last round's draws.
     """
@@ -116,12 +114,9 @@ def refit(
 
     Parameters
     ----------
-    log_prob : callable
-    old : Proposal
     draws : ndarray, shape (k, d)
     effective : float
         What the draws are worth.
-    rng : Generator
     """
     weight = np.full(draws.shape[0], 1.0 / draws.shape[0])
     proposal = fit_proposal(old, draws, weight, effective, 1.0, rng)

@@ -44,7 +44,6 @@ def climb(
     width : ndarray, shape (d,)
         A length over which each coordinate matters (its prior sd).
     lower, upper : ndarray, shape (d,)
-    steps : int
     tolerance : float
         In log density: an ascent that gains less in a step, and expects less, stops.
 

@@ -62,7 +62,6 @@ def judge(
     ----------
     draws : ndarray, shape (ensembles, walkers, steps, d)
     names : tuple of str, length d
-    gate : Gate
     tau : ndarray, shape (d,)
         Integrated autocorrelation time in steps, the worst of the ensembles.
     steps : int, optional

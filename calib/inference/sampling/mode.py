@@ -56,7 +56,6 @@ class Mode:
     Parameters
     ----------
     t : ndarray, shape (d,)
-    log_prob : float
     covariance : ndarray, shape (d, d)
         Of the normal with the curvature there.
     """
@@ -95,8 +94,6 @@ def find_modes(
     ----------
     log_prob : callable
         ``(k, d) -> (k,)``.
-    priors : Priors
-    rng : Generator
     starts : ndarray, shape (m, d), optional
         Point estimates, in internal coordinates.
     n_screen, n_climb : int

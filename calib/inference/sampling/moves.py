@@ -32,13 +32,11 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
 
     Parameters
     ----------
-    proposal : Proposal
     rng : Generator
         Draws the pairs.
     ahead : int
         Steps, two for each pair, whose points are evaluated at once. Those left over at the end
         are wasted.
-    walk : WalkMove, optional
     every : int
         Steps with pairs between two of the walk's.
     """
@@ -62,14 +60,8 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
     def propose(self, model: Any, state: Any) -> tuple[Any, Array]:
         """Move the walkers; the interface is emcee's.
 
-        Parameters
-        ----------
-        model : emcee.model.Model
-        state : emcee.State
-
         Returns
         -------
-        state : emcee.State
         moved : ndarray of bool, shape (walkers,)
         """
         if self.walk is not None and self._since_walk == self.every:
@@ -179,7 +171,6 @@ class _Steps:
     which, side : ndarray of int, shape (steps, walkers)
         The pair that a walker holds after a step, and at which of its points it stands.
     moved : ndarray of bool, shape (steps, walkers)
-    done : int
     """
 
     pairs: _Pairs
@@ -258,7 +249,6 @@ class WalkMove(emcee.moves.Move):  # type: ignore[misc]
     ----------
     proposal : Proposal
         Whose straightened coordinates they are.
-    rng : Generator
     """
 
     def __init__(self, proposal: Proposal, rng: np.random.Generator) -> None:
@@ -269,14 +259,8 @@ class WalkMove(emcee.moves.Move):  # type: ignore[misc]
     def propose(self, model: Any, state: Any) -> tuple[Any, Array]:
         """Move the walkers; the interface is emcee's.
 
-        Parameters
-        ----------
-        model : emcee.model.Model
-        state : emcee.State
-
         Returns
         -------
-        state : emcee.State
         accepted : ndarray of bool, shape (walkers,)
         """
         walkers, d = state.coords.shape

@@ -29,7 +29,6 @@ class Proposal:
 
     Parameters
     ----------
-    straightener : Straightener
     mixture : Mixture
         Of straightened coordinates.
     """

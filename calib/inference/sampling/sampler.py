@@ -73,10 +73,8 @@ class Draws:
     mode : ndarray, shape (d,)
     log_evidence, efficiency : float
         By importance sampling from the proposal, and its effective fraction.
-    acceptance : float
     evaluations : int
         Parameter vectors whose density was evaluated, all stages included.
-    seconds : float
     walkers : int
         That were run in each ensemble.
     """
@@ -111,12 +109,10 @@ def sample_posterior(
 
     Parameters
     ----------
-    problem : Problem
     seed : int or SeedSequence
         Same seed, same numbers.
     starts : ndarray, shape (m, d), optional
         Point estimates in internal coordinates that seed the search for the mode.
-    settings : SamplerSettings, optional
     progress : callable, optional
         Called with steps done and steps planned.
 
@@ -208,9 +204,6 @@ def sample_density(
         One for the adaptation (already used by `rng`) and one for each ensemble.
     names : tuple of str
         Of the coordinates.
-    settings : SamplerSettings
-    rng : Generator
-    progress : callable, optional
     began : float, optional
         ``time.perf_counter()`` at which the work began.
     """
@@ -269,7 +262,6 @@ def _drawn(t: Array, log_prob: Array, draws: int) -> tuple[Array, Array]:
     ----------
     t : ndarray, shape (ensembles, steps, walkers, d)
     log_prob : ndarray, shape (ensembles, steps, walkers)
-    draws : int
 
     Returns
     -------

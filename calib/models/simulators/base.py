@@ -95,14 +95,10 @@ class Simulator:
     ----------
     name : str
         Of the simulator, and of its model where there is one output.
-    way : Way
-    parameters : tuple of str
     priors : str
         TOML text of their tables ``parameters.NAME``, as in a prior file.
     conditions : mapping of str to str
         The simulator's own name of each condition to a header in the unit it takes.
-    outputs : tuple of Output
-    title : str
     source : str
         Whom it is after.
     limit : float

@@ -70,7 +70,6 @@ def output_of_text(text: str, how: str, patterns: Mapping[str, str]) -> Result:
 
     Parameters
     ----------
-    text : str
     how : {"json", "csv", "pattern"}
         JSON: an object of lists or numbers; CSV: a column each.
     patterns : mapping of str to str

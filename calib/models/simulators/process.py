@@ -27,7 +27,6 @@ def run_program(arguments: Sequence[str], folder: Path, limit: float) -> Failure
 
     Parameters
     ----------
-    arguments : sequence of str
     folder : Path
         Its working directory.
     limit : float
@@ -82,7 +81,6 @@ def call_function(function: Callable[..., Any], arguments: Sequence[Any], limit:
     ----------
     function : callable
         Handed over with whatever it refers to, as it is now: what it changes is lost.
-    arguments : sequence
     limit : float
         Seconds, the start of the process (a third of one, and what the function imports) included.
 

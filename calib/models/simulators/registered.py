@@ -29,7 +29,6 @@ class Simulated:
 
     Parameters
     ----------
-    simulator : Simulator
     folder : Path, optional
         Where its runs are kept; in memory without.
     budget : mapping of str to number
@@ -195,14 +194,10 @@ def declare(
 
     Parameters
     ----------
-    name : str
-    way : Way
     priors : str
         TOML text of all prior tables, those of the noise among them.
     conditions, outputs : mapping of str to str
         The simulator's own names to headers.
-    folder : Path, optional
-    budget : mapping, optional
     **details
         Other fields of `Simulator`.
     """

@@ -34,7 +34,6 @@ class Run:
     theta : ndarray, shape (d,)
     outputs : mapping of str to ndarray, shape (n,)
         By canonical column; empty where it failed.
-    failure : Failure, optional
     """
 
     theta: Array
@@ -62,7 +61,6 @@ class RunKeeper:
 
     Parameters
     ----------
-    simulator : Simulator
     folder : Path, optional
         Where runs are kept, each a file named after a hash of simulator, parameters and
         conditions, written whole or not at all; without one, in memory.

@@ -38,7 +38,6 @@ class CallableWay:
         false theta has the shape (d,), the output (n,).
     columns : tuple of str
         The outputs.
-    batched : bool
     limit : float, optional
         Seconds for a run, which is then made in a process of its own; without one, in this.
     """
@@ -104,7 +103,6 @@ class CommandWay:
     template : str
         The input in the program's own format, ``@name@`` where a value belongs.
     gives : {"json", "csv", "pattern"}
-    patterns : mapping of str to str
     each_row : bool
         Whether the program is run for each row of conditions by itself.
     limit : float
@@ -210,7 +208,6 @@ class UmbridgeWay:
 
     Parameters
     ----------
-    url, model : str
     columns : tuple of str
         The outputs, in the order of the server's output vectors.
     rows : {"each", "config"}

@@ -58,7 +58,6 @@ def render(found: Mapping[str, Any], image: str, command: Sequence[str]) -> str:
         The content of `comparison.json`.
     image : str
         Data URI of the figure.
-    command : sequence of str
     """
     head, body = table(found)
     models = [get_model(name) for name in found["models"]]

@@ -70,9 +70,6 @@ def section(
 
     Parameters
     ----------
-    key : str
-    result : OutputResult
-    plates : sequence of Plate
     images : mapping of str to bytes
         PNG files by name, ``{key}_{plate.name}.png``.
     """

@@ -60,7 +60,6 @@ def write_page(
 
     Parameters
     ----------
-    found : Diagnosis
     folder : Path
         Gets ``figures/*.png`` and ``index.html``.
     manifest : mapping
@@ -97,11 +96,8 @@ def render_diagnosis(
 
     Parameters
     ----------
-    found : Diagnosis
-    plates : sequence of Plate
     images : mapping of str to bytes
         PNG files by name, ``{plate.name}.png``.
-    manifest : mapping
 
     Returns
     -------

@@ -175,7 +175,6 @@ def parameter_text(prior: Prior, value: float, sd: float) -> str:
 
     Parameters
     ----------
-    prior : Prior
     value, sd : float
         In internal coordinates.
 
@@ -214,7 +213,6 @@ def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
 
     Parameters
     ----------
-    outputs : sequence of OutputData
     fit : Fit
         Of a parameter shift.
     """

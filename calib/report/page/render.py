@@ -34,14 +34,12 @@ def render_page(
 
     Parameters
     ----------
-    study : Study
     plates : mapping of str to sequence of Plate
         Figures of every output that was worked out.
     images : mapping of str to bytes
         PNG files by name, ``{output}_{plate.name}.png``.
     manifest : mapping
         As `calib.report.manifest.build_manifest` returns it.
-    title : str
     reconstructed : bool
         Whether any data were reconstructed from published results.
     more : sequence of Written

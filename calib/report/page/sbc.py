@@ -36,10 +36,8 @@ def render(score: SbcScore, images: Mapping[str, str], command: Sequence[str]) -
 
     Parameters
     ----------
-    score : SbcScore
     images : mapping of str to str
         Data URIs of the figures: one for each model, and ``coverage``.
-    command : sequence of str
     """
     return template("sbc.html.j2").render(
         verdict=verdict(score),

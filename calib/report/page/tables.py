@@ -29,15 +29,7 @@ _MINUS = "\N{MINUS SIGN}"
 
 @dataclass(frozen=True)
 class Grid:
-    """A table: a caption, column heads, rows and rows at the foot.
-
-    Parameters
-    ----------
-    caption : str
-    head : list of str
-    rows, foot : list of list of str
-    notes : list of str
-    """
+    """A table: a caption, column heads, rows and rows at the foot."""
 
     caption: str
     head: list[Any]

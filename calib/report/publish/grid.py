@@ -18,7 +18,6 @@ class CsvTable:
 
     Parameters
     ----------
-    head : tuple of str
     rows : tuple of tuple of str
         Each as long as the head.
     """

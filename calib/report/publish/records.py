@@ -21,7 +21,6 @@ class Output:
 
     Parameters
     ----------
-    key, model : str
     task : mapping
         Its entry in the manifest.
     found : mapping

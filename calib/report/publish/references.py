@@ -37,7 +37,6 @@ def bibtex(keys: Iterable[str], version: str) -> str:
 
     Parameters
     ----------
-    keys : iterable of str
     version : str
         Of this package, for its own entry.
     """

@@ -138,7 +138,6 @@ def convergence_latex(outputs: Sequence[Output], gate: Mapping[str, float]) -> L
 
     Parameters
     ----------
-    outputs : sequence of Output
     gate : mapping
         Its limits, as in the manifest.
     """

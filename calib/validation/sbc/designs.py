@@ -21,7 +21,6 @@ class Design:
 
     Parameters
     ----------
-    model : str
     table : Table
         The rows to calibrate on; their outputs are placeholders for simulated ones.
     held : mapping of str to ndarray, shape (m,)
@@ -47,7 +46,6 @@ class ModelDesign:
 
     Parameters
     ----------
-    model : str
     make : callable
         ``() -> Design``.
     """

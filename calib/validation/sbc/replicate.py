@@ -39,12 +39,10 @@ class Item:
 
     Parameters
     ----------
-    model : str
     index : int
         Number of the replicate.
     seed : int
         Of the whole run.
-    settings : SamplerSettings
     priors : PriorFile, optional
         The shipped ones by default.
     """

@@ -48,8 +48,6 @@ def run_sbc(
         By default all that are not slow.
     simulations : int
         Of each model.
-    seed : int
-    settings : SamplerSettings
     priors : sequence of Path
         Prior files in the place of the shipped ones; each says which model it is for.
     workers, scheduler, progress, announce

@@ -50,7 +50,6 @@ class BandCoverage:
 
     Parameters
     ----------
-    level : float
     rows, replicates : int
         Measurements, and the campaigns that they belong to.
     proportion : float
@@ -86,7 +85,6 @@ class ModelScore:
 
     Parameters
     ----------
-    model : str
     replicates : int
         Campaigns simulated and calibrated.
     unconverged, extended : int
@@ -97,8 +95,6 @@ class ModelScore:
         Draws from the prior that were needed.
     no_band : int
         Held-out measurements for which no band was given.
-    quantities : tuple of Quantity
-    coverage : tuple of BandCoverage
     failed : mapping of str to str
         Replicates that ended with an error.
     """
@@ -122,7 +118,6 @@ class SbcScore:
     ----------
     seed, simulations : int
         Simulations of each model.
-    models : tuple of ModelScore
     """
 
     seed: int

@@ -51,8 +51,6 @@ def simulate(template: Problem, design: Design, rng: np.random.Generator) -> Sim
     ----------
     template : Problem
         Of the design's conditions; its outputs are not used.
-    design : Design
-    rng : Generator
 
     Raises
     ------

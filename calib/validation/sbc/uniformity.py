@@ -31,12 +31,7 @@ _JUMPS = 60  # a Poisson variable of mean one exceeds it with probability below 
 
 @dataclass(frozen=True)
 class EcdfBand:
-    """ECDF of probability integral transforms and its simultaneous band, arrays of shape (n + 1,).
-
-    Parameters
-    ----------
-    x, ecdf, lower, upper : ndarray
-    """
+    """ECDF of probability integral transforms, its simultaneous band; arrays of shape (n + 1,)."""
 
     x: Array
     ecdf: Array
@@ -64,7 +59,6 @@ def ecdf_band(values: Array, level: float) -> EcdfBand:
     Parameters
     ----------
     values : ndarray, shape (n,)
-    level : float
     """
     ecdf_pit: Any = import_module("arviz_stats.ecdf_utils").ecdf_pit
 
@@ -107,10 +101,6 @@ def _p_of_tail(n: int, tail: float) -> float:
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """Adjust p values for their number, family-wise (Holm 1979, JSTOR 4615733).
-
-    Parameters
-    ----------
-    p_values : sequence of float
 
     Returns
     -------

@@ -59,7 +59,6 @@ class Task:
         Key of `calib.batch.campaign.kinds.KINDS`.
     seed : int
         Its own, from the stream of its name.
-    settings : mapping of str to object
     inputs : mapping of str to Path
         As planned.
     """

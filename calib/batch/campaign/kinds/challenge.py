@@ -50,8 +50,6 @@ class ChallengeItem:
     ----------
     own : SeedSequence
         The case's seed.
-    tier : str
-    truth : str
     bench : str
         Hash of the code that makes it.
     """

@@ -45,10 +45,8 @@ class DiagnosisItem:
 
     Parameters
     ----------
-    case : Case
     effects : mapping of str to bytes
         The user's file of effects, first, and the prior files beside it.
-    page : bool
     """
 
     case: Case

@@ -64,8 +64,6 @@ class FitItem:
     ----------
     problem : Problem
         On the rows that are not held out.
-    held : Table, optional
-    settings : SamplerSettings
     posterior : bool
         Whether to keep the run folder.
     """
