@@ -7,8 +7,6 @@ from contextlib import contextmanager
 
 from calib.errors import CalibError
 
-__all__ = ["from_the_bench"]
-
 _BENCH = "challenge"
 
 

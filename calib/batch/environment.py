@@ -14,8 +14,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Environment", "code_sha256", "sha256", "source_sha256", "versions"]
-
 _PACKAGES = (
     "terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-base", "arviz-stats", "xarray",
     "matplotlib", "corner", "pillow", "jinja2", "h5netcdf", "h5py",

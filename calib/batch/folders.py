@@ -15,8 +15,6 @@ from pathlib import Path
 
 from calib.errors import CalibError
 
-__all__ = ["check_folder", "fresh_folder", "read_folder", "unwritable"]
-
 # Files by which a folder is known to be one of ours, and may be replaced.
 _OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json",
          "comparison.json")  # fmt: skip

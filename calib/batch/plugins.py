@@ -14,8 +14,6 @@ from types import ModuleType
 
 from calib.errors import CalibError
 
-__all__ = ["PLUGINS", "inherit", "load_files", "load_installed", "loaded_files", "run_file"]
-
 # Entry points of packages that register several things.
 PLUGINS = "terracalib.plugins"
 # What the names of modules begin with that were loaded by their paths.

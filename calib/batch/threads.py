@@ -8,8 +8,6 @@ from functools import cache
 from importlib import import_module
 from typing import Any
 
-__all__ = ["blas_kernels", "one_thread"]
-
 
 @contextmanager
 def one_thread() -> Iterator[None]:

@@ -16,8 +16,6 @@ from calib.check.outcome import Outcome
 from calib.check.schema import ComparisonRecord, Manifest, Record, RunRecord, read_folder
 from calib.report.study import Progress
 
-__all__ = ["check"]
-
 
 def check(
     folder: Path, *, quick: bool = False, progress: Progress | None = None, pool: Pool = HERE,

@@ -37,8 +37,6 @@ from calib.validation.comparison import (
     stacking_weights,
 )
 
-__all__ = ["check_comparison"]
-
 _GROUP = "comparison"
 # Of what follows from rows by arithmetic; weights by iterations that stop at a billionth.
 _ROUNDING = 1e-6

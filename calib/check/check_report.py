@@ -33,8 +33,6 @@ from calib.inference.problem import build_problem
 from calib.report.study import Progress
 from calib.report.study_tasks import Task, fitted_rows
 
-__all__ = ["check_report"]
-
 _PAGE = "index.html"
 
 

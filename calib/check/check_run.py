@@ -24,8 +24,6 @@ from calib.inference.io import describe_estimates, run_problem
 from calib.inference.problem import Problem
 from calib.report.study import Progress
 
-__all__ = ["check_run", "compare_run", "consistent_run", "estimates_of_run", "verify_run"]
-
 _RECORD, _POSTERIOR, _PRIORS, _DATA = "run.json", "posterior.nc", "priors.toml", "data.csv"
 _FILES = (_POSTERIOR, _PRIORS, _DATA)
 # Durations, and hashes that are verified as such.

@@ -21,11 +21,6 @@ from calib.report.study import Progress, Study, estimate_task
 from calib.report.study_tasks import Task
 from calib.report.summary import summarise_estimates
 
-__all__ = [
-    "RECORD", "SUMMARY", "Again", "compare_estimates", "compare_numbers", "count_numbers",
-    "is_document", "output_entry", "part_of",
-]  # fmt: skip
-
 RECORD, SUMMARY = "manifest.json", "summary.json"
 # What a manifest has about itself: durations, and hashes that are verified as such.
 _NOT_COMPARED = ("seconds", "files", "left_out")

@@ -21,8 +21,6 @@ from calib.check.montecarlo import (
 from calib.models.base import Array
 from calib.validation.comparison import Candidate, Comparison
 
-__all__ = ["count_compared", "drawn_in_comparison"]
-
 
 def count_compared(comparison: Comparison) -> int:
     """Return how many numbers of a comparison follow from posterior draws, those of runs too."""

@@ -26,10 +26,6 @@ from calib.gap.where import row_gaps
 from calib.report.publish import publication
 from calib.report.sections import SECTIONS
 
-__all__ = [
-    "AUDIT_CSV", "AUDIT_JSON", "derived_files", "verify_derived", "verify_form", "verify_gaps",
-]  # fmt: skip
-
 AUDIT_JSON, AUDIT_CSV = "audit.json", "audit.csv"
 _INDENTED = ("summary.json", "manifest.json", AUDIT_JSON)
 # Of the sd of a gap; and a gap that is nil, in kN, mm or g/cm^3.

@@ -17,8 +17,6 @@ from calib.check.items import Item, Status
 from calib.check.numbers import NUMBER
 from calib.models.base import Array
 
-__all__ = ["GROUP", "compare_figure", "compare_pictures", "compare_prints", "thumbnails"]
-
 GROUP = "figures"
 # Root mean square difference of grey levels from 0 to 1 of figures reduced to 64 x 64. Other draws
 # of the same posterior move a figure by up to 0.05, most by 0.02; two different ones by over 0.04.

@@ -18,8 +18,6 @@ from calib.check.text import GROUP as TEXT
 from calib.check.text import compare_page, own_pictures
 from calib.check.tolerances import ORDER_OF_MAGNITUDE
 
-__all__ = ["Moved", "compare_files", "moved_parts"]
-
 # Below this part of what is allowed, or of itself, a number has only been rounded otherwise.
 _ROUNDED = 1e-3
 _ROUNDED_PART = 1e-6

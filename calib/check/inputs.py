@@ -12,8 +12,6 @@ from calib.data import Table
 from calib.data.labels import KNOWN_DATA, label_of
 from calib.inference.prior_files import default_priors
 
-__all__ = ["GROUP", "verify_files", "verify_hashes", "verify_label", "verify_priors"]
-
 GROUP, FILES = "data and priors", "files and their hashes"
 
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-__all__ = ["Item", "Status"]
-
 
 class Status(StrEnum):
     """How something recorded compares with the same computed again."""

@@ -15,12 +15,6 @@ from calib.models.base import Array
 from calib.validation.scores import LEVELS, RELATIVE_ERROR_FLOOR
 from calib.validation.validate import Validation
 
-__all__ = [
-    "MONTE_CARLO", "Place", "count_drawn", "describe", "drawn_in_output", "drawn_in_run",
-    "left_out", "lever_of", "multiple", "of_difference", "posterior_errors", "scaled",
-    "validation_errors",
-]  # fmt: skip
-
 MONTE_CARLO = "Monte Carlo"
 
 type Place = tuple[str, ...]

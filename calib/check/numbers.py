@@ -13,8 +13,6 @@ from calib.check.items import Item, Status
 from calib.check.montecarlo import Place
 from calib.check.tolerances import ARITHMETIC, Of, Tolerance, natural_scale, tolerance_of
 
-__all__ = ["NUMBER", "SAME_WORDS", "compare_entries", "flatten", "read_json", "without_numbers"]
-
 NUMBER = re.compile(
     r"[-+\u2212]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+|\u00d710[\u2070-\u2079\u00b2\u00b3\u00b9\u207b]+)?"
 )

@@ -9,8 +9,6 @@ from typing import Any, Literal
 from calib.check.items import Item, Status
 from calib.check.montecarlo import MONTE_CARLO
 
-__all__ = ["SCHEMA", "Outcome"]
-
 SCHEMA = "calib/check/1"
 # Below this part of what is allowed, the draws are the same ones and rounding differs.
 _ROUNDED = 1e-3

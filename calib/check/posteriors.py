@@ -16,11 +16,6 @@ from calib.inference.diagnostics import hdi
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-__all__ = [
-    "GROUP", "DrawsFile", "compare_posterior", "read_draws", "summary_of", "verify_density",
-    "verify_summary",
-]  # fmt: skip
-
 GROUP = "posteriors"
 _HDI = 0.95
 # The summary is computed from the same draws in another order of summation.

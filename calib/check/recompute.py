@@ -28,8 +28,6 @@ from calib.report.study import Progress, Study
 from calib.report.study_tasks import HoldOut, Task
 from calib.report.writer import write_report
 
-__all__ = ["estimate_again", "not_computed", "recompute_report", "recompute_run", "report_tasks"]
-
 
 @contextmanager
 def not_computed(items: list[Item], folder: Path, record: str) -> Iterator[None]:

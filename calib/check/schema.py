@@ -31,10 +31,6 @@ from calib.report.comparison import SCHEMA as COMPARISON_SCHEMA
 from calib.report.manifest import SCHEMA as REPORT_SCHEMA
 from calib.report.sections import SECTIONS
 
-__all__ = [
-    "ComparisonRecord", "Manifest", "RunRecord", "TaskRecord", "read_folder", "read_run",
-]  # fmt: skip
-
 
 def _inside(path: str) -> str:
     """A path that leaves the folder is no path of one of its files."""

@@ -18,8 +18,6 @@ from calib.batch.environment import sha256
 from calib.check.items import Item, Status
 from calib.check.numbers import NUMBER, without_numbers
 
-__all__ = ["GROUP", "compare_page", "differing_lines", "own_pictures", "verify_images"]
-
 GROUP = "page and tables"
 _IMAGE = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]*)")
 _TAG = re.compile(r"<[^>]*>")

@@ -34,10 +34,6 @@ from typing import Any
 
 from calib.check.montecarlo import MONTE_CARLO, Place
 
-__all__ = [
-    "ARITHMETIC", "ORDER_OF_MAGNITUDE", "TABLE", "Of", "Tolerance", "natural_scale", "tolerance_of",
-]  # fmt: skip
-
 ORDER_OF_MAGNITUDE = "order of magnitude"
 
 type Entries = Mapping[Place, Any]

@@ -14,8 +14,6 @@ from calib.cli.machine import Json, finish
 if TYPE_CHECKING:
     from calib.he2019.audit import Audit
 
-__all__ = ["register"]
-
 
 def register(app: typer.Typer) -> None:
     """Add the verb to an app."""

@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from calib.report.sections import Section
     from calib.report.study_tasks import HoldOut
 
-__all__ = ["register"]
-
 _Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
 _Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
 _HoldOut = Annotated[

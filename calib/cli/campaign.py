@@ -11,8 +11,6 @@ import typer
 from calib.cli.machine import Json, finish
 from calib.cli.parallel import Models, Scheduler, Simulators, Workers, announce
 
-__all__ = ["register"]
-
 
 def register(app: typer.Typer) -> None:
     """Add the verb to an app."""

@@ -11,8 +11,6 @@ import typer
 from calib.batch.bench import from_the_bench
 from calib.cli.parallel import Models, Scheduler, Workers, announce
 
-__all__ = ["register"]
-
 _Cases = Annotated[Path, typer.Argument(help="Folder with cases.")]
 _Key = Annotated[Path, typer.Option(help="Their sealed answers.")]
 _Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]

@@ -12,8 +12,6 @@ from rich.table import Table
 from calib.check.items import Item, Status
 from calib.check.outcome import Outcome
 
-__all__ = ["show"]
-
 _MOST = 40
 
 

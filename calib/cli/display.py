@@ -10,8 +10,6 @@ from contextlib import contextmanager
 from calib.inference.calibration import Calibration
 from calib.report.posterior_text import centre_text, interval_text
 
-__all__ = ["posterior_table", "progress_bars", "told", "verdict_line"]
-
 _log = logging.getLogger("calib")
 
 

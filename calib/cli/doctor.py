@@ -9,8 +9,6 @@ import typer
 
 from calib.cli.machine import Json, finish
 
-__all__ = ["register"]
-
 # Extra of `pip install terracalib[...]` to the package that shows it is there, and what it is for.
 _OPTIONAL = {
     "dashboard": ("bokeh", "Dask's page of what the workers do"),

@@ -6,8 +6,6 @@ from collections.abc import Iterable
 
 import typer
 
-__all__ = ["EXAMPLES", "add_examples"]
-
 EXAMPLES = {
     "report": "calib report my.csv --hold-out inflation_pressure_psi=30 --out report",
     "fit": "calib fit my.csv --model magic_formula_pressure --out run",

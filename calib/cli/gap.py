@@ -12,8 +12,6 @@ from calib.cli.machine import Json, finish
 from calib.cli.parallel import CORES, Models, Simulators, Workers
 from calib.errors import CalibError
 
-__all__ = ["register"]
-
 # What the processes that draw the page import.
 _PAGE = ("calib.report.page.diagnosis",)
 

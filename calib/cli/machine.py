@@ -13,8 +13,6 @@ from typing import Annotated, Any, TextIO
 
 import typer
 
-__all__ = ["Json", "finish"]
-
 
 class _Aside(io.TextIOBase):
     """An output that forgets what it is told, before the one that a program reads."""

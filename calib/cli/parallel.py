@@ -9,8 +9,6 @@ from typing import Annotated
 
 import typer
 
-__all__ = ["CORES", "Models", "Scheduler", "Simulators", "Workers", "announce"]
-
 # As many processes as there are cores, of which two bring most of what there is to gain.
 CORES = min(2, os.cpu_count() or 1)
 Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1)]

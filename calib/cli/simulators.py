@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from calib.gap.case import Case
     from calib.inference.emulation import Emulation
 
-__all__ = ["keep_emulators", "prepare_case", "say"]
-
 
 def say(model: str, emulation: Emulation | None) -> bool:
     """Say what became of an emulation; return whether it is good enough (or was not needed)."""

@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from calib.data.headers import Column
 from calib.errors import CalibError
 
-__all__ = ["CellReader", "Decimals", "Problems", "check_values", "label_codes"]
-
 type Array = NDArray[np.float64]
 type Lines = Sequence[int] | NDArray[np.int64]
 

@@ -18,8 +18,6 @@ from numpy.typing import ArrayLike
 
 from calib.errors import CalibError
 
-__all__ = ["CsvFile", "open_csv", "write_table"]
-
 _A_CSV = "a CSV file in UTF-8: a line of column names, then one line per row"
 
 

@@ -18,8 +18,6 @@ from calib.data.quantities import QUANTITIES, UNITS, Quantity
 from calib.data.units import convert
 from calib.errors import CalibError
 
-__all__ = ["Column", "accepted_headers", "match_headers", "parse_header"]
-
 # A column such as drawbar_pull_sd or slip_angle_deg is about a quantity without being it.
 _QUALIFIERS = frozenset({
     "sd", "std", "stdev", "se", "sem", "cv", "var", "variance", "err", "error", "uncertainty",

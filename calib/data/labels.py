@@ -8,8 +8,6 @@ from dataclasses import dataclass, replace
 from calib.data.registry import Registry
 from calib.data.table import Table
 
-__all__ = ["KNOWN_DATA", "KnownData", "label_of", "labelled"]
-
 
 @dataclass(frozen=True)
 class KnownData:

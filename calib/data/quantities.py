@@ -21,11 +21,6 @@ from calib.data.registry import Registry
 from calib.data.units import convert
 from calib.errors import CalibError
 
-__all__ = [
-    "OUTPUTS", "QUANTITIES", "UNITS", "Quantity", "Range", "columns_of", "output_of",
-    "physical_role", "role_of",
-]  # fmt: skip
-
 _RATIO = {"ratio": "dimensionless", "fraction": "dimensionless", "percent": "percent",
           "pct": "percent"}  # fmt: skip
 

@@ -13,16 +13,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from calib.data.cells import CellReader, Decimals, Problems, check_values, label_codes
-from calib.data.csvfile import CsvFile, open_csv, write_table
+from calib.data.csvfile import CsvFile, open_csv
 from calib.data.headers import Column, match_headers
 from calib.data.quantities import QUANTITIES
-from calib.data.table import MAX_TEXT_ROWS, Table, check_enough, check_varies, hold_out
+from calib.data.table import MAX_TEXT_ROWS, Table
 from calib.errors import CalibError
-
-__all__ = [
-    "Table", "check_enough", "check_varies", "hold_out", "read_for_model", "read_table",
-    "table_from_arrays", "write_table",
-]  # fmt: skip
 
 _BATCH = 65_536
 

@@ -8,8 +8,6 @@ from typing import Protocol
 from calib.batch.plugins import PLUGINS, load_installed
 from calib.errors import CalibError
 
-__all__ = ["Registry", "register"]
-
 
 class _Declared(Protocol):
     def register(self) -> None: ...

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from calib.data.headers import parse_header
 from calib.errors import CalibError
 
-__all__ = ["MAX_TEXT_ROWS", "Table", "check_enough", "check_varies", "hold_out"]
-
 MAX_TEXT_ROWS = 10_000
 
 

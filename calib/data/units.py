@@ -14,8 +14,6 @@ from calib.errors import CalibError
 if TYPE_CHECKING:
     import pint
 
-__all__ = ["convert"]
-
 
 @cache
 def _registry() -> pint.UnitRegistry:

@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from calib.data.quantities import Quantity
 from calib.data.table import Table
 
-__all__ = ["lines_of", "mixed_units", "source_of", "unit_notes"]
-
 type Array = NDArray[np.float64]
 
 # A psi is so many kPa; levels of a design that are so far apart to this part are no coincidence.

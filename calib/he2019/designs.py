@@ -16,8 +16,6 @@ from calib.he2019.datasets.embedded import load_he2019
 from calib.models import get_model
 from calib.validation.sbc.designs import Design, ModelDesign
 
-__all__ = ["DESIGNS"]
-
 _PSI = "inflation_pressure_psi"
 # Between the embedded samples: cone index (kPa) and water content (g/g).
 _HELD_INDEX, _HELD_WATER = (130.0, 400.0, 1300.0), (0.02, 0.05, 0.08)

@@ -18,8 +18,6 @@ from calib.report.reference import REFERENCES
 from calib.report.sections import Section, SectionKind
 from calib.validation.sbc.designs import DESIGNS
 
-__all__ = ["HE2019", "Plugin"]
-
 _LABEL = "reconstructed"
 
 

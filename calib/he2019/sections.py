@@ -19,8 +19,6 @@ from calib.report.figures.export import png
 from calib.report.sections import Written
 from calib.report.study import Progress, Study
 
-__all__ = ["AuditSection", "FoundAudit", "FoundGaps", "GapsSection"]
-
 
 @dataclass(frozen=True)
 class GapsSection:

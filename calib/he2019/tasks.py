@@ -5,8 +5,6 @@ from __future__ import annotations
 from calib.he2019.datasets.embedded import load_he2019
 from calib.report.study_tasks import HoldOut, Task
 
-__all__ = ["he2019_tasks"]
-
 
 def he2019_tasks() -> tuple[Task, ...]:
     """Return the paper's three calibrations on the embedded, reconstructed data.

@@ -15,8 +15,6 @@ from calib.inference.random import stream
 from calib.inference.sampling.sampler import Draws, Progress, SamplerSettings, sample_posterior
 from calib.models.base import Array
 
-__all__ = ["Calibration", "ParameterSummary", "calibrate"]
-
 _HDI = 0.95
 # Parts of each ensemble's steps whose scatter gives Monte Carlo errors.
 _PARTS = 4

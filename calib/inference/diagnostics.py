@@ -17,11 +17,6 @@ from scipy.special import ndtri
 
 from calib.models.base import Array
 
-__all__ = [
-    "Convergence", "autocorrelation_time", "convergence", "ess", "hdi", "hdi_error", "mcse",
-    "median_error", "power_scaled_weights", "power_sensitivity", "psis", "tail_shape",
-]  # fmt: skip
-
 _AXES = {"chain_axis": 0, "draw_axis": 1}
 
 

@@ -39,11 +39,6 @@ from calib.models.base import Array
 from calib.models.simulators.emulator.files import load_emulator, save_emulator
 from calib.models.simulators.emulator.model import emulated_model, emulator_of
 
-__all__ = [
-    "SCHEMA", "describe_estimates", "load_calibration", "run_problem", "save_calibration",
-    "to_datatree", "write_netcdf",
-]  # fmt: skip
-
 SCHEMA = "calib/run/1"
 _HASHED = ("posterior.nc", "priors.toml", "data.csv")
 _EMULATOR = "emulator.npz"

@@ -23,8 +23,6 @@ from numpy.typing import NDArray
 
 from calib.models.base import N_WORK, Array, BoundModel, Conditions, Rows
 
-__all__ = ["Squares"]
-
 # Cells (rows times vectors) of a tile: three arrays of doubles in a cache of a megabyte or two.
 # Measured from 8,192 to 131,072: smaller ones pay for NumPy's calls, larger ones for memory.
 _TILE_CELLS = 65_536

@@ -22,8 +22,6 @@ from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.models.base import Array, Conditions
 
-__all__ = ["DEFAULT_PRIORS", "NORMAL", "USUAL", "Family", "Noise", "NoiseChoice", "noise_of"]
-
 type Family = Literal["normal", "student_t"]
 
 _HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))

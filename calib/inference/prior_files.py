@@ -20,19 +20,6 @@ from calib.inference.noise import DEFAULT_PRIORS, USUAL, Family, NoiseChoice
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
 
-__all__ = [
-    "DeclaredPriors",
-    "PriorFile",
-    "default_priors",
-    "json_schema",
-    "parse_priors",
-    "prior_file_model",
-    "prior_references",
-    "read_priors",
-    "relative_columns",
-]
-
-
 # Beyond these, squares and products of numbers leave the range of double precision; no quantity of
 # the field comes near them. An sd of 20 on the logarithm is a factor of 5e8 to either side.
 _Number = Annotated[float, Field(ge=-1e15, le=1e15)]

@@ -21,8 +21,6 @@ from calib.errors import CalibError
 from calib.inference.noise import USUAL, NoiseChoice
 from calib.models.base import Array
 
-__all__ = ["Prior", "Priors"]
-
 type Mask = NDArray[np.bool_]
 
 

@@ -35,8 +35,6 @@ from calib.inference.priors import Priors
 from calib.inference.uncertain import log_normal
 from calib.models import Array, BoundModel, get_model
 
-__all__ = ["Problem", "build_problem"]
-
 _HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))
 # Rows times vectors that are worked out at once where each row has a density of its own.
 _CELLS = 200_000

@@ -10,8 +10,6 @@ from zlib import crc32
 
 import numpy as np
 
-__all__ = ["generator", "stream"]
-
 
 def stream(seed: int, *labels: str | int) -> np.random.SeedSequence:
     """Return the seed sequence of a purpose, such as ``stream(1, "drawbar_pull", "sample")``."""

@@ -15,8 +15,6 @@ import numpy as np
 
 from calib.models.base import Array
 
-__all__ = ["log_normal"]
-
 
 def log_normal(residuals: Array, sigma: Array, variances: Array, curves: Array) -> Array:
     """Evaluate the log density.

@@ -16,8 +16,6 @@ import numpy as np
 
 from calib.models.base import Array, Columns, Conditions, Model, References, Rows
 
-__all__ = ["AYERS_PERUMPRAL", "AYERS_PERUMPRAL_VOLUMETRIC", "bulk_density"]
-
 _LN_DENSITY_BRACKET = (float(np.log(0.1)), float(np.log(5.0)))
 _MAX_ITERATIONS = 80
 

@@ -20,11 +20,6 @@ from numpy.typing import NDArray
 from calib.errors import CalibError
 from calib.models.latex import text
 
-__all__ = [
-    "N_WORK", "Alone", "Array", "BoundModel", "Columns", "Conditions", "Model", "References",
-    "Rows", "Searched", "columns", "not_given",
-]  # fmt: skip
-
 N_WORK = 3
 # Vectors that are evaluated one by one before all are at once.
 _TRIED = 3

@@ -16,8 +16,6 @@ import numpy as np
 
 from calib.models.base import Array, Columns, Conditions, Model, References, Rows
 
-__all__ = ["BEKKER", "MODIFIED_BEKKER", "rut_depth"]
-
 LN_MM_PER_M = float(np.log(1000.0))
 
 

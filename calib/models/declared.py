@@ -11,8 +11,6 @@ from calib.errors import CalibError
 if TYPE_CHECKING:
     from calib.models.base import Model
 
-__all__ = ["check_model"]
-
 
 def check_model(model: Model) -> None:
     """Check a declaration.

@@ -10,8 +10,6 @@ import numpy as np
 
 from calib.models.base import Array, Conditions, Model
 
-__all__ = ["JANOSI_HANAMOTO"]
-
 
 def _predict(theta: Array, conditions: Conditions) -> Array:
     c, phi, K = (theta[:, j, None] for j in range(3))

@@ -11,8 +11,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from html import escape
 
-__all__ = ["html", "text"]
-
 _TOKEN = re.compile(r"\\[A-Za-z]+|\\.|[{}^_]|\d+(?:\.\d+)?|\s+|.", re.DOTALL)
 _FUNCTIONS = frozenset({"sin", "cos", "tan", "arctan", "exp", "ln", "log", "max", "min"})
 _SIGNS = {"cdot": "\N{DOT OPERATOR}", "times": "\N{MULTIPLICATION SIGN}", "le": "\u2264",

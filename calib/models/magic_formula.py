@@ -18,8 +18,6 @@ import numpy as np
 
 from calib.models.base import Array, Columns, Conditions, Model, References, Rows, Searched
 
-__all__ = ["MAGIC_FORMULA", "half_sine_in_place", "magic_formula"]
-
 
 def magic_formula(
     slip_percent: Array,

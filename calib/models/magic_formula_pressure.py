@@ -25,8 +25,6 @@ from calib.errors import CalibError
 from calib.models.base import Alone, Array, Columns, Conditions, Model, References, Rows, columns
 from calib.models.magic_formula import half_sine_in_place
 
-__all__ = ["MAGIC_FORMULA_PRESSURE", "coefficients_at"]
-
 
 def _positive(mean: Array, half: Array, curvature: Array) -> NDArray[np.bool_]:
     """Whether mean + half u + curvature (u^2 - 1) is positive over -1 <= u <= 1."""

@@ -18,8 +18,6 @@ import numpy as np
 
 from calib.models.base import Array, Conditions, Model
 
-__all__ = ["BRIXIUS", "WISMER_LUTH", "mobility_number", "wheel_numeric"]
-
 
 def wheel_numeric(conditions: Conditions) -> Array:
     """Return Cn = CI b d / W, dimensionless, of the shape of the conditions."""

@@ -18,8 +18,6 @@ import numpy as np
 
 from calib.models.base import Array, Columns, Conditions, Model, References, Rows
 
-__all__ = ["BEKKER_PLATE", "LYASKO", "REECE"]
-
 _P, _B = "average_ground_pressure_kpa", "plate_width_mm"
 
 

@@ -22,8 +22,6 @@ from numpy.typing import NDArray
 
 from calib.models.base import Array, Conditions
 
-__all__ = ["Contact", "Wheel", "contact", "wheels"]
-
 N_NODES = 8
 _LN_ANGLE = (float(np.log(1e-4)), float(np.log(1.5)))
 _MAX_ITERATIONS = 60

@@ -26,11 +26,6 @@ from calib.validation.comparison import Candidate, Comparison, difference
 from calib.validation.prediction import N_DRAWS
 from calib.validation.validate import PARETO_K_MAX
 
-__all__ = [
-    "FIGURE", "FILE", "HELD_OUT", "PAGE", "SCHEMA", "document", "load_stack", "page",
-    "write_comparison",
-]  # fmt: skip
-
 SCHEMA = "calib/comparison/2"
 FILE, PAGE, FIGURE, HELD_OUT = (
     "comparison.json", "index.html", "figures/bands.png", "held_out.csv"

@@ -11,8 +11,6 @@ from calib.report.sections import Found, Section
 from calib.report.study import Progress, Study, begin_study
 from calib.report.study_tasks import Task
 
-__all__ = ["Contents", "work_out"]
-
 
 @dataclass(frozen=True)
 class Contents:

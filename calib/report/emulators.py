@@ -15,8 +15,6 @@ from calib.report.numbers import format_number
 from calib.report.sections import Written
 from calib.report.study import Progress, Study
 
-__all__ = ["EmulatorSection", "FoundEmulators"]
-
 type Document = Mapping[str, Any]
 
 # So many failed runs are shown; the manifest has all.

@@ -40,11 +40,6 @@ from calib.report.gap_verdict import (
 )
 from calib.report.labels import MINUS, axis_of, joined, short
 
-__all__ = [
-    "conditions_text", "gap_evidence", "gap_verdict", "region_words", "scaled_shrink",
-    "shrink_facts", "where_fact",
-]  # fmt: skip
-
 
 def gap_verdict(found: Diagnosis) -> GapVerdict:
     """Say in a headline and a few sentences what a diagnosis found; nothing is drawn.

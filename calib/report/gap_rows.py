@@ -16,12 +16,6 @@ from calib.gap.where import Region
 from calib.models.base import Array
 from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of
 
-__all__ = [
-    "EVERYWHERE", "OutputRows", "best_fit", "best_of", "output_axis",
-    "output_rows", "output_word", "panel_groups", "region_text", "short_name", "title_of",
-    "unit_after",
-]  # fmt: skip
-
 # The words for a region that covers all rows.
 EVERYWHERE = "all conditions"
 

@@ -29,8 +29,6 @@ from calib.report.gap_rows import (
 from calib.report.labels import axis_of, joined
 from calib.report.numbers import format_value
 
-__all__ = ["size_sentences", "where_to_look"]
-
 _N_DRAWS = 400
 # A mean change below this part of the noise is not worth a sentence.
 _SMALL = 0.3

@@ -20,11 +20,6 @@ from enum import StrEnum
 
 from calib.report.labels import joined
 
-__all__ = [
-    "Candidate", "GapEvidence", "GapVerdict", "NextFact", "ShrinkFact", "Tone", "WhereFact",
-    "judge_gap", "odds_text", "repeats_needed",
-]  # fmt: skip
-
 SURE = 0.9
 # Hypotheses within this factor of the best are read as a tie with it.
 TIE = 0.2

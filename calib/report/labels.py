@@ -11,11 +11,6 @@ from calib.data.quantities import QUANTITIES
 from calib.models.base import Array
 from calib.report.numbers import NOTHING, format_number
 
-__all__ = [
-    "MINUS", "NO_UNIT", "Axis", "axis_of", "joined", "parameter_label", "percent", "plain",
-    "short", "symbol", "unbroken", "unit_plain", "unit_text",
-]  # fmt: skip
-
 NO_UNIT = NOTHING
 MINUS = "\N{MINUS SIGN}"
 

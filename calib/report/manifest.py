@@ -14,8 +14,6 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.study import OutputResult, Study
 from calib.report.study_tasks import Task
 
-__all__ = ["SCHEMA", "build_manifest", "file_hashes"]
-
 SCHEMA = "calib/manifest/2"
 
 

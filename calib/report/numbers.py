@@ -15,12 +15,6 @@ from __future__ import annotations
 import math
 from decimal import Decimal
 
-__all__ = [
-    "NOTHING", "TIMES", "ascii_number", "ascii_text", "format_as_printed", "format_at",
-    "format_interval", "format_like", "format_number", "format_value", "interval_places",
-    "last_place", "place_of",
-]  # fmt: skip
-
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"
 TIMES = "\N{MULTIPLICATION SIGN}"

@@ -11,10 +11,6 @@ from calib.report.numbers import (
     last_place,
 )
 
-__all__ = [
-    "centre_place", "centre_text", "end_places", "end_scales", "interval_text", "skewed",
-]  # fmt: skip
-
 # An interval that is this much longer on one side, or spans this factor, has no telling mean.
 _LOPSIDED = 2.0
 _DECADES = 30.0

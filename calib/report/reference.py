@@ -10,8 +10,6 @@ from typing import ClassVar
 from calib.data.registry import Registry
 from calib.models.base import Array, BoundModel
 
-__all__ = ["NOTHING", "REFERENCES", "Figure", "FittedTable", "Limit", "Reference", "reference_of"]
-
 type Limit = tuple[float, str]
 
 

@@ -19,11 +19,6 @@ from calib.report.study import OutputResult
 from calib.validation.prediction import Bands, bands
 from calib.validation.residuals import sign_changes
 
-__all__ = [
-    "Group", "data_word", "grid", "group_column", "groups", "held_table", "signs_along",
-    "smooth_bands", "x_column",
-]  # fmt: skip
-
 MAX_PANELS = 6
 _N_DRAWS = 1000
 _GRID = 100

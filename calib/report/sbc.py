@@ -15,8 +15,6 @@ from calib.report.page.sbc import render
 from calib.validation.sbc.designs import design_of
 from calib.validation.sbc.score import ModelScore, SbcScore
 
-__all__ = ["SCHEMA", "document", "write_sbc"]
-
 SCHEMA = "calib/sbc/1"
 
 

@@ -16,8 +16,6 @@ from calib.batch.pool import Pool
 from calib.data.registry import Registry
 from calib.report.study import Progress, Study
 
-__all__ = ["SECTIONS", "Found", "Section", "SectionKind", "Written"]
-
 
 @dataclass(frozen=True)
 class Written:

@@ -33,10 +33,6 @@ from calib.validation.prediction import predictive_draws
 from calib.validation.sensitivity import Sensitivity, prior_sensitivity
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
-__all__ = [
-    "Failure", "OutputResult", "Study", "begin_study", "estimate_task", "judged", "run_study",
-]  # fmt: skip
-
 N_PRIOR_PREDICTIVE = 1000
 
 type Progress = Callable[[str, int, int], None]

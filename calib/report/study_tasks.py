@@ -15,8 +15,6 @@ from calib.errors import CalibError
 from calib.inference.prior_files import prior_file_model
 from calib.models import MODELS, get_model
 
-__all__ = ["HoldOut", "Task", "choose_model", "fitted_rows", "plan_tasks"]
-
 # A report's figures and leave-one-out hold a number for every draw and row.
 MAX_ROWS = 5000
 

@@ -17,8 +17,6 @@ from calib.validation.noise_preference import NoisePreference
 from calib.validation.scores import Scores
 from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 
-__all__ = ["SCHEMA", "summarise", "summarise_estimates"]
-
 SCHEMA = "calib/summary/1"
 
 

@@ -32,8 +32,6 @@ from calib.validation.residuals import standardise
 from calib.validation.roles import MOVED, PRIOR, role
 from calib.validation.validate import Validation
 
-__all__ = ["Evidence", "Level", "Verdict", "Where", "gather", "judge_evidence", "verdict"]
-
 _SIGNIFICANT = 0.05
 _WEAK_SKILL = 0.5
 _EXPECTED = 0.5

@@ -29,8 +29,6 @@ from calib.report.sections import Found
 from calib.report.study import OutputResult, Study
 from calib.report.summary import summarise
 
-__all__ = ["write_report"]
-
 type Progress = Callable[[str, int, int], None]
 
 

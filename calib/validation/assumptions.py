@@ -19,8 +19,6 @@ from calib.inference.problem import Problem
 from calib.models.base import Array
 from calib.validation.outliers import linear, outlying_notes
 
-__all__ = ["LEVEL", "durbin_watson_moments", "file_notes", "residual_notes", "warnings_of"]
-
 # Chance that a test of residuals warns of rows that are as the likelihood says.
 LEVEL = 1e-3
 # Chance that readings agree to the last digit, from which equal rows are taken for copies.

@@ -26,11 +26,6 @@ from calib.models import get_model
 from calib.models.base import Array
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
-__all__ = [
-    "Candidate", "Comparison", "Difference", "check_comparable", "compare", "compare_problems",
-    "difference", "sentence", "stacking_weights",
-]  # fmt: skip
-
 # Differences of less are small whatever their standard error, which few rows then underestimate.
 SMALL = 4.0
 # A difference of more standard errors than this is called one.

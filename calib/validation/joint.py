@@ -12,8 +12,6 @@ import numpy as np
 
 from calib.models.base import Array
 
-__all__ = ["coverage_probability", "effective_rows", "hits", "ks_distance", "pit_half_width"]
-
 _MAX_REPLICATES = 2000
 
 

@@ -13,8 +13,6 @@ from calib.inference.sampling.sampler import Progress, SamplerSettings
 from calib.validation.comparison import CLEAR, SMALL
 from calib.validation.validate import Validation, leave_one_out
 
-__all__ = ["NoisePreference", "noise_preference", "noise_words", "with_usual_noise"]
-
 
 @dataclass(frozen=True)
 class NoisePreference:

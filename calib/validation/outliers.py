@@ -15,8 +15,6 @@ from calib.inference.problem import Problem
 from calib.inference.sampling.mode import find_modes
 from calib.models.base import Array
 
-__all__ = ["OutlyingRow", "linear", "outlying_notes", "outlying_rows"]
-
 # Probability of naming any row of data that are as the likelihood says.
 LEVEL = 1e-3
 _STEP, _HUGE = 1e-5, 1e9

@@ -21,11 +21,6 @@ from calib.validation.scores import LEVELS
 if TYPE_CHECKING:
     from calib.inference.calibration import Calibration
 
-__all__ = [
-    "Bands", "Prediction", "bands", "outside", "predict", "predict_stacked", "prediction_columns",
-    "predictive_draws",
-]  # fmt: skip
-
 N_DRAWS = 4000
 MIN_DEFINED = 0.95
 _ROWS_AT_ONCE = 2000

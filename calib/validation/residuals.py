@@ -12,8 +12,6 @@ from calib.inference.calibration import Calibration
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-__all__ = ["Standardised", "sign_changes", "standardise"]
-
 _N_DRAWS = 1000
 
 

@@ -7,8 +7,6 @@ import numpy as np
 from calib.inference.calibration import Calibration
 from calib.validation.sensitivity import CONTRACTION_MIN
 
-__all__ = ["BOTH", "DATA", "MOVED", "PRIOR", "ROLES", "role", "role_of", "shift"]
-
 DATA, BOTH = "set by the data", "partly by the prior"
 MOVED, PRIOR = "moved, not narrowed", "set by the prior"
 ROLES = (DATA, BOTH, MOVED, PRIOR)

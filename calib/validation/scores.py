@@ -13,8 +13,6 @@ from scipy.special import betaincinv
 
 from calib.models.base import Array
 
-__all__ = ["LEVELS", "Coverage", "Scores", "coverage", "crps", "pit", "score"]
-
 LEVELS = (0.5, 0.9, 0.95)
 # Relative errors of a pull near zero say nothing: rows below this part of the largest are left out.
 RELATIVE_ERROR_FLOOR = 0.05

@@ -24,10 +24,6 @@ from calib.inference.diagnostics import power_scaled_weights, power_sensitivity
 from calib.inference.random import generator
 from calib.models.base import Array
 
-__all__ = [
-    "CONTRACTION_MIN", "SENSITIVITY_MIN", "Sensitivity", "prior_sensitivity",
-]  # fmt: skip
-
 # Below, a posterior's sd is more than nine tenths of its prior's.
 CONTRACTION_MIN = 0.19
 # The threshold of Kallioinen et al.: above, a marginal reacts to the power.

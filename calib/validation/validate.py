@@ -21,8 +21,6 @@ from calib.models.base import Array
 from calib.validation.prediction import N_DRAWS, predictive_draws
 from calib.validation.scores import Scores, score
 
-__all__ = ["Validation", "leave_one_out", "validate_held_out"]
-
 # Above this, importance sampling cannot be trusted to leave a row out (Vehtari et al. 2024).
 PARETO_K_MAX = 0.7
 

@@ -11,8 +11,6 @@ from pathlib import Path
 
 from calib.errors import CalibError
 
-__all__ = ["Place", "word"]
-
 
 @dataclass(frozen=True)
 class Place:

@@ -15,8 +15,6 @@ from calib.batch.campaign.place import Place
 from calib.errors import CalibError
 from calib.inference.random import stream
 
-__all__ = ["Plan", "read_plan"]
-
 SEED = 2019
 
 

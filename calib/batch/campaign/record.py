@@ -12,8 +12,6 @@ from calib.batch.campaign.kinds import Task
 from calib.batch.environment import sha256, versions
 from calib.errors import CalibError
 
-__all__ = ["RECORD", "describe", "discard_changed"]
-
 RECORD = "task.json"
 SCHEMA = "calib/task/1"
 

@@ -17,8 +17,6 @@ from calib.batch.folders import check_folder
 from calib.batch.tasks import LateItems, check_names, run_folder_tasks
 from calib.errors import CalibError
 
-__all__ = ["run_campaign"]
-
 PLAN = "plan.toml"
 
 

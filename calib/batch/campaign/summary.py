@@ -18,8 +18,6 @@ from typing import Any, Literal
 from calib.batch.campaign.plan import Plan
 from calib.batch.tasks import failed_tasks
 
-__all__ = ["NUMBERS", "Summary", "summarise", "write_summary"]
-
 NUMBERS = "numbers.json"
 SCHEMA = "calib/campaign/1"
 

@@ -10,8 +10,6 @@ from pathlib import Path
 
 from calib.errors import CalibError
 
-__all__ = ["Finished", "attempt", "describe"]
-
 
 @dataclass(frozen=True)
 class Finished[R]:

@@ -22,8 +22,6 @@ from calib.batch.environment import code_sha256
 from calib.batch.tasks.attempt import Finished, attempt, describe
 from calib.errors import CalibError
 
-__all__ = ["on_cluster"]
-
 # Tasks at the scheduler at a time, and bytes of their items: enough for a large cluster, few enough
 # for a small memory. They are sent in batches, so that the first are at work while others are read.
 WINDOW, BYTES, BATCH = 5000, 400_000_000, 200

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 
-__all__ = ["LateItems"]
-
 
 class LateItems[S, I](Mapping[str, I]):
     """A mapping whose values are read anew each time they are asked for.

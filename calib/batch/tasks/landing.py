@@ -15,11 +15,6 @@ from calib.batch.folders import unwritable
 from calib.batch.tasks.attempt import Finished
 from calib.errors import CalibError
 
-__all__ = [
-    "FAILED", "Folders", "JsonFiles", "Landing", "check_names", "failed_tasks", "landing_ground",
-    "read_seconds",
-]  # fmt: skip
-
 FAILED = "failed.json"
 SECONDS = "seconds.csv"
 _SCRATCH = ".landing"

@@ -21,8 +21,6 @@ from calib.batch.tasks.landing import (
 )
 from calib.batch.tasks.stream import completed
 
-__all__ = ["Outcome", "run_folder_tasks", "run_tasks"]
-
 type Progress = Callable[[int, int], None]
 
 

@@ -7,8 +7,6 @@ from collections.abc import Callable, Collection, Generator, Mapping
 from calib.batch.tasks.attempt import Finished, attempt
 from calib.errors import CalibError
 
-__all__ = ["completed"]
-
 
 def completed[I, R](
     function: Callable[[I], R],

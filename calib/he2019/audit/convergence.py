@@ -34,11 +34,6 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.models.base import Array
 
-__all__ = [
-    "GeneticStudy", "Search", "Seeds", "begin_convergence", "convergence_findings",
-    "printed_settings", "study_convergence",
-]  # fmt: skip
-
 type _Progress = Callable[[str, int, int], None]
 
 _BOX = 30.0

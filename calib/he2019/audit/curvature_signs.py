@@ -32,8 +32,6 @@ from calib.he2019.datasets.published import Published
 from calib.inference.random import generator
 from calib.models.base import Array
 
-__all__ = ["CurvatureStudy", "curvature_signs", "least_cost", "study_curvature_signs"]
-
 _SHIFTS = (0.0, 1.0, 3.0, 4.0)
 _SCREENED, _STARTS, _STEP, _WORST = 400, 4, 1e-5, 1e4
 

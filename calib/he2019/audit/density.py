@@ -13,8 +13,6 @@ from calib.he2019.audit.intervals import Interval, exact, exp, log, printed, squ
 from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.published import Published
 
-__all__ = ["density_findings", "density_range"]
-
 _FAMILY = "Table 1, Eq 1"
 # Cone indices of soils that carry a wheel but let it sink, kPa.
 _CONE_INDEX = Interval(np.array(100.0), np.array(3000.0))

@@ -14,8 +14,6 @@ from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
 from calib.he2019.audit.run import Audit
 from calib.he2019.datasets.published import DOI
 
-__all__ = ["SCHEMA", "audit_csv", "audit_json", "read_findings"]
-
 SCHEMA = "calib/audit/1"
 _COLUMNS = (
     "key", "verdict", "where", "claim", "test", "found", "evidence", "stays_open", "basis",

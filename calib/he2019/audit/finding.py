@@ -9,8 +9,6 @@ from enum import StrEnum
 from calib.he2019.audit.intervals import Interval
 from calib.he2019.datasets.published import Figure
 
-__all__ = ["Basis", "Finding", "Quantity", "Verdict", "rounded"]
-
 
 class Verdict(StrEnum):
     """What a test says of a published figure, as it is printed and read."""

@@ -25,8 +25,6 @@ from calib.he2019.datasets.published import FittedTable, Published
 from calib.inference.estimators import PointEstimate
 from calib.models.magic_formula import magic_formula
 
-__all__ = ["Features", "chord_curvature", "features", "geometric_findings"]
-
 _FAMILY = "Table 3, Eqs 6-9"
 # A published slope this much nearer to one reading than to the other is taken for it.
 _NEAR = 0.05

@@ -12,8 +12,6 @@ from calib.he2019.datasets.published import Figure, Published
 from calib.he2019.datasets.rut import SLIPS
 from calib.inference.calibration import ParameterSummary
 
-__all__ = ["inverse_by_likelihood", "inverse_by_print", "inverse_findings", "prediction_at_30"]
-
 _FAMILY = "Table 6, Eq 22"
 _UNITS = {"n0": "1", "n1": "1", "k": "kPa/m^n"}
 # An exponent off by less than this part would not be worth a correction.

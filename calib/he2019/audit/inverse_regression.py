@@ -29,10 +29,6 @@ from calib.inference.sampling.sampler import Progress
 from calib.models.base import Array
 from calib.models.bekker import rut_depth
 
-__all__ = [
-    "InverseStudy", "attenuation", "simulate_inverse", "study_inverse",
-]  # fmt: skip
-
 _N_CAMPAIGNS = 4000
 _MM = 1000.0
 

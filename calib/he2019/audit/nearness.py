@@ -25,11 +25,6 @@ from calib.he2019.datasets.reconstruct import normalised_basis
 from calib.models.base import Array
 from calib.models.magic_formula import magic_formula
 
-__all__ = [
-    "ASSUMED_SLIPS", "COEFFICIENTS", "Reference", "joint_bounds", "pressure_curves",
-    "printed_coefficients", "references",
-]  # fmt: skip
-
 ASSUMED_SLIPS = 100.0 * (np.array(NOMINAL_SLIPS) + SLIP_SHIFT)
 """Slips in percent at which the 14 tests of each pressure are assumed."""
 

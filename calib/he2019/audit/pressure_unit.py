@@ -11,8 +11,6 @@ from calib.he2019.audit.signs import FAR
 from calib.he2019.audit.words import percent
 from calib.he2019.datasets.published import Published
 
-__all__ = ["PSI_PER_UNIT", "pressure_unit"]
-
 PSI_PER_UNIT: Mapping[str, float] = MappingProxyType(
     {"psi": 1.0, "kPa": 1.0 / 6.894757, "bar": 100.0 / 6.894757}
 )

@@ -19,11 +19,6 @@ from calib.he2019.audit.intervals import Interval, arctan, exact, printed, sin, 
 from calib.he2019.datasets.published import FittedTable, Published
 from calib.models.base import Array
 
-__all__ = [
-    "Coefficients", "coefficients", "largest_pull", "peak_argument", "peak_slip", "pressure_box",
-    "pull", "pull_from_slope", "quadratic",
-]  # fmt: skip
-
 
 class Coefficients(NamedTuple):
     """Intervals of B (1/%) or K (kN/%), C, D (kN) and E."""

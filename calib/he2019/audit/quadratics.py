@@ -19,8 +19,6 @@ from scipy.optimize import linprog
 from calib.he2019.datasets.published import Published
 from calib.models.base import Array
 
-__all__ = ["NAMES", "Nearest", "Signs", "nearest", "nearest_by_signs", "targets"]
-
 type Signs = tuple[int, int, int]
 
 NAMES: Mapping[str, tuple[str, str, str]] = MappingProxyType(

@@ -17,8 +17,6 @@ from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.published import Published
 from calib.models.base import Array
 
-__all__ = ["RoundingStudy", "rounding_findings", "study_rounding"]
-
 _FAMILY = "Digits of Table 5"
 # Digits are enough where D is fixed to this part.
 _WANTED = 0.01

@@ -33,8 +33,6 @@ from calib.he2019.audit.untested import untested
 from calib.he2019.datasets.published import PUBLISHED, Published
 from calib.inference.calibration import Calibration
 
-__all__ = ["Audit", "begin_audit", "run_audit"]
-
 type Progress = Callable[[str, int, int], None]
 
 

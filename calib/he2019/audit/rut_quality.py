@@ -23,11 +23,6 @@ from calib.he2019.datasets.published import Published
 from calib.he2019.datasets.rut import SLIPS
 from calib.models.base import Array
 
-__all__ = [
-    "QualityStudy", "log_pressure_ratio", "rut_quality_findings", "study_quality",
-    "within_pressure_sd",
-]  # fmt: skip
-
 _FAMILY = "Table 6, Eq 22"
 _N_MAX = 160
 _HELD_OUT_LEAST = 0.025

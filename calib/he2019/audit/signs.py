@@ -20,8 +20,6 @@ from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.published import FittedTable, Published
 from calib.models.magic_formula import magic_formula
 
-__all__ = ["FAMILY", "sign_of_curvature", "signs", "signs_of_quadratic", "signs_of_rut"]
-
 FAMILY = "Signs"
 
 # A reading is refused if even its best coefficients miss Table 4 by more than this part.

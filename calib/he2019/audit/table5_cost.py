@@ -28,11 +28,6 @@ from calib.he2019.datasets.published import FittedTable, Published
 from calib.models.base import Array
 from calib.models.magic_formula import magic_formula
 
-__all__ = [
-    "Bounds", "any_slips_bound", "assumed_slips_bound", "bounds", "cost_as_printed",
-    "cost_findings", "joint_cost",
-]  # fmt: skip
-
 _FAMILY = "Cost of Table 5"
 
 _BINS = 75

@@ -5,8 +5,6 @@ from __future__ import annotations
 from calib.he2019.audit.finding import Basis, Finding, Verdict
 from calib.he2019.datasets.published import Published
 
-__all__ = ["untested"]
-
 
 def untested(published: Published) -> Finding:
     """Name the figures of the test description that no other figure bears on."""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["number", "percent"]
-
 
 def number(value: float, digits: int = 3) -> str:
     """Write a number to some significant digits, without an exponent where that is readable."""

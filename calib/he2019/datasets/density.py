@@ -24,8 +24,6 @@ from calib.he2019.datasets.published import PUBLISHED
 from calib.he2019.datasets.reconstruct import Array, nearest_errors, normalised_basis, read_only
 from calib.models.ayers_perumpral import bulk_density as eq_1
 
-__all__ = ["DECIMALS", "bulk_density"]
-
 # C2 has a standard error of 20 and is printed to 0.001; C1 is known to a factor of 10^30 and is
 # printed to 1 in 10^4. So densities must be written to 1e-8 g/cm^3 for all printed digits to
 # return; it is not a claim on any instrument. A fit that stops at a change of 1e-8 in the sum of

@@ -25,8 +25,6 @@ from calib.he2019.datasets.published import PUBLISHED
 from calib.he2019.datasets.reconstruct import Array, nearest_errors, normalised_basis, read_only
 from calib.models.magic_formula import magic_formula
 
-__all__ = ["DECIMALS", "NOMINAL_SLIPS", "SLIP_SHIFT", "drawbar_pull", "magic_formula_jacobian"]
-
 NOMINAL_SLIPS = (
     0.0, 0.025, 0.05, 0.075, 0.10, 0.125, 0.15, 0.175, 0.20, 0.30, 0.40, 0.50, 0.60, 0.70,
 )  # fmt: skip

@@ -24,17 +24,6 @@ from calib.errors import CalibError
 from calib.he2019.datasets import density, drawbar, rut
 from calib.he2019.datasets.reconstruct import Array
 
-__all__ = [
-    "LABEL",
-    "bulk_density",
-    "drawbar_pull",
-    "holds",
-    "load_he2019",
-    "rut_depth",
-    "tables",
-    "write",
-]
-
 LABEL = "reconstructed"
 
 # Decimals of every column; they carry the printed digits through the files.

@@ -14,8 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, minimize
 
-__all__ = ["Array", "Conditions", "nearest_errors", "normalised_basis", "read_only"]
-
 type Array = NDArray[np.float64]
 type Conditions = Callable[[Array], tuple[Array, Array]]
 

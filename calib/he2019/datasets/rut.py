@@ -22,8 +22,6 @@ from calib.he2019.datasets.published import PUBLISHED
 from calib.he2019.datasets.reconstruct import Array, nearest_errors, read_only
 from calib.models.bekker import rut_depth as eq_21
 
-__all__ = ["DECIMALS", "SLIPS", "ground_pressure", "rut_depth"]
-
 SLIPS = (0.0, 0.025, 0.05, 0.075, 0.10, 0.125, 0.15, 0.175, 0.20)
 
 # Of ruts in mm: five decimals return k to its printed 1 in 10^4 with a wide margin.

@@ -18,8 +18,6 @@ import numpy as np
 from calib.errors import CalibError
 from calib.models.base import Array
 
-__all__ = ["Coefficients", "Features", "coefficients", "read_features"]
-
 _FEWEST_LEVELS = 4
 # More distinct slips than this are averaged in groups, or noise would decide where the peak is.
 _MOST_LEVELS = 40

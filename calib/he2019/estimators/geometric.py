@@ -11,8 +11,6 @@ from calib.inference.estimators.base import PointEstimate, goodness, sum_of_squa
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-__all__ = ["estimate_geometric"]
-
 # Eq 9 may give an E above 1, for which the formula has no single peak; G = 1 - E is kept positive.
 _LEAST_G = 0.01
 

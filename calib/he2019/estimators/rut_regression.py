@@ -18,8 +18,6 @@ from calib.errors import CalibError
 from calib.inference.estimators.base import PointEstimate, goodness
 from calib.inference.problem import Problem
 
-__all__ = ["RutRegression", "estimate_published_regression", "rut_regression"]
-
 _MM_PER_M = 1000.0
 
 

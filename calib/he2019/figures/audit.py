@@ -11,8 +11,6 @@ from calib.he2019.figures.audit_pull import chord_plate, digits_plate, signs_pla
 from calib.he2019.figures.audit_rut import rut_plate
 from calib.report.figures.plate import Plate, draw_all
 
-__all__ = ["audit_plates"]
-
 _DRAWINGS: dict[str, Callable[[Audit], Plate]] = {
     "audit_costs": costs_plate,
     "audit_digits": digits_plate,

@@ -13,8 +13,6 @@ from calib.report.figures.plate import Plate
 from calib.report.figures.style import BLUE, DASHES, GREY, ORANGE, VERMILION, legend_below, panels
 from calib.report.labels import NO_UNIT
 
-__all__ = ["costs_plate"]
-
 
 def costs_plate(audit: Audit) -> Plate:
     """Draw where the minimum of Eq 16 can lie, and where the genetic algorithm ends."""

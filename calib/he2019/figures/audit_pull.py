@@ -26,8 +26,6 @@ from calib.report.figures.style import (
 )
 from calib.report.labels import joined, short
 
-__all__ = ["chord_plate", "digits_plate", "signs_plate"]
-
 _SLIPS = np.linspace(0.0, 75.0, 301)
 _PULL = "Drawbar pull (kN)"
 _SLIP = "Slip (%)"

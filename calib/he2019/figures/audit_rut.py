@@ -25,8 +25,6 @@ from calib.report.figures.style import (
 )
 from calib.report.labels import NO_UNIT
 
-__all__ = ["rut_plate"]
-
 _SHOWN = 1500
 _AT_SLIP = 0.10
 

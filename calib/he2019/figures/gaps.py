@@ -34,8 +34,6 @@ from calib.report.gap_rows import (
 )
 from calib.report.labels import NO_UNIT, axis_of, short
 
-__all__ = ["gap_plate"]
-
 _BAND = "#e6e6e6"
 _Z_90 = 1.645
 _MOST = 5

@@ -15,8 +15,6 @@ from calib.models.bekker import rut_depth
 from calib.models.magic_formula import magic_formula
 from calib.report.reference import Figure, FittedTable, Limit, Reference
 
-__all__ = ["HE2019"]
-
 _TABLES = {
     "ayers_perumpral": PUBLISHED.bulk_density,
     "magic_formula_pressure": PUBLISHED.pressure,

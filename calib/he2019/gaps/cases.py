@@ -28,8 +28,6 @@ from calib.data.quantities import OUTPUTS
 from calib.gap.case import Case
 from calib.he2019.datasets.embedded import LABEL, load_he2019
 
-__all__ = ["RECONSTRUCTED", "PaperGap", "paper_gaps"]
-
 RECONSTRUCTED = "the data are reconstructed from published results; they are not measurements"
 
 _RUT = (

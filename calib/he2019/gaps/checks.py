@@ -17,8 +17,6 @@ from calib.he2019.gaps.find import FoundGap, unfitted_errors
 from calib.models.base import Array
 from calib.models.bekker import rut_depth as eq_21
 
-__all__ = ["Check", "checks", "probability_of"]
-
 _FITTED_SLIP = 0.0125  # the middle of the slips at which plain Bekker was calibrated
 _Z_90 = 1.645
 

@@ -19,10 +19,6 @@ from calib.inference.sampling.adapt import Guess, adapt
 from calib.inference.sampling.mode import find_modes
 from calib.models.base import Array
 
-__all__ = [
-    "FoundGap", "Unfitted", "begin_gaps", "find_gaps", "simulator_sd", "unfitted_errors",
-]  # fmt: skip
-
 _N_DRAWS = 20_000
 _NEGLIGIBLE = 1e-9
 # Fewer effective draws do not give an sd to 5 %.

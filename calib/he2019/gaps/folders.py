@@ -10,8 +10,6 @@ from calib.data import write_table
 from calib.errors import CalibError
 from calib.he2019.gaps.cases import RECONSTRUCTED, PaperGap
 
-__all__ = ["write_cases"]
-
 
 def write_cases(gaps: Sequence[PaperGap], out: Path, *, overwrite: bool = False) -> list[Path]:
     """Write each gap as a case folder, and return the folders.

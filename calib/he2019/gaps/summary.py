@@ -10,8 +10,6 @@ from calib.gap.files import document
 from calib.he2019.gaps.checks import checks
 from calib.he2019.gaps.find import FoundGap
 
-__all__ = ["summarise_gaps"]
-
 
 def summarise_gaps(results: Sequence[FoundGap]) -> dict[str, Any]:
     """Return plain dictionaries by the names of the gaps.

@@ -23,8 +23,6 @@ from calib.report.numbers import NOTHING, format_number
 from calib.report.page.equations import unit_html
 from calib.report.page.template import template
 
-__all__ = ["AUDIT_MARKS", "audit_section", "write_audit", "write_audit_page"]
-
 _TITLE = "Audit of the published tables: He, Sandu & Osorio (2019)"
 _MINUS = "\N{MINUS SIGN}"
 _DIGITS = 4

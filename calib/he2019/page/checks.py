@@ -10,8 +10,6 @@ from calib.report.gap_verdict import odds_text
 from calib.report.labels import percent, short
 from calib.report.numbers import format_value
 
-__all__ = ["check_text"]
-
 type _Values = Mapping[str, float]
 
 

@@ -24,8 +24,6 @@ from calib.report.labels import short
 from calib.report.page.diagnosis import render_diagnosis
 from calib.report.page.template import template
 
-__all__ = ["begin_gaps_section", "write_gaps"]
-
 _MARKS = {
     Tone.FINE: "\N{HEAVY CHECK MARK}",
     Tone.CARE: "\N{BLACK UP-POINTING TRIANGLE}",

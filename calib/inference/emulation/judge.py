@@ -11,8 +11,6 @@ from calib.inference.emulation.settings import Emulation, EmulationSettings, Hel
 from calib.inference.emulation.state import State
 from calib.models.base import Array
 
-__all__ = ["WORTH", "held_out", "judged"]
-
 _NINETY = 1.645
 _LEAST_COVERED = 0.7
 # The error a further run is worth making for, as a part of what the gate allows.

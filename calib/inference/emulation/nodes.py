@@ -11,8 +11,6 @@ from scipy.stats import qmc
 from calib.data.quantities import QUANTITIES
 from calib.models.base import Array
 
-__all__ = ["choose_nodes"]
-
 # Nodes by the number of conditions that vary: a curve is smooth, a surface needs more.
 _ENOUGH = {0: 1, 1: 24, 2: 56}
 _MANY, _MOST, _CORNERS = 90, 160, 3

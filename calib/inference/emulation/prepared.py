@@ -24,8 +24,6 @@ from calib.models.simulators.registered import SIMULATED, Simulated, simulated_b
 from calib.models.simulators.runs import RunKeeper
 from calib.models.simulators.ways import TableWay
 
-__all__ = ["emulated", "prepare", "prepare_field", "reaches", "write_failed"]
-
 type Progress = Callable[[str, int, int], None]
 
 

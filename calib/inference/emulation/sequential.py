@@ -31,8 +31,6 @@ from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.emulator.kriging import correlation
 from calib.models.simulators.runs import RunKeeper
 
-__all__ = ["emulate", "extend", "prior_design"]
-
 _CANDIDATES = 400
 # Some of the candidates are so many times as far from the posterior's middle as its draws.
 _WIDER = 1.6

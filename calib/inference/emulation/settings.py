@@ -11,8 +11,6 @@ from calib.models.base import Array
 from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.runs import Run
 
-__all__ = ["Emulation", "EmulationSettings", "HeldOut"]
-
 
 @dataclass(frozen=True)
 class EmulationSettings:

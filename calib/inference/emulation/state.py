@@ -19,8 +19,6 @@ from calib.models.simulators.emulator.model import emulated_model
 from calib.models.simulators.emulator.region import Region
 from calib.models.simulators.runs import Run, RunKeeper
 
-__all__ = ["State"]
-
 # Draws on the way to the next runs: for a picture, not for a result.
 _ROUGH = SamplerSettings(ensembles=2, walkers=64, steps=60, max_steps=60, keep=1024)
 _DRAWS = 512

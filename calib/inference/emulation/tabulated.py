@@ -21,8 +21,6 @@ from calib.models.simulators.emulator import Training
 from calib.models.simulators.runs import Run, RunKeeper
 from calib.models.simulators.ways import TableWay
 
-__all__ = ["emulate_table", "read_runs"]
-
 # Every so many-th run is kept for the check.
 _EVERY = 5
 _LEAST = 8

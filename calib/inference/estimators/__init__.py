@@ -10,7 +10,8 @@ import numpy as np
 from calib.batch.threads import one_thread
 from calib.errors import CalibError
 from calib.inference.estimators.base import PointEstimate
-from calib.inference.estimators.genetic import GeneticSettings, minimise_genetic
+from calib.inference.estimators.generation import GeneticSettings
+from calib.inference.estimators.genetic import minimise_genetic
 from calib.inference.estimators.methods import METHODS, Method, method_name
 from calib.inference.problem import Problem
 from calib.models import get_model

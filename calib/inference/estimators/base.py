@@ -11,8 +11,6 @@ from calib.data.quantities import QUANTITIES
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-__all__ = ["PointEstimate", "goodness", "residuals", "sum_of_squares"]
-
 # Rows times vectors evaluated at once: bounds the memory, keeps temporaries in cache.
 _CHUNK_CELLS = 200_000
 

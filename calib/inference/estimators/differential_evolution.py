@@ -12,8 +12,6 @@ from calib.inference.estimators.search import Box, Found, SearchSpace, search_in
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-__all__ = ["estimate_differential_evolution"]
-
 # Instead of `inf`, with which the population's spread, SciPy's stopping rule, is undefined.
 _WORST = 1e100
 

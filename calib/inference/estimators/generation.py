@@ -30,8 +30,6 @@ from numpy.typing import NDArray
 from calib.errors import CalibError
 from calib.models.base import Array
 
-__all__ = ["GeneticDraws", "GeneticSettings", "descendants", "draw_generations"]
-
 
 @dataclass(frozen=True)
 class GeneticSettings:

@@ -24,11 +24,6 @@ from calib.inference.estimators.search import Box, Found, SearchSpace, search_in
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-__all__ = [
-    "GeneticResult", "GeneticSettings", "estimate_genetic", "minimise_genetic",
-    "minimise_genetic_runs",
-]  # fmt: skip
-
 # Generations whose random numbers are drawn in one call: the calls would cost more than the
 # numbers. Part of what a seed means; changing it changes the numbers of a run.
 _BLOCK = 32

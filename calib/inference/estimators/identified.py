@@ -15,8 +15,6 @@ from calib.inference.estimators.base import residuals
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-__all__ = ["central_interval", "hold_unidentified", "location", "representative_rows", "widths"]
-
 # A parameter is flat if one prior standard deviation of it moves the predictions, as far as the
 # others cannot imitate it, by less than this part of their own scatter.
 _FLAT = 1e-6

@@ -21,8 +21,6 @@ from calib.inference.estimators.search import edge_notes, held_note
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-__all__ = ["estimate_least_squares"]
-
 # Relative step of the central differences, in prior standard deviations.
 _STEP = 1e-5
 _TOLERANCE = 1e-13

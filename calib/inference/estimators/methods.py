@@ -11,8 +11,6 @@ from calib.inference.estimators.differential_evolution import estimate_different
 from calib.inference.estimators.genetic import estimate_genetic
 from calib.inference.estimators.least_squares import estimate_least_squares
 
-__all__ = ["METHODS", "Method", "method_name"]
-
 
 @dataclass(frozen=True)
 class Method:

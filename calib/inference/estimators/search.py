@@ -16,10 +16,6 @@ from calib.inference.estimators.identified import central_interval, hold_unident
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-__all__ = [
-    "Box", "Found", "SearchSpace", "edge_notes", "held_note", "search_in_box", "search_space",
-]  # fmt: skip
-
 # Sampled parameters of the Magic Formula at one pressure, and what the source searches instead.
 
 type Box = Mapping[str, tuple[float, float]]

@@ -20,8 +20,6 @@ from calib.inference.sampling.proposal import Proposal, fit_proposal
 from calib.inference.sampling.straighten import Straightener
 from calib.models.base import Array
 
-__all__ = ["Assessment", "Guess", "adapt", "refit", "tempered_moments"]
-
 type LogProb = Callable[[Array], Array]
 
 # Shares, scales and degrees of freedom of the first proposal, about the first guess: the curvature

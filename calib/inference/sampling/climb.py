@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 
 from calib.models.base import Array
 
-__all__ = ["climb"]
-
 type Mask = NDArray[np.bool_]
 
 _WORST = 1e12

@@ -8,8 +8,6 @@ import numpy as np
 
 from calib.models.base import Array
 
-__all__ = ["hessian_scale"]
-
 # Of curvatures over that of the prior.
 _NARROWEST = 1e13
 

@@ -15,8 +15,6 @@ from calib.inference.sampling.moves import PairMove, WalkMove
 from calib.inference.sampling.proposal import Proposal
 from calib.models.base import Array
 
-__all__ = ["GOOD", "POOR", "Ensemble"]
-
 # Efficiency of the proposal below which local moves do most of the work, and above which few do.
 POOR, GOOD = 0.1, 0.5
 # Steps with pairs between two of the walk's: a good proposal has the walk for safety only.

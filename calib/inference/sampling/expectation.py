@@ -14,8 +14,6 @@ from scipy.special import gammaln
 from calib.inference.sampling.mixture import Mixture, StudentT, log_sum
 from calib.models.base import Array
 
-__all__ = ["fit_mixture", "moments"]
-
 _MOST_COMPONENTS = 8
 # Effective draws per entry of a component's covariance.
 _DRAWS_PER_ENTRY = 20.0

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from calib.inference.diagnostics import convergence
 from calib.models.base import Array
 
-__all__ = ["Gate", "GateReport", "judge"]
-
 
 @dataclass(frozen=True)
 class Gate:

@@ -10,8 +10,6 @@ from scipy.special import gammaln
 
 from calib.models.base import Array
 
-__all__ = ["Mixture", "StudentT", "log_sum"]
-
 
 @dataclass(frozen=True)
 class StudentT:

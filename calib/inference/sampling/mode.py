@@ -13,8 +13,6 @@ from calib.inference.sampling.climb import climb
 from calib.inference.sampling.curvature import hessian_scale
 from calib.models.base import Array
 
-__all__ = ["Mode", "find_mode", "find_modes", "prior_widths"]
-
 _WORST = 1e12
 _MOST_POLISHED = 6
 # Modes so many nats below the highest hold no mass worth finding; squared standard distances up to

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from calib.inference.sampling.proposal import Proposal
 from calib.models.base import Array
 
-__all__ = ["PairMove", "WalkMove"]
-
 
 class PairMove(emcee.moves.Move):  # type: ignore[misc]
     """Metropolis-Hastings with opposite pairs of points from a fitted proposal.

@@ -12,8 +12,6 @@ from calib.inference.sampling.mixture import Mixture, StudentT
 from calib.inference.sampling.straighten import Straightener
 from calib.models.base import Array
 
-__all__ = ["Proposal", "fit_proposal"]
-
 _FITTED_DRAWS = 6000
 _BROAD_SCALE, _BROAD_DOF = 1.3, 4.0
 _LEAST_BROAD, _MOST_BROAD = 0.08, 0.4

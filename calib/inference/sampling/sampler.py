@@ -19,8 +19,6 @@ from calib.inference.sampling.mode import Mode, find_modes
 from calib.inference.sampling.proposal import Proposal
 from calib.models.base import Array
 
-__all__ = ["Draws", "SamplerSettings", "sample_density", "sample_posterior"]
-
 type Progress = Callable[[int, int], None]
 
 

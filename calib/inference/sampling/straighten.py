@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 
 from calib.models.base import Array
 
-__all__ = ["Straightener"]
-
 # Squares, products and the scale saturate this many standard deviations from the mean: they are
 # fitted to the bulk, and tails beyond it are bent no further.
 _SATURATION = 4.0

@@ -20,8 +20,6 @@ from calib.data.units import convert
 from calib.errors import CalibError
 from calib.models.base import Array
 
-__all__ = ["Failure", "Output", "Result", "Simulator", "Way", "checked", "tail"]
-
 type Kind = Literal["time", "exit", "nan", "short", "unreadable", "error"]
 type Values = Mapping[str, Array]
 

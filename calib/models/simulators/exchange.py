@@ -15,8 +15,6 @@ from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Result
 
-__all__ = ["check_template", "filled", "input_csv", "input_json", "output_of_text"]
-
 _MARK = re.compile(r"@([A-Za-z_]\w*)@")
 
 

@@ -19,8 +19,6 @@ from calib.models.simulators.exchange import check_template
 from calib.models.simulators.registered import SIMULATED, Simulated, declare
 from calib.models.simulators.ways import CallableWay, CommandWay, TableWay, UmbridgeWay
 
-__all__ = ["read_simulator", "register_file"]
-
 _WAYS = ("run", "python", "url", "table")
 
 

@@ -17,8 +17,6 @@ from calib.batch.plugins import USER_MODULE
 from calib.errors import CalibError
 from calib.models.simulators.base import Failure, tail
 
-__all__ = ["call_function", "run_program"]
-
 _PRINTED = ".printed"
 
 

@@ -18,10 +18,6 @@ from calib.models.base import Array, Conditions, Model
 from calib.models.simulators.base import Failure, Output, Simulator
 from calib.models.simulators.ways import CallableWay
 
-__all__ = [
-    "SIMULATED", "Simulated", "declare", "from_callable", "models_of", "simulated_by",
-]  # fmt: skip
-
 
 @dataclass(frozen=True)
 class Simulated:

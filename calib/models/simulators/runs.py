@@ -17,8 +17,6 @@ from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Result, Simulator
 
-__all__ = ["Run", "RunKeeper"]
-
 type Progress = Callable[[int, int], None]
 
 # Processes of their own take some seconds to start: only for batches that take longer here.

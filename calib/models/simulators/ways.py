@@ -23,8 +23,6 @@ from calib.models.simulators.base import Failure, Result, tail
 from calib.models.simulators.exchange import filled, input_csv, input_json, output_of_text
 from calib.models.simulators.process import call_function, run_program
 
-__all__ = ["CallableWay", "CommandWay", "TableWay", "UmbridgeWay"]
-
 
 @dataclass(frozen=True)
 class CallableWay:

@@ -10,8 +10,6 @@ from calib.models import get_model
 from calib.report.numbers import format_number
 from calib.report.page.template import template
 
-__all__ = ["render", "table", "text"]
-
 _HEAD = (
     "Model", "Below the best, elpd", "Standard error", "Stacking weight", "RMSE", "90 % covers",
     "Rows fitted again", "Log evidence",

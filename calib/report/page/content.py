@@ -27,8 +27,6 @@ from calib.report.rows import held_table
 from calib.report.study import Failure, OutputResult
 from calib.report.verdict import Evidence, Level, gather, judge_evidence
 
-__all__ = ["MARKS", "failed_section", "section"]
-
 # A shape beside every colour.
 MARKS: Mapping[str, str] = {
     Level.FINE: "\N{HEAVY CHECK MARK}",

@@ -41,8 +41,6 @@ from calib.report.page.gap_tables import (
 )
 from calib.report.page.template import template
 
-__all__ = ["render_diagnosis", "write_page"]
-
 # A cause less probable is not shown.
 _POSSIBLE = 0.01
 

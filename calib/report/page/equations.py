@@ -13,10 +13,6 @@ from calib.models import BoundModel
 from calib.models.latex import html
 from calib.report.labels import MINUS, axis_of, plain, stem_and_subscript, unbroken
 
-__all__ = [
-    "equation", "likelihood", "parametrisation", "prose", "symbol_html", "unit_html",
-]  # fmt: skip
-
 _GREEK = {"sigma": Markup("&sigma;"), "gamma": Markup("&gamma;"),
           "nu": Markup("&nu;"), "theta": Markup("&theta;")}  # fmt: skip
 

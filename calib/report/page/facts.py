@@ -11,8 +11,6 @@ from calib.report.numbers import TIMES, format_number, format_value
 from calib.report.rows import held_table, x_column
 from calib.report.study import OutputResult
 
-__all__ = ["repeats_words", "sampling_facts", "validation_facts", "worst_row"]
-
 
 def validation_facts(result: OutputResult, effective: float, low_p: float) -> list[list[str]]:
     """Label and value of every validation figure."""

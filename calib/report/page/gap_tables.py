@@ -27,16 +27,6 @@ from calib.report.labels import MINUS, percent
 from calib.report.numbers import format_number, format_value
 from calib.report.page.equations import equation, parametrisation, prose
 
-__all__ = [
-    "hypothesis_groups",
-    "next_rows",
-    "parameter_rows",
-    "parameter_text",
-    "prior_text",
-    "shift_sizes",
-    "simulators",
-]
-
 _POSSIBLE = 0.01
 # An sd above this part of the prior's says that the data did not narrow the parameter.
 _NOT_NARROWED = 0.9

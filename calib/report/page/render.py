@@ -16,8 +16,6 @@ from calib.report.publish import Publication
 from calib.report.sections import Written
 from calib.report.study import OutputResult, Study
 
-__all__ = ["render_page"]
-
 
 def render_page(
     study: Study,

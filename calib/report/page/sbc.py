@@ -12,8 +12,6 @@ from calib.report.page.template import template
 from calib.validation.sbc.designs import design_of
 from calib.validation.sbc.score import LEVEL, ModelScore, SbcScore
 
-__all__ = ["render", "text_table", "verdict"]
-
 
 def verdict(score: SbcScore) -> str:
     """Say in one sentence what a run found."""

@@ -19,10 +19,6 @@ from calib.report.study import OutputResult
 from calib.validation.roles import role
 from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
 
-__all__ = [
-    "Grid", "estimates_grid", "posterior_rows", "pressure_grids", "prior_rows", "sensitivity_grid",
-]  # fmt: skip
-
 _TICK = "\N{CHECK MARK}"
 _MINUS = "\N{MINUS SIGN}"
 

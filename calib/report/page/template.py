@@ -9,8 +9,6 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Te
 
 from calib.report.labels import unbroken
 
-__all__ = ["template"]
-
 _HERE = "calib.report.page"
 
 

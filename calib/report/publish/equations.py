@@ -5,8 +5,6 @@ from __future__ import annotations
 from calib.models import get_model
 from calib.models.latex import text
 
-__all__ = ["equation_numbers", "latex_equation", "letters", "text_equation"]
-
 
 def text_equation(model: str) -> str:
     """Return a model's equation as plain text."""

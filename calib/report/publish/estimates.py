@@ -14,8 +14,6 @@ from calib.report.publish.markup import in_brackets
 from calib.report.publish.records import Output
 from calib.report.reference import Figure, FittedTable, reference_of
 
-__all__ = ["estimates_csv", "estimates_latex", "pressure_latex"]
-
 _HEAD = (
     "output", "model", "rows", "n_rows", "quantity", "unit", "method", "value", "published",
     "published_in", "same_printed_digits",

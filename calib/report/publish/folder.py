@@ -22,8 +22,6 @@ from calib.report.publish.validation import (
     validation_latex,
 )
 
-__all__ = ["Publication", "publication"]
-
 _WIDTH = 96
 
 

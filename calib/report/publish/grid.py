@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 from calib.report.publish.markup import to_latex
 
-__all__ = ["CsvTable", "LatexTable", "write_csv", "write_latex"]
-
 
 @dataclass(frozen=True)
 class CsvTable:

@@ -7,8 +7,6 @@ import unicodedata
 
 from calib.report.labels import symbol, unit_text
 
-__all__ = ["escape", "latex_symbol", "latex_unit"]
-
 _SPECIAL = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
     "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",

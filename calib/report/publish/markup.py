@@ -15,8 +15,6 @@ from calib.report.publish.equations import latex_equation, text_equation
 from calib.report.publish.latex import escape, latex_symbol, latex_unit
 from calib.report.publish.references import short_citation
 
-__all__ = ["cited", "in_brackets", "joined_symbols", "to_latex", "to_text", "with_symbols"]
-
 _MARK = re.compile(r"\[@([^\]]+)\]|\[\$(\w+)\]|\[u:([^\]]*)\]|\[=(\w+)\]|`([^`]*)`")
 
 

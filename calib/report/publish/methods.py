@@ -15,8 +15,6 @@ from calib.report.numbers import format_number, format_value
 from calib.report.publish.markup import joined_symbols
 from calib.report.publish.records import Output
 
-__all__ = ["Paragraph", "methods"]
-
 # Digits of a hash that tell two files apart; the manifest has all of them.
 _HASH = 12
 

@@ -11,8 +11,6 @@ from calib.report.publish.grid import CsvTable, LatexTable
 from calib.report.publish.markup import in_brackets
 from calib.report.publish.records import Output
 
-__all__ = ["posterior_csv", "posterior_latex"]
-
 _HEAD = (
     "output", "model", "parameter", "unit", "mean", "sd", "mcse_mean", "median", "hdi95_lower",
     "hdi95_upper", "ess_bulk", "ess_tail", "rhat", "posterior_sd_over_prior_sd", "converged",

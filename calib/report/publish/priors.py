@@ -8,8 +8,6 @@ from calib.report.publish.grid import CsvTable, LatexTable
 from calib.report.publish.markup import in_brackets, with_symbols
 from calib.report.publish.records import Output
 
-__all__ = ["priors_csv", "priors_latex"]
-
 
 def priors_csv(outputs: Sequence[Output]) -> CsvTable:
     """Return the priors of all outputs."""

@@ -10,8 +10,6 @@ from calib.inference.calibration import ParameterSummary
 from calib.models import get_model
 from calib.report.publish.equations import equation_numbers
 
-__all__ = ["Output", "outputs"]
-
 _NAN = float("nan")
 
 

@@ -17,8 +17,6 @@ from calib.report.numbers import (
 from calib.report.publish.grid import CsvTable, LatexTable
 from calib.report.publish.records import Output
 
-__all__ = ["convergence_csv", "convergence_latex", "validation_csv", "validation_latex"]
-
 _LEVELS = ("50", "90", "95")
 
 

@@ -12,8 +12,6 @@ from calib.data.registry import Registry
 from calib.models import Model, example_csv, get_model
 from calib.models.base import Array
 
-__all__ = ["DESIGNS", "Design", "ModelDesign", "design_of"]
-
 
 @dataclass(frozen=True)
 class Design:

@@ -16,8 +16,6 @@ from calib.models import MODELS, get_model
 from calib.validation.sbc.replicate import Item, replicate
 from calib.validation.sbc.score import SbcScore, score
 
-__all__ = ["SETTINGS", "chosen_models", "read_records", "run_sbc"]
-
 # As for a report, but a chain is extended to 3200 steps, not 25,600, before it counts as one that
 # did not converge: simulated campaigns are many, and some tell next to nothing.
 SETTINGS = SamplerSettings(max_steps=3200)

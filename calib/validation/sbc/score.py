@@ -15,8 +15,6 @@ from calib.models.base import Array
 from calib.validation.sbc.uniformity import holm, p_value, pit
 from calib.validation.scores import LEVELS
 
-__all__ = ["LEVEL", "BandCoverage", "ModelScore", "Quantity", "SbcScore", "score", "score_model"]
-
 # Chance of a false alarm in all quantities and bands of a run together.
 LEVEL = 0.05
 # Of a single rank there is no distribution.

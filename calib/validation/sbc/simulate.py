@@ -12,8 +12,6 @@ from calib.inference.problem import Problem
 from calib.models.base import Array
 from calib.validation.sbc.designs import Design
 
-__all__ = ["Simulated", "simulate"]
-
 _MOST_ATTEMPTS = 10_000
 
 

@@ -23,8 +23,6 @@ from scipy.stats import binom, poisson
 
 from calib.models.base import Array
 
-__all__ = ["EcdfBand", "ecdf_band", "holm", "p_value", "pit"]
-
 _SIMULATIONS = 4000
 _JUMPS = 60  # a Poisson variable of mean one exceeds it with probability below 1e-80
 

@@ -12,8 +12,6 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from calib.batch.campaign.place import Place
 
-__all__ = ["Kind", "Planned", "Section", "Task", "Work"]
-
 
 class Section(BaseModel):
     """A table of the plan; each field's description is shown where its value will not do."""

@@ -24,8 +24,6 @@ from calib.gap.batch import written
 from calib.gap.case import read_case
 from calib.gap.diagnose import diagnose
 
-__all__ = ["Challenge", "ChallengeItem", "ChallengeSection"]
-
 _TABLE = "[[challenge]]"
 
 

@@ -22,8 +22,6 @@ from calib.gap.effects.check import check_on_case
 from calib.gap.effects.load import load_effects
 from calib.report.page.diagnosis import write_page
 
-__all__ = ["Diagnose", "DiagnoseSection", "DiagnosisItem", "diagnosis_numbers"]
-
 
 class DiagnoseSection(Section):
     """``[[diagnose]]``: every case folder."""

@@ -30,8 +30,6 @@ from calib.report.study_tasks import HoldOut
 from calib.validation.assumptions import warnings_of
 from calib.validation.validate import validate_held_out
 
-__all__ = ["Fit", "FitItem", "FitSection"]
-
 SHIPPED, NOTHING = "shipped", "nothing"
 
 

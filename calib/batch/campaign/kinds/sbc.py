@@ -14,8 +14,6 @@ from calib.models import get_model
 from calib.validation.sbc.replicate import Item, replicate
 from calib.validation.sbc.run import SETTINGS, chosen_models
 
-__all__ = ["Sbc", "SbcSection"]
-
 
 class SbcSection(Section):
     """``[[sbc]]``: simulated campaigns of some models."""
