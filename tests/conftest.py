@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from calib.batch.pool import HERE
 from calib.data import Table, hold_out, table_from_arrays
 from calib.he2019.audit import Audit, Seeds, run_audit
 from calib.he2019.datasets import embedded
-from calib.he2019.gaps.find import FoundGap, find_gaps
+from calib.he2019.gaps.cases import paper_gaps
+from calib.he2019.gaps.find import FoundGap, begin_gaps
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
@@ -72,7 +74,8 @@ def density_calibration() -> Calibration:
 @pytest.fixture(scope="session")
 def found_gaps() -> dict[str, FoundGap]:
     """The source's own gaps, diagnosed."""
-    return {result.gap.name: result for result in find_gaps(SEED)}
+    found = begin_gaps(SEED, paper_gaps(), HERE)(lambda what, done, planned: None)
+    return {result.gap.name: result for result in found}
 
 
 @pytest.fixture(scope="session")

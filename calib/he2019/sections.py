@@ -22,13 +22,7 @@ from calib.report.study import Progress, Study
 
 @dataclass(frozen=True)
 class GapsSection:
-    """The paper's own gaps, to be diagnosed.
-
-    Parameters
-    ----------
-    gaps : sequence of PaperGap
-        All by default.
-    """
+    """The paper's own gaps, to be diagnosed."""
 
     gaps: Sequence[PaperGap] = field(default_factory=paper_gaps)
 
@@ -67,13 +61,7 @@ class FoundGaps:
 
 @dataclass(frozen=True)
 class AuditSection:
-    """The audit of the published tables.
-
-    Parameters
-    ----------
-    seeds : Seeds
-        How often each search is repeated.
-    """
+    """The audit of the published tables, each search repeated over so many seeds."""
 
     seeds: Seeds = field(default_factory=Seeds)
 

@@ -5,9 +5,7 @@ With the rows that were held out and a hash of every file, so that it can be com
 
 from __future__ import annotations
 
-import base64
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -21,7 +19,9 @@ from calib.inference.io import load_calibration, save_calibration
 from calib.report.figures.comparison import comparison_figure
 from calib.report.figures.export import png_bytes
 from calib.report.manifest import file_hashes
+from calib.report.numbers import finite
 from calib.report.page.comparison import render
+from calib.report.page.pictures import data_uri
 from calib.validation.comparison import Candidate, Comparison, difference
 from calib.validation.prediction import N_DRAWS
 from calib.validation.validate import PARETO_K_MAX
@@ -35,12 +35,8 @@ FILE, PAGE, FIGURE, HELD_OUT = (
 def document(comparison: Comparison, hold_out: str = "", best: str | None = None) -> dict[str, Any]:
     """Return every number of a comparison as plain dictionaries.
 
-    Parameters
-    ----------
-    hold_out : str
-        What was held out, in words; empty for nothing.
-    best : str, optional
-        The model that differences are from, where another comparison had it for the best.
+    What was held out is said in words. Differences are from the model `best`, where another
+    comparison had it for the best.
     """
     first = next(c for c in comparison.candidates if best in (None, c.model))
     return {
@@ -65,34 +61,29 @@ def _model(comparison: Comparison, c: Candidate, best: Candidate) -> dict[str, A
         "told_apart": below.clear,
         "elpd_rows": c.rows.tolist(),
         "converged": c.calibration.converged,
-        "pareto_k_max": None if loo.pareto_k is None else _finite(float(loo.pareto_k.max())),
+        "pareto_k_max": None if loo.pareto_k is None else finite(float(loo.pareto_k.max())),
         "pareto_k_limit": PARETO_K_MAX,
         "refitted_rows": len(loo.refitted),
         "refits_not_converged": len(loo.unconverged),
         "rmse": loo.scores.rmse,
-        "crps": _finite(loo.scores.crps),
+        "crps": finite(loo.scores.crps),
         "coverage_90": loo.scores.coverage[0.9].proportion,
-        "log_evidence": _finite(c.calibration.draws.log_evidence),
+        "log_evidence": finite(c.calibration.draws.log_evidence),
     }
     if c.held is not None:
         found["held_out"] = {
             "rows": c.held.scores.n,
-            "elpd": _finite(c.held_elpd),
+            "elpd": finite(c.held_elpd),
             "rmse": c.held.scores.rmse,
-            "crps": _finite(c.held.scores.crps),
+            "crps": finite(c.held.scores.crps),
             "coverage_90": c.held.scores.coverage[0.9].proportion,
         }
     return found
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def page(found: Mapping[str, Any], image: bytes) -> str:
     """Return the page of a comparison, from the content of `comparison.json` and the figure."""
-    uri = f"data:image/png;base64,{base64.b64encode(image).decode()}"
-    return render(found, uri, found["command"])
+    return render(found, data_uri(image), found["command"])
 
 
 def write_comparison(
@@ -105,14 +96,7 @@ def write_comparison(
 ) -> dict[str, Any]:
     """Write a comparison into an empty folder and return what `comparison.json` holds.
 
-    Parameters
-    ----------
-    command : sequence of str
-        The command line, for the page.
-    hold_out : str
-        What was held out, in words; empty for nothing.
-    environment : Environment, optional
-        Where it says that it was made: in that of this process by default.
+    What was held out is said in words; the command line is for the page.
     """
     here = environment or Environment.here()
     first = comparison.candidates[0]
@@ -138,13 +122,7 @@ def write_comparison(
 
 
 def load_stack(folder: Path) -> tuple[dict[str, Any], list[tuple[float, Calibration]]]:
-    """Read a folder of `calib compare`: what it found, and the models that have a weight.
-
-    Raises
-    ------
-    CalibError
-        If it is damaged.
-    """
+    """Read a folder of `calib compare`, if whole: what it found, and models that have a weight."""
     path = folder / FILE
     try:
         found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

@@ -14,13 +14,7 @@ from calib.report.study_tasks import Task
 
 @dataclass(frozen=True)
 class Contents:
-    """What `calib.report.writer.write_report` writes.
-
-    Parameters
-    ----------
-    found : tuple of Found
-        What the sections found, in their order on the page.
-    """
+    """What `calib.report.writer.write_report` writes: the study, and what its sections found."""
 
     study: Study
     found: tuple[Found, ...]
@@ -40,8 +34,6 @@ def work_out(
 
     Parameters
     ----------
-    seed : int
-        Same seed, same numbers.
     sections : sequence of Section
         What the report has beside its outputs.
     progress : callable, optional

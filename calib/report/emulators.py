@@ -34,13 +34,7 @@ _WORDS = (
 
 @dataclass(frozen=True)
 class EmulatorSection:
-    """What became of the emulations, by model.
-
-    Parameters
-    ----------
-    documents : mapping of str to mapping
-        As `calib.inference.emulation.Emulation.document` returns them.
-    """
+    """What became of the emulations, as their `Emulation.document`, by model."""
 
     documents: Mapping[str, Document]
 

@@ -92,17 +92,11 @@ def best_of(found: Diagnosis) -> str:
 
 @dataclass(frozen=True)
 class OutputRows:
-    """Field rows of one output, as they are drawn.
+    """Field rows of one output, as they are drawn, arrays of shape (n,).
 
-    Parameters
-    ----------
-    rows : ndarray of int, shape (n,)
-    measured, before, after : ndarray, shape (n,)
-        On the scale of the axis: the reading; the calibrated simulator; the corrected one.
-    noise : ndarray, shape (n,)
-        Sd of a reading.
-    gap, sd, probability : ndarray, shape (n,)
-        Truth minus simulator, and that it exceeds the noise.
+    On the scale of the axis the reading, the calibrated simulator before and the corrected one
+    after; the sd of a reading; truth minus simulator, its sd, and the probability that it exceeds
+    the noise.
     """
 
     name: str

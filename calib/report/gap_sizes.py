@@ -46,13 +46,7 @@ class _Change:
 
 
 def size_sentences(found: Diagnosis, name: str) -> list[str]:
-    """Say what a hypothesis amounts to on the field's conditions.
-
-    Parameters
-    ----------
-    name : str
-        Of a fitted hypothesis; ``none`` has no size.
-    """
+    """Say what a fitted hypothesis amounts to on the field's conditions; ``none`` has no size."""
     if name == "none":
         return []
     fit = best_fit(found, name)

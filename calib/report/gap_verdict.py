@@ -151,18 +151,9 @@ class GapEvidence:
 
 @dataclass(frozen=True)
 class GapVerdict:
-    """What a busy reader needs.
+    """What a busy reader needs: a headline of one sentence, and a state of two or three words.
 
-    Parameters
-    ----------
-    rule : str
-        Which rule decided.
-    state : str
-        Two or three words.
-    headline : str
-        One sentence.
-    facts : sequence of (str, str)
-        Which, how large, where, how far, what next.
+    The facts say which, how large, where, how far, what next; `rule` is the one that decided.
     """
 
     tone: Tone

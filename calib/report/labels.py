@@ -27,15 +27,7 @@ _GREEK_PLAIN = {
 
 @dataclass(frozen=True)
 class Axis:
-    """How a canonical column is drawn.
-
-    Parameters
-    ----------
-    name, unit : str
-        In words.
-    factor : float
-        From the canonical unit to the drawn one.
-    """
+    """How a canonical column is drawn: in words, and by a factor from the canonical unit."""
 
     name: str
     unit: str

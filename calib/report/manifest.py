@@ -37,19 +37,7 @@ def build_manifest(
 ) -> dict[str, Any]:
     """Return the manifest of a study, its file hashes still to be added.
 
-    Parameters
-    ----------
-    command : sequence of str
-        The command line, program first.
-    inputs : mapping
-        For every output: the files its data and priors were copied to, and their hashes.
-    title : str
-        Of the report.
-    environment : Environment, optional
-        That of this process by default.
-
-    Notes
-    -----
+    `inputs` are for every output the files its data and priors were copied to, and their hashes.
     ``seconds`` is the one place of a report that holds durations, which no two runs share.
     """
     return {

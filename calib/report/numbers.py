@@ -13,7 +13,9 @@ At least one digit of the uncertainty always stays.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from decimal import Decimal
+from typing import Any
 
 NOTHING = "\N{EN DASH}"
 _MINUS = "\N{MINUS SIGN}"
@@ -25,6 +27,17 @@ _FROM_SUPERSCRIPTS = str.maketrans(_RAISED, "-0123456789")
 _PLAIN = range(-3, 5)
 
 
+def finite(value: Any) -> Any:
+    """Return what JSON can hold of a value: null for what is undefined, plain numbers and lists."""
+    if isinstance(value, Mapping):
+        return {key: finite(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(v) for v in value]
+    if hasattr(value, "item"):
+        value = value.item()
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def place_of(value: float, digits: int) -> int:
     """Return the power of ten of a significant digit: 0.0996 has its second at 10^-2."""
     return _exponent(value, digits) - digits + 1
@@ -33,12 +46,8 @@ def place_of(value: float, digits: int) -> int:
 def last_place(uncertainty: float, mcse: float = 0.0) -> int:
     """Return the power of ten of the last digit to be shown.
 
-    Parameters
-    ----------
-    uncertainty : float
-        A standard deviation, or another distance within which the value is not known; positive.
-    mcse : float
-        Monte Carlo standard error of the value; zero or NaN where there is none.
+    The uncertainty, positive, is a standard deviation, or another distance within which the value
+    is not known; a Monte Carlo standard error of zero or NaN is none.
     """
     second = place_of(uncertainty, 2)
     if not (math.isfinite(mcse) and mcse > 0.0):
@@ -47,18 +56,10 @@ def last_place(uncertainty: float, mcse: float = 0.0) -> int:
 
 
 def format_value(mean: float, sd: float, mcse: float = 0.0) -> str:
-    """Write a value and its uncertainty.
+    """Write a value and its uncertainty, such as ``1.648 ± 0.025``.
 
-    Parameters
-    ----------
-    mcse : float
-        Monte Carlo standard error of the mean.
-
-    Returns
-    -------
-    str
-        Such as ``1.648 ± 0.025``, with a power of ten set apart where numbers are large or
-        small; a dash where a value is not finite.
+    A power of ten is set apart where numbers are large or small; a dash stands where a value is not
+    finite.
     """
     if not math.isfinite(mean) or not math.isfinite(sd):
         return NOTHING
@@ -79,15 +80,8 @@ def format_interval(
     """Write an interval, each end to the last digit that it warrants.
 
     Ends whose last digits are neighbours share the coarser of them; an end that is nothing at its
-    last digit is written 0.
-
-    Parameters
-    ----------
-    uncertainty : float or pair of float
-        Of both ends, or of each: the standard deviation of what lies in the interval, or an end's
-        distance from its centre.
-    mcse : pair of float
-        Monte Carlo standard errors of the ends.
+    last digit is written 0. The uncertainty of both ends, or of each, is the standard deviation of
+    what lies in the interval, or an end's distance from its centre.
     """
     scales = uncertainty if isinstance(uncertainty, tuple) else (uncertainty, uncertainty)
     if not all(math.isfinite(x) for x in (lower, upper, *scales)):

@@ -51,16 +51,7 @@ class Figure:
 class FittedTable:
     """Estimates of one model, and the goodness of fit printed with them.
 
-    Parameters
-    ----------
-    source : str
-        Where they are printed.
-    model : str
-        The equations fitted.
-    estimates, quality : mapping of str to Figure
-        Parameters, and what is said of the fit.
-    note : str
-        How to read them.
+    With where they are printed, the equations fitted, and how to read them.
     """
 
     source: str
@@ -68,7 +59,6 @@ class FittedTable:
     estimates: Mapping[str, Figure]
     quality: Mapping[str, Figure]
     note: str = ""
-    doi: str = ""
 
     @property
     def values(self) -> dict[str, float]:

@@ -26,18 +26,9 @@ _GRID = 100
 
 @dataclass(frozen=True)
 class Group:
-    """Rows that share a panel.
+    """Rows, of the calibration table and of the held-out one, that share a panel.
 
-    Parameters
-    ----------
-    held : bool
-        Whether its rows were held out.
-    column : str or None
-        The condition that the panel stands for.
-    value : float
-        Its value there; NaN where there is none.
-    fitted, held_out : ndarray of bool
-        Rows of the calibration table, and of the held-out one.
+    The panel stands for a value of a condition, NaN and None where there is none.
     """
 
     title: str
@@ -84,12 +75,8 @@ def group_column(result: OutputResult) -> str | None:
 def groups(result: OutputResult, *, most: bool = True) -> list[Group]:
     """Split the rows into at most six panels: those held out and the most populated others.
 
-    More distinct values than twice that are pooled into thirds of the rows.
-
-    Parameters
-    ----------
-    most : bool
-        Whether to stop at six; otherwise every row is in a group.
+    More distinct values than twice that are pooled into thirds of the rows. If asked for more than
+    the most, every row is in a group.
     """
     column = group_column(result)
     fitted, held = result.calibration.problem.table, held_table(result)
@@ -168,14 +155,9 @@ def grid(result: OutputResult, group: Group) -> dict[str, Array]:
 def smooth_bands(
     calibration: Calibration, conditions: Mapping[str, Array], *, prior: bool = False
 ) -> tuple[Bands, Bands]:
-    """Bands of the mean output and of a measurement along a curve.
+    """Bands of the mean output and of a measurement along a curve, of posterior or prior.
 
     Each draw has one noise value for the whole curve, so that its quantiles are smooth in x.
-
-    Parameters
-    ----------
-    prior : bool
-        Of the prior instead of the posterior.
     """
     problem = calibration.problem
     rng = generator(calibration.seed, calibration.label, "figures")

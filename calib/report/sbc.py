@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import base64
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from calib.report.figures.export import png_bytes
 from calib.report.figures.sbc import coverage_figure, ranks_figure
+from calib.report.numbers import finite
+from calib.report.page.pictures import data_uri
 from calib.report.page.sbc import render
 from calib.validation.sbc.designs import design_of
 from calib.validation.sbc.score import ModelScore, SbcScore
@@ -42,9 +42,9 @@ def _model(m: ModelScore, adjusted: dict[tuple[str, str], float]) -> dict[str, A
         "held_out_without_band": m.no_band,
         "coverage": {
             f"{100 * c.level:g}": {
-                "proportion": _finite(c.proportion),
-                "standard_error": _finite(c.se),
-                "interval": [_finite(x) for x in c.interval],
+                "proportion": finite(c.proportion),
+                "standard_error": finite(c.se),
+                "interval": finite(c.interval),
                 "measurements": c.rows,
                 "campaigns": c.replicates,
                 "p": c.p,
@@ -64,27 +64,16 @@ def _model(m: ModelScore, adjusted: dict[tuple[str, str], float]) -> dict[str, A
     }
 
 
-def _finite(value: float) -> float | None:
-    return value if math.isfinite(value) else None
-
-
 def write_sbc(score: SbcScore, out: Path, settings: dict[str, Any], command: Sequence[str]) -> Path:
     """Write numbers, figures and page into the folder of a run, and return the page's path.
 
-    Parameters
-    ----------
-    out : Path
-        That of `calib.validation.sbc.run.run_sbc`; files of an earlier end of the run are replaced.
-    settings : dict
-        Of the sampler.
-    command : sequence of str
-        The command line, for the page.
+    Files of an earlier end of the run are replaced. Settings are the sampler's, the command line is
+    for the page.
     """
     text = json.dumps(document(score, settings), allow_nan=False) + "\n"
     images = {m.model: png_bytes(ranks_figure(m, score.adjusted)) for m in score.models}
     images["coverage"] = png_bytes(coverage_figure(score))
-    uris = {k: f"data:image/png;base64,{base64.b64encode(v).decode()}" for k, v in images.items()}
-    page = render(score, uris, command)
+    page = render(score, {name: data_uri(image) for name, image in images.items()}, command)
     (out / "figures").mkdir(exist_ok=True)
     for name, image in images.items():
         (out / "figures" / f"{name}.png").write_bytes(image)

@@ -19,13 +19,7 @@ from calib.report.study import Progress, Study
 
 @dataclass(frozen=True)
 class Written:
-    """A section of the page.
-
-    Parameters
-    ----------
-    badge : str
-        Beside the heading: what its data are called; empty for none.
-    """
+    """A section of the page; the badge beside its heading says what its data are called."""
 
     anchor: str
     heading: str

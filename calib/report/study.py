@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import Pool
 from calib.batch.threads import one_thread
 from calib.data import table_from_arrays
 from calib.data.quantities import output_of
@@ -40,23 +40,18 @@ type Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class OutputResult:
-    """What a study found for one output.
+    """What a study found for one output, calibrated on the rows that are not held out.
 
     Parameters
     ----------
-    calibration : Calibration
-        On the rows that are not held out.
     estimates : tuple of PointEstimate
         Every applicable method, on all rows the source fitted.
     by_pressure : mapping of float to tuple of PointEstimate
         The Magic Formula at each inflation pressure (psi) on its own; empty for other models.
-    prior_predictive : ndarray, shape (draws, n)
-        Measurements the prior alone expects, at the calibration conditions.
-    posterior_predictive : ndarray, shape (draws, n)
+    prior_predictive, posterior_predictive : ndarray, shape (draws, n)
+        Measurements that are expected at the calibration conditions.
     seconds : mapping of str to float
         Of each step of the work.
-    sensitivity : mapping of str to Sensitivity
-        Of each parameter to prior and data.
     preference : NoisePreference, optional
         Of the noise that the prior file asks for over the usual one.
     warnings : tuple of str
@@ -103,30 +98,6 @@ class Study:
         return {k: r for k, r in self.results.items() if isinstance(r, Failure)}
 
 
-def run_study(
-    tasks: Sequence[Task],
-    seed: int,
-    *,
-    settings: SamplerSettings | None = None,
-    progress: Progress | None = None,
-    workers: int = 1,
-    pool: Pool = HERE,
-) -> Study:
-    """Work every task out.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with what is being done, steps done and steps planned.
-    workers : int
-        Processes for leaving rows out; the numbers do not depend on it.
-    pool : Pool, optional
-        Where outputs are worked out; here, one after the other, by default.
-    """
-    asked = begin_study(tasks, seed, pool, settings=settings, progress=progress, workers=workers)
-    return asked(progress or _silent)
-
-
 def begin_study(
     tasks: Sequence[Task],
     seed: int,
@@ -136,7 +107,11 @@ def begin_study(
     progress: Progress | None = None,
     workers: int = 1,
 ) -> Callable[[Progress], Study]:
-    """Ask for every output, the parameters as for `run_study`; return what waits for them."""
+    """Ask for every output; return what waits for them.
+
+    Where they are worked out here, `progress` is called with what is being done, steps done and
+    steps planned. The numbers do not depend on the number of workers, which leave rows out.
+    """
     began = time.perf_counter()
     inner = progress if pool.here else None
     pieces = {
@@ -233,13 +208,7 @@ def _work_out(
 
 
 def judged(calibration: Calibration, validation: Validation) -> OutputResult:
-    """Return a calibration and its validation as a study has them, without point estimates.
-
-    Parameters
-    ----------
-    validation : Validation
-        On rows that were held out, or left out in turn.
-    """
+    """Return a calibration and its validation as a study has them, without point estimates."""
     problem = calibration.problem
     table, model = problem.table, problem.bound.model
     if validation.method == "held_out":
@@ -259,13 +228,7 @@ def judged(calibration: Calibration, validation: Validation) -> OutputResult:
 def estimate_task(
     task: Task, seed: int, *, progress: Progress | None = None
 ) -> tuple[tuple[PointEstimate, ...], dict[float, tuple[PointEstimate, ...]]]:
-    """Return the point estimates of a task, and those at each inflation pressure on its own.
-
-    Raises
-    ------
-    CalibError
-        If the data or the priors do not fit the model.
-    """
+    """Return the point estimates of a task, and those at each inflation pressure on its own."""
     tell = progress or _silent
     # The paper fitted drawbar pull at all pressures, rut depth at the two outer ones.
     everything = task.held_out is None or get_model(task.model).estimates_all_rows

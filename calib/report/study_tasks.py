@@ -31,13 +31,7 @@ class HoldOut:
 
     @classmethod
     def parse(cls, text: str) -> HoldOut:
-        """Read ``COLUMN=VALUE``.
-
-        Raises
-        ------
-        CalibError
-            If it is not of this form.
-        """
+        """Read ``COLUMN=VALUE``, or raise a CalibError."""
         column, equals, value = text.partition("=")
         try:
             if not equals:
@@ -55,20 +49,14 @@ class HoldOut:
         column = parse_header(self.column)
         return column is not None and column.quantity.canonical in table
 
+    def split(self, table: Table) -> tuple[Table, Table]:
+        """Return the rows that are left, and these; see `calib.data.hold_out`."""
+        return hold_out(table, self.column, self.value)
+
 
 @dataclass(frozen=True)
 class Task:
-    """One output to calibrate.
-
-    Parameters
-    ----------
-    output : str
-        Key of `OUTPUTS`.
-    table : Table
-        All rows.
-    held_out : HoldOut, optional
-        Validation by held-out rows; by leave-one-out where there is none.
-    """
+    """One output (a key of `OUTPUTS`) to calibrate; leave-one-out where no rows are held out."""
 
     output: str
     model: str
@@ -118,14 +106,8 @@ def plan_tasks(
 ) -> tuple[Task, ...]:
     """Find the outputs in some tables and choose a model for each.
 
-    Parameters
-    ----------
-    models : sequence of str
-        Models to use for their outputs, in the place of the ones the columns suggest.
-    prior_paths : sequence of Path
-        Prior files; each names the model it is for.
-    only : sequence of str
-        Outputs to work out (keys of `OUTPUTS`); all by default.
+    Models are used for their outputs, in the place of the ones the columns suggest; a prior file
+    names the model it is for; `only` has outputs to work out (keys of `OUTPUTS`).
 
     Raises
     ------
@@ -187,7 +169,7 @@ def _check_held_out(tasks: Sequence[Task], held_out: HoldOut) -> None:
     refusals = []
     for task in tasks:
         try:
-            hold_out(task.table, held_out.column, held_out.value)
+            held_out.split(task.table)
         except CalibError as error:
             refusals.append(error)
     if len(refusals) == len(tasks):
@@ -198,4 +180,4 @@ def fitted_rows(task: Task) -> tuple[Table, Table | None]:
     """Return the rows that are fitted, and those held out."""
     if task.held_out is None:
         return task.table, None
-    return hold_out(task.table, task.held_out.column, task.held_out.value)
+    return task.held_out.split(task.table)

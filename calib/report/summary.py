@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from calib.inference.calibration import Calibration
 from calib.inference.estimators import PointEstimate
 from calib.inference.noise import Noise
 from calib.models.base import Array
+from calib.report.numbers import finite
 from calib.report.study import OutputResult, Study
 from calib.validation.noise_preference import NoisePreference
 from calib.validation.scores import Scores
@@ -34,7 +35,7 @@ def summarise(study: Study) -> dict[str, Any]:
         "seed": study.seed,
         "models": {key: models[key] for key in study.results},
     }
-    plain: dict[str, Any] = _finite(document)
+    plain: dict[str, Any] = finite(document)
     return plain
 
 
@@ -97,7 +98,7 @@ def summarise_estimates(
     estimates: Sequence[PointEstimate], by_pressure: Mapping[float, Sequence[PointEstimate]]
 ) -> dict[str, Any]:
     """Return an output's point estimates as they stand in the summary."""
-    plain: dict[str, Any] = _finite(
+    plain: dict[str, Any] = finite(
         {
             "estimates": {e.method: dict(e.reported) for e in estimates},
             "fit": {e.method: _fit(e) for e in estimates},
@@ -132,23 +133,10 @@ def _fit(e: PointEstimate) -> dict[str, Any]:
 
 
 def _posterior(calibration: Calibration) -> dict[str, Any]:
+    # Under a name that says of what the ratio is.
+    spelt = {"sd_ratio": "posterior_to_prior_sd"}
     return {
-        name: {
-            "unit": s.unit,
-            "mean": s.mean,
-            "sd": s.sd,
-            "median": s.median,
-            "hdi_lower": s.hdi_lower,
-            "hdi_upper": s.hdi_upper,
-            "ess_bulk": s.ess_bulk,
-            "ess_tail": s.ess_tail,
-            "rhat": s.rhat,
-            "mcse_mean": s.mcse_mean,
-            "mcse_median": s.mcse_median,
-            "mcse_hdi_lower": s.mcse_hdi_lower,
-            "mcse_hdi_upper": s.mcse_hdi_upper,
-            "posterior_to_prior_sd": s.sd_ratio,
-        }
+        name: {spelt.get(k, k): v for k, v in asdict(s).items() if k != "name"}
         for name, s in calibration.summary.items()
     }
 
@@ -229,16 +217,3 @@ def _sampling(calibration: Calibration) -> dict[str, Any]:
         },
         "log_posterior_at_mode": float(problem.log_prob(d.mode[None])[0]),
     }
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN: what is undefined is null."""
-    if isinstance(value, dict):
-        return {k: _finite(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if hasattr(value, "item"):
-        return _finite(value.item())
-    return value

@@ -60,8 +60,6 @@ class Evidence:
 
     Parameters
     ----------
-    reasons : sequence of str
-        Why not.
     held_out : bool
         Whether rows were held out; otherwise each was left out in turn.
     hits, n : int
@@ -70,8 +68,6 @@ class Evidence:
         Probability of covering no more than that, were the bands right.
     effective : float
         Independent rows that would say as much.
-    unit : str
-        Of the output.
     max_relative_error : float
         NaN where no row is large enough to be judged.
     prior_set : sequence of str
@@ -81,13 +77,9 @@ class Evidence:
     skill : float
         Part of the scatter of unseen rows about the calibrated mean that the median removes.
     sign_changes, neighbours : int
-        Of the residuals along the curve.
-    along : str
-        What the curve runs along.
+        Of the residuals along the curve, which runs `along` a condition.
     inside : str
         The calibrated range in words.
-    label : str
-        Of the data.
     unseen_at : Where
         Where in pressure the unseen rows lie.
     at_pressures : str

@@ -47,20 +47,14 @@ def write_report(
     progress: Progress | None = None,
     pool: Pool = HERE,
 ) -> Path:
-    """Write a report folder.
+    """Write a report folder, whole or not at all, and return the path of its ``index.html``.
 
     Parameters
     ----------
-    out : Path
-        Appears whole or not at all.
     settings : SamplerSettings
-        Of the study, for the manifest.
-    command : sequence of str
-        The command line, for the manifest.
+        Of the study, for the manifest; so is the command line.
     sections : sequence of Found
         What it shows beside its outputs, in their order on the page.
-    overwrite : bool
-        Replace an earlier report.
     posteriors : bool
         Whether to keep the netCDF files, which are megabytes. Where they are left out, the
         manifest says so and has their hashes.
@@ -71,15 +65,10 @@ def write_report(
     pool : Pool, optional
         Where figures are drawn.
 
-    Returns
-    -------
-    Path
-        Of ``index.html``.
-
     Raises
     ------
     CalibError
-        If the folder exists or cannot be written.
+        If the folder exists, and an earlier report is not to be replaced, or cannot be written.
     """
     tell = progress or (lambda what, done, planned: None)
     successes = study.successes

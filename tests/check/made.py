@@ -34,7 +34,7 @@ from calib.report.figures.bands import bands_plate
 from calib.report.figures.learned import learned_plate
 from calib.report.figures.style import style
 from calib.report.reference import NOTHING, Reference
-from calib.report.study import OutputResult, Study, run_study
+from calib.report.study import OutputResult, Study
 from calib.report.study_tasks import Task
 from calib.report.writer import write_report
 from calib.validation.comparison import compare
@@ -59,7 +59,7 @@ def rut_tasks() -> list[Task]:
 
 
 def rut_study(seed: int = 2019) -> Study:
-    return run_study(rut_tasks(), seed, settings=SETTINGS)
+    return work_out(rut_tasks(), seed, settings=SETTINGS).study
 
 
 def write(study: Study, out: Path, **kwargs: Any) -> Path:

@@ -19,7 +19,7 @@ from calib.errors import CalibError
 from calib.he2019.tasks import he2019_tasks
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
-from calib.report.study import run_study
+from calib.report.contents import work_out
 from calib.report.writer import write_report
 from tests.check.conftest import different, edit_json, findings, seal
 from tests.check.made import rut_study, write
@@ -57,7 +57,7 @@ def test_the_same_report_of_a_posterior_that_did_not_converge(tmp_path: Path) ->
     tasks = [task for task in he2019_tasks() if task.output == "rut_depth"]
     short = SamplerSettings(steps=40, max_steps=40)
     write_report(
-        run_study(tasks, 3, settings=short), tmp_path / "report",
+        work_out(tasks, 3, settings=short).study, tmp_path / "report",
         settings=short, command=["calib", "report"], title="A report",
     )  # fmt: skip
     outcome = check(tmp_path / "report")

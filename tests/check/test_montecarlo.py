@@ -22,7 +22,7 @@ from calib.inference.calibration import calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
 from calib.inference.random import generator
-from calib.report.study import run_study
+from calib.report.contents import work_out
 from calib.report.summary import summarise
 from calib.validation.scores import score
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
@@ -158,7 +158,7 @@ DRAWN = ("posterior", "validation", "sampling")
 def test_no_false_alarm_over_the_pairs_of_many_seeds() -> None:
     """Six studies of all three outputs, each compared with each other as if recomputed."""
     tasks = he2019_tasks()
-    studies = [run_study(tasks, seed) for seed in range(6)]
+    studies = [work_out(tasks, seed).study for seed in range(6)]
     documents = [summarise(study)["models"] for study in studies]
     alarms, compared = [], 0
     for i, study in enumerate(studies):

@@ -20,8 +20,9 @@ from calib.he2019.datasets.published import PUBLISHED
 from calib.he2019.tasks import he2019_tasks
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
+from calib.report.contents import work_out
 from calib.report.manifest import build_manifest, file_hashes
-from calib.report.study import Failure, OutputResult, Study, run_study
+from calib.report.study import Failure, OutputResult, Study
 from calib.report.study_tasks import Task, plan_tasks
 from calib.report.summary import summarise
 from tests.user_tables import pulls, table
@@ -33,7 +34,7 @@ def study() -> Study:
     tasks = {task.output: task for task in he2019_tasks()}
     few = tasks["drawbar_pull"].table.take([0, 1])
     broken = replace(tasks["drawbar_pull"], table=few, held_out=None)
-    return run_study([tasks["bulk_density"], broken, tasks["rut_depth"]], 2019)
+    return work_out([tasks["bulk_density"], broken, tasks["rut_depth"]], 2019).study
 
 
 def test_an_output_column_without_a_value_fails_alone() -> None:
@@ -43,7 +44,7 @@ def test_an_output_column_without_a_value_fails_alone() -> None:
         rut_depth_mm=np.full(2, np.nan),
     )
     (task,) = plan_tasks([empty])
-    found = run_study([task], 1).failures["rut_depth"]
+    found = work_out([task], 1).study.failures["rut_depth"]
     assert "0 rows cannot calibrate" in found.error
 
 
@@ -65,7 +66,7 @@ def test_any_error_of_one_output_leaves_the_others(
         raise error
 
     monkeypatch.setattr(study_module, "_work_out", fail)
-    found = run_study(he2019_tasks(), 1)
+    found = work_out(he2019_tasks(), 1).study
     assert set(found.failures) == {t.output for t in he2019_tasks()}
     assert all(type(error).__name__ in f.error for f in found.failures.values())
 
@@ -76,7 +77,7 @@ def test_an_interruption_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(study_module, "_work_out", interrupt)
     with pytest.raises(KeyboardInterrupt):
-        run_study(he2019_tasks(), 1)
+        work_out(he2019_tasks(), 1)
 
 
 def test_rut_depth_is_validated_on_30_psi_and_density_by_leaving_one_out(study: Study) -> None:
@@ -132,7 +133,7 @@ def test_pressures_that_cannot_be_fitted_alone_are_left_out() -> None:
 def test_progress_names_what_is_done() -> None:
     seen: list[tuple[str, int, int]] = []
     task = next(t for t in he2019_tasks() if t.output == "rut_depth")
-    run_study([task], 1, settings=SamplerSettings(steps=50, max_steps=50),
+    work_out([task], 1, settings=SamplerSettings(steps=50, max_steps=50),
               progress=lambda *told: seen.append(told))  # fmt: skip
     assert {what for what, _, _ in seen} == {"rut_depth: estimating", "rut_depth: sampling"}
     last = {what: (done, planned) for what, done, planned in seen}
@@ -253,7 +254,7 @@ def test_a_failure_does_not_say_where_the_priors_lie(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(default_priors("bekker").read_text().replace("sd_log = ", "sd_log = -"))
     (task,) = plan_tasks([load_he2019("rut_depth")], models=["bekker"], prior_paths=[path])
-    error = run_study([task], 1).failures["rut_depth"].error
+    error = work_out([task], 1).study.failures["rut_depth"].error
     assert "mine.toml, parameters." in error
     assert str(tmp_path) not in error
 

@@ -14,15 +14,7 @@ from calib.errors import CalibError
 
 @dataclass(frozen=True)
 class Place:
-    """Where a table of a plan stands.
-
-    Parameters
-    ----------
-    folder : Path
-        Of the plan; names in it are relative to this.
-    where : str
-        Plan and table, for messages.
-    """
+    """Where a table of a plan stands: its folder, and plan and table for messages."""
 
     folder: Path
     where: str
@@ -30,19 +22,13 @@ class Place:
     def find(self, key: str, patterns: Sequence[str], *, holding: str = "") -> list[Path]:
         """Return what some patterns match, each once, in the order of patterns and names.
 
-        Parameters
-        ----------
-        key : str
-            Of the plan, for messages.
-        patterns : sequence of str
-            With ``*``, ``?``, ``[]`` and ``**``.
-        holding : str, optional
-            A file that a match must hold, where folders are wanted; files are wanted otherwise.
+        Patterns have ``*``, ``?``, ``[]`` and ``**``. Folders are wanted that hold a file, or files
+        if none is named.
 
         Raises
         ------
         CalibError
-            If a pattern matches nothing.
+            If a pattern matches nothing, naming the plan's key.
         """
         found: dict[Path, None] = {}
         for pattern in patterns:
@@ -61,13 +47,7 @@ class Place:
         return list(found)
 
     def file(self, key: str, name: str) -> Path:
-        """Return one file.
-
-        Raises
-        ------
-        CalibError
-            If there is none.
-        """
+        """Return one file; a CalibError if there is none."""
         path = self.folder / name
         if not path.is_file():
             raise CalibError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from calib.batch.campaign.summary import NUMBERS, Summary, summarise, write_summ
 from calib.batch.folders import check_folder
 from calib.batch.tasks import LateItems, check_names, run_folder_tasks
 from calib.errors import CalibError
+from calib.report.numbers import finite
 
 PLAN = "plan.toml"
 
@@ -100,16 +100,5 @@ def _keep_plan(plan: Plan, out: Path) -> None:
 
 def _work(item: _Item) -> dict[str, str | bytes]:
     work = KINDS[item.kind].work(item.content, item.seed)
-    numbers = json.dumps(_finite(work.numbers), indent=1, allow_nan=False) + "\n"
+    numbers = json.dumps(finite(work.numbers), indent=1, allow_nan=False) + "\n"
     return {**work.files, NUMBERS: numbers, RECORD: json.dumps(item.record, indent=1) + "\n"}
-
-
-def _finite(value: Any) -> Any:
-    """JSON has no NaN: what is undefined is null."""
-    if isinstance(value, Mapping):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    if hasattr(value, "item"):
-        value = value.item()
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.stats import beta
 
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import Pool
 from calib.batch.threads import one_thread
 from calib.data import Table
 from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
@@ -55,16 +55,7 @@ class Seeds:
 class Search:
     """One search, repeated over seeds.
 
-    Parameters
-    ----------
-    name : str
-        What was searched, in words.
-    optimum : float
-        The least cost known, kN^2.
-    costs : ndarray, shape (n_seeds,)
-        Final cost by seed, kN^2.
-    published : str
-        The printed cost.
+    In kN^2: the least cost known, the final cost by seed, shape (n_seeds,), and the printed one.
     """
 
     name: str
@@ -89,17 +80,7 @@ class Search:
 
 @dataclass(frozen=True, eq=False)
 class GeneticStudy:
-    """All searches.
-
-    Parameters
-    ----------
-    settings : GeneticSettings
-        Table 2's.
-    by_pressure : mapping of int to Search
-        By inflation pressure in psi.
-    read_off : mapping of int to PointEstimate
-        The geometric method on the same data.
-    """
+    """All searches with Table 2's settings, and the geometric method on the same data; by psi."""
 
     settings: GeneticSettings
     by_pressure: Mapping[int, Search]
@@ -122,27 +103,10 @@ def printed_settings(published: Published) -> GeneticSettings:
     )  # fmt: skip
 
 
-def study_convergence(
-    published: Published,
-    seed: int,
-    seeds: Seeds | None = None,
-    progress: _Progress | None = None,
-) -> GeneticStudy:
-    """Repeat the searches over seeds, on the reconstructed data.
-
-    Parameters
-    ----------
-    progress : callable, optional
-        Called with what is being done, runs done and runs planned.
-    """
-    tell = progress or (lambda what, done, planned: None)
-    return begin_convergence(published, seed, seeds or Seeds(), HERE)(tell)
-
-
 def begin_convergence(
     published: Published, seed: int, seeds: Seeds, pool: Pool
 ) -> Callable[[_Progress], GeneticStudy]:
-    """Ask for the searches over seeds; return what waits for them."""
+    """Ask for the searches over seeds, on the reconstructed data; return what waits for them."""
     settings = printed_settings(published)
     box = _printed_box(published)
     printed = [

@@ -48,14 +48,8 @@ def least_cost(
 ) -> float:
     """Return the least total cost (kN^2) that Table 5's digits allow under a reading of c7 to c9.
 
-    Searched from several starts by L-BFGS-B, so found rather than proved.
-
-    Parameters
-    ----------
-    slips : ndarray, shape (n,)
-        In percent.
-    optimal : bool
-        Whether Table 4 is taken for the optimum of each pressure.
+    Searched from several starts by L-BFGS-B, so found rather than proved. Slips, shape (n,), are in
+    percent; `optimal` takes Table 4 for the optimum of each pressure.
     """
     known = references(published, slips)
     middle, half = _box(published, signs)
@@ -80,16 +74,9 @@ def least_cost(
 
 @dataclass(frozen=True)
 class CurvatureStudy:
-    """Least costs by reading of c7, c8 and c9.
+    """Least costs (kN^2) by reading of c7, c8 and c9, Table 4 taken for the optimum.
 
-    Parameters
-    ----------
-    least : mapping of Signs to float
-        At the assumed slips, Table 4 taken for the optimum.
-    least_free : mapping of Signs to float
-        Without that.
-    by_shift : mapping of Signs to tuple of float
-        The best two readings at other shifts of zero slip.
+    `least_free` is without that, `by_shift` of the best two readings at other shifts of zero slip.
     """
 
     published_cost: float

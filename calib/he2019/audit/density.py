@@ -31,14 +31,8 @@ def density_range(
 ) -> Interval:
     """Return the densities (g/cm^3) that Table 1 gives over the tested water contents.
 
-    Parameters
-    ----------
-    exponent : {1, -1}
-        1 for the exponent of C1 as it is read, -1 for the other sign.
-    C3_sign : {1, -1}
-        Likewise for C3.
-    cone_index : Interval
-        In the unit of Eq 1.
+    1 takes the exponent of C1, or C3, with the sign that it is read with, -1 with the other; cone
+    index is in the unit of Eq 1.
     """
     figures = published.bulk_density.estimates
     C1, C2, C3, C4 = (printed(figures[name]) for name in ("C1", "C2", "C3", "C4"))

@@ -13,6 +13,7 @@ from typing import Any
 from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
 from calib.he2019.audit.run import Audit
 from calib.he2019.datasets.published import DOI
+from calib.report.numbers import finite
 
 SCHEMA = "calib/audit/1"
 _COLUMNS = (
@@ -36,20 +37,14 @@ def audit_json(audit: Audit) -> str:
 
 def _finding(finding: Finding) -> dict[str, Any]:
     shown = asdict(finding)
-    shown["found"] = [{k: _finite(v) for k, v in asdict(q).items()} for q in finding.found]
+    shown["found"] = [finite(asdict(q)) for q in finding.found]
     shown["depends_on_reconstruction"] = finding.reconstructed
     shown["caveat"] = finding.basis.caveat
     return shown
 
 
 def read_findings(content: Mapping[str, Any]) -> tuple[Finding, ...]:
-    """Return the findings of an audit read from its JSON.
-
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        If it is not what `audit_json` writes.
-    """
+    """Return the findings in what `audit_json` writes; else a KeyError, TypeError or ValueError."""
     return tuple(_read(entry) for entry in content["findings"])
 
 
@@ -69,10 +64,6 @@ def _read(entry: Mapping[str, Any]) -> Finding:
 
 def _with_nan(entry: Mapping[str, Any]) -> dict[str, Any]:
     return {key: math.nan if value is None else value for key, value in entry.items()}
-
-
-def _finite(value: Any) -> Any:
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def audit_csv(findings: Iterable[Finding]) -> str:

@@ -103,12 +103,7 @@ def rounded(
 ) -> Quantity:
     """Return a quantity whose interval comes from the printed digits.
 
-    Parameters
-    ----------
-    interval : Interval
-        Of one number, or of several: then from the least to the largest.
-    middle : bool
-        Whether the midpoint is worth showing.
+    An interval of several numbers counts from the least to the largest; `middle` is shown if asked.
     """
     low, high = float(interval.lower.min()), float(interval.upper.max())
     value = 0.5 * (low + high) if middle else math.nan
@@ -117,7 +112,7 @@ def rounded(
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding.
+    """One finding: what is claimed, how it was tested, and one sentence of evidence.
 
     Parameters
     ----------
@@ -128,13 +123,7 @@ class Finding:
     where : str
         Table or equation of the source. Pages are not known: the text reached us without them.
     figures : tuple of str
-        The printed figures it judges, by the keys of `printed_figures`.
-    claim : str
-        What is claimed, or how the figure is read.
-    test : str
-        How it was tested.
-    evidence : str
-        One sentence.
+        The printed figures it judges, by where they stand: ``"Table 4, 18 psi: E"``.
     stays_open : str
         What the test leaves undecided; empty where nothing is.
     """

@@ -34,16 +34,7 @@ _NEAR = 0.05
 class Features:
     """What a row of Table 3 or 4 says of its curve, over all coefficients that print alike.
 
-    Parameters
-    ----------
-    slope : Interval
-        Initial slope BCD, kN/%.
-    x_peak : Interval or None
-        Slip of the peak, %.
-    asymptote : Interval
-        Pull at unlimited slip, kN.
-    chord : Interval or None
-        ym/xm, kN/%.
+    Initial slope BCD and chord ym/xm in kN/%, slip of the peak in %, pull at unlimited slip in kN.
     """
 
     slope: Interval
@@ -74,13 +65,7 @@ def chord_curvature(C: float) -> float:
 def geometric_findings(
     published: Published, read_off: Mapping[int, PointEstimate] | None = None
 ) -> list[Finding]:
-    """Judge Table 3.
-
-    Parameters
-    ----------
-    read_off : mapping of int to PointEstimate, optional
-        The geometric method on the reconstructed data, by inflation pressure in psi.
-    """
+    """Judge Table 3; `read_off` is the geometric method on the reconstructed data, by psi."""
     found = [_features(published), _slope(published), _curvature(published), _costs(published)]
     return [*found, _reconstructed(published, read_off)] if read_off else found
 

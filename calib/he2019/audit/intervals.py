@@ -27,13 +27,7 @@ _ULPS = 8.0
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """Closed intervals, elementwise.
-
-    Parameters
-    ----------
-    lower, upper : ndarray
-        Of one shape; `lower` never above `upper`.
-    """
+    """Closed intervals, elementwise; ends of one shape, `lower` never above `upper`."""
 
     lower: Array
     upper: Array

@@ -37,22 +37,10 @@ _MM = 1000.0
 class InverseStudy:
     """The proper likelihood beside Eq 22, on the reconstructed data.
 
-    Parameters
-    ----------
-    calibration : Calibration
-        Of the modified Bekker model on 18 and 42 psi.
-    direct : PointEstimate
-        Least squares of ln zt.
-    held_out : Table
-        The 30 psi rows.
-    n0, n1, k : ndarray, shape (m,)
-        Posterior draws.
-    published_30 : ndarray, shape (n,)
-        Eq 21 at Table 6, mm, at the slips of `held_out`.
-    mean_30 : ndarray, shape (m, n)
-        Posterior draws of the mean rut there, mm.
-    simulated : ndarray, shape (c, 3)
-        n0, n1 and R^2 of Eq 22 in campaigns simulated from `direct`.
+    The modified Bekker model calibrated on 18 and 42 psi, with posterior draws n0, n1 and k of
+    shape (m,), and least squares of ln zt. At the slips of the 30 psi rows, in mm: Eq 21 at Table
+    6, (n,), and draws of the mean rut, (m, n). `simulated`, (c, 3): n0, n1 and R^2 of Eq 22 in
+    campaigns simulated from `direct`.
     """
 
     calibration: Calibration
@@ -71,12 +59,8 @@ def simulate_inverse(
 ) -> Array:
     """Fit Eq 22 to campaigns simulated from Eq 21, shape (size, 3): n0, n1 and R^2.
 
-    Parameters
-    ----------
-    problem : Problem
-        Of the model modified_bekker; its conditions are used, not its ruts.
-    truth : PointEstimate
-        Parameters, and the noise of ln zt as its RMSE.
+    Of a problem of modified_bekker the conditions are used, not the ruts; the RMSE of `truth` is
+    the noise of ln zt.
     """
     pressure = problem.conditions["average_ground_pressure_kpa"]
     slip, y = problem.conditions["slip_ratio"], np.log(pressure)
@@ -100,10 +84,7 @@ def study_inverse(
 ) -> InverseStudy:
     """Calibrate the rut model by its likelihood, and set Eq 22 beside it.
 
-    Parameters
-    ----------
-    calibration : Calibration, optional
-        Of the modified Bekker model on the 18 and 42 psi rows, if it is at hand.
+    A calibration of the modified Bekker model on the 18 and 42 psi rows is used if it is at hand.
     """
     fitted, held = hold_out(
         load_he2019("rut_depth"), "inflation_pressure_psi", float(published.setup.held_out_psi)

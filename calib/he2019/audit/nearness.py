@@ -54,13 +54,9 @@ class Reference:
     cost: float
 
     def bounds(self, pull: Array, *, optimal: bool) -> tuple[Array, Array]:
-        """Return the least and the largest cost of curves, each of shape (k,).
+        """Return the least and the largest cost of curves (k, n), each of shape (k,).
 
-        Parameters
-        ----------
-        pull : ndarray, shape (k, n)
-        optimal : bool
-            Whether Table 4 is taken to be the least-squares optimum of the data.
+        `optimal` takes Table 4 for the least-squares optimum of the data.
         """
         apart = pull - self.curve
         squared = np.einsum("kn,kn->k", apart, apart)
@@ -94,21 +90,10 @@ def printed_coefficients(published: Published) -> Array:
 
 
 def pressure_curves(coefficients: Array, pressures: Array, slips: Array) -> Array:
-    """Evaluate Eqs 3-5 and 12-15 with the coefficients as they are printed.
+    """Evaluate Eqs 3-5 and 12-15 with c1 to c9 and b0, shape (k, 10), as they are printed.
 
-    Parameters
-    ----------
-    coefficients : ndarray, shape (k, 10)
-        c1 to c9 and b0.
-    pressures : ndarray, shape (m,)
-        In psi.
-    slips : ndarray, shape (n,)
-        In percent.
-
-    Returns
-    -------
-    ndarray, shape (k, m, n)
-        Pull in kN; infinite where K or D is not positive.
+    Pressures (m,) in psi and slips (n,) in percent give pulls (k, m, n) in kN; infinite where K or
+    D is not positive.
     """
     powers = np.vander(pressures, 3, increasing=True)
     D, K, E = (np.asarray(coefficients[:, j : j + 3] @ powers.T)[:, :, None] for j in (0, 3, 6))
@@ -121,19 +106,9 @@ def pressure_curves(coefficients: Array, pressures: Array, slips: Array) -> Arra
 def joint_bounds(
     coefficients: Array, known: tuple[Reference, ...], slips: Array, *, optimal: bool
 ) -> tuple[Array, Array]:
-    """Return the least and largest total cost (Eq 16) of coefficients of Eqs 12-15.
+    """Return the least and largest total cost (Eq 16) of c1 to c9 and b0, shape (k, 10) to (k,).
 
-    Parameters
-    ----------
-    coefficients : ndarray, shape (k, 10)
-    slips : ndarray, shape (n,)
-    optimal : bool
-        As for `Reference.bounds`.
-
-    Returns
-    -------
-    least, largest : ndarray, shape (k,)
-        Infinite where the formula has no value.
+    Infinite where the formula has no value; `optimal` as for `Reference.bounds`.
     """
     pressures = np.array([float(r.psi) for r in known])
     pull = pressure_curves(coefficients, pressures, slips)

@@ -70,17 +70,8 @@ def _argument(u: Interval, E: Interval) -> Interval:
 def pull(slip_percent: Array, box: Coefficients) -> Interval:
     """Return the exact extremes of the pull (kN) where B is printed (Tables 3 and 4).
 
-    Parameters
-    ----------
-    slip_percent : ndarray, shape (n,)
-        Not negative.
-    box : Coefficients
-        B positive, C between 1 and 2, D positive, E at most 1.
-
-    Raises
-    ------
-    ValueError
-        Outside these ranges.
+    For slips (n,) not negative, B and D positive, C between 1 and 2, E at most 1; else a
+    ValueError.
     """
     u = box.stiffness * exact(slip_percent)
     return box.D * sin(box.C * arctan(_argument(u, box.E)))
@@ -91,18 +82,8 @@ def pull_from_slope(
 ) -> Interval:
     """Return an enclosure of the pull (kN) where K = BCD is printed (Table 5).
 
-    Parameters
-    ----------
-    slip_percent : ndarray, shape (n,)
-    box : Coefficients
-        K positive, C between 1 and 2, E at most 1; D of either sign.
-    cells, C_cells : int
-        Into how many cells D and C are cut.
-
-    Raises
-    ------
-    ValueError
-        Outside these ranges.
+    D and C are cut into cells. For K positive, C between 1 and 2, E at most 1, D of either sign;
+    else a ValueError.
     """
     if np.any(box.stiffness.lower <= 0.0):
         raise ValueError("the slope must be positive")
@@ -155,15 +136,7 @@ def largest_pull(box: Coefficients) -> Interval:
 def peak_slip(box: Coefficients) -> Interval | None:
     """Return the slip (%) of the peak, or None if no coefficients of the box have one.
 
-    Parameters
-    ----------
-    box : Coefficients
-        Of B, C, D and E.
-
-    Raises
-    ------
-    ValueError
-        If a part of the box has a peak and another has none.
+    ValueError if a part of the box has a peak and another has none.
     """
     target = peak_argument(box.C)
     low_E, high_E = float(box.E.lower), float(box.E.upper)

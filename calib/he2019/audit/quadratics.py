@@ -29,14 +29,8 @@ NAMES: Mapping[str, tuple[str, str, str]] = MappingProxyType(
 class Nearest(NamedTuple):
     """The best a box of coefficients can do.
 
-    Parameters
-    ----------
-    deviation : float
-        Smallest possible largest relative deviation over the pressures.
-    coefficients : ndarray, shape (3,)
-        That reach it.
-    values : ndarray, shape (m,)
-        The quadratic there.
+    The smallest possible largest relative deviation over the pressures, the coefficients (3,) that
+    reach it, and the quadratic there (m,).
     """
 
     deviation: float
@@ -65,15 +59,9 @@ def printed_signs(published: Published, what: str) -> Signs:
 def nearest(
     published: Published, what: str, *, signs: Signs | None = None, psi_per_unit: float = 1.0
 ) -> Nearest:
-    """Return the best that coefficients printed as in Table 5 can do.
+    """Return the best that coefficients of D, BCD or E printed as in Table 5 can do.
 
-    Parameters
-    ----------
-    what : {"D", "BCD", "E"}
-    signs : tuple of int, optional
-        Of the three coefficients; as they are read by default.
-    psi_per_unit : float
-        The unit in which pressure enters, in psi.
+    Signs are as they are read by default; pressure enters in units of so many psi.
     """
     figures = [published.pressure.estimates[name] for name in NAMES[what]]
     read = signs or printed_signs(published, what)

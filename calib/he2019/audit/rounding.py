@@ -16,6 +16,7 @@ from calib.he2019.audit.quadratics import NAMES, nearest, targets
 from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.published import Published
 from calib.models.base import Array
+from calib.report.labels import joined
 
 _FAMILY = "Digits of Table 5"
 # Digits are enough where D is fixed to this part.
@@ -24,18 +25,10 @@ _WANTED = 0.01
 
 @dataclass(frozen=True, eq=False)
 class RoundingStudy:
-    """The pull curves that Table 5's digits allow, by inflation pressure.
+    """The pull curves (kN) that the digits of Tables 4 and 5 allow, by pressure in psi.
 
-    Parameters
-    ----------
-    slips : ndarray, shape (n,)
-        In percent.
-    allowed : mapping of int to Interval
-        Pull (kN) over all coefficients that print alike.
-    as_printed : mapping of int to ndarray
-        Pull at the printed digits as they stand; infinite where K or D is not positive.
-    table4 : mapping of int to Interval
-        Pull over all coefficients that print as Table 4.
+    Slips are in percent. `as_printed` takes Table 5's digits as they stand; infinite where K or D
+    is not positive.
     """
 
     slips: Array
@@ -139,8 +132,9 @@ def _slope_and_curvature(published: Published) -> Finding:
         "c4 to c9 as printed give the slope BCD and the curvature factor E of Table 4",
         "interval arithmetic over all coefficients that print alike, at the three pressures",
         (*found, *more), verdict,
-        f"No coefficients that print alike give Table 4's BCD at {_listed(missed)} psi or its E at "
-        f"{_listed(outside)} psi; the digits leave BCD open by up to {percent(spread, 2)}."
+        f"No coefficients that print alike give Table 4's BCD at {joined(missed or ['any'])} psi "
+        f"or its E at {joined(outside or ['any'])} psi; the digits leave BCD open by up to "
+        f"{percent(spread, 2)}."
         if outside or missed else
         f"Table 4's BCD and E can be reached; the digits leave BCD open by up to "
         f"{percent(spread, 2)}.",
@@ -148,12 +142,6 @@ def _slope_and_curvature(published: Published) -> Finding:
         "the cost of Table 5.",
         Basis.PRINTED,
     )  # fmt: skip
-
-
-def _listed(words: list[str]) -> str:
-    if not words:
-        return "any"
-    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 
 def _curve(published: Published, study: RoundingStudy) -> Finding:
@@ -185,7 +173,7 @@ def _curve(published: Published, study: RoundingStudy) -> Finding:
         tuple(found), verdict,
         f"The digits leave the pull open by up to {percent(relative[best], 2)} of the peak at "
         f"{best} psi and {percent(relative[worst], 2)} at {worst} psi"
-        + (f"; Table 4 lies outside that range {_listed(outside)}." if outside
+        + (f"; Table 4 lies outside that range {joined(outside)}." if outside
            else "; Table 4 lies inside that range."),
         "Table 4, pressure by pressure, is the reference to use.",
         Basis.PRINTED,

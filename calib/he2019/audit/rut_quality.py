@@ -30,17 +30,10 @@ _HELD_OUT_LEAST = 0.025
 
 @dataclass(frozen=True, eq=False)
 class QualityStudy:
-    """ln(pgr42/pgr18) by the number of points, and from the contact lengths.
+    """ln(pgr42/pgr18) by the number of points n (m,), and from the contact lengths.
 
-    Parameters
-    ----------
-    n : ndarray of int, shape (m,)
-    implied : Interval
-        From R^2 and RMSE, pressures equally often, shape (m,).
-    from_contact : Interval
-        From the contact lengths.
-    assumed_n : int
-        Two pressures at the nine nominal slips up to 20 %.
+    `implied` (m,) follows from R^2 and RMSE, pressures equally often; the assumed n are two
+    pressures at the nine nominal slips up to 20 %.
     """
 
     n: Array
@@ -64,14 +57,9 @@ def _fitted(published: Published) -> tuple[int, int]:
 
 
 def log_pressure_ratio(published: Published, n: Array, share: float = 0.5) -> Interval:
-    """Return the ln(pgr42/pgr18) that R^2 and RMSE imply for n points.
+    """Return the ln(pgr42/pgr18) that R^2 and RMSE imply for n points, more than parameters.
 
-    Parameters
-    ----------
-    n : ndarray
-        More than the number of parameters.
-    share : float
-        Part of the points at one of the two pressures.
+    `share` is the part of the points at one of the two pressures.
     """
     quality = published.rut_depth.quality
     rmse, r_squared = printed(quality["rmse"]), printed(quality["r_squared"])

@@ -114,10 +114,7 @@ def any_slips_bound(published: Published) -> float:
 def assumed_slips_bound(published: Published, *, optimal: bool) -> float:
     """Return a cost (kN^2) that the joint optimum cannot exceed at the assumed slips.
 
-    Parameters
-    ----------
-    optimal : bool
-        Whether Table 4 is taken for the optimum of each pressure.
+    `optimal` takes Table 4 for the optimum of each pressure.
     """
     known = references(published)
 

@@ -76,12 +76,9 @@ def _must_vanish(fitted: Array, water: Array) -> Array:
 
 
 def bulk_density() -> dict[str, Array]:
-    """Return the reconstructed bulk densities.
+    """Return the reconstructed bulk densities of 36 samples.
 
-    Returns
-    -------
-    dict of ndarray, shape (36,)
-        cone_index_kpa, gravimetric_water_content and bulk_density_g_cm3.
+    By cone_index_kpa, gravimetric_water_content and bulk_density_g_cm3.
     """
     table = PUBLISHED.bulk_density
     quality = {name: figure.value for name, figure in table.quality.items()}

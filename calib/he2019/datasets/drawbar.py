@@ -111,10 +111,7 @@ def _errors(psi: int, slip_percent: Array, drawn: Array) -> Array:
 def drawbar_pull() -> dict[str, Array]:
     """Return the reconstructed drawbar pulls, three pressures by fourteen slips.
 
-    Returns
-    -------
-    dict of ndarray, shape (42,)
-        inflation_pressure_psi, nominal_slip_ratio, slip_ratio (shifted) and drawbar_pull_kn.
+    By inflation_pressure_psi, nominal_slip_ratio, slip_ratio (shifted) and drawbar_pull_kn.
     """
     nominal = np.array(NOMINAL_SLIPS)
     slip = nominal + SLIP_SHIFT

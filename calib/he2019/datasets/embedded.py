@@ -42,32 +42,24 @@ _DECIMALS: Mapping[str, int] = MappingProxyType(
 )
 
 
-@cache
-def bulk_density() -> Mapping[str, Array]:
-    """Return cone index, water content and bulk density, 36 samples."""
-    return MappingProxyType(density.bulk_density())
-
-
-@cache
-def drawbar_pull() -> Mapping[str, Array]:
-    """Return drawbar pull at 3 inflation pressures and 14 slips."""
-    return MappingProxyType(drawbar.drawbar_pull())
-
-
-@cache
-def rut_depth() -> Mapping[str, Array]:
-    """Return rut depth at 3 inflation pressures and 9 slips."""
-    return MappingProxyType(rut.rut_depth())
-
-
-_TABLES: Mapping[str, Callable[[], Mapping[str, Array]]] = MappingProxyType(
-    {"bulk_density": bulk_density, "drawbar_pull": drawbar_pull, "rut_depth": rut_depth}
+_MAKERS: Mapping[str, Callable[[], Mapping[str, Array]]] = MappingProxyType(
+    {
+        "bulk_density": density.bulk_density,
+        "drawbar_pull": drawbar.drawbar_pull,
+        "rut_depth": rut.rut_depth,
+    }
 )
 
 
+@cache
+def columns(output: str) -> Mapping[str, Array]:
+    """Return one output with its conditions, as read-only arrays."""
+    return MappingProxyType(_MAKERS[output]())
+
+
 def tables() -> dict[str, Mapping[str, Array]]:
-    """Return all three outputs by name; columns are read-only arrays."""
-    return {name: table() for name, table in _TABLES.items()}
+    """Return all three outputs by name."""
+    return {name: columns(name) for name in _MAKERS}
 
 
 def load_he2019(output: str) -> Table:
@@ -82,47 +74,39 @@ def load_he2019(output: str) -> Table:
     CalibError
         If there is no such output.
     """
-    if output not in tables():
-        raise CalibError(f"there is no output {output!r}", allowed=", ".join(tables()))
-    return table_from_arrays(tables()[output], source=f"he2019 {output}", label=LABEL)
+    if output not in _MAKERS:
+        raise CalibError(f"there is no output {output!r}", allowed=", ".join(_MAKERS))
+    return table_from_arrays(columns(output), source=f"he2019 {output}", label=LABEL)
 
 
-def _csv(columns: Mapping[str, Array]) -> str:
-    texts = [[f"{x:.{_DECIMALS[name]}f}" for x in column] for name, column in columns.items()]
-    rows = [list(columns), *zip(*texts, strict=True)]
+def _csv(table: Mapping[str, Array]) -> str:
+    texts = [[f"{x:.{_DECIMALS[name]}f}" for x in column] for name, column in table.items()]
+    rows = [list(table), *zip(*texts, strict=True)]
     return "".join(",".join(row) + "\n" for row in rows)
 
 
 def holds(table: Table) -> bool:
     """Whether all rows of a table are rows of the embedded data."""
-    return any(_within(table, columns) for columns in tables().values())
+    return any(_within(table, known) for known in tables().values())
 
 
-def _within(table: Table, columns: Mapping[str, Array]) -> bool:
-    names = list(columns)
-    if len(table) > len(columns[names[0]]) or any(name not in table for name in names):
+def _within(table: Table, known: Mapping[str, Array]) -> bool:
+    names = list(known)
+    if len(table) > len(known[names[0]]) or any(name not in table for name in names):
         return False
     rows = np.column_stack([table[name] for name in names])
-    embedded = np.column_stack([columns[name] for name in names])
+    embedded = np.column_stack([known[name] for name in names])
     same = np.isclose(rows[:, None], embedded[None], rtol=1e-9, atol=1e-12).all(axis=2)
     return bool(same.any(axis=1).all())
 
 
 def write(out_dir: Path) -> list[Path]:
-    """Write one CSV per output, and return their paths.
+    """Write one CSV per output over files of the same names, and return their paths.
 
-    Parameters
-    ----------
-    out_dir : Path
-        Folder, made if it is missing; files of the same names are replaced.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be made or written to.
+    The folder is made if it is missing; OSError if it cannot be made or written to.
     """
     # All text is worked out first: a failure there leaves no files behind.
-    texts = {out_dir / f"{name}.csv": _csv(columns) for name, columns in tables().items()}
+    texts = {out_dir / f"{name}.csv": _csv(table) for name, table in tables().items()}
     out_dir.mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
         path.write_text(text, encoding="ascii", newline="\n")

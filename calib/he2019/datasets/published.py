@@ -20,7 +20,7 @@ from typing import Any
 
 from calib.report.reference import Figure, FittedTable
 
-__all__ = ["DOI", "PUBLISHED", "Figure", "FittedTable", "Published", "Setup", "printed_figures"]
+__all__ = ["DOI", "PUBLISHED", "Figure", "FittedTable", "Published", "Setup"]
 
 DOI = "10.1016/j.jterra.2019.07.003"
 
@@ -57,23 +57,11 @@ class Setup:
             }
         )
     )  # fmt: skip
-    source: str = "the test description and Table 2"
-    doi: str = DOI
 
 
 @dataclass(frozen=True)
 class Published:
-    """All published figures.
-
-    Parameters
-    ----------
-    bulk_density, pressure, rut_depth : FittedTable
-        Tables 1, 5 and 6.
-    geometric, genetic : mapping of int to FittedTable
-        Tables 3 and 4, by inflation pressure in psi.
-    setup : Setup
-        The experiment and Table 2.
-    """
+    """All published figures: Tables 1 to 6, those of several pressures one for each, by psi."""
 
     bulk_density: FittedTable
     geometric: Mapping[int, FittedTable]
@@ -85,28 +73,6 @@ class Published:
     def __reduce__(self) -> str | tuple[Any, ...]:
         # By its name: another process knows it, and mapping proxies do not travel.
         return "PUBLISHED" if self is PUBLISHED else super().__reduce__()
-
-
-def printed_figures(published: Published) -> dict[str, Figure]:
-    """Return every printed figure by where it stands, such as ``"Table 4, 18 psi: E"``."""
-    tables = (
-        published.bulk_density, *published.geometric.values(), *published.genetic.values(),
-        published.pressure, published.rut_depth,
-    )  # fmt: skip
-    found = {
-        f"{table.source}: {name}": figure
-        for table in tables
-        for name, figure in (*table.estimates.items(), *table.quality.items())
-    }
-    setup = published.setup
-    found |= {f"Table 2: {name}": figure for name, figure in setup.genetic_settings.items()}
-    found |= {f"Setup: contact length, {p} psi": f for p, f in setup.contact_length_mm.items()}
-    found |= {f"Setup: named slip {i}": f for i, f in enumerate(setup.named_slips, start=1)}
-    plain = (
-        "tyre_width_mm", "normal_load_kn", "speed_m_s", "contact_width_mm", "slip_levels",
-        "largest_rut_slip", "rebound_slip", "largest_water_content",
-    )  # fmt: skip
-    return found | {f"Setup: {name}": getattr(setup, name) for name in plain}
 
 
 _SIGN_OF_E = (
@@ -126,7 +92,6 @@ def _magic(table: int, psi: int, *printed: str) -> FittedTable:
     B, C, D, E, cost = printed
     note = _SIGN_OF_E_18 if psi == 18 else _SIGN_OF_E
     return FittedTable(
-        doi=DOI,
         source=f"Table {table}, {psi} psi",
         model="Eqs 3-5 with Sh = Sv = 0, slip in percent, drawbar pull in kN",
         estimates=_frozen(
@@ -138,7 +103,6 @@ def _magic(table: int, psi: int, *printed: str) -> FittedTable:
 
 
 _BULK_DENSITY = FittedTable(
-    doi=DOI,
     source="Table 1",
     model="Eq 1, density in g/cm^3, cone index in kPa, gravimetric water content in g/g",
     estimates=_frozen(
@@ -158,7 +122,6 @@ _BULK_DENSITY = FittedTable(
 )  # fmt: skip
 
 _PRESSURE = FittedTable(
-    doi=DOI,
     source="Table 5",
     model="Eqs 12-15 in inflation pressure in psi, least squares of Eq 16 over 42 points",
     estimates=_frozen(
@@ -185,7 +148,6 @@ _PRESSURE = FittedTable(
 )
 
 _RUT_DEPTH = FittedTable(
-    doi=DOI,
     source="Table 6",
     model="Eq 22, ln pgr = ln k + (n0 + n1 s) ln zt, fitted to 18 and 42 psi, slips to 20 %",
     estimates=_frozen(

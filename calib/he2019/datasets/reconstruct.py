@@ -22,12 +22,9 @@ _DEPENDENT = 1e-9
 
 
 def normalised_basis(directions: Array) -> Array:
-    """Return an orthonormal basis of the span of some directions, shape (n, rank).
+    """Return an orthonormal basis of the span of some directions, shape (n, k) to (n, rank).
 
-    Parameters
-    ----------
-    directions : ndarray, shape (n, k)
-        In order of importance: those that earlier ones already span are dropped.
+    In order of importance: those that earlier ones already span are dropped.
     """
     q, r = np.linalg.qr(directions / np.linalg.norm(directions, axis=0))
     return np.asarray(q[:, np.abs(np.diag(r)) > _DEPENDENT])
@@ -48,23 +45,10 @@ def nearest_errors(
     upper: Array,
     at_least: Conditions | None = None,
 ) -> Array:
-    """Return the errors nearest to a draw that meet the conditions, shape (n,).
+    """Return the errors nearest to a draw that meet the conditions, all of shape (n,).
 
-    Parameters
-    ----------
-    drawn : ndarray, shape (n,)
-        The noise to stay near to.
-    equal : callable
-        ``errors -> (values (m,), Jacobian (m, n))``: values that must be zero.
-    lower, upper : ndarray, shape (n,)
-        Bounds of the errors; equal bounds fix one.
-    at_least : callable, optional
-        As `equal`: values that must not be negative.
-
-    Raises
-    ------
-    RuntimeError
-        If the conditions cannot be met.
+    Conditions map errors to values (m,) and their Jacobian (m, n): those of `equal` must be zero,
+    those of `at_least` not negative. Equal bounds fix an error. RuntimeError if they cannot be met.
     """
     constraints: list[Any] = [_constraint("eq", equal)]
     if at_least is not None:

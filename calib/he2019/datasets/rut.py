@@ -104,12 +104,9 @@ def _held_out_ruts(rng: np.random.Generator, pressure: Array, slip: Array) -> Ar
 
 
 def rut_depth() -> dict[str, Array]:
-    """Return the reconstructed rut depths: 18 and 42 psi as fitted, 30 psi as held out.
+    """Return the reconstructed ruts, 27 rows: 18 and 42 psi as fitted, 30 psi as held out.
 
-    Returns
-    -------
-    dict of ndarray, shape (27,)
-        inflation_pressure_psi, average_ground_pressure_kpa, slip_ratio and rut_depth_mm.
+    By inflation_pressure_psi, average_ground_pressure_kpa, slip_ratio and rut_depth_mm.
     """
     rng = np.random.default_rng(_SEED)
     psi = np.repeat(np.array([float(p) for p in PUBLISHED.setup.contact_length_mm]), len(SLIPS))

@@ -27,18 +27,9 @@ _GROUPS = 20
 class Features(NamedTuple):
     """What the geometric method reads off a curve of pull (kN) against slip (%).
 
-    Parameters
-    ----------
-    slope : float
-        Initial slope tan(theta), kN/%.
-    x_peak, peak : float
-        Slip (%) and pull (kN) of the peak, xm and ym.
-    asymptote : float
-        Pull at the largest slips ys, kN.
-    zero : float
-        Slip at which the pull is zero (%); the other features are counted from there.
-    has_peak : bool
-        Whether the pull falls again inside the range.
+    Initial slope tan(theta) (kN/%), slip and pull of the peak xm and ym, pull at the largest slips
+    ys. Features are counted from `zero`, the slip at which the pull is zero; `has_peak` says
+    whether the pull falls again inside the range.
     """
 
     slope: float
@@ -59,16 +50,9 @@ class Coefficients(NamedTuple):
 
 
 def coefficients(features: Features, C_without_peak: float = 1.5) -> Coefficients:
-    """Evaluate Eqs 6-9.
+    """Evaluate Eqs 6-9 of He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003.
 
-    Parameters
-    ----------
-    C_without_peak : float
-        C where the range holds no peak, so that the asymptote cannot be seen.
-
-    References
-    ----------
-    He, Sandu & Osorio (2019), Eqs 6-9, doi:10.1016/j.jterra.2019.07.003.
+    Where the range holds no peak the asymptote cannot be seen, and C is given.
     """
     D = features.peak
     if features.has_peak:
@@ -89,24 +73,16 @@ def read_features(
     find_zero: bool = False,
     where: str | None = None,
 ) -> Features:
-    """Read the features of a measured curve.
+    """Read the features of a measured curve, slips and pulls of shape (n,).
 
     - Initial slope: the least-squares line through the origin and the rows of slips up to
       `slope_slip_percent`, or through the two smallest positive slips if there are fewer; if that
-      line falls, through all rows up to the highest.
+      line falls, through all rows up to the highest. With `find_zero` it is not forced through the
+      origin, and slips count from where it is zero, as the source redefined its zero of slip.
     - Peak: its pull is the highest one measured, repeats being averaged, which on the embedded
       data is the published D; its slip is that of the vertex of the parabola through the highest
       point and its neighbours. If the highest point is the last one, the range holds no peak.
     - Asymptote: the pull at the largest slip.
-
-    Parameters
-    ----------
-    slip_percent, pull : ndarray, shape (n,)
-    find_zero : bool
-        Do not force the line through the origin and count slips from where it is zero, as the
-        source redefined its zero of slip.
-    where : str, optional
-        Names the data in messages.
 
     Raises
     ------

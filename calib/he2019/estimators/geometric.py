@@ -21,21 +21,12 @@ def estimate_geometric(
     *,
     slope_slip_percent: float = 5.0,
 ) -> PointEstimate:
-    """Read the Magic Formula's coefficients off the data.
+    """Read the coefficients of magic_formula or magic_formula_pressure off the data, without `rng`.
 
-    At one pressure, Sh is the zero of the initial line if it is free, and Sv is zero if it is
-    free. With several pressures the slope K, the peak D and G = 1 - E of each are joined by
-    their quadratics, exactly through two or three pressures, C is averaged, and two pressures
-    leave the bends at their prior location. Results are moved inside the prior's bounds.
-
-    Parameters
-    ----------
-    problem : Problem
-        Of the model magic_formula or magic_formula_pressure.
-    rng : Generator, optional
-        Not used.
-    slope_slip_percent : float
-        As for `read_features`.
+    At one pressure, Sh is the zero of the initial line if it is free, and Sv is zero if it is free.
+    With several pressures the slope K, the peak D and G = 1 - E of each are joined by their
+    quadratics, exactly through two or three pressures, C is averaged, and two pressures leave the
+    bends at their prior location. Results are moved inside the prior's bounds.
     """
     clock = time.perf_counter()
     one_pressure = problem.bound.model.name == "magic_formula"

@@ -23,24 +23,14 @@ _MM_PER_M = 1000.0
 
 @dataclass(frozen=True)
 class RutRegression:
-    """Result of the published regression.
+    """Result of the published regression on n rows.
 
-    Parameters
-    ----------
-    reported : dict of str to float
-        n0, n1 and k (n and k without slip), k in kPa/m^n.
-    standard_errors : dict of str to float
-        Of the same; that of k is k times that of ln k.
-    r_squared, rmse : float
-        Of ln pgr; ``rmse = sqrt(SSE/(n - p))`` with p parameters, as in MATLAB.
-    n : int
-        Rows used.
-    n_excluded : int
-        Rows left out for their slip.
+    n0, n1 and k (n and k without slip), k in kPa/m^n; R^2 and RMSE are of ln pgr, RMSE being
+    ``sqrt(SSE/(n - p))`` with p parameters, as in MATLAB. `n_excluded` rows were left out for
+    their slip.
     """
 
     reported: dict[str, float]
-    standard_errors: dict[str, float]
     r_squared: float
     rmse: float
     n: int
@@ -48,15 +38,10 @@ class RutRegression:
 
 
 def rut_regression(problem: Problem, max_slip: float = 0.2) -> RutRegression:
-    """Regress the logarithm of ground pressure on that of rut depth.
+    """Regress the logarithm of ground pressure on that of rut depth, without slip for bekker.
 
-    Parameters
-    ----------
-    problem : Problem
-        Of the model modified_bekker, or of bekker, for which the term in slip is left out.
-    max_slip : float
-        Rows of larger slip are left out, where the table has a slip: above 30 % the rut rebounds
-        and its depth is no longer the sinkage, and the source used slips up to 20 %.
+    Rows above `max_slip` are left out, where the table has a slip: above 30 % the rut rebounds and
+    its depth is no longer the sinkage, and the source used slips up to 20 %.
 
     Raises
     ------
@@ -89,14 +74,10 @@ def rut_regression(problem: Problem, max_slip: float = 0.2) -> RutRegression:
     beta = np.linalg.lstsq(X, y, rcond=None)[0]
     r = y - X @ beta
     sse = float(r @ r)
-    covariance = sse / (n - p) * np.linalg.inv(X.T @ X)
     values = dict(zip(names, beta.tolist(), strict=True))
-    errors = dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     values["k"] = float(np.exp(values["k"]))
-    errors["k"] *= values["k"]
     return RutRegression(
         reported={name: values[name] for name in problem.bound.model.reported},
-        standard_errors={name: errors[name] for name in problem.bound.model.reported},
         r_squared=1.0 - sse / float(np.square(y - y.mean()).sum()),
         rmse=float(np.sqrt(sse / (n - p))),
         n=n,
@@ -110,14 +91,7 @@ def estimate_published_regression(
     *,
     max_slip: float = 0.2,
 ) -> PointEstimate:
-    """Estimate by the published regression, judged on the likelihood's scale (ln zt, all rows).
-
-    Parameters
-    ----------
-    rng : Generator, optional
-        Not used.
-    max_slip : float
-        As for `rut_regression`.
+    """Estimate by `rut_regression`, judged on the likelihood's scale (ln zt, all rows).
 
     Raises
     ------

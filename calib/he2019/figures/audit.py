@@ -21,11 +21,5 @@ _DRAWINGS: dict[str, Callable[[Audit], Plate]] = {
 
 
 def audit_plates(audit: Audit) -> list[Plate]:
-    """Draw the figures of an audit.
-
-    Returns
-    -------
-    list of Plate
-        In reading order. A figure that failed has ``figure=None`` and a caption saying why.
-    """
+    """Draw the figures of an audit; one that failed has a caption saying why instead."""
     return draw_all({name: partial(draw, audit) for name, draw in _DRAWINGS.items()})

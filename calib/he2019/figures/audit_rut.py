@@ -112,7 +112,9 @@ def _by_pressure(ax: Axes, audit: Audit) -> dict[str, Any]:
     study, values = audit.inverse, audit.published.rut_depth.values
     pressure = np.geomspace(60.0, 320.0, 60)
     draws = 1000.0 * rut_depth(
-        pressure, _AT_SLIP, *(v[:: max(1, v.size // 2000), None] for v in _parameters(study))
+        pressure,
+        _AT_SLIP,
+        *(v[:: max(1, v.size // 2000), None] for v in (study.k, study.n0, study.n1)),
     )
     low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975], axis=0)
     band = ax.fill_between(pressure, low, high, color="#bcd6ea", lw=0)
@@ -143,10 +145,6 @@ def _at_one_slip(study: InverseStudy, table: Table) -> tuple[Array, Array]:
         for slip in (np.full_like(pressure, _AT_SLIP), table["slip_ratio"])
     )
     return pressure, table["rut_depth_mm"] * there / here
-
-
-def _parameters(study: InverseStudy) -> tuple[Any, Any, Any]:
-    return study.k, study.n0, study.n1
 
 
 def _held_out(ax: Axes, audit: Audit) -> dict[str, Any]:

@@ -46,8 +46,6 @@ class PaperGap:
     ----------
     name : str
         Of its folder.
-    lab_rows, field_rows : str
-        In words: the rows of the two campaigns.
     limits : str
         What a finding can mean and what it cannot, the data being reconstructed.
     withheld : str, optional

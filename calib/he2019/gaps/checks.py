@@ -23,13 +23,7 @@ _Z_90 = 1.645
 
 @dataclass(frozen=True)
 class Check:
-    """One comparison.
-
-    Parameters
-    ----------
-    values : mapping of str to float
-        All numbers in it, by name; units are in the names.
-    """
+    """One comparison: all numbers in it, by names with their units."""
 
     name: str
     values: Mapping[str, float]

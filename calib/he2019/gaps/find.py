@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import logsumexp
 
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import Pool
 from calib.batch.threads import one_thread
 from calib.data.quantities import OUTPUTS
 from calib.gap.case import Case
 from calib.gap.diagnose import Diagnosis, diagnose_once, with_unseen_rows
-from calib.he2019.gaps.cases import PaperGap, paper_gaps
+from calib.he2019.gaps.cases import PaperGap
 from calib.inference.random import generator
 from calib.inference.sampling.adapt import Guess, adapt
 from calib.inference.sampling.mode import find_modes
@@ -29,15 +29,10 @@ type Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class FoundGap:
-    """A gap and what the diagnosis makes of it.
+    """A gap and what the diagnosis makes of it, and of the same question asked otherwise.
 
-    Parameters
-    ----------
-    variants : mapping of str to Diagnosis
-        Of the same question asked otherwise.
-    open_sd : ndarray, shape (n_field,)
-        What the laboratory left open: sd of the calibrated simulator at the field rows, in the
-        output's unit.
+    `open_sd` (n_field,) is what the laboratory left open: the sd of the calibrated simulator at the
+    field rows, in the output's unit.
     """
 
     gap: PaperGap
@@ -53,16 +48,11 @@ class FoundGap:
 
 @dataclass(frozen=True)
 class Unfitted:
-    """Errors of predictions at rows that stood in neither campaign.
+    """Errors of predictions at n rows that stood in neither campaign.
 
-    Parameters
-    ----------
-    n, covered : int
-        Rows, and those within the 90 % predictive band of the corrected model.
-    rmse_before, rmse_after : float
-        Measured minus predicted, by the calibrated simulator and by the corrected model.
-    largest_before, largest_after : float
-        Largest relative error, of the measured value.
+    Of them `covered` lie within the corrected model's 90 % predictive band. Measured minus
+    predicted and the largest relative error, of the measured value: by the calibrated simulator
+    before, by the corrected model after.
     """
 
     n: int
@@ -71,27 +61,6 @@ class Unfitted:
     rmse_after: float
     largest_before: float
     largest_after: float
-
-
-def find_gaps(
-    seed: int,
-    *,
-    gaps: Sequence[PaperGap] | None = None,
-    progress: Progress | None = None,
-) -> tuple[FoundGap, ...]:
-    """Diagnose the source's gaps.
-
-    Parameters
-    ----------
-    seed : int
-        Same seed, same numbers.
-    gaps : sequence of PaperGap, optional
-        The four of `paper_gaps` by default.
-    progress : callable, optional
-        Called with what is being done, steps done and steps planned.
-    """
-    chosen = paper_gaps() if gaps is None else tuple(gaps)
-    return begin_gaps(seed, chosen, HERE)(progress or (lambda what, done, planned: None))
 
 
 def begin_gaps(
@@ -131,19 +100,9 @@ def _with_sd(case: Case, seed: int) -> tuple[Diagnosis, Array]:
 def simulator_sd(found: Diagnosis) -> Array:
     """Return how uncertain the simulator is at the field rows as the laboratory calibrated it.
 
-    The posterior of the laboratory rows alone, noise included, by importance sampling from a
-    mixture of Student-t fitted to it.
-
-    Parameters
-    ----------
-    found : Diagnosis
-        Of a case with one output.
-
-    Returns
-    -------
-    ndarray, shape (n_field,)
-        Sd of the noise-free prediction, in the output's unit; NaN where too few draws carry the
-        weight.
+    The sd of the noise-free prediction of a case with one output, (n_field,) in its unit, under the
+    posterior of the laboratory rows alone, by importance sampling from a mixture of Student-t
+    fitted to it; NaN where too few draws carry the weight.
     """
     o = found.data.outputs[0]
     rng = generator(found.seed, "paper gaps", "simulator", o.name)

@@ -14,21 +14,13 @@ from calib.he2019.gaps.cases import RECONSTRUCTED, PaperGap
 def write_cases(gaps: Sequence[PaperGap], out: Path, *, overwrite: bool = False) -> list[Path]:
     """Write each gap as a case folder, and return the folders.
 
-    Parameters
-    ----------
-    out : Path
-        Gets a folder for each gap with ``case.toml``, ``lab.csv``, ``field.csv`` and, where rows
-        were kept out, ``fresh.csv`` with their conditions and ``fresh_measured.csv`` with their
-        outcomes, which no diagnosis reads.
-    overwrite : bool
-        Replace files of these names.
+    With ``case.toml``, ``lab.csv``, ``field.csv`` and, where rows were kept out, ``fresh.csv`` with
+    their conditions and ``fresh_measured.csv`` with their outcomes, which no diagnosis reads.
 
     Raises
     ------
-    CalibError
-        If a folder exists and may not be replaced.
-    OSError
-        If a folder cannot be made or written to.
+    CalibError, OSError
+        If a folder exists and may not be replaced; if one cannot be made or written to.
     """
     folders = [Path(out) / gap.name for gap in gaps]
     existing = [folder.name for folder in folders if folder.exists()]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 import re
 import shlex
@@ -16,11 +15,12 @@ from calib.he2019.audit import Audit, Finding, Quantity, Verdict
 from calib.he2019.audit.files import audit_csv, audit_json
 from calib.he2019.datasets.published import DOI
 from calib.he2019.figures.audit import audit_plates
-from calib.report.figures.export import png, png_size
+from calib.report.figures.export import png
 from calib.report.figures.plate import Plate
 from calib.report.labels import unbroken
 from calib.report.numbers import NOTHING, format_number
 from calib.report.page.equations import unit_html
+from calib.report.page.pictures import picture
 from calib.report.page.template import template
 
 _TITLE = "Audit of the published tables: He, Sandu & Osorio (2019)"
@@ -38,17 +38,9 @@ AUDIT_MARKS: Mapping[Verdict, str] = {
 
 
 def write_audit(audit: Audit, folder: Path) -> str:
-    """Write an audit's numbers and figures into an existing folder, and return its section.
+    """Write an audit's numbers and figures into an existing folder, and return its section as HTML.
 
-    Parameters
-    ----------
-    folder : Path
-        Gets ``audit.json``, ``audit.csv`` and ``figures/audit_*.png``.
-
-    Returns
-    -------
-    str
-        HTML to be placed in a page that has the report's style.
+    The folder gets ``audit.json``, ``audit.csv`` and ``figures/audit_*.png``.
     """
     (folder / "audit.json").write_text(audit_json(audit), encoding="utf-8")
     (folder / "audit.csv").write_text(audit_csv(audit.findings), encoding="utf-8")
@@ -61,13 +53,7 @@ def write_audit(audit: Audit, folder: Path) -> str:
 
 
 def write_audit_page(audit: Audit, folder: Path, command: Sequence[str]) -> None:
-    """Write an audit and a page of its own into an existing folder.
-
-    Parameters
-    ----------
-    folder : Path
-        Gets ``index.html`` beside what `write_audit` writes.
-    """
+    """Write what `write_audit` does, and ``index.html``, into an existing folder."""
     page = template("audit_page.html.j2", "calib.he2019.page").render(
         title=_TITLE,
         section=Markup(write_audit(audit, folder)),
@@ -81,10 +67,7 @@ def write_audit_page(audit: Audit, folder: Path, command: Sequence[str]) -> None
 def audit_section(audit: Audit, plates: Sequence[Plate], images: Mapping[str, bytes]) -> str:
     """Render the section: verdicts first, then the evidence of each, then the figures.
 
-    Parameters
-    ----------
-    images : mapping of str to bytes
-        PNG files by the name of their plate.
+    Images are PNG files by the name of their plate.
     """
     groups = [
         {
@@ -104,7 +87,11 @@ def audit_section(audit: Audit, plates: Sequence[Plate], images: Mapping[str, by
         groups=groups,
         free=sum(not f.reconstructed for f in audit.findings),
         total=len(audit.findings),
-        figures=[_figure(plate, images) for plate in plates],
+        figures=[
+            picture(p, images.get(p.name, b""), _text(p.caption))
+            | {"name": p.name.replace("_", "-")}
+            for p in plates
+        ],
     )
 
 
@@ -152,15 +139,4 @@ def _quantity(q: Quantity) -> dict[str, Any]:
         "interval": interval,
         "kind": q.interval or NOTHING,
         "published": _text(q.published) or NOTHING,
-    }
-
-
-def _figure(plate: Plate, images: Mapping[str, bytes]) -> dict[str, Any]:
-    image = images.get(plate.name)
-    return {
-        "name": plate.name.replace("_", "-"),
-        "heading": plate.heading or plate.name.replace("_", " ").capitalize(),
-        "caption": _text(plate.caption),
-        "uri": f"data:image/png;base64,{base64.b64encode(image).decode()}" if image else "",
-        "size": png_size(image) if image else (0, 0),
     }

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import Pool
 from calib.gap.files import write_diagnosis
 from calib.he2019.figures.gaps import gap_plate
 from calib.he2019.gaps.checks import checks, probability_of
@@ -19,52 +18,14 @@ from calib.report.figures.gap import gap_plates
 from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_rows import short_name
-from calib.report.gap_verdict import Tone, odds_text
+from calib.report.gap_verdict import odds_text
 from calib.report.labels import short
-from calib.report.page.diagnosis import render_diagnosis
+from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
+from calib.report.page.pictures import data_uri
 from calib.report.page.template import template
-
-_MARKS = {
-    Tone.FINE: "\N{HEAVY CHECK MARK}",
-    Tone.CARE: "\N{BLACK UP-POINTING TRIANGLE}",
-    Tone.NO: "?",
-}
 
 type Progress = Callable[[str, int, int], None]
 type ToPng = Callable[[Plate], bytes]
-
-
-def write_gaps(
-    results: Sequence[FoundGap],
-    folder: Path,
-    to_png: ToPng,
-    *,
-    manifest: Mapping[str, Any],
-    pdf: bool = False,
-    progress: Progress | None = None,
-) -> str:
-    """Write figures and pages of the gaps into a report folder, and return the section.
-
-    Parameters
-    ----------
-    folder : Path
-        Has ``figures/``; gets ``figures/gap_NAME.png`` and ``gaps/NAME/``, each what
-        `calib diagnose` writes, its figures inside the page only.
-    to_png : callable
-        Renders a figure.
-    manifest : mapping
-        Of the report, for the pages' versions.
-    pdf : bool
-        Whether each gap's figure also comes as PDF.
-
-    Returns
-    -------
-    str
-        HTML for `calib.report.page.render.render_page`.
-    """
-    versions = manifest.get("versions", {})
-    section = begin_gaps_section(results, folder, to_png, versions=versions, pdf=pdf, pool=HERE)
-    return section(progress or (lambda what, done, planned: None))
 
 
 def begin_gaps_section(
@@ -76,7 +37,11 @@ def begin_gaps_section(
     pdf: bool,
     pool: Pool,
 ) -> Callable[[Progress], str]:
-    """Ask for figures and pages as `write_gaps` does; return what waits for the section."""
+    """Ask for figures and pages of the gaps in a report folder; return what waits for the section.
+
+    The folder has ``figures/``; it gets ``figures/gap_NAME.png``, as PDF too if asked, and
+    ``gaps/NAME/``, each what `calib diagnose` writes, its figures inside the page only.
+    """
     pieces = [pool.submit(_write_gap, r, folder, to_png, versions, pdf) for r in results]
 
     def finish(tell: Progress) -> str:
@@ -124,7 +89,7 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
             ("Field", f"{_upper(gap.field_rows)}: {len(case.field)} rows"),
         ],
         "tone": verdict.tone.value,
-        "mark": _MARKS[verdict.tone],
+        "mark": TONE_MARKS[verdict.tone],
         "state": verdict.state,
         "headline": verdict.headline,
         "facts": [fact for fact in verdict.facts if fact[0] != "Next"],
@@ -135,7 +100,7 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
         "limits": gap.limits,
         "page": f"gaps/{gap.name}/index.html",
         "caption": plate.caption,
-        "uri": f"data:image/png;base64,{base64.b64encode(image).decode()}",
+        "uri": data_uri(image),
         "size": png_size(image),
     }
 

@@ -48,15 +48,7 @@ def text(found: Mapping[str, Any]) -> str:
 
 
 def render(found: Mapping[str, Any], image: str, command: Sequence[str]) -> str:
-    """Render the page.
-
-    Parameters
-    ----------
-    found : mapping
-        The content of `comparison.json`.
-    image : str
-        Data URI of the figure.
-    """
+    """Render the page from the content of `comparison.json` and the figure's data URI."""
     head, body = table(found)
     models = [get_model(name) for name in found["models"]]
     return template("comparison.html.j2").render(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -11,10 +10,10 @@ from typing import Any
 
 from calib.models import get_model
 from calib.report.figures import Plate
-from calib.report.figures.export import png_size
 from calib.report.labels import axis_of, percent, short
 from calib.report.page.equations import equation, likelihood, parametrisation, prose
 from calib.report.page.facts import repeats_words, sampling_facts, validation_facts, worst_row
+from calib.report.page.pictures import picture
 from calib.report.page.tables import (
     estimates_grid,
     posterior_rows,
@@ -64,13 +63,7 @@ def failed_section(key: str, failure: Failure) -> dict[str, Any]:
 def section(
     key: str, result: OutputResult, plates: Sequence[Plate], images: Mapping[str, bytes]
 ) -> dict[str, Any]:
-    """Return everything that is said of an output.
-
-    Parameters
-    ----------
-    images : mapping of str to bytes
-        PNG files by name, ``{key}_{plate.name}.png``.
-    """
+    """Return everything that is said of an output; images by ``{key}_{plate.name}.png``."""
     calibration = result.calibration
     problem = calibration.problem
     evidence = gather(result)
@@ -106,7 +99,11 @@ def section(
         "validation": validation_facts(result, evidence.effective, evidence.low_coverage_p),
         "validation_title": _validation_title(result),
         "noise": result.preference and prose(result.preference.sentence, ()),
-        "figures": {p.name: _figure(key, p, images, names) for p in plates},
+        "figures": {
+            p.name: picture(p, images.get(f"{key}_{p.name}.png", b""), prose(p.caption, names))
+            | {"alt": p.caption}
+            for p in plates
+        },
         "converged": calibration.converged,
     }
 
@@ -165,16 +162,3 @@ def _data_facts(result: OutputResult) -> list[list[str]]:
         facts.append(["Columns not used", ", ".join(table.ignored)])
     facts.append(["SHA-256", table.sha256])
     return facts
-
-
-def _figure(
-    key: str, plate: Plate, images: Mapping[str, bytes], names: Sequence[str]
-) -> dict[str, Any]:
-    image = images.get(f"{key}_{plate.name}.png")
-    return {
-        "heading": plate.heading or plate.name.replace("_", " ").capitalize(),
-        "caption": prose(plate.caption, names),
-        "alt": plate.caption,
-        "uri": f"data:image/png;base64,{base64.b64encode(image).decode()}" if image else "",
-        "size": png_size(image) if image else (0, 0),
-    }

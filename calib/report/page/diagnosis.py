@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +14,7 @@ from calib.gap.inclusion import UNLISTED
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
 from calib.models import get_model
-from calib.report.figures.export import png, png_size
+from calib.report.figures.export import png
 from calib.report.figures.gap import GAP_FIGURES, gap_plates
 from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import gap_evidence, region_words, shrink_facts, where_fact
@@ -28,6 +27,7 @@ from calib.report.gap_rows import (
 )
 from calib.report.gap_verdict import (
     GapEvidence,
+    Tone,
     judge_gap,
     odds_text,
 )
@@ -39,32 +39,27 @@ from calib.report.page.gap_tables import (
     prior_text,
     simulators,
 )
+from calib.report.page.pictures import picture
 from calib.report.page.template import template
 
 # A cause less probable is not shown.
 _POSSIBLE = 0.01
 
-_MARKS = {
-    "fine": "\N{HEAVY CHECK MARK}",
-    "care": "\N{BLACK UP-POINTING TRIANGLE}",
-    "no": "?",
+# A shape beside every colour.
+TONE_MARKS = {
+    Tone.FINE: "\N{HEAVY CHECK MARK}",
+    Tone.CARE: "\N{BLACK UP-POINTING TRIANGLE}",
+    Tone.NO: "?",
 }
 
 
 def write_page(
     found: Diagnosis, folder: Path, manifest: Mapping[str, Any], *, pool: Pool = HERE
 ) -> None:
-    """Draw the figures and write them and the page into an existing folder.
+    """Draw ``figures/*.png`` and write them and ``index.html`` into an existing folder.
 
-    Parameters
-    ----------
-    folder : Path
-        Gets ``figures/*.png`` and ``index.html``.
-    manifest : mapping
-        ``command`` and ``versions``, as `calib.report.manifest.build_manifest` has them; both
-        optional.
-    pool : Pool, optional
-        Where the first figures are drawn; the others are drawn here meanwhile.
+    Of the manifest ``command`` and ``versions`` are shown, if they are there. The first figures are
+    drawn in the pool, the others here meanwhile.
     """
     there = pool.submit(_drawn, found, GAP_FIGURES[:3])
     drawn = _drawn(found, GAP_FIGURES[3:]) | there.result()
@@ -90,17 +85,9 @@ def render_diagnosis(
     *,
     manifest: Mapping[str, Any],
 ) -> str:
-    """Render the page.
+    """Render the page, which makes no request: style and images are inside.
 
-    Parameters
-    ----------
-    images : mapping of str to bytes
-        PNG files by name, ``{plate.name}.png``.
-
-    Returns
-    -------
-    str
-        HTML that makes no request: style and images are inside.
+    Images are PNG files by name, ``{plate.name}.png``.
     """
     evidence = gap_evidence(found)
     verdict = judge_gap(evidence)
@@ -111,9 +98,9 @@ def render_diagnosis(
     return template("diagnosis.html.j2").render(
         title=f"Sim-to-real gap: {case.name}",
         verdict=verdict,
-        mark=_MARKS[verdict.tone.value],
+        mark=TONE_MARKS[verdict.tone],
         probability=round(100.0 * found.ranking.probability[best_of(found)]),
-        figures={p.name: _figure(p, images) for p in plates},
+        figures={p.name: picture(p, images.get(f"{p.name}.png", b""), p.caption) for p in plates},
         facts=_case_facts(found),
         warnings=found.warnings,
         causes=_cause_rows(evidence),
@@ -200,13 +187,3 @@ def _case_facts(found: Diagnosis) -> list[tuple[str, str]]:
             )
         )
     return facts
-
-
-def _figure(plate: Plate, images: Mapping[str, bytes]) -> dict[str, Any]:
-    image = images.get(f"{plate.name}.png")
-    return {
-        "heading": plate.heading or plate.name.replace("_", " ").capitalize(),
-        "caption": plate.caption,
-        "uri": f"data:image/png;base64,{base64.b64encode(image).decode()}" if image else "",
-        "size": png_size(image) if image else (0, 0),
-    }

@@ -13,14 +13,11 @@ from calib.models import BoundModel
 from calib.models.latex import html
 from calib.report.labels import MINUS, axis_of, plain, stem_and_subscript, unbroken
 
-_GREEK = {"sigma": Markup("&sigma;"), "gamma": Markup("&gamma;"),
-          "nu": Markup("&nu;"), "theta": Markup("&theta;")}  # fmt: skip
-
 
 def symbol_html(name: str) -> Markup:
     """Return a parameter's symbol: ``K_lo`` as K with a subscript."""
     stem, below = stem_and_subscript(name)
-    inside = Markup("<i>{}</i>").format(_GREEK.get(stem, stem))
+    inside = Markup("<i>{}</i>").format(plain(stem))
     return inside + Markup("<sub>{}</sub>").format(below) if below else inside
 
 

@@ -161,18 +161,10 @@ def simulators(found: Diagnosis) -> list[dict[str, Any]]:
 
 
 def parameter_text(prior: Prior, value: float, sd: float) -> str:
-    """Write a parameter with its sd and unit.
+    """Write a parameter, in internal coordinates, with its sd and unit.
 
-    Parameters
-    ----------
-    value, sd : float
-        In internal coordinates.
-
-    Returns
-    -------
-    str
-        A parameter that cannot be told from its bound at zero is an upper limit (95 %); one that
-        the data did not narrow is called so.
+    One that cannot be told from its bound at zero is an upper limit (95 %); one that the data did
+    not narrow is called so.
     """
     unit = _unit_of(prior)
     half = prior.lower == 0.0 and prior.loc == 0.0
@@ -199,13 +191,7 @@ def parameter_text(prior: Prior, value: float, sd: float) -> str:
 
 
 def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
-    """Write the shifts of the simulators' parameters that stand out from their own sd.
-
-    Parameters
-    ----------
-    fit : Fit
-        Of a parameter shift.
-    """
+    """Write the shifts of the simulators' parameters that stand out from their own sd."""
     part, shift = fit.forward.shift_slice, fit.forward.shift
     if shift is None:
         return []

@@ -28,7 +28,7 @@ def render_page(
     more: Sequence[Written] = (),
     paper: Publication | None = None,
 ) -> str:
-    """Render the report.
+    """Render the report, which makes no request: style and images are inside.
 
     Parameters
     ----------
@@ -36,19 +36,12 @@ def render_page(
         Figures of every output that was worked out.
     images : mapping of str to bytes
         PNG files by name, ``{output}_{plate.name}.png``.
-    manifest : mapping
-        As `calib.report.manifest.build_manifest` returns it.
     reconstructed : bool
         Whether any data were reconstructed from published results.
     more : sequence of Written
         Sections after the outputs, as trusted HTML.
     paper : Publication, optional
         Tables and methods beside the page.
-
-    Returns
-    -------
-    str
-        HTML that makes no request: style and images are inside.
     """
     sections = [
         section(key, result, plates.get(key, ()), images)

@@ -30,13 +30,7 @@ def verdict(score: SbcScore) -> str:
 
 
 def render(score: SbcScore, images: Mapping[str, str], command: Sequence[str]) -> str:
-    """Render the page of a run.
-
-    Parameters
-    ----------
-    images : mapping of str to str
-        Data URIs of the figures: one for each model, and ``coverage``.
-    """
+    """Render the page of a run; data URIs of its figures by model, and ``coverage``."""
     return template("sbc.html.j2").render(
         verdict=verdict(score),
         fine=not score.alarms,

@@ -14,19 +14,9 @@ _HERE = "calib.report.page"
 
 @cache
 def template(name: str, package: str = _HERE) -> Template:
-    """Return a template, which may include those of this package.
+    """Return a template by the name of its file in a package, which may include those of this one.
 
-    Parameters
-    ----------
-    name : str
-        Of its file.
-    package : str, optional
-        Where the file lies.
-
-    Returns
-    -------
-    jinja2.Template
-        Escapes what it is given; a name that it is not given is an error.
+    It escapes what it is given; a name that it is not given is an error.
     """
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(p, ".") for p in dict.fromkeys((package, _HERE))]),

@@ -27,16 +27,10 @@ _WIDTH = 96
 
 @dataclass(frozen=True)
 class Publication:
-    """What a paper takes from a report.
+    """What a paper takes from a report: text by path in its folder.
 
-    Parameters
-    ----------
-    files : mapping of str to str
-        Text by path in the report folder.
-    methods : tuple of (str, str)
-        Heading, empty for the first, and text of every paragraph of the methods.
-    references : tuple of str
-        One line for every reference that they cite.
+    And heading, empty for the first, and text of every paragraph of the methods; a line for every
+    reference that they cite.
     """
 
     files: Mapping[str, str]
@@ -55,20 +49,9 @@ class Publication:
 
 
 def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publication:
-    """Make tables, methods and references.
+    """Make tables, methods and references; nothing where no output was worked out.
 
-    Parameters
-    ----------
-    manifest : mapping
-        As `calib.report.manifest.build_manifest` returns it.
-    summary : mapping
-        As `calib.report.summary.summarise` returns it.
-
-    Returns
-    -------
-    Publication
-        The same text for the same numbers; times are left out, which never are the same. Nothing
-        where no output was worked out.
+    The same text for the same numbers; times are left out, which never are the same.
     """
     found = outputs(manifest, summary)
     if not found:

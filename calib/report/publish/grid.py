@@ -12,13 +12,7 @@ from calib.report.publish.markup import to_latex
 
 @dataclass(frozen=True)
 class CsvTable:
-    """Rows for programs: numbers in ASCII, units in a column or in the header.
-
-    Parameters
-    ----------
-    rows : tuple of tuple of str
-        Each as long as the head.
-    """
+    """Rows for programs: numbers in ASCII, units in a column or in the header."""
 
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -26,22 +20,10 @@ class CsvTable:
 
 @dataclass(frozen=True)
 class LatexTable:
-    """Rows for print.
+    """Rows for print, in groups with a rule between them; a wide table is in a small font.
 
-    Parameters
-    ----------
-    label : str
-        Name of its file, and of its LaTeX label.
-    caption : str
-        A sentence with marks, see `calib.report.publish.markup`.
-    columns : str
-        LaTeX's column specification.
-    head : tuple of str
-        With marks.
-    groups : tuple of tuple of tuple of str
-        Rows with marks; a rule stands between groups.
-    small : bool
-        Whether it is set in a small font, as wide tables are.
+    The label names its file too. Caption, head and cells have marks, see
+    `calib.report.publish.markup`; `columns` is LaTeX's column specification.
     """
 
     label: str

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import unicodedata
 
-from calib.report.labels import symbol, unit_text
+from calib.report.labels import unit_text
 
 _SPECIAL = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
@@ -43,13 +43,10 @@ _TO_PLAIN = str.maketrans(_RAISED, "-0123456789")
 
 
 def escape(text: str) -> str:
-    """Return text as LaTeX sets it.
+    """Return any text as LaTeX sets it.
 
-    Parameters
-    ----------
-    text : str
-        Any; raised digits, signs and Greek letters become mathematics, letters that LaTeX's
-        default encoding lacks lose their accents, and what is left of others is a question mark.
+    Raised digits, signs and Greek letters become mathematics, letters that LaTeX's default encoding
+    lacks lose their accents, and what is left of others is a question mark.
     """
     raised = re.split(f"([{_RAISED}]+)", text)
     return "".join(
@@ -77,12 +74,6 @@ def _greek(letter: str) -> str | None:
     if script == "GREEK CAPITAL" and name in _CAPITALS:
         return f"$\\{name.capitalize()}$"
     return None
-
-
-def latex_symbol(name: str) -> str:
-    r"""Return a parameter's symbol: ``K_lo`` as ``$K_\mathrm{lo}$``."""
-    # Mathtext is a part of LaTeX.
-    return symbol(name)
 
 
 def latex_unit(unit: str) -> str:

@@ -10,9 +10,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable
 
-from calib.report.labels import plain, unbroken, unit_plain
-from calib.report.publish.equations import latex_equation, text_equation
-from calib.report.publish.latex import escape, latex_symbol, latex_unit
+from calib.models import get_model
+from calib.models.latex import text
+from calib.report.labels import joined, plain, symbol, unbroken, unit_plain
+from calib.report.publish.latex import escape, latex_unit
 from calib.report.publish.references import short_citation
 
 _MARK = re.compile(r"\[@([^\]]+)\]|\[\$(\w+)\]|\[u:([^\]]*)\]|\[=(\w+)\]|`([^`]*)`")
@@ -32,8 +33,7 @@ def cited(sentences: Iterable[str]) -> list[str]:
 
 def joined_symbols(names: Iterable[str]) -> str:
     """Return marks of several symbols, as a sentence lists them."""
-    marks = [f"[${name}]" for name in names]
-    return marks[0] if len(marks) == 1 else f"{', '.join(marks[:-1])} and {marks[-1]}"
+    return joined([f"[${name}]" for name in names])
 
 
 def in_brackets(unit: str) -> str:
@@ -60,7 +60,9 @@ def to_text(sentence: str) -> str:
             return f"({'; '.join(short_citation(key.strip(' @')) for key in keys.split(';'))})"
         if unit:
             return unit_plain(unit)
-        return plain(name) if name else text_equation(model) if model else code
+        if model:
+            return ", ".join(map(text, get_model(model).latex))
+        return plain(name) if name else code
 
     return _MARK.sub(replaced, unbroken(sentence))
 
@@ -76,11 +78,11 @@ def to_latex(sentence: str) -> str:
             before = before.rstrip(" ") + "~"
             mark = f"\\cite{{{','.join(key.strip(' @') for key in keys.split(';'))}}}"
         elif name:
-            mark = latex_symbol(name)
+            mark = symbol(name)  # mathtext is a part of LaTeX
         elif unit:
             mark = latex_unit(unit)
         elif model:
-            mark = latex_equation(model)
+            mark = ", ".join(get_model(model).latex)
         else:
             # Long names and hashes may break after a slash.
             mark = f"\\texttt{{{escape(code).replace('/', '/' + chr(92) + 'allowbreak{}')}}}"

@@ -28,14 +28,7 @@ class Paragraph:
 
 
 def methods(manifest: Mapping[str, Any], outputs: Sequence[Output]) -> list[Paragraph]:
-    """Return the methods in words, see `calib.report.publish.markup` for the marks in them.
-
-    Parameters
-    ----------
-    manifest : mapping
-        As `calib.report.manifest.build_manifest` returns it.
-    outputs : sequence of Output
-    """
+    """Return the methods in words, see `calib.report.publish.markup` for the marks in them."""
     return [
         Paragraph("", tuple(_everything(manifest, outputs))),
         *(Paragraph(o.name, tuple(_output(o))) for o in outputs),

@@ -8,22 +8,13 @@ from typing import Any
 
 from calib.inference.calibration import ParameterSummary
 from calib.models import get_model
-from calib.report.publish.equations import equation_numbers
 
 _NAN = float("nan")
 
 
 @dataclass(frozen=True)
 class Output:
-    """One output that was worked out.
-
-    Parameters
-    ----------
-    task : mapping
-        Its entry in the manifest.
-    found : mapping
-        Its entry in the summary.
-    """
+    """One output that was worked out: its entries in manifest and summary."""
 
     key: str
     model: str
@@ -40,7 +31,7 @@ class Output:
         """The model by its title and its place in the source, with marks."""
         model = get_model(self.model)
         source = f"the source [@{model.cited}]" if model.cited else model.source
-        numbers = equation_numbers(self.model)
+        numbers = model.numbers.replace("-", "\N{EN DASH}")
         origin = f"{numbers} of {source}" if numbers and source else source
         return f"\u201c{model.title}\u201d" + (f" ({origin})" if origin else "")
 

@@ -31,13 +31,7 @@ def entries() -> Mapping[str, Mapping[str, str]]:
 
 
 def bibtex(keys: Iterable[str], version: str) -> str:
-    """Return the cited references as BibTeX.
-
-    Parameters
-    ----------
-    version : str
-        Of this package, for its own entry.
-    """
+    """Return the cited references as BibTeX, this package with its version."""
     wanted = list(keys)
     found = [match[0] for match in _ENTRY.finditer(_source()) if match[2] in wanted]
     own = (

@@ -132,13 +132,7 @@ def _convergence(o: Output) -> tuple[str, ...]:
 
 
 def convergence_latex(outputs: Sequence[Output], gate: Mapping[str, float]) -> LatexTable:
-    """Return what the convergence gate saw.
-
-    Parameters
-    ----------
-    gate : mapping
-        Its limits, as in the manifest.
-    """
+    """Return what the convergence gate saw, with its limits as in the manifest."""
     return LatexTable(
         label="convergence",
         caption=(

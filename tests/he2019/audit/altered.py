@@ -5,15 +5,31 @@ from __future__ import annotations
 from dataclasses import replace
 from types import MappingProxyType
 
-from calib.he2019.datasets.published import (
-    PUBLISHED,
-    Figure,
-    FittedTable,
-    Published,
-    printed_figures,
-)
+from calib.he2019.datasets.published import PUBLISHED, Figure, FittedTable, Published
 
-__all__ = ["altered", "flipped"]
+__all__ = ["altered", "flipped", "printed_figures"]
+
+
+def printed_figures(published: Published) -> dict[str, Figure]:
+    """Return every printed figure by where it stands, such as ``"Table 4, 18 psi: E"``."""
+    tables = (
+        published.bulk_density, *published.geometric.values(), *published.genetic.values(),
+        published.pressure, published.rut_depth,
+    )  # fmt: skip
+    found = {
+        f"{table.source}: {name}": figure
+        for table in tables
+        for name, figure in (*table.estimates.items(), *table.quality.items())
+    }
+    setup = published.setup
+    found |= {f"Table 2: {name}": figure for name, figure in setup.genetic_settings.items()}
+    found |= {f"Setup: contact length, {p} psi": f for p, f in setup.contact_length_mm.items()}
+    found |= {f"Setup: named slip {i}": f for i, f in enumerate(setup.named_slips, start=1)}
+    plain = (
+        "tyre_width_mm", "normal_load_kn", "speed_m_s", "contact_width_mm", "slip_levels",
+        "largest_rut_slip", "rebound_slip", "largest_water_content",
+    )  # fmt: skip
+    return found | {f"Setup: {name}": getattr(setup, name) for name in plain}
 
 
 def _in_table(table: FittedTable, name: str, text: str) -> FittedTable:

@@ -8,20 +8,25 @@ import numpy as np
 import pytest
 from scipy.stats import beta
 
+from calib.batch.pool import HERE
 from calib.he2019.audit.convergence import (
     Search,
     Seeds,
+    begin_convergence,
     convergence_findings,
     printed_settings,
-    study_convergence,
 )
 from calib.he2019.audit.finding import Verdict
 from calib.he2019.datasets.published import PUBLISHED
 
 
+def searched(seed, seeds, tell=lambda what, done, planned: None):
+    return begin_convergence(PUBLISHED, seed, seeds, HERE)(tell)
+
+
 @pytest.fixture(scope="module")
 def study():
-    return study_convergence(PUBLISHED, 2019, Seeds(4, 2, 3))
+    return searched(2019, Seeds(4, 2, 3))
 
 
 def judged(study):
@@ -84,20 +89,20 @@ def test_shares_carry_jeffreys_intervals(costs, hits):
 
 
 def test_same_seed_same_costs(study):
-    again = study_convergence(PUBLISHED, 2019, Seeds(1, 1, 1))
+    again = searched(2019, Seeds(1, 1, 1))
     for a, b in zip(again.searches, study.searches, strict=True):
         assert a.costs[0] == b.costs[0]
 
 
 def test_progress_is_told(study):
     told = []
-    study_convergence(PUBLISHED, 1, Seeds(1, 1, 1), lambda *args: told.append(args))
+    searched(1, Seeds(1, 1, 1), lambda *args: told.append(args))
     assert told[-1][1:] == (5, 5)
     assert [t[1] for t in told] == [1, 2, 3, 4, 5]
 
 
 @pytest.mark.slow
 def test_through_the_printed_coefficients_some_runs_stop_short():
-    found = study_convergence(PUBLISHED, 2019, Seeds(1, 1, 40)).printed_coordinates
+    found = searched(2019, Seeds(1, 1, 40)).printed_coordinates
     assert 0 < found.arrived < 40
     assert found.costs.max() > 1.5 * found.optimum

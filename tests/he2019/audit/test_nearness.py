@@ -12,7 +12,7 @@ from calib.he2019.audit.nearness import (
     printed_coefficients,
     references,
 )
-from calib.he2019.datasets.embedded import drawbar_pull
+from calib.he2019.datasets.embedded import columns
 from calib.he2019.datasets.published import PUBLISHED
 from calib.models.magic_formula import magic_formula
 
@@ -43,7 +43,7 @@ def test_simulated_data_stay_within_the_bounds(known, optimal):
 
 
 def test_the_reconstructed_data_stay_within_the_bounds(known):
-    data = drawbar_pull()
+    data = columns("drawbar_pull")
     for reference in known:
         rows = data["inflation_pressure_psi"] == reference.psi
         observed = data["drawbar_pull_kn"][rows]

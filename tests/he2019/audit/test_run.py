@@ -13,8 +13,8 @@ import pytest
 
 from calib.he2019.audit import Basis, Quantity, Seeds, Verdict, audit_csv, audit_json, run_audit
 from calib.he2019.audit.words import number, percent
-from calib.he2019.datasets.published import PUBLISHED, printed_figures
-from tests.he2019.audit.altered import flipped
+from calib.he2019.datasets.published import PUBLISHED
+from tests.he2019.audit.altered import flipped, printed_figures
 
 
 def test_every_printed_figure_is_judged(audit):

@@ -16,7 +16,7 @@ from calib.he2019.audit.table5_cost import (
     joint_cost,
 )
 from calib.he2019.datasets.drawbar import magic_formula_jacobian
-from calib.he2019.datasets.embedded import drawbar_pull
+from calib.he2019.datasets.embedded import columns
 from calib.he2019.datasets.published import PUBLISHED
 from calib.models.magic_formula import magic_formula
 from tests.he2019.audit.altered import altered
@@ -99,7 +99,7 @@ def test_simulated_data_at_the_assumed_slips(optimal):
 
 
 def test_the_reconstructed_optimum_obeys_all_bounds(anywhere):
-    pulls = drawbar_pull()["drawbar_pull_kn"].reshape(3, -1)
+    pulls = columns("drawbar_pull")["drawbar_pull_kn"].reshape(3, -1)
     optimum = joint_optimum([ASSUMED_SLIPS] * 3, pulls)
     assert optimum == pytest.approx(0.0709, abs=5e-5)
     strict, free = (assumed_slips_bound(PUBLISHED, optimal=o) for o in (True, False))

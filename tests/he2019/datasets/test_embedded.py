@@ -55,7 +55,7 @@ def test_files_hold_what_the_functions_return(files: dict[str, Columns]) -> None
 def test_labelled_and_read_only() -> None:
     assert embedded.LABEL == "reconstructed"
     with pytest.raises(ValueError, match="read-only"):
-        embedded.rut_depth()["rut_depth_mm"][0] = 1.0
+        embedded.columns("rut_depth")["rut_depth_mm"][0] = 1.0
 
 
 def test_reconstruction_is_quick() -> None:

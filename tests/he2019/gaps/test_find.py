@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from scipy.stats import f as f_distribution
 
+from calib.batch.pool import HERE
 from calib.gap.diagnose import verdict
 from calib.he2019.gaps.checks import Check, checks, probability_of
-from calib.he2019.gaps.find import find_gaps, simulator_sd, unfitted_errors
+from calib.he2019.gaps.find import begin_gaps, simulator_sd, unfitted_errors
 from calib.he2019.gaps.summary import summarise_gaps
 from calib.inference.calibration import calibrate
 from calib.models.bekker import rut_depth as eq_21
@@ -151,7 +152,7 @@ def test_the_summary_is_json_and_holds_every_gap(found_gaps):
 def test_same_seed_same_numbers(found_gaps):
     first = found_gaps["plain_bekker"]
     said = []
-    (again,) = find_gaps(first.found.seed, gaps=[first.gap], progress=lambda *a: said.append(a[1:]))
+    (again,) = begin_gaps(first.found.seed, [first.gap], HERE)(lambda *a: said.append(a[1:]))
     assert summarise_gaps([again]) == summarise_gaps([first])
     np.testing.assert_array_equal(simulator_sd(again.found), first.open_sd)
     assert said == [(1, 1)]

@@ -332,7 +332,7 @@ def test_symbols_in_sentences():
         )
     )
     assert "<i>K</i><sub>lo</sub> and <i>C</i><sub>2</sub> &lt; 5\N{NO-BREAK SPACE}kN" in text
-    assert "<i>&sigma;</i> is C, not C23" in text
+    assert "<i>\N{GREEK SMALL LETTER SIGMA}</i> is C, not C23" in text
 
 
 def test_symbols_and_units_are_escaped():

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from calib.models import MODELS
 from calib.report.numbers import TIMES
-from calib.report.publish.equations import equation_numbers, latex_equation, letters, text_equation
-from calib.report.publish.latex import escape, latex_symbol, latex_unit
+from calib.report.publish.latex import escape, latex_unit
 from calib.report.publish.markup import cited, joined_symbols, to_latex, to_text, with_symbols
 from tests.report.publish.reader import check
 
@@ -35,7 +34,7 @@ def test_any_text_is_well_formed(text):
 
 
 def test_symbols_and_units():
-    assert latex_symbol("K_lo") == r"$K_\mathrm{lo}$"
+    assert to_latex("[$K_lo]") == r"$K_\mathrm{lo}$"
     assert latex_unit("kPa (g/cm^3)^-C4") == "kPa (g/cm$^{3}$)$^{-C4}$"
     assert latex_unit("kN/%") == r"kN/\%"
     assert latex_unit("1") == "--"
@@ -43,17 +42,18 @@ def test_symbols_and_units():
 
 @pytest.mark.parametrize("name", MODELS)
 def test_every_model_has_its_equation(name):
-    check(latex_equation(name))
-    check(to_latex(letters(name)))
-    assert "Eq" not in text_equation(name)
+    equation = to_latex(f"[={name}]")
+    check(equation)
+    check(to_latex(MODELS[name].letters))
+    assert "Eq" not in to_text(f"[={name}]")
     # Of other sources than the paper the numbers are not known.
-    numbers = equation_numbers(name)
+    numbers = MODELS[name].numbers
     assert numbers.startswith("Eq") if MODELS[name].cited == "He_2019" else not numbers
     # The parameters that the source prints are all in it.
     for parameter in MODELS[name].reported:
         digits = parameter.strip("ABCDEKSbcknvh")
-        assert parameter[0] in latex_equation(name)
-        assert not digits or digits in latex_equation(name)
+        assert parameter[0] in equation
+        assert not digits or digits in equation
 
 
 def test_marks():

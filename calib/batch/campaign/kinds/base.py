@@ -28,12 +28,10 @@ class Section(BaseModel):
 
 @dataclass(frozen=True)
 class Planned:
-    """A task as its kind describes it.
+    """A task as its kind describes it; the label tells it from the others of its table.
 
     Parameters
     ----------
-    label : str
-        Tells it from the other tasks of its table.
     settings : mapping of str to object
         All that decides the result beside the inputs and the seed; JSON can hold it.
     inputs : mapping of str to Path
@@ -47,19 +45,7 @@ class Planned:
 
 @dataclass(frozen=True)
 class Task:
-    """A task of a plan.
-
-    Parameters
-    ----------
-    name : str
-        Of its result.
-    kind : str
-        Key of `calib.batch.campaign.kinds.KINDS`.
-    seed : int
-        Its own, from the stream of its name.
-    inputs : mapping of str to Path
-        As planned.
-    """
+    """A task of a plan, of one of `KINDS`, as planned; the seed is from the stream of its name."""
 
     name: str
     kind: str
@@ -101,13 +87,7 @@ class Kind[S: Section, I](ABC):
 
     @abstractmethod
     def plan(self, section: S, place: Place) -> Iterator[Planned]:
-        """Yield the tasks of a table.
-
-        Parameters
-        ----------
-        section : Section
-        place : Place
-            Finds files beside the plan.
+        """Yield the tasks of a table; `place` finds files beside the plan.
 
         Raises
         ------

@@ -42,15 +42,7 @@ class ChallengeSection(Section):
 
 @dataclass(frozen=True)
 class ChallengeItem:
-    """What a case is made from.
-
-    Parameters
-    ----------
-    own : SeedSequence
-        The case's seed.
-    bench : str
-        Hash of the code that makes it.
-    """
+    """What a case is made from: its seed, and the hash of the code that makes it, among it."""
 
     own: np.random.SeedSequence
     tier: Literal["easy", "hard"]

@@ -41,10 +41,7 @@ class DiagnoseSection(Section):
 class DiagnosisItem:
     """A case, ready to be sent off.
 
-    Parameters
-    ----------
-    effects : mapping of str to bytes
-        The user's file of effects, first, and the prior files beside it.
+    With the user's file of effects, first, and the prior files beside it.
     """
 
     case: Case

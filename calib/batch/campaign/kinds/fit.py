@@ -15,7 +15,7 @@ from pydantic import Field
 from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
 from calib.batch.campaign.place import Place, word
 from calib.batch.folders import read_folder
-from calib.data import Table, hold_out, read_for_model
+from calib.data import Table, read_for_model
 from calib.data.labels import labelled
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
@@ -56,15 +56,7 @@ class FitSection(Section):
 
 @dataclass(frozen=True)
 class FitItem:
-    """A fit, ready to be sent off.
-
-    Parameters
-    ----------
-    problem : Problem
-        On the rows that are not held out.
-    posterior : bool
-        Whether to keep the run folder.
-    """
+    """A fit, ready to be sent off: a problem on the rows that are not held out."""
 
     problem: Problem
     held: Table | None
@@ -101,7 +93,7 @@ class Fit(Kind[FitSection, FitItem]):
         model = get_model(task.settings["model"])
         table = labelled(read_for_model(task.inputs["data"], (*model.conditions, model.output)))
         kept = _held(task.settings["hold_out"])
-        fitted, held = hold_out(table, kept.column, kept.value) if kept else (table, None)
+        fitted, held = kept.split(table) if kept else (table, None)
         problem = build_problem(model.name, fitted, task.inputs.get("priors"))
         settings = SamplerSettings(max_steps=task.settings["max_steps"])
         return FitItem(problem, held, settings, task.settings["posteriors"])
