@@ -60,15 +60,13 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-calibration.register(app)
-compare.register(app)
-gap.register(app)
-challenge.register(app)
-check.register(app)
-audit.register(app)
-campaign.register(app)
-sbc.register(app)
-doctor.register(app)
+for verb in (
+    calibration.report, calibration.fit, calibration.predict, calibration.data,
+    calibration.template, calibration.priors, calibration.models, compare.compare, gap.diagnose,
+    check.check, audit.audit, campaign.campaign, sbc.sbc, doctor.doctor,
+):  # fmt: skip
+    app.command()(verb)
+app.add_typer(challenge.verbs, name="challenge")
 add_examples(app)
 
 

@@ -9,28 +9,24 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from calib.cli.machine import Json, finish
-from calib.cli.parallel import CORES, Models, Simulators, Workers
+from calib.cli.options import (
+    CORES,
+    HoldOutOption,
+    MaxSteps,
+    Models,
+    Overwrite,
+    PriorFiles,
+    Seed,
+    Simulators,
+    Workers,
+    command,
+)
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from calib.report.sections import Section
-    from calib.report.study_tasks import HoldOut
-
-_Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
-_Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
-_HoldOut = Annotated[
-    str | None,
-    typer.Option("--hold-out", help="Rows kept for validation, e.g. inflation_pressure_psi=30."),
-]
-_MaxSteps = Annotated[int, typer.Option(help="Where extending the chains stops.", min=100)]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verbs to an app."""
-    for verb in (report, fit, predict, data, template, priors, models):
-        app.command()(verb)
 
 
 def report(
@@ -38,20 +34,18 @@ def report(
         list[Path] | None, typer.Argument(help="Your CSV files; the embedded data if none.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-report"),
-    seed: _Seed = 2019,
-    hold_out: _HoldOut = None,
+    seed: Seed = 2019,
+    hold_out: HoldOutOption = None,
     model: Annotated[
         list[str] | None, typer.Option(help="Model for its output, not the suggested; repeatable.")
     ] = None,
-    priors: Annotated[
-        list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")
-    ] = None,
+    priors: PriorFiles = None,
     only: Annotated[
         list[str] | None, typer.Option(help="Output to report, e.g. drawbar_pull; repeatable.")
     ] = None,
-    overwrite: _Overwrite = False,
+    overwrite: Overwrite = False,
     pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
-    max_steps: _MaxSteps = 25_600,
+    max_steps: MaxSteps = 25_600,
     posteriors: Annotated[
         bool, typer.Option(help="Keep the posteriors, megabytes of netCDF, in the folder.")
     ] = True,
@@ -75,13 +69,13 @@ def report(
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.report.contents import work_out
     from calib.report.emulators import EmulatorSection
-    from calib.report.study_tasks import fitted_rows, plan_tasks
+    from calib.report.study_tasks import HoldOut, fitted_rows, plan_tasks
     from calib.report.writer import write_report
 
     if files:
         tasks = plan_tasks(
             [labelled(read_table(f, allow_missing=tuple(OUTPUTS.values()))) for f in files],
-            _parse_hold_out(hold_out),
+            None if hold_out is None else HoldOut.parse(hold_out),
             models=model or (),
             prior_paths=priors or (),
             only=only or (),
@@ -116,7 +110,7 @@ def report(
         )  # fmt: skip
         study = found.study
         page = write_report(
-            study, out, settings=settings, command=_command(), title=title, sections=found.found,
+            study, out, settings=settings, command=command(), title=title, sections=found.found,
             overwrite=overwrite, posteriors=posteriors, pdf=pdf, progress=tell, pool=side,
         )  # fmt: skip
     for key, result in study.successes.items():
@@ -138,10 +132,10 @@ def fit(
     model: Annotated[str, typer.Option(help="See `calib models`.")],
     out: Annotated[Path, typer.Option(help="Run folder to write.")] = Path("calib-run"),
     priors: Annotated[Path | None, typer.Option(help="Prior file; see `calib priors`.")] = None,
-    seed: _Seed = 2019,
-    hold_out: _HoldOut = None,
-    overwrite: _Overwrite = False,
-    max_steps: _MaxSteps = 25_600,
+    seed: Seed = 2019,
+    hold_out: HoldOutOption = None,
+    overwrite: Overwrite = False,
+    max_steps: MaxSteps = 25_600,
     workers: Workers = CORES,
     plugins: Models = None,
     simulator: Simulators = None,
@@ -153,7 +147,6 @@ def fit(
     from calib.batch.folders import check_folder, fresh_folder
     from calib.cli.display import posterior_table, progress_bars, verdict_line
     from calib.cli.simulators import say
-    from calib.data import hold_out as split
     from calib.data import read_for_model
     from calib.data.labels import labelled
     from calib.inference.calibration import calibrate
@@ -165,6 +158,7 @@ def fit(
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import get_model
     from calib.report.numbers import format_number
+    from calib.report.study_tasks import HoldOut
     from calib.validation.assumptions import warnings_of
     from calib.validation.noise_preference import noise_preference
     from calib.validation.validate import validate_held_out
@@ -173,8 +167,8 @@ def fit(
     check_folder(out, overwrite=overwrite)
     settings = SamplerSettings(max_steps=max_steps)
     table = labelled(read_for_model(file, (*chosen.conditions, chosen.output)))
-    kept = _parse_hold_out(hold_out)
-    fitted, held = split(table, kept.column, kept.value) if kept else (table, None)
+    kept = None if hold_out is None else HoldOut.parse(hold_out)
+    fitted, held = kept.split(table) if kept else (table, None)
     with progress_bars() as tell:
         emulation = prepare(
             model, fitted, seed, priors=priors, elsewhere=[] if held is None else [held],
@@ -232,7 +226,7 @@ def predict(
     effects: Annotated[
         Path | None, typer.Option(help="Python file with the effects of your own it was made with.")
     ] = None,
-    overwrite: _Overwrite = False,
+    overwrite: Overwrite = False,
     plugins: Models = None,
     simulator: Simulators = None,
     json: Json = False,
@@ -336,7 +330,7 @@ def _number(cell: Any) -> float | str:
 def data(
     name: Annotated[str, typer.Argument(help="he2019 or he2019-gaps")],
     out: Annotated[Path | None, typer.Option(help="Folder to write; its name if none.")] = None,
-    overwrite: _Overwrite = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write the embedded, reconstructed data as CSV files, or as cases for `calib diagnose`."""
     writers = {"he2019": _write_he2019, "he2019-gaps": _write_he2019_gaps}
@@ -425,14 +419,3 @@ def _emit(text: str, out: Path | None) -> None:
             mend="choose another --out",
         ) from None  # fmt: skip
     print(out)
-
-
-def _parse_hold_out(text: str | None) -> HoldOut | None:
-    from calib.report.study_tasks import HoldOut
-
-    return None if text is None else HoldOut.parse(text)
-
-
-def _command() -> list[str]:
-    """Return the command line without the folder the program was started from."""
-    return ["calib", *sys.argv[1:]]

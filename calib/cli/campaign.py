@@ -9,12 +9,7 @@ from typing import Annotated
 import typer
 
 from calib.cli.machine import Json, finish
-from calib.cli.parallel import Models, Scheduler, Simulators, Workers, announce
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb to an app."""
-    app.command()(campaign)
+from calib.cli.options import Models, Scheduler, Simulators, Workers, announce
 
 
 def campaign(

@@ -9,27 +9,19 @@ from typing import Annotated, Literal
 import typer
 
 from calib.batch.bench import from_the_bench
-from calib.cli.parallel import Models, Scheduler, Workers, announce
+from calib.cli.options import Models, Overwrite, Scheduler, Seed, Workers, announce
 
 _Cases = Annotated[Path, typer.Argument(help="Folder with cases.")]
 _Key = Annotated[Path, typer.Option(help="Their sealed answers.")]
-_Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
+
+verbs = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.")
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verbs to an app."""
-    verbs = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.")
-    verbs.command("make")(make)
-    verbs.command("run")(run)
-    verbs.command("well-specified")(well_specified)
-    verbs.command("score")(score)
-    app.add_typer(verbs, name="challenge")
-
-
+@verbs.command()
 def make(
     out: Annotated[Path, typer.Option(help="Folder for the cases.")],
     key: Annotated[Path, typer.Option(help="File for the sealed answers, outside it.")],
-    seed: _Seed,
+    seed: Seed,
     cases: Annotated[int, typer.Option(help="How many.", min=1)] = 300,
     tier: Annotated[
         Literal["both", "easy", "hard", "large"],
@@ -52,10 +44,11 @@ def make(
     print(f"{cases} cases in {out}; the key's SHA-256 is {digest}")
 
 
+@verbs.command()
 def run(
     folder: _Cases,
     out: Annotated[Path, typer.Option(help="Folder for the diagnoses; resumed if it is there.")],
-    seed: _Seed = 1,
+    seed: Seed = 1,
     workers: Workers = 2,
     scheduler: Scheduler = None,
     plugins: Models = None,
@@ -77,12 +70,13 @@ def run(
         raise typer.Exit(1)
 
 
+@verbs.command("well-specified")
 def well_specified(
     folder: _Cases,
     key: _Key,
     out: Annotated[Path, typer.Option(help="Folder for the well-specified cases.")],
     out_key: Annotated[Path, typer.Option(help="File for their answers, outside it.")],
-    seed: _Seed = 1,
+    seed: Seed = 1,
     workers: Workers = 2,
     scheduler: Scheduler = None,
 ) -> None:
@@ -105,6 +99,7 @@ def well_specified(
     print(f"well-specified cases in {out}; diagnose and score them as any others")
 
 
+@verbs.command()
 def score(
     folder: _Cases,
     results: Annotated[Path, typer.Option(help="Folder with the diagnoses.")],
@@ -113,9 +108,7 @@ def score(
         str, typer.Option(help="Only cases that measure these, e.g. drawbar_pull,rut_depth.")
     ] = "",
     out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace an earlier result.")
-    ] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Compare diagnoses with the sealed answers."""
     with from_the_bench("calib challenge score"):

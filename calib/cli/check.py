@@ -8,13 +8,8 @@ from typing import Annotated
 import typer
 
 from calib.cli.machine import Json, finish
-from calib.cli.parallel import CORES, Models, Simulators, Workers
+from calib.cli.options import CORES, Models, Simulators, Workers
 from calib.errors import CalibError
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb to an app."""
-    app.command()(check)
 
 
 def check(

@@ -16,13 +16,7 @@ _MOST = 40
 
 
 def show(outcome: Outcome, *, every: bool) -> None:
-    """Print what a check found.
-
-    Parameters
-    ----------
-    every : bool
-        List every number and file, not only those that are not the same.
-    """
+    """Print what a check found: every number and file, or only those that are not the same."""
     # A pipe has no width of its own: wide enough for whole rows.
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False, markup=False)
     console.print(outcome.verdict, soft_wrap=True)

@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from calib.cli.machine import Json, finish
-from calib.cli.parallel import CORES, Models, Simulators, Workers
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb to an app."""
-    app.command()(compare)
+from calib.cli.options import (
+    CORES,
+    HoldOutOption,
+    MaxSteps,
+    Models,
+    Overwrite,
+    PriorFiles,
+    Seed,
+    Simulators,
+    Workers,
+    command,
+)
 
 
 def compare(
     what: Annotated[list[str], typer.Argument(help="Models, then the CSV: A B my.csv.")],
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-comparison"),
-    priors: Annotated[
-        list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)] = 2019,
-    hold_out: Annotated[
-        str | None, typer.Option("--hold-out", help="Rows kept, e.g. plate_width_mm=80.")
-    ] = None,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an earlier one.")] = False,
-    max_steps: Annotated[int, typer.Option(help="Where extending the chains stops.")] = 25_600,
+    priors: PriorFiles = None,
+    seed: Seed = 2019,
+    hold_out: HoldOutOption = None,
+    overwrite: Overwrite = False,
+    max_steps: MaxSteps = 25_600,
     workers: Workers = CORES,
     plugins: Models = None,
     simulator: Simulators = None,
@@ -38,7 +39,6 @@ def compare(
     from calib.batch.folders import check_folder, fresh_folder
     from calib.cli.display import progress_bars
     from calib.cli.simulators import say
-    from calib.data import hold_out as split
     from calib.data import read_for_model
     from calib.data.labels import labelled
     from calib.inference.emulation.prepared import prepare
@@ -58,7 +58,7 @@ def compare(
     needed = {c for m in chosen for c in (*m.conditions, m.output)}
     table = labelled(read_for_model(Path(file), sorted(needed)))
     kept = None if hold_out is None else HoldOut.parse(hold_out)
-    fitted, held = split(table, kept.column, kept.value) if kept else (table, None)
+    fitted, held = kept.split(table) if kept else (table, None)
     elsewhere = [] if held is None else [held]
     given = {prior_file_model(path): path for path in priors or ()}
     with progress_bars() as tell:
@@ -75,7 +75,7 @@ def compare(
         )  # fmt: skip
     good = [say(name, emulation) for name, emulation in emulations.items()]
     with fresh_folder(out, overwrite=overwrite) as folder:
-        written = write_comparison(found, folder, ["calib", *sys.argv[1:]], hold_out or "")
+        written = write_comparison(found, folder, command(), hold_out or "")
     print(text(written))
     print(out / "index.html")
     finish(0 if found.sound and all(good) else 3, written, folder=str(out))

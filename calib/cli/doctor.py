@@ -17,11 +17,6 @@ _OPTIONAL = {
 }
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verb to an app."""
-    app.command()(doctor)
-
-
 def doctor(
     report: Annotated[
         Path | None,
@@ -77,7 +72,7 @@ def _checked(folder: Path, *, quick: bool) -> dict[str, Any]:
     from calib.batch.pool import pool
     from calib.check.check import check
     from calib.cli.display import progress_bars
-    from calib.cli.parallel import CORES
+    from calib.cli.options import CORES
 
     with pool(1 if quick else CORES) as side, progress_bars() as tell:
         outcome = check(folder, quick=quick, progress=tell, pool=side)

@@ -9,29 +9,21 @@ from typing import Annotated
 import typer
 
 from calib.cli.machine import Json, finish
-from calib.cli.parallel import CORES, Models, Simulators, Workers
+from calib.cli.options import CORES, Models, Overwrite, Seed, Simulators, Workers, command
 from calib.errors import CalibError
 
 # What the processes that draw the page import.
 _PAGE = ("calib.report.page.diagnosis",)
 
-_Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
-_Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb to an app."""
-    app.command()(diagnose)
-
 
 def diagnose(
     case: Annotated[Path | None, typer.Argument(help="Case folder with a case.toml.")] = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-diagnosis"),
-    seed: _Seed = 1,
+    seed: Seed = 1,
     run: Annotated[Path | None, typer.Option(help="Run folder of `calib fit`.")] = None,
     field: Annotated[Path | None, typer.Option(help="CSV of the field campaign.")] = None,
     effects: Annotated[Path | None, typer.Option(help="Python file with your effects.")] = None,
-    overwrite: _Overwrite = False,
+    overwrite: Overwrite = False,
     workers: Workers = CORES,
     plugins: Models = None,
     simulator: Simulators = None,
@@ -75,7 +67,7 @@ def diagnose(
     with progress_bars() as tell:
         emulations = prepare_case(given, run, seed, workers, tell)
     told = [say(what, emulation) for what, emulation in emulations]
-    manifest = {"seed": seed, "command": ["calib", *sys.argv[1:]]}
+    manifest = {"seed": seed, "command": command()}
     own_files = [] if effects is None else [effects]
     with pool(workers, _PAGE, own_files) as side:
         found = find(given, seed, effects={**EFFECTS, **own}, pool=side)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 import sys
 from collections.abc import Mapping
 from contextlib import redirect_stdout
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import Annotated, Any, TextIO
 
 import typer
+
+from calib.report.numbers import finite
 
 
 class _Aside(io.TextIOBase):
@@ -40,24 +41,12 @@ Json = Annotated[
 def finish(code: int, found: Mapping[str, Any] | Path, **more: Any) -> None:
     """Print what was found if JSON is asked for, and end with an exit code.
 
-    Parameters
-    ----------
-    found : mapping or Path
-        A document, or the JSON file that holds it.
-    **more
-        What stands before it. What is not finite is null.
+    It is a document, or the JSON file that holds it; `more` stands before it. What is not finite is
+    null.
     """
     if isinstance(sys.stdout, _Aside):
         document = found if isinstance(found, Mapping) else json.loads(found.read_bytes())
-        whole = _finite({"exit_code": code, **more, **document})
+        whole = finite({"exit_code": code, **more, **document})
         sys.stdout.output.write(json.dumps(whole, indent=1, allow_nan=False) + "\n")
     if code:
         raise typer.Exit(code)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -9,12 +9,16 @@ from typing import Annotated
 import typer
 
 from calib.cli.machine import Json, finish
-from calib.cli.parallel import Models, Scheduler, Simulators, Workers, announce
-
-
-def register(app: typer.Typer) -> None:
-    """Add the verb to an app."""
-    app.command()(sbc)
+from calib.cli.options import (
+    Models,
+    PriorFiles,
+    Scheduler,
+    Seed,
+    Simulators,
+    Workers,
+    announce,
+    command,
+)
 
 
 def sbc(
@@ -23,10 +27,8 @@ def sbc(
         list[str] | None, typer.Option(help="Model to test; all but slow ones if none; repeatable.")
     ] = None,
     simulations: Annotated[int, typer.Option(help="Campaigns per model.", min=10)] = 300,
-    seed: Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)] = 2019,
-    priors: Annotated[
-        list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")
-    ] = None,
+    seed: Seed = 2019,
+    priors: PriorFiles = None,
     workers: Workers = 2,
     scheduler: Scheduler = None,
     plugins: Models = None,
@@ -54,7 +56,7 @@ def sbc(
             workers=workers, scheduler=scheduler, announce=announce,
             progress=lambda done, n: tell("simulating and calibrating", done, n),
         )  # fmt: skip
-    page = write_sbc(score, out, asdict(SETTINGS), ["calib", *sys.argv[1:]])
+    page = write_sbc(score, out, asdict(SETTINGS), command())
     print(text_table(score))
     for of_model in score.models:
         for name, error in of_model.failed.items():

@@ -1,4 +1,4 @@
-"""Options of verbs that do many independent tasks."""
+"""Options that several verbs have."""
 
 from __future__ import annotations
 
@@ -9,6 +9,14 @@ from typing import Annotated
 
 import typer
 
+Seed = Annotated[int, typer.Option(help="Same seed, same numbers.", min=0)]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier result.")]
+HoldOutOption = Annotated[
+    str | None,
+    typer.Option("--hold-out", help="Rows kept for validation, e.g. inflation_pressure_psi=30."),
+]
+MaxSteps = Annotated[int, typer.Option(help="Where extending the chains stops.", min=100)]
+PriorFiles = Annotated[list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")]
 # As many processes as there are cores, of which two bring most of what there is to gain.
 CORES = min(2, os.cpu_count() or 1)
 Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1)]
@@ -46,6 +54,11 @@ Simulators = Annotated[
         is_eager=True,
     ),
 ]
+
+
+def command() -> list[str]:
+    """Return the command line without the folder the program was started from."""
+    return ["calib", *sys.argv[1:]]
 
 
 def announce(line: str) -> None:
