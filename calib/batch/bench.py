@@ -14,15 +14,10 @@ _BENCH = "challenge"
 def from_the_bench(what: str) -> Iterator[None]:
     """Say of an import of `challenge` within the block that a wheel does not have it.
 
-    Parameters
-    ----------
-    what : str
-        The command or table that needs it.
-
     Raises
     ------
     CalibError
-        If there is no such package.
+        Naming the command or table that needs it.
     """
     try:
         yield

@@ -110,13 +110,7 @@ def code_sha256() -> str:
 
 @cache
 def source_sha256(package: Path) -> str:
-    """Return the SHA-256 over the source files of a package.
-
-    Parameters
-    ----------
-    package : Path
-        Its folder.
-    """
+    """Return the SHA-256 over the source files in the folder of a package."""
     return _digest(_sources(package))
 
 

@@ -39,10 +39,7 @@ def _is_ours(name: str) -> bool:
 def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """Yield a scratch folder that becomes `out` once the block succeeds.
 
-    Parameters
-    ----------
-    overwrite : bool
-        Replace an existing folder; only one that was written by this package.
+    An existing folder is replaced if asked, and only one that was written by this package.
 
     Raises
     ------
@@ -150,13 +147,7 @@ def _umask() -> int:
 
 
 def check_folder(out: Path, *, overwrite: bool = False) -> None:
-    """Check, before long work, that a folder may be written.
-
-    Raises
-    ------
-    CalibError
-        If it exists and may not be replaced, or could not be made.
-    """
+    """Check, before long work and with a CalibError, that a folder may be written, or replaced."""
     try:
         exists = out.exists()
     except OSError as error:  # a name that is too long, a folder that may not be searched

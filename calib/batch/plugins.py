@@ -26,15 +26,10 @@ _VARIABLE = "CALIB_MODELS"
 def run_file(path: Path, what: str) -> ModuleType:
     """Run a Python file as a module of its own; one that has been run is not run again.
 
-    Parameters
-    ----------
-    what : str
-        What it holds, for messages: ``"effects"``.
-
     Raises
     ------
     CalibError
-        If it cannot be read or does not run, with the line.
+        If it cannot be read, naming `what` it holds, or does not run, with the line.
     """
     path = Path(path).resolve()
     name = f"{USER_MODULE}{path.stem}"
@@ -108,10 +103,7 @@ def _load(path: Path) -> None:
 def load_installed(group: str) -> None:
     """Load what installed packages declare as entry points of a group, once.
 
-    Raises
-    ------
-    CalibError
-        If one cannot be loaded, naming the package.
+    A CalibError names the package of one that cannot be loaded.
     """
     if group in _LOADED:
         return

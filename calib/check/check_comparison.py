@@ -54,16 +54,9 @@ def check_comparison(
     quick: bool,
     workers: int = 1,
 ) -> tuple[list[Item], str]:
-    """Return what was found, and what Monte Carlo error was allowed, in words.
+    """Return what was found in a comparison, and what Monte Carlo error was allowed, in words.
 
-    Parameters
-    ----------
-    folder, scratch : Path
-        The comparison, and an empty folder.
-    quick : bool
-        Skip the sampling.
-    workers : int
-        Processes that leave rows out.
+    `scratch` is an empty folder; `quick` skips the sampling.
     """
     items = verify_files(folder, record.files, FILE, {})
     items += _follows(record, folder, same_program=record.environment.same_program(here))

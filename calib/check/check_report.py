@@ -46,16 +46,9 @@ def check_report(
     quick: bool,
     pool: Pool = HERE,
 ) -> tuple[list[Item], str]:
-    """Return what was found, and what Monte Carlo error was allowed, in words.
+    """Return what was found in a report, and what Monte Carlo error was allowed, in words.
 
-    Parameters
-    ----------
-    folder, scratch : Path
-        The report, and an empty folder.
-    quick : bool
-        Skip the sampling.
-    pool : Pool, optional
-        Where the report is made again.
+    `scratch` is an empty folder; `quick` skips the sampling.
     """
     items = verify_files(folder, manifest.files, RECORD, manifest.left_out)
     for key, said in manifest.tasks.items():

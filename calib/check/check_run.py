@@ -39,14 +39,9 @@ def check_run(
     *,
     quick: bool,
 ) -> tuple[list[Item], str]:
-    """Return what was found, and what Monte Carlo error was allowed, in words.
+    """Return what was found in a run, and what Monte Carlo error was allowed, in words.
 
-    Parameters
-    ----------
-    folder, scratch : Path
-        The run, and an empty folder.
-    quick : bool
-        Skip the sampling.
+    `scratch` is an empty folder; `quick` skips the sampling.
     """
     items = verify_run(record, folder)
     allowed = ""
@@ -83,15 +78,7 @@ def estimates_of_run(record: RunRecord, folder: Path, problem: Problem) -> list[
 def compare_run(
     record: RunRecord, calibration: Calibration, folder: Path, made: Path
 ) -> list[Item]:
-    """Compare a run with the same sampled and written again.
-
-    Parameters
-    ----------
-    calibration : Calibration
-        As it was sampled again.
-    folder, made : Path
-        The run, and the one made again.
-    """
+    """Compare a run with the same sampled again, and written into the folder `made`."""
     again = json.loads((made / _RECORD).read_text(encoding="utf-8"))
     recorded, found = _entries(record.document, folder), _entries(again, made)
     if not any(path[1] == "posterior" for path in recorded):  # unreadable, which has been said

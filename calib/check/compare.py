@@ -32,15 +32,7 @@ _SEARCHES = ("(genetic", "(differential_evolution")
 
 @dataclass(frozen=True)
 class Again:
-    """A report folder and the same made again.
-
-    Parameters
-    ----------
-    folder, made : Path
-        The report, and the one made again.
-    study : Study
-        What the second shows.
-    """
+    """A report folder and the same `made` again, which shows `study`."""
 
     manifest: Manifest
     folder: Path

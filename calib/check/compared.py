@@ -31,19 +31,9 @@ def count_compared(comparison: Comparison) -> int:
 def drawn_in_comparison(
     comparison: Comparison, best: str, steps: Mapping[str, object]
 ) -> dict[Place, float | None]:
-    """Return what Monte Carlo error allows to the numbers of a comparison.
+    """Return what Monte Carlo error allows to a comparison's numbers, by paths below ``models``.
 
-    Parameters
-    ----------
-    best : str
-        The model that differences are from.
-    steps : mapping of str to object
-        Recorded lengths of the other runs, by model.
-
-    Returns
-    -------
-    dict
-        By paths below ``models``.
+    Differences are from the model `best`; `steps` are recorded lengths of the other runs, by model.
     """
     moved = {c.model: _RowErrors.of(c) for c in comparison.candidates}
     first = next(c for c in comparison.candidates if c.model == best)
@@ -70,10 +60,7 @@ def drawn_in_comparison(
 def _scores(errors: Mapping[Place, float | None], heavy: float) -> dict[Place, float | None]:
     """Those of a validation's errors that a comparison states, as it names them.
 
-    Parameters
-    ----------
-    heavy : float
-        How many times as large errors are as those of draws that all weigh the same.
+    They are `heavy` times as large as those of draws that all weigh the same.
     """
     found: dict[Place, float | None] = {
         (name,): errors["validation", name] for name in ("elpd", "elpd_se")
@@ -104,12 +91,8 @@ def _least_ess(c: Candidate) -> float:
 class _RowErrors:
     """Monte Carlo errors of the log density of each row without it.
 
-    Parameters
-    ----------
-    influence : ndarray, shape (draws, n)
-        Of each draw, of mean zero.
-    root : float
-        Of the effective sample size.
+    From the influence of each draw (draws, n), of mean zero, and the root of the effective sample
+    size.
     """
 
     influence: Array

@@ -49,14 +49,7 @@ def verify_derived(
 ) -> list[Item]:
     """Write the derived files of a report again from what it records, and compare the bytes.
 
-    Parameters
-    ----------
-    files : mapping of str to str
-        The files that are listed.
-    manifest, summary : mapping
-        As recorded.
-    same_code : bool
-        Whether this version wrote the report: another one may word it otherwise.
+    Another version than the one that wrote the report may word it otherwise.
     """
     expected: dict[str, str] = {}
     failed = []
@@ -123,12 +116,7 @@ def verify_form(folder: Path) -> list[Item]:
 def verify_gaps(folder: Path, summary: Mapping[str, Any], *, same_code: bool) -> list[Item]:
     """Hold what a summary says of the source's gaps, and their corrected models, against diagnoses.
 
-    Parameters
-    ----------
-    summary : mapping
-        As recorded.
-    same_code : bool
-        Whether this version wrote the report: another one may predict otherwise.
+    Another version than the one that wrote the report may predict otherwise.
     """
     gaps = summary.get("paper_gaps")
     if not isinstance(gaps, Mapping):

@@ -36,15 +36,7 @@ def thumbnails(folder: Path) -> dict[str, Array]:
 
 
 def compare_figure(name: str, recorded: bytes, drawn: bytes, others: Mapping[str, Array]) -> Item:
-    """Compare a figure with the one drawn again.
-
-    Parameters
-    ----------
-    name : str
-        Its path in the folder.
-    others : mapping of str to ndarray
-        All figures drawn again, as `thumbnails` returns them.
-    """
+    """Compare a figure with the one drawn again, among the `thumbnails` of all drawn again."""
     if recorded == drawn:
         return Item(GROUP, name, Status.IDENTICAL)
     image = _thumbnail(recorded)
@@ -62,15 +54,7 @@ def compare_figure(name: str, recorded: bytes, drawn: bytes, others: Mapping[str
 
 
 def compare_pictures(page: str, recorded: Sequence[bytes], drawn: Sequence[bytes]) -> list[Item]:
-    """Compare the pictures that a page alone has with those drawn again, in their order.
-
-    Parameters
-    ----------
-    page : str
-        Its path in the folder.
-    recorded, drawn : sequence of bytes
-        PNG files.
-    """
+    """Compare the PNG files that a page alone has with those drawn again, in their order."""
     if len(recorded) != len(drawn):
         note = f"it has {len(recorded)} pictures of its own, not {len(drawn)}"
         return [Item(GROUP, page, Status.DIFFERENT, note=note)]
@@ -84,13 +68,7 @@ def compare_pictures(page: str, recorded: Sequence[bytes], drawn: Sequence[bytes
 
 
 def compare_prints(recorded: Mapping[str, bytes], drawn: Mapping[str, bytes]) -> list[Item]:
-    """Compare figures as PDF by what is drawn in them, numbers apart.
-
-    Parameters
-    ----------
-    recorded, drawn : mapping of str to bytes
-        By path in the folder; only those that are in both are compared.
-    """
+    """Compare figures as PDF that are in both by what is drawn in them, numbers apart."""
     inks = {name: _ink(content) for name, content in drawn.items()}
     items = []
     for name in sorted(set(recorded) & set(drawn)):

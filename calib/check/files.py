@@ -28,12 +28,8 @@ _INPUTS = ("data/", "priors/")
 class Moved:
     """Parts of a report with entries that moved by more than rounding.
 
-    Parameters
-    ----------
-    readings : frozenset of str
-        Those in which words may turn on what moved.
-    numbers : frozenset of str
-        Those with other numbers: these, and where the work merely took other steps.
+    Those in which words may turn on what moved; and those with other numbers: these, and where the
+    work merely took other steps.
     """
 
     readings: frozenset[str]

@@ -18,16 +18,9 @@ GROUP, FILES = "data and priors", "files and their hashes"
 def verify_files(
     folder: Path, hashes: Mapping[str, str], own: str, left_out: Mapping[str, str]
 ) -> list[Item]:
-    """Return one item for each file that is listed or there.
+    """Return one item for each file that is listed, by its SHA-256, or there.
 
-    Parameters
-    ----------
-    hashes : mapping of str to str
-        Relative path to SHA-256.
-    own : str
-        The file that holds the hashes, and so has none.
-    left_out : mapping of str to str
-        Files that are not there on purpose.
+    `own` holds the hashes, and so has none; what was left out is not there on purpose.
     """
     there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()} - {own}
     items = [_listed(folder, name, expected) for name, expected in hashes.items()]
@@ -66,15 +59,7 @@ def verify_hashes(key: str, entry: TaskRecord, folder: Path) -> list[Item]:
 
 
 def verify_label(file: str, table: Table, label: str) -> Item:
-    """Check that data which are known are called what they are, and nothing else is.
-
-    Parameters
-    ----------
-    file : str
-        Where the rows are.
-    label : str
-        What they are said to be.
-    """
+    """Check that rows which are known are called what they are, and no others are."""
     known = label_of(table)
     if label == known:
         note = KNOWN_DATA[known].words if known else "data of the user"

@@ -18,14 +18,12 @@ class Status(StrEnum):
 
 @dataclass(frozen=True)
 class Item:
-    """One thing that was compared.
+    """One thing that was compared: a file, the path of a number in it, or a claim.
 
     Parameters
     ----------
     group : str
         What it belongs to, such as ``"rut_depth: posterior"``.
-    name : str
-        The file, the path of the number in it, or the claim.
     recorded, found : object
         In the folder, and computed again; None where there is no number to show.
     allowed : float, optional

@@ -65,12 +65,8 @@ def drawn_in_output(
 ) -> dict[Place, float | None]:
     """Return what Monte Carlo error allows to the numbers of one output of a report.
 
-    Parameters
-    ----------
-    n : int
-        How many numbers follow from posterior draws, in the whole report.
-    steps : object
-        Recorded length of the other run.
+    Of the whole report n numbers follow from posterior draws; `steps` is the recorded length of the
+    other run.
     """
     times = multiple(n) * of_difference(calibration, steps)
     errors = posterior_errors(calibration)
@@ -116,13 +112,9 @@ def scaled(errors: dict[Place, float | None], times: float) -> dict[Place, float
 
 
 def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:
-    """Return the Monte Carlo standard errors of a posterior summary.
+    """Return the Monte Carlo standard errors of a posterior summary, by paths below the output.
 
-    Returns
-    -------
-    dict
-        Paths in ``summary.json`` below the output; None where the posterior's tail is so heavy
-        that there is no such error.
+    None where the posterior's tail is so heavy that there is no such error.
     """
     names = tuple(calibration.parameters)
     stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
@@ -155,16 +147,10 @@ def validation_errors(
 ) -> dict[Place, float | None]:
     """Return the Monte Carlo standard errors of a validation's scores.
 
-    Parameters
-    ----------
-    multiple : float
-        How many errors will be allowed: so many decide which rows may cross the edge of a band.
-
-    Notes
-    -----
     A part p of the predictive draws has the error sqrt(p (1 - p) (1/N + 1/ESS)): N draws of the
-    noise on top of ESS effective draws of the parameters. What is a mean over rows has the error
-    of the mean influence of a draw on them.
+    noise on top of ESS effective draws of the parameters. What is a mean over rows has the error of
+    the mean influence of a draw on them. How many errors will be allowed decides which rows may
+    cross the edge of a band.
     """
     draws, observed, scores = validation.draws, validation.observed, validation.scores
     n_draws, n = draws.shape

@@ -59,16 +59,9 @@ def compare_entries(
     group_of: Callable[[Place], str],
     drawn: Mapping[Place, float | None] | None = None,
 ) -> list[Item]:
-    """Return one item for each entry of a document or a part of one.
+    """Return one item for each entry, by path, the file first, of a document or a part of one.
 
-    Parameters
-    ----------
-    recorded, found : mapping
-        Entries by path, the file first.
-    group_of : callable
-        Names the group of an entry by its path.
-    drawn : mapping, optional
-        What Monte Carlo error allows, by path; None where there is no such error.
+    `drawn` is what Monte Carlo error allows, by path; None where there is no such error.
     """
     errors = drawn or {}
     paths = [*recorded, *(path for path in found if path not in recorded)]

@@ -16,15 +16,10 @@ _ROUNDED = 1e-3
 
 @dataclass(frozen=True)
 class Outcome:
-    """What a check found.
+    """What a check found; `quick` where sampling was skipped.
 
     Parameters
     ----------
-    folder : str
-        As it was given.
-    kind : {"report", "run", "comparison"}
-    quick : bool
-        Whether sampling was skipped.
     environment : mapping of str to (str, str)
         What differs between where it was made and here: pairs of there and here.
     allowed : str

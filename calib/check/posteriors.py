@@ -28,27 +28,14 @@ _AT_BOUNDS = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class DrawsFile:
-    """What is compared of a netCDF file.
-
-    Parameters
-    ----------
-    draws : mapping of str to ndarray, shape (chains, draws)
-        By parameter.
-    log_prob : ndarray, shape (chains, draws)
-    """
+    """What is compared of a netCDF file: draws (chains, draws) by parameter, and log density."""
 
     draws: Mapping[str, Array]
     log_prob: Array
 
 
 def read_draws(path: Path) -> DrawsFile:
-    """Read the posterior draws in a file.
-
-    Raises
-    ------
-    CalibError
-        If the file cannot be read.
-    """
+    """Read the posterior draws in a file; a CalibError if it cannot be read."""
     import xarray as xr
 
     try:

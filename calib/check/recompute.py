@@ -50,15 +50,7 @@ def not_computed(items: list[Item], folder: Path, record: str) -> Iterator[None]
 def report_tasks(manifest: Manifest, folder: Path, scratch: Path) -> tuple[Task, ...]:
     """Return the tasks of a report, with the folder's own data and priors.
 
-    Parameters
-    ----------
-    scratch : Path
-        Where priors are copied to under their first names, which the page shows.
-
-    Raises
-    ------
-    CalibError
-        If a data file cannot be read.
+    These are copied into `scratch` under their first names, which the page shows.
     """
     return tuple(_task(key, entry, folder, scratch / key) for key, entry in manifest.tasks.items())
 

@@ -207,13 +207,7 @@ def read_folder(folder: Path) -> Record:
 
 
 def read_run(folder: Path) -> RunRecord:
-    """Read what a run folder inside another says of itself.
-
-    Raises
-    ------
-    CalibError
-        If it is damaged, missing or of an earlier version.
-    """
+    """Read what a run folder inside another says of itself; see `read_folder`."""
     return _run(_content(folder / "run.json"), folder / "run.json")
 
 
@@ -226,19 +220,13 @@ def _content(path: Path) -> Any:
 
 def _comparison(content: Any, path: Path) -> ComparisonRecord:
     _check_schema(content, COMPARISON_SCHEMA, path)
-    try:
-        return ComparisonRecord.model_validate({**content, "document": content})
-    except ValidationError as error:
-        raise _damaged(path, _first(error)) from None
+    return _validated(ComparisonRecord, content, path, document=content)
 
 
 def _manifest(content: Any, path: Path) -> Manifest:
     _check_schema(content, REPORT_SCHEMA, path)
-    try:
-        sections = {name: content[name] for name in SECTIONS if name in content}
-        manifest = Manifest.model_validate({**content, "sections": sections})
-    except ValidationError as error:
-        raise _damaged(path, _first(error)) from None
+    sections = {name: content[name] for name in SECTIONS if name in content}
+    manifest = _validated(Manifest, content, path, sections=sections)
     for name, record in sections.items():
         try:
             SECTIONS[name].again(record)
@@ -252,10 +240,7 @@ def _manifest(content: Any, path: Path) -> Manifest:
 
 def _run(content: Any, path: Path) -> RunRecord:
     _check_schema(content, RUN_SCHEMA, path)
-    try:
-        return RunRecord.model_validate({**content, "document": content})
-    except ValidationError as error:
-        raise _damaged(path, _first(error)) from None
+    return _validated(RunRecord, content, path, document=content)
 
 
 def _check_schema(content: Any, schema: str, path: Path) -> None:
@@ -269,9 +254,13 @@ def _check_schema(content: Any, schema: str, path: Path) -> None:
         )
 
 
-def _first(error: ValidationError) -> str:
-    first = error.errors()[0]
-    return f"{'.'.join(str(part) for part in first['loc'])}: {first['msg']}"
+def _validated[R: _Made](kind: type[R], content: Any, path: Path, **more: Any) -> R:
+    try:
+        return kind.model_validate({**content, **more})
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = ".".join(str(part) for part in first["loc"])
+        raise _damaged(path, f"{place}: {first['msg']}") from None
 
 
 def _damaged(path: Path, found: str) -> CalibError:

@@ -77,17 +77,10 @@ def compare_page(
     written: Path,
     judged: Callable[[str], tuple[str | None, bool]],
 ) -> Item:
-    """Compare a page, or another text, with the one written again.
+    """Compare a page, or another text, by its path in two folders, with the one written again.
 
-    Parameters
-    ----------
-    name : str
-        Its path in the folder.
-    recorded, written : Path
-        The folders it is in.
-    judged : callable
-        Tells by the name of a section why its words cannot be judged (None where they can), and
-        whether its numbers can.
+    `judged` tells by the name of a section why its words cannot be judged (None where they can),
+    and whether its numbers can.
     """
     if (recorded / name).read_bytes() == (written / name).read_bytes():
         return Item(GROUP, name, Status.IDENTICAL)

@@ -56,16 +56,12 @@ class Of(StrEnum):
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What is taken for the same.
+    """What is taken for the same, of entries of a kind that the module's docstring names.
 
     Parameters
     ----------
-    kind : str
-        What the entry is, as the module's docstring has it.
     part : float
         Largest difference in units of the natural scale.
-    of : Of
-        The natural scale.
     floor : float
         Added to it, in the entry's own unit.
     words : bool
@@ -209,15 +205,7 @@ _SIBLINGS = {"mean": "sd", "gap": "gap_sd"}
 
 
 def tolerance_of(place: Place, entries: Entries) -> Tolerance:
-    """Return the tolerance of an entry.
-
-    Parameters
-    ----------
-    place : tuple of str
-        Path of the entry, the file first.
-    entries : mapping
-        All entries of its document, by such paths.
-    """
+    """Return the tolerance of an entry, by its path, the file first, among all of its document."""
     found = _row("/".join(place))
     if found is _READ_OFF:
         return _SIDES if _near_threshold(place, entries) else ARITHMETIC
@@ -264,16 +252,9 @@ _PATTERNS = tuple((_compiled(pattern), tolerance) for pattern, tolerance in TABL
 def natural_scale(
     of: Of, place: Place, entries: Entries, errors: Mapping[Place, float | None]
 ) -> float | None:
-    """Return the natural scale of a number; None where it has none.
+    """Return the natural scale of a number, by its path among entries computed again, or None.
 
-    Parameters
-    ----------
-    place : tuple of str
-        Path of the number, the file first.
-    entries : mapping
-        Computed again, by such paths.
-    errors : mapping
-        What Monte Carlo error allows, by such paths; None where a tail is too heavy for one.
+    `errors` is what Monte Carlo error allows, by paths; None where a tail is too heavy for one.
     """
     value = entries.get(place)
     size = abs(value) if isinstance(value, int | float) else 0.0

@@ -13,17 +13,7 @@ from calib.errors import CalibError
 
 @dataclass(frozen=True)
 class Finished[R]:
-    """A task that came to its end.
-
-    Parameters
-    ----------
-    result : object
-        What the task returned; None where it failed.
-    error : str, optional
-        Why it failed; None where it did not.
-    seconds : float
-        Wall-clock time of the task itself.
-    """
+    """A task that came to its end, with its result or why it failed, and how long it took."""
 
     name: str
     result: R | None
@@ -32,13 +22,7 @@ class Finished[R]:
 
 
 def attempt[I, R](function: Callable[[I], R], name: str, item: Callable[[], I]) -> Finished[R]:
-    """Run a task and keep whatever goes wrong with it.
-
-    Parameters
-    ----------
-    item : callable
-        Returns what `function` is called with.
-    """
+    """Run a task on what `item` returns, and keep whatever goes wrong with it."""
     began = time.perf_counter()
     try:
         result = function(item())

@@ -102,15 +102,7 @@ def _gather[I, R](
 
 
 class _Sent:
-    """The tasks that the scheduler has.
-
-    Parameters
-    ----------
-    call : callable
-        Called with a name and a sealed item.
-    window : int
-        How many it may have.
-    """
+    """The tasks that the scheduler has, a window of them; `call` takes a name and a sealed item."""
 
     def __init__(
         self, client: Client, call: Callable[[str, bytes], Finished[Any]], window: int
@@ -182,8 +174,6 @@ def _call[I, R](function: Callable[[I], R], name: str, sealed: bytes) -> Finishe
 def _local(workers: int) -> Iterator[Client]:
     """Start worker processes, spawned and of one thread each, which a nanny replaces if they die.
 
-    Notes
-    -----
     Dask gives them one thread of the linear algebra each. They end with this process, however it
     ends.
     """

@@ -6,14 +6,9 @@ from collections.abc import Callable, Iterator, Mapping
 
 
 class LateItems[S, I](Mapping[str, I]):
-    """A mapping whose values are read anew each time they are asked for.
+    """A mapping whose values are read anew from their sources each time they are asked for.
 
-    Parameters
-    ----------
-    sources : mapping of str to object
-        Where each item is, such as a path.
-    read : callable
-        Returns the item of a source; what it raises is the error of that task alone.
+    What `read` raises is the error of that task alone.
     """
 
     def __init__(self, sources: Mapping[str, S], read: Callable[[S], I]) -> None:

@@ -90,13 +90,7 @@ class Folders:
 
 
 def check_names(names: Iterable[str]) -> None:
-    """Check that every task can have a file of its name.
-
-    Raises
-    ------
-    CalibError
-        Naming the first that cannot.
-    """
+    """Check that every task can have a file of its name; a CalibError names one that cannot."""
     for name in names:
         if not _NAME.fullmatch(name) or name in ("failed", SECONDS, FAILED):
             raise CalibError(

@@ -28,16 +28,8 @@ type Progress = Callable[[int, int], None]
 class Outcome:
     """What came of some tasks, in the order in which they were given.
 
-    Parameters
-    ----------
-    done : tuple of str
-        Tasks whose result is there.
-    resumed : tuple of str
-        Those of `done` that were there before.
-    failed : mapping of str to str
-        The error of every task that failed.
-    seconds : mapping of str to float
-        Wall-clock time of each task of `done`, when it was done.
+    Tasks whose result is there, and those of them that were there before; errors of those that
+    failed; wall-clock time of each that is done, when it was done.
     """
 
     done: tuple[str, ...]

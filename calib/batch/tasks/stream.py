@@ -19,32 +19,18 @@ def completed[I, R](
 ) -> Generator[Finished[R]]:
     """Yield tasks as they come to their end, in any order.
 
-    Parameters
-    ----------
-    function : callable
-        Of a module, so that another process can import it; called with one item.
-    items : mapping of str to object
-        What each task works on, picklable. An item is asked for when its task is sent off, so the
-        mapping may read it only then; where that raises, the task has failed.
-    names : collection of str, optional
-        The tasks to do, in this order; all items by default.
-    workers : int
-        Processes on this machine; with 1 the tasks are done here, one after the other.
-    scheduler : str, optional
-        Address of a Dask scheduler, such as ``tcp://host:8786``, in the place of `workers`.
-    announce : callable, optional
-        Called with one line that says where the tasks are done.
+    The parameters are those of `calib.batch.tasks.run_tasks`, and `names`, the tasks to do, in this
+    order. An item is asked for when its task is sent off, so the mapping may read it only then;
+    where that raises, the task has failed.
+
+    What a task returns must not depend on where it is done: it takes every random number from a
+    stream of its own (`calib.inference.random`). A task whose worker dies is done again elsewhere;
+    one that takes its worker down every time fails.
 
     Raises
     ------
     CalibError
         If there is no such cluster, or it is lost.
-
-    Notes
-    -----
-    What a task returns must not depend on where it is done: it takes every random number from a
-    stream of its own (`calib.inference.random`). A task whose worker dies is done again elsewhere;
-    one that takes its worker down every time fails.
     """
     if workers < 1:
         raise CalibError(f"{workers} workers were asked for", allowed="1 or more")
