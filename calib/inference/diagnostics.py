@@ -34,23 +34,11 @@ class Convergence:
 
 
 def convergence(draws: Array) -> Convergence:
-    """Judge ensembles of walkers.
+    """Judge draws of ensembles, shape (ensembles, walkers, steps, d); NaN of fewer than four steps.
 
-    Parameters
-    ----------
-    draws : ndarray, shape (ensembles, walkers, steps, d)
-        Of an odd number of steps the first is left out.
-
-    Returns
-    -------
-    Convergence
-        NaN where draws are not finite or fewer than four steps.
-
-    Notes
-    -----
     Walkers of one ensemble are not independent chains, so R-hat compares whole ensembles: each is
-    one chain, its halves the earlier and the later steps. Effective sample sizes take each walker
-    as a chain, for autocorrelation runs along its steps.
+    one chain, its halves the earlier and the later steps, without the first of an odd number.
+    Effective sample sizes take each walker as a chain, for autocorrelation runs along its steps.
 
     References
     ----------
@@ -99,18 +87,9 @@ def _normal_scores(x: Array) -> Array:
 
 
 def autocorrelation_time(chain: Array, c: float = 5.0) -> Array:
-    """Integrated autocorrelation time in steps, as `emcee.autocorr.integrated_time`.
+    """Integrated autocorrelation time in steps, shape (walkers, steps, d) to (d,), as emcee's.
 
-    Parameters
-    ----------
-    chain : ndarray, shape (walkers, steps, d)
-    c : float
-        The window is the first that spans as many autocorrelation times (Sokal).
-
-    Returns
-    -------
-    ndarray, shape (d,)
-        NaN if a walker never moved.
+    The window is the first that spans five of them (Sokal). NaN if a walker never moved.
     """
     _, steps, d = chain.shape
     size = next_fast_len(2 * steps, real=True)
@@ -145,11 +124,8 @@ def mcse(chains: Array, method: Literal["mean", "sd", "median"]) -> Array:
 def tail_shape(chains: Array) -> Array:
     """Pareto shape k of the heavier tail of each parameter, (chains, draws, d) to (d,).
 
-    Moments up to 1/k exist: with k above 1/2 no variance, so no Monte Carlo error of a mean.
-
-    References
-    ----------
-    Vehtari et al. (2024), Pareto smoothed importance sampling, JMLR 25(72).
+    Moments up to 1/k exist: with k above 1/2 no variance, so no Monte Carlo error of a mean
+    (Vehtari et al. 2024, Pareto smoothed importance sampling, JMLR 25(72)).
     """
     with np.errstate(all="ignore"):
         return np.asarray(_stats().pareto_khat(chains, **_AXES))
@@ -164,16 +140,10 @@ def hdi(draws: Array, prob: float) -> tuple[float, float]:
 def hdi_error(batches: Array, prob: float) -> Array:
     """Monte Carlo standard errors of the ends of a highest-density interval, shape (2,).
 
-    Parameters
-    ----------
-    batches : ndarray, shape (g, m)
-        The draws in g nearly independent parts.
-
-    Notes
-    -----
-    The ends of a shortest interval converge with the cube root of the number of draws (Kim &
-    Pollard 1990, doi:10.1214/aos/1176347498), slower than the quantiles at which they lie: so do
-    the ends of the parts, whose scatter is scaled by that root.
+    From the draws in g nearly independent parts, shape (g, m). The ends of a shortest interval
+    converge with the cube root of the number of draws (Kim & Pollard 1990,
+    doi:10.1214/aos/1176347498), slower than the quantiles at which they lie: so do the ends of the
+    parts, whose scatter is scaled by that root.
     """
     ends = np.asarray(_stats().hdi(batches, prob, axis=-1))
     return np.asarray(ends.std(axis=0, ddof=1) / np.cbrt(batches.shape[0]))
@@ -187,9 +157,7 @@ def median_error(batches: Array) -> float:
 def psis(log_ratio: Array) -> tuple[Array, Array]:
     """Pareto-smoothed log weights (n, draws) of log ratios (n, draws), and the shapes k, (n,).
 
-    References
-    ----------
-    Vehtari et al. (2024), Pareto smoothed importance sampling, JMLR 25(72).
+    After Vehtari et al. (2024), Pareto smoothed importance sampling, JMLR 25(72).
     """
     # ArviZ takes log likelihoods, of which it forms the ratios of leave-one-out itself.
     log_weight, k = _stats().psislw(-log_ratio)
@@ -197,23 +165,10 @@ def psis(log_ratio: Array) -> tuple[Array, Array]:
 
 
 def power_scaled_weights(log_density: Array, alpha: float) -> Array:
-    """Smoothed weights that raise a part of the density to a power.
+    """Smoothed weights, of sum one, that raise a part of the density to a power `alpha`.
 
-    Parameters
-    ----------
-    log_density : ndarray, shape (chains, draws)
-        Of the prior, or of the likelihood, at each draw.
-    alpha : float
-        The power.
-
-    Returns
-    -------
-    ndarray, shape (chains, draws)
-        Of sum one.
-
-    References
-    ----------
-    Kallioinen et al. (2024), doi:10.1007/s11222-023-10366-5.
+    Shape (chains, draws), as the log density of that part, the prior or the likelihood, at each
+    draw. After Kallioinen et al. (2024), doi:10.1007/s11222-023-10366-5.
     """
     log_weight = np.asarray(_stats().power_scale_lw(log_density, alpha=alpha, axis=(0, 1)))
     weight = np.exp(log_weight - log_weight.max())
@@ -223,15 +178,9 @@ def power_scaled_weights(log_density: Array, alpha: float) -> Array:
 def power_sensitivity(
     draws: Array, weights: tuple[Array, Array], alphas: tuple[float, float]
 ) -> float:
-    """Distance that a marginal moves per doubling of the power.
+    """Distance that a marginal, draws (chains, draws), moves per doubling of the power.
 
-    Parameters
-    ----------
-    draws : ndarray, shape (chains, draws)
-    weights : tuple of ndarray
-        For the lower and for the upper power.
-    alphas : tuple of float
-        The two powers.
+    Weights are those for the lower and for the upper of two powers.
     """
     lower, upper = weights
     value = _stats().power_scale_sense(

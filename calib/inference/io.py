@@ -268,15 +268,7 @@ def _damage(path: Path) -> Iterator[None]:
 
 
 def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
-    """Return the problem of a run folder.
-
-    Parameters
-    ----------
-    meta : mapping
-        The content of its ``run.json``.
-    data : Path
-        Its ``data.csv``.
-    """
+    """Return the problem of a run folder from the content of its ``run.json`` and ``data.csv``."""
     model = get_model(meta["model"])
     if (data.parent / _EMULATOR).exists():
         model = emulated_model(model, load_emulator(data.parent / _EMULATOR)[1])

@@ -47,14 +47,8 @@ class _Tile:
 class Squares:
     """Sum of squared residuals of a bound model on fixed data.
 
-    Parameters
-    ----------
-    n_distinct : int
-        Distinct conditions.
-    within : float
-        Sum of squares of the repeats about their means.
-    threads : int
-        For large tasks; the result does not depend on it.
+    `within` is that of the repeats about their means. Threads are for large tasks; the result does
+    not depend on them.
     """
 
     bound: BoundModel
@@ -73,16 +67,7 @@ class Squares:
         *,
         threads: int | None = None,
     ) -> Squares:
-        """Arrange data for a bound model.
-
-        Parameters
-        ----------
-        bound : BoundModel
-        conditions : mapping of str to ndarray, shape (n,)
-        response : ndarray, shape (n,)
-        threads : int, optional
-            As many as processors by default.
-        """
+        """Arrange conditions and responses (n,) for a bound model, a thread for each processor."""
         distinct, mean, repeats, within = _distinct(conditions, response)
         tiles = tuple(
             _tile(bound, distinct, mean, repeats, rows) for rows in _blocks(distinct, mean.size)
@@ -94,18 +79,7 @@ class Squares:
         return {**self.__dict__, "_spare": []}
 
     def __call__(self, theta: Array) -> Array:
-        """Evaluate.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (k, d)
-            Natural parameters of the model.
-
-        Returns
-        -------
-        ndarray, shape (k,)
-            NaN where the model has no value.
-        """
+        """Evaluate natural parameters of the model, (k, d) to (k,); NaN where it has no value."""
         sums = np.empty((len(self.tiles), theta.shape[0]))
 
         def work(i: int) -> None:
@@ -166,16 +140,8 @@ def _distinct(
 ) -> tuple[dict[str, Array], Array, Array | None, float]:
     """Merge the repeats; long data come back sorted by the condition of fewest values.
 
-    Returns
-    -------
-    distinct : dict of ndarray, shape (m,)
-        Distinct conditions.
-    mean : ndarray, shape (m,)
-        Mean response at each.
-    repeats : ndarray, shape (m,), optional
-        Rows at each; None if no condition was repeated.
-    within : float
-        Sum of squares about the means.
+    Return the distinct conditions and, of the rows at each, the mean response and the number (None
+    if none was repeated), all of shape (m,); and the sum of squares about the means.
     """
     n = response.size
     levels = [np.unique(v, return_inverse=True) for v in conditions.values()]

@@ -51,11 +51,7 @@ source = "This project: weak, and as ready to fall as to grow"
 class NoiseChoice:
     """What a prior file says of the noise.
 
-    Parameters
-    ----------
-    family : {"normal", "student_t"}
-    depends_on : str
-        A quantity or its canonical column; empty for one scale at all conditions.
+    It may depend on a quantity, or its canonical column; empty for one scale at all conditions.
     """
 
     family: Family = "normal"
@@ -80,12 +76,7 @@ USUAL = NoiseChoice()
 class Noise:
     """A choice of noise on some data.
 
-    Parameters
-    ----------
-    column : str
-        The condition that the scale depends on, if any.
-    centre, spread : float
-        Its mean and sd over the rows that are calibrated on.
+    Of the condition that the scale depends on, if any: its mean and sd over the calibrated rows.
     """
 
     choice: NoiseChoice = USUAL
@@ -99,13 +90,7 @@ class Noise:
         return self.choice.usual
 
     def must_be_usual(self, source: str, what: str) -> None:
-        """Refuse any other noise for what is worked out for the usual one alone.
-
-        Raises
-        ------
-        CalibError
-            If it is another.
-        """
+        """Refuse, with a CalibError, any other for what is worked out for the usual noise alone."""
         if not self.usual:
             raise CalibError(
                 f"{what} takes normal noise of one standard deviation only",
@@ -176,14 +161,7 @@ NORMAL = Noise()
 
 
 def noise_of(choice: NoiseChoice, conditions: Conditions, source: str) -> Noise:
-    """Return a choice of noise on the rows that are calibrated on.
-
-    Parameters
-    ----------
-    conditions : mapping of str to ndarray, shape (n,)
-        Of the model.
-    source : str
-        The prior file's name, for the message.
+    """Return a choice of noise on the rows, (n,), that are calibrated on.
 
     Raises
     ------

@@ -212,12 +212,7 @@ def read_priors(
 
 
 def prior_references(columns: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
-    """Return the scales that priors may be relative to: medians of columns, where positive.
-
-    Parameters
-    ----------
-    columns : mapping of str to ndarray, shape (n,)
-    """
+    """Return the scales that priors may be relative to: medians of columns (n,), where positive."""
     medians = {
         name: float(np.median(values[np.isfinite(values)]))
         for name, values in columns.items()
@@ -227,13 +222,7 @@ def prior_references(columns: Mapping[str, NDArray[np.float64]]) -> dict[str, fl
 
 
 def relative_columns(text: str) -> dict[str, float]:
-    """Return the columns that priors are relative to, and what is assumed where one is not there.
-
-    Parameters
-    ----------
-    text : str
-        Of a prior file that was read.
-    """
+    """Return the columns that priors are relative to, and what is assumed without one."""
     entries = tomllib.loads(text)["parameters"].values()
     return {
         e["relative_to"]: float(e.get("default_reference", 1.0))

@@ -26,18 +26,14 @@ type Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Prior:
-    """One parameter's prior in internal coordinates.
+    """One parameter's prior in internal coordinates: what it is, why, after whom, and in words.
 
     Parameters
     ----------
-    name, unit, reason, source, text : str
-        What it is, why, after whom, and the distribution in words.
     log : bool
         Whether the internal coordinate is the logarithm.
     loc, scale : float
         Of the normal; an infinite scale makes it uniform between the bounds, zero fixes it.
-    lower, upper : float
-        Bounds of the internal coordinate.
     gamma : tuple of (float, float), optional
         Shape and rate of a gamma distribution, whose internal coordinate is the logarithm; `loc`
         and `scale` are then the mean and sd of that.
@@ -65,16 +61,8 @@ class Prior:
 class Priors:
     """The joint prior of a problem, evaluated on the free parameters.
 
-    Parameters
-    ----------
-    entries : tuple of Prior
-        In the order of the model's parameters, the noise scale ``sigma`` last.
-    text : str
-        The TOML it was read from.
-    source : str
-        The file's name.
-    noise : NoiseChoice
-        What it says of the noise.
+    Entries stand in the order of the model's parameters, others of the noise and its scale
+    ``sigma`` last; text and source are those of the TOML file they were read from.
     """
 
     entries: tuple[Prior, ...]
@@ -123,17 +111,7 @@ class Priors:
         return float(np.where(normal, normals, uniforms).sum())
 
     def log_prob(self, t: Array) -> Array:
-        """Log prior density of internal coordinates.
-
-        Parameters
-        ----------
-        t : ndarray, shape (k, d)
-
-        Returns
-        -------
-        ndarray, shape (k,)
-            ``-inf`` outside the bounds.
-        """
+        """Log prior density of internal coordinates, (k, d) to (k,); ``-inf`` outside bounds."""
         loc, _, lower, upper, precision = self._arrays
         z = (t - loc) * precision
         inside = ((t >= lower) & (t <= upper)).all(axis=1)

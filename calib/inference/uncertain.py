@@ -17,21 +17,10 @@ from calib.models.base import Array
 
 
 def log_normal(residuals: Array, sigma: Array, variances: Array, curves: Array) -> Array:
-    """Evaluate the log density.
+    """Evaluate the log density of residuals (k, n), shape (k,); NaN where one is.
 
-    Parameters
-    ----------
-    residuals : ndarray, shape (k, n)
-    sigma : ndarray, shape (k,)
-        Sd of the noise.
-    variances : ndarray, shape (k, j)
-        Of the coefficients of the prediction's error.
-    curves : ndarray, shape (n, j)
-
-    Returns
-    -------
-    ndarray, shape (k,)
-        NaN where a residual is.
+    The noise has an sd (k,), the coefficients of the prediction's error, along curves (n, j), have
+    variances (k, j).
     """
     n = residuals.shape[1]
     squares = np.einsum("kn,kn->k", residuals, residuals)

@@ -26,7 +26,7 @@ def choose_nodes(
     *,
     across_zero: bool = False,
 ) -> dict[str, Array]:
-    """Choose nodes.
+    """Choose the conditions of every run: the distinct recorded ones, then others between them.
 
     Parameters
     ----------
@@ -39,11 +39,6 @@ def choose_nodes(
     across_zero : bool
         Whether the margin may change a condition's sign, as a slip's does with another rolling
         radius: many formulas and some simulators end there.
-
-    Returns
-    -------
-    dict of str to ndarray, shape (m,)
-        The distinct recorded conditions first, others in the largest gaps between them.
     """
     columns = tuple(recorded[0])
     rows = np.concatenate([np.stack([r[c] for c in columns], axis=1) for r in recorded])
@@ -80,13 +75,11 @@ def _box(
             continue
         span = QUANTITIES[column].range
         least = max(span.low, 0.0 if low[i] >= 0.0 and not across_zero else -np.inf)
-        low[i] = max(low[i] - wide[i], min(least, low[i]), _positive(span.low_open, low[i]))
+        low[i] = max(
+            low[i] - wide[i], min(least, low[i]), 0.5 * low[i] if span.low_open else -np.inf
+        )
         high[i] = min(high[i] + wide[i], span.high)
     return low, high
-
-
-def _positive(open_: bool, low: float) -> float:
-    return 0.5 * low if open_ else -np.inf
 
 
 def _between(inside: Array, varying: NDArray[np.bool_], more: int) -> tuple[Array, Array]:

@@ -108,15 +108,7 @@ def prepare(
 ) -> Emulation | None:
     """Emulate a model's simulator if it has to be, for all that this process does from now on.
 
-    Parameters
-    ----------
-    table : Table
-        What it is calibrated on.
-
-    Returns
-    -------
-    Emulation, optional
-        None for a model that is none of a slow simulator.
+    For the calibration on `table`; None for a model that is none of a slow simulator.
     """
     found = simulated_by(model)
     if found is None or not found.simulator.emulate:
@@ -138,21 +130,9 @@ def prepare_field(
     workers: int = 1,
     progress: Progress | None = None,
 ) -> Emulation | None:
-    """Have an emulator in use serve a field campaign as well.
+    """Have an emulator in use serve a field campaign as well, with `more` runs at the most.
 
-    Parameters
-    ----------
-    model : str
-        One that is an emulator by now.
-    field : Table
-        Rows that have the output.
-    more : int
-        Runs at most.
-
-    Returns
-    -------
-    Emulation, optional
-        None where no run can be made: of no slow simulator, or of a table of runs.
+    None where no run can be made: of no slow simulator, or of a table of runs.
     """
     found, emulator = simulated_by(model), emulator_of(get_model(model))
     if found is None or emulator is None or not found.simulator.way.runs:

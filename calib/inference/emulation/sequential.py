@@ -51,20 +51,7 @@ def emulate(
 ) -> Emulation:
     """Emulate the simulator of a problem as well as its posterior needs it.
 
-    Parameters
-    ----------
-    problem : Problem
-    keeper : RunKeeper
-    seed : int
-        Same seed, same runs, same emulator.
-    settings : EmulationSettings, optional
-    elsewhere : sequence of mapping of str to ndarray
-        Conditions that will be predicted beside those of the data.
-
-    Returns
-    -------
-    Emulation
-        Read ``passed`` before use.
+    Read ``passed`` before use. `elsewhere` has conditions that will be predicted beside the data's.
 
     Raises
     ------
@@ -92,22 +79,8 @@ def extend(
 ) -> Emulation:
     """Make runs where another problem of the same simulator needs them, a field campaign's.
 
-    Parameters
-    ----------
-    emulator : Emulator
-        That serves the calibration; where it is good it stays so.
-    problem : Problem
-        The same model and priors with the rows of the field.
-    keeper : RunKeeper
-    seed : int
-    settings : EmulationSettings, optional
-    more : int
-        Runs at most.
-
-    Returns
-    -------
-    Emulation
-        Its runs are the new ones.
+    It has the same model and priors. Where the emulator, which serves the calibration, is good it
+    stays so. The emulation's runs are the new ones, `more` at the most.
     """
     state = State.beyond(emulator, problem, keeper, seed)
     return _improved(state, settings or EmulationSettings(), more, 0.0)

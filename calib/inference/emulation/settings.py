@@ -47,17 +47,9 @@ class EmulationSettings:
 class HeldOut:
     """The emulator against runs that it had not seen, at draws of the posterior.
 
-    Parameters
-    ----------
-    rmse : float
-        Error over runs and rows, in sds of the noise.
-    z : ndarray
-        Errors of the coefficients in their predicted sds.
-    pit : ndarray
-        Where the true coefficients lie in their predicted distributions; even from 0 to 1 if the
-        emulator knows its error.
-    covered : float
-        Share of the coefficients within their central 90 % intervals.
+    The rms error is over runs and rows, in sds of the noise. `z` are errors of the coefficients in
+    their predicted sds, `pit` where these lie in their predicted distributions (even from 0 to 1 if
+    the emulator knows its error), `covered` the share within central 90 % intervals.
     """
 
     runs: int

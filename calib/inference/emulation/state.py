@@ -29,17 +29,7 @@ _NEGLIGIBLE = 0.003
 
 
 class State:
-    """What is known so far.
-
-    Parameters
-    ----------
-    problem : Problem
-        Whose posterior the emulator is to serve.
-    nodes : mapping of str to ndarray, shape (m,)
-        Conditions of every run.
-    label : str
-        Names the random streams.
-    """
+    """What is known so far for a problem's posterior; `nodes` (m,) are conditions of each run."""
 
     def __init__(
         self, problem: Problem, keeper: RunKeeper, nodes: Mapping[str, Array], seed: int,

@@ -29,13 +29,7 @@ _LEAST = 8
 def emulate_table(
     problem: Problem, simulator: Simulator, seed: int, settings: EmulationSettings
 ) -> Emulation:
-    """Emulate from a table; every fifth run checks the emulator before it is taken in.
-
-    Raises
-    ------
-    CalibError
-        If the table lacks a column, has too few runs, or they have different conditions.
-    """
+    """Emulate from a table; every fifth run checks the emulator before it is taken in."""
     training = read_runs(simulator, problem)
     state = State(problem, RunKeeper(simulator), training.nodes, seed)
     state.runs = [

@@ -66,17 +66,9 @@ class PointEstimate:
 
 
 def residuals(problem: Problem, natural: Array) -> Array:
-    """Observed minus predicted on the scale of the response, in chunks.
+    """Observed minus predicted on the scale of the response, in chunks, shape (k, d_all) to (k, n).
 
-    Parameters
-    ----------
-    natural : ndarray, shape (k, d_all)
-        Natural parameters, the noise scale last.
-
-    Returns
-    -------
-    ndarray, shape (k, n)
-        NaN where the model has no value.
+    Natural parameters have the noise scale last. NaN where the model has no value.
     """
     k, n = natural.shape[0], problem.response.size
     at_once = max(1, _CHUNK_CELLS // n)
@@ -91,10 +83,7 @@ def residuals(problem: Problem, natural: Array) -> Array:
 def sum_of_squares(problem: Problem, natural: Array) -> Array:
     """Sum of squared residuals (Eqs 10 and 16), shape (k,); ``inf`` where there is no value.
 
-    Parameters
-    ----------
-    natural : ndarray, shape (k, d_all)
-        Natural parameters, the noise scale last.
+    Of natural parameters (k, d_all), the noise scale last.
     """
     cost = problem.squares(problem.of_model(natural))
     cost[np.isnan(cost)] = np.inf
@@ -112,17 +101,9 @@ def goodness(
     converged: bool = True,
     notes: Sequence[str] = (),
 ) -> PointEstimate:
-    """Complete an estimate with its cost, RMSE and R².
+    """Complete an estimate (d_model,) with its cost, RMSE and R².
 
-    Parameters
-    ----------
-    theta : ndarray, shape (d_model,)
-    n_fitted : int
-        Number of parameters fitted: those held or fixed do not count.
-    n_evaluations, seconds, converged
-        As in `PointEstimate`.
-    notes : sequence of str
-        Joined to the note; empty ones are left out.
+    Parameters held or fixed do not count as fitted; notes that are empty are left out.
     """
     cost = float(sum_of_squares(problem, theta[None])[0])
     y = problem.response

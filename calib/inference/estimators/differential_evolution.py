@@ -28,16 +28,8 @@ def estimate_differential_evolution(
 ) -> PointEstimate:
     """Minimise the sum of squares by `scipy.optimize.differential_evolution`.
 
-    A generation is one batched model evaluation.
-
-    Parameters
-    ----------
-    box : mapping of str to (lower, upper), optional
-        As for `calib.inference.estimators.search.search_space`.
-    polish : bool
-        Whether L-BFGS-B follows.
-    tol, popsize, maxiter
-        As in SciPy, whose defaults they have.
+    A generation is one batched model evaluation. The box is as for
+    `calib.inference.estimators.search.search_space`, the other settings are SciPy's.
     """
 
     def minimise(space: SearchSpace) -> Found:

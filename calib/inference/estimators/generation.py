@@ -87,14 +87,8 @@ class GeneticSettings:
 class GeneticDraws(NamedTuple):
     """The random numbers of some generations, each array with a leading axis of generations.
 
-    Parameters
-    ----------
-    first, second : ndarray of int, shape (g, NP)
-        r1 and r2 of each parent.
-    crossed : ndarray of bool, shape (g, NP, d)
-        Genes taken from the disturbing vector.
-    mutation : ndarray, shape (g, NP, d)
-        Amounts in units of the box; zero for genes that do not mutate.
+    r1 and r2 of each parent, (g, NP); whether a gene is the disturbing vector's, (g, NP, d);
+    amounts of mutation in units of the box, (g, NP, d), zero for genes that do not mutate.
     """
 
     first: NDArray[np.intp]
@@ -122,20 +116,9 @@ def draw_generations(
 def descendants(
     population: Array, best: Array, draws: GeneticDraws, F: float, lower: Array, upper: Array
 ) -> Array:
-    """Make the descendants of one generation (Eq 11, crossover, mutation).
+    """Make the descendants of one generation (Eq 11, crossover, mutation), shape (NP, d).
 
-    Parameters
-    ----------
-    population : ndarray, shape (NP, d)
-    best : ndarray, shape (d,)
-    draws : GeneticDraws
-        Of this generation, without the leading axis.
-    lower, upper : ndarray, shape (d,)
-        The search box.
-
-    Returns
-    -------
-    ndarray, shape (NP, d)
+    `draws` are of this generation, without the leading axis; `lower` and `upper` (d,) are the box.
     """
     disturbing = best + F * (population.take(draws.first, 0) - population.take(draws.second, 0))
     child = np.where(draws.crossed, disturbing, population)

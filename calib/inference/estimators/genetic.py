@@ -32,13 +32,8 @@ _BLOCK = 32
 class GeneticResult(NamedTuple):
     """What `minimise_genetic` returns.
 
-    Parameters
-    ----------
-    x : ndarray, shape (d,)
-    history : ndarray, shape (generations + 1,)
-        Lowest cost of the first population and after each generation.
-    converged : bool
-        Whether the population converged before the last iteration.
+    `x` (d,), and the lowest cost of the first population and after each generation. Converged is a
+    population that agrees before the last iteration.
     """
 
     x: Array
@@ -55,16 +50,10 @@ def minimise_genetic(
     rng: np.random.Generator,
     settings: GeneticSettings | None = None,
 ) -> GeneticResult:
-    """Minimise a cost over a box.
+    """Minimise a cost over a box, shapes (d,), in which the first population is drawn uniformly.
 
-    Parameters
-    ----------
-    cost : callable
-        ``(k, d) -> (k,)``, ``inf`` where it has no value; called once per generation.
-    lower, upper : ndarray, shape (d,)
-        The search box, in which the first population is drawn uniformly.
-    settings : GeneticSettings, optional
-        Table 2 by default.
+    The cost ``(k, d) -> (k,)``, ``inf`` where it has no value, is called once per generation;
+    settings are Table 2's by default.
 
     References
     ----------
@@ -163,12 +152,10 @@ def estimate_genetic(
     restarts: int = 0,
     polish: bool = False,
 ) -> PointEstimate:
-    """Minimise the sum of squares by the genetic algorithm of the source.
+    """Minimise the sum of squares by the genetic algorithm of the source, Table 2 by default.
 
     Parameters
     ----------
-    settings : GeneticSettings, optional
-        Table 2 by default.
     box : mapping of str to (lower, upper), optional
         As for `calib.inference.estimators.search.search_space`.
     restarts : int

@@ -13,6 +13,7 @@ from scipy.linalg import qr
 
 from calib.inference.estimators.base import residuals
 from calib.inference.problem import Problem
+from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 
 # A parameter is flat if one prior standard deviation of it moves the predictions, as far as the
@@ -20,16 +21,6 @@ from calib.models.base import Array
 _FLAT = 1e-6
 _N_POINTS = 8
 _STEP = 1e-4
-
-
-def widths(problem: Problem) -> Array:
-    """Prior sd (uniform: a quarter of the range) of the internal coordinates, shape (n_dim,)."""
-    return np.array(
-        [
-            p.scale if np.isfinite(p.scale) else 0.25 * (p.upper - p.lower)
-            for p in problem.priors.free
-        ]
-    )
 
 
 def location(problem: Problem) -> Array:
@@ -63,14 +54,9 @@ def hold_unidentified(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     """Hold the noise's parameters and every parameter that the data do not determine.
 
     The rank of the Jacobian of the predictions is taken at the prior's centre and at a few points
-    around it; a parameter is given up only if it is flat, or imitated by the others, at all.
-
-    Returns
-    -------
-    held_problem : Problem
-        Whose free coordinates are the parameters to fit; the noise scale is fixed at one.
-    held : tuple of str
-        Names of the parameters held at their prior location.
+    around it; a parameter is given up only if it is flat, or imitated by the others, at all. Return
+    the problem whose free coordinates are to be fitted, the noise scale fixed at one, and the names
+    of those held at their prior location.
     """
     entries = problem.priors.entries[len(problem.bound.model.parameters) :]
     # Their values do not enter a sum of squares.
@@ -87,7 +73,7 @@ def hold_unidentified(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
 
 
 def _flat_at_points(problem: Problem) -> list[tuple[int, ...]]:
-    d, width, centre = problem.n_dim, widths(problem), location(problem)
+    d, width, centre = problem.n_dim, prior_widths(problem.priors), location(problem)
     # A low-discrepancy sequence in the middle of the prior: the answer needs no random numbers.
     ratio = (1.0 + np.sqrt(5.0)) / 2.0
     steps = np.mod(np.outer(np.arange(1, _N_POINTS + 1), ratio ** -np.arange(1, d + 1)), 1.0)

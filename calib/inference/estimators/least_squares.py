@@ -15,10 +15,10 @@ from calib.inference.estimators.identified import (
     hold_unidentified,
     location,
     representative_rows,
-    widths,
 )  # fmt: skip
 from calib.inference.estimators.search import edge_notes, held_note
 from calib.inference.problem import Problem
+from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 
 # Relative step of the central differences, in prior standard deviations.
@@ -38,7 +38,7 @@ class _Descent:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        self.location, self.width = location(problem), widths(problem)
+        self.location, self.width = location(problem), prior_widths(problem.priors)
         self.lower = (np.array([p.lower for p in problem.priors.free]) - self.location) / self.width
         self.upper = (np.array([p.upper for p in problem.priors.free]) - self.location) / self.width
         self.n_evaluations = 0
@@ -83,17 +83,10 @@ def estimate_least_squares(
 ) -> PointEstimate:
     """Minimise the sum of squares from many starts.
 
-    Prior draws are screened in one batched evaluation, in `n_polish` groups; the best of each
-    group is polished by SciPy's trust-region reflective method. The prior's bounds hold;
-    otherwise the prior only supplies the starts. Of more than a few thousand rows a
-    representative part is used, and the best of what is found is polished on all of them.
-
-    Parameters
-    ----------
-    n_screen : int
-        Prior draws.
-    n_polish : int
-        Starts that are polished.
+    Prior draws are screened in one batched evaluation, in `n_polish` groups; the best of each group
+    is polished by SciPy's trust-region reflective method. The prior's bounds hold; otherwise the
+    prior only supplies the starts. Of more than a few thousand rows a representative part is used,
+    and the best of what is found is polished on all of them.
     """
     clock = time.perf_counter()
     reduced, held = hold_unidentified(problem)

@@ -16,8 +16,6 @@ from calib.inference.estimators.identified import central_interval, hold_unident
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-# Sampled parameters of the Magic Formula at one pressure, and what the source searches instead.
-
 type Box = Mapping[str, tuple[float, float]]
 
 
@@ -32,12 +30,10 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class SearchSpace:
-    """Coordinates, box and cost of a search.
+    """Coordinates, box and cost of a search for the free parameters of a problem.
 
     Parameters
     ----------
-    problem : Problem
-        Whose free parameters are searched.
     names : tuple of str
         The coordinates; ``B`` and ``E`` in the place of ``K`` and ``G`` for the Magic Formula at
         one pressure, as in the source.
@@ -91,15 +87,10 @@ class SearchSpace:
 def search_space(problem: Problem, box: Box | None = None) -> SearchSpace:
     """Return the space in which a population method searches.
 
-    Parameters
-    ----------
-    problem : Problem
-        With the noise scale and undetermined parameters held.
-    box : mapping of str to (lower, upper), optional
-        Bounds in natural units that replace the default of some coordinates. By default B from
-        0.001 to 0.5 per percent, C from 1 to 2, D from 0 to twice the largest pull and E from
-        -30 to 1 for the Magic Formula at one pressure; for all other parameters the central
-        99.8 % interval of the prior.
+    The problem has the noise scale and undetermined parameters held. A box replaces the bounds, in
+    natural units, of some coordinates: by default B from 0.001 to 0.5 per percent, C from 1 to 2, D
+    from 0 to twice the largest pull and E from -30 to 1 for the Magic Formula at one pressure; for
+    all other parameters the central 99.8 % interval of the prior.
 
     Raises
     ------
@@ -162,15 +153,7 @@ def edge_notes(names: tuple[str, ...], x: Array, lower: Array, upper: Array, wha
 def search_in_box(
     problem: Problem, method: str, box: Box | None, minimise: Callable[[SearchSpace], Found]
 ) -> PointEstimate:
-    """Hold what the data do not determine, search the rest, and complete the estimate.
-
-    Parameters
-    ----------
-    box : mapping of str to (lower, upper), optional
-        As for `search_space`.
-    minimise : callable
-        The search.
-    """
+    """Hold what the data do not determine, search the rest, and complete the estimate."""
     clock = time.perf_counter()
     reduced, held = hold_unidentified(problem)
     space = search_space(reduced, box)

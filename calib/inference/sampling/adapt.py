@@ -43,12 +43,8 @@ class Guess:
 class Assessment:
     """What importance sampling from a proposal says of it and of the density.
 
-    Parameters
-    ----------
-    log_evidence : float
-        Log of the density's integral.
-    efficiency : float
-        Effective fraction of the draws, in (0, 1]; zero if the density was zero at all of them.
+    The log of the density's integral, and the effective fraction of the draws, in (0, 1]; zero if
+    the density was zero at all of them.
     """
 
     log_evidence: float
@@ -58,24 +54,11 @@ class Assessment:
 def adapt(
     log_prob: LogProb, guesses: Sequence[Guess], rng: np.random.Generator, planned: int = 0
 ) -> tuple[Proposal, Assessment]:
-    """Fit a proposal to a density by adaptive importance sampling.
+    """Fit a proposal to an unnormalised density ``(k, d) -> (k,)`` by adaptive importance sampling.
 
     Every round draws from the proposal that all rounds before it made, and ends the work if it
-    resembles the density well enough.
-
-    Parameters
-    ----------
-    log_prob : callable
-        ``(k, d) -> (k,)``, unnormalised.
-    guesses : sequence of Guess
-        One for each mode that is known.
-    planned : int
-        Draws that the chains are to have at first.
-
-    Returns
-    -------
-    Assessment
-        By the last round's draws.
+    resembles the density well enough; the assessment is by the last round's draws. There is a guess
+    for each mode that is known; the chains are to have `planned` draws at first.
     """
     d = guesses[0].mean.size
     first = Mixture(
@@ -108,14 +91,7 @@ def refit(
     effective: float,
     rng: np.random.Generator,
 ) -> tuple[Proposal, Assessment]:
-    """Fit a proposal to draws of a chain that did not converge with the old one.
-
-    Parameters
-    ----------
-    draws : ndarray, shape (k, d)
-    effective : float
-        What the draws are worth.
-    """
+    """Fit a proposal to draws (k, d), worth so many, of a chain that the old one left short."""
     weight = np.full(draws.shape[0], 1.0 / draws.shape[0])
     proposal = fit_proposal(old, draws, weight, effective, 1.0, rng)
     fresh, log_q = proposal.draw(rng, _ROUNDS[-2] * (draws.shape[1] + 5))
@@ -123,17 +99,9 @@ def refit(
 
 
 def tempered_moments(draws: Array, log_weight: Array) -> tuple[Array, Array] | None:
-    """Mean and Cholesky factor of weighted draws, weights flattened where few draws carry them.
+    """Mean (d,) and Cholesky factor (d, d) of weighted draws (k, d); None if they are degenerate.
 
-    Parameters
-    ----------
-    draws : ndarray, shape (k, d)
-    log_weight : ndarray, shape (k,)
-
-    Returns
-    -------
-    tuple of ndarray, shapes (d,) and (d, d), or None
-        None where the draws are degenerate.
+    Log weights (k,) are flattened where few draws carry them.
     """
     total = logsumexp(log_weight)
     if not np.isfinite(total):

@@ -29,28 +29,19 @@ def climb(
     steps: int = 60,
     tolerance: float = 1e-4,
 ) -> tuple[Array, Array]:
-    """Climb from every start to near a local maximum, inside bounds.
+    """Climb from every start (m, d) to near a local maximum; return where and how high it is.
 
-    BFGS with gradients by central differences; of eight lengths along each direction the best is
-    taken, at most one `width` long.
+    BFGS with gradients by central differences inside bounds (d,); of eight lengths along each
+    direction the best is taken, at most one `width` long.
 
     Parameters
     ----------
     log_prob : callable
         ``(k, d) -> (k,)``; ``-inf`` where it is not allowed.
-    starts : ndarray, shape (m, d)
     width : ndarray, shape (d,)
         A length over which each coordinate matters (its prior sd).
-    lower, upper : ndarray, shape (d,)
     tolerance : float
         In log density: an ascent that gains less in a step, and expects less, stops.
-
-    Returns
-    -------
-    ndarray, shape (m, d)
-        Where each ascent ended.
-    ndarray, shape (m,)
-        Log density there.
     """
     d = width.size
     low, high = lower / width, upper / width

@@ -15,20 +15,10 @@ type LogProb = Callable[[Array], Array]
 
 
 def hessian_scale(log_prob: LogProb, mode: Array, width: Array) -> Array:
-    """Covariance of the normal approximation at a mode, by central differences.
+    """Covariance (d, d) of the normal approximation at a mode (d,), by central differences.
 
-    Parameters
-    ----------
-    log_prob : callable
-        ``(k, d) -> (k,)``.
-    mode : ndarray, shape (d,)
-    width : ndarray, shape (d,)
-        A length over which each coordinate matters (its prior sd); the step is found from it.
-
-    Returns
-    -------
-    ndarray, shape (d, d)
-        Positive definite: directions in which the density does not fall are given `width`.
+    Their step is found from `width` (d,), a length over which each coordinate matters (its prior
+    sd). Positive definite: directions in which the density does not fall are given that width.
     """
     d = mode.size
     step = _unit_drop_steps(log_prob, mode, width)

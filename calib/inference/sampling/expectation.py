@@ -48,19 +48,9 @@ def fit_mixture(
     effective: float,
     rng: np.random.Generator,
 ) -> Mixture:
-    """Fit a mixture to weighted draws of known moments.
+    """Fit a mixture to weighted draws (k, d), weights (k,) of sum 1, of known `moments`.
 
-    Parameters
-    ----------
-    v : ndarray, shape (k, d)
-    weight : ndarray, shape (k,)
-        Of sum 1.
-    mean, cholesky : ndarray, shapes (d,) and (d, d)
-        Their `moments`.
-    effective : float
-        What the draws are worth: it limits the number of components.
-    rng : Generator
-        Picks the draws at which components start.
+    What the draws are worth limits the number of components; these start at draws picked at random.
     """
     d = mean.size
     m = int(np.clip(effective / (_DRAWS_PER_ENTRY * d**2), 1, _MOST_COMPONENTS))

@@ -12,18 +12,8 @@ from calib.models.base import Array
 class Gate:
     """What a set of ensembles must reach, for every parameter.
 
-    Parameters
-    ----------
-    rhat_max : float
-        Largest rank-normalised split R-hat between ensembles.
-    ess_min : float
-        Smallest bulk and tail effective sample size.
-    taus_min : float
-        Shortest chain in integrated autocorrelation times.
-
-    References
-    ----------
-    Vehtari et al. (2021), doi:10.1214/20-BA1221.
+    Rank-normalised split R-hat between ensembles (Vehtari et al. 2021, doi:10.1214/20-BA1221), bulk
+    and tail effective sample size, and length in integrated autocorrelation times.
     """
 
     rhat_max: float = 1.01
@@ -54,22 +44,10 @@ def judge(
     steps: int | None = None,
     min_ensembles: int = 4,
 ) -> GateReport:
-    """Judge draws of independently seeded ensembles.
+    """Judge draws of independently seeded ensembles, shape (ensembles, walkers, steps, d).
 
-    Parameters
-    ----------
-    draws : ndarray, shape (ensembles, walkers, steps, d)
-    names : tuple of str, length d
-    tau : ndarray, shape (d,)
-        Integrated autocorrelation time in steps, the worst of the ensembles.
-    steps : int, optional
-        Length of the chain that was run; that of `draws` if it is not thinned.
-    min_ensembles : int
-        Fewer cannot be compared.
-
-    See Also
-    --------
-    calib.inference.diagnostics.convergence : How R-hat and effective sample sizes are taken.
+    `tau` (d,) is the integrated autocorrelation time in steps, the worst of the ensembles; `steps`
+    the length of the chain that was run, that of the draws if it is not thinned.
     """
     ensembles = draws.shape[0]
     steps = draws.shape[2] if steps is None else steps

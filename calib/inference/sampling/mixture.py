@@ -13,16 +13,7 @@ from calib.models.base import Array
 
 @dataclass(frozen=True)
 class StudentT:
-    """A multivariate Student-t.
-
-    Parameters
-    ----------
-    mean : ndarray, shape (d,)
-    cholesky : ndarray, shape (d, d)
-        Lower factor of the scale matrix.
-    dof : float
-        Degrees of freedom.
-    """
+    """A multivariate Student-t: mean (d,), lower factor of the scale matrix (d, d), and dof."""
 
     mean: Array
     cholesky: Array
@@ -57,13 +48,7 @@ class StudentT:
 
 @dataclass(frozen=True)
 class Mixture:
-    """A mixture of Student-t components.
-
-    Parameters
-    ----------
-    weights : ndarray, shape (m,)
-    components : tuple of StudentT, length m
-    """
+    """A mixture of m Student-t components with weights (m,)."""
 
     weights: Array
     components: tuple[StudentT, ...]

@@ -36,27 +36,14 @@ def find_mode(
     n_screen: int = 400,
     n_climb: int = 16,
 ) -> Array:
-    """Return the highest mode of a posterior in internal coordinates, shape (d,).
-
-    Parameters
-    ----------
-    log_prob, priors, rng, starts, n_screen, n_climb
-        As for `find_modes`.
-    """
+    """Return the highest of `find_modes` in internal coordinates, shape (d,)."""
     modes = find_modes(log_prob, priors, rng, starts=starts, n_screen=n_screen, n_climb=n_climb)
     return modes[0].t
 
 
 @dataclass(frozen=True)
 class Mode:
-    """A mode of a posterior.
-
-    Parameters
-    ----------
-    t : ndarray, shape (d,)
-    covariance : ndarray, shape (d, d)
-        Of the normal with the curvature there.
-    """
+    """A mode of a posterior, (d,), and the covariance of the normal with the curvature there."""
 
     t: Array
     log_prob: float
@@ -81,21 +68,13 @@ def find_modes(
     n_screen: int = 400,
     n_climb: int = 16,
 ) -> list[Mode]:
-    """Return the modes of a posterior that were found, the highest first.
+    """Return the modes of a posterior ``(k, d) -> (k,)`` that were found, the highest first.
 
-    The given starts and the best of each group of prior draws climb together, a batch of
-    quasi-Newton ascents. The highest is polished by L-BFGS-B, with gradients by central
-    differences; so is each of the others that neither lies in its neighbourhood nor far below it.
-    A sampler that knows one mode only may miss another whatever its own diagnostics say.
-
-    Parameters
-    ----------
-    log_prob : callable
-        ``(k, d) -> (k,)``.
-    starts : ndarray, shape (m, d), optional
-        Point estimates, in internal coordinates.
-    n_screen, n_climb : int
-        Prior draws screened (if zero, only the given starts climb), and how many of them climb.
+    The given starts (m, d) and the best of each of `n_climb` groups of prior draws climb together,
+    a batch of quasi-Newton ascents; if none are screened, only the given starts climb. The highest
+    is polished by L-BFGS-B, with gradients by central differences; so is each of the others that
+    neither lies in its neighbourhood nor far below it. A sampler that knows one mode only may miss
+    another whatever its own diagnostics say.
     """
     width = prior_widths(priors)
     ends, values = climb(

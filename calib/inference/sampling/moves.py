@@ -56,12 +56,7 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
         self._steps: _Steps | None = None
 
     def propose(self, model: Any, state: Any) -> tuple[Any, Array]:
-        """Move the walkers; the interface is emcee's.
-
-        Returns
-        -------
-        moved : ndarray of bool, shape (walkers,)
-        """
+        """Move the walkers, and say which moved, shape (walkers,); the interface is emcee's."""
         if self.walk is not None and self._since_walk == self.every:
             self._since_walk = 0
             return self.walk.propose(model, state)
@@ -100,16 +95,9 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
 
 @dataclass(frozen=True)
 class _Pairs:
-    """Opposite pairs, and at which of its points a walker stands or would stand.
+    """Opposite pairs, points (2, k, d), and at which of them (k,) a walker stands or would stand.
 
-    Parameters
-    ----------
-    points : ndarray, shape (2, k, d)
-    log_prob : ndarray, shape (2, k)
-    side : ndarray of int, shape (k,)
-    log_odds : ndarray, shape (k,)
-        Log of the density at the second over that at the first, in straightened coordinates.
-    log_weight : ndarray, shape (k,)
+    Log odds are of the density at the second over that at the first, in straightened coordinates.
     """
 
     points: Array
@@ -238,15 +226,10 @@ class _Steps:
 
 
 class WalkMove(emcee.moves.Move):  # type: ignore[misc]
-    """A random walk in straightened coordinates: a local move that follows bends and funnels.
+    """A random walk in a proposal's straightened coordinates: it follows bends and funnels.
 
     All walkers step at once, each on its own, by a normal as wide as the posterior there times a
     factor drawn anew for each step: long ones cross the bulk, short ones are accepted in corners.
-
-    Parameters
-    ----------
-    proposal : Proposal
-        Whose straightened coordinates they are.
     """
 
     def __init__(self, proposal: Proposal, rng: np.random.Generator) -> None:
@@ -255,12 +238,7 @@ class WalkMove(emcee.moves.Move):  # type: ignore[misc]
         self.rng = rng
 
     def propose(self, model: Any, state: Any) -> tuple[Any, Array]:
-        """Move the walkers; the interface is emcee's.
-
-        Returns
-        -------
-        accepted : ndarray of bool, shape (walkers,)
-        """
+        """Move the walkers, and say which moved, shape (walkers,); the interface is emcee's."""
         walkers, d = state.coords.shape
         v, before = self.straightener.straighten(state.coords)
         length = 2.38 / np.sqrt(d) * 0.1 ** self.rng.random((walkers, 1))

@@ -24,11 +24,6 @@ class Proposal:
     Its draws come alone or in opposite pairs. Points t and t' are opposite if their straightened
     coordinates v and v' = 2 c - v are, about the mixture's mean c; either is the other's. Of a pair
     the density is the mean of the mixture's at its two points.
-
-    Parameters
-    ----------
-    mixture : Mixture
-        Of straightened coordinates.
     """
 
     straightener: Straightener
@@ -55,15 +50,10 @@ class Proposal:
         return self.mixture.log_prob(v) + log_jacobian
 
     def draw_pairs(self, rng: np.random.Generator, size: int) -> tuple[Array, Array, Array]:
-        """Draw opposite pairs.
+        """Draw opposite pairs, shape (2, size, d).
 
-        Returns
-        -------
-        t : ndarray, shape (2, size, d)
-        log_jacobian : ndarray, shape (2, size)
-            Log of |dv/dt| at each.
-        log_q : ndarray, shape (size,)
-            Log density of each pair, in straightened coordinates.
+        With the log of |dv/dt| at each, (2, size), and the log density of each pair, (size,), in
+        straightened coordinates.
         """
         v = self.mixture.sample(rng, size)
         both = np.concatenate([v, 2.0 * self._centre - v])
@@ -72,18 +62,9 @@ class Proposal:
         return t.reshape(2, size, -1), log_jacobian.reshape(2, size), log_q
 
     def opposite(self, t: Array) -> tuple[Array, Array, Array]:
-        """Find the points opposite to some.
+        """Find the points opposite to some, (k, d) to (k, d).
 
-        Parameters
-        ----------
-        t : ndarray, shape (k, d)
-
-        Returns
-        -------
-        t : ndarray, shape (k, d)
-        log_jacobian : ndarray, shape (2, k)
-            Log of |dv/dt| at the points, and at those opposite to them.
-        log_q : ndarray, shape (k,)
+        With the log of |dv/dt| at both, (2, k), and the log density of each pair, (k,).
         """
         v, here = self.straightener.straighten(t)
         other, there = self.straightener.bend(2.0 * self._centre - v)

@@ -68,7 +68,6 @@ class Draws:
     log_prob : ndarray, shape (ensembles, walkers, draws)
     report : GateReport
         On as many draws as are stored by default, autocorrelation times on all.
-    mode : ndarray, shape (d,)
     log_evidence, efficiency : float
         By importance sampling from the proposal, and its effective fraction.
     evaluations : int
@@ -103,21 +102,9 @@ def sample_posterior(
     settings: SamplerSettings | None = None,
     progress: Progress | None = None,
 ) -> Draws:
-    """Sample the posterior of a problem.
+    """Sample the posterior of a problem; read ``report.passed`` before use.
 
-    Parameters
-    ----------
-    seed : int or SeedSequence
-        Same seed, same numbers.
-    starts : ndarray, shape (m, d), optional
-        Point estimates in internal coordinates that seed the search for the mode.
-    progress : callable, optional
-        Called with steps done and steps planned.
-
-    Returns
-    -------
-    Draws
-        Read ``report.passed`` before use.
+    `starts` (m, d) are point estimates in internal coordinates that seed the search for the mode.
 
     Raises
     ------
@@ -190,18 +177,12 @@ def sample_density(
     progress: Progress | None = None,
     began: float | None = None,
 ) -> Draws:
-    """Sample any density from a first guess of its location and scale.
+    """Sample any unnormalised density ``(k, d) -> (k,)`` from first guesses, the best first.
 
     Parameters
     ----------
-    log_prob : callable
-        ``(k, d) -> (k,)``, unnormalised.
-    first : sequence of Guess
-        First guesses, the best first, for instance from the curvature at each mode.
     seeds : list of SeedSequence
         One for the adaptation (already used by `rng`) and one for each ensemble.
-    names : tuple of str
-        Of the coordinates.
     began : float, optional
         ``time.perf_counter()`` at which the work began.
     """
@@ -256,16 +237,7 @@ def sample_density(
 def _drawn(t: Array, log_prob: Array, draws: int) -> tuple[Array, Array]:
     """About so many draws of each ensemble, of evenly picked walkers and among its steps.
 
-    Parameters
-    ----------
-    t : ndarray, shape (ensembles, steps, walkers, d)
-    log_prob : ndarray, shape (ensembles, steps, walkers)
-
-    Returns
-    -------
-    ndarray, shape (ensembles, walkers, kept, d)
-    ndarray, shape (ensembles, walkers, kept)
-        Log densities.
+    Shape (ensembles, steps, walkers, d) to (ensembles, walkers, kept, d), and their log densities.
     """
     _, steps, walkers, _ = t.shape
     kept = min(steps, max(_LEAST_STEPS, draws // walkers))

@@ -54,19 +54,7 @@ class Straightener:
 
     @classmethod
     def fit(cls, t: Array, weight: Array) -> Straightener:
-        """Fit to weighted draws.
-
-        Parameters
-        ----------
-        t : ndarray, shape (k, d)
-        weight : ndarray, shape (k,)
-            Of sum 1.
-
-        Raises
-        ------
-        numpy.linalg.LinAlgError
-            If the draws are degenerate.
-        """
+        """Fit to draws (k, d) of weights (k,), sum 1; a LinAlgError if they are degenerate."""
         d = t.shape[1]
         mean = weight @ t
         sd = np.sqrt(weight @ np.square(t - mean))
