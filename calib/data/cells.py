@@ -37,12 +37,7 @@ class _Problem:
 class Problems:
     """What is wrong with a table, collected to be told at once.
 
-    Parameters
-    ----------
-    source : str
-        File, or label of the arrays.
-    place : str
-        What the rows are counted in: ``"line"`` of a file or ``"row"`` of arrays.
+    The source is a file, or the label of arrays; its rows are counted in ``"line"`` or ``"row"``.
     """
 
     source: str
@@ -58,13 +53,7 @@ class Problems:
             kept.append(_Problem(line, column, found, allowed, mend))
 
     def raise_any(self) -> None:
-        """Raise what was noted, in the order of the lines.
-
-        Raises
-        ------
-        CalibError
-            If there is any problem; it tells up to five of them.
-        """
+        """Raise what was noted, up to five problems in the order of the lines, if anything."""
         if not self.total:
             return
         shown = sorted(p for kept in self._kept.values() for p in kept)[:MAX_SHOWN]
@@ -196,17 +185,12 @@ def check_values(
     column: Column, values: Array, lines: Lines, problems: Problems, *,
     missing_ok: bool, used: bool, cells: Sequence[str] = (), skip: set[int] | None = None,
 ) -> Array:  # fmt: skip
-    """Convert values to the canonical unit and note those that are not allowed.
+    """Convert values (n,) to the canonical unit and note those that are not allowed.
 
     Parameters
     ----------
-    column : Column
-        The quantity and the unit of `values`.
-    values : ndarray, shape (n,)
     lines : sequence of int, shape (n,)
         Where the values are.
-    problems : Problems
-        Where complaints go.
     missing_ok : bool
         Whether NaN is allowed.
     used : bool
@@ -215,10 +199,6 @@ def check_values(
         The values as written, for messages.
     skip : set of int, optional
         Positions already complained about.
-
-    Returns
-    -------
-    ndarray, shape (n,)
     """
     with np.errstate(over="ignore"):
         canonical = column.to_canonical(values)

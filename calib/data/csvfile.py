@@ -25,16 +25,8 @@ _A_CSV = "a CSV file in UTF-8: a line of column names, then one line per row"
 class CsvFile:
     """A file that was found readable as CSV.
 
-    Parameters
-    ----------
-    source : str
-        Path as given.
-    header_line : int
-        Its line, counted from 1.
-    sha256 : str
-        Of the bytes.
-    rows : iterator of (int, list of str)
-        Line number and cells of each row that is not blank; not checked for their number.
+    Lines are counted from 1, the hash is of the bytes; rows that are not blank come with the number
+    of their line, and cells that are not checked for their number.
     """
 
     source: str

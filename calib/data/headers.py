@@ -136,23 +136,9 @@ def _unit_error(header: str, quantity: Quantity, suffix: str, where: str) -> Cal
 def match_headers(
     headers: Sequence[str], *, where: str, required: Sequence[str] = ()
 ) -> tuple[tuple[Column, ...], tuple[str, ...]]:
-    """Read a whole header line.
+    """Read a whole header line: columns that name a quantity, and the names of the others.
 
-    Parameters
-    ----------
-    headers : sequence of str
-        Column names.
-    where : str
-        File and line to name in errors.
-    required : sequence of str
-        Canonical names that must be among them.
-
-    Returns
-    -------
-    columns : tuple of Column
-        Those that name a quantity, in the order of the file.
-    ignored : tuple of str
-        The other column names.
+    `required` has canonical names that must be among them.
 
     Raises
     ------

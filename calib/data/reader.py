@@ -145,17 +145,9 @@ class _Parts:
 
 
 def read_for_model(path: str | os.PathLike[str], used: Sequence[str]) -> Table:
-    """Read a file of which only some columns will be used; the others may have empty cells.
+    """Read a file, as `read_table`, of which only some columns, canonical names, will be used.
 
-    Parameters
-    ----------
-    used : sequence of str
-        Canonical names of the columns that must be there, whole.
-
-    Raises
-    ------
-    CalibError
-        As `read_table` does.
+    These must be there, whole; the others may have empty cells.
     """
     unused = [name for name in QUANTITIES if name not in used]
     return read_table(path, required=used, allow_missing=unused)

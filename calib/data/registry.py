@@ -43,13 +43,7 @@ class Registry[T](Mapping[str, T]):
             self.add(one)
 
     def add(self, declared: T) -> None:
-        """Add a declaration.
-
-        Raises
-        ------
-        CalibError
-            If another one has its name.
-        """
+        """Add a declaration; a CalibError if another one has its name."""
         name = self._key(declared)
         self.version += 1
         if self._known.setdefault(name, declared) is not declared:

@@ -82,13 +82,7 @@ class Table:
         return self.columns[name]
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64] | Sequence[int]) -> Table:
-        """Return some of the rows.
-
-        Parameters
-        ----------
-        rows : ndarray
-            Mask of shape (n,), or row indices from 0 in the order wanted.
-        """
+        """Return some of the rows, by a mask (n,) or by indices from 0 in the order wanted."""
         index = np.arange(len(self))[np.asarray(rows, dtype=None if len(rows) else np.int64)]
         return replace(
             self,
@@ -155,19 +149,12 @@ def _distinct(values: NDArray[np.float64], most: int = 12) -> list[str]:
 
 
 def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -> None:
-    """Check that there are more rows than parameters.
-
-    Parameters
-    ----------
-    n_parameters : int
-        How many parameters are fitted, without the noise scale.
-    model : str
-        Name for the message.
+    """Check that there are more rows than parameters that are fitted, without the noise scale.
 
     Raises
     ------
     CalibError
-        If the rows cannot show any noise about a fit.
+        Naming the model, if the rows cannot show any noise about a fit.
     """
     if len(table) > n_parameters:
         return
@@ -181,18 +168,7 @@ def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -
 
 
 def check_varies(table: Table, column: str) -> None:
-    """Check that a column is not constant.
-
-    Parameters
-    ----------
-    column : str
-        Canonical name.
-
-    Raises
-    ------
-    CalibError
-        If all its values are equal, up to rounding.
-    """
+    """Check, with a CalibError, that the values of a column are not all equal, up to rounding."""
     values = table[column][~np.isnan(table[column])]
     if values.size and np.ptp(values) > 1e-12 * np.abs(values).max():
         return

@@ -73,19 +73,9 @@ def _factor(from_unit: str, to_unit: str) -> float:
 
 
 def convert(values: ArrayLike, from_unit: str, to_unit: str) -> NDArray[np.float64]:
-    """Convert values from one unit to another.
+    """Convert values of any shape from one unit to another; NaN stays NaN.
 
-    Parameters
-    ----------
-    values : array_like, any shape
-        Values in `from_unit`.
-    from_unit, to_unit : str
-        Units in pint's spelling, such as ``"kPa"``, ``"g/cm**3"`` or ``"percent"``.
-
-    Returns
-    -------
-    ndarray of float64, same shape
-        New array in `to_unit`; NaN stays NaN.
+    Units are in pint's spelling, such as ``"kPa"``, ``"g/cm**3"`` or ``"percent"``.
 
     Raises
     ------

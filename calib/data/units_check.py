@@ -19,13 +19,7 @@ _MOST_NAMED = 5
 
 
 def unit_notes(table: Table, quantity: Quantity, values: Array) -> list[str]:
-    """Say which values of a condition are unusual, or as in another unit than the others.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Its column.
-    """
+    """Say which values (n,) of a condition are unusual, or as in another unit than the others."""
     return [*_unusual(table, quantity, values), *_mixed_units(table, quantity, values)]
 
 
@@ -44,10 +38,7 @@ def _unusual(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
 def mixed_units(quantity: Quantity, values: Array) -> tuple[NDArray[np.bool_], str]:
     """Return which rows' pressures are others' in another unit, and whether larger or smaller.
 
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        Of a few levels; among many, ratios come about by chance.
+    Values (n,) are of a few levels; among many, ratios come about by chance.
     """
     levels, none = np.unique(values), np.zeros(values.size, dtype=np.bool_)
     if quantity.kind != "pressure" or not 2 <= levels.size <= _FEW_LEVELS or levels[0] <= 0.0:

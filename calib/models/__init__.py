@@ -42,23 +42,10 @@ MODELS: Registry[Model] = Registry(
 
 
 def example_csv(model_name: str) -> str:
-    """Return an example of the data a model is calibrated on.
+    """Return an example of the data a model is calibrated on, as CSV.
 
-    Parameters
-    ----------
-    model_name : str
-        Name of the model, such as ``"magic_formula_pressure"``.
-
-    Returns
-    -------
-    str
-        A CSV with the units in the column names; any other unit in `calib.data.quantities` may
-        stand in their place.
-
-    Raises
-    ------
-    CalibError
-        If there is no model of that name, or it has no example.
+    Units are in the column names; any other unit in `calib.data.quantities` may stand in their
+    place. Of a model without an example it is a CalibError.
     """
     model = get_model(model_name)
     if not model.example:
@@ -71,13 +58,7 @@ def example_csv(model_name: str) -> str:
 
 
 def get_model(name: str) -> Model:
-    """Return a model by its name.
-
-    Raises
-    ------
-    CalibError
-        If there is none of that name.
-    """
+    """Return a model by its name; a CalibError lists those there are."""
     if name not in MODELS:
         raise CalibError(
             f"there is no model {name!r}",

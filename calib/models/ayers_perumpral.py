@@ -45,15 +45,14 @@ def _ln_water_term(water: Array | float, C2: Array, C3: Array) -> Array:
     return np.asarray(np.log(C2 + (water - C3) ** 2))
 
 
-def _ln_index(conditions: Conditions, references: References) -> Array:
-    return np.asarray(np.log(conditions["cone_index_kpa"] / references["ci_ref_kpa"]))
+def _water(conditions: Conditions) -> Array:
+    name = "gravimetric_water_content"
+    return conditions[name if name in conditions else "volumetric_water_content"]
 
 
 def _prepare(conditions: Conditions, references: References) -> Rows:
-    return {
-        "ln_index": _ln_index(conditions, references),
-        "water": conditions["gravimetric_water_content"],
-    }
+    ln_index = np.log(conditions["cone_index_kpa"] / references["ci_ref_kpa"])
+    return {"ln_index": ln_index, "water": _water(conditions)}
 
 
 def _location(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
@@ -92,21 +91,7 @@ def _from_reported(reported: Mapping[str, float], references: References) -> Arr
 def _references(conditions: Conditions) -> dict[str, float]:
     return {
         "ci_ref_kpa": float(np.exp(np.log(conditions["cone_index_kpa"]).mean())),
-        "water_ref": float(conditions["gravimetric_water_content"].mean()),
-    }
-
-
-def _references_volumetric(conditions: Conditions) -> dict[str, float]:
-    return {
-        "ci_ref_kpa": float(np.exp(np.log(conditions["cone_index_kpa"]).mean())),
-        "water_ref": float(conditions["volumetric_water_content"].mean()),
-    }
-
-
-def _prepare_volumetric(conditions: Conditions, references: References) -> Rows:
-    return {
-        "ln_index": _ln_index(conditions, references),
-        "water": conditions["volumetric_water_content"],
+        "water_ref": float(_water(conditions).mean()),
     }
 
 
@@ -227,8 +212,8 @@ AYERS_PERUMPRAL_VOLUMETRIC = Model(
     location=_location_volumetric,
     report_theta=_report_volumetric,
     theta_from_reported=_from_reported_volumetric,
-    bind_references=_references_volumetric,
-    prepare=_prepare_volumetric,
+    bind_references=_references,
+    prepare=_prepare,
     latex=(
         (
             r"$\mathrm{CI} = A_1 \gamma_\mathrm{d}^{A_2} / [A_3 + "

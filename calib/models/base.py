@@ -33,16 +33,7 @@ type Rows = Mapping[str, NDArray[Any]]
 
 
 def columns(theta: Array) -> Columns:
-    """Split parameter vectors into columns that broadcast against conditions.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (k, n_parameters)
-
-    Returns
-    -------
-    tuple of ndarray, each of shape (k, 1)
-    """
+    """Split parameter vectors (k, d) into columns (k, 1), to broadcast against conditions."""
     return tuple(theta[:, j, None] for j in range(theta.shape[1]))
 
 
@@ -169,14 +160,7 @@ class Searched:
 class Alone:
     """A simpler model, for each value of a condition by itself, to be seen beside a joint one.
 
-    Parameters
-    ----------
-    column : str
-        The condition.
-    model : str
-        Name of the simpler model.
-    fixed : mapping of str to float
-        Parameters of it that are held.
+    Some of its parameters are held.
     """
 
     column: str
@@ -333,13 +317,7 @@ class Model:
         return BoundModel(self, self.bind_references(self.select(conditions)))
 
     def select(self, conditions: Conditions) -> dict[str, Array]:
-        """Return the columns this model needs.
-
-        Raises
-        ------
-        CalibError
-            If one is missing.
-        """
+        """Return the columns this model needs; a CalibError names one that is missing."""
         missing = [name for name in self.conditions if name not in conditions]
         if missing:
             raise CalibError(

@@ -46,18 +46,7 @@ def _at(columns: Columns, u: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def coefficients_at(theta: Array, pressure_psi: Array, references: References) -> dict[str, Array]:
-    """Return B (1/%), C, D (kN) and E at given pressures.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (k, 10)
-        Sampled parameters.
-    pressure_psi : ndarray, shape (n,)
-
-    Returns
-    -------
-    dict of ndarray, shape (k, n)
-    """
+    """Return B (1/%), C, D (kN), E (k, n) of sampled parameters (k, 10) at pressures (n,)."""
     u = (np.asarray(pressure_psi) - references["p_mid_psi"]) / references["p_half_psi"]
     K, C, D, G = _at(columns(np.atleast_2d(theta)), u)
     return {"B": K / (C * D), "C": np.broadcast_to(C, D.shape), "D": D, "E": 1.0 - G}

@@ -99,6 +99,13 @@ def _theta_lyasko(reported: Mapping[str, float], references: References) -> Arra
     return np.array([_z_ref(reported["k"], n, references), n, reported["a"]])
 
 
+_OF_WIDTHS = (
+    "The sinkage z_ref at {p_ref_kpa:.4g} kPa and a width of {b_ref_mm:.4g} mm (means of the "
+    "data) is sampled in the place of the modulus, which is almost collinear with n, and "
+    "beside it the part of the modulus there that depends on the width; the published "
+    "constants follow."
+)
+
 BEKKER_PLATE = Model(
     name="bekker_plate",
     title="Bekker under plates of several widths",
@@ -120,12 +127,7 @@ BEKKER_PLATE = Model(
         "units, so they carry over to another soil only together with it."
     ),
     letters="[$p] the pressure (kPa), [$z] the sinkage and [$b] the width of the plate (m)",
-    parametrisation=(
-        "The sinkage z_ref at {p_ref_kpa:.4g} kPa and a width of {b_ref_mm:.4g} mm (means of the "
-        "data) is sampled in the place of the modulus, which is almost collinear with n, and "
-        "beside it the part of the modulus there that depends on the width; the published "
-        "constants follow."
-    ),
+    parametrisation=_OF_WIDTHS,
     example="""\
 average_ground_pressure_kpa,plate_width_mm,rut_depth_mm
 5,60,3.221
@@ -164,12 +166,7 @@ REECE = Model(
         "for layered soil or a box whose walls are within a few plate widths."
     ),
     letters="[$p] the pressure (kPa), [$z] the sinkage and [$b] the width of the plate (m)",
-    parametrisation=(
-        "The sinkage z_ref at {p_ref_kpa:.4g} kPa and a width of {b_ref_mm:.4g} mm (means of the "
-        "data) is sampled in the place of the modulus, which is almost collinear with n, and "
-        "beside it the part of the modulus there that depends on the width; the published "
-        "constants follow."
-    ),
+    parametrisation=_OF_WIDTHS,
     example="""\
 average_ground_pressure_kpa,plate_width_mm,rut_depth_mm
 5,60,3.955

@@ -34,12 +34,8 @@ _TOLERANCE = 1e-9
 class Wheel:
     """Soil and wheel, arrays that broadcast to (k, n, 1).
 
-    Parameters
-    ----------
-    k1, k2, n, c, tan_phi, K, c1, c2 : ndarray
-        In kPa, kPa/m, 1, kPa, 1, m, 1, 1.
-    radius, width, load, slip : ndarray
-        In m, m, kN, as a fraction.
+    k1, k2, n, c, tan_phi, K, c1 and c2 in kPa, kPa/m, 1, kPa, 1, m, 1 and 1; radius, width, load
+    and slip in m, m, kN and as a fraction.
     """
 
     k1: Array
@@ -133,16 +129,10 @@ def _evaluate(entry: Array, wheel: Wheel) -> Contact:
 def contact(wheel: Wheel) -> Contact:
     """Find where each wheel carries its load, and what it then pulls.
 
-    Returns
-    -------
-    Contact
-        NaN for a braked wheel (slip below zero, part II of the source), and where the soil does
-        not carry the wheel although it has sunk to its axle.
-
-    Notes
-    -----
-    The load grows about as the entry angle to the power 2n + 1: on logarithms the secant method
-    takes some five steps, kept inside a shrinking bracket.
+    NaN for a braked wheel (slip below zero, part II of the source), and where the soil does not
+    carry the wheel although it has sunk to its axle. The load grows about as the entry angle to the
+    power 2n + 1: on logarithms the secant method takes some five steps, kept inside a shrinking
+    bracket.
 
     References
     ----------

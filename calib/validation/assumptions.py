@@ -29,10 +29,7 @@ _FEWEST, _FEWEST_FOR_TAILS = 8, 20
 def warnings_of(problem: Problem, t: Array) -> tuple[str, ...]:
     """Say what a reader should mend, or know, before believing a calibration's width.
 
-    Parameters
-    ----------
-    t : ndarray, shape (d,)
-        Internal coordinates of a fit to all rows, for instance the posterior's mode.
+    `t` (d,) are internal coordinates of a fit to all rows, for instance the posterior's mode.
     """
     return (
         *outlying_notes(problem, t), *file_notes(problem, _scatter(problem, t)),
@@ -43,10 +40,7 @@ def warnings_of(problem: Problem, t: Array) -> tuple[str, ...]:
 def file_notes(problem: Problem, scatter: float) -> tuple[str, ...]:
     """Say what is odd in the rows themselves: units, copies, conditions that do not vary.
 
-    Parameters
-    ----------
-    scatter : float
-        Sd of a reading about the prediction, on the scale of the response.
+    `scatter` is the sd of a reading about the prediction, on the scale of the response.
     """
     found: list[str] = []
     for name, values in problem.conditions.items():
@@ -95,15 +89,8 @@ def _last_digit(problem: Problem) -> float:
 
 
 def residual_notes(problem: Problem, t: Array) -> tuple[str, ...]:
-    """Say where the residuals are not as the likelihood has them.
+    """Say where the residuals at a fit, `t` (d,), are not as the likelihood has them.
 
-    Parameters
-    ----------
-    t : ndarray, shape (d,)
-        Internal coordinates of a fit to all rows.
-
-    Notes
-    -----
     Residuals are those of the model made linear at the fit, over the noise's scale there (Student's
     as normal scores), so that the moments of linear least squares hold.
     """
@@ -146,16 +133,10 @@ def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[st
 def durbin_watson_moments(design: Array) -> tuple[float, float]:
     """Mean and variance of Durbin and Watson's statistic under independent normal noise.
 
-    Parameters
-    ----------
-    design : ndarray, shape (n, k)
-        Orthonormal columns that span what was fitted.
-
-    Notes
-    -----
     Of d = e'Ae/e'e with A the second difference they are exact: E = P/(n - k) and
     2 (Q - P E)/((n - k)(n - k + 2)), with P and Q the traces of MA and (MA)^2, and M the
-    projection on what the design leaves (doi:10.1093/biomet/38.1-2.159).
+    projection on what the design leaves (doi:10.1093/biomet/38.1-2.159), whose columns, shape
+    (n, k), are orthonormal and span what was fitted.
     """
     n, rank = design.shape
     left = n - rank

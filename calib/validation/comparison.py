@@ -37,16 +37,9 @@ type Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Candidate:
-    """A model, calibrated and scored.
+    """A model, calibrated and scored: by leave-one-out, and on the rows held out if there are any.
 
-    Parameters
-    ----------
-    loo : Validation
-        By leave-one-out, on the fitted rows.
-    held : Validation or None
-        On the rows held out.
-    held_elpd : float
-        Their summed log predictive density, each given the fitted rows; NaN without any.
+    `held_elpd` is their summed log predictive density, each given the fitted rows; NaN without any.
     """
 
     calibration: Calibration
@@ -124,12 +117,7 @@ class Comparison:
 def sentence(told_apart: Mapping[str, bool], unsound: Sequence[str]) -> str:
     """Say what data prefer, and what they cannot tell.
 
-    Parameters
-    ----------
-    told_apart : mapping of str to bool
-        Models, the best first: whether the data tell each from the best.
-    unsound : sequence of str
-        Those that did not converge.
+    Models come the best first, with whether the data tell each from it; `unsound` did not converge.
     """
     if unsound:
         return (
@@ -239,13 +227,7 @@ def _check_possible(found: Candidate) -> None:
 
 
 def check_comparable(models: Sequence[str]) -> None:
-    """Check that there are at least two models, all of one output.
-
-    Raises
-    ------
-    CalibError
-        If not, or there is no model of a name.
-    """
+    """Check, with a CalibError, that there are at least two models, all of one output."""
     if len(models) < 2 or len(set(models)) < len(models):
         raise CalibError(
             f"there is nothing to compare in {', '.join(models) or 'no model'}",
@@ -287,21 +269,11 @@ def _candidate(
 
 
 def stacking_weights(elpd: Array) -> Array:
-    """Weights of predictive distributions whose mixture predicts the rows best.
+    """Weights (models,) of predictive distributions whose mixture predicts the rows best.
 
-    Parameters
-    ----------
-    elpd : ndarray, shape (n, models)
-        Log predictive density of each row without it.
-
-    Returns
-    -------
-    ndarray, shape (models,)
-
-    References
-    ----------
-    Yao et al. (2018), doi:10.1214/17-BA1091, Eq 4. The sum of logarithms is concave in the
-    weights; each step of expectation maximisation increases it.
+    From the log predictive density of each row without it, (n, models) (Yao et al. 2018,
+    doi:10.1214/17-BA1091, Eq 4). The sum of logarithms is concave in the weights; each step of
+    expectation maximisation increases it.
     """
     density = np.exp(elpd - elpd.max(axis=1, keepdims=True))
     weights = np.full(density.shape[1], 1.0 / density.shape[1])

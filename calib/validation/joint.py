@@ -25,25 +25,14 @@ def ks_distance(pit: Array) -> Array:
 
 
 def pit_half_width(draws: Array, level: float = 0.95) -> float:
-    """Half the width of the simultaneous band that PIT values of possible rows stay inside.
-
-    Parameters
-    ----------
-    draws : ndarray, shape (size, n)
-    """
+    """Half the width of the simultaneous band that PIT values of possible rows (size, n) are in."""
     return float(np.quantile(ks_distance(_pit_of_draws(draws)), level))
 
 
 def coverage_probability(draws: Array, hits: int, level: float) -> float:
     """Probability of covering no more rows than were covered, were the predictions right.
 
-    Parameters
-    ----------
-    draws : ndarray, shape (size, n)
-    hits : int
-        Rows inside their central band.
-    level : float
-        Of the band.
+    `hits` rows are inside their central band of draws (size, n).
     """
     covered = (np.abs(_pit_of_draws(draws) - 0.5) <= 0.5 * level).sum(axis=1)
     # The draw that was observed counts among those possible, so it is never 0.
@@ -51,15 +40,7 @@ def coverage_probability(draws: Array, hits: int, level: float) -> float:
 
 
 def hits(draws: Array, observed: Array, level: float) -> int:
-    """Count the observations inside the central band of their draws.
-
-    Parameters
-    ----------
-    draws : ndarray, shape (size, n)
-    observed : ndarray, shape (n,)
-    level : float
-        Of the band.
-    """
+    """Count the observations (n,) inside the central band of their draws (size, n)."""
     low, high = np.nanquantile(draws, [0.5 - 0.5 * level, 0.5 + 0.5 * level], axis=0)
     return int(((observed >= low) & (observed <= high)).sum())
 

@@ -18,15 +18,9 @@ from calib.validation.validate import Validation, leave_one_out
 class NoisePreference:
     """How much better a noise predicts rows left out than normal noise of one sd does.
 
-    Parameters
-    ----------
-    elpd, se : float
-        Difference of the expected log predictive densities, and its standard error.
-    sound : bool
-        Whether both calibrations, and all without a row, passed the gate, and every row has a
-        density.
-    line : int
-        Of the row in the file that makes more than half of the difference; 0 if none does.
+    Difference of the expected log predictive densities, and its standard error. It is sound if both
+    calibrations, and all without a row, passed the gate, and every row has a density. `line` is
+    that of the row in the file that makes more than half of the difference; 0 if none does.
     """
 
     noise: Noise
@@ -94,22 +88,8 @@ def noise_preference(
 ) -> NoisePreference | None:
     """Compare the noise of a calibration with normal noise of one sd by leave-one-out.
 
-    Parameters
-    ----------
-    calibration : Calibration
-    loo : Validation, optional
-        Of it, where it was left one out already.
-    settings : SamplerSettings, optional
-        For the other calibration and the refits.
-    progress : callable, optional
-        Called with rows done and rows in all.
-    workers : int
-        Processes for refits; the numbers do not depend on it.
-
-    Returns
-    -------
-    NoisePreference, optional
-        None where the noise is that of all by default.
+    None where the noise is that of all by default. `loo` is of the calibration, where it was left
+    one out already; settings are for the other calibration and the refits.
 
     References
     ----------

@@ -26,16 +26,9 @@ _MOST_NAMED = 5
 
 @dataclass(frozen=True)
 class OutlyingRow:
-    """A row far off the others' calibration.
+    """A row far off the others' calibration: its line in the file, and the output measured there.
 
-    Parameters
-    ----------
-    line : int
-        Of the file.
-    value : float
-        The output measured there.
-    sds : float
-        Its distance from what the other rows predict, in units of that distance's sd.
+    `sds` is its distance from what the other rows predict, in units of that distance's sd.
     """
 
     line: int
@@ -44,26 +37,15 @@ class OutlyingRow:
 
 
 def outlying_rows(problem: Problem, t: Array) -> tuple[OutlyingRow, ...]:
-    """Find rows that are too far from what the others say for any of so many.
+    """Find rows, the farthest first, that are too far from what the others say for any of so many.
 
-    Parameters
-    ----------
-    t : ndarray, shape (d,)
-        Internal coordinates of a fit to all rows, for instance the posterior's mode.
-
-    Returns
-    -------
-    tuple of OutlyingRow
-        The farthest first; empty where too few rows would be left to judge by.
-
-    Notes
-    -----
-    Two that are wrong can hide each other. As in Rosner's (1983) generalised procedure,
-    doi:10.1080/00401706.1983.10487848, the row of the largest externally studentised residual
-    (Cook & Weisberg 1982, section 2.2, with the model made linear at the fit) is taken out and the
-    others are fitted again, a few times; the last time at which it was too large by Bonferroni's
-    bound says how many are suspected, and each of these must be too far from the fit to the rest.
-    Long data are not fitted again: in them one row hides nothing.
+    `t` (d,) are internal coordinates of a fit to all rows; none is found where too few would be
+    left to judge by. Two that are wrong can hide each other. As in Rosner's (1983) generalised
+    procedure, doi:10.1080/00401706.1983.10487848, the row of the largest externally studentised
+    residual (Cook & Weisberg 1982, section 2.2, with the model made linear at the fit) is taken out
+    and the others are fitted again, a few times; the last time at which it was too large by
+    Bonferroni's bound says how many are suspected, and each of these must be too far from the fit
+    to the rest. Long data are not fitted again: in them one row hides nothing.
     """
     n = problem.response.size
     most = 1 if n > _LONG else min(max(2, n // 10), _MOST)
@@ -135,16 +117,10 @@ def _from_the_rest(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple
 
 
 def linear(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, Array, int]:
-    """Residuals, and the model made linear at a fit, in coordinates orthonormal over rows used.
+    """Residuals (n,), and the model made linear at a fit, orthonormal over the rows used.
 
-    Where the noise depends on a condition, over its scale there in units of sigma.
-
-    Returns
-    -------
-    residual : ndarray, shape (n,)
-    design : ndarray, shape (n, rank)
-    rank : int
-        Directions that move predictions; the noise scale does not.
+    Where the noise depends on a condition, over its scale there in units of sigma. The design is of
+    shape (n, rank), of directions that move predictions; the noise scale does not.
     """
     steps = _STEP * np.maximum(np.abs(t), 1.0)
     moved = np.concatenate([t[None], t + np.diag(steps), t - np.diag(steps)])

@@ -79,23 +79,10 @@ def predictive_draws(
 
 
 def predict_stacked(parts: Sequence[tuple[float, Calibration]], table: Table) -> Prediction:
-    """Predict with the mixture of several calibrations.
+    """Predict with the mixture of several calibrations of one output, weights first, of sum 1.
 
-    Parameters
-    ----------
-    parts : sequence of (float, Calibration)
-        Weights, which sum to 1, and calibrations of one output.
-    table : Table
-        With the conditions of all of those that have a weight.
-
-    Raises
-    ------
-    CalibError
-        If a condition is missing.
-
-    Notes
-    -----
-    Each calibration gives as many of the `N_DRAWS` draws as is its weight.
+    Each gives as many of the `N_DRAWS` draws as is its weight, and the table has the conditions of
+    all that have one; else a CalibError.
     """
     used = [(weight, c) for weight, c in parts if round(weight * N_DRAWS) > 0]
     means, measured, outer = [], [], []
@@ -203,13 +190,7 @@ def bands(draws: Array) -> Bands:
 
 
 def prediction_columns(prediction: Prediction, table: Table) -> dict[str, Array | list[str]]:
-    """Lay a prediction out as columns of a CSV: the conditions first, as they were given.
-
-    Parameters
-    ----------
-    table : Table
-        The conditions.
-    """
+    """Lay a prediction out as columns of a CSV: the table's conditions first, as given."""
     output = prediction.output
     columns: dict[str, Array | list[str]] = echoed(table, output)
     columns[f"{output}_median"] = prediction.predictive.median

@@ -17,14 +17,10 @@ _N_DRAWS = 1000
 
 @dataclass(frozen=True)
 class Standardised:
-    """Residuals over the noise scale, posterior means, of some rows.
+    """Residuals over the noise scale, posterior means, and predictions of some rows, each (n,).
 
     Where the noise is Student's, normal scores: standard normal values of the same quantile.
-
-    Parameters
-    ----------
-    residual, predicted : ndarray, shape (n,)
-        In noise sds, on the scale of the response; the prediction is in the output's unit.
+    Residuals are on the scale of the response; the prediction is in the output's unit.
     """
 
     residual: Array
@@ -32,13 +28,7 @@ class Standardised:
 
 
 def standardise(calibration: Calibration, problem: Problem) -> Standardised:
-    """Work residuals out at the posterior.
-
-    Parameters
-    ----------
-    problem : Problem
-        Its rows: the calibrated ones or, by ``with_table``, others.
-    """
+    """Work residuals out at the posterior: of the problem's rows, calibrated on or others."""
     natural = problem.theta(calibration.subset(_N_DRAWS))
     location = problem.bound.location(problem.of_model(natural), problem.conditions)
     residual = np.nanmean(
@@ -49,15 +39,10 @@ def standardise(calibration: Calibration, problem: Problem) -> Standardised:
 
 
 def sign_changes(x: Array, residual: Array, groups: Iterable[NDArray[np.bool_]]) -> tuple[int, int]:
-    """Count sign changes of residuals along x within each group, and neighbours in all.
+    """Count sign changes of residuals (n,) along x within each group, and neighbours in all.
 
-    Independent residuals change sign between half of the neighbours; a curve that misses a
-    pattern leaves long runs of one sign.
-
-    Parameters
-    ----------
-    x, residual : ndarray, shape (n,)
-    groups : iterable of ndarray of bool, shape (n,)
+    Independent residuals change sign between half of the neighbours; a curve that misses a pattern
+    leaves long runs of one sign.
     """
     changes, pairs = 0, 0
     for rows in groups:

@@ -19,12 +19,7 @@ MOVED_SDS = 0.5
 def role_of(sd_ratio: float, moved: float) -> str:
     """Say what set a parameter.
 
-    Parameters
-    ----------
-    sd_ratio : float
-        Posterior over prior standard deviation; NaN for a derived parameter.
-    moved : float
-        Distance of the means in prior standard deviations.
+    From its posterior over prior sd (NaN if derived) and the distance of the means in prior sds.
     """
     if np.isnan(sd_ratio):
         return ""

@@ -36,7 +36,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class Scores:
-    """Scores of one set of observations.
+    """Scores of one set of n observations.
 
     Parameters
     ----------
@@ -48,9 +48,8 @@ class Scores:
     relative_error : ndarray, shape (n,)
         (median - observed)/observed; NaN where the observation is below a twentieth of the
         largest.
-    pit : ndarray, shape (n,)
-        Probability integral transform.
-    median : ndarray, shape (n,)
+    pit, median : ndarray, shape (n,)
+        Probability integral transform, and the predictive median.
     """
 
     n: int
@@ -71,9 +70,7 @@ class Scores:
 def crps(draws: Array, observed: Array) -> Array:
     """Continuous ranked probability score of each observation, shape (n,).
 
-    References
-    ----------
-    Gneiting & Raftery (2007), doi:10.1198/016214506000001437, Eq 21, with the sorted form of
+    After Gneiting & Raftery (2007), doi:10.1198/016214506000001437, Eq 21, with the sorted form of
     the mean absolute difference.
     """
     m = draws.shape[0]
@@ -100,15 +97,7 @@ def coverage(draws: Array, observed: Array, level: float) -> Coverage:
 
 
 def score(draws: Array, observed: Array, *, heavy: bool = False) -> Scores:
-    """Score predictive draws.
-
-    Parameters
-    ----------
-    draws : ndarray, shape (n_draws, n)
-    observed : ndarray, shape (n,)
-    heavy : bool
-        Whether they are of a distribution that has no CRPS.
-    """
+    """Score predictive draws (n_draws, n) of observations (n,); heavy ones have no CRPS."""
     median = np.median(draws, axis=0)
     large = np.abs(observed) > RELATIVE_ERROR_FLOOR * np.abs(observed).max()
     relative = np.full(observed.size, np.nan)

@@ -36,16 +36,11 @@ _CELLS = 1_000_000
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """What a parameter owes to the prior and to the data.
+    """What a parameter owes to the prior and to the data, per doubling of the power of either.
 
-    Parameters
-    ----------
-    prior, likelihood : float
-        Power-scaling sensitivities, per doubling of the power.
-    contraction : float
-        ``1 - var_post/var_prior``: of the internal coordinate of a sampled parameter, of the
-        normal scores under the prior (whatever the parameter's scale) of a derived one. Negative
-        where the posterior is wider.
+    `contraction` is ``1 - var_post/var_prior``: of the internal coordinate of a sampled parameter,
+    of the normal scores under the prior (whatever the parameter's scale) of a derived one. Negative
+    where the posterior is wider.
     """
 
     name: str

@@ -133,13 +133,7 @@ class Simulator:
         return hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def canonical(self, header: str) -> str:
-        """Return the canonical column of one of its headers.
-
-        Raises
-        ------
-        CalibError
-            If the header names no known quantity.
-        """
+        """Return the canonical column of one of its headers, which must name a known quantity."""
         return _parsed(header, self.name)[0]
 
     @property
@@ -150,17 +144,8 @@ class Simulator:
     def run(self, theta: Array, conditions: Mapping[str, Array]) -> Result:
         """Carry out one run, tried again where it fails.
 
-        Parameters
-        ----------
-        theta : ndarray, shape (d,)
-            In the order of `parameters`, in the units of the priors.
-        conditions : mapping of str to ndarray, shape (n,)
-            Canonical columns in canonical units.
-
-        Returns
-        -------
-        mapping of str to ndarray, shape (n,), or Failure
-            Outputs by canonical column, in canonical units.
+        Parameters (d,) are in the order and units of the priors; conditions and outputs (n,) by
+        canonical column, in canonical units.
         """
         parameters = dict(zip(self.parameters, map(float, theta), strict=True))
         asked = self.asked(conditions)

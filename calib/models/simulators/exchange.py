@@ -36,13 +36,7 @@ def input_csv(parameters: Mapping[str, float], conditions: Mapping[str, Array]) 
 
 
 def check_template(template: str, names: tuple[str, ...], where: str) -> None:
-    """Check that every parameter and condition has its place in a template, and no other name.
-
-    Raises
-    ------
-    CalibError
-        Naming what is missing or unknown.
-    """
+    """Check, with a CalibError, that a template has a place for each name, and no other."""
     marks = set(_MARK.findall(template))
     missing = [name for name in names if name not in marks]
     unknown = sorted(marks - set(names))
@@ -64,14 +58,9 @@ def filled(template: str, parameters: Mapping[str, float], conditions: Mapping[s
 
 
 def output_of_text(text: str, how: str, patterns: Mapping[str, str]) -> Result:
-    """Read outputs.
+    """Read outputs: of JSON an object of lists or numbers, of CSV a column each.
 
-    Parameters
-    ----------
-    how : {"json", "csv", "pattern"}
-        JSON: an object of lists or numbers; CSV: a column each.
-    patterns : mapping of str to str
-        Output to a regular expression whose first group is the number, found once for each row.
+    A pattern is a regular expression whose first group is the number, found once for each row.
     """
     try:
         match how:

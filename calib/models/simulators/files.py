@@ -16,7 +16,7 @@ from calib.batch.plugins import run_file
 from calib.errors import CalibError
 from calib.models.simulators.base import Way
 from calib.models.simulators.exchange import check_template
-from calib.models.simulators.registered import SIMULATED, Simulated, declare
+from calib.models.simulators.registered import SIMULATED, Simulated, declare, written
 from calib.models.simulators.ways import CallableWay, CommandWay, TableWay, UmbridgeWay
 
 _WAYS = ("run", "python", "url", "table")
@@ -62,13 +62,7 @@ class _File(BaseModel):
 
 
 def register_file(path: Path) -> Simulated:
-    """Read a simulator file and make its models known, once.
-
-    Raises
-    ------
-    CalibError
-        See `read_simulator`.
-    """
+    """Read a simulator file (see `read_simulator`) and make its models known, once."""
     found = read_simulator(path)
     known = SIMULATED.get(found.name)
     if known is not None and known.simulator.digest == found.simulator.digest:
@@ -101,7 +95,7 @@ def read_simulator(path: Path) -> Simulated:
         file = _File.model_validate(content)
     except ValidationError as error:
         raise _explain(error, path) from None
-    priors = "\n".join(_table(name, table) for name, table in file.parameters.items())
+    priors = "\n".join(written(name, table) for name, table in file.parameters.items())
     try:
         return declare(
             file.name, _way(file, path), priors, file.conditions, file.outputs,
@@ -116,13 +110,6 @@ def read_simulator(path: Path) -> Simulated:
         raise CalibError(
             error.message, where=found, allowed=error.allowed, mend=error.mend
         ) from None
-
-
-def _table(name: str, table: dict[str, Any]) -> str:
-    import json
-
-    lines = "\n".join(f"{key} = {json.dumps(v)}" for key, v in table.items())
-    return f"[parameters.{name}]\n{lines}\n"
 
 
 def _explain(error: ValidationError, path: Path) -> CalibError:

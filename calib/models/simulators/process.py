@@ -21,29 +21,16 @@ _PRINTED = ".printed"
 
 
 def run_program(arguments: Sequence[str], folder: Path, limit: float) -> Failure | str:
-    """Run a program in a folder and wait for it.
+    """Run a program in a folder and wait for it, so many seconds at the most.
 
-    Parameters
-    ----------
-    folder : Path
-        Its working directory.
-    limit : float
-        Seconds.
-
-    Returns
-    -------
-    str or Failure
-        What it printed, or why it failed.
+    Return what it printed, or why it failed. It leads a process group (a session of its own), which
+    is killed when it has come to its end, when the limit has passed, and when this process is
+    interrupted: what it started ends with it.
 
     Raises
     ------
     CalibError
         If it cannot be started.
-
-    Notes
-    -----
-    It leads a process group (a session of its own), which is killed when it has come to its end,
-    when the limit has passed, and when this process is interrupted: what it started ends with it.
     """
     path = folder / _PRINTED
     with path.open("wb") as printed:
@@ -75,17 +62,9 @@ def run_program(arguments: Sequence[str], folder: Path, limit: float) -> Failure
 def call_function(function: Callable[..., Any], arguments: Sequence[Any], limit: float) -> Any:
     """Call a Python function in a process of its own, which is ended when the limit has passed.
 
-    Parameters
-    ----------
-    function : callable
-        Handed over with whatever it refers to, as it is now: what it changes is lost.
-    limit : float
-        Seconds, the start of the process (a third of one, and what the function imports) included.
-
-    Returns
-    -------
-    object or Failure
-        What it returned, or why there is nothing.
+    It is handed over with whatever it refers to, as it is now: what it changes is lost. The limit
+    is in seconds, the start of the process (a third of one, and what the function imports)
+    included.
 
     Raises
     ------

@@ -186,16 +186,10 @@ def declare(
     name: str, way: Any, priors: str, conditions: Mapping[str, str], outputs: Mapping[str, str],
     *, folder: Path | None = None, budget: Mapping[str, float] | None = None, **details: Any,
 ) -> Simulated:  # fmt: skip
-    """Put a simulator together from its parts.
+    """Put a simulator together from its parts, `details` being other fields of `Simulator`.
 
-    Parameters
-    ----------
-    priors : str
-        TOML text of all prior tables, those of the noise among them.
-    conditions, outputs : mapping of str to str
-        The simulator's own names to headers.
-    **details
-        Other fields of `Simulator`.
+    Priors are the TOML text of all prior tables, those of the noise among them; conditions and
+    outputs map the simulator's own names to headers.
     """
     tables = split_tables(priors, name)
     sigmas = {own: "sigma" if len(outputs) == 1 else f"sigma_{own}" for own in outputs}
@@ -232,9 +226,10 @@ def split_tables(priors: str, name: str) -> dict[str, str]:
             "there are no parameters with priors", where=f"simulator {name}",
             allowed="[parameters.NAME] with dist, unit, reason and source", mend="add them",
         )  # fmt: skip
-    return {key: _written(key, table) for key, table in known.items()}
+    return {key: written(key, table) for key, table in known.items()}
 
 
-def _written(name: str, table: Mapping[str, Any]) -> str:
+def written(name: str, table: Mapping[str, Any]) -> str:
+    """Write a table ``[parameters.NAME]``."""
     lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items()]
     return "\n".join([f"[parameters.{name}]", *lines]) + "\n"

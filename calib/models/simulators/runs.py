@@ -25,14 +25,7 @@ _WORTH_SECONDS = 8.0
 
 @dataclass(frozen=True)
 class Run:
-    """A run that was made.
-
-    Parameters
-    ----------
-    theta : ndarray, shape (d,)
-    outputs : mapping of str to ndarray, shape (n,)
-        By canonical column; empty where it failed.
-    """
+    """A run that was made: parameters (d,), and outputs (n,) by canonical column if it has any."""
 
     theta: Array
     outputs: Mapping[str, Array]
@@ -90,15 +83,9 @@ class RunKeeper:
     def runs(
         self, thetas: Array, conditions: Mapping[str, Array], replicate: Sequence[int] | int = 0
     ) -> list[Run]:
-        """Return runs in the order asked for.
+        """Return runs of parameters (k, d) at canonical conditions (n,), in the order asked for.
 
-        Parameters
-        ----------
-        thetas : ndarray, shape (k, d)
-        conditions : mapping of str to ndarray, shape (n,)
-            Canonical columns.
-        replicate : int or sequence of int
-            Tells runs with equal input apart.
+        `replicate` tells runs with equal input apart.
 
         Raises
         ------

@@ -256,13 +256,7 @@ class UmbridgeWay:
         return {name: np.array(values) for name, values in outputs.items()}
 
     def ask(self, what: str, content: Mapping[str, Any]) -> dict[str, Any] | Failure:
-        """Send one request of the protocol.
-
-        Raises
-        ------
-        CalibError
-            If there is no server.
-        """
+        """Send one request of the protocol; a CalibError if there is no server."""
         body = json.dumps({"name": self.model, **content}).encode()
         request = urllib.request.Request(
             f"{self.url.rstrip('/')}/{what}", body, {"Content-Type": "application/json"}

@@ -60,13 +60,7 @@ DESIGNS: Registry[ModelDesign] = Registry("design", lambda design: design.model)
 
 
 def design_of(model_name: str) -> Design:
-    """Return the design of a model.
-
-    Raises
-    ------
-    CalibError
-        If there is no such model, or it has neither a design nor an example.
-    """
+    """Return the design of a model; a CalibError if it has neither a design nor an example."""
     model = get_model(model_name)
     known = DESIGNS.get(model.name)
     return known.make() if known is not None else _of_example(model)

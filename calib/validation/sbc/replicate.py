@@ -33,17 +33,7 @@ _KEPT_STEPS = 5
 
 @dataclass(frozen=True)
 class Item:
-    """What a replicate needs.
-
-    Parameters
-    ----------
-    index : int
-        Number of the replicate.
-    seed : int
-        Of the whole run.
-    priors : PriorFile, optional
-        The shipped ones by default.
-    """
+    """What a replicate, by its number, needs; the seed is of the whole run."""
 
     model: str
     index: int
@@ -53,13 +43,10 @@ class Item:
 
 
 def replicate(item: Item) -> dict[str, Any]:
-    """Run one replicate.
+    """Run one replicate, and return plain numbers.
 
-    Returns
-    -------
-    dict
-        Plain numbers: convergence, ranks by quantity as ``[rank, draws]``, and how many held-out
-        measurements each band covered.
+    Convergence, ranks by quantity as ``[rank, draws]``, and how many held-out measurements each
+    band covered.
     """
     case = simulated(item)
     calibration = calibrated(case, item)
@@ -104,17 +91,8 @@ def measure(case: Simulated, calibration: Calibration, design: Design) -> dict[s
 def ranks(case: Simulated, calibration: Calibration, watched: int) -> dict[str, list[int]]:
     """Rank the truth of every quantity among nearly independent posterior draws.
 
-    Parameters
-    ----------
-    case : Simulated
-    calibration : Calibration
-    watched : int
-        Held-out row at which a prediction is ranked.
-
-    Returns
-    -------
-    dict of str to [int, int]
-        Draws below the truth, and draws. Where the truth has no value the quantity is left out.
+    Return draws below the truth, and draws; a quantity whose truth has no value is left out. A
+    prediction is ranked at the held-out row `watched`.
     """
     drawn = _quantities(calibration, _thinned(calibration.draws), case, watched)
     true = _quantities(calibration, case.truth[None], case, watched)

@@ -38,18 +38,9 @@ def run_sbc(
 ) -> SbcScore:
     """Simulate, calibrate and rank; what is there already is not done again.
 
-    Parameters
-    ----------
-    out : Path
-        Its folder ``replicates`` gets one JSON file for each replicate.
-    models : sequence of str
-        By default all that are not slow.
-    simulations : int
-        Of each model.
-    priors : sequence of Path
-        Prior files in the place of the shipped ones; each says which model it is for.
-    workers, scheduler, progress, announce
-        As for `calib.batch.tasks.run_tasks`.
+    The folder's ``replicates`` gets one JSON file for each replicate of each model, by default of
+    all that are not slow. A prior file says which model it is for. The others are as for
+    `calib.batch.tasks.run_tasks`.
 
     Raises
     ------
@@ -79,13 +70,7 @@ def run_sbc(
 
 
 def chosen_models(models: Sequence[str] = ()) -> list[str]:
-    """Return the names of models; of all that are not slow if none is given.
-
-    Raises
-    ------
-    CalibError
-        If there is no such model.
-    """
+    """Return the names of models, which must be known; of all that are not slow by default."""
     named = [get_model(name).name for name in models]
     return named or [m.name for m in MODELS.values() if not m.slow]
 

@@ -44,17 +44,11 @@ class Quantity:
 
 @dataclass(frozen=True)
 class BandCoverage:
-    """Coverage of one predictive band on simulated hold-outs.
+    """Coverage of one predictive band on measurements of simulated hold-outs.
 
-    Parameters
-    ----------
-    rows, replicates : int
-        Measurements, and the campaigns that they belong to.
-    proportion : float
-        Mean over campaigns of the part of their measurements inside the band.
-    se : float
-        Its standard error between campaigns, whose rows share a posterior; no less than that of as
-        many independent rows of a band that is right, which few campaigns may fall short of.
+    The mean over campaigns of the part of their measurements inside the band, and its standard
+    error between campaigns, whose rows share a posterior; no less than that of as many independent
+    rows of a band that is right, which few campaigns may fall short of.
     """
 
     level: float
@@ -83,8 +77,6 @@ class ModelScore:
 
     Parameters
     ----------
-    replicates : int
-        Campaigns simulated and calibrated.
     unconverged, extended : int
         Posteriors that did not pass the gate even when extended, and all that were extended. The
         former are left out of ranks and coverage, as a user is told not to use them: a choice
@@ -110,13 +102,7 @@ class ModelScore:
 
 @dataclass(frozen=True)
 class SbcScore:
-    """A whole run.
-
-    Parameters
-    ----------
-    seed, simulations : int
-        Simulations of each model.
-    """
+    """A whole run, so many simulations of each model."""
 
     seed: int
     simulations: int
@@ -141,15 +127,9 @@ def score(
     records: Sequence[Mapping[str, Any]], seed: int, simulations: int,
     failed: Mapping[str, str] | None = None,
 ) -> SbcScore:  # fmt: skip
-    """Score the records of a run.
+    """Score the records of a run, as `calib.validation.sbc.replicate.replicate` returns them.
 
-    Parameters
-    ----------
-    records : sequence of mapping
-        As `calib.validation.sbc.replicate.replicate` returns them.
-    seed, simulations : int
-    failed : mapping of str to str, optional
-        Errors by the name of the replicate, which begins with its model's.
+    Errors are by the name of the replicate, which begins with its model's.
 
     Raises
     ------

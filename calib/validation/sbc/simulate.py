@@ -43,24 +43,17 @@ class Simulated:
 
 
 def simulate(template: Problem, design: Design, rng: np.random.Generator) -> Simulated:
-    """Simulate a campaign.
+    """Simulate a campaign at the design's conditions.
 
-    Parameters
-    ----------
-    template : Problem
-        Of the design's conditions; its outputs are not used.
+    Parameters for which the equation has no value at some row have no likelihood: the posterior
+    excludes them, so the prior that the truths come from does too. Data that a float cannot hold
+    are drawn again with new parameters; a choice made by looking at data alone keeps ranks uniform
+    (Modrak et al. 2023, doi:10.1214/23-BA1404).
 
     Raises
     ------
     CalibError
         If the model has no value at the design, however often the prior is asked.
-
-    Notes
-    -----
-    Parameters for which the equation has no value at some row have no likelihood: the posterior
-    excludes them, so the prior that the truths come from does too. Data that a float cannot hold
-    are drawn again with new parameters; a choice made by looking at data alone keeps ranks
-    uniform (Modrak et al. 2023, doi:10.1214/23-BA1404).
     """
     bound = template.bound
     for attempt in range(1, _MOST_ATTEMPTS + 1):

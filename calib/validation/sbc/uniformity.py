@@ -38,26 +38,16 @@ class EcdfBand:
 
 
 def pit(ranks: Sequence[Sequence[int]], rng: np.random.Generator) -> Array:
-    """Turn ranks among draws into transforms that are uniform on (0, 1) if all is right.
+    """Turn ranks (draws below the truth, and draws) into what is uniform on (0, 1) if all is right.
 
-    Parameters
-    ----------
-    ranks : sequence of [int, int]
-        Draws below the truth, and draws.
-    rng : Generator
-        Spreads each rank over its share of the interval, so that they are uniform exactly.
+    Each rank is spread over its share of the interval, so that they are uniform exactly.
     """
     below, draws = np.array(ranks, dtype=float).reshape(-1, 2).T
     return np.asarray((below + rng.uniform(size=below.size)) / (draws + 1.0))
 
 
 def ecdf_band(values: Array, level: float) -> EcdfBand:
-    """ECDF of values and the band that holds a uniform sample's with a probability, by ArviZ.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-    """
+    """ECDF of values (n,) and the band that holds a uniform sample's with a probability."""
     ecdf_pit: Any = import_module("arviz_stats.ecdf_utils").ecdf_pit
 
     # The same random numbers every time: the band is a property of n and the level.
@@ -65,13 +55,7 @@ def ecdf_band(values: Array, level: float) -> EcdfBand:
 
 
 def p_value(values: Array) -> float:
-    """Probability that as many uniform values leave the band by as much, exactly.
-
-    Parameters
-    ----------
-    values : ndarray, shape (n,)
-        In (0, 1).
-    """
+    """Probability that as many uniform values (n,) leave the band by as much, exactly."""
     n = values.size
     z = np.arange(1, n) / n
     counts = np.searchsorted(np.sort(values), z, side="right")
@@ -98,13 +82,7 @@ def _p_of_tail(n: int, tail: float) -> float:
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
-    """Adjust p values for their number, family-wise (Holm 1979, JSTOR 4615733).
-
-    Returns
-    -------
-    list of float
-        In the order given.
-    """
+    """Adjust p values, in their order, for their number, family-wise (Holm 1979, JSTOR 4615733)."""
     p = np.asarray(p_values, dtype=float)
     order = np.argsort(p)
     scaled = np.maximum.accumulate(p[order] * np.arange(p.size, 0, -1))
