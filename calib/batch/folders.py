@@ -147,7 +147,7 @@ def _umask() -> int:
 
 
 def check_folder(out: Path, *, overwrite: bool = False) -> None:
-    """Check, before long work and with a CalibError, that a folder may be written, or replaced."""
+    """Raise a CalibError, before long work, if a folder may not be written, or not replaced."""
     try:
         exists = out.exists()
     except OSError as error:  # a name that is too long, a folder that may not be searched

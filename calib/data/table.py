@@ -168,7 +168,7 @@ def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -
 
 
 def check_varies(table: Table, column: str) -> None:
-    """Check, with a CalibError, that the values of a column are not all equal, up to rounding."""
+    """Raise a CalibError if the values of a column are all equal, up to rounding."""
     values = table[column][~np.isnan(table[column])]
     if values.size and np.ptp(values) > 1e-12 * np.abs(values).max():
         return

@@ -90,7 +90,7 @@ class Noise:
         return self.choice.usual
 
     def must_be_usual(self, source: str, what: str) -> None:
-        """Refuse, with a CalibError, any other for what is worked out for the usual noise alone."""
+        """Raise a CalibError unless usual, for what is worked out for the usual noise alone."""
         if not self.usual:
             raise CalibError(
                 f"{what} takes normal noise of one standard deviation only",

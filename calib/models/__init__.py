@@ -45,7 +45,7 @@ def example_csv(model_name: str) -> str:
     """Return an example of the data a model is calibrated on, as CSV.
 
     Units are in the column names; any other unit in `calib.data.quantities` may stand in their
-    place. Of a model without an example it is a CalibError.
+    place. A CalibError names a model that has no example.
     """
     model = get_model(model_name)
     if not model.example:

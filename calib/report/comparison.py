@@ -122,7 +122,10 @@ def write_comparison(
 
 
 def load_stack(folder: Path) -> tuple[dict[str, Any], list[tuple[float, Calibration]]]:
-    """Read a folder of `calib compare`, if whole: what it found, and models that have a weight."""
+    """Read a folder of `calib compare`: what it found, and the models that have a weight.
+
+    A CalibError says that it is damaged.
+    """
     path = folder / FILE
     try:
         found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))

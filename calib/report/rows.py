@@ -75,8 +75,8 @@ def group_column(result: OutputResult) -> str | None:
 def groups(result: OutputResult, *, most: bool = True) -> list[Group]:
     """Split the rows into at most six panels: those held out and the most populated others.
 
-    More distinct values than twice that are pooled into thirds of the rows. If asked for more than
-    the most, every row is in a group.
+    More distinct values than twice that are pooled into thirds of the rows. Without `most` it does
+    not stop at six, and every row is in a group.
     """
     column = group_column(result)
     fitted, held = result.calibration.problem.table, held_table(result)

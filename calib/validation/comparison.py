@@ -227,7 +227,7 @@ def _check_possible(found: Candidate) -> None:
 
 
 def check_comparable(models: Sequence[str]) -> None:
-    """Check, with a CalibError, that there are at least two models, all of one output."""
+    """Raise a CalibError unless there are at least two models, all of one output."""
     if len(models) < 2 or len(set(models)) < len(models):
         raise CalibError(
             f"there is nothing to compare in {', '.join(models) or 'no model'}",

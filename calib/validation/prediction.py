@@ -81,8 +81,8 @@ def predictive_draws(
 def predict_stacked(parts: Sequence[tuple[float, Calibration]], table: Table) -> Prediction:
     """Predict with the mixture of several calibrations of one output, weights first, of sum 1.
 
-    Each gives as many of the `N_DRAWS` draws as is its weight, and the table has the conditions of
-    all that have one; else a CalibError.
+    Each gives as many of the `N_DRAWS` draws as is its weight. A CalibError names a condition of
+    one that has any and the table has not.
     """
     used = [(weight, c) for weight, c in parts if round(weight * N_DRAWS) > 0]
     means, measured, outer = [], [], []

@@ -36,7 +36,7 @@ def input_csv(parameters: Mapping[str, float], conditions: Mapping[str, Array]) 
 
 
 def check_template(template: str, names: tuple[str, ...], where: str) -> None:
-    """Check, with a CalibError, that a template has a place for each name, and no other."""
+    """Check that a template has a place for each name, and no other; a CalibError if not."""
     marks = set(_MARK.findall(template))
     missing = [name for name in names if name not in marks]
     unknown = sorted(marks - set(names))

@@ -24,8 +24,6 @@ from calib.validation.sbc.designs import Design, design_of
 from calib.validation.sbc.simulate import Simulated, simulate
 from calib.validation.scores import LEVELS
 
-# Quantities that are followed beside the parameters.
-DERIVED = ("log_likelihood", "prediction", "measurement")
 # Steps of each walker that are kept for ranks. The gate asks for 50 autocorrelation times, so five
 # steps are at least ten of them apart: as good as independent.
 _KEPT_STEPS = 5
