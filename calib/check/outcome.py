@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
@@ -61,7 +61,7 @@ class Outcome:
     @property
     def verdict(self) -> str:
         """The verdict in one sentence."""
-        different = _names(self.of(Status.DIFFERENT))
+        different = list(dict.fromkeys(item.name for item in self.of(Status.DIFFERENT)))
         if different:
             shown = ", ".join(different[:4]) + (", ..." if len(different) > 4 else "")
             return f"DIFFERENT: {shown}"
@@ -97,7 +97,3 @@ class Outcome:
             "not_converged": list(self.not_converged),
             "items": [{**asdict(item), "status": str(item.status)} for item in self.items],
         }
-
-
-def _names(items: Iterable[Item]) -> list[str]:
-    return list(dict.fromkeys(item.name for item in items))

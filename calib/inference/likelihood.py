@@ -19,7 +19,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.models.base import N_WORK, Array, BoundModel, Conditions, Rows
 
@@ -149,7 +148,7 @@ def _distinct(
     code = np.zeros(n, dtype=np.intp)
     for values, inverse in levels:
         # Renumbered at every step, so that the codes cannot overflow.
-        code = _renumbered(code * values.size + inverse)
+        code = np.unique(code * values.size + inverse, return_inverse=True)[1]
     count = np.bincount(code)
     if count.size == n:
         order = np.argsort(code) if n > _SHORT else np.arange(n)
@@ -160,10 +159,6 @@ def _distinct(
     within = float(np.square(response - mean[code]).sum())
     distinct = {name: v[first] for name, v in conditions.items()}
     return distinct, mean, count.astype(np.float64), within
-
-
-def _renumbered(code: NDArray[np.intp]) -> NDArray[np.intp]:
-    return np.unique(code, return_inverse=True)[1]
 
 
 def _blocks(distinct: Conditions, n: int) -> list[slice]:

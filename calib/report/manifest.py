@@ -11,7 +11,7 @@ from typing import Any
 from calib.batch.environment import Environment, sha256
 from calib.inference.estimators import GeneticSettings
 from calib.inference.sampling.sampler import SamplerSettings
-from calib.report.study import OutputResult, Study
+from calib.report.study import Study
 from calib.report.study_tasks import Task
 
 SCHEMA = "calib/manifest/2"
@@ -51,7 +51,10 @@ def build_manifest(
         "tasks": {k: _task(r.task, inputs[k]) for k, r in study.results.items()},
         "seconds": {
             "study": study.seconds,
-            **{key: _seconds(result) for key, result in study.successes.items()},
+            **{
+                key: {**r.seconds, "methods": {e.method: e.seconds for e in r.estimates}}
+                for key, r in study.successes.items()
+            },
         },
     }
 
@@ -64,7 +67,3 @@ def _task(task: Task, inputs: Mapping[str, Any]) -> dict[str, Any]:
         "label": task.table.label,
         **inputs,
     }
-
-
-def _seconds(result: OutputResult) -> dict[str, Any]:
-    return {**result.seconds, "methods": {e.method: e.seconds for e in result.estimates}}

@@ -31,9 +31,9 @@ def warnings_of(problem: Problem, t: Array) -> tuple[str, ...]:
 
     `t` (d,) are internal coordinates of a fit to all rows, for instance the posterior's mode.
     """
+    scatter = float(problem.theta(t[None])[0, -1])
     return (
-        *outlying_notes(problem, t), *file_notes(problem, _scatter(problem, t)),
-        *residual_notes(problem, t),
+        *outlying_notes(problem, t), *file_notes(problem, scatter), *residual_notes(problem, t),
     )  # fmt: skip
 
 
@@ -181,10 +181,6 @@ def _heavy_tailed(problem: Problem, residual: Array) -> Iterable[str]:
             f"(excess kurtosis {stats.kurtosis(residual):.1f}); single readings then weigh too "
             'much: correct those that are wrong, or write family = "student_t" in the prior file'
         )
-
-
-def _scatter(problem: Problem, t: Array) -> float:
-    return float(problem.theta(t[None])[0, -1])
 
 
 def _rows(n: int) -> str:

@@ -47,7 +47,7 @@ def short_citation(key: str) -> str:
     if key == OWN:
         return "The calib authors"
     entry = entries()[key]
-    names = [_family(name) for name in entry["author"].split(" and ")]
+    names = [_plain(name).partition(",")[0] for name in entry["author"].split(" and ")]
     who = f"{names[0]} et al." if len(names) > 2 else " and ".join(names)
     return f"{who} {entry['year']}"
 
@@ -74,10 +74,6 @@ def _line(entry: Mapping[str, str]) -> str:
         f"{who} ({entry['year']}) {title}. {_plain(entry['journal'])} {entry['volume']}{number}, "
         f"{pages}. {where}"
     )
-
-
-def _family(name: str) -> str:
-    return _plain(name).partition(",")[0]
 
 
 def _plain(text: str) -> str:
