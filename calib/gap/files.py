@@ -15,6 +15,7 @@ from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
 from calib.gap.inclusion import Included
+from calib.gap.where import Region
 from calib.models.base import Array
 
 __all__ = ["SCHEMA", "document", "write_diagnosis"]
@@ -40,8 +41,7 @@ def document(found: Diagnosis) -> dict[str, Any]:
         "remainder": {
             **_included(found.inclusion.remainder),
             "where": [
-                {"output": r.output, "conditions": {k: list(v) for k, v in r.conditions.items()}}
-                for r in found.inclusion.where
+                {"output": r.output, "conditions": _ends(found, r)} for r in found.inclusion.where
             ],
         },
         "not_testable": [{"name": n, "reason": r} for n, r in ranking.not_testable.items()],
@@ -59,7 +59,7 @@ def document(found: Diagnosis) -> dict[str, Any]:
         "regions": [
             {
                 "output": r.output,
-                "conditions": {k: list(v) for k, v in r.conditions.items()},
+                "conditions": _ends(found, r),
                 "gap": r.gap,
                 "probability": r.probability,
             }
@@ -86,6 +86,15 @@ def document(found: Diagnosis) -> dict[str, Any]:
             }
             for m in found.next_measurements
         ],
+    }
+
+
+def _ends(found: Diagnosis, region: Region) -> dict[str, list[float] | list[str]]:
+    """Return the ends of a region, or the value of a category that it is."""
+    covariates = found.data.case.covariates
+    return {
+        name: [words_of(covariates, name, *ends)] if covariates.get(name) else list(ends)
+        for name, ends in region.conditions.items()
     }
 
 

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from calib.data.quantities import columns_of
 from calib.gap.case import Campaigns
 from calib.gap.covariates import other_conditions
-from calib.gap.effects import View
 from calib.gap.mixture import Truth
 from calib.models.base import Array
 
@@ -52,12 +51,13 @@ class RowGap:
 
 @dataclass(frozen=True)
 class Region:
-    """A stretch of one condition over which the gap exceeds the noise.
+    """A stretch of one condition, or a value of a category, over which the gap exceeds the noise.
 
     Parameters
     ----------
     output : str
     conditions : mapping of str to (float, float)
+        Its ends; of a category both are the place of one value in its list.
     gap : float
         Posterior mean of the mean gap over its rows, in the output's unit.
     interval : tuple of float
@@ -73,10 +73,14 @@ class Region:
     probability: float
 
 
-def conditions_to_search(view: View) -> list[str]:
-    """Return the recorded conditions along which a gap may lie somewhere, in a reader's order."""
-    roles = (*_ROLES, *other_conditions(view))
-    return [c for role in roles for c in columns_of(role) if c in view.conditions]
+def conditions_to_search(data: Campaigns) -> list[str]:
+    """Return the recorded conditions along which a gap may lie somewhere, in a reader's order.
+
+    Those that the case declares come last.
+    """
+    roles = (*_ROLES, *other_conditions(data.view))
+    known = [c for role in roles for c in columns_of(role) if c in data.view.conditions]
+    return [*known, *data.case.covariates]
 
 
 def row_gaps(data: Campaigns, truth: Truth) -> tuple[RowGap, ...]:
@@ -105,12 +109,13 @@ def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Re
         left = np.ones(o.rows.size, dtype=bool)
         for _ in range(_MOST):
             best: tuple[float, Region, NDArray[np.bool_]] | None = None
-            for name in conditions_to_search(data.view):
+            for name in conditions_to_search(data):
                 column = data.view.conditions[name]
                 if np.ptp(column[o.rows]) == 0.0:
                     continue
                 values = column[o.rows]
-                for low, high in _stretches(values, row_gap, left):
+                category = bool(data.case.covariates.get(name))
+                for low, high in _stretches(values, row_gap, left, category):
                     inside = (values >= low) & (values <= high)
                     region = _region(truth, o.name, {name: (low, high)}, draws, noise, inside)
                     # As many readings of one mean gap: what tells a long stretch from a short one.
@@ -139,15 +144,22 @@ def _quantile(truth: Truth, draws: Array, q: float) -> float:
     return float(truth.quantile(draws[:, None], q)[0])
 
 
-def _stretches(values: Array, gap: RowGap, left: NDArray[np.bool_]) -> list[tuple[float, float]]:
-    """The stretches of distinct values whose rows, those left, probably have a gap of one sign."""
+def _stretches(
+    values: Array, gap: RowGap, left: NDArray[np.bool_], category: bool
+) -> list[tuple[float, float]]:
+    """The stretches of distinct values whose rows, those left, probably have a gap of one sign.
+
+    Values of a category have no order, so that each is a stretch of its own.
+    """
     distinct = np.unique(values)
-    groups = np.array_split(distinct, min(8, distinct.size))
+    groups = np.array_split(distinct, distinct.size if category else min(8, distinct.size))
     rows = [(values >= group[0]) & (values <= group[-1]) & left for group in groups]
     signs = [_sign(gap, inside) for inside in rows]
     fewest = max(_FEWEST, int(_FEWEST_PART * values.size))
     found = []
-    for sign, run in groupby(range(len(groups)), key=signs.__getitem__):
+    for (sign, _), run in groupby(
+        range(len(groups)), key=lambda i: (signs[i], i if category else 0)
+    ):
         at = list(run)
         if sign and sum(int(rows[i].sum()) for i in at) >= fewest:
             found.append((float(groups[at[0]][0]), float(groups[at[-1]][-1])))

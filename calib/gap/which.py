@@ -213,7 +213,7 @@ def _sets_and_unlisted(
         (joined(best[a].forward.hypothesis, best[b].forward.hypothesis), [best[a], best[b]])
         for i, a in enumerate(single)
         for b in single[i + 1 :]
-        if a in seeds or b in seeds
+        if (a in seeds or b in seeds) and _apart(best[a], best[b])
     ]
     truncated_fits = together(
         [worker.truncated_joint(h, members, 1) for h, members in others + pairs]
@@ -261,10 +261,19 @@ def _larger(sets: Sequence[Fit], single: Sequence[Fit]) -> list[_Started]:
     for a in sets:
         names = {e.name for e in a.forward.hypothesis.effects}
         for b in single:
-            if b.forward.hypothesis.name not in names:
+            if b.forward.hypothesis.name not in names and _apart(a, b):
                 h = joined(a.forward.hypothesis, b.forward.hypothesis)
                 found.setdefault(h.name, (h, [a, b]))
     return list(found.values())
+
+
+def _apart(a: Fit, b: Fit) -> bool:
+    """Whether no effect of one explanation holds one of the other already."""
+    return not any(
+        e.name in other.holds or other.name in e.holds
+        for e in a.forward.hypothesis.effects
+        for other in b.forward.hypothesis.effects
+    )
 
 
 def _finished(truncated_fits: Sequence[Sequence[Fit]], hopeless: float, odds: Odds) -> list[Fit]:
@@ -526,5 +535,21 @@ class _Worker:
         rng = generator(self.seed, "gap", hypothesis.name, *which)
         starts = np.repeat(start[None], size, axis=0)
         for i in which:
-            starts[:, forward.phi_slices[i]] = hypothesis.effect_priors[i].sample(rng, size)
+            effect, priors = hypothesis.effects[i], hypothesis.effect_priors[i]
+            drawn = priors.sample(rng, size)
+            if type(effect).begun is not Effect.begun:
+                natural = effect.begun(
+                    priors.to_natural(drawn), self._left(forward, start), self.data.view
+                )
+                drawn = priors.to_internal(natural)
+            starts[:, forward.phi_slices[i]] = drawn
         return starts
+
+    def _left(self, forward: Forward, start: Array) -> dict[str, Array]:
+        """What a guess leaves of the field's readings, by the role of the output."""
+        predicted = forward.field(start[None], self.data.view)
+        left = {}
+        for o in self.data.outputs:
+            left[o.role] = np.full(predicted[o.name].shape[1], np.nan)
+            left[o.role][o.rows] = o.field - predicted[o.name][0, o.rows]
+        return left

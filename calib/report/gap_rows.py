@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data.quantities import OUTPUTS, role_of
+from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
@@ -63,6 +64,9 @@ def region_text(found: Diagnosis, region: Region) -> str:
     if ends[0] <= values.min() and ends[1] >= values.max():
         return EVERYWHERE
     axis = axis_of(column)
+    words = words_of(found.data.case.covariates, column, *ends)
+    if words:
+        return f"{axis.name.lower()} {words}"
     low, high = (_stretch_end(column, axis.scale(np.array(v)).item()) for v in ends)
     span = low if low == high else f"{low} to {high}"
     return f"{axis.name.lower()} {span}{unit_after(axis)}"

@@ -58,6 +58,8 @@ def size_sentences(found: Diagnosis, name: str) -> list[str]:
     if len(effects) != 1:
         return _rms_sentences(found, changes, together=len(effects) > 1)
     effect = effects[0]
+    if "change_point" in effect.parameters:
+        return [_step_sentence(found, fit, psi)]
     if type(effect).on_output is Effect.on_output:
         phi = fit.forward.hypothesis.effect_priors[0].to_natural(psi[:, fit.forward.phi_slices[0]])
         sentences = _instrument_sentences(found, effect, phi)
@@ -228,6 +230,24 @@ def _instrument_sentences(found: Diagnosis, effect: Effect, phi: Array) -> list[
     if "pressure" in sentences:
         sentences.pop("ground_pressure", None)
     return list(sentences.values())
+
+
+def _step_sentence(found: Diagnosis, fit: Fit, psi: Array) -> str:
+    """Say by how much the reading jumps, and after which run."""
+    (effect,), (priors,) = fit.forward.hypothesis.effects, fit.forward.hypothesis.effect_priors
+    natural = priors.to_natural(psi[:, fit.forward.phi_slices[0]])
+    before, after, at = (
+        natural[:, effect.parameters.index(p)] for p in ("before", "after", "change_point")
+    )
+    (output,) = found.data.with_role("pull")
+    axis = output_axis(found, output)
+    jump = axis.factor * (after - before)
+    first, last = found.data.view.order_range
+    run = first + float(np.median(at)) * (last - first)
+    way = "higher" if jump.mean() > 0.0 else "lower"
+    amount = format_value(abs(float(jump.mean())), float(jump.std()))
+    word = output_word(output)
+    return f"{word} reads {amount} {axis.unit} {way} after run {np.floor(run):.0f} than before"
 
 
 def _end_sentences(

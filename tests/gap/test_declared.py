@@ -16,7 +16,10 @@ from calib.gap.corrected import load_corrected, predict_columns, save_corrected
 from calib.gap.declared import new_values, words_of
 from calib.gap.diagnose import diagnose_once
 from calib.gap.effects import EFFECTS
+from calib.gap.files import document
 from calib.gap.provenance import case_hashes, inputs_record
+from calib.report.figures.gap_where import conditions_plate
+from calib.report.gap_rows import region_text
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 FEW = {name: EFFECTS[name] for name in ("force_offset", "sensor_drift", "slip_zero_shift")}
@@ -63,6 +66,10 @@ def test_a_number_that_the_simulator_ignores_is_found(tmp_path):
     found = diagnose_once(read_case(folder), 1, effects=FEW)
     assert found.inclusion.causes["depends_on_tyre_temperature_c"].probability > 0.9
     assert found.ranking.order[0] == "depends_on_tyre_temperature_c"
+    regions = document(found)["regions"]
+    stretches = [r["conditions"].get("tyre_temperature_c") for r in regions]
+    # Warm tyres pull more than simulated; stretches are known to one of eight groups.
+    assert any(s and 20.0 < s[0] < s[1] and s[1] > 28.0 for s in stretches)
     again = saved(found, tmp_path)
     assert again.data.case.covariates == {"tyre_temperature_c": ()}
     at = predict_columns(again, read_table(folder / "field.csv"))
@@ -81,6 +88,13 @@ def test_a_category_is_found_and_kept_by_its_names(tmp_path):
     assert set(effect.parameters) >= {"pull_factor_Dahl", "pull_offset_Dahl"}
     assert words_of(found.data.case.covariates, "operator", 1.0, 1.0) == "Dahl"
     assert words_of(found.data.case.covariates, "operator", 1.0, 2.0) == "Dahl, Lind"
+    region, *others = document(found)["regions"]
+    assert region["conditions"] == {"operator": ["Dahl"]}
+    assert not any("operator" in r["conditions"] for r in others)
+    assert region_text(found, found.regions[0]) == "operator Dahl"
+    plate = conditions_plate(found)
+    ticks = [[t.get_text() for t in ax.get_xticklabels()] for ax in plate.figure.axes]
+    assert ["Berg", "Dahl", "Lind"] in ticks
     recorded = json.loads(inputs_record(found.data.case, 1))
     assert recorded["covariates"] == case_hashes(folder)["covariates"] == {"operator": "category"}
     again = saved(found, tmp_path)

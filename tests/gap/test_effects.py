@@ -21,6 +21,7 @@ SIZES = {
     "slip_zero_shift": ("radius_error",),
     "force_offset": ("offset",),
     "sensor_drift": ("drift",),
+    "sensor_step": ("before", "after"),
     "pressure_gauge_bias": ("gain", "offset"),
     "multipass_compaction": ("pull", "slope", "resistance", "rut", "rut_slip"),
     "rate_effect": ("pull", "slope", "resistance", "rut", "rut_slip"),
@@ -39,6 +40,7 @@ SOME: Mapping[str, tuple[Mapping[str, float], int | None, int | None]] = {
     "slip_zero_shift": ({"radius_error": 0.05}, 1, 1),
     "force_offset": ({"offset": 0.2}, 1, None),
     "sensor_drift": ({"drift": 0.2, "curvature": 1.0, "half_way": 1e9, "zero_at": 0.0}, 1, None),
+    "sensor_step": ({"before": 0.1, "after": 0.2}, 1, None),
     "pressure_gauge_bias": ({"gain": 0.3}, -1, 1),
     "multipass_compaction": ({"pull": 0.1, "rut": -0.1}, 1, -1),
     "rate_effect": ({"pull": 0.1, "rut": -0.1}, 1, -1),
@@ -174,6 +176,29 @@ def test_amounts(view):
     np.testing.assert_allclose(lug, 0.5 * -np.expm1(-view.slip() / 0.2))
 
 
+def test_a_step_is_one_constant_before_a_run_and_another_after_it(view):
+    size = {"before": -0.1, "after": 0.2, "change_point": 9.5 / 19.0, "duration": 1e-9}
+    step = apply("sensor_step", size, "pull", view)[0]
+    np.testing.assert_allclose(step, np.where(np.arange(20) < 10, -0.1, 0.2), atol=1e-6)
+    # In the middle of a run it reads in between; over a longer time it rises with the runs.
+    middle = apply("sensor_step", size | {"change_point": 9.0 / 19.0}, "pull", view)[0]
+    assert middle[9] == pytest.approx(0.05)
+    slow = apply("sensor_step", size | {"duration": 3.0 / 19.0}, "pull", view)[0]
+    np.testing.assert_allclose(np.diff(slow)[8:11], 0.3 / 4.0)
+
+
+def test_a_fit_of_a_step_begins_with_what_is_left_on_its_sides(view):
+    effect = EFFECTS["sensor_step"]
+    drawn = np.tile(parameters("sensor_step", {"change_point": 9.5 / 19.0}), (2, 1))
+    left = np.where(np.arange(20) < 10, 0.3, -0.1)
+    left[3] = np.nan
+    begun = effect.begun(drawn, {"pull": left}, view)
+    # Begun wide, a tenth of the campaign, so that the sides mix a little.
+    np.testing.assert_allclose(begun[:, :2], [[0.3, -0.1]] * 2, atol=0.04)
+    np.testing.assert_allclose(begun[:, 2], 0.5)
+    assert drawn[0, 0] == 0.0
+
+
 def test_true_slip_from_a_wrong_rolling_radius(view):
     phi = parameters("slip_zero_shift", {"radius_error": 0.1})
     changed = EFFECTS["slip_zero_shift"].on_conditions(phi, "pull", by_role(view), view)
@@ -253,6 +278,17 @@ def test_every_effect_has_priors_with_units_and_reasons(name):
         assert p.unit
         assert len(p.reason) > 10
         assert len(p.source) > 3
+
+
+@pytest.mark.parametrize("name", EFFECTS)
+def test_no_size_rests_on_one_source(name):
+    priors = read_priors(
+        default_priors(f"effects/{name}"), name, EFFECTS[name].parameters, {"normal_load_kn": 5}
+    )
+    for p in priors.entries:
+        if p.name in SIZES[name]:
+            several = "; " in p.source or "), " in p.source
+            assert several or "widened" in p.source, (p.name, p.source)
 
 
 def test_reasons_why_an_effect_cannot_be_tested(view):

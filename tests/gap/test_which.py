@@ -13,6 +13,7 @@ from calib.errors import CalibError
 from calib.gap.case import Case, campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import dependences
+from calib.gap.inclusion import inclusion_probability
 from calib.gap.which import Odds, calibrate_lab, probabilities, rank
 from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
@@ -103,6 +104,26 @@ def test_a_warming_gauge_is_found_from_several_guesses():
     assert phi[0] < -0.2
     assert phi[1] < 0.8
     assert ranking.order[0] == "sensor_drift"
+
+
+# Of the size of five noise sds: a step of them, a drift of them in the rms from zero at its start.
+OVER_ORDER = {
+    "sensor_step": {"after": 0.15, "change_point": 0.5, "duration": 1e-9},
+    "sensor_drift": {"drift": 0.26, "curvature": 1.0, "half_way": 10.0, "zero_at": 0.0},
+    None: {},
+}
+
+
+@pytest.mark.parametrize("name", OVER_ORDER)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_step_and_a_drift_are_told_apart(name, seed):
+    case = make_case(name, size=OVER_ORDER[name], models=PULL_ONLY, seed=seed)
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "sensor_step", "lug_thrust")}
+    ranking = rank(campaigns(case), 1, effects=few)
+    assert ranking.order[0] == (name or "none")
+    assert inclusion_probability(ranking.probability).get(name or "", 1.0) >= 0.8
+    # A step is an offset on either side of its change point: beside it one more would be idle.
+    assert not any({"force_offset", "sensor_step"} <= set(n.split("+")) for n in ranking.fits)
 
 
 def wave(data, output: str, size: float):

@@ -9,6 +9,7 @@ from calib.gap.effects.instruments import (
     ForceOffset,
     PressureGaugeBias,
     SensorDrift,
+    SensorStep,
     SlipZeroShift,
     WaterContentBias,
 )
@@ -30,6 +31,7 @@ EFFECTS: Registry[Effect] = Registry(
     SlipZeroShift(),
     ForceOffset(),
     SensorDrift(),
+    SensorStep(),
     PressureGaugeBias(),
     MultipassCompaction(),
     RateEffect(),

@@ -120,6 +120,8 @@ class Effect:
         Along what its size may depart from its formula, by the form error of the diagnosis
         (extrapolation: along inflation pressure, to values the simulator was not fitted at);
         empty where the formula is exact.
+    holds : tuple of str
+        Names of effects that it is with some of its own parameters: beside it they add nothing.
     priors : str
         Its priors as the text of a prior file, if they are in no file.
     prior_file : Path, optional
@@ -135,6 +137,7 @@ class Effect:
     covariates: tuple[str, ...] = ()
     varies: bool = True
     form: tuple[str, ...] = ()
+    holds: tuple[str, ...] = ()
     priors: str = ""
     prior_file: Path | None = None
 
@@ -171,6 +174,20 @@ class Effect:
         view : View
         """
         return location
+
+    def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
+        """Return guesses from which a fit may begin better than from draws of the prior.
+
+        Parameters
+        ----------
+        phi : ndarray, shape (k, n_parameters)
+            Draws of the prior.
+        left : mapping of str to ndarray, shape (n,)
+            By the role of the output, what a fit without the effect leaves of the field's
+            readings, on the scale of the response; NaN where there is none.
+        view : View
+        """
+        return phi
 
     def shape(self, view: View) -> Array | None:
         """Return the covariate along which the effect's form is least certain, shape (n,)."""

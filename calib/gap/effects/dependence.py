@@ -149,7 +149,7 @@ class DiffersBy(Effect):
             f'\n[parameters."{p}"]\ndist = "normal"\nmean = 0.0\n'
             f'sd = {0.02 if "_offset_" in p else 0.3}\nunit = "1"\n'
             f'reason = "How it differs from {reference}, the most frequent"\n'
-            'source = "Of the order of the scatter between laboratories and operators"\n'
+            'source = "This project: no published value was found; wide enough to be noticed"\n'
             for p in self.parameters
         )
 

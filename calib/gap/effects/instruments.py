@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from calib.gap.effects.base import Effect, View, saturating
 from calib.models.base import Array
 
 __all__ = [
-    "ConeIndexBias", "ForceOffset", "PressureGaugeBias", "SensorDrift", "SlipZeroShift",
-    "WaterContentBias",
+    "ConeIndexBias", "ForceOffset", "PressureGaugeBias", "SensorDrift", "SensorStep",
+    "SlipZeroShift", "WaterContentBias",
 ]  # fmt: skip
+
+# Part of the campaign over which a step is first taken to happen.
+_WIDE = 0.1
 
 
 class SlipZeroShift(Effect):
@@ -50,6 +55,12 @@ class ForceOffset(Effect):
         return location + phi[:, :1] if output == "pull" else location
 
 
+def _progress(view: View) -> Array:
+    """Part of the campaign that is over at each run, by run order, shape (n,)."""
+    first, last = view.order_range
+    return np.clip((view.of("order") - first) / max(last - first, 1.0), 0.0, 1.2)
+
+
 class SensorDrift(Effect):
     """A drift with run order: steady, settling, or from some run on; zeroed at any part of it."""
 
@@ -67,22 +78,62 @@ class SensorDrift(Effect):
     outputs = ("pull",)
     covariates = ("order",)
 
-    def _progress(self, view: View) -> Array:
-        first, last = view.order_range
-        span = max(last - first, 1.0)
-        return np.clip((view.of("order") - first) / span, 0.0, 1.2)
-
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Add the drift (kN from the first run to the last)."""
         if output != "pull":
             return location
         drift, curvature, half_way, zero_at = (phi[:, i : i + 1] for i in range(4))
-        u = np.maximum(self._progress(view), 1e-3)
+        u = np.maximum(_progress(view), 1e-3)
         return np.asarray(location + drift * (saturating(u, curvature, half_way) - zero_at))
 
     def shape(self, view: View) -> Array | None:
         """Run order."""
-        return self._progress(view)
+        return _progress(view)
+
+
+class SensorStep(Effect):
+    """A jump of the drawbar reading at some run: off by one constant before it, another after.
+
+    It takes at least one run, so that a fit can move the change point from one to the next.
+    """
+
+    name = "sensor_step"
+    title = "the drawbar reading jumps at some run, as when a sensor is replaced or slips"
+    latex = (
+        r"$P_\mathrm{f} = P + \text{before} + (\text{after} - \text{before})\, H(u)$ for the pull "
+        r"$P$",
+        (
+            r"$H(u)$ rises from 0 to 1 about the change point, during one run and the duration, "
+            r"$u$ being the part of the campaign that is over"
+        ),
+    )
+    parameters = ("before", "after", "change_point", "duration")
+    outputs = ("pull",)
+    holds = ("force_offset",)
+    covariates = ("order",)
+
+    def _beyond(self, phi: Array, view: View) -> Array:
+        """How far each run is beyond the change point, 0 to 1, shape (k, n)."""
+        first, last = view.order_range
+        lasts = phi[:, 3:4] + 1.0 / max(last - first, 1.0)
+        return np.asarray(np.clip((_progress(view) - phi[:, 2:3]) / lasts + 0.5, 0.0, 1.0))
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Add the errors before and after the change point (kN)."""
+        if output != "pull":
+            return location
+        before, after = phi[:, :1], phi[:, 1:2]
+        return np.asarray(location + before + (after - before) * self._beyond(phi, view))
+
+    def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
+        """Begin with mean residuals on both sides, and wide: from a sharp step no fit gets away."""
+        begun = phi.copy()
+        begun[:, 3] = _WIDE
+        known = np.isfinite(left["pull"])
+        beyond = self._beyond(begun, view)[:, known]
+        for i, part in enumerate((1.0 - beyond, beyond)):
+            begun[:, i] = part @ left["pull"][known] / (part.sum(axis=1) + 0.5)
+        return begun
 
 
 class PressureGaugeBias(Effect):

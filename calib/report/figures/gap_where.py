@@ -76,7 +76,7 @@ def where_plate(found: Diagnosis) -> Plate:
 def conditions_plate(found: Diagnosis) -> Plate | None:
     """Draw the gap in noise sds over every condition that varies, with regions marked."""
     conditions = found.data.view.conditions
-    order = conditions_to_search(found.data.view)
+    order = conditions_to_search(found.data)
     names = [n for n in order if np.ptp(conditions[n]) > 0.0]
     if {"pressure", "ground_pressure"} <= {role_of(n) for n in names}:
         names = [n for n in names if role_of(n) != "ground_pressure"]
@@ -102,7 +102,11 @@ def conditions_plate(found: Diagnosis) -> Plate | None:
             _points(ax, axis.scale(conditions[name][own.rows]), scaled, np.ones(own.rows.size, "?"))
             ax.set_ylim(*_limits(scaled))
             if i == len(outputs) - 1:
-                ax.set_xlabel(f"{axis.name}\n({axis.unit})")
+                levels = found.data.case.covariates.get(name)
+                ax.set_xlabel(axis.name if levels else f"{axis.name}\n({axis.unit})")
+                if levels:
+                    ax.set_xticks(range(len(levels)), levels, rotation=90)
+                    continue
                 ax.xaxis.set_major_locator(MaxNLocator(3))
                 ax.ticklabel_format(axis="x", style="plain", useOffset=False)
         row[0].set_ylabel(f"Gap in {output_word(own.name)}\n(noise sd)")

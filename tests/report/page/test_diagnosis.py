@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import pytest
 
+from calib.gap.diagnose import diagnose_once
+from calib.gap.effects import EFFECTS
 from calib.gap.inclusion import Included, Inclusion, inclusion_probability
 from calib.gap.next_measurement import NextMeasurement
 from calib.inference.priors import Prior
@@ -34,7 +36,7 @@ from calib.report.page.gap_tables import (
     prior_text,
 )
 from tests.browser import faults
-from tests.gap.cases import diagnosis_of, pull_diagnosis
+from tests.gap.cases import PULL_ONLY, diagnosis_of, make_case, pull_diagnosis
 from tests.report.page.test_page import Reader
 
 
@@ -280,6 +282,19 @@ def test_the_size_is_that_of_the_drift(found):
     assert match
     # The last fifth of a drift of 0.25 kN: 0.9 of it on average.
     assert abs(float(match[1]) - 0.225) < 4.0 * float(match[2])
+
+
+def test_the_size_of_a_step_names_its_run():
+    size = {"after": -0.2, "change_point": 12.5 / 26.0, "duration": 1e-9}
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "sensor_step")}
+    case = make_case("sensor_step", size=size, models=PULL_ONLY)
+    (sentence,) = size_sentences(diagnose_once(case, 1, effects=few), "sensor_step")
+    match = re.fullmatch(
+        r"drawbar pull reads ([\d.]+) ± ([\d.]+) kN lower after run (\d+) than before", sentence
+    )
+    assert match
+    assert abs(float(match[1]) - 0.2) < 4.0 * float(match[2])
+    assert match[3] == "12"
 
 
 def test_sizes_of_other_kinds_of_effect():
