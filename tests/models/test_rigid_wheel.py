@@ -61,7 +61,7 @@ def test_quadrature_of_all_rows_is_adaptive_quadrature_of_each() -> None:
                 {name: float(v[j]) for name, v in conditions.items()},
             )
             got = (found.pull[i, j], found.torque[i, j], found.sinkage[i, j])
-            # Loads are kilonewtons, and 12 nodes leave some 1e-8 of them.
+            # Loads are kilonewtons, and 8 nodes leave some 1e-6 of them.
             np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
 
 
@@ -76,14 +76,18 @@ def test_each_model_is_its_part_of_the_contact(name: str, field: str, scale: flo
     np.testing.assert_allclose(found, scale * getattr(whole, field), rtol=1e-9)
 
 
-def test_the_stresses_carry_the_load() -> None:
-    _, theta, conditions = draw(5, "wong_reece_pull", k=20, n=1)
-    slips = np.linspace(0.0, 0.6, 9)
-    rows = {name: np.repeat(v, 9) for name, v in conditions.items()} | {"slip_ratio": slips}
-    found = contact(wheels(theta, rows))
-    np.testing.assert_allclose(found.load, np.tile(rows["normal_load_kn"], (20, 1)), rtol=1e-8)
-    assert np.all(found.torque > 0.0)
-    assert np.all(found.sinkage > 0.0)
+def test_a_wheel_is_the_same_alone_and_among_many() -> None:
+    _, theta, conditions = draw(5, "wong_reece_pull", k=60, n=50)
+    # One in fifty so heavy that few soils carry it: these take longer.
+    conditions["normal_load_kn"][7] = 60.0
+    among = contact(wheels(theta, conditions))
+    assert 0 < np.isfinite(among.pull[:, 7]).sum() < 60
+    assert np.all(np.delete(among.torque, 7, axis=1) > 0.0)
+    for j in (3, 7):
+        alone = contact(wheels(theta, {name: v[j : j + 1] for name, v in conditions.items()}))
+        for field in ("pull", "torque", "sinkage"):
+            got, expected = getattr(alone, field)[:, 0], getattr(among, field)[:, j]
+            np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_braked_and_bottomless_wheels_have_no_value() -> None:
