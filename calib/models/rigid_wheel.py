@@ -24,22 +24,23 @@ from math import factorial
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.models.base import Array, Conditions
+from calib.models.base import Array, Columns, Rows
 
 __all__ = ["Contact", "Wheel", "contact", "wheels"]
 
 type Indices = NDArray[np.intp]
 
-# In each half of the contact.
-_N_NODES = 8
+# In each half of the contact; for a first step from the guess fewer will do.
+_N_NODES, _ROUGH = 8, 3
 # Of sine and cosine: 1e-13 at the largest angle.
 _TERMS = 8
-_SMALLEST, _LARGEST = 1e-4, 1.5
-# Steps that nearly all wheels need at most, and all.
-_USUAL, _MAX_ITERATIONS = 4, 60
-# The load's relative error beside which a secant is a tangent; its product with the last step in
-# ln theta1, of which the secant's own error is about a tenth.
-_NEAR, _TOLERANCE = 1e-3, 1e-9
+_LARGEST = 1.5
+_LN_ENTRY = (float(np.log(1e-4)), float(np.log(_LARGEST)))
+# Further steps that nearly all wheels need at most, and all.
+_USUAL, _MAX_ITERATIONS = 3, 60
+# Of the load's relative error times the last step in ln theta1; the next secant step leaves about
+# a tenth of it.
+_TOLERANCE, _ROUNDING = 3e-9, 1e-12
 # Arrays of 8 nodes for so many wheels fit into a cache of two megabytes.
 _BLOCK = 2048
 _N_WORK = 10
@@ -47,7 +48,7 @@ _N_WORK = 10
 
 @dataclass(frozen=True)
 class Wheel:
-    """Soil and wheel, arrays that broadcast to (k, n).
+    """Soil and wheel, arrays that broadcast.
 
     Parameters
     ----------
@@ -73,17 +74,16 @@ class Wheel:
 
 @dataclass(frozen=True)
 class Contact:
-    """Where a wheel stands: pull (kN), torque (kN m) and sinkage (m), shape (k, n)."""
+    """Where a wheel stands: pull (kN), torque (kN m) and sinkage (m), as it broadcasts."""
 
     pull: Array
     torque: Array
     sinkage: Array
 
 
-def wheels(theta: Array, conditions: Conditions) -> Wheel:
-    """Lay parameters k1, k2, n, c, phi (degrees), K (mm), c1, c2 out beside conditions."""
-    k1, k2, n, c, phi, K, c1, c2 = (theta[:, j, None] for j in range(8))
-    rows = {name: np.atleast_2d(v) for name, v in conditions.items()}
+def wheels(columns: Columns, rows: Rows) -> Wheel:
+    """Take parameters k1, k2, n, c, phi (degrees), K (mm), c1, c2, and conditions."""
+    k1, k2, n, c, phi, K, c1, c2 = columns
     return Wheel(
         k1, k2, n, c, np.tan(np.radians(phi)), K / 1000.0, c1, c2,
         rows["tyre_diameter_m"] / 2.0, rows["tyre_width_m"], rows["normal_load_kn"],
@@ -113,8 +113,8 @@ class _Rule:
 
 
 @cache
-def _rule() -> _Rule:
-    u, weight = np.polynomial.legendre.leggauss(_N_NODES)
+def _rule(size: int) -> _Rule:
+    u, weight = np.polynomial.legendre.leggauss(size)
     u = 0.5 * (u[:, None] + 1.0)
     node, order = u * u, np.arange(_TERMS)
     over = [1.0 / factorial(j) for j in range(1, 2 * _TERMS + 1)]
@@ -183,15 +183,15 @@ class _Cells:
         cohesion = 0.3 * self.c * self.area * angle / self.load
         x -= (friction - bent + cohesion) / (power + friction - 2.0 * bent)
         slope = np.maximum(power + friction - 2.0 * bent - cohesion, 0.5)
-        return np.clip(x, np.log(_SMALLEST), np.log(_LARGEST)), slope
+        return np.clip(x, *_LN_ENTRY), slope
 
 
-def _forces(entry: Array, cells: _Cells, work: Array) -> Array:
+def _forces(entry: Array, cells: _Cells, work: Array, nodes: int = _N_NODES) -> Array:
     """Integrate the stresses: load, pull and torque over radius (kN) in the first of 4 rows."""
-    rule, size = _rule(), entry.size
+    rule, size = _rule(nodes), entry.size
     sin, cos, sin_rear, cos_rear, rise, strength, tau, tau_rear, spare, powers = (
         part[: rows * size].reshape(rows, size)
-        for part, rows in zip(work, [_N_NODES] * (_N_WORK - 1) + [_TERMS], strict=True)
+        for part, rows in zip(work, [nodes] * (_N_WORK - 1) + [_TERMS], strict=True)
     )
     sin_entry, cos_entry = np.sin(entry), np.cos(entry)
     rear = cells.turn * entry
@@ -289,15 +289,19 @@ def _solve(which: Indices, cells: _Cells, work: Array, found: Array, steps: int)
     for where in _blocks(which):
         some = cells.some(where)
         x, slope = some.guess()
-        low, high = np.full_like(x, np.log(_SMALLEST)), np.full_like(x, np.log(_LARGEST))
+        rough = _forces(np.exp(x), some, work, _ROUGH)[0]
+        x = np.clip(x - np.log(rough / some.load) / slope, *_LN_ENTRY)
+        low, high = (np.full_like(x, edge) for edge in _LN_ENTRY)
         before = np.full((4, x.size), np.nan)
         for _ in range(steps):
             here = _forces(np.exp(x), some, work)
             value = np.log(here[0] / some.load)
             here[0], here[3] = value, x
             moved = here - before
-            step = np.abs(moved[3])
-            done = np.flatnonzero((np.abs(value) <= np.minimum(_TOLERANCE / step, _NEAR)))
+            # A secant is to be followed no farther than it is long, but for rounding.
+            gained = np.maximum(np.abs(moved[0]), _ROUNDING)
+            off = np.abs(value)
+            done = np.flatnonzero((off <= gained) & (off * np.abs(moved[3]) <= _TOLERANCE))
             if done.size:
                 on = np.where(moved[0] == 0.0, 0.0, -value / moved[0])[done]
                 found[:, where[done]] = here[1:, done] + on * moved[1:, done]
