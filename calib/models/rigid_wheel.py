@@ -40,9 +40,9 @@ _LN_ENTRY = (float(np.log(1e-4)), float(np.log(_LARGEST)))
 _USUAL, _MAX_ITERATIONS = 3, 60
 # Of the load's relative error times the last step in ln theta1; the next secant step leaves about
 # a tenth of it.
-_TOLERANCE, _ROUNDING = 3e-9, 1e-12
-# Arrays of 8 nodes for so many wheels fit into a cache of two megabytes.
-_BLOCK = 2048
+_TOLERANCE, _ROUNDING = 1e-10, 1e-12
+# Wheels whose arrays of 8 nodes stay in a cache of two megabytes.
+_BLOCK = 3072
 _N_WORK = 10
 
 
