@@ -213,14 +213,15 @@ def log_joint(fit: Fit, psi: Array) -> Array:
     """Log likelihood plus log prior at a fit's noise, shape (k, d) to (k,)."""
     problem = Residuals(fit.forward.data, fit.forward)
     sds = problem.sds(fit.noise)
-    inside = problem.clip(psi)
     with np.errstate(all="ignore"):
         prior = fit.forward.priors.log_prob(psi)
-        squares = np.concatenate(
-            [
-                np.square(problem.raw(inside[i : i + _AT_ONCE]) / sds).sum(axis=1)
-                for i in range(0, len(inside), _AT_ONCE)
-            ]
-        )
+        squares = np.full(len(psi), np.inf)
+        # Where the prior has no mass nothing need be predicted: of draws from it with heavy tails
+        # that is a good part.
+        inside = np.flatnonzero(np.isfinite(prior))
+        clipped = problem.clip(psi[inside])
+        for i in range(0, inside.size, _AT_ONCE):
+            raw = problem.raw(clipped[i : i + _AT_ONCE])
+            squares[inside[i : i + _AT_ONCE]] = np.square(raw / sds).sum(axis=1)
     constant = np.log(sds).sum() + 0.5 * sds.size * np.log(2.0 * np.pi)
     return np.asarray(prior - 0.5 * squares - constant)

@@ -37,6 +37,7 @@ from calib.gap.isolate import Isolability, isolability
 from calib.gap.noise import Noise
 from calib.gap.refine import refine
 from calib.gap.relevance import relevance
+from calib.inference.defined import check_defined
 from calib.inference.random import generator
 from calib.inference.sampling.mode import find_mode
 from calib.models.base import Array
@@ -59,8 +60,8 @@ _N_ADDED, _N_BEGUN_LARGER = 5, 2
 _N_LEADING, _N_LEADING_SETS = 5, 2
 # An effect that far out in its prior (sds) is fitted with a wider one as well.
 _FAR_OUT = 2.0
-# Draws of the prior by which a row is tried, and rows that are named.
-_N_TRIED, _SHOWN = 32, 5
+# Draws of the prior by which a row is tried.
+_N_TRIED = 32
 _IDLE = "it changes nothing that the models of this case predict"
 # A discrepancy or a pair that is so many nats (prior and all) behind the best hypothesis after a
 # truncated fit is given up. Of 1344 discrepancies and 2698 pairs (14 cases) those that ended
@@ -404,20 +405,14 @@ def calibrate_lab(data: Campaigns, seed: int) -> Lab:
 
 
 def _check_defined(data: Campaigns, o: OutputData, rng: np.random.Generator) -> None:
-    """Refuse rows at which a simulator has no value, whatever its parameters."""
-    problem = o.problem
+    """Refuse rows of either campaign at which a simulator has no value."""
+    problem, field = o.problem, data.case.field
     theta = o.priors.to_natural(o.priors.sample(rng, _N_TRIED))
-    with np.errstate(all="ignore"):
-        location = problem.bound.location(theta, problem.conditions)
-    empty = problem.table.lines[~np.isfinite(location).any(axis=0)]
-    if empty.size:
-        raise CalibError(
-            f"the model {problem.bound.model.name} has no value there",
-            where=f"{data.case.lab.source}, lines {', '.join(map(str, empty[:_SHOWN]))}"
-            + (f" and {empty.size - _SHOWN} more" if empty.size > _SHOWN else ""),
-            allowed="conditions at which the model is defined (see its page in the documentation)",
-            mend="leave these rows out, or choose another model",
-        )
+    check_defined(
+        problem.bound, theta, problem.conditions, data.case.lab.source, problem.table.lines
+    )
+    there = {k: v[o.rows] for k, v in problem.bound.model.select(data.view.conditions).items()}
+    check_defined(problem.bound, theta, there, field.source, field.lines[o.rows])
 
 
 class _Worker:

@@ -66,8 +66,8 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     shape = (chains, kept, problem.response.size)
     natural = calibration.natural[:, picked].reshape(-1, calibration.natural.shape[-1])
     internal = draws.t.reshape(chains, steps, -1)[:, picked].reshape(-1, draws.t.shape[-1])
-    location = problem.bound.location(problem.of_model(natural), problem.conditions)
     rng = generator(calibration.seed, calibration.label, "posterior_predictive")
+    location = problem.draw_location(natural, problem.conditions, rng)
     noisy = location + problem.noise.draw(natural, problem.conditions, rng, problem.response.size)
     prior = problem.theta(
         problem.priors.sample(generator(calibration.seed, calibration.label, "prior"), N_PRIOR)

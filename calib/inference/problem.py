@@ -33,7 +33,7 @@ from calib.inference.prior_files import (
 )
 from calib.inference.priors import Priors
 from calib.inference.uncertain import log_normal
-from calib.models import Array, BoundModel, get_model
+from calib.models import Array, BoundModel, Conditions, get_model
 
 _HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))
 # Rows times vectors that are worked out at once where each row has a density of its own.
@@ -127,6 +127,31 @@ class Problem:
     def residuals(self, natural: Array) -> Array:
         """Observed minus predicted on the scale of the response, shape (k, n)."""
         return self.response - self.bound.location(self.of_model(natural), self.conditions)
+
+    def draw_location(
+        self, natural: Array, conditions: Conditions, rng: np.random.Generator
+    ) -> Array:
+        """Predict on the scale of the response, with a draw of the prediction's own error.
+
+        Parameters
+        ----------
+        natural : ndarray, shape (k, d_all)
+        conditions : mapping of str to ndarray, shape (n,)
+        rng : Generator
+            Used for an emulator only. Its error is one curve for all rows, the same whichever
+            rows are asked for together.
+
+        Returns
+        -------
+        ndarray, shape (k, n)
+        """
+        theta, uncertain = self.of_model(natural), self.bound.model.uncertain
+        if uncertain is None:
+            return self.bound.location(theta, conditions)
+        with np.errstate(all="ignore"):
+            location, variances, curves = uncertain(theta, conditions)
+            error = np.sqrt(variances) * rng.standard_normal(variances.shape)
+            return np.asarray(location + error @ curves.T)
 
     def log_likelihood(self, t: Array) -> Array:
         """Log likelihood of internal coordinates, shape (k,); ``-inf`` where undefined."""

@@ -340,6 +340,17 @@ class BoundModel:
         with np.errstate(all="ignore"):
             theta = np.atleast_2d(theta)
             k = max([len(theta)] + [len(v) for v in conditions.values() if v.ndim > 1])
+            if self.model.slow and k > 1:
+                # Differences in turn leave most parameters as they are, those of an effect all.
+                own = {name: v for name, v in conditions.items() if v.ndim > 1}
+                each = [np.broadcast_to(v, (k, v.shape[1])) for v in (theta, *own.values())]
+                _, first, again = np.unique(
+                    np.concatenate(each, axis=1), axis=0, return_index=True, return_inverse=True
+                )
+                if first.size < k:
+                    theta, *rest = (v[first] for v in each)
+                    conditions = {**conditions, **dict(zip(own, rest, strict=True))}
+                    return self.location(theta, conditions, None if own else rows)[again]
             work = np.empty((N_WORK, k, next(iter(conditions.values())).shape[-1]))
             rows = self.model.prepare(conditions, self.references) if rows is None else rows
             return self.model.location(columns(theta), rows, self.references, work)

@@ -9,33 +9,51 @@ entered and 0 where it is left. With p = k1 + k2 b, the normal stress is
 the shear stress is that of Janosi & Hanamoto (1961), tau = (c + sigma tan phi)(1 - exp(-j/K)) with
 j = r [theta1 - theta - (1 - s)(sin theta1 - sin theta)], and the entry angle is the one at which
 the stresses carry the load.
+
+Time goes into sines and into memory. Wheels are worked through in blocks that stay in the
+processor's cache, nodes along the first axis, in the same memory; sines are matrix products of
+their series.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
+from math import factorial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.models.base import Array, Conditions
+from calib.models.base import Array, Columns, Rows
 
-N_NODES = 8
-_LN_ANGLE = (float(np.log(1e-4)), float(np.log(1.5)))
-_MAX_ITERATIONS = 60
-# Steps after which cells are asked whether they have a solution.
-_PATIENCE = 8
-_TOLERANCE = 1e-9
+type Indices = NDArray[np.intp]
+
+# In each half of the contact; for a first step from the guess fewer will do.
+_N_NODES, _ROUGH = 8, 3
+# Of sine and cosine: 1e-13 at the largest angle.
+_TERMS = 8
+_LARGEST = 1.5
+_LN_ENTRY = (float(np.log(1e-4)), float(np.log(_LARGEST)))
+# Further steps that nearly all wheels need at most, and all.
+_USUAL, _MAX_ITERATIONS = 3, 60
+# Of the load's relative error times the last step in ln theta1; the next secant step leaves about
+# a tenth of it.
+_TOLERANCE, _ROUNDING = 1e-10, 1e-12
+# Wheels whose arrays of 8 nodes stay in a cache of two megabytes.
+_BLOCK = 3072
+_N_WORK = 10
 
 
 @dataclass(frozen=True)
 class Wheel:
-    """Soil and wheel, arrays that broadcast to (k, n, 1).
+    """Soil and wheel, arrays that broadcast.
 
-    k1, k2, n, c, tan_phi, K, c1 and c2 in kPa, kPa/m, 1, kPa, 1, m, 1 and 1; radius, width, load
-    and slip in m, m, kN and as a fraction.
+    Parameters
+    ----------
+    k1, k2, n, c, tan_phi, K, c1, c2 : ndarray
+        In kPa, kPa/m, 1, kPa, 1, m, 1, 1.
+    radius, width, load, slip : ndarray
+        In m, m, kN, as a fraction.
     """
 
     k1: Array
@@ -54,18 +72,16 @@ class Wheel:
 
 @dataclass(frozen=True)
 class Contact:
-    """Where a wheel stands: load, pull (kN), torque (kN m) and sinkage (m), shape (k, n)."""
+    """Where a wheel stands: pull (kN), torque (kN m) and sinkage (m), as it broadcasts."""
 
-    load: Array
     pull: Array
     torque: Array
     sinkage: Array
 
 
-def wheels(theta: Array, conditions: Conditions) -> Wheel:
-    """Lay parameters k1, k2, n, c, phi (degrees), K (mm), c1, c2 out beside conditions."""
-    k1, k2, n, c, phi, K, c1, c2 = (theta[:, j, None, None] for j in range(8))
-    rows = {name: np.atleast_2d(v)[:, :, None] for name, v in conditions.items()}
+def wheels(columns: Columns, rows: Rows) -> Wheel:
+    """Take parameters k1, k2, n, c, phi (degrees), K (mm), c1, c2, and conditions."""
+    k1, k2, n, c, phi, K, c1, c2 = columns
     return Wheel(
         k1, k2, n, c, np.tan(np.radians(phi)), K / 1000.0, c1, c2,
         rows["tyre_diameter_m"] / 2.0, rows["tyre_width_m"], rows["normal_load_kn"],
@@ -73,106 +89,232 @@ def wheels(theta: Array, conditions: Conditions) -> Wheel:
     )  # fmt: skip
 
 
-@cache
-def _nodes() -> tuple[Array, Array]:
-    """Return Gauss-Legendre nodes and weights in u^2 on [0, 1].
+@dataclass(frozen=True)
+class _Rule:
+    """Gauss and Legendre's rule in u^2 on [0, 1], with series of sin(a x) and cos(a x) - 1.
 
     The stress rises as distance to the power n from either end of the contact: in u, the root of
     that distance, it is smooth for the exponents of soils.
+
+    Parameters
+    ----------
+    node, weight : ndarray, shape (m, 1)
+        The nodes x.
+    sine, cosine : ndarray, shape (m, terms)
+        Coefficients of a, a^3, ... and of a^2, a^4, ...
     """
-    x, weight = np.polynomial.legendre.leggauss(N_NODES)
-    u = 0.5 * (x + 1.0)
-    return u * u, u * weight
+
+    node: Array
+    weight: Array
+    sine: Array
+    cosine: Array
 
 
-def _halves(entry: Array, wheel: Wheel) -> Iterator[tuple[Array, Array, Array, Array, Array]]:
-    """Yield sine and cosine, stresses and lengths of front and rear, for entry angles (..., 1)."""
-    part, weight = _nodes()
-    turning = np.minimum(wheel.c1 + wheel.c2 * wheel.slip, 0.999) * entry
-    front = entry - (entry - turning) * part
-    sine_entry, cosine_entry = np.sin(entry), np.cos(entry)
-    sine, cosine = np.sin(front), np.cos(front)
-    rise = np.maximum(cosine - cosine_entry, 0.0) * wheel.radius / wheel.width
-    normal = (wheel.k1 + wheel.k2 * wheel.width) * rise**wheel.n
-    strength = wheel.c + normal * wheel.tan_phi
-    rear = turning * part
-    for angle, length, sin, cos in (
-        (front, entry - turning, sine, cosine),
-        (rear, turning, np.sin(rear), np.cos(rear)),
-    ):
-        moved = entry - angle - (1.0 - wheel.slip) * (sine_entry - sin)
-        shear = -strength * np.expm1(moved * (-wheel.radius / wheel.K))
-        yield sin, cos, normal, shear, weight * length
+@cache
+def _rule(size: int) -> _Rule:
+    u, weight = np.polynomial.legendre.leggauss(size)
+    u = 0.5 * (u[:, None] + 1.0)
+    node, order = u * u, np.arange(_TERMS)
+    over = [1.0 / factorial(j) for j in range(1, 2 * _TERMS + 1)]
+    sine = (-1.0) ** order * node ** (2 * order + 1) * over[::2]
+    cosine = -((-1.0) ** order) * node ** (2 * order + 2) * over[1::2]
+    return _Rule(node, weight[:, None] * u, sine, cosine)
 
 
-def _load(entry: Array, wheel: Wheel) -> Array:
-    """Return the load (kN) that wheels carry at entry angles, both (..., 1)."""
-    lifted = sum(
-        np.vecdot(normal * cosine + shear * sine, measure)
-        for sine, cosine, normal, shear, measure in _halves(entry, wheel)
+@dataclass(frozen=True)
+class _Cells:
+    """What the integrals need of wheels, each of shape (cells,).
+
+    Parameters
+    ----------
+    n, c, tan_phi, radius, load : ndarray
+        As of a `Wheel`.
+    turn : ndarray
+        theta_m / theta1.
+    scale : ndarray
+        p^(1/n) r/b: sigma is (scale (cos theta - cos theta1))^n.
+    stiff, rest : ndarray
+        r/K, and (1 - s) r/K.
+    area : ndarray
+        r b.
+    """
+
+    n: Array
+    c: Array
+    tan_phi: Array
+    radius: Array
+    load: Array
+    turn: Array
+    scale: Array
+    stiff: Array
+    rest: Array
+    area: Array
+
+    @classmethod
+    def of(cls, w: Wheel) -> _Cells:
+        """Without a value where the slip is below zero."""
+        slip = np.where(w.slip >= 0.0, w.slip, np.nan)
+        stiff = w.radius / w.K
+        parts = (
+            w.n, w.c, w.tan_phi, w.radius, w.load, np.minimum(w.c1 + w.c2 * slip, 0.999),
+            (w.k1 + w.k2 * w.width) ** (1.0 / w.n) * w.radius / w.width, stiff,
+            (1.0 - slip) * stiff, w.radius * w.width,
+        )  # fmt: skip
+        return cls(*(v.ravel() for v in np.broadcast_arrays(*parts)))
+
+    def some(self, which: Indices) -> _Cells:
+        """Some of the cells."""
+        return _Cells(*(v[which] for v in vars(self).values()))
+
+    def guess(self) -> tuple[Array, Array]:
+        """Return ln theta1, and the slope of ln load over it, by a formula for small angles.
+
+        Nothing depends on its numbers but how many steps follow: they were fitted to soils drawn
+        from the priors.
+        """
+        power = 2.0 * self.n + 1.0
+        spread = (1.0 - self.turn) * (2.0 + self.turn) / 3.0
+        x = np.log(self.load / self.area) - self.n * np.log(0.5 * self.scale)
+        x = (x - self.n**0.7 * np.log(spread)) / power
+        angle = np.exp(np.minimum(x, 0.0))
+        friction, bent = 0.4 * self.tan_phi * angle, power * angle**2 / 12.0
+        cohesion = 0.3 * self.c * self.area * angle / self.load
+        x -= (friction - bent + cohesion) / (power + friction - 2.0 * bent)
+        slope = np.maximum(power + friction - 2.0 * bent - cohesion, 0.5)
+        return np.clip(x, *_LN_ENTRY), slope
+
+
+def _forces(entry: Array, cells: _Cells, work: Array, nodes: int = _N_NODES) -> Array:
+    """Integrate the stresses: load, pull and torque over radius (kN) in the first of 4 rows."""
+    rule, size = _rule(nodes), entry.size
+    sin, cos, sin_rear, cos_rear, rise, strength, tau, tau_rear, spare, powers = (
+        part[: rows * size].reshape(rows, size)
+        for part, rows in zip(work, [nodes] * (_N_WORK - 1) + [_TERMS], strict=True)
     )
-    return np.asarray(wheel.radius * wheel.width * np.asarray(lifted)[..., None])
+    sin_entry, cos_entry = np.sin(entry), np.cos(entry)
+    rear = cells.turn * entry
+    front = entry - rear
+    # Of angles from the entry on, and from the vertical on; cosines less one.
+    for length, sines, cosines in ((front, sin, cos), (rear, sin_rear, cos_rear)):
+        square = length * length
+        powers[0] = length
+        for j in range(1, _TERMS):
+            np.multiply(powers[j - 1], square, out=powers[j])
+        np.matmul(rule.sine, powers, out=sines)
+        powers *= length
+        np.matmul(rule.cosine, powers, out=cosines)
+    # In front: rise is cos theta - cos theta1, and fall sin theta1 - sin theta.
+    np.multiply(cos, cos_entry, out=rise)
+    rise += np.multiply(sin, sin_entry, out=spare)
+    sin *= cos_entry
+    cos *= sin_entry
+    fall = np.subtract(sin, cos, out=sin)
+    sigma = np.multiply(rise, cells.scale, out=cos)
+    np.log(sigma, out=sigma)
+    sigma *= cells.n
+    np.exp(sigma, out=sigma)
+    sigma *= rule.weight
+    np.multiply(sigma, cells.tan_phi, out=strength)
+    strength += np.multiply(rule.weight, cells.c, out=spare)
+    # Both tau are the negative of the shear stress.
+    np.multiply(fall, cells.rest, out=tau)
+    tau -= np.multiply(rule.node, front * cells.stiff, out=spare)
+    np.multiply(rule.node, rear * cells.stiff, out=tau_rear)
+    tau_rear -= np.multiply(sin_rear, cells.rest, out=spare)
+    tau_rear += cells.rest * sin_entry - cells.stiff * entry
+    for part in (tau, tau_rear):
+        np.expm1(part, out=part)
+        part *= strength
 
+    def dot(a: Array, b: Array) -> Array:
+        return np.asarray(np.add.reduce(np.multiply(a, b, out=spare), axis=0))
 
-def _evaluate(entry: Array, wheel: Wheel) -> Contact:
-    """Integrate the stresses for entry angles, shape (k, n, 1)."""
-    lifted = pulled = turned = np.zeros(entry.shape[:2])
-    for sine, cosine, normal, shear, measure in _halves(entry, wheel):
-        lifted = lifted + np.vecdot(normal * cosine + shear * sine, measure)
-        pulled = pulled + np.vecdot(shear * cosine - normal * sine, measure)
-        turned = turned + np.vecdot(shear, measure)
-    radius, area = wheel.radius[..., 0], (wheel.radius * wheel.width)[..., 0]
-    sinkage = radius * (1.0 - np.cos(entry[..., 0]))
-    return Contact(area * lifted, area * pulled, area * radius * turned, sinkage)
+    normal, shear, shear_rear = (np.add.reduce(part, axis=0) for part in (sigma, tau, tau_rear))
+    forces = np.empty((4, size))
+    load = front * (normal * cos_entry + dot(sigma, rise) - shear * sin_entry + dot(tau, fall))
+    load += rear * (normal + dot(sigma, cos_rear) - dot(tau_rear, sin_rear))
+    pull = front * (dot(sigma, fall) - normal * sin_entry - shear * cos_entry - dot(tau, rise))
+    pull -= rear * (shear_rear + dot(tau_rear, cos_rear) + dot(sigma, sin_rear))
+    np.multiply(cells.area, load, out=forces[0])
+    np.multiply(cells.area, pull, out=forces[1])
+    np.multiply(-cells.area, front * shear + rear * shear_rear, out=forces[2])
+    return forces
 
 
 def contact(wheel: Wheel) -> Contact:
     """Find where each wheel carries its load, and what it then pulls.
 
-    NaN for a braked wheel (slip below zero, part II of the source), and where the soil does not
-    carry the wheel although it has sunk to its axle. The load grows about as the entry angle to the
-    power 2n + 1: on logarithms the secant method takes some five steps, kept inside a shrinking
-    bracket.
+    Parameters
+    ----------
+    wheel : Wheel
+
+    Returns
+    -------
+    Contact
+        NaN for a braked wheel (slip below zero, part II of the source), and where the soil does
+        not carry the wheel although it has sunk to its axle.
 
     References
     ----------
     Wong & Reece (1967), J. Terramechanics 4(1), 81-98, doi:10.1016/0022-4898(67)90105-X.
     """
-    fields = [np.asarray(v) for v in vars(wheel).values()]
-    shape = np.broadcast_shapes(*(v.shape for v in fields))
-    flat = [np.broadcast_to(v, shape).reshape(-1, 1) for v in fields]
-    return _evaluate(_entry(Wheel(*flat)).reshape(shape), wheel)
+    shape = np.broadcast_shapes(*(np.shape(v) for v in vars(wheel).values()))
+    with np.errstate(all="ignore"):
+        cells = _Cells.of(wheel)
+        found = np.full((3, cells.load.size), np.nan)
+        work = np.empty((_N_WORK, _N_NODES * min(_BLOCK, cells.load.size)))
+        # The few that take longer are gone on with together; some of them have no solution.
+        left = _solve(np.flatnonzero(np.isfinite(cells.turn)), cells, work, found, _USUAL)
+        most = [_forces(np.full(v.size, _LARGEST), cells.some(v), work)[0] for v in _blocks(left)]
+        bears = np.concatenate([[], *most]) > cells.load[left]
+        _solve(left[bears], cells, work, found, _MAX_ITERATIONS)
+        pull, torque, entry = found.reshape(3, *shape)
+        return Contact(pull, wheel.radius * torque, wheel.radius * (1.0 - np.cos(np.exp(entry))))
 
 
-def _entry(wheel: Wheel) -> Array:
-    """Solve for the entry angles of wheels, shape (cells, 1); NaN where there is none."""
-    entry = np.full(wheel.load.shape, np.nan)
-    cells = np.flatnonzero(wheel.slip[:, 0] >= 0.0)
-    low, high = (np.full((cells.size, 1), edge) for edge in _LN_ANGLE)
-    left, x = _some(wheel, cells), np.full((cells.size, 1), np.log(0.4))
-    slope = 2.0 * left.n + 1.0
-    value = np.log(_load(np.exp(x), left) / left.load)
-    for step in range(_MAX_ITERATIONS):
-        low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
-        new = x - value / slope
-        new = np.where((new > low) & (new < high), new, 0.5 * (low + high))
-        found = np.log(_load(np.exp(new), left) / left.load)
-        with np.errstate(all="ignore"):
-            secant = (found - value) / (new - x)
-        slope = np.where(np.isfinite(secant) & (secant > 0.1), secant, slope)
-        x, value = new, found
-        done = np.abs(value[:, 0]) <= _TOLERANCE
-        entry[cells[done]] = np.exp(x[done])
-        stays = ~done
-        if step == _PATIENCE:  # those that are still sought may have no solution
-            stays &= (_load(np.exp(np.full_like(x, _LN_ANGLE[1])), left) > left.load)[:, 0]
-        # Cells that are found leave: their neighbours do not change them, nor cost them time.
-        cells, left = cells[stays], _some(left, np.flatnonzero(stays))
-        low, high, x, value, slope = (v[stays] for v in (low, high, x, value, slope))
-        if not cells.size:
-            break
-    return entry
+def _blocks(which: Indices) -> list[Indices]:
+    return [which[i : i + _BLOCK] for i in range(0, which.size, _BLOCK)]
 
 
-def _some(wheel: Wheel, cells: NDArray[np.intp]) -> Wheel:
-    return Wheel(*(v[cells] for v in vars(wheel).values()))
+def _solve(which: Indices, cells: _Cells, work: Array, found: Array, steps: int) -> Indices:
+    """Write pull, torque over radius and ln theta1, (3, cells), and return where there is none yet.
+
+    The load grows about as the entry angle to the power 2n + 1: on logarithms the secant method
+    takes few steps, kept inside a shrinking bracket, and the last one need not be evaluated: pull
+    and torque are taken along their own secants as far.
+    """
+    left = [np.flatnonzero([])]
+    for where in _blocks(which):
+        some = cells.some(where)
+        x, slope = some.guess()
+        rough = _forces(np.exp(x), some, work, _ROUGH)[0]
+        x = np.clip(x - np.log(rough / some.load) / slope, *_LN_ENTRY)
+        low, high = (np.full_like(x, edge) for edge in _LN_ENTRY)
+        before = np.full((4, x.size), np.nan)
+        for _ in range(steps):
+            here = _forces(np.exp(x), some, work)
+            value = np.log(here[0] / some.load)
+            here[0], here[3] = value, x
+            moved = here - before
+            # A secant is to be followed no farther than it is long, but for rounding.
+            gained = np.maximum(np.abs(moved[0]), _ROUNDING)
+            off = np.abs(value)
+            done = np.flatnonzero((off <= gained) & (off * np.abs(moved[3]) <= _TOLERANCE))
+            if done.size:
+                on = np.where(moved[0] == 0.0, 0.0, -value / moved[0])[done]
+                found[:, where[done]] = here[1:, done] + on * moved[1:, done]
+                if done.size == where.size:
+                    where = where[:0]
+                    break
+                stays = np.delete(np.arange(where.size), done)
+                where, some = where[stays], some.some(stays)
+                low, high, x, slope, value = (v[stays] for v in (low, high, x, slope, value))
+                here, moved = here[:, stays], moved[:, stays]
+            secant = moved[0] / moved[3]
+            slope = np.where(secant > 0.1, secant, slope)
+            low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
+            x = x - value / slope
+            x = np.where((x > low) & (x < high), x, 0.5 * (low + high))
+            before = here
+        left.append(where)
+    return np.concatenate(left)

@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from functools import partial
 
-from calib.models.base import Array, Conditions, Model
+import numpy as np
+
+from calib.models.base import Array, Columns, Model, References, Rows
 from calib.models.rigid_wheel import contact, wheels
 
 __all__ = ["WONG_REECE_PULL", "WONG_REECE_SINKAGE", "WONG_REECE_TORQUE"]
@@ -17,16 +19,16 @@ __all__ = ["WONG_REECE_PULL", "WONG_REECE_SINKAGE", "WONG_REECE_TORQUE"]
 _MM_PER_M = 1000.0
 
 
-def _pull(theta: Array, conditions: Conditions) -> Array:
-    return contact(wheels(theta, conditions)).pull
+def _pull(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+    return contact(wheels(columns, rows)).pull
 
 
-def _torque(theta: Array, conditions: Conditions) -> Array:
-    return contact(wheels(theta, conditions)).torque
+def _torque(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+    return contact(wheels(columns, rows)).torque
 
 
-def _sinkage(theta: Array, conditions: Conditions) -> Array:
-    return _MM_PER_M * contact(wheels(theta, conditions)).sinkage
+def _ln_sinkage(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+    return np.log(_MM_PER_M * contact(wheels(columns, rows)).sinkage)
 
 
 _LETTERS = (
@@ -63,7 +65,7 @@ WONG_REECE_PULL = _model(
     name="wong_reece_pull",
     title="Wong-Reece rigid wheel: drawbar pull",
     output="drawbar_pull_kn",
-    predict=_pull,
+    location=_pull,
     response="identity",
     latex=(r"$P = r b \int (\tau \cos\theta - \sigma_\mathrm{n} \sin\theta) d\theta$", *_STRESS),
     letters="[$P] the pull (kN), " + _LETTERS,
@@ -91,7 +93,7 @@ WONG_REECE_TORQUE = _model(
     name="wong_reece_torque",
     title="Wong-Reece rigid wheel: torque",
     output="driving_torque_knm",
-    predict=_torque,
+    location=_torque,
     response="identity",
     latex=(r"$T = r^2 b \int \tau d\theta$", *_STRESS),
     letters="[$T] the torque (kN m), " + _LETTERS,
@@ -119,7 +121,7 @@ WONG_REECE_SINKAGE = _model(
     name="wong_reece_sinkage",
     title="Wong-Reece rigid wheel: sinkage",
     output="rut_depth_mm",
-    predict=_sinkage,
+    location=_ln_sinkage,
     response="log",
     latex=(r"$z = r(1 - \cos\theta_1)$", *_STRESS),
     letters="[$z] the sinkage (m), " + _LETTERS,

@@ -165,7 +165,7 @@ def smooth_bands(
     natural = problem.theta(t)
     size = natural.shape[0]
     z = ndtri((rng.permutation(size) + 0.5) / size)[:, None]
-    location = problem.bound.location(problem.of_model(natural), conditions)
+    location = problem.draw_location(natural, conditions, rng)
     noise = problem.noise.of_normal(natural, conditions, z)
     back = problem.bound.from_response
     return bands(back(location)), bands(back(location + noise))

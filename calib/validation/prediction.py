@@ -46,7 +46,8 @@ class Prediction:
         Canonical column, with its unit.
     conditions : mapping of str to ndarray
     parameter : Bands
-        Uncertainty of the parameters alone: where the mean curve lies.
+        Uncertainty of the parameters, and of an emulator if there is one, without the noise:
+        where the mean curve lies.
     predictive : Bands
         With the noise: where a measurement would lie.
     outside : tuple of tuple of str
@@ -72,7 +73,7 @@ def predictive_draws(
     """Draw the mean output and a measurement, both of shape (size, n)."""
     problem = calibration.problem
     natural = problem.theta(calibration.subset(size))
-    location = problem.bound.location(problem.of_model(natural), conditions)
+    location = problem.draw_location(natural, conditions, rng)
     noise = problem.noise.draw(natural, conditions, rng, location.shape[1])
     from_response = problem.bound.from_response
     return from_response(location), from_response(location + noise)
@@ -134,7 +135,9 @@ def predict(calibration: Calibration, table: Table) -> Prediction:
     parts = []
     for start in range(0, len(table), _ROWS_AT_ONCE):
         rows = {name: v[start : start + _ROWS_AT_ONCE] for name, v in conditions.items()}
-        location = problem.bound.location(problem.of_model(natural), rows)
+        # An emulator's error, too.
+        error = generator(calibration.seed, calibration.label, "predict", "emulator")
+        location = problem.draw_location(natural, rows, error)
         share = np.isfinite(location).mean(axis=0)
         # Where many plausible parameters give the equation no value (a quadratic in pressure
         # extrapolated below zero), the rest are no sample of anything: no value is better.

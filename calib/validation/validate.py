@@ -150,7 +150,7 @@ def leave_one_out(
             sample = sample[np.resize(np.flatnonzero(defined), N_DRAWS)]
         natural = problem.theta(sample)
         here = problem.bound.model.select(row.columns)
-        location = problem.bound.location(problem.of_model(natural), here)
+        location = problem.draw_location(natural, here, rng)
         noisy = location + problem.noise.draw(natural, here, rng, 1)
         drawn[:, i] = problem.bound.from_response(noisy)[:, 0]
     if progress is not None and not refits:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calib.errors import CalibError
-from calib.models import MODELS
+from calib.models import MODELS, Array, BoundModel, Conditions, Model
 from calib.models.magic_formula_pressure import coefficients_at
 from tests.models.ranges import THETA, draw
 
@@ -233,3 +233,24 @@ def test_every_model_has_a_range_to_be_tested_over() -> None:
     assert {name: set(r) for name, r in THETA.items()} == {
         name: set(model.parameters) for name, model in MODELS.items()
     }
+
+
+def test_a_slow_equation_is_evaluated_once_for_equal_vectors() -> None:
+    asked: list[int] = []
+
+    def predict(theta: Array, at: Conditions) -> Array:
+        asked.append(len(theta))
+        return theta[:, :1] * at["slip_ratio"]
+
+    model = Model(
+        name="asked", title="", output="drawbar_pull_kn", conditions=("slip_ratio",),
+        parameters=("a",), predict=predict, slow=True,
+    )  # fmt: skip
+    theta, slip = np.array([[3.0], [1.0], [3.0], [2.0], [1.0]]), np.array([0.1, 0.2])
+    bound = BoundModel(model, {})
+    np.testing.assert_allclose(bound.location(theta, {"slip_ratio": slip}), theta * slip)
+    assert asked == [3]
+    # Conditions of each vector's own: the first and third differ now.
+    own = slip * np.array([[1.0], [1.0], [2.0], [1.0], [1.0]])
+    np.testing.assert_allclose(bound.location(theta, {"slip_ratio": own}), theta * own)
+    assert max(asked[1:]) == 4

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -11,6 +13,7 @@ from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.validation.prediction import bands, predict, prediction_columns, predictive_draws
 from calib.validation.scores import LEVELS
+from calib.validation.validate import leave_one_out
 
 
 def conditions(slip, psi=30.0, **more) -> Table:
@@ -45,6 +48,55 @@ def test_parameter_bands_are_those_of_the_model_over_the_draws(
     np.testing.assert_allclose(found.parameter.median, np.median(curve, axis=0))
     np.testing.assert_allclose(found.parameter.upper[0.95], np.quantile(curve, 0.975, axis=0))
     assert found.output == "drawbar_pull_kn"
+
+
+def emulated(calibration: Calibration, sd: float) -> Calibration:
+    """The calibration with a prediction that has an error of its own: sd (1 + slip)."""
+    bound = calibration.problem.bound
+
+    def uncertain(theta, at):
+        curve = 1.0 + at["slip_ratio"]
+        return bound.location(theta, at), np.full((len(theta), 1), sd**2), curve[:, None]
+
+    model = replace(bound.model, uncertain=uncertain)
+    return replace(
+        calibration, problem=replace(calibration.problem, bound=replace(bound, model=model))
+    )
+
+
+def test_bands_contain_an_emulators_error(pull_calibration: Calibration) -> None:
+    slip, sd = np.linspace(0.0, 0.6, 7), 0.2
+    table, calibration = conditions(slip), emulated(pull_calibration, sd)
+    found = predict(calibration, table)
+    natural = pull_calibration.problem.theta(pull_calibration.subset(4000))
+    curve = pull_calibration.problem.bound.predict(natural[:, :-1], table.columns)
+    error = sd * (1.0 + slip)
+    whole = np.sqrt(natural[:, -1:] ** 2 + error**2)
+    for banded, scale in ((found.parameter, error), (found.predictive, whole)):
+        for level in LEVELS:
+            below = stats.norm.cdf(banded.upper[level], curve, scale).mean(axis=0)
+            # Five standard errors of the level of a quantile of 4000 draws.
+            np.testing.assert_allclose(below, 0.5 + level / 2, atol=2.5 / np.sqrt(4000))
+    mean, reading = predictive_draws(calibration, table.columns, np.random.default_rng(1))
+    spread = curve.var(axis=0) + error**2
+    np.testing.assert_allclose(mean.var(axis=0), spread, rtol=0.12)
+    more = np.mean(natural[:, -1] ** 2)
+    np.testing.assert_allclose(reading.var(axis=0), spread + more, rtol=0.12)
+    # A row's band does not depend on the others.
+    alone = predict(calibration, conditions(slip[3]))
+    assert alone.predictive.upper[0.9][0] == pytest.approx(found.predictive.upper[0.9][3])
+
+
+def test_rows_left_out_are_predicted_with_an_emulators_error(
+    pull_calibration: Calibration,
+) -> None:
+    sd = 0.5
+    plain = leave_one_out(pull_calibration)
+    found = leave_one_out(emulated(pull_calibration, sd))
+    added = (sd * (1.0 + pull_calibration.problem.conditions["slip_ratio"])) ** 2
+    # Importance weights differ as well, in the parameters alone.
+    more = found.draws.var(axis=0) - plain.draws.var(axis=0)
+    np.testing.assert_allclose(more, added, rtol=0.25)
 
 
 def test_predictive_bands_add_the_noise(pull_calibration: Calibration) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from calib.errors import CalibError
+from calib.inference.defined import check_defined
 from calib.inference.estimators.base import PointEstimate, goodness, residuals, sum_of_squares
 from calib.inference.estimators.identified import (
     central_interval,
@@ -146,10 +147,15 @@ def _starts(descent: _Descent, rng: np.random.Generator, n_screen: int, n_polish
     best = np.array([group[cost[group].argmin()] for group in groups])
     best = best[np.isfinite(cost[best])]
     if best.size == 0:
+        problem = descent.problem
+        theta = problem.of_model(problem.theta(drawn))
+        check_defined(
+            problem.bound, theta, problem.conditions, problem.table.source, problem.table.lines
+        )
         raise CalibError(
-            f"{descent.problem.bound.model.name} has no value for some rows, wherever in the "
+            f"{problem.bound.model.name} has no value for some rows, wherever in the "
             "prior its parameters are drawn",
-            where=descent.problem.table.source,
+            where=problem.table.source,
             mend="look for impossible conditions in the data, or widen the prior",
         )
     return np.asarray(z[best])

@@ -155,5 +155,7 @@ def test_conditions_without_a_value_are_reported(problem_of, method):
     columns["average_ground_pressure_kpa"][3] = -1.0
     table = problem.table
     broken = problem.with_table(type(table)(columns, "broken.csv", table.lines, (), (), ""))
-    with pytest.raises(CalibError, match="no value for some rows"):
+    with pytest.raises(CalibError, match="no value") as error:
         estimate(broken, method, np.random.default_rng(RNG))
+    if method == "least_squares":
+        assert error.value.where == f"broken.csv, lines {table.lines[3]}"

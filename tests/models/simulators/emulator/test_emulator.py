@@ -43,6 +43,27 @@ def test_it_predicts_and_knows_its_error() -> None:
     assert 0.3 < np.sqrt(np.median(z[:, 0] ** 2)) / 0.67 < 2.0
 
 
+def test_its_drawn_error_covers_the_simulator() -> None:
+    model = calib.Model(
+        name="line", title="", output="drawbar_pull_kn",
+        conditions=("slip_ratio", "normal_load_kn"), parameters=("mu", "s0"),
+        predict=lambda theta, x: theta[:, :1] * x["slip_ratio"],
+    )  # fmt: skip
+    bound = emulated_model(model, made(12)).bind(NODES)
+    table = calib.table_from_arrays({**NODES, "drawbar_pull_kn": NODES["slip_ratio"]})
+    problem = calib.inference.problem.Problem(bound, table, calib.inference.priors.Priors(()))
+    rng = np.random.default_rng(8)
+    at = AXES.natural(rng.uniform(-1.5, 1.5, (300, 2)))
+    natural = np.repeat(np.c_[at, np.ones(300)], 200, axis=0)
+    drawn = problem.draw_location(natural, NODES, rng).reshape(300, 200, -1)
+    low, high = np.quantile(drawn, [0.05, 0.95], axis=1)
+    true = pull(at, NODES)
+    assert 0.8 < ((low < true) & (true < high)).mean() < 0.99
+    # Its own prediction alone is off.
+    plain = bound.location(at, NODES)
+    assert np.abs(plain - true).max() > 0.1 * np.abs(high - low).max()
+
+
 def test_where_there_are_runs_it_is_better() -> None:
     whole, both = made(), made(regions=(REGION,))
     at = AXES.natural(REGION.centre + 0.1 * np.random.default_rng(6).standard_normal((50, 2)))
