@@ -5,6 +5,9 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections.abc import Callable
+from functools import partial
+from threading import Timer
 from typing import Annotated, Any
 
 import typer
@@ -107,8 +110,21 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # A polite kill cleans up as an interrupt does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    usual = sys.unraisablehook
+    sys.unraisablehook = partial(_interrupt_again, usual)
     try:
         app(prog_name="calib")
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0) from None
+    finally:
+        sys.unraisablehook = usual
+
+
+def _interrupt_again(usual: Callable[[Any], object], lost: Any) -> None:
+    """Interrupt anew after one that came where Python raises nothing: in a callback, say."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        # Not from here, where it would be lost as well.
+        Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        usual(lost)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import signal
+import time
 from importlib.metadata import version
 from pathlib import Path
 
@@ -137,3 +139,27 @@ def test_an_interruption_says_how_to_go_on(calib: Calib, monkeypatch: pytest.Mon
     assert ran.code == 130
     assert "nothing was written. Start the same command again" in ran.err
     assert not Path("calib-run").exists()
+
+
+def test_an_interruption_in_a_callback_is_not_lost(
+    calib: Calib, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python reports what a finaliser raises, and goes on."""
+
+    class Finalised:
+        def __del__(self) -> None:
+            raise KeyboardInterrupt
+
+    def stopped(*_: object, **__: object) -> None:
+        Finalised()
+        time.sleep(60.0)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr("calib.inference.calibration.calibrate", stopped)
+    Path("my.csv").write_text(example_csv("bekker"))
+    try:
+        ran = calib("fit", "my.csv", "--model", "bekker")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert ran.code == 130
+    assert "interrupted" in ran.err
