@@ -14,7 +14,7 @@ from scipy import stats
 
 from calib.data import Table
 from calib.data.quantities import QUANTITIES
-from calib.data.units_check import lines_of, source_of, unit_notes
+from calib.data.units_check import column_notes, lines_of, source_of, unit_notes
 from calib.inference.problem import Problem
 from calib.models.base import Array
 from calib.validation.outliers import linear, outlying_notes
@@ -52,7 +52,7 @@ def file_notes(problem: Problem, scatter: float) -> tuple[str, ...]:
     scatter : float
         Sd of a reading about the prediction, on the scale of the response.
     """
-    found: list[str] = []
+    found = list(column_notes(problem.table))
     for name, values in problem.conditions.items():
         quantity = QUANTITIES[name]
         if np.unique(values).size == 1:
