@@ -17,7 +17,7 @@ from scipy.special import digamma, polygamma
 
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
-from calib.inference.noise import DEFAULT_PRIORS, USUAL, Family, NoiseChoice
+from calib.inference.noise import DEFAULT_PRIORS, USUAL, Along, Family, NoiseChoice
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
 
@@ -103,6 +103,7 @@ class _Likelihood(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     family: Family = "normal"
     noise_depends_on: str = ""
+    correlated_along: Along = ""
 
 
 class _File(BaseModel):
@@ -289,6 +290,8 @@ def parse_priors(
     entries = tuple(_prior(name, given[name], source, references) for name in names)
     if noise.family == "student_t":
         _check_nu(entries[len(parameters) - 1], source)
+    if noise.correlated_along:
+        _check_rho(entries[-2], source)
     return Priors(entries, text, source, noise)
 
 
@@ -299,6 +302,18 @@ def _check_nu(nu: Prior, source: str) -> None:
             f"degrees of freedom of {lowest:g} are admitted",
             where=f"{source}, parameters.nu",
             allowed="a prior of what is above 0: gamma, lognormal, or with a lower bound > 0",
+            mend="correct this entry",
+        )
+
+
+def _check_rho(rho: Prior, source: str) -> None:
+    low, high = (rho.loc, rho.loc) if rho.fixed else (rho.lower, rho.upper)
+    low, high = np.exp([low, high]) if rho.log else (low, high)
+    if not 0.0 <= low <= high < 1.0:
+        raise CalibError(
+            f"correlations from {low:g} to {high:g} are admitted",
+            where=f"{source}, parameters.rho",
+            allowed="a prior with bounds of at least 0 and below 1",
             mend="correct this entry",
         )
 
@@ -323,9 +338,15 @@ def _noise_choice(
         raise CalibError(
             f"{'.'.join(map(str, first['loc']))}: {first['msg']}", where=where,
             allowed='family = "normal" or "student_t", noise_depends_on = "slip" or another '
-            "condition of the model", mend="correct this entry",
+            'condition of the model, correlated_along = "run_order" or "file_order"',
+            mend="correct this entry",
         ) from None  # fmt: skip
-    noise = NoiseChoice(chosen.family, chosen.noise_depends_on)
+    noise = NoiseChoice(chosen.family, chosen.noise_depends_on, chosen.correlated_along)
+    if noise.correlated_along and noise.family != "normal":
+        raise CalibError(
+            "noise that is correlated along a run is normal", where=where,
+            allowed='family = "normal"', mend="take one of the two out",
+        )  # fmt: skip
     taken = [name for name in noise.parameters if name in parameters]
     if taken:
         raise CalibError(
