@@ -15,7 +15,7 @@ from pathlib import Path
 
 from calib.errors import CalibError
 
-__all__ = ["check_folder", "fresh_folder", "read_folder", "unwritable"]
+__all__ = ["check_folder", "fresh_folder", "read_folder", "unwritable", "write_whole"]
 
 # Files by which a folder is known to be one of ours, and may be replaced.
 _OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json",
@@ -124,6 +124,13 @@ def read_folder(folder: Path) -> dict[str, bytes]:
         for path in sorted(folder.rglob("*"))
         if path.is_file()
     }
+
+
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that is there whole or not at all, or as it was, whenever it is killed."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
 
 
 def unwritable(out: Path, why: str) -> CalibError:

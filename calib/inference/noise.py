@@ -30,7 +30,7 @@ __all__ = [
 ]  # fmt: skip
 
 type Family = Literal["normal", "student_t"]
-type Along = Literal["", "run_order", "file_order"]
+type Along = Literal["", "run_order"]
 
 _HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))
 
@@ -72,7 +72,7 @@ class NoiseChoice:
     family : {"normal", "student_t"}
     depends_on : str
         A quantity or its canonical column; empty for one scale at all conditions.
-    correlated_along : {"", "run_order", "file_order"}
+    correlated_along : {"", "run_order"}
         What neighbours are counted in; empty for independent rows.
     """
 

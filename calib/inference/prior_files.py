@@ -338,7 +338,7 @@ def _noise_choice(
         raise CalibError(
             f"{'.'.join(map(str, first['loc']))}: {first['msg']}", where=where,
             allowed='family = "normal" or "student_t", noise_depends_on = "slip" or another '
-            'condition of the model, correlated_along = "run_order" or "file_order"',
+            'condition of the model, correlated_along = "run_order"',
             mend="correct this entry",
         ) from None  # fmt: skip
     noise = NoiseChoice(chosen.family, chosen.noise_depends_on, chosen.correlated_along)

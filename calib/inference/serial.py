@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.data import Table
 from calib.errors import CalibError
@@ -36,7 +37,7 @@ class Serial:
         How far each of these is from the one before; infinite for the first of a run.
     """
 
-    order: Array
+    order: NDArray[np.intp]
     gap: Array
 
     def before(self, z: Array, rho: Array) -> tuple[Array, Array]:
@@ -86,34 +87,34 @@ def serial_of(along: Along, table: Table) -> Serial | None:
 
     Parameters
     ----------
-    along : {"", "run_order", "file_order"}
-        ``run_order`` is that column, in each ``run`` by itself where the table has this one;
-        ``file_order`` the lines of the file. A row that is missing leaves a gap.
+    along : {"", "run_order"}
+        That column, in each ``run`` by itself where the table has this one. Rows that are missing
+        leave a gap.
     table : Table
 
     Raises
     ------
     CalibError
-        If there is no such column, two rows have the same place, or one is less than 1 apart.
+        If there is no such column, or it does not say the order.
     """
     if not along:
         return None
-    if along == "run_order" and along not in table:
+    if along not in table:
         raise CalibError(
-            "the noise is to be correlated along run_order, a column that is not there",
-            where=table.source, allowed="a column run_order, or correlated_along = \"file_order\"",
+            f"the noise is to be correlated along {along}, a column that is not there",
+            where=table.source, allowed=f"a column {along}",
             mend="add the column, with whole numbers in the order of the measurement",
         )  # fmt: skip
-    n = len(table)
-    place = table[along] if along == "run_order" else table.lines.astype(np.float64)
-    run = table["run"] if along == "run_order" and "run" in table else np.zeros(n)
-    order = np.lexsort((place, run))
+    place, n = table[along], len(table)
+    run = table["run"] if "run" in table else np.zeros(n)
+    order = np.lexsort((place, run)).astype(np.intp)
     gap = np.full(n, np.inf)
     gap[1:] = np.where(np.diff(run[order]) == 0.0, np.diff(place[order]), np.inf)
+    # An empty cell is neither.
     if not gap.min() >= 1.0:
         raise CalibError(
-            f"two rows have the same place along {along}, or places that are no whole numbers",
-            where=table.source, allowed="whole numbers, none of them twice in a run",
+            f"{along} does not say in which order the rows of a run were measured",
+            where=table.source, allowed="whole numbers, in no row none, and none of them twice",
             mend="number the rows of each run as they were measured, and label the runs (run)",
         )  # fmt: skip
     return Serial(order, gap)

@@ -140,13 +140,12 @@ def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[st
     if not stats.beta.cdf(d / 4.0, x * size, (1.0 - x) * size) < LEVEL:
         return
     r = float(np.clip(1.0 - d / mean, 0.0, 0.99))
-    along = "run_order" if "run_order" in table else "file_order"
     yield (
         f"{source_of(table)}: residuals of neighbouring rows are alike (correlation {r:.2f}), as "
         "in rows of one continuous run, or where the curve misses a pattern; the rows are worth "
         f"about {max(1.0, n * (1.0 - r) / (1.0 + r)):.0f} independent ones, not {n}, so that "
-        f'widths are too narrow: correlated_along = "{along}" under [likelihood] in the prior file '
-        "widens them; or thin the rows, or look at the residuals"
+        'widths are too narrow: correlated_along = "run_order" (a column) under [likelihood] in '
+        "the prior file widens them; or thin the rows, or look at the residuals"
     )
 
 

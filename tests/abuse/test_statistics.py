@@ -61,7 +61,10 @@ class Rows:
 
 
 def _table(slip: np.ndarray, pressure: np.ndarray, rut: np.ndarray):
-    columns = {"slip_ratio": slip, "average_ground_pressure_kpa": pressure, "rut_depth_mm": rut}
+    columns = {
+        "slip_ratio": slip, "average_ground_pressure_kpa": pressure, "rut_depth_mm": rut,
+        "run_order": np.arange(rut.size),
+    }  # fmt: skip
     return table_from_arrays(columns, source="ruts.csv")
 
 
@@ -199,8 +202,8 @@ def test_rows_that_are_alike_along_a_run(tmp_path: Path) -> None:
     independent = rows.calibrated()
     found = warned(independent)
     assert "neighbouring rows are alike" in found
-    assert 'correlated_along = "file_order"' in found
-    honest = rows.calibrated('\n[likelihood]\ncorrelated_along = "file_order"\n', tmp_path)
+    assert 'correlated_along = "run_order"' in found
+    honest = rows.calibrated('\n[likelihood]\ncorrelated_along = "run_order"\n', tmp_path)
     assert "alike" not in warned(honest)
     assert holds(honest)
     # A level of 48 rows of which neighbours correlate by 0.9 is worth that of some three.
