@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import signal
+import sys
 import time
-from importlib.metadata import version
+from importlib.metadata import entry_points, version
 from pathlib import Path
 
 import pytest
@@ -163,3 +164,15 @@ def test_an_interruption_in_a_callback_is_not_lost(
         signal.signal(signal.SIGINT, before)
     assert ran.code == 130
     assert "interrupted" in ran.err
+
+
+def test_a_stopped_program_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    (script,) = entry_points(group="console_scripts", name="calib")
+    left: list[int] = []
+    monkeypatch.setattr("calib.cli.os._exit", left.append)
+    monkeypatch.setattr("calib.cli.atexit._run_exitfuncs", lambda: None)
+    for code in (130, 0):
+        monkeypatch.setattr("calib.cli.main", lambda code=code: sys.exit(code))
+        with pytest.raises(SystemExit):
+            script.load()()
+    assert left == [130]
