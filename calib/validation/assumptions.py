@@ -110,7 +110,8 @@ def residual_notes(problem: Problem, t: Array) -> tuple[str, ...]:
     Notes
     -----
     Residuals are those of the model made linear at the fit, over the noise's scale there (Student's
-    as normal scores), so that the moments of linear least squares hold.
+    as normal scores), so that the moments of linear least squares hold. Of noise that is correlated
+    along a run, what each row adds to those before it is tested, without the least squares' part.
     """
     residual, design, rank = linear(problem, t, np.ones(problem.response.size, dtype=bool))
     left = residual.size - rank
@@ -120,10 +121,13 @@ def residual_notes(problem: Problem, t: Array) -> tuple[str, ...]:
     raw = problem.residuals(natural)
     score = problem.noise.normal_scores(raw, natural, problem.conditions)[0]
     leverage = np.sum(design**2, axis=1)
+    if problem.serial is not None:
+        mean, variance = problem.serial.before(score[None], problem.noise.own("rho", natural))
+        score, leverage = ((score - mean) / np.sqrt(variance))[0], np.zeros_like(score)
     judged = leverage < 1.0 - 1e-9
     studentised = np.where(judged, score / np.sqrt(np.where(judged, 1.0 - leverage, 1.0)), 0.0)
     return (
-        *(() if problem.serial else _autocorrelated(problem.table, score, design)),
+        *(() if problem.serial is not None else _autocorrelated(problem.table, score, design)),
         *_uneven(problem, studentised[judged], judged),
         *_heavy_tailed(problem, studentised[judged]),
     )
