@@ -120,6 +120,13 @@ def read_folder(folder: Path) -> dict[str, bytes]:
     }
 
 
+def write_whole(path: Path, text: str) -> None:
+    """Write a file that is there whole or not at all, or as it was, whenever it is killed."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(path)
+
+
 def unwritable(out: Path, why: str) -> CalibError:
     """Return the error for a folder that cannot be written, and why."""
     return CalibError(

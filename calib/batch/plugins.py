@@ -47,9 +47,12 @@ def run_file(path: Path, what: str) -> ModuleType:
     sys.modules[name] = module
     try:
         spec.loader.exec_module(module)
-    except CalibError:
+    except CalibError as error:
         sys.modules.pop(name)
-        raise
+        found = str(path) if error.where is None else f"{path}, {error.where}"
+        raise CalibError(
+            error.message, where=found, allowed=error.allowed, mend=error.mend
+        ) from None
     except Exception as error:
         sys.modules.pop(name)
         frames = traceback.extract_tb(error.__traceback__)

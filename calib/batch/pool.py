@@ -28,7 +28,7 @@ from typing import Protocol
 from calib.batch.plugins import load_files, loaded_files
 from calib.errors import CalibError
 
-__all__ = ["HERE", "Later", "Pool", "begin_imports", "pool"]
+__all__ = ["HERE", "Later", "Pool", "begin_imports", "pool", "without_interruptions"]
 
 _LOOK_SECONDS = 2.0
 # What a report needs, and what its figures and files import when they are first made.
@@ -169,11 +169,7 @@ def _serve() -> None:
 
     It is for the process that waits for the pieces; they would end with tracebacks.
     """
-    if hasattr(signal, "pthread_sigmask"):
-        # Started before: what starts it lets interruptions through again.
-        resource_tracker.ensure_running()
-        # Of this thread alone, and inherited by what it starts.
-        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    without_interruptions()
     with suppress(EOFError, OSError):  # stopped meanwhile
         forkserver.ensure_running()
 
@@ -184,6 +180,14 @@ def _start(executor: ProcessPoolExecutor) -> None:
         _serve()
     with suppress(EOFError, OSError, RuntimeError):  # stopped meanwhile
         executor.submit(_begun)
+
+
+def without_interruptions() -> None:
+    """Keep interruptions from this thread, and from the threads and processes it starts."""
+    if hasattr(signal, "pthread_sigmask"):
+        # Started before: what starts it lets interruptions through again.
+        resource_tracker.ensure_running()
+        signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
 
 
 def _stop(executor: ProcessPoolExecutor) -> None:

@@ -85,7 +85,7 @@ def drawn_in_run(calibration: Calibration, steps: object) -> dict[Place, float |
 
 def left_out(calibration: Calibration) -> tuple[Array, Array]:
     """Influence of each draw on -ln E[1/p(y_i | theta)], (draws, n), and that itself, (n,)."""
-    rows = calibration.problem.log_likelihood_rows(calibration.draws.flat)
+    rows = calibration.problem.log_likelihood_left_out(calibration.draws.flat)
     inverse = np.exp(rows.min(axis=0) - rows)
     influence = inverse / inverse.mean(axis=0) - 1.0
     return influence, rows.min(axis=0) - np.log(inverse.mean(axis=0))

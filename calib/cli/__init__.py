@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
+from collections.abc import Callable
+from functools import partial
+from threading import Timer
 from typing import Annotated, Any
 
 import typer
@@ -23,7 +27,7 @@ from calib.cli import (
 )
 from calib.cli.examples import add_examples
 
-__all__ = ["app", "main"]
+__all__ = ["app", "main", "program"]
 
 
 class _Verbs(TyperGroup):
@@ -43,9 +47,10 @@ class _Verbs(TyperGroup):
             raise typer.Exit(2) from None
         except KeyboardInterrupt as stop:
             print(f"calib: {str(stop) or _STOPPED}", file=sys.stderr)
-            raise typer.Exit(130) from None
+            raise typer.Exit(_INTERRUPTED) from None
 
 
+_INTERRUPTED = 130
 _STOPPED = (
     "interrupted; nothing was written. Start the same command again; what a simulator has run "
     "is kept and not run again"
@@ -105,8 +110,35 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # A polite kill cleans up as an interrupt does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
+    usual = sys.unraisablehook
+    sys.unraisablehook = partial(_interrupt_again, usual)
     try:
         app(prog_name="calib")
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0) from None
+    finally:
+        sys.unraisablehook = usual
+
+
+def program() -> None:
+    """Run the command line in a process of its own, which ends at once when it is stopped."""
+    try:
+        main()
+    except SystemExit as ended:
+        if ended.code == _INTERRUPTED:
+            # The interpreter would take as long again to give back, one by one, what it holds.
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(_INTERRUPTED)
+        raise
+
+
+def _interrupt_again(usual: Callable[[Any], object], lost: Any) -> None:
+    """Interrupt anew after one that came where Python raises nothing: in a callback, say."""
+    if issubclass(lost.exc_type, KeyboardInterrupt):
+        # Not from here, where it would be lost as well.
+        Timer(0.01, os.kill, (os.getpid(), signal.SIGINT)).start()
+    else:
+        usual(lost)

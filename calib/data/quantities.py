@@ -119,6 +119,8 @@ class Quantity:
         logarithm.
     usual : tuple of (float, float), optional
         Where values usually lie, in the canonical unit; others are read, with a warning.
+    largest : tuple of (float, float), optional
+        Where the largest size in a column usually lies, in the canonical unit; of vehicles' wheels.
     suffixes : mapping of str to str, optional
         Accepted unit suffixes of a header and the pint units they mean, for a dimension that is
         not in `UNITS`.
@@ -140,6 +142,7 @@ class Quantity:
     physical: str = ""
     of_factors: bool = False
     usual: tuple[float, float] | None = None
+    largest: tuple[float, float] | None = None
     suffixes: Mapping[str, str] | None = None
 
     def __post_init__(self) -> None:
@@ -204,16 +207,18 @@ QUANTITIES: Registry[Quantity] = Registry(
              "dry mass of soil over its volume", Range(low=0.3, high=3.5),
              title="Dry bulk density", shown=("g/cm³", 1.0), physical="density"),
     Quantity("drawbar_pull", "drawbar_pull_kn", "force", "kN", "output",
-             "net pull of the wheel; negative when it must be pushed", physical="pull"),
+             "net pull of the wheel; negative when it must be pushed", physical="pull",
+             largest=(0.15, 120.0)),
     Quantity("rut_depth", "rut_depth_mm", "length", "mm", "output",
              "depth of the rut, or sinkage", _POSITIVE, synonyms=("sinkage",),
-             log_scale=True, physical="sinkage",
+             log_scale=True, physical="sinkage", largest=(1.0, 1e3),
              mend="the models compare the logarithm of the rut depth, which zero and negative "
              "depths do not have: correct the zero of the gauge, or delete the row"),
     Quantity("driving_torque", "driving_torque_knm", "torque", "kN*m", "output",
-             "torque that the axle gives to the wheel", shown=("kN m", 1.0)),
+             "torque that the axle gives to the wheel", shown=("kN m", 1.0),
+             largest=(0.1, 100.0)),
     Quantity("shear_stress", "shear_stress_kpa", "pressure", "kPa", "output",
-             "shear force over the sheared area", Range(low=0.0)),
+             "shear force over the sheared area", Range(low=0.0), largest=(1.0, 1e3)),
     Quantity("slip", "slip_ratio", "slip", _ONE, "condition",
              "wheel slip; 0.2 means 20 %", _SLIP, shown=("%", 100.0)),
     Quantity("nominal_slip", "nominal_slip_ratio", "slip", _ONE, "bookkeeping",
@@ -223,10 +228,11 @@ QUANTITIES: Registry[Quantity] = Registry(
              usual=(6.0, 150.0)),
     Quantity("average_ground_pressure", "average_ground_pressure_kpa", "pressure", "kPa",
              "condition", "load over contact area", _POSITIVE, title="Ground pressure",
+             largest=(5.0, 5e3),
              physical="ground_pressure"),
     Quantity("normal_load", "normal_load_kn", "force", "kN", "condition",
              "vertical load on the wheel", _POSITIVE, physical="load", of_factors=True,
-             synonyms=("load", "wheel_load", "vertical_load")),
+             synonyms=("load", "wheel_load", "vertical_load"), largest=(0.3, 200.0)),
     Quantity("speed", "speed_m_s", "speed", "m/s", "condition",
              "travel speed", Range(low=0.0), of_factors=True),
     Quantity("pass_number", "pass_number", "number", _ONE, "condition",
@@ -250,25 +256,27 @@ QUANTITIES: Registry[Quantity] = Registry(
              shown=("% of volume", 100.0), physical="water_by_volume"),
     Quantity("cone_index", "cone_index_kpa", "pressure", "kPa", "condition",
              "penetration resistance of a cone", _POSITIVE, physical="cone", of_factors=True,
-             synonyms=("penetration_resistance",)),
+             synonyms=("penetration_resistance",), largest=(20.0, 15e3)),
     Quantity("tyre_width", "tyre_width_m", "length", "m", "condition",
              "width of the tyre's section, or of a rigid wheel", _POSITIVE, of_factors=True,
-             synonyms=("tire_width", "wheel_width", "section_width")),
+             synonyms=("tire_width", "wheel_width", "section_width"), largest=(0.02, 2.0)),
     Quantity("tyre_diameter", "tyre_diameter_m", "length", "m", "condition",
              "outer diameter of the tyre or wheel, unloaded", _POSITIVE, of_factors=True,
-             synonyms=("tire_diameter", "wheel_diameter")),
+             synonyms=("tire_diameter", "wheel_diameter"), largest=(0.05, 5.0)),
     Quantity("tyre_deflection", "tyre_deflection_mm", "length", "mm", "condition",
              "how far the load flattens the tyre on hard ground", Range(low=0.0),
-             synonyms=("tire_deflection",)),
+             synonyms=("tire_deflection",), largest=(1.0, 500.0)),
     Quantity("section_height", "section_height_mm", "length", "mm", "condition",
-             "height of the tyre's section, from rim to tread", _POSITIVE, of_factors=True),
+             "height of the tyre's section, from rim to tread", _POSITIVE, of_factors=True,
+             largest=(20.0, 1e3)),
     Quantity("plate_width", "plate_width_mm", "length", "mm", "condition",
              "smaller side of a rectangular plate; diameter of a round one", _POSITIVE,
-             of_factors=True, synonyms=("plate_diameter",)),
+             of_factors=True, synonyms=("plate_diameter",), largest=(5.0, 2e3)),
     Quantity("shear_displacement", "shear_displacement_mm", "length", "mm", "condition",
-             "how far the sheared soil has moved", Range(low=0.0)),
+             "how far the sheared soil has moved", Range(low=0.0), largest=(1.0, 1e3)),
     Quantity("normal_stress", "normal_stress_kpa", "pressure", "kPa", "condition",
-             "normal force over the sheared area", Range(low=0.0), of_factors=True),
+             "normal force over the sheared area", Range(low=0.0), of_factors=True,
+             largest=(0.5, 2e3)),
     group="terracalib.quantities",
 )  # fmt: skip
 

@@ -1,14 +1,14 @@
-"""Values of a condition that are unusual, or as in another unit than the others."""
+"""Values that are unusual, or as in another unit than the others, or than their column says."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import PurePath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.quantities import Quantity
+from calib.data.quantities import QUANTITIES, Quantity
 from calib.data.table import Table
 
 type Array = NDArray[np.float64]
@@ -16,11 +16,48 @@ type Array = NDArray[np.float64]
 # A psi is so many kPa; levels of a design that are so far apart to this part are no coincidence.
 _PSI, _NEAR, _FEW_LEVELS = 6.894757, 2e-3, 6
 _MOST_NAMED = 5
+# The pull of a wheel is a part of its load: small forces that agree on that are of a small wheel.
+_PULL, _LOAD, _PULL_OVER_LOAD = "drawbar_pull_kn", "normal_load_kn", (0.01, 3.0)
+_OF_SMALL_WHEELS = (_PULL, _LOAD, "driving_torque_knm")
 
 
 def unit_notes(table: Table, quantity: Quantity, values: Array) -> list[str]:
     """Say which values (n,) of a condition are unusual, or as in another unit than the others."""
     return [*_unusual(table, quantity, values), *_mixed_units(table, quantity, values)]
+
+
+def column_notes(table: Table) -> Iterator[str]:
+    """Say which whole columns are a thousand times too large or small, as N that are typed as kN.
+
+    A small wheel's forces are not taken for such if the table has its load and its pull.
+
+    Parameters
+    ----------
+    table : Table
+    """
+    sizes = {
+        name: float(np.nanmax(np.abs(table[name])))
+        for name in table
+        if name in QUANTITIES and np.isfinite(table[name]).any()
+    }
+    low, high = _PULL_OVER_LOAD
+    fits = _LOAD in sizes and low * sizes[_LOAD] < sizes.get(_PULL, 0.0) < high * sizes[_LOAD]
+    for name, size in sizes.items():
+        quantity = QUANTITIES[name]
+        if quantity.largest is None:
+            continue
+        low, high = quantity.largest
+        if fits and name in _OF_SMALL_WHEELS and size < low:
+            continue
+        factor = 1e-3 if size > high else 1e3
+        if low <= size <= high or not low <= factor * size <= high:
+            continue
+        yield (
+            f"{source_of(table)}, {name}: the largest {quantity.word} is {size:g} "
+            f"{quantity.unit.replace('**', '')}, and {low:g} to {high:g} is usual: about 1000 "
+            f"times too {'large' if size > high else 'small'}, as where a unit and its thousandth "
+            "(kN and N, MPa and kPa, m and mm) were mixed up; check the unit in the column name"
+        )
 
 
 def _unusual(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:

@@ -68,7 +68,7 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     internal = draws.t.reshape(chains, steps, -1)[:, picked].reshape(-1, draws.t.shape[-1])
     rng = generator(calibration.seed, calibration.label, "posterior_predictive")
     location = problem.draw_location(natural, problem.conditions, rng)
-    noisy = location + problem.noise.draw(natural, problem.conditions, rng, problem.response.size)
+    noisy = location + problem.draw_noise(natural, rng)
     prior = problem.theta(
         problem.priors.sample(generator(calibration.seed, calibration.label, "prior"), N_PRIOR)
     )
@@ -76,7 +76,7 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
         measured = problem.bound.from_response(noisy).reshape(shape).astype(np.float32)
     by_row = {
         "posterior_predictive": {output: measured},
-        "log_likelihood": {output: problem.log_likelihood_rows(internal).reshape(shape)},
+        "log_likelihood": {output: problem.log_likelihood_left_out(internal).reshape(shape)},
     }
     if kept == 0:
         by_row = {}

@@ -4,9 +4,12 @@ The usual is normal noise of one standard deviation sigma. A prior file may have
 
 - Student-t noise: sigma is its scale, and the degrees of freedom nu are inferred beside it;
 - a noise that depends on a condition c: ln sigma(c) = ln sigma + sigma_slope (c - m)/s, with m and
-  s the mean and the sd of the condition over the rows that are calibrated on.
+  s the mean and the sd of the condition over the rows that are calibrated on;
+- normal noise that is correlated along a run (`calib.inference.serial`): by rho^k between readings
+  that are k apart.
 
-Natural parameters are those of the model, then nu and sigma_slope if they are there, then sigma.
+Natural parameters are those of the model, then nu, sigma_slope and rho if they are there, then
+sigma.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from calib.errors import CalibError
 from calib.models.base import Array, Conditions
 
 type Family = Literal["normal", "student_t"]
+type Along = Literal["", "run_order"]
 
 _HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))
 
@@ -36,6 +40,14 @@ lower = 1.0
 unit = "1"
 reason = "From tails as heavy as Cauchy's, below which a prediction has no mean, to nearly normal"
 source = "Juarez & Steel (2010), doi:10.1198/jbes.2009.07145"
+
+[rho]
+dist = "uniform"
+lower = 0.0
+upper = 0.99
+unit = "1"
+reason = "From independent rows to a noise that hardly changes in a hundred rows"
+source = "This project: nothing is preferred"
 
 [sigma_slope]
 dist = "normal"
@@ -51,17 +63,22 @@ source = "This project: weak, and as ready to fall as to grow"
 class NoiseChoice:
     """What a prior file says of the noise.
 
-    It may depend on a quantity, or its canonical column; empty for one scale at all conditions.
+    It may depend on a quantity, or its canonical column; empty for one scale at all conditions. In
+    runs neighbours may be correlated; what they are counted in, or empty for independent rows.
     """
 
     family: Family = "normal"
     depends_on: str = ""
+    correlated_along: Along = ""
 
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of the noise's parameters beside sigma."""
-        student = ("nu",) if self.family == "student_t" else ()
-        return (*student, "sigma_slope") if self.depends_on else student
+        there = {
+            "nu": self.family == "student_t", "sigma_slope": self.depends_on,
+            "rho": self.correlated_along,
+        }  # fmt: skip
+        return tuple(name for name, asked in there.items() if asked)
 
     @property
     def usual(self) -> bool:
@@ -111,10 +128,13 @@ class Noise:
         z = (conditions[self.column] - self.centre) / self.spread
         # What exceeds all bounds is for the density to exclude.
         with np.errstate(over="ignore", invalid="ignore"):
-            return np.asarray(sigma * np.exp(natural[:, -2:-1] * z))
+            return np.asarray(sigma * np.exp(self.own("sigma_slope", natural) * z))
 
-    def _nu(self, natural: Array) -> Array:
-        return natural[:, -3:-2] if self.column else natural[:, -2:-1]
+    def own(self, name: str, natural: Array) -> Array:
+        """Return a parameter of the noise's own beside sigma, shape (k, 1)."""
+        names = self.choice.parameters
+        j = natural.shape[1] - 1 - len(names) + names.index(name)
+        return natural[:, j : j + 1]
 
     def draw(
         self, natural: Array, conditions: Mapping[str, Array], rng: np.random.Generator, n: int
@@ -122,7 +142,7 @@ class Noise:
         """Draw the noise of n readings for each parameter vector, shape (k, n)."""
         z = rng.standard_normal((natural.shape[0], n))
         if self.student:
-            nu = self._nu(natural)
+            nu = self.own("nu", natural)
             z *= np.sqrt(nu / rng.chisquare(np.broadcast_to(nu, z.shape)))
         return self.scale(natural, conditions) * z
 
@@ -130,7 +150,7 @@ class Noise:
         """Return the noise at the quantiles of standard normals z, (k, 1) to (k, 1) or (k, n)."""
         if self.student:
             # From the tail, where a probability near one would be rounded to it.
-            z = -np.sign(z) * stdtrit(self._nu(natural), ndtr(-np.abs(z)))
+            z = -np.sign(z) * stdtrit(self.own("nu", natural), ndtr(-np.abs(z)))
         return np.asarray(self.scale(natural, conditions) * z)
 
     def log_density(
@@ -142,7 +162,7 @@ class Noise:
             z = residuals / scale
             if not self.student:
                 return np.asarray(-0.5 * z * z - np.log(scale) - _HALF_LN_2PI)
-            nu = self._nu(natural)
+            nu = self.own("nu", natural)
             half = 0.5 * (nu + 1.0)
             constant = gammaln(half) - gammaln(0.5 * nu) - 0.5 * np.log(np.pi * nu)
             return np.asarray(constant - np.log(scale) - half * np.log1p(z * z / nu))
@@ -154,7 +174,7 @@ class Noise:
         z = residuals / self.scale(natural, conditions)
         if not self.student:
             return np.asarray(z)
-        return np.asarray(-np.sign(z) * ndtri(stdtr(self._nu(natural), -np.abs(z))))
+        return np.asarray(-np.sign(z) * ndtri(stdtr(self.own("nu", natural), -np.abs(z))))
 
 
 NORMAL = Noise()

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -16,7 +17,7 @@ from scipy.special import digamma, polygamma
 
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
-from calib.inference.noise import DEFAULT_PRIORS, USUAL, Family, NoiseChoice
+from calib.inference.noise import DEFAULT_PRIORS, USUAL, Along, Family, NoiseChoice
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
 
@@ -76,6 +77,10 @@ class _Fixed(_Entry):
     value: _Number
 
 
+_DISTS: Mapping[str, type[_Entry]] = {
+    "normal": _Normal, "lognormal": _LogNormal, "half_normal": _HalfNormal, "uniform": _Uniform,
+    "gamma": _Gamma, "fixed": _Fixed,
+}  # fmt: skip
 type _AnyEntry = Annotated[
     _Normal | _LogNormal | _HalfNormal | _Uniform | _Gamma | _Fixed, Field(discriminator="dist")
 ]
@@ -85,6 +90,7 @@ class _Likelihood(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
     family: Family = "normal"
     noise_depends_on: str = ""
+    correlated_along: Along = ""
 
 
 class _File(BaseModel):
@@ -246,6 +252,8 @@ def parse_priors(
             f"the prior file is not valid TOML: {error}", where=source, mend="correct that line"
         ) from None
     # A misspelt name is reported before its content: it is the likelier mistake.
+    if unknown := [key for key in content if key not in _File.model_fields]:
+        raise _no_such_key(unknown[0], _File.model_fields, source)
     noise = _noise_choice(content, source, parameters)
     _check_names(content, source, model_name, parameters, noise.parameters)
     try:
@@ -258,6 +266,8 @@ def parse_priors(
     entries = tuple(_prior(name, given[name], source, references) for name in names)
     if noise.family == "student_t":
         _check_nu(entries[len(parameters) - 1], source)
+    if noise.correlated_along:
+        _check_rho(entries[-2], source)
     return Priors(entries, text, source, noise)
 
 
@@ -268,6 +278,18 @@ def _check_nu(nu: Prior, source: str) -> None:
             f"degrees of freedom of {lowest:g} are admitted",
             where=f"{source}, parameters.nu",
             allowed="a prior of what is above 0: gamma, lognormal, or with a lower bound > 0",
+            mend="correct this entry",
+        )
+
+
+def _check_rho(rho: Prior, source: str) -> None:
+    low, high = (rho.loc, rho.loc) if rho.fixed else (rho.lower, rho.upper)
+    low, high = np.exp([low, high]) if rho.log else (low, high)
+    if not 0.0 <= low <= high < 1.0:
+        raise CalibError(
+            f"correlations from {low:g} to {high:g} are admitted",
+            where=f"{source}, parameters.rho",
+            allowed="a prior with bounds of at least 0 and below 1",
             mend="correct this entry",
         )
 
@@ -286,13 +308,21 @@ def _noise_choice(
     try:
         chosen = _Likelihood.model_validate(content["likelihood"])
     except ValidationError as error:
-        first = error.errors()[0]
+        first = _likeliest(error)
+        if first["type"] == "extra_forbidden":
+            raise _no_such_key(first["loc"][-1], _Likelihood.model_fields, where) from None
         raise CalibError(
             f"{'.'.join(map(str, first['loc']))}: {first['msg']}", where=where,
             allowed='family = "normal" or "student_t", noise_depends_on = "slip" or another '
-            "condition of the model", mend="correct this entry",
+            'condition of the model, correlated_along = "run_order"',
+            mend="correct this entry",
         ) from None  # fmt: skip
-    noise = NoiseChoice(chosen.family, chosen.noise_depends_on)
+    noise = NoiseChoice(chosen.family, chosen.noise_depends_on, chosen.correlated_along)
+    if noise.correlated_along and noise.family != "normal":
+        raise CalibError(
+            "noise that is correlated along a run is normal", where=where,
+            allowed='family = "normal"', mend="take one of the two out",
+        )  # fmt: skip
     taken = [name for name in noise.parameters if name in parameters]
     if taken:
         raise CalibError(
@@ -327,7 +357,8 @@ def _check_names(
             found,
             where=f"{source}, [parameters]",
             allowed=", ".join(parameters),
-            mend="give exactly these parameters; copy the shipped file and edit it",
+            mend=f"{_meant(unknown, missing)}give exactly these parameters; copy the shipped file "
+            "and edit it",
         )
 
 
@@ -350,12 +381,36 @@ def _check_units(file: _File, source: str, model_name: str) -> None:
             )
 
 
+def _likeliest(error: ValidationError) -> Any:
+    """Return the error to tell: of a misspelt key, by which another is missing, its name."""
+    errors = error.errors()
+    return next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
+
+
+def _no_such_key(key: object, known: Iterable[str], where: str) -> CalibError:
+    return CalibError(
+        f"there is no key {str(key)!r}", where=where, allowed=", ".join(known),
+        mend=f"{_meant([str(key)], known)}correct it, or take it out",
+    )  # fmt: skip
+
+
+def _meant(found: Iterable[str], known: Iterable[str]) -> str:
+    """Say which names may have been meant."""
+    known = list(known)
+    pairs = ((name, difflib.get_close_matches(name, known, n=2, cutoff=0.5)) for name in found)
+    said = ", ".join(f"{' or '.join(near)} by {name}" for name, near in pairs if near)
+    return f"did you mean {said}? " if said else ""
+
+
 def _explain(error: ValidationError, source: str) -> CalibError:
-    first = error.errors()[0]
-    place = ".".join(str(part) for part in first["loc"] if not str(part).startswith("_"))
+    first = _likeliest(error)
+    place = [str(part) for part in first["loc"]]
+    if first["type"] == "extra_forbidden" and place[0] == "parameters":
+        _, name, dist, key = place
+        return _no_such_key(key, _DISTS[dist].model_fields, f"{source}, parameters.{name}")
     return CalibError(
         f"{first['msg']} (found {first.get('input')!r})",
-        where=f"{source}, {place}",
+        where=f"{source}, {'.'.join(place)}",
         allowed="dist = normal (mean, sd > 0), lognormal (median > 0, sd_log > 0), half_normal "
         "(sd > 0), uniform (lower < upper) or fixed (value); of nu also gamma (shape > 0, "
         "rate > 0); each with unit, reason, source",

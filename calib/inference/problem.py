@@ -14,7 +14,7 @@ that of the noise (`calib.inference.uncertain`).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -32,8 +32,12 @@ from calib.inference.prior_files import (
     relative_columns,
 )
 from calib.inference.priors import Priors
+from calib.inference.serial import Serial, serial_of
 from calib.inference.uncertain import log_normal
 from calib.models import Array, BoundModel, Conditions, get_model
+
+# Mean and variance of each row given others.
+type _Given = Callable[[Serial, Array, Array], tuple[Array, Array]]
 
 _HALF_LN_2PI = 0.5 * float(np.log(2.0 * np.pi))
 # Rows times vectors that are worked out at once where each row has a density of its own.
@@ -107,6 +111,11 @@ class Problem:
     def squares(self) -> Squares:
         """Sums of squared residuals, on the scale of the response, of natural parameters."""
         return Squares.of(self.bound, self.conditions, self.response)
+
+    @cached_property
+    def serial(self) -> Serial | None:
+        """The order of the rows, where their noise is correlated along it."""
+        return serial_of(self.noise.choice.correlated_along, self.table)
 
     def theta(self, t: Array) -> Array:
         """Natural parameters, sigma last, of internal ones: (k, n_dim) to (k, d_all)."""
@@ -189,10 +198,36 @@ class Problem:
         value = np.empty(len(natural))
         for i in range(0, len(natural), at_once):
             some = natural[i : i + at_once]
-            rows = self.noise.log_density(self.residuals(some), some, self.conditions)
+            rows = self._log_densities(some, Serial.before)
             value[i : i + at_once] = rows.sum(axis=1)
         value += self._sum_ln_jacobian
         return np.where(np.isfinite(value), value, -np.inf)
+
+    def _log_densities(self, natural: Array, given: _Given) -> Array:
+        """Log density of the noise of every row given others, where it is correlated, (k, n)."""
+        residuals, serial = self.residuals(natural), self.serial
+        if serial is None:
+            return self.noise.log_density(residuals, natural, self.conditions)
+        with np.errstate(all="ignore"):
+            scale = self.noise.scale(natural, self.conditions)
+            z = residuals / scale
+            mean, variance = given(serial, z, self.noise.own("rho", natural))
+            squared = (z - mean) ** 2 / variance
+            return -0.5 * (squared + np.log(variance)) - np.log(scale) - _HALF_LN_2PI
+
+    def log_likelihood_left_out(self, t: Array) -> Array:
+        """Log density of every row given all others and the parameters, shape (k, n)."""
+        if self.serial is None:
+            return self.log_likelihood_rows(t)
+        return self._log_densities(self.theta(t), Serial.given_all_others) + self._ln_jacobian
+
+    def draw_noise(self, natural: Array, rng: np.random.Generator) -> Array:
+        """Draw the noise of the rows for each parameter vector, shape (k, n)."""
+        n, serial = self.response.size, self.serial
+        if serial is None:
+            return self.noise.draw(natural, self.conditions, rng, n)
+        z = serial.correlate(rng.standard_normal((len(natural), n)), self.noise.own("rho", natural))
+        return np.asarray(self.noise.scale(natural, self.conditions) * z)
 
     def log_likelihood_rows(self, t: Array) -> Array:
         """Log likelihood of every row by itself, shape (k, n)."""
@@ -289,4 +324,5 @@ def build_problem(
     if model.uncertain is not None:
         noise.must_be_usual(priors.source, f"the emulator {model.name}")
     problem = Problem(bound, table, priors, notes, noise)
+    _ = problem.serial  # refused here, not in the middle of an estimation
     return problem.with_fixed(fixed) if fixed else problem

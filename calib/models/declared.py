@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import tomllib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from calib.data.quantities import OUTPUTS, QUANTITIES
+from calib.data.units import convert
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
     from calib.models.base import Model
+
+_ONE = "dimensionless"
 
 
 def check_model(model: Model) -> None:
@@ -19,7 +22,7 @@ def check_model(model: Model) -> None:
     ------
     CalibError
         If a column is no quantity, the output is none, a name is given twice, or the priors are
-        missing or not of the model's parameters.
+        missing, not of the model's parameters, or in another unit than theirs.
     """
     where = f"model {model.name!r}"
     if not model.name.isidentifier():
@@ -68,3 +71,32 @@ def check_model(model: Model) -> None:
             f"its priors and its parameters differ by {', '.join(apart)}", where=where,
             allowed=", ".join(names), mend="give a prior for each of these, and for nothing else",
         )  # fmt: skip
+    _check_units(model, given, where)
+
+
+def _check_units(model: Model, given: dict[str, Any], where: str) -> None:
+    """A prior in another unit would silently be taken for one in the parameter's.
+
+    That of sigma follows from the output; those of parameters are known where they are reported.
+    """
+    log = model.response == "log"
+    wanted = {"sigma": "1" if log else QUANTITIES[model.output].unit}
+    # Without `reported` they all have the unit 1, which then says nothing.
+    if set(model.reported.values()) != {"1"}:
+        wanted |= {name: unit for name, unit in model.reported.items() if name in model.parameters}
+    for name, unit in wanted.items():
+        found = given[name].get("unit") if isinstance(given[name], dict) else None
+        if found is not None and not _same_unit(str(found), unit):
+            raise CalibError(
+                f"the unit is {found!r}", where=f"{where}, priors, parameters.{name}.unit",
+                allowed=f'unit = "{unit.replace("**", "^").replace(_ONE, "1")}"',
+                mend="convert the numbers to this unit",
+            )  # fmt: skip
+
+
+def _same_unit(found: str, wanted: str) -> bool:
+    found, wanted = (_ONE if u == "1" else u.replace("^", "**") for u in (found, wanted))
+    try:
+        return found == wanted or float(convert(1.0, found, wanted)) == 1.0
+    except CalibError:
+        return False

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from calib.batch.folders import write_whole
 from calib.report.figures.export import png_bytes
 from calib.report.figures.sbc import coverage_figure, ranks_figure
 from calib.report.numbers import finite
@@ -77,6 +78,6 @@ def write_sbc(score: SbcScore, out: Path, settings: dict[str, Any], command: Seq
     (out / "figures").mkdir(exist_ok=True)
     for name, image in images.items():
         (out / "figures" / f"{name}.png").write_bytes(image)
-    (out / "sbc.json").write_text(text, encoding="utf-8")
-    (out / "index.html").write_text(page, encoding="utf-8")
+    write_whole(out / "sbc.json", text)
+    write_whole(out / "index.html", page)
     return out / "index.html"

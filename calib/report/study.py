@@ -276,5 +276,4 @@ def _each_alone(task: Task, seed: int) -> dict[float, tuple[PointEstimate, ...]]
 def _prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
     natural = problem.theta(problem.priors.sample(rng, N_PRIOR_PREDICTIVE))
     location = problem.draw_location(natural, problem.conditions, rng)
-    noise = problem.noise.draw(natural, problem.conditions, rng, location.shape[1])
-    return problem.bound.from_response(location + noise)
+    return problem.bound.from_response(location + problem.draw_noise(natural, rng))

@@ -84,6 +84,7 @@ def _noise(noise: Noise, preference: NoisePreference | None) -> dict[str, Any]:
         "noise": {
             "family": noise.choice.family,
             "depends_on": depends if noise.column else None,
+            "correlated_along": noise.choice.correlated_along or None,
             "against_normal": {
                 "elpd_difference": preference.elpd,
                 "se": preference.se,

@@ -14,7 +14,7 @@ from scipy import stats
 
 from calib.data import Table
 from calib.data.quantities import QUANTITIES
-from calib.data.units_check import lines_of, source_of, unit_notes
+from calib.data.units_check import column_notes, lines_of, source_of, unit_notes
 from calib.inference.problem import Problem
 from calib.models.base import Array
 from calib.validation.outliers import linear, outlying_notes
@@ -42,7 +42,7 @@ def file_notes(problem: Problem, scatter: float) -> tuple[str, ...]:
 
     `scatter` is the sd of a reading about the prediction, on the scale of the response.
     """
-    found: list[str] = []
+    found = list(column_notes(problem.table))
     for name, values in problem.conditions.items():
         quantity = QUANTITIES[name]
         if np.unique(values).size == 1:
@@ -92,7 +92,8 @@ def residual_notes(problem: Problem, t: Array) -> tuple[str, ...]:
     """Say where the residuals at a fit, `t` (d,), are not as the likelihood has them.
 
     Residuals are those of the model made linear at the fit, over the noise's scale there (Student's
-    as normal scores), so that the moments of linear least squares hold.
+    as normal scores), so that the moments of linear least squares hold. Of noise that is correlated
+    along a run, what each row adds to those before it is tested, without the least squares' part.
     """
     residual, design, rank = linear(problem, t, np.ones(problem.response.size, dtype=bool))
     left = residual.size - rank
@@ -102,10 +103,13 @@ def residual_notes(problem: Problem, t: Array) -> tuple[str, ...]:
     raw = problem.residuals(natural)
     score = problem.noise.normal_scores(raw, natural, problem.conditions)[0]
     leverage = np.sum(design**2, axis=1)
+    if problem.serial is not None:
+        mean, variance = problem.serial.before(score[None], problem.noise.own("rho", natural))
+        score, leverage = ((score - mean) / np.sqrt(variance))[0], np.zeros_like(score)
     judged = leverage < 1.0 - 1e-9
     studentised = np.where(judged, score / np.sqrt(np.where(judged, 1.0 - leverage, 1.0)), 0.0)
     return (
-        *_autocorrelated(problem.table, score, design),
+        *(() if problem.serial is not None else _autocorrelated(problem.table, score, design)),
         *_uneven(problem, studentised[judged], judged),
         *_heavy_tailed(problem, studentised[judged]),
     )
@@ -126,7 +130,8 @@ def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[st
         f"{source_of(table)}: residuals of neighbouring rows are alike (correlation {r:.2f}), as "
         "in rows of one continuous run, or where the curve misses a pattern; the rows are worth "
         f"about {max(1.0, n * (1.0 - r) / (1.0 + r)):.0f} independent ones, not {n}, so that "
-        "widths are too narrow: thin them, or look at the residuals"
+        'widths are too narrow: correlated_along = "run_order" (a column) under [likelihood] in '
+        "the prior file widens them; or thin the rows, or look at the residuals"
     )
 
 

@@ -68,7 +68,10 @@ class NoisePreference:
 def noise_words(noise: Noise) -> str:
     """Name a noise in plain words."""
     law = "Student-t noise" if noise.student else "normal noise"
-    return f"{law} that depends on {noise.choice.depends_on}" if noise.column else law
+    along = noise.choice.correlated_along
+    said = [f"depends on {noise.choice.depends_on}"] * bool(noise.column)
+    said += [f"is correlated along {along}"] * bool(along)
+    return f"{law} that {' and '.join(said)}" if said else law
 
 
 def with_usual_noise(problem: Problem) -> Problem:

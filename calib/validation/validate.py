@@ -126,7 +126,7 @@ def leave_one_out(
     """
     problem = calibration.problem
     t = calibration.draws.flat
-    log_likelihood = problem.log_likelihood_rows(t)
+    log_likelihood = problem.log_likelihood_left_out(t)
     log_weight, k = psis(-log_likelihood.T)
     rng = generator(calibration.seed, calibration.label, "leave_one_out")
     n = problem.response.size
@@ -143,7 +143,7 @@ def leave_one_out(
             elpd[i] = _log_mean(log_weight[i] + log_likelihood[:, i], log_weight[i])
         else:
             sample = refits[i].sample
-            held = problem.with_table(row).log_likelihood_rows(sample)[:, 0]
+            held = problem.log_likelihood_left_out(sample)[:, i]
             # Without this row, the equation may have no value at it: density zero there.
             defined = np.isfinite(held)
             elpd[i] = _log_mean(np.where(defined, held, -np.inf), np.zeros_like(held))

@@ -34,7 +34,7 @@ VERBS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "sbc": (
         ("sbc", "--model", "bekker", "--simulations", "10", "--workers", "1", "--out", "out"),
-        ("summary.json",),
+        ("sbc.json",),
     ),
 }  # fmt: skip
 

@@ -12,13 +12,14 @@ from typer.testing import CliRunner
 
 from calib.cli import app
 from calib.data import read_for_model, table_from_arrays
+from calib.data.units_check import column_notes
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.prior_files import default_priors
 from calib.inference.problem import build_problem
 from calib.models import get_model
-from calib.validation.assumptions import warnings_of
+from calib.validation.assumptions import file_notes, warnings_of
 
 MODEL = "modified_bekker"
 TRUTH = {"z_ref": 20.0, "n0": 1.0, "n1": 1.0}
@@ -60,7 +61,10 @@ class Rows:
 
 
 def _table(slip: np.ndarray, pressure: np.ndarray, rut: np.ndarray):
-    columns = {"slip_ratio": slip, "average_ground_pressure_kpa": pressure, "rut_depth_mm": rut}
+    columns = {
+        "slip_ratio": slip, "average_ground_pressure_kpa": pressure, "rut_depth_mm": rut,
+        "run_order": np.arange(rut.size),
+    }  # fmt: skip
     return table_from_arrays(columns, source="ruts.csv")
 
 
@@ -104,6 +108,38 @@ def test_psi_typed_as_kpa_in_some_rows() -> None:
     found = rows.calibrated()
     lines = ", ".join(str(found.problem.table.lines[i]) for i in range(30, 34))
     assert f"lines {lines}: average ground pressure is 6.895 times smaller" in warned(found)
+
+
+def in_metres(rows: Rows) -> Rows:
+    return Rows(rows.slip, rows.pressure, rows.rut / 1000.0)
+
+
+def test_a_whole_column_in_another_unit(clean: Calibration) -> None:
+    problem = build_problem(
+        MODEL, _table(*(getattr(in_metres(Rows.made()), k) for k in ("slip", "pressure", "rut")))
+    )
+    said = " | ".join(file_notes(problem, 0.05))
+    assert "ruts.csv, rut_depth_mm: the largest rut depth is 0.0" in said
+    assert "about 1000 times too small" in said
+
+
+@pytest.mark.parametrize(("load", "factor", "told"), [
+    (5.0, 1.0, ()), (5.0, 1e3, ("pull",)), (5.0, 1e-3, ("pull",)), (5e3, 1e-3, ("load",)),
+    (0.06, 1.0, ()), (0.06, 1e3, ("load",)), (5e3, 1.0, ("pull", "load")), (None, 1e-3, ("pull",)),
+])  # fmt: skip
+def test_forces_of_which_one_is_in_another_unit(
+    load: float | None, factor: float, told: tuple[str, ...]
+) -> None:
+    """A pull is a part of its load, which tells a small wheel from N that are typed as kN."""
+    pull = factor * np.array([0.1, 0.2, 0.3]) * (5.0 if load is None else load)
+    columns = {"slip_ratio": np.array([0.1, 0.2, 0.3]), "drawbar_pull_kn": pull}
+    if load is not None:
+        columns["normal_load_kn"] = np.full(3, load)
+    said = " | ".join(column_notes(table_from_arrays(columns, source="pull.csv")))
+    for word in ("pull", "load"):
+        assert (f"the largest {'drawbar' if word == 'pull' else 'normal'} {word}" in said) == (
+            word in told
+        )
 
 
 def test_duplicated_rows(clean: Calibration) -> None:
@@ -157,14 +193,22 @@ def test_uneven_noise(tmp_path: Path) -> None:
     assert abs(slope.mean - 5.0 * slip.std()) < 4.0 * slope.sd
 
 
-def test_rows_that_are_alike_along_a_run() -> None:
+def test_rows_that_are_alike_along_a_run(tmp_path: Path) -> None:
     rng = np.random.default_rng(6)
     noise = rng.standard_normal(N)
     for i in range(1, N):
         noise[i] = 0.9 * noise[i - 1] + np.sqrt(1.0 - 0.81) * noise[i]
-    found = warned(Rows.made(0.05 * noise).calibrated())
+    rows = Rows.made(0.05 * noise)
+    independent = rows.calibrated()
+    found = warned(independent)
     assert "neighbouring rows are alike" in found
-    assert "too narrow" in found
+    assert 'correlated_along = "run_order"' in found
+    honest = rows.calibrated('\n[likelihood]\ncorrelated_along = "run_order"\n', tmp_path)
+    assert warned(honest) == ""
+    assert holds(honest)
+    # A level of 48 rows of which neighbours correlate by 0.9 is worth that of some three.
+    assert honest.summary["z_ref"].sd > 2.0 * independent.summary["z_ref"].sd
+    assert abs(honest.summary["rho"].mean - 0.9) < 4.0 * honest.summary["rho"].sd
 
 
 def written(rows: Rows, path: Path) -> Path:

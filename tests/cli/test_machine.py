@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
-from importlib.metadata import version
+import signal
+import sys
+import time
+from importlib.metadata import entry_points, version
 from pathlib import Path
 
 import pytest
@@ -137,3 +140,39 @@ def test_an_interruption_says_how_to_go_on(calib: Calib, monkeypatch: pytest.Mon
     assert ran.code == 130
     assert "nothing was written. Start the same command again" in ran.err
     assert not Path("calib-run").exists()
+
+
+def test_an_interruption_in_a_callback_is_not_lost(
+    calib: Calib, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Python reports what a finaliser raises, and goes on."""
+
+    class Finalised:
+        def __del__(self) -> None:
+            raise KeyboardInterrupt
+
+    def stopped(*_: object, **__: object) -> None:
+        Finalised()
+        time.sleep(60.0)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    monkeypatch.setattr("calib.inference.calibration.calibrate", stopped)
+    Path("my.csv").write_text(example_csv("bekker"))
+    try:
+        ran = calib("fit", "my.csv", "--model", "bekker")
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert ran.code == 130
+    assert "interrupted" in ran.err
+
+
+def test_a_stopped_program_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    (script,) = entry_points(group="console_scripts", name="calib")
+    left: list[int] = []
+    monkeypatch.setattr("calib.cli.os._exit", left.append)
+    monkeypatch.setattr("calib.cli.atexit._run_exitfuncs", lambda: None)
+    for code in (130, 0):
+        monkeypatch.setattr("calib.cli.main", lambda code=code: sys.exit(code))
+        with pytest.raises(SystemExit):
+            script.load()()
+    assert left == [130]

@@ -319,3 +319,31 @@ def test_models_travel_by_name_or_whole() -> None:
     other = replace(model, name="another", title="Not registered")
     again = pickle.loads(pickle.dumps(other))
     assert (again.name, again.title) == ("another", "Not registered")
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "words"),
+    [
+        ('unit = "kN*m"\nreason = "Torque meters', 'unit = "N*m"\nreason = "Torque meters',
+         ["parameters.sigma.unit: the unit is 'N*m'", 'unit = "kN*m"']),
+        ('parameters=("mu", "s0"),', 'parameters=("mu", "s0"), reported={"mu": "1", "s0": "%"},',
+         ["parameters.s0.unit: the unit is '1'", 'unit = "%"']),
+    ],
+)  # fmt: skip
+def test_a_prior_in_another_unit_than_its_parameter_is_refused(
+    run: Calib, right: str, wrong: str, words: list[str]
+) -> None:
+    text = (HERE / "wheel_torque.py").read_text(encoding="utf-8")
+    assert text.count(right) == 1
+    own = Path("own.py")
+    own.write_text(text.replace(right, wrong), encoding="utf-8")
+    refused = run("models", "--models", own)
+    assert refused.code == 2
+    for word in (*words, f"{own.resolve()}, model 'janosi_torque'", "to mend: convert"):
+        assert word in refused.err
+
+
+def test_a_unit_written_otherwise_is_the_same(run: Calib) -> None:
+    text = (HERE / "wheel_torque.py").read_text(encoding="utf-8")
+    Path("own.py").write_text(text.replace('unit = "kN*m"', 'unit = "kN m"'), encoding="utf-8")
+    assert run("models", "--models", "own.py").code == 0

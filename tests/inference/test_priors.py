@@ -208,7 +208,7 @@ def refusal(call: Callable[[], object]) -> str:
         ('dist = "normal"\nmean = 0.0\nsd = inf', ["sd", "finite", "inf"]),
         ('dist = "normal"\nmean = "wide"\nsd = 1.0', ["mean", "number", "wide"]),
         ('dist = "normal"\nmean = 0.0', ["normal.sd", "Field required"]),
-        ('dist = "normal"\nmean = 0.0\nsd = 1.0\nsigma = 2', ["sigma", "not permitted"]),
+        ('dist = "normal"\nmean = 0.0\nsd = 1.0\nsigma = 2', ["no key 'sigma'"]),
         ('dist = "cauchy"\nmean = 0.0', ["cauchy", "normal", "uniform"]),
         ("mean = 0.0\nsd = 1.0", ["parameters.x", "dist"]),
         ('dist = "fixed"', ["value", "Field required"]),
@@ -340,3 +340,29 @@ def test_a_prior_may_be_relative_to_any_column() -> None:
     assert (given.loc, given.scale) == (200.0, 100.0)
     assert (assumed.loc, assumed.scale) == (3.0, 1.5)
     assert relative_columns(one(body).text) == {"cone_index_kpa": 3.0}
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "words"),
+    [
+        ("sd_log", "sdlog", ["my.toml, parameters.x: ", "no key 'sdlog'", "mean sd_log by sdlog"]),
+        ("[parameters.x]", "[parameters.sigm]", ["[parameters]", "sigm; missing parameter x"]),
+        ("[parameters.x]", "[parameters.xx]", ["unknown parameter xx", "mean x by xx"]),
+        ('model = "m"', 'modle = "m"', ["my.toml: ", "no key 'modle'", "mean model by modle"]),
+    ],
+)
+def test_a_misspelt_key_is_named_with_the_nearest_ones(
+    right: str, wrong: str, words: list[str]
+) -> None:
+    body = 'dist = "lognormal"\nmedian = 1.0\nsd_log = 0.2'
+    text = f'model = "m"\n{ENTRY.format(name="x")}{body}'.replace(right, wrong)
+    with pytest.raises(CalibError) as refused:
+        parse_priors(text, "my.toml", "m", ("x",), {})
+    for word in (*words, "allowed: "):
+        assert word in str(refused.value)
+
+
+def test_a_misspelt_key_of_the_likelihood_is_named() -> None:
+    with pytest.raises(CalibError, match="did you mean family by famly") as refused:
+        parse_priors('model = "m"\n[likelihood]\nfamly = 1\n', "my.toml", "m", ("sigma",), {})
+    assert refused.value.where == "my.toml, [likelihood]"

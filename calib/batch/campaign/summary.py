@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from calib.batch.campaign.plan import Plan
+from calib.batch.folders import write_whole
 from calib.batch.tasks import failed_tasks
 
 NUMBERS = "numbers.json"
@@ -76,10 +77,10 @@ def write_summary(summary: Summary, folder: Path) -> None:
         "counts": summary.counts,
         "tasks": {name: _entry(summary, name) for name in summary.kinds},
     }
-    _write(folder / "summary.json", json.dumps(document, indent=1) + "\n")
+    write_whole(folder / "summary.json", json.dumps(document, indent=1) + "\n")
     for kind in dict.fromkeys(summary.kinds.values()):
         names = [name for name, its in summary.kinds.items() if its == kind]
-        _write(folder / f"{kind}.csv", _table(summary, names))
+        write_whole(folder / f"{kind}.csv", _table(summary, names))
 
 
 def _entry(summary: Summary, name: str) -> dict[str, Any]:
@@ -109,9 +110,3 @@ def _flat(numbers: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, A
             yield from _flat(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
-
-
-def _write(path: Path, text: str) -> None:
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)

@@ -7,10 +7,12 @@ import os
 import pickle
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import closing, contextmanager, suppress
 from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
+from multiprocessing import active_children
 from typing import Any
 
 import dask
@@ -19,6 +21,7 @@ from distributed.scheduler import KilledWorker
 from distributed.utils import silence_logging_cmgr
 
 from calib.batch.environment import code_sha256
+from calib.batch.pool import without_interruptions
 from calib.batch.tasks.attempt import Finished, attempt, describe
 from calib.errors import CalibError
 
@@ -44,6 +47,7 @@ _LOCAL = {
 START_TRIES = 2
 CONNECT_SECONDS = 10
 SETTLE_SECONDS, CLOSE_SECONDS = 20, 20
+_LOOK_SECONDS = 0.02
 _SAME = ("numpy", "scipy", "emcee")
 
 
@@ -180,7 +184,7 @@ def _local(workers: int) -> Iterator[Client]:
     with _own_environment(), dask.config.set(_LOCAL):
         cluster = _start(workers)
         try:
-            with Client(cluster, set_as_default=False) as client:
+            with Client(cluster, set_as_default=False) as client, _left_at_once(cluster):
                 yield client
                 # A worker that died is being replaced: Dask cannot close its nanny meanwhile.
                 with suppress(TimeoutError):
@@ -194,19 +198,52 @@ def _local(workers: int) -> Iterator[Client]:
 
 def _start(workers: int, tries: int = START_TRIES) -> LocalCluster:
     """Start a scheduler here and its workers, once more if one of them died as it started."""
-    try:
-        return LocalCluster(
+    # Where no interruption reaches it, which would leave half a cluster.
+    with ThreadPoolExecutor(1, initializer=without_interruptions) as apart:
+        coming = apart.submit(
+            LocalCluster,
             n_workers=workers, threads_per_worker=1, processes=True, memory_limit=1.0 / workers,
             dashboard_address="127.0.0.1:0",  # any free port: the usual one may be taken
             silence_logs=logging.CRITICAL, preload=["calib.batch.tasks.worker"],
         )  # fmt: skip
-    except RuntimeError as error:
-        if tries > 1:
-            return _start(workers, tries - 1)
-        raise CalibError(
-            f"the worker processes do not start ({error})",
-            mend='in a script of yours, put the call below `if __name__ == "__main__":`',
-        ) from error
+        try:
+            return coming.result()
+        except RuntimeError as error:
+            if tries > 1:
+                return _start(workers, tries - 1)
+            raise CalibError(
+                f"the worker processes do not start ({error})",
+                mend='in a script of yours, put the call below `if __name__ == "__main__":`',
+            ) from error
+        except KeyboardInterrupt:
+            # Without its workers it fails to start, and closes itself.
+            while not wait([coming], _LOOK_SECONDS).done:
+                _kill_workers()
+            if coming.exception() is None:
+                with closing(coming.result()) as cluster, _left_at_once(cluster):
+                    raise
+            raise
+
+
+@contextmanager
+def _left_at_once(cluster: LocalCluster) -> Iterator[None]:
+    """Kill the workers if what they are at is not wanted any more.
+
+    Asked to stop, one that is at work or still starting takes seconds, and keeps nothing.
+    """
+    try:
+        yield
+    except BaseException:
+        for nanny in cluster.workers.values():
+            nanny.close_gracefully()  # it starts no other
+        _kill_workers()
+        raise
+
+
+def _kill_workers() -> None:
+    for process in active_children():
+        if process.name.startswith("Dask Worker"):
+            process.kill()
 
 
 @contextmanager

@@ -69,8 +69,7 @@ def run_tasks[I](
     progress : callable, optional
         Called with tasks finished and tasks in all.
     announce : callable, optional
-        Called with one line that says where the tasks are done, and with another if they are
-        interrupted while others do them.
+        Called with one line that says where the tasks are done.
 
     Returns
     -------
@@ -149,14 +148,10 @@ def _run[I, R, C](
                     failed[task.name] = task.error
                 tell(len(found) + len(failed), len(items))
         except KeyboardInterrupt:
-            kept = (
+            raise KeyboardInterrupt(
                 f"interrupted; {len(found)} of {len(items)} results are kept in {landing.folder}, "
                 "and the same command does the others"
-            )
-            if announce is not None and (workers > 1 or scheduler is not None):
-                announce(f"{kept}; letting go of the workers takes some seconds")
-                kept = "interrupted"
-            raise KeyboardInterrupt(kept) from None
+            ) from None
         finally:
             failed = {name: failed[name] for name in items if name in failed}
             _list(failed, landing.folder / FAILED)

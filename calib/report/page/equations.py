@@ -63,7 +63,13 @@ def likelihood(problem: Problem, output: str) -> str:
     law, scale = ("normal", "standard deviation")
     if noise.student:
         law, scale = "Student-t, of unknown degrees of freedom nu,", "scale"
-    text = f"Rows are independent; {what} is {law} about the prediction, with "
+    rows = "Rows are independent"
+    if noise.choice.correlated_along:
+        rows = (
+            f"Rows are correlated along {noise.choice.correlated_along}, by rho to the power of "
+            "how many rows they are apart"
+        )
+    text = f"{rows}; {what} is {law} about the prediction, with "
     if not noise.column:
         return f"{text}one unknown {scale} sigma for all rows."
     column = axis_of(noise.column)

@@ -118,7 +118,7 @@ def _inference(o: Output) -> list[str]:
     sampled = [name for name, p in o.found["posterior"].items()
                if p["posterior_to_prior_sd"] is not None]  # fmt: skip
     sentences = [
-        f"The likelihood takes the rows as independent and {what} as {_noise(o)}.",
+        f"The likelihood takes the rows as {_dependence(o)} and {what} as {_noise(o)}.",
         f"The sampled parameters are {joined_symbols(sampled)}; their priors, with reasons and "
         f"sources, are those of `{priors['source']}` (SHA-256 `{priors['sha256'][:_HASH]}`).",
     ]
@@ -130,6 +130,12 @@ def _inference(o: Output) -> list[str]:
             "the mode from which sampling began."
         )
     return sentences
+
+
+def _dependence(o: Output) -> str:
+    if not o.found.get("noise", {}).get("correlated_along"):
+        return "independent"
+    return "correlated along a run by [$rho] to the power of how many rows they are apart"
 
 
 def _noise(o: Output) -> str:

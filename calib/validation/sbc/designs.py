@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+
+import numpy as np
 
 from calib.data import Table, read_for_model
 from calib.data.registry import Registry
@@ -63,7 +65,10 @@ def design_of(model_name: str) -> Design:
     """Return the design of a model; a CalibError if it has neither a design nor an example."""
     model = get_model(model_name)
     known = DESIGNS.get(model.name)
-    return known.make() if known is not None else _of_example(model)
+    design = known.make() if known is not None else _of_example(model)
+    # For noise that is correlated along a run, if the priors ask for it.
+    order = {"run_order": np.arange(1.0, len(design.table) + 1.0)}
+    return replace(design, table=replace(design.table, columns=order | dict(design.table.columns)))
 
 
 def _of_example(model: Model) -> Design:

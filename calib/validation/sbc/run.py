@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from calib.batch.folders import write_whole
 from calib.batch.tasks import run_tasks
 from calib.errors import CalibError
 from calib.inference.prior_files import DeclaredPriors, prior_file_model
@@ -93,14 +94,14 @@ def _claim(out: Path, run: dict[str, Any]) -> None:
                     mend="choose another --out, or the seed that is there",
                 )
             return
-        if Path(out).exists() and any(Path(out).iterdir()):
+        if Path(out).exists() and any(p.suffix != ".part" for p in Path(out).iterdir()):
             raise CalibError(
                 "the output folder exists, is not empty and holds no simulation-based calibration",
                 where=str(out),
                 mend="choose another --out",
             )
         Path(out).mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text)
     except OSError as error:
         raise CalibError(
             f"the output folder cannot be written ({error.strerror})",

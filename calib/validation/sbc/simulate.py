@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -59,8 +60,9 @@ def simulate(template: Problem, design: Design, rng: np.random.Generator) -> Sim
     for attempt in range(1, _MOST_ATTEMPTS + 1):
         truth = template.priors.sample(rng, 1)
         natural = template.theta(truth)
-        noisy = _noisy(template, natural, dict(template.conditions), rng)[1]
-        location, measured = _noisy(template, natural, design.held, rng)
+        noisy = _noisy(template, natural, template.conditions, template.draw_noise(natural, rng))[1]
+        apart = template.noise.draw(natural, design.held, rng, _count(design.held))
+        location, measured = _noisy(template, natural, design.held, apart)
         if np.isfinite(noisy).all() and (bound.model.response != "log" or (noisy > 0.0).all()):
             return Simulated(
                 truth[0], template.with_table(_measured(template, noisy)), design.held, location,
@@ -74,14 +76,17 @@ def simulate(template: Problem, design: Design, rng: np.random.Generator) -> Sim
 
 
 def _noisy(
-    problem: Problem, natural: Array, conditions: dict[str, Array], rng: np.random.Generator
+    problem: Problem, natural: Array, conditions: Mapping[str, Array], noise: Array
 ) -> tuple[Array, Array]:
     """Output at some conditions and a measurement of it, each of shape (n,)."""
     location = problem.bound.location(problem.of_model(natural), conditions)[0]
-    noise = problem.noise.draw(natural, conditions, rng, location.size)[0]
     with np.errstate(over="ignore"):
         back = problem.bound.from_response
-        return back(location), back(location + noise)
+        return back(location), back(location + noise[0])
+
+
+def _count(conditions: Mapping[str, Array]) -> int:
+    return next(iter(conditions.values())).size
 
 
 def _measured(template: Problem, output: Array) -> Table:

@@ -10,7 +10,10 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from multiprocessing import active_children
+from multiprocessing.process import BaseProcess
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -29,6 +32,10 @@ def content(folder: Path) -> dict[str, bytes]:
         for p in sorted(folder.rglob("*"))
         if p.is_file() and p.name != "seconds.csv"
     }
+
+
+def dask_workers() -> list[BaseProcess]:
+    return [p for p in active_children() if p.name.startswith("Dask Worker")]
 
 
 @pytest.fixture(scope="module")
@@ -253,3 +260,36 @@ def test_workers_of_other_versions_are_refused(tmp_path, scheduler, monkeypatch)
 def test_the_cluster_is_not_asked_when_nothing_is_missing(tmp_path):
     run_tasks(work.draw, {"a": 1}, tmp_path)
     assert run_tasks(work.draw, {"a": 1}, tmp_path, scheduler="tcp://127.0.0.1:1").done == ("a",)
+
+
+def test_an_interruption_does_not_wait_for_workers_at_their_work(tmp_path, monkeypatch):
+    # Asked to end, those that work or start take longer than that.
+    monkeypatch.setattr(cluster, "CLOSE_SECONDS", 1)
+    working: list[BaseProcess] = []
+
+    def interrupt(done: int, planned: int) -> None:
+        if done == 1:
+            working.extend(dask_workers())
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt, match="1 of 3 results are kept"):
+        run_tasks(work.slow, {"a": (0, 0.0), "b": (1, 600.0), "c": (2, 600.0)}, tmp_path, workers=2,
+                  progress=interrupt)  # fmt: skip
+    assert [process.exitcode for process in working] == [-signal.SIGKILL, -signal.SIGKILL]
+
+
+def test_an_interruption_leaves_no_half_started_worker(tmp_path):
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def interrupt() -> None:
+        while not dask_workers():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    try:
+        Thread(target=interrupt, daemon=True).start()
+        with pytest.raises(KeyboardInterrupt, match="0 of 1 results are kept"):
+            run_tasks(work.slow, {"a": (0, 600.0)}, tmp_path, workers=2)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert not dask_workers()

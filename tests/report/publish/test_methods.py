@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 import re
+from importlib.metadata import version
 from typing import Any
 
 import pytest
@@ -131,7 +132,7 @@ def test_no_number_is_remembered(he2019, text):
 
 def test_what_a_methods_section_must_say(text):
     for words in (
-        "The data are reconstructed", "not measurements", "with calib 0.1.0",
+        "The data are reconstructed", "not measurements", f"with calib {version('terracalib')}",
         "Eqs 12\N{EN DASH}15 of the source", "normal about the model", "logarithm of rut depth",
         "ayers_perumpral.toml (SHA-256 ", "emcee 3", "Student-t", "seed 42",
         "calib report --out 'a folder'", "The 14 rows at inflation pressure 30 psi were held out",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from importlib import resources
-from importlib.metadata import metadata
+from importlib.metadata import metadata, version
 
 import pytest
 
@@ -70,7 +70,7 @@ def test_only_what_is_cited_is_listed_and_all_of_it(published):
     used = {k for group in re.findall(r"\\cite\{(.*?)\}", tex) for k in group.split(",")}
     assert set(re.findall(r"@\w+\{(\w+),", bib)) == used
     assert {*DOIS, "calib"} <= used
-    assert "Version 0.1.0" in bib
+    assert f"Version {version('terracalib')}" in bib
     for line in published.references:
         assert re.search(r"doi:10\.|https://jmlr|Version", line)
 

@@ -153,3 +153,19 @@ def test_a_prior_file_chooses_the_noise_that_is_proved(tmp_path: Path) -> None:
         run_sbc(tmp_path / "run", models=MODELS, **options)
     with pytest.raises(CalibError, match="priors of modified_bekker"):
         run_sbc(tmp_path / "other", models=MODELS[:1], priors=[path], **options)
+
+
+def test_a_run_that_was_killed_as_it_began_begins_again(tmp_path: Path) -> None:
+    (tmp_path / ".run.json.part").write_text('{"see', encoding="utf-8")
+    run_sbc(tmp_path, models=["bekker"], simulations=2, seed=3, settings=QUICK)
+    assert json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))["seed"] == 3
+
+
+def test_the_option_of_correlated_noise_is_simulated(tmp_path: Path) -> None:
+    priors = tmp_path / "along.toml"
+    extra = '\n[likelihood]\ncorrelated_along = "run_order"\n'
+    priors.write_text(default_priors("bekker").read_text(encoding="utf-8") + extra, "utf-8")
+    score = run_sbc(
+        tmp_path / "out", models=["bekker"], simulations=3, seed=3, settings=QUICK, priors=[priors]
+    )
+    assert "rho" in {quantity.name for quantity in score.models[0].quantities}
