@@ -24,8 +24,6 @@ from calib.models.base import Array
 
 __all__ = ["Fit", "finish", "fit", "full_fit", "log_joint", "truncated_fit"]
 
-# The noise of an output is known beforehand to this factor (sd of its logarithm).
-SIGMA_SD_LOG = 1.0
 _MAX_STEPS = 40
 # Steps of a truncated fit; of one at a discrepancy alone, which predictions are linear in.
 _FIRST_STEPS, _LINEAR_STEPS = 3, 1
