@@ -52,10 +52,10 @@ def test_a_case_can_be_calibrated_and_predicted(
     assert len(field) >= MIN_FIELD_ROWS
     for model in case.models.values():
         problem = build_problem(model, lab)
-        theta = problem.priors.sample(np.random.default_rng(1), 20)[:, :-1]
+        drawn = problem.theta(problem.priors.sample(np.random.default_rng(1), 20))
         for table in (lab, field):
             conditions = problem.bound.model.select(table.columns)
-            predicted = problem.bound.location(theta, conditions)
+            predicted = problem.bound.location(problem.of_model(drawn), conditions)
             # A soil may be too soft for the wheel; a row must not be beyond the model.
             assert np.isfinite(predicted).any(axis=0).all()
 
