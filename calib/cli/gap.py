@@ -13,7 +13,10 @@ from calib.cli.options import CORES, Models, Overwrite, Seed, Simulators, Worker
 from calib.errors import CalibError
 
 # What the processes that draw the page import.
-_PAGE = ("calib.report.page.diagnosis",)
+_PAGE = (
+    "calib.report.page.gap_page", "calib.report.page.diagnosis", "calib.report.figures.gap",
+    "calib.report.figures.export", "PIL.Image",
+)  # fmt: skip
 
 
 def diagnose(
@@ -71,7 +74,7 @@ def diagnose(
     own_files = [] if effects is None else [effects]
     with pool(workers, _PAGE, own_files) as side:
         found = find(given, seed, effects={**EFFECTS, **own}, pool=side)
-        from calib.report.page.diagnosis import write_page
+        from calib.report.page.gap_page import write_page
 
         with fresh_folder(out, overwrite=overwrite) as folder:
             write_diagnosis(found, folder)

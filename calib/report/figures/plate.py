@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-from matplotlib.figure import Figure
-
-from calib.report.figures.style import style
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["Plate", "draw_all"]
 
@@ -36,6 +36,9 @@ class Plate:
 
 def draw_all(drawings: Mapping[str, Callable[[], Plate | None]]) -> list[Plate]:
     """Draw figures by name, in order; one that fails has no figure and a caption saying why."""
+    # What drawing takes is not imported where a plate is only shown.
+    from calib.report.figures.style import style
+
     with style():
         drawn = [_attempt(name, draw) for name, draw in drawings.items()]
     return [plate for plate in drawn if plate is not None]

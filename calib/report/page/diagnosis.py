@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import Any
 
-from calib.batch.pool import HERE, Pool
 from calib.gap.diagnose import Diagnosis
 from calib.gap.inclusion import UNLISTED
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
 from calib.models import get_model
-from calib.report.figures.export import png
-from calib.report.figures.gap import GAP_FIGURES, gap_plates
 from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import gap_evidence, region_words, shrink_facts, where_fact
 from calib.report.gap_rows import (
@@ -51,31 +47,6 @@ TONE_MARKS = {
     Tone.CARE: "\N{BLACK UP-POINTING TRIANGLE}",
     Tone.NO: "?",
 }
-
-
-def write_page(
-    found: Diagnosis, folder: Path, manifest: Mapping[str, Any], *, pool: Pool = HERE
-) -> None:
-    """Draw ``figures/*.png`` and write them and ``index.html`` into an existing folder.
-
-    Of the manifest ``command`` and ``versions`` are shown, if they are there. The first figures are
-    drawn in the pool, the others here meanwhile.
-    """
-    there = pool.submit(_drawn, found, GAP_FIGURES[:3])
-    drawn = _drawn(found, GAP_FIGURES[3:]) | there.result()
-    plates = [drawn[name][0] for name in GAP_FIGURES if name in drawn]
-    images = {f"{plate.name}.png": image for plate, image in drawn.values() if image}
-    (folder / "figures").mkdir(exist_ok=True)
-    for name, image in images.items():
-        (folder / "figures" / name).write_bytes(image)
-    page = render_diagnosis(found, plates, images, manifest=manifest)
-    (folder / "index.html").write_text(page, encoding="utf-8")
-
-
-def _drawn(found: Diagnosis, names: Sequence[str]) -> dict[str, tuple[Plate, bytes]]:
-    """Draw figures; return each without its canvas, and as a file."""
-    plates = gap_plates(found, names)
-    return {p.name: (replace(p, figure=None), png(p)) for p in plates}
 
 
 def render_diagnosis(

@@ -27,7 +27,8 @@ from calib.report.gap_verdict import (
     odds_text,
     repeats_needed,
 )
-from calib.report.page.diagnosis import render_diagnosis, write_page
+from calib.report.page.diagnosis import render_diagnosis
+from calib.report.page.gap_page import write_page
 from calib.report.page.gap_tables import (
     conditions_text,
     hypothesis_groups,

@@ -20,7 +20,7 @@ from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.check import check_on_case
 from calib.gap.effects.load import load_effects
-from calib.report.page.diagnosis import write_page
+from calib.report.page.gap_page import write_page
 
 
 class DiagnoseSection(Section):

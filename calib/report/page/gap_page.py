@@ -1,0 +1,63 @@
+"""Write the page of a diagnosis, drawn and rendered by the processes of a pool.
+
+Where there are others this one never imports what that takes: it would, on one core, while they
+wait.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from calib.batch.pool import HERE, Pool
+from calib.gap.diagnose import Diagnosis
+from calib.report.figures.plate import Plate
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+# Places of figures, in reading order, that take as long to draw as all others.
+_HALF = (1, 2, 3)
+
+
+def write_page(
+    found: Diagnosis, folder: Path, manifest: Mapping[str, Any], *, pool: Pool = HERE
+) -> None:
+    """Draw ``figures/*.png`` and write them and ``index.html`` into an existing folder.
+
+    Of the manifest ``command`` and ``versions`` are shown, if they are there.
+    """
+    halves = [pool.submit(_drawn, found, half) for half in (True, False)]
+    by_place = halves[0].result() | halves[1].result()
+    drawn = [by_place[place] for place in sorted(by_place)]
+    images = {f"{plate.name}.png": image for plate, image in drawn if image}
+    plates = [plate for plate, _ in drawn]
+    page = pool.submit(_rendered, found, plates, images, dict(manifest)).result()
+    (folder / "figures").mkdir(exist_ok=True)
+    for name, image in images.items():
+        (folder / "figures" / name).write_bytes(image)
+    (folder / "index.html").write_text(page, encoding="utf-8")
+
+
+def _drawn(found: Diagnosis, half: bool) -> dict[int, tuple[Plate, bytes]]:
+    """Draw one half of the figures; return each by its place, without its canvas and as a file."""
+    from dataclasses import replace
+
+    from calib.report.figures.export import png
+    from calib.report.figures.gap import GAP_FIGURES, gap_plates
+
+    places = {name: i for i, name in enumerate(GAP_FIGURES) if (i in _HALF) is half}
+    plates = gap_plates(found, tuple(places))
+    return {places[p.name]: (replace(p, figure=None), png(p)) for p in plates}
+
+
+def _rendered(
+    found: Diagnosis,
+    plates: Sequence[Plate],
+    images: Mapping[str, bytes],
+    manifest: Mapping[str, Any],
+) -> str:
+    from calib.report.page.diagnosis import render_diagnosis
+
+    return render_diagnosis(found, plates, images, manifest=manifest)
