@@ -91,12 +91,12 @@ def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> N
     assert emulation.failed
     assert all(run.theta[0] > 0.6 for run in emulation.failed)
     found = calib.calibrate(emulation.problem, seed=1)
-    # The data are of mu = 0.6: half of the posterior is cut off there. The edge lies somewhere
-    # between runs, so that it is known to the distance between these only: two sds here, at most.
+    # The data are of mu = 0.6. The edge lies somewhere between runs, so that it is known to the
+    # distance between these only, here some sds: what lies beyond a run that failed is out.
     whole = exact(table()).parameters["mu"]
     kept = whole[whole < 0.6]
-    assert np.quantile(found.parameters["mu"], 0.99) < 0.6 + 2.0 * kept.std()
-    assert (found.parameters["mu"] > 0.6).mean() < (whole > 0.6).mean()
+    nearest = min(run.theta[0] for run in emulation.failed)
+    assert found.parameters["mu"].max() < nearest < whole.max()
     assert abs(found.summary["mu"].mean - kept.mean()) < kept.std()
     write_failed(emulation, simulated.simulator.parameters, tmp_path / "failed.csv")
     lines = (tmp_path / "failed.csv").read_text().splitlines()
