@@ -42,7 +42,7 @@ def test_sums_are_those_over_all_rows(name: str, seed: int, n: int, levels: int 
     bound, theta, conditions, response = data(name, seed, n, levels=levels)
     found = Squares.of(bound, conditions, response)
     expected, largest = plain(bound, theta, conditions, response), np.abs(response).max()
-    # Of 3000 terms, each with a relative rounding error of some 1e-13 (Newton's tolerance), and that
+    # Of 3000 terms, each with a relative rounding error of some 1e-13 (Newton's tolerance) and that
     # of a response, and of a mean of them, which may be large beside its residual.
     rounding = 4.0 * np.finfo(float).eps * largest * np.sqrt(n * expected)
     there = np.isfinite(expected)
