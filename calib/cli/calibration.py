@@ -294,6 +294,9 @@ def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | No
     if "run_order" in corrected.data.view.conditions and "run_order" not in table:
         print("calib: no run_order is given: what depends on it is predicted as it stood at the "
               "end of the campaign", file=sys.stderr)  # fmt: skip
+    if faults := corrected.faults:
+        print(f"calib: what is predicted is the reading, with {', '.join(faults)} in it; once the "
+              "instrument is mended, that is no longer right", file=sys.stderr)  # fmt: skip
     beyond = conditions_outside(corrected, table)
     if beyond:
         told = ", ".join(f"{name} in {count} rows" for name, count in beyond.items())

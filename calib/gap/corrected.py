@@ -40,6 +40,10 @@ SCHEMA = "calib/corrected/5"
 _SAME = 1e-4
 
 
+# A cause so probable is spoken of.
+_LIKELY = 0.5
+
+
 class Corrected:
     """A mixture of hypotheses and the simulator as the lab calibrated it.
 
@@ -58,6 +62,16 @@ class Corrected:
     def data(self) -> Campaigns:
         """The campaigns it was fitted to."""
         return self.mixture.data
+
+    @property
+    def faults(self) -> list[str]:
+        """Effects of instruments that are part of what is predicted, as probably as not or more."""
+        probability: dict[str, float] = {}
+        for fit, p in zip(self.mixture.fits, self.mixture.probability, strict=True):
+            for effect in fit.forward.hypothesis.effects:
+                if effect.instrument:
+                    probability[effect.name] = probability.get(effect.name, 0.0) + p
+        return [name for name, p in probability.items() if p >= _LIKELY]
 
     def calibrated(self, conditions: Mapping[str, Array]) -> dict[str, Array]:
         """Predict with the simulator alone, in the outputs' units, shapes (n,)."""

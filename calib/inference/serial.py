@@ -24,6 +24,9 @@ from calib.models.base import Array
 
 __all__ = ["Serial", "serial_of"]
 
+# Lines that are named.
+_SHOWN = 8
+
 
 @dataclass(frozen=True)
 class Serial:
@@ -111,10 +114,15 @@ def serial_of(along: Along, table: Table) -> Serial | None:
     gap = np.full(n, np.inf)
     gap[1:] = np.where(np.diff(run[order]) == 0.0, np.diff(place[order]), np.inf)
     # An empty cell is neither.
-    if not gap.min() >= 1.0:
+    wrong = np.flatnonzero(~(gap >= 1.0))
+    if wrong.size:
+        lines = sorted(table.lines[row] for row in order[np.union1d(wrong, wrong - 1)])
         raise CalibError(
-            f"{along} does not say in which order the rows of a run were measured",
-            where=table.source, allowed="whole numbers, in no row none, and none of them twice",
+            f"{along} does not say in which order the rows of a run were measured: see line"
+            f"{'s' if len(lines) > 1 else ''} {', '.join(map(str, lines[:_SHOWN]))}"
+            f"{' and others' if len(lines) > _SHOWN else ''}",
+            where=table.source,
+            allowed="a whole number in every row, another one for each row of a run",
             mend="number the rows of each run as they were measured, and label the runs (run)",
         )  # fmt: skip
     return Serial(order, gap)

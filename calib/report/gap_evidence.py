@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data.quantities import role_of
+from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.inclusion import UNLISTED, Included
 from calib.gap.next_measurement import NextMeasurement
@@ -101,8 +102,11 @@ def _without(found: Diagnosis) -> str:
 
 def _cause(found: Diagnosis, name: str, c: Included) -> CauseFact:
     words = "something unlisted" if name == UNLISTED else short_name(name)
+    fits = (fit for group in found.ranking.fits.values() for fit in group)
+    effects = (e for fit in fits for e in fit.forward.hypothesis.effects if e.name == name)
+    fault = any(e.instrument for e in effects)
     return CauseFact(
-        name, words, title_of(found, name), c.probability, c.share, c.share_interval
+        name, words, title_of(found, name), c.probability, c.share, c.share_interval, fault
     )  # fmt: skip
 
 
@@ -184,7 +188,9 @@ def conditions_text(found: Diagnosis, measurement: NextMeasurement) -> str:
         if np.ptp(both) == 0.0 or follows or role == "order" or role not in matters:
             continue
         axis = axis_of(column)
-        shown = f"{100.0 * value:.0f}" if role == "slip" else _rounded(axis.factor * value)
+        shown = words_of(found.data.case.covariates, column, value, value) or (
+            f"{100.0 * value:.0f}" if role == "slip" else _rounded(axis.factor * value)
+        )
         parts.append(f"{axis.name.lower()} {shown.replace('-', MINUS)}{unit_after(axis)}")
     if "order" in matters & measured:
         parts.append("after the last run")

@@ -57,7 +57,10 @@ class WhereFact:
 
 @dataclass(frozen=True)
 class CauseFact:
-    """A cause: its name, in words, what happens, whether it acts, and its share of the gap."""
+    """A cause: its name, in words, what happens, whether it acts, and its share of the gap.
+
+    `instrument` says that it is a fault of one, not of wheel or soil.
+    """
 
     name: str
     words: str
@@ -65,6 +68,7 @@ class CauseFact:
     probability: float
     share: float
     interval: tuple[float, float]
+    instrument: bool = False
 
 
 @dataclass(frozen=True)
@@ -310,6 +314,13 @@ def _next(e: GapEvidence) -> list[tuple[str, str]]:
     """Say what would show the unknown, or separate the first two unless the first is certain."""
     if e.look and e.verdict == "unknown":
         return [("Next", e.look)]
+    faults = [c.words for c in e.acting if c.instrument]
+    if faults and e.verdict == "effect":
+        return [
+            ("Next", f"Check the instrument before the model ({joined(faults)}): zero and span, "
+             "and an early run once more. What is predicted with the cause is the reading, not the "
+             "truth"),
+        ]  # fmt: skip
     if not e.next_facts or e.ranked[0].probability >= SURE:
         return []
     n = max(e.next_facts, key=lambda fact: (_leading(e, fact), fact.gain_nats))

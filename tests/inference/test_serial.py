@@ -168,3 +168,9 @@ def test_the_order_is_the_tables_not_the_problems() -> None:
     )
     with pytest.raises(CalibError, match="not say in which order"):
         serial_of("run_order", empty)
+
+
+def test_lines_that_do_not_say_the_order_are_named() -> None:
+    table = table_from_arrays({"run_order": [1.0, 2.0, 2.0, 4.0], "slip_ratio": [0.1] * 4})
+    with pytest.raises(CalibError, match="see lines 1, 2"):
+        serial_of("run_order", table)

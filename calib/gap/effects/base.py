@@ -122,6 +122,8 @@ class Effect:
         empty where the formula is exact.
     holds : tuple of str
         Names of effects that it is with some of its own parameters: beside it they add nothing.
+    instrument : bool
+        Whether an instrument is at fault, not wheel or soil; predicted with it is what it reads.
     priors : str
         Its priors as the text of a prior file, if they are in no file.
     prior_file : Path, optional
@@ -138,6 +140,7 @@ class Effect:
     varies: bool = True
     form: tuple[str, ...] = ()
     holds: tuple[str, ...] = ()
+    instrument: bool = False
     priors: str = ""
     prior_file: Path | None = None
 

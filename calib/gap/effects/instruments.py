@@ -18,7 +18,11 @@ __all__ = [
 _WIDE = 0.1
 
 
-class SlipZeroShift(Effect):
+class _Fault(Effect):
+    instrument = True
+
+
+class SlipZeroShift(_Fault):
     """A rolling radius wrong by a factor: 1 - s_true = (1 - s_recorded)(1 - error)."""
 
     name = "slip_zero_shift"
@@ -40,7 +44,7 @@ class SlipZeroShift(Effect):
         return {**conditions, "slip": 1.0 - (1.0 - slip) * (1.0 - phi[:, :1])}
 
 
-class ForceOffset(Effect):
+class ForceOffset(_Fault):
     """A constant error of the drawbar reading."""
 
     name = "force_offset"
@@ -61,7 +65,7 @@ def _progress(view: View) -> Array:
     return np.clip((view.of("order") - first) / max(last - first, 1.0), 0.0, 1.2)
 
 
-class SensorDrift(Effect):
+class SensorDrift(_Fault):
     """A drift with run order: steady, settling, or from some run on; zeroed at any part of it."""
 
     name = "sensor_drift"
@@ -91,7 +95,7 @@ class SensorDrift(Effect):
         return _progress(view)
 
 
-class SensorStep(Effect):
+class SensorStep(_Fault):
     """A jump of the drawbar reading at some run: off by one constant before it, another after.
 
     It takes at least one run, so that a fit can move the change point from one to the next.
@@ -136,7 +140,7 @@ class SensorStep(Effect):
         return begun
 
 
-class PressureGaugeBias(Effect):
+class PressureGaugeBias(_Fault):
     """True inflation pressure differs from the gauge's by a gain and an offset.
 
     Slip was zeroed at the recorded pressure. At another one the tyre rolls on another radius, and
@@ -183,7 +187,7 @@ class PressureGaugeBias(Effect):
         return changed
 
 
-class ConeIndexBias(Effect):
+class ConeIndexBias(_Fault):
     """A cone penetrometer that reads wrong by a gain and an offset."""
 
     name = "cone_index_bias"
@@ -213,7 +217,7 @@ class ConeIndexBias(Effect):
         return {**conditions, "cone": np.maximum(true, 0.02 * recorded)}
 
 
-class WaterContentBias(Effect):
+class WaterContentBias(_Fault):
     """A moisture probe that reads wrong by a gain and an offset."""
 
     name = "water_content_bias"

@@ -81,6 +81,8 @@ class Ensemble:
             *self.state.coords.shape, self.log_prob_fn, vectorize=True, moves=moves,
             backend=_Backend(t, log_prob),
         )  # fmt: skip
+        # emcee's wrapper prints the arguments of whatever ends a call, an interruption as well.
+        self.sampler.log_prob_fn = self.log_prob_fn
         self.sampler.begin(self.random_state)
         with warnings.catch_warnings():
             # numpy 2 deprecates what emcee does inside its moves.

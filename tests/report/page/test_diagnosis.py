@@ -108,6 +108,15 @@ def test_less_than_sure_is_hedged_with_rivals_and_a_measurement():
     assert facts["Next"] == "To separate lug thrust from drift: about 3 measurements at slip 65 %"
 
 
+def test_where_an_instrument_is_at_fault_it_is_to_be_checked_first():
+    step = CauseFact("sensor_step", "sensor step", "a jump", 0.97, 0.9, (0.8, 1.0), True)
+    soil = CauseFact("lug_thrust", "lug thrust", "more thrust", 0.6, 0.1, (0.0, 0.2))
+    e = replace(evidence("effect", sensor_step=0.97), causes=[step, soil])
+    assert "the instrument before the model (sensor step)" in dict(judge_gap(e).facts)["Next"]
+    others = dict(judge_gap(replace(e, causes=[replace(step, instrument=False)])).facts)
+    assert "instrument" not in others.get("Next", "")
+
+
 def test_a_tie_names_its_members_and_not_the_rest():
     found = judge_gap(evidence("ambiguous", lug_thrust=0.45, drift=0.4, none=0.02))
     assert "cannot tell lug thrust and drift apart" in found.headline
