@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -163,33 +163,60 @@ def match_headers(
             )
     for name in required:
         if name not in found:
-            raise _missing_error(QUANTITIES[name], headers, ignored, where)
+            raise missing_column(name, headers, ignored, where)
     return tuple(found.values()), tuple(ignored)
 
 
-def _missing_error(
-    quantity: Quantity, headers: Sequence[str], ignored: Sequence[str], where: str
+def missing_column(
+    name: str, headers: Sequence[str], ignored: Sequence[str], where: str
 ) -> CalibError:
-    mend = f"add the column {quantity.canonical} ({quantity.description})"
-    guesses = [guess for header in ignored if (guess := _guess(header, quantity))]
-    if guesses:
-        mend = f"{'; '.join(guesses)} Rename it, or {mend}"
+    """Return the error of a quantity, by its canonical name, that no header names.
+
+    The ignored headers are those that name none.
+    """
+    quantity = QUANTITIES[name]
     return CalibError(
         f"there is no column for {quantity.stem}; found {', '.join(map(repr, headers))}",
         where=_at(where, quantity.canonical),
         allowed=", ".join(accepted_headers(quantity)),
-        mend=mend,
+        mend=f"{renamed(ignored, [name])}add the column {quantity.canonical} "
+        f"({quantity.description})",
     )
 
 
-def _guess(header: str, quantity: Quantity) -> str:
-    """Ask whether a header was meant to be a quantity; empty if it is nothing like it."""
+def renamed(headers: Iterable[str], names: Iterable[str]) -> str:
+    """Begin a way to mend with what headers may have been meant to be; empty if nothing."""
+    guesses = "; ".join(meant(headers, names))
+    return f"{guesses} Rename it, or " if guesses else ""
+
+
+def meant(headers: Iterable[str], names: Iterable[str], cutoff: float = 0.7) -> list[str]:
+    """Ask of headers that name no quantity whether one of some was meant.
+
+    Parameters
+    ----------
+    headers : iterable of str
+    names : iterable of str
+        Canonical names of the quantities.
+    cutoff : float
+        How like one a header must be, up to 1.
+    """
+    known = {
+        name: quantity
+        for quantity in (QUANTITIES[name] for name in names)
+        for stem in (quantity.stem, *quantity.synonyms)
+        for name in (*accepted_headers(quantity), *(f"{stem}_{unit}" for unit in quantity.units))
+    }
+    return [guess for header in headers if (guess := _guess(header, known, cutoff))]
+
+
+def _guess(header: str, known: Mapping[str, Quantity], cutoff: float) -> str:
     name = _normal(header)
-    stems = (quantity.stem, *quantity.synonyms)
-    names = [f"{stem}_{unit}" for stem in stems for unit in quantity.units]
-    near = difflib.get_close_matches(name, [*accepted_headers(quantity), *names], n=1, cutoff=0.7)
+    near = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
     if not near:
         return ""
+    quantity = known[near[0]]
+    stems = (quantity.stem, *quantity.synonyms)
     if any(near[0] == stem or name.endswith(near[0].removeprefix(stem)) for stem in stems):
         return f"{header!r}: did you mean {near[0]}?"
     # The header says nothing about the unit, so neither may the suggestion.

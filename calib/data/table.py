@@ -9,7 +9,8 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.headers import parse_header
+from calib.data.headers import missing_column, parse_header, renamed
+from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 
 MAX_TEXT_ROWS = 10_000
@@ -81,6 +82,12 @@ class Table:
             )  # fmt: skip
         return self.columns[name]
 
+    def must_have(self, *names: str) -> None:
+        """Raise a CalibError unless there are columns of these canonical names."""
+        for name in names:
+            if name not in self.columns:
+                raise missing_column(name, self.header, self.ignored, self.source)
+
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64] | Sequence[int]) -> Table:
         """Return some of the rows, by a mask (n,) or by indices from 0 in the order wanted."""
         index = np.arange(len(self))[np.asarray(rows, dtype=None if len(rows) else np.int64)]
@@ -120,9 +127,11 @@ def hold_out(
     """
     column = parse_header(quantity_header)
     if column is None or column.quantity.canonical not in table:
+        guess = renamed([quantity_header], [name for name in table if name in QUANTITIES])
         raise CalibError(
             f"there is no column to hold {quantity_header!r} out by", where=table.source,
-            allowed=", ".join(table), mend="name one of these quantities, with a unit",
+            allowed=", ".join(table),
+            mend=f"{guess}name one of these quantities, with a unit",
         )  # fmt: skip
     values = table[column.quantity.canonical]
     wanted = float(column.to_canonical(value))

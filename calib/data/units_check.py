@@ -1,4 +1,4 @@
-"""Values that are unusual, or as in another unit than the others, or than their column says."""
+"""Values that are unusual or as in another unit than their column says; columns misspelt."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import PurePath
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.data.headers import meant
 from calib.data.quantities import QUANTITIES, Quantity
 from calib.data.table import Table
 
@@ -16,6 +17,8 @@ type Array = NDArray[np.float64]
 # A psi is so many kPa; levels of a design that are so far apart to this part are no coincidence.
 _PSI, _NEAR, _FEW_LEVELS = 6.894757, 2e-3, 6
 _MOST_NAMED = 5
+# A column that may be left out is asked after when its name is so like a known one.
+_ALIKE = 0.8
 # The pull of a wheel is a part of its load: small forces that agree on that are of a small wheel.
 _PULL, _LOAD, _PULL_OVER_LOAD = "drawbar_pull_kn", "normal_load_kn", (0.01, 3.0)
 _OF_SMALL_WHEELS = (_PULL, _LOAD, "driving_torque_knm")
@@ -58,6 +61,12 @@ def column_notes(table: Table) -> Iterator[str]:
             f"times too {'large' if size > high else 'small'}, as where a unit and its thousandth "
             "(kN and N, MPa and kPa, m and mm) were mixed up; check the unit in the column name"
         )
+
+
+def spelling_notes(table: Table) -> Iterator[str]:
+    """Ask after columns that are not used, and are named nearly as one that the table lacks."""
+    for guess in meant(table.ignored, [n for n in QUANTITIES if n not in table], _ALIKE):
+        yield f"{source_of(table)}: a column is not used: {guess}"
 
 
 def _unusual(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table, read_table
+from calib.data.headers import renamed
 from calib.data.quantities import OUTPUTS, columns_of, output_of, physical_role
 from calib.errors import CalibError
 from calib.gap.context import Context, read_context
@@ -353,7 +354,8 @@ def campaigns(case: Case) -> Campaigns:
         order_range=(float(order.min()), float(order.max())),
     )
     if case.new_conditions is not None:
-        _check_conditions(case.new_conditions, case.models)
+        needed = {c: None for m in case.models.values() for c in get_model(m).conditions}
+        case.new_conditions.must_have(*needed)
     lab_at = {o.name: noise_conditions_of_lab(o.problem.table, view) for o in outputs}
     return Campaigns(outputs, view, lab_at, case)
 
@@ -370,10 +372,11 @@ def _output(case: Case, name: str, model: str) -> OutputData:
         if column not in table or not np.isfinite(table[column]).any():
             raise CalibError(
                 f"the case models {name}, but there are no values of {column}",
-                where=table.source, mend="add the column, or take the model out of case.toml",
+                where=table.source,
+                mend=f"{renamed(table.ignored, [column])}add the column, or take the model out of "
+                "case.toml",
             )  # fmt: skip
-    for table in (case.lab, case.field):
-        _check_conditions(table, {name: model})
+        table.must_have(*get_model(model).conditions)
     lab = case.lab.take(np.isfinite(case.lab[column]))
     problem = build_problem(model, lab, case.priors.get(name))
     problem.noise.must_be_usual(problem.priors.source, "a diagnosis")
@@ -382,17 +385,6 @@ def _output(case: Case, name: str, model: str) -> OutputData:
     response = problem.bound.to_response(case.field[column][rows])
     # The noise scale is not a parameter of the simulator: it is inferred beside it.
     return OutputData(name, problem, Priors(problem.priors.entries[:-1]), rows, response)
-
-
-def _check_conditions(table: Table, models: Mapping[str, str]) -> None:
-    """Refuse a table that lacks a condition that a model takes, naming its file."""
-    for model in models.values():
-        try:
-            get_model(model).select(table.columns)
-        except CalibError as error:
-            raise CalibError(
-                error.message, where=table.source, allowed=error.allowed, mend=error.mend
-            ) from None
 
 
 def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) -> None:

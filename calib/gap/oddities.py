@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.data import Table
 from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, role_of
-from calib.data.units_check import column_notes, unit_notes
+from calib.data.units_check import column_notes, spelling_notes, unit_notes
 from calib.models import get_model
 from calib.models.base import Array
 
@@ -57,7 +57,7 @@ def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, 
         )
     used = {name for model in models.values() for name in get_model(model).conditions}
     for table in (lab, field):
-        said += column_notes(table)
+        said += [*column_notes(table), *spelling_notes(table)]
         for name in sorted(used & set(table)):
             said += unit_notes(table, QUANTITIES[name], table[name])
     held = [n for n in used if n in lab and n in field and not np.ptp(lab[n]) and np.ptp(field[n])]

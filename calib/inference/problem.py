@@ -287,15 +287,7 @@ def build_problem(
         not fit the model.
     """
     model = get_model(model_name)
-    model.select(table.columns)
-    if model.output not in table:
-        model_columns = (*model.conditions, model.output)
-        raise CalibError(
-            f"model {model.name} needs the measured output {model.output}",
-            where=table.source,
-            allowed=f"columns {', '.join(model_columns)} (in any known unit)",
-            mend=f"add the column, or see `calib template {model.name}` for an example",
-        )
+    table.must_have(*model.conditions, model.output)
     check_enough(table, len(model.parameters), model=model.name)
     check_varies(table, model.output)
     references = prior_references(table.columns)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calib.data import Table, hold_out
-from calib.data.headers import parse_header
+from calib.data.headers import parse_header, renamed
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.inference.prior_files import prior_file_model
@@ -86,13 +86,14 @@ def choose_model(output: str, table: Table) -> str:
             for m in suited
         ]
         return suited[uses.index(max(uses))].name
+    conditions = {c for m in known for c in m.conditions}
     raise CalibError(
         f"no model of {output} suits the columns",
         where=table.source,
         allowed="; ".join(f"{m.name}: {', '.join(m.conditions)}" for m in known)
         or "a model that is registered for this output",
-        mend="add the columns of one of these models, declare a model of your own (--models), or "
-        "report the other outputs (--only)",
+        mend=f"{renamed(table.ignored, conditions)}add the columns of one of these models, "
+        "declare a model of your own (--models), or report the other outputs (--only)",
     )
 
 
@@ -145,7 +146,8 @@ def plan_tasks(
                 "there is no output to calibrate",
                 where=table.source,
                 allowed=", ".join(OUTPUTS.values()) + " (in any known unit)",
-                mend="add a column with the measured output",
+                mend=f"{renamed(table.ignored, OUTPUTS.values())}add a column with the measured "
+                "output",
             )
         for key in found:
             if key in tasks:

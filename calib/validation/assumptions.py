@@ -14,7 +14,7 @@ from scipy import stats
 
 from calib.data import Table
 from calib.data.quantities import QUANTITIES
-from calib.data.units_check import column_notes, lines_of, source_of, unit_notes
+from calib.data.units_check import column_notes, lines_of, source_of, spelling_notes, unit_notes
 from calib.inference.problem import Problem
 from calib.models.base import Array
 from calib.validation.outliers import linear, outlying_notes
@@ -38,11 +38,11 @@ def warnings_of(problem: Problem, t: Array) -> tuple[str, ...]:
 
 
 def file_notes(problem: Problem, scatter: float) -> tuple[str, ...]:
-    """Say what is odd in the rows themselves: units, copies, conditions that do not vary.
+    """Say what is odd in the rows themselves: units, names, copies, conditions that do not vary.
 
     `scatter` is the sd of a reading about the prediction, on the scale of the response.
     """
-    found = list(column_notes(problem.table))
+    found = [*column_notes(problem.table), *spelling_notes(problem.table)]
     for name, values in problem.conditions.items():
         quantity = QUANTITIES[name]
         if np.unique(values).size == 1:

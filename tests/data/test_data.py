@@ -370,6 +370,7 @@ def test_hold_out_in_any_unit(header: str, value: float) -> None:
         ("slip_percent", 20, ["no row is at 20", "values present: 10"]),
         ("speed_m_s", 1, ["no column to hold 'speed_m_s' out", "inflation_pressure_psi"]),
         ("colour", 1, ["no column to hold 'colour' out"]),
+        ("inflaton_presure_psi", 18, ["no column", "did you mean inflation_pressure_psi?"]),
     ],
 )
 def test_impossible_hold_outs(header: str, value: float, words: list[str]) -> None:

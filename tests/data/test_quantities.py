@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
-from calib.data.headers import accepted_headers, match_headers, parse_header
+from calib.data.headers import accepted_headers, match_headers, meant, parse_header
 from calib.data.quantities import QUANTITIES, UNITS, Range
+from calib.data.reader import table_from_arrays
 from calib.errors import CalibError
 from calib.models import MODELS
 
@@ -91,6 +92,20 @@ def test_a_misspelt_required_column_gets_a_suggestion() -> None:
         )
     assert "'drawber_pul_n': did you mean drawbar_pull_n? Rename it" in str(caught.value)
     assert "found 'slip_ratio', 'drawber_pul_n'" in str(caught.value)
+
+
+def test_a_table_that_lacks_a_column_suggests_the_misspelt_one() -> None:
+    table = table_from_arrays({"slip_ratio": [0.1], "drawber_pul_n": [5.0]}, source="my.csv")
+    table.must_have("slip_ratio")
+    with pytest.raises(CalibError, match=r"my\.csv.*no column for drawbar_pull") as caught:
+        table.must_have("slip_ratio", "drawbar_pull_kn")
+    assert "did you mean drawbar_pull_n?" in str(caught.value)
+
+
+def test_of_several_quantities_the_nearest_is_suggested() -> None:
+    assert meant(["operator", "inflaton_presure_bar"], QUANTITIES) == [
+        "'inflaton_presure_bar': did you mean inflation_pressure_bar?"
+    ]
 
 
 def test_a_suggestion_does_not_make_up_a_unit() -> None:

@@ -39,6 +39,12 @@ def test_a_fair_pair_has_nothing_odd():
     assert said(make_case("sensor_drift")) == ""
 
 
+def test_a_misspelt_column_is_asked_after():
+    case = make_case(None)
+    found = said(changed(case, tyre_widht_m=np.ones(len(case.field))))
+    assert found.endswith("a column is not used: 'tyre_widht_m': did you mean tyre_width_m?")
+
+
 @pytest.mark.parametrize("what", sorted(NAMES))
 def test_another_unit_is_named_with_its_factor(what):
     column, factor, units = NAMES[what]
@@ -60,7 +66,7 @@ def test_new_conditions_without_a_needed_one_are_refused_by_file():
     fresh = table_without(case.field, "slip_ratio")
     with pytest.raises(CalibError, match="slip_ratio") as error:
         campaigns(replace(case, new_conditions=fresh))
-    assert error.value.where == fresh.source
+    assert error.value.where == f"{fresh.source}, column 'slip_ratio'"
 
 
 def test_readings_left_far_off_are_named_by_line():

@@ -135,8 +135,8 @@ def table_of(model: str, tmp_path, **changed: np.ndarray | None) -> Table:
 @pytest.mark.parametrize(
     ("model", "changed", "words"),
     [
-        ("modified_bekker", {"rut_depth_mm": None}, ["my.csv", "rut_depth_mm", "template"]),
-        ("modified_bekker", {"slip_ratio": None}, ["slip_ratio", "template"]),
+        ("modified_bekker", {"rut_depth_mm": None}, ["my.csv", "rut_depth_mm", "rut_depth_cm"]),
+        ("modified_bekker", {"slip_ratio": None}, ["slip_ratio", "slip_percent"]),
         ("modified_bekker", {"rut_depth_mm": np.full(9, 20.0)}, ["my.csv", "rut_depth_mm", "20"]),
         ("magic_formula_pressure", {"inflation_pressure_psi": np.full(22, 30.0)},
          ["my.csv", "inflation_pressure", "one inflation pressure only (30 psi)"]),

@@ -90,6 +90,10 @@ def test_the_hold_out_goes_to_the_outputs_that_have_the_column() -> None:
     [
         ([table("a.csv", slip_ratio=np.array([0.1]))], None, ["a.csv", "no output",
          "drawbar_pull_kn"]),
+        ([table("a.csv", slip_ratio=np.array([0.1]), drawbr_pul_kn=np.array([1.0]))], None,
+         ["no output", "did you mean drawbar_pull_kn?"]),
+        ([table("a.csv", slp_ratio=np.array([0.1]), drawbar_pull_kn=np.array([1.0]))], None,
+         ["no model", "did you mean slip_ratio?"]),
         ([pulls(source="a.csv"), pulls(source="b.csv")], None, ["a.csv, b.csv", "drawbar_pull"]),
         ([pulls()], HoldOut("speed_m_s", 1.0), ["my.csv", "speed_m_s", "inflation_pressure_psi"]),
         ([pulls()], HoldOut("spede", 1.0), ["my.csv", "spede"]),

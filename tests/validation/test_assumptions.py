@@ -171,6 +171,13 @@ def test_every_example_is_left_alone(tmp_path: Path) -> None:
         assert warnings_of(problem, mode) == ()
 
 
+def test_a_column_that_may_be_left_out_is_asked_after_when_misspelt() -> None:
+    names = {"run_ordr": np.arange(12), "operator": np.ones(12), "rut_depth_mm_sd": np.ones(12)}
+    assert notes_of(rut(**names)) == (
+        "my ruts.csv: a column is not used: 'run_ordr': did you mean run_order?"
+    )
+
+
 def test_copies_are_named_by_line() -> None:
     table = rut()
     doubled = table.take(np.append(np.arange(12), [3, 3, 5]))
