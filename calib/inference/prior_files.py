@@ -23,9 +23,9 @@ from calib.models import MODELS
 
 # Beyond these, squares and products of numbers leave the range of double precision; no quantity of
 # the field comes near them. An sd of 20 on the logarithm is a factor of 5e8 to either side.
-_Number = Annotated[float, Field(ge=-1e15, le=1e15)]
-_Positive = Annotated[float, Field(gt=1e-15, le=1e15)]
-_LogSd = Annotated[float, Field(gt=1e-6, le=20.0)]
+_Number = Annotated[float, Field(strict=True, ge=-1e15, le=1e15)]
+_Positive = Annotated[float, Field(strict=True, gt=1e-15, le=1e15)]
+_LogSd = Annotated[float, Field(strict=True, gt=1e-6, le=20.0)]
 
 
 class _Entry(BaseModel):
@@ -408,6 +408,14 @@ def _explain(error: ValidationError, source: str) -> CalibError:
     if first["type"] == "extra_forbidden" and place[0] == "parameters":
         _, name, dist, key = place
         return _no_such_key(key, _DISTS[dist].model_fields, f"{source}, parameters.{name}")
+    if first["type"].startswith("union_tag"):
+        return _no_such_dist(first["input"], f"{source}, {'.'.join(place)}")
+    if first["type"] == "float_type":
+        return CalibError(
+            f"{place[-1]} = {first['input']!r} is not a number",
+            where=f"{source}, parameters.{place[1]}", allowed=f"a number, as in {place[-1]} = 0.75",
+            mend="write a number without quotes",
+        )  # fmt: skip
     return CalibError(
         f"{first['msg']} (found {first.get('input')!r})",
         where=f"{source}, {'.'.join(place)}",
@@ -416,6 +424,15 @@ def _explain(error: ValidationError, source: str) -> CalibError:
         "rate > 0); each with unit, reason, source",
         mend="correct this entry",
     )
+
+
+def _no_such_dist(entry: Mapping[str, Any], where: str) -> CalibError:
+    dist = entry.get("dist")
+    found = "there is no dist" if dist is None else f"there is no distribution {dist!r}"
+    return CalibError(
+        found, where=where, allowed=", ".join(_DISTS),
+        mend=f"{_meant([str(dist)], _DISTS)}choose one of these",
+    )  # fmt: skip
 
 
 def _prior(name: str, entry: _AnyEntry, source: str, references: Mapping[str, float]) -> Prior:

@@ -190,6 +190,33 @@ def refusal(call: Callable[[], object]) -> str:
     return message
 
 
+NUMBERS = {
+    "normal": ("mean", "sd", "lower", "upper"),
+    "lognormal": ("median", "sd_log", "lower", "upper"),
+    "half_normal": ("sd",),
+    "uniform": ("lower", "upper"),
+    "gamma": ("shape", "rate", "lower", "upper"),
+    "fixed": ("value",),
+}
+
+
+@pytest.mark.parametrize(
+    ("dist", "key"),
+    [(dist, key) for dist, keys in NUMBERS.items() for key in (*keys, "default_reference")],
+)
+@pytest.mark.parametrize("value", ['"0.75"', "true"])
+def test_a_text_is_no_number(dist: str, key: str, value: str) -> None:
+    given = {**dict.fromkeys(NUMBERS[dist], "0.5"), key: value}
+    body = "\n".join(f"{name} = {text}" for name, text in given.items())
+    message = refusal(lambda: one(f'dist = "{dist}"\n{body}'))
+    assert f"my.toml, parameters.x: {key} = " in message
+    assert f"allowed: a number, as in {key} = 0.75" in message
+
+
+def test_whole_numbers_are_numbers() -> None:
+    assert one('dist = "normal"\nmean = 1\nsd = 2').entries[0].scale == 2.0
+
+
 @pytest.mark.parametrize(
     ("body", "words"),
     [
@@ -209,7 +236,8 @@ def refusal(call: Callable[[], object]) -> str:
         ('dist = "normal"\nmean = "wide"\nsd = 1.0', ["mean", "number", "wide"]),
         ('dist = "normal"\nmean = 0.0', ["normal.sd", "Field required"]),
         ('dist = "normal"\nmean = 0.0\nsd = 1.0\nsigma = 2', ["no key 'sigma'"]),
-        ('dist = "cauchy"\nmean = 0.0', ["cauchy", "normal", "uniform"]),
+        ('dist = "cauchy"\nmean = 0.0', ["no distribution 'cauchy'", "normal, lognormal, half"]),
+        ('dist = "nromal"\nmean = 0.0', ["no distribution 'nromal'", "did you mean normal"]),
         ("mean = 0.0\nsd = 1.0", ["parameters.x", "dist"]),
         ('dist = "fixed"', ["value", "Field required"]),
         ('dist = "normal"\nmean = 0.0\nsd = 1.0\nrelative_to = "load"', ["relative_to",
