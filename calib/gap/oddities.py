@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
 from calib.data import Table
 from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, role_of
-from calib.data.units_check import column_notes, spelling_notes, unit_notes
+from calib.data.units_check import column_notes, lines_of, source_of, spelling_notes, unit_notes
 from calib.models import get_model
 from calib.models.base import Array
 
@@ -55,6 +55,7 @@ def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, 
             f"{copies} of {len(field)} field rows are copies of another, value for value; a copy "
             "counts as a measurement of its own and makes every probability too sure: leave it out"
         )
+    said += _same_place(field)
     used = {name for model in models.values() for name in get_model(model).conditions}
     for table in (lab, field):
         said += [*column_notes(table), *spelling_notes(table)]
@@ -85,6 +86,24 @@ def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, 
         if missing:
             said.append(f"{missing} of {len(field)} field rows have no {output}")
     return (*said, *_other_units(lab, field, models))
+
+
+def _same_place(field: Table) -> Iterator[str]:
+    """Name rows with the same place in the order of the runs as another, unless they are copies."""
+    for name in columns_of("order"):
+        if name not in field:
+            continue
+        whole = np.column_stack([field[column] for column in field])
+        first = np.unique(whole, axis=0, return_index=True)[1]
+        _, place, count = np.unique(field[name][first], return_inverse=True, return_counts=True)
+        shared = np.zeros(len(field), dtype=np.bool_)
+        shared[first] = count[place] > 1
+        if shared.any():
+            yield (
+                f"{source_of(field)}, {lines_of(field, shared)}: the same {name} as another row; a "
+                "drift or a step of a sensor is sought in this order: number the rows as they were "
+                "measured, or leave the column out"
+            )
 
 
 def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[str]:

@@ -54,6 +54,23 @@ def test_another_unit_is_named_with_its_factor(what):
     assert units in found
 
 
+def test_rows_of_one_place_in_the_run_order_are_named_by_line():
+    case = make_case(None)
+    order = np.arange(1.0, len(case.field) + 1.0)
+    assert said(changed(case, run_order=order)) == ""
+    order[[4, 7]] = order[2]
+    twice = changed(case, run_order=order)
+    lines = ", ".join(str(twice.field.lines[i]) for i in (2, 4, 7))
+    assert f"lines {lines}: the same run_order as another row" in said(twice)
+    # Of a copy of a whole row it is said that it is one.
+    rows = np.append(np.arange(len(order)), 5)
+    copied = said(
+        replace(twice, field=changed(case, run_order=np.arange(len(order))).field.take(rows))
+    )
+    assert "copies of another" in copied
+    assert "the same run_order" not in copied
+
+
 def test_columns_that_were_swapped_pull_more_than_the_wheel_carries():
     case = make_case(None)
     found = said(changed(case, **{PULL: case.field[RUT], RUT: case.field[PULL]}))
