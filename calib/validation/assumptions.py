@@ -24,16 +24,23 @@ LEVEL = 1e-3
 # Chance that readings agree to the last digit, from which equal rows are taken for copies.
 _COPIED = 0.01
 _FEWEST, _FEWEST_FOR_TAILS = 8, 20
+_UNIT_FIRST = (
+    "whether neighbouring rows are alike, the scatter even and its tails light is not judged while "
+    "a column looks to be in another unit"
+)
 
 
 def warnings_of(problem: Problem, t: Array) -> tuple[str, ...]:
     """Say what a reader should mend, or know, before believing a calibration's width.
 
-    `t` (d,) are internal coordinates of a fit to all rows, for instance the posterior's mode.
+    `t` (d,) are internal coordinates of a fit to all rows, for instance the posterior's mode. Of a
+    column in another unit the priors make a misfit, whose residuals say nothing of the rows.
     """
     scatter = float(problem.theta(t[None])[0, -1])
+    off = any(column_notes(problem.table))
     return (
-        *outlying_notes(problem, t), *file_notes(problem, scatter), *residual_notes(problem, t),
+        *outlying_notes(problem, t), *file_notes(problem, scatter),
+        *((_UNIT_FIRST,) if off else residual_notes(problem, t)),
     )  # fmt: skip
 
 

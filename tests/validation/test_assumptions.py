@@ -178,6 +178,18 @@ def test_a_column_that_may_be_left_out_is_asked_after_when_misspelt() -> None:
     )
 
 
+def test_residuals_are_not_judged_while_a_column_looks_to_be_in_another_unit() -> None:
+    slip = np.linspace(0.01, 0.5, 30)
+    pull = 1e3 * np.sin(20.0 * slip)
+    table = table_from_arrays({"slip_ratio": slip, "drawbar_pull_kn": pull}, source="n.csv")
+    problem = build_problem("magic_formula", table)
+    t = find_mode(problem.log_prob, problem.priors, np.random.default_rng(3))
+    assert "neighbouring rows are alike" in " | ".join(residual_notes(problem, t))
+    unit, withheld = warnings_of(problem, t)
+    assert "about 1000 times too large" in unit
+    assert "is not judged while a column looks to be in another unit" in withheld
+
+
 def test_copies_are_named_by_line() -> None:
     table = rut()
     doubled = table.take(np.append(np.arange(12), [3, 3, 5]))
