@@ -379,9 +379,13 @@ def template(
     simulator: Simulators = None,
 ) -> None:
     """Write an example CSV of a model to fill in."""
-    from calib.models import example_csv, get_model
+    from calib.models import get_model, template_csv
 
-    _emit(example_csv(get_model(model).name), out)
+    text = template_csv(get_model(model).name)
+    _emit(text, out)
+    if "run_order" in text:
+        print("calib: run_order may be left out: number the rows as they were measured, or delete "
+              "the column", file=sys.stderr)  # fmt: skip
 
 
 def priors(

@@ -16,7 +16,7 @@ from calib.models.wong_reece import WONG_REECE_PULL, WONG_REECE_SINKAGE, WONG_RE
 
 __all__ = [
     "MODELS", "Array", "BoundModel", "Conditions", "Model", "References", "example_csv",
-    "get_model",
+    "get_model", "template_csv",
 ]  # fmt: skip
 
 MODELS: Registry[Model] = Registry(
@@ -55,6 +55,19 @@ def example_csv(model_name: str) -> str:
             mend='declare the model with example="..."',
         )
     return model.example
+
+
+def template_csv(model_name: str) -> str:
+    """Return the example with the column ``run_order``, which any data may have or lack.
+
+    What drifts, jumps or is correlated along a run is only seen in data that have it.
+    """
+    text = example_csv(model_name)
+    head, *rows = text.strip().splitlines()
+    if "," not in head or "run_order" in head:
+        return text
+    numbered = [f"{row},{i}" for i, row in enumerate(rows, start=1)]
+    return "\n".join([f"{head},run_order", *numbered, ""])
 
 
 def get_model(name: str) -> Model:

@@ -15,7 +15,7 @@ import pytest
 
 from calib.cli import main
 from calib.inference.prior_files import default_priors
-from calib.models import MODELS, example_csv
+from calib.models import MODELS, example_csv, template_csv
 from calib.report.manifest import file_hashes
 
 RUT = example_csv("modified_bekker")
@@ -205,7 +205,9 @@ def test_own_priors_are_used(calib: Calib) -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_templates_and_priors_are_printed_and_written(calib: Calib, model: str) -> None:
-    assert calib("template", model).out == example_csv(model)
+    template = calib("template", model)
+    assert template.out == template_csv(model)
+    assert "run_order may be left out" in template.err
     printed = calib("priors", model).out
     assert tomllib.loads(printed)["model"] == model
     assert printed == default_priors(model).read_text(encoding="utf-8")
@@ -469,7 +471,7 @@ def test_an_interruption_is_no_traceback(calib: Calib, monkeypatch: pytest.Monke
     def interrupt(name: str) -> str:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("calib.models.example_csv", interrupt)
+    monkeypatch.setattr("calib.models.template_csv", interrupt)
     ran = calib("template", "bekker")
     assert ran.code == 130
     assert "Traceback" not in ran.err

@@ -48,8 +48,8 @@ def field_of(example: str, rng: np.random.Generator) -> str:
     """Return field rows of the torque's example at larger loads, a loss in them."""
     lines = example.splitlines()
     rows = [tuple(map(float, line.split(","))) for line in lines[1:]]
-    written = [lines[0]]
-    for slip, load, _ in rows:
+    written = [lines[0].removesuffix(",run_order")]
+    for slip, load, *_ in rows:
         for heavier in (1.25, 1.5):
             mobilised = 1.0 - np.exp(-slip / 8.0)
             loss = 0.25 * (heavier * load / 4.0 - 1.0)
