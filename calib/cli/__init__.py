@@ -1,4 +1,4 @@
-"""The `calib` command: thin, every verb one call into the package, heavy imports only when used."""
+"""The `calib` command: its entry, which imports nothing before it can be interrupted politely."""
 
 from __future__ import annotations
 
@@ -9,97 +9,15 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from threading import Timer
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-from typer.core import TyperGroup
+__all__ = ["INTERRUPTED", "STOPPED", "interruptible", "main", "program"]
 
-from calib.cli import (
-    audit,
-    calibration,
-    campaign,
-    challenge,
-    check,
-    compare,
-    doctor,
-    gap,
-    sbc,
-)
-from calib.cli.examples import add_examples
-
-__all__ = ["app", "main", "program"]
-
-
-class _Verbs(TyperGroup):
-    """All verbs: what the user can mend, or stops, ends with a line and no traceback."""
-
-    def invoke(self, ctx: Any) -> Any:
-        from calib.errors import CalibError
-
-        try:
-            return super().invoke(ctx)
-        except CalibError as error:
-            if ctx.params["verbose"]:
-                import traceback
-
-                traceback.print_exc()
-            print(f"calib: {error}", file=sys.stderr)
-            raise typer.Exit(2) from None
-        except KeyboardInterrupt as stop:
-            print(f"calib: {str(stop) or _STOPPED}", file=sys.stderr)
-            raise typer.Exit(_INTERRUPTED) from None
-
-
-_INTERRUPTED = 130
-_STOPPED = (
+INTERRUPTED = 130
+STOPPED = (
     "interrupted; nothing was written. Start the same command again; what a simulator has run "
     "is kept and not run again"
 )
-
-app = typer.Typer(
-    name="calib",
-    cls=_Verbs,
-    help="Probabilistic calibration of tyre-soil models.",
-    no_args_is_help=True,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-for verb in (
-    calibration.report, calibration.fit, calibration.predict, calibration.data,
-    calibration.template, calibration.priors, calibration.models, compare.compare, gap.diagnose,
-    check.check, audit.audit, campaign.campaign, sbc.sbc, doctor.doctor,
-):  # fmt: skip
-    app.command()(verb)
-app.add_typer(challenge.verbs, name="challenge")
-add_examples(app)
-
-
-def _version(wanted: bool) -> None:
-    if wanted:
-        from importlib.metadata import version
-
-        print(f"calib {version('terracalib')}")
-        raise typer.Exit
-
-
-@app.callback()
-def start(
-    ctx: typer.Context,
-    version: Annotated[
-        bool, typer.Option("--version", help="Say which, and stop.", callback=_version,
-                           is_eager=True)
-    ] = False,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", "-v", help="Say on the error output with what versions, "
-                           "what was read and how long it took; where an error came from.")
-    ] = False,
-) -> None:  # fmt: skip
-    """Probabilistic calibration of tyre-soil models."""
-    if verbose:
-        from calib.cli.display import told
-
-        ctx.with_resource(told())
 
 
 def main() -> None:
@@ -108,6 +26,8 @@ def main() -> None:
     os.environ.setdefault("MPLBACKEND", "Agg")
     # The matrices are small: threads of the linear algebra would only wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from calib.cli.verbs import app
+
     # A polite kill cleans up as an interrupt does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     usual = sys.unraisablehook
@@ -123,16 +43,31 @@ def main() -> None:
 
 def program() -> None:
     """Run the command line in a process of its own, which ends at once when it is stopped."""
+    # In the background of a shell Ctrl-C is ignored, and stays so.
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _stop)
     try:
         main()
     except SystemExit as ended:
-        if ended.code == _INTERRUPTED:
+        if ended.code == INTERRUPTED:
             # The interpreter would take as long again to give back, one by one, what it holds.
             atexit._run_exitfuncs()
             sys.stdout.flush()
             sys.stderr.flush()
-            os._exit(_INTERRUPTED)
+            os._exit(INTERRUPTED)
         raise
+
+
+def interruptible() -> None:
+    """Make Ctrl-C an exception, which cleans up: from here on there may be something to."""
+    if signal.getsignal(signal.SIGINT) is _stop:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _stop(*_: object) -> None:
+    """End while the commands are imported, where an exception would come out as any other."""
+    os.write(2, f"calib: {STOPPED}\n".encode())
+    os._exit(INTERRUPTED)
 
 
 def _interrupt_again(usual: Callable[[Any], object], lost: Any) -> None:

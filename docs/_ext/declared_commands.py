@@ -7,7 +7,7 @@ from typing import Any
 import typer
 from declared_text import code, table, words
 
-from calib.cli import app
+from calib.cli.verbs import app
 
 
 def page() -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from calib.cli import app
+from calib.cli.verbs import app
 from calib.data import read_for_model, table_from_arrays
 from calib.data.units_check import column_notes
 from calib.errors import CalibError

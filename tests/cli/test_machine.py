@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
 import sys
 import time
 from importlib.metadata import entry_points, version
@@ -12,8 +13,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from calib.cli import app
 from calib.cli.examples import EXAMPLES
+from calib.cli.verbs import app
 from calib.models import MODELS, example_csv
 from tests.cli.test_cli import Calib
 from tests.cli.test_cli import calib as calib
@@ -176,3 +177,29 @@ def test_a_stopped_program_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None
         with pytest.raises(SystemExit):
             script.load()()
     assert left == [130]
+
+
+@pytest.mark.parametrize("module", ["calib.cli.verbs", "typer", "calib.inference.problem"])
+def test_an_interruption_while_it_imports_says_how_to_go_on(module: str, tmp_path: Path) -> None:
+    code = f"""
+import os, signal, sys
+class Interrupted:
+    def find_spec(name, *_):
+        if name == {module!r}:
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+            except KeyboardInterrupt:
+                if name == "typer":  # as an extension module may
+                    raise ImportError(name) from None
+                raise
+sys.meta_path.insert(0, Interrupted)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from calib.cli import program
+program()
+"""
+    (tmp_path / "my.csv").write_text(example_csv("bekker"))
+    command = [sys.executable, "-c", code, "fit", "my.csv", "--model", "bekker"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert done.returncode == 130
+    assert done.stderr.startswith("calib: interrupted; nothing was written. Start the same command")
+    assert len(done.stderr.splitlines()) == 1

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from calib.cli import app
+from calib.cli.verbs import app
 from calib.data import table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError

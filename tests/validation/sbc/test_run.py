@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from calib.cli import app
+from calib.cli.verbs import app
 from calib.errors import CalibError
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings

@@ -1,0 +1,94 @@
+"""The verbs: thin, each one call into the package, heavy imports only when used."""
+
+from __future__ import annotations
+
+import sys
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from calib.cli import (
+    INTERRUPTED,
+    STOPPED,
+    audit,
+    calibration,
+    campaign,
+    challenge,
+    check,
+    compare,
+    doctor,
+    gap,
+    interruptible,
+    sbc,
+)
+from calib.cli.examples import add_examples
+
+__all__ = ["app"]
+
+
+class _Verbs(TyperGroup):
+    """All verbs: what the user can mend, or stops, ends with a line and no traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        from calib.errors import CalibError
+
+        try:
+            interruptible()
+            return super().invoke(ctx)
+        except CalibError as error:
+            if ctx.params["verbose"]:
+                import traceback
+
+                traceback.print_exc()
+            print(f"calib: {error}", file=sys.stderr)
+            raise typer.Exit(2) from None
+        except KeyboardInterrupt as stop:
+            print(f"calib: {str(stop) or STOPPED}", file=sys.stderr)
+            raise typer.Exit(INTERRUPTED) from None
+
+
+app = typer.Typer(
+    name="calib",
+    cls=_Verbs,
+    help="Probabilistic calibration of tyre-soil models.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for verb in (
+    calibration.report, calibration.fit, calibration.predict, calibration.data,
+    calibration.template, calibration.priors, calibration.models, compare.compare, gap.diagnose,
+    check.check, audit.audit, campaign.campaign, sbc.sbc, doctor.doctor,
+):  # fmt: skip
+    app.command()(verb)
+app.add_typer(challenge.verbs, name="challenge")
+add_examples(app)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"calib {version('terracalib')}")
+        raise typer.Exit
+
+
+@app.callback()
+def start(
+    ctx: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", help="Say which, and stop.", callback=_version,
+                           is_eager=True)
+    ] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Say on the error output with what versions, "
+                           "what was read and how long it took; where an error came from.")
+    ] = False,
+) -> None:  # fmt: skip
+    """Probabilistic calibration of tyre-soil models."""
+    if verbose:
+        from calib.cli.display import told
+
+        ctx.with_resource(told())
