@@ -226,6 +226,13 @@ def predict(
     effects: Annotated[
         Path | None, typer.Option(help="Python file with the effects of your own it was made with.")
     ] = None,
+    without: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Cause of a diagnosis that no longer acts, as of an "
+            "instrument that was mended; repeatable."
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     plugins: Models = None,
     simulator: Simulators = None,
@@ -244,12 +251,13 @@ def predict(
     from calib.validation.prediction import predict_stacked, prediction_columns
 
     if (run / "corrected.json").exists():
-        _predict_corrected(run, at, out, effects)
+        _predict_corrected(run, at, out, effects, without or [])
         return
-    if effects is not None:
+    if effects is not None or without:
         raise CalibError(
             "there is no diagnosis, which alone has effects", where=str(run),
-            allowed="a folder of `calib diagnose`", mend="correct its name, or leave --effects out",
+            allowed="a folder of `calib diagnose`",
+            mend="correct its name, or leave --effects and --without out",
         )  # fmt: skip
     if (run / "comparison.json").exists():
         from calib.report.comparison import load_stack
@@ -277,7 +285,9 @@ def predict(
     finish(0 if converged else 3, {"columns": _lists(columns)}, outside=outside)
 
 
-def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | None) -> None:
+def _predict_corrected(
+    run: Path, at: Path, out: Path | None, effects: Path | None, without: Sequence[str]
+) -> None:
     """Predict with the corrected model of a diagnosis, beside the calibrated simulator."""
     from calib.batch.plugins import load_files
     from calib.data import read_for_model
@@ -290,13 +300,14 @@ def _predict_corrected(run: Path, at: Path, out: Path | None, effects: Path | No
     corrected = load_corrected(run, {**EFFECTS, **own})
     used = {c for o in corrected.data.outputs for c in o.problem.bound.model.conditions}
     table = read_for_model(at, sorted(used))
-    columns = predict_columns(corrected, table)
+    columns = predict_columns(corrected, table, without)
     if "run_order" in corrected.data.view.conditions and "run_order" not in table:
         print("calib: no run_order is given: what depends on it is predicted as it stood at the "
               "end of the campaign", file=sys.stderr)  # fmt: skip
-    if faults := corrected.faults:
+    if faults := [cause for cause in corrected.faults if cause not in without]:
         print(f"calib: what is predicted is the reading, with {', '.join(faults)} in it; once the "
-              "instrument is mended, that is no longer right", file=sys.stderr)  # fmt: skip
+              f"instrument is mended, predict --without {' --without '.join(faults)}",
+              file=sys.stderr)  # fmt: skip
     beyond = conditions_outside(corrected, table)
     if beyond:
         told = ", ".join(f"{name} in {count} rows" for name, count in beyond.items())

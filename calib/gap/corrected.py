@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +72,11 @@ class Corrected:
                 if effect.instrument:
                     probability[effect.name] = probability.get(effect.name, 0.0) + p
         return [name for name, p in probability.items() if p >= _LIKELY]
+
+    @property
+    def causes(self) -> tuple[str, ...]:
+        """What acts in any of the hypotheses."""
+        return tuple(dict.fromkeys(c for fit in self.mixture.fits for c in fit.forward.causes))
 
     def calibrated(self, conditions: Mapping[str, Array]) -> dict[str, Array]:
         """Predict with the simulator alone, in the outputs' units, shapes (n,)."""
@@ -273,7 +278,9 @@ def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
     return dict(Counter(name for row in beyond for name in row))
 
 
-def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array | list[str]]:
+def predict_columns(
+    corrected: Corrected, table: Table, left_out: Collection[str] = ()
+) -> dict[str, Array | list[str]]:
     """Lay out a prediction at new conditions: conditions, before, after, 90 % predictive band.
 
     Parameters
@@ -281,12 +288,22 @@ def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array | lis
     corrected : Corrected
     table : Table
         With the conditions of all models and the covariates of the effects.
+    left_out : collection of str, optional
+        Causes that no longer act, as of an instrument that was mended; hypotheses without them
+        predict as before.
 
     Raises
     ------
     CalibError
-        If a condition is missing.
+        If a condition is missing, or a cause is none of the corrected model.
     """
+    unknown = [cause for cause in left_out if cause not in corrected.causes]
+    if unknown:
+        raise CalibError(
+            f"the corrected model has no cause {', '.join(unknown)} to leave out",
+            allowed=", ".join(corrected.causes) or "none: it has no cause",
+            mend="name one of these, or leave nothing out",
+        )
     table = with_declared(table, corrected.data.case.covariates)
     needed = corrected.data.view.conditions
     order = corrected.data.view.column("order")
@@ -300,7 +317,7 @@ def predict_columns(corrected: Corrected, table: Table) -> dict[str, Array | lis
     if order is not None and order not in conditions:
         # A drift is predicted as it stood at the end of the campaign.
         conditions[order] = np.full(len(table), corrected.data.view.order_range[1])
-    truth = corrected.mixture.at(corrected.data.at_conditions(conditions))
+    truth = corrected.mixture.at(corrected.data.at_conditions(conditions), left_out=left_out)
     recorded = {n: v for n, v in table.columns.items() if n not in OUTPUTS.values()}
     columns = cells(recorded, corrected.data.case.covariates)
     for name, p in predict_new(truth, corrected.calibrated(conditions)).items():

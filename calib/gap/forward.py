@@ -12,7 +12,7 @@ The vector psi of a hypothesis stacks, all with (truncated) normal or uniform pr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -207,17 +207,17 @@ class Forward:
         return lab, plain
 
     @_SILENT
-    def field(self, psi: Array, view: View) -> dict[str, Array]:
-        """Predict field rows with the hypothesis in force, on the scale of the response."""
+    def field(self, psi: Array, view: View, idle: Collection[int] = ()) -> dict[str, Array]:
+        """Predict field rows with the hypothesis in force, but for effects that are idle."""
         if self.shift is None:
-            return self.departed(psi, view, self.simulator(psi, view))
+            return self.departed(psi, view, self.simulator(psi, view), idle)
         plain: dict[str, Array] = {}
         shift = psi[:, self.shift_slice]
         for name, s in self._simulated.items():
             t = psi[:, self.theta_slices[name]] + shift @ self.shift.parameters[name].T
             conditions = self._shifted(shift, s.conditions(view))
             plain[name] = s.predict(t, psi[:, self.misfit_slices[name]], conditions)
-        return self.departed(psi, view, plain)
+        return self.departed(psi, view, plain, idle)
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -227,23 +227,22 @@ class Forward:
         return (*names, *(["unknown"] if self.smooth_slices else []))
 
     @_SILENT
-    def without(self, psi: Array, view: View, cause: str) -> dict[str, Array]:
-        """Predict field rows with all of `causes` in force but one."""
-        names = [e.name for e in self.hypothesis.effects]
-        if cause in names:
-            plain = self.simulator(psi, view)
-            return self.departed(psi, view, plain, idle=names.index(cause))
+    def without(self, psi: Array, view: View, *left_out: str) -> dict[str, Array]:
+        """Predict field rows with all of `causes` in force but some."""
         rest = psi.copy()
-        shifted = [self.shift_slice] if cause == "parameter_shift" else []
-        for part in shifted or self.smooth_slices.values():
-            rest[:, part] = 0.0
-        return self.field(rest, view)
+        if "parameter_shift" in left_out:
+            rest[:, self.shift_slice] = 0.0
+        if "unknown" in left_out:
+            for part in self.smooth_slices.values():
+                rest[:, part] = 0.0
+        effects = enumerate(self.hypothesis.effects)
+        return self.field(rest, view, [i for i, e in effects if e.name in left_out])
 
     @_SILENT
     def departed(
-        self, psi: Array, view: View, plain: dict[str, Array], idle: int | None = None
+        self, psi: Array, view: View, plain: dict[str, Array], idle: Collection[int] = ()
     ) -> dict[str, Array]:
-        """Add effects, all but one that is idle, and discrepancies to what simulators predict."""
+        """Add effects, but for those idle, and discrepancies to what simulators predict."""
         changed = dict(plain)
         if self.hypothesis.effects:
             changed = self._with_effects(psi, view, changed, idle)
@@ -272,19 +271,17 @@ class Forward:
         return {**conditions, column: 1.0 - (1.0 - conditions[column]) * (1.0 - error[:, None])}
 
     def _with_effects(
-        self, psi: Array, view: View, plain: dict[str, Array], idle: int | None
+        self, psi: Array, view: View, plain: dict[str, Array], idle: Collection[int]
     ) -> dict[str, Array]:
         base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in self.data.outputs}
         view = replace(view, base=base)
         acting = [
             (effect, p.to_natural(psi[:, s]))
-            for effect, p, s in zip(
+            for i, (effect, p, s) in enumerate(zip(
                 self.hypothesis.effects, self.hypothesis.effect_priors, self.phi_slices,
                 strict=True,
-            )
+            )) if i not in idle
         ]  # fmt: skip
-        if idle is not None:
-            del acting[idle]
         form = self._form(view)
         return {name: self._changed(psi, name, view, acting, plain[name], form) for name in plain}
 

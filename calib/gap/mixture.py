@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,7 +73,7 @@ class Mixture:
     probability: tuple[float, ...]
     seed: int
 
-    def at(self, view: View, without: str | None = None) -> Truth:
+    def at(self, view: View, without: str | None = None, left_out: Collection[str] = ()) -> Truth:
         """Draw the truth at conditions.
 
         Parameters
@@ -82,9 +82,11 @@ class Mixture:
             From `Campaigns.at` for conditions other than the field's.
         without : str, optional
             A cause, part of every fit: what is predicted without it is in the simulator's place.
+        left_out : collection of str, optional
+            Causes that no longer act, in the fits that have them.
         """
         parts = [
-            self._part(fit, probability, view, i, without)
+            self._part(fit, probability, view, i, without, left_out)
             for i, (fit, probability) in enumerate(zip(self.fits, self.probability, strict=True))
         ]
         weight = np.concatenate([part.weight for part in parts])
@@ -98,13 +100,16 @@ class Mixture:
         )
 
     def _part(
-        self, fit: Fit, probability: float, view: View, index: int, without: str | None
-    ) -> Truth:
+        self, fit: Fit, probability: float, view: View, index: int, without: str | None,
+        left_out: Collection[str],
+    ) -> Truth:  # fmt: skip
         """Draw under one hypothesis; the weights carry its probability."""
         size = max(100, int(N_DRAWS * probability))
         rng = generator(self.seed, "gap", "truth", fit.forward.hypothesis.name, index)
         psi = fit.draws(rng, size)
         full, plain = fit.forward.field_and_plain(psi, view)
+        if left_out:
+            full = fit.forward.without(psi, view, *left_out)
         if without is not None:
             plain = fit.forward.without(psi, view, without)
         # Draws for which a model has no value somewhere are left out for all outputs.

@@ -116,3 +116,44 @@ def test_an_effect_of_ones_own_is_passed_to_predict(tmp_path, capsys):
     change = columns["drawbar_pull_kn_after"] - columns["drawbar_pull_kn_before"]
     # The offset of the case, which the wind explains, to two noise sds of its mean and the lab's.
     np.testing.assert_allclose(change.mean(), LARGE["force_offset"]["offset"], atol=0.02)
+
+
+def test_a_fault_that_was_mended_is_left_out(saved):
+    found, folder = saved
+    corrected, field = load_corrected(folder), found.data.case.field
+    assert corrected.faults == ["force_offset"]
+    with_it = predict_columns(corrected, field)
+    mended = predict_columns(corrected, field, ["force_offset"])
+    # The truth is the simulator again, to what the field taught it; the reading had the offset.
+    change = with_it["drawbar_pull_kn_after"] - mended["drawbar_pull_kn_after"]
+    np.testing.assert_allclose(change.mean(), LARGE["force_offset"]["offset"], atol=0.02)
+    half = (mended["drawbar_pull_kn_after_upper"] - mended["drawbar_pull_kn_after_lower"]) / 2.0
+    gap = np.abs(mended["drawbar_pull_kn_after"] - mended["drawbar_pull_kn_before"])
+    assert (gap < half).all()
+    np.testing.assert_allclose(mended["rut_depth_mm_after"], with_it["rut_depth_mm_after"])
+
+
+def test_without_every_cause_the_simulator_is_left(saved):
+    found, folder = saved
+    for fit in load_corrected(folder).mixture.fits:
+        forward, psi = fit.forward, fit.psi[None]
+        left = forward.without(psi, found.data.view, *forward.causes)
+        plain = forward.simulator(psi, found.data.view)
+        for name, values in plain.items():
+            np.testing.assert_allclose(left[name], values, rtol=1e-9)
+
+
+def test_what_is_left_out_must_be_a_cause(saved, tmp_path):
+    found, folder = saved
+    with pytest.raises(CalibError, match="no cause offset to leave out") as refused:
+        predict_columns(load_corrected(folder), found.data.case.field, ["offset"])
+    assert "force_offset" in refused.value.allowed
+    conditions = dict(found.data.case.field.columns)
+    write_table(tmp_path / "at.csv", conditions)
+    given = ["predict", str(folder), "--at", str(tmp_path / "at.csv")]
+    told = CliRunner().invoke(app, given)
+    assert "predict --without force_offset" in told.stderr
+    mended = CliRunner().invoke(app, [*given, "--without", "force_offset"])
+    assert mended.exit_code == 0
+    assert "what is predicted is the reading" not in mended.stderr
+    assert mended.stdout != told.stdout
