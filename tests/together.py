@@ -12,8 +12,7 @@ TESTS = Path(__file__).parent
 # A file that is not here is a group of its own, after these.
 GROUPS = (
     ("check/test_reference_report.py",),
-    ("check/test_check_report.py", "check/test_processors.py"),
-    ("check/test_check_whole.py",),
+    ("check/test_check_report.py", "check/test_processors.py", "check/test_check_whole.py"),
     ("check/test_check_run.py",),
     ("batch/campaign/test_run.py", "batch/campaign/test_kinds.py", "batch/campaign/test_plan.py"),
     ("he2019/gaps/test_find.py", "he2019/gaps/test_cases.py", "cli/test_paper_gaps.py",

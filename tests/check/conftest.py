@@ -18,14 +18,15 @@ from unittest.mock import patch
 import pytest
 
 import calib.check.check_report as check_report_module
+import calib.check.check_run as check_run_module
 from calib.batch.environment import sha256
+from calib.check import posteriors
 from calib.check.check import check
 from calib.check.items import Status
 from calib.check.outcome import Outcome
-from calib.check.recompute import recompute_report
+from calib.check.recompute import recompute_report, recompute_run
 from calib.report.manifest import file_hashes
 from calib.report.publish import publication
-from calib.report.study import Study
 from tests.check.kernels import ALL, FEW, Setting
 
 from . import made
@@ -106,29 +107,63 @@ def compared(original_comparison: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="package")
-def _made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[Any, tuple[Study, Path]], Path]:
+def _made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[Any, tuple[Any, Path]], Path]:
     return {}, tmp_path_factory.mktemp("made")
 
 
+@pytest.fixture(scope="package")
+def _read() -> dict[Any, Any]:
+    return {}
+
+
 @pytest.fixture
-def computed_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Do the work of equal inputs once: most tampering leaves them as they are."""
+def computed_once(_made, _read, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do the work of equal inputs once, and read equal posteriors once.
+
+    Most tampering leaves them as they are.
+    """
     cache, folder = _made
 
-    def again(manifest, tasks, out, progress, pool):
+    def once(key: Any, out: Path, make: Callable[[Path], Any]) -> Any:
+        if key not in cache:
+            kept = folder / str(len(cache))
+            cache[key] = make(kept), kept
+        result, kept = cache[key]
+        shutil.copytree(kept, out)
+        return result
+
+    def report_again(manifest, tasks, out, progress, pool):
         key = (
             manifest.model_dump_json(exclude={"files", "left_out"}),
             *(t.table[c].tobytes() for t in tasks for c in t.table),
             *(t.prior_path.read_bytes() for t in tasks),
         )
-        if key not in cache:
-            kept = folder / str(len(cache))
-            cache[key] = recompute_report(manifest, tasks, kept, progress), kept
-        study, kept = cache[key]
-        shutil.copytree(kept, out)
-        return study
+        return once(key, out, lambda kept: recompute_report(manifest, tasks, kept, progress))
 
-    monkeypatch.setattr(check_report_module, "recompute_report", again)
+    def run_again(record, problem, out, progress):
+        # All but its numbers that nothing is computed from.
+        said = {
+            k: v for k, v in record.document.items() if k not in ("sha256", "log_evidence", "gate")
+        }
+        key = (json.dumps(said), *(problem.table[c].tobytes() for c in problem.table))
+        return once(key, out, lambda kept: recompute_run(record, problem, kept, progress))
+
+    def reading_once(read: Callable[[Path], Any]) -> Callable[[Path], Any]:
+        def read_once(path: Path) -> Any:
+            if not path.is_file():
+                return read(path)
+            key = read, sha256(path.read_bytes())
+            if key not in _read:
+                _read[key] = read(path)
+            return _read[key]
+
+        return read_once
+
+    monkeypatch.setattr(check_report_module, "recompute_report", report_again)
+    monkeypatch.setattr(check_run_module, "recompute_run", run_again)
+    monkeypatch.setattr(posteriors, "_groups", reading_once(posteriors._groups))
+    for module in (check_report_module, check_run_module):
+        monkeypatch.setattr(module, "read_draws", reading_once(posteriors.read_draws))
 
 
 def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:

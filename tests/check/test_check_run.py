@@ -22,6 +22,8 @@ from tests.check.made import SETTINGS, fitted_run
 
 from . import made
 
+pytestmark = pytest.mark.usefixtures("computed_once")
+
 
 def test_an_untouched_run_is_the_same_bit_for_bit(tmp_path: Path) -> None:
     run = made.run(tmp_path / "run")
