@@ -30,6 +30,7 @@ PICTURE = re.compile(r"(data:image/png;base64,)([A-Za-z0-9+/=]*)")
 def test_an_untouched_report_is_the_same(whole: Path) -> None:
     outcome = check(whole)
     assert different(outcome) == {}
+    assert not outcome.draws_differ  # though another processor made it
     names = {item.name for item in outcome.items}
     there = {p.relative_to(whole).as_posix() for p in whole.rglob("*") if p.is_file()}
     assert there <= {name.partition(": ")[0] for name in names}

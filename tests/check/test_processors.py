@@ -16,7 +16,7 @@ from calib.gap.forward import Forward
 from calib.inference.problem import Problem
 from calib.inference.sampling import sampler
 from tests.check.conftest import different
-from tests.check.kernels import ALL, FEW, KERNELS, Setting, skip_what_crashes
+from tests.check.kernels import ALL, KERNELS, Setting, skip_what_crashes
 
 from . import made
 
@@ -73,13 +73,6 @@ def test_chains_that_part_ways_are_judged_by_their_monte_carlo_error(
     assert different(outcome) == {}
     assert outcome.draws_differ
     assert outcome.verdict.startswith("SAME within Monte Carlo error")
-
-
-@pytest.mark.parametrize("setting", FEW[-1:], ids=str)
-def test_a_report_of_another_processor_is_the_same(tmp_path: Path, setting: Setting) -> None:
-    outcome = check(made.elsewhere("report", tmp_path / "report", setting))
-    assert different(outcome) == {}
-    assert not outcome.draws_differ
 
 
 @pytest.mark.slow

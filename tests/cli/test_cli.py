@@ -16,6 +16,7 @@ import pytest
 from calib.cli import main
 from calib.inference.prior_files import default_priors
 from calib.models import MODELS, example_csv, template_csv
+from calib.report.figures.collect import plates
 from calib.report.manifest import file_hashes
 
 RUT = example_csv("modified_bekker")
@@ -237,14 +238,15 @@ def test_the_embedded_data_are_written_and_called_reconstructed(calib: Calib, he
 
 
 def test_a_report_of_own_data_is_complete_and_its_hashes_hold(
-    calib: Calib, he2019: Path, tmp_path: Path
+    calib: Calib, he2019: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One output works; the other has too few rows, which ends with 1 and leaves the first."""
+    monkeypatch.setattr("calib.report.writer.plates", lambda *args: plates(*args)[:1])
     Path("few.csv").write_text("slip_ratio,drawbar_pull_kn\n0.1,1\n0.2,1.1\n")
     before = contents(tmp_path)
     ran = calib(
         "report", he2019 / "rut_depth.csv", "few.csv", "--out", "rep",
-        "--hold-out", "inflation_pressure_psi=30",
+        "--hold-out", "inflation_pressure_psi=30", "--workers", 1,
     )  # fmt: skip
     assert ran.code == 1, ran.err
     assert "rut_depth: converged; 90 % band covers" in ran.out
@@ -261,6 +263,10 @@ def test_a_report_of_own_data_is_complete_and_its_hashes_hold(
     assert {"index.html", "rut_depth.nc", "data/rut_depth.csv", "priors/rut_depth.toml"} <= set(
         manifest["files"]
     )
+    # What the embedded report says of its source.
+    assert "paper_gaps" not in summary
+    assert "paper-gaps" not in (rep / "index.html").read_text()
+    assert not (rep / "gaps").exists()
 
 
 # What is refused

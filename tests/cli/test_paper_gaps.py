@@ -1,4 +1,4 @@
-"""The source's own gaps at the command line: in the embedded report, not in that of own data."""
+"""The source's own gaps at the command line; a report of own data has none (`test_cli.py`)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from calib.batch.environment import sha256
-from calib.models import example_csv
 from tests.cli.test_cli import Calib, assert_refused, calib, contents  # noqa: F401
 
 
@@ -80,16 +79,3 @@ def test_the_report_of_the_embedded_data_has_the_section(
     assert asked == [5]
     assert set(json.loads(Path("rep/summary.json").read_text())["paper_gaps"]) == {"plain_bekker"}
     assert 'id="paper-gaps"' in Path("rep/index.html").read_text()
-
-
-def test_the_report_of_own_data_has_no_such_section(
-    calib: Calib,  # noqa: F811
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("calib.report.writer.plates", lambda result, reference: [])
-    Path("my.csv").write_text(example_csv("modified_bekker"))
-    ran = calib("report", "my.csv", "--out", "rep")
-    assert ran.code == 0, ran.err
-    assert "paper_gaps" not in json.loads(Path("rep/summary.json").read_text())
-    assert "paper-gaps" not in Path("rep/index.html").read_text()
-    assert not Path("rep/gaps").exists()

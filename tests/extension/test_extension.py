@@ -131,8 +131,10 @@ def test_a_condition_that_the_simulator_ignores_is_named_as_the_cause(run: Calib
     Path("case").mkdir()
     Path("case/lab.csv").write_text(rows(np.full(20, 5.0)))
     Path("case/field.csv").write_text(rows(np.resize([3.0, 5.0, 8.0], 20)))
+    Path("case/fresh.csv").write_text("slip_ratio,normal_load_kn\n0.2,5\n0.3,8\n")
     Path("case/case.toml").write_text(
-        'calibration = "lab.csv"\nfield = "field.csv"\n[models]\ndrawbar_pull = "magic_formula"\n'
+        'calibration = "lab.csv"\nfield = "field.csv"\npredict = "fresh.csv"\n'
+        '[models]\ndrawbar_pull = "magic_formula"\n'
     )
     own = ["--models", HERE / "load_sensitivity.py"]
     found = run("diagnose", "case", *own, "--out", "gap", "--workers", 1)

@@ -49,6 +49,7 @@ def test_a_rigid_wheel_in_sand_has_no_peak_that_its_data_determine():
     assert np.median(problem.observed[problem.conditions["slip_ratio"] < 0.01]) < 0.0
 
 
+@pytest.mark.slow
 @here
 def test_the_measured_gap_is_found_and_is_in_the_pull():
     found = diagnose(read_case(SHARED / "cases" / "real-000"), 1)

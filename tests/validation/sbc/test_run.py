@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from calib.cli.verbs import app
 from calib.errors import CalibError
 from calib.inference.prior_files import default_priors
+from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.page.sbc import text_table, verdict
 from calib.validation.sbc.run import run_sbc
@@ -19,6 +20,8 @@ from tests.browser import Browser, faults
 
 MODELS = ("bekker", "modified_bekker")
 QUICK = SamplerSettings(steps=100, max_steps=400)
+# Where it does not matter how well replicates converge.
+SHORT = SamplerSettings(steps=40, max_steps=40, gate=Gate(rhat_max=10.0, ess_min=0.0, taus_min=0.0))
 
 
 @pytest.fixture(scope="module")
@@ -62,12 +65,12 @@ def test_the_page_holds_in_a_browser(out: Path, browser: Browser) -> None:
 
 
 def test_a_run_is_resumed_and_extended(out: Path, tmp_path: Path) -> None:
-    first = run_sbc(tmp_path / "run", models=MODELS, simulations=3, seed=1, settings=QUICK)
+    first = run_sbc(tmp_path / "run", models=MODELS, simulations=3, seed=1, settings=SHORT)
     files = sorted((tmp_path / "run" / "replicates").glob("*-*.json"))
     assert len(files) == 6
     before = {f: (f.read_bytes(), f.stat().st_mtime_ns) for f in files}
     files[2].unlink()
-    more = run_sbc(tmp_path / "run", models=MODELS, simulations=4, seed=1, settings=QUICK)
+    more = run_sbc(tmp_path / "run", models=MODELS, simulations=4, seed=1, settings=SHORT)
     assert [m.replicates for m in first.models] == [3, 3]
     assert [m.replicates for m in more.models] == [4, 4]
     for path, (content, changed) in before.items():
@@ -143,7 +146,7 @@ def test_a_prior_file_chooses_the_noise_that_is_proved(tmp_path: Path) -> None:
     path = tmp_path / "heavy.toml"
     text = default_priors("modified_bekker").read_text(encoding="utf-8")
     path.write_text(f'{text}\n[likelihood]\nfamily = "student_t"\nnoise_depends_on = "slip"\n')
-    options = {"simulations": 2, "seed": 1, "settings": QUICK}
+    options = {"simulations": 2, "seed": 1, "settings": SHORT}
     found = run_sbc(tmp_path / "run", models=MODELS, priors=[path], **options)
     named = {m.model: {q.name for q in m.quantities} for m in found.models}
     assert {"nu", "sigma_slope", "sigma"} <= named["modified_bekker"]
@@ -157,7 +160,7 @@ def test_a_prior_file_chooses_the_noise_that_is_proved(tmp_path: Path) -> None:
 
 def test_a_run_that_was_killed_as_it_began_begins_again(tmp_path: Path) -> None:
     (tmp_path / ".run.json.part").write_text('{"see', encoding="utf-8")
-    run_sbc(tmp_path, models=["bekker"], simulations=2, seed=3, settings=QUICK)
+    run_sbc(tmp_path, models=["bekker"], simulations=2, seed=3, settings=SHORT)
     assert json.loads((tmp_path / "run.json").read_text(encoding="utf-8"))["seed"] == 3
 
 
@@ -166,6 +169,6 @@ def test_the_option_of_correlated_noise_is_simulated(tmp_path: Path) -> None:
     extra = '\n[likelihood]\ncorrelated_along = "run_order"\n'
     priors.write_text(default_priors("bekker").read_text(encoding="utf-8") + extra, "utf-8")
     score = run_sbc(
-        tmp_path / "out", models=["bekker"], simulations=3, seed=3, settings=QUICK, priors=[priors]
+        tmp_path / "out", models=["bekker"], simulations=3, seed=3, settings=SHORT, priors=[priors]
     )
     assert "rho" in {quantity.name for quantity in score.models[0].quantities}
