@@ -19,7 +19,8 @@ def checked(setting: Setting) -> dict:
     """Check the report in a process that stands in for another processor."""
     skip_what_crashes(setting)
     ran = subprocess.run(
-        [sys.executable, "-c", PROGRAM, "check", str(FOLDER), "--json"],
+        [sys.executable, "-c", PROGRAM, "check", str(FOLDER), "--json",
+         "--workers", str(setting.threads)],
         env=setting.environment(), capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert ran.stdout, ran.stderr
