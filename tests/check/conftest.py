@@ -25,6 +25,8 @@ from calib.check.check import check
 from calib.check.items import Status
 from calib.check.outcome import Outcome
 from calib.check.recompute import recompute_report, recompute_run
+from calib.he2019 import sections
+from calib.he2019.audit.run import begin_audit
 from calib.report.manifest import file_hashes
 from calib.report.publish import publication
 from tests.check.kernels import ALL, FEW, Setting
@@ -107,7 +109,7 @@ def compared(original_comparison: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="package")
-def _made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[Any, tuple[Any, Path]], Path]:
+def _made(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[Any, Any], Path]:
     return {}, tmp_path_factory.mktemp("made")
 
 
@@ -159,6 +161,16 @@ def computed_once(_made, _read, monkeypatch: pytest.MonkeyPatch) -> None:
 
         return read_once
 
+    def audit_again(seed, seeds, pool):
+        def finish(calibration, tell):
+            key = "audit", seed, seeds, calibration and calibration.draws.t.tobytes()
+            if key not in cache:
+                cache[key] = begin_audit(seed, seeds, pool)(calibration, tell)
+            return cache[key]
+
+        return finish
+
+    monkeypatch.setattr(sections, "begin_audit", audit_again)
     monkeypatch.setattr(check_report_module, "recompute_report", report_again)
     monkeypatch.setattr(check_run_module, "recompute_run", run_again)
     monkeypatch.setattr(posteriors, "_groups", reading_once(posteriors._groups))
