@@ -5,7 +5,7 @@ The vector psi of a hypothesis stacks, all with (truncated) normal or uniform pr
     simulator parameters of each output (internal coordinates)
     inadequacy of each simulator, in the lab and the field alike
     parameters of each effect
-    form errors: the effect's size departs from its formula by 1 + sum_j c_j b_j(x)
+    form errors of each effect: its size departs from its formula by 1 + sum_j c_j b_j(x)
     shifts of the simulator's parameters in the field (parameter_shift only)
     coefficients of a free smooth discrepancy (unknown only)
 """
@@ -99,11 +99,19 @@ class Forward:
         ]
         self.covariates = data.covariates
         self.discrepancy = Discrepancy(data, hypothesis, lab_mode or {}, bases)
-        self._field_form, sds = self._form_basis(data.view)
-        self.form_slices: dict[str, slice] = {}
-        for o in data.outputs:
-            errors = [_normal(f"{o.name}.form", sd) for sd in sds]
-            self.form_slices[o.name] = _append(entries, errors)
+        forms = [self._form_basis(e, data.view) for e in hypothesis.effects]
+        self._field_form = [basis for basis, _ in forms]
+        # Of each effect in each output that it touches; elsewhere it has none.
+        self.form_slices: dict[str, list[slice]] = {
+            o.name: [
+                _append(
+                    entries,
+                    [_normal(f"{o.name}.{e.name}.form", sd) for sd in sds if o.role in e.outputs],
+                )
+                for e, (_, sds) in zip(hypothesis.effects, forms, strict=True)
+            ]
+            for o in data.outputs
+        }
         self.shift_slice = slice(len(entries), len(entries))
         self.shift: ShiftMap | None = None
         if hypothesis.shift > 0.0:
@@ -133,35 +141,32 @@ class Forward:
         """Length of psi."""
         return len(self.priors.free)
 
-    def _form(self, view: View) -> Array:
-        same = view.conditions is self.data.view.conditions
-        return self._field_form if same else self._form_basis(view)[0]
+    def _form(self, view: View) -> list[Array]:
+        """Basis of each effect's form error, shapes (n, m)."""
+        if view.conditions is self.data.view.conditions:
+            return self._field_form
+        return [self._form_basis(e, view)[0] for e in self.hypothesis.effects]
 
-    def _form_basis(self, view: View) -> tuple[Array, list[float]]:
-        """Basis of the form error, shape (n, m), and the sds of its coefficients."""
-        wanted = {kind for e in self.hypothesis.effects for kind in e.form}
+    def _form_basis(self, effect: Effect, view: View) -> tuple[Array, list[float]]:
+        """Basis of an effect's form error, shape (n, m), and the sds of its coefficients."""
         n = view.slip().size
         basis: list[tuple[str, Array]] = []
-        slip = self.covariates.over(view, "slip")
-        pressure = self.covariates.over(view, "pressure")
-        if "size" in wanted:
+        if "size" in effect.form:
             basis.append(("size", np.ones(n)))
-        if "slip" in wanted and slip is not None:
+        slip = self.covariates.over(view, "slip")
+        if "slip" in effect.form and slip is not None:
             basis += [("slip", slip), ("bend", 1.5 * slip**2 - 0.5)]
-        if pressure is not None:
-            basis += [(k, pressure) for k in ("pressure", "extrapolation") if k in wanted][:1]
-        for kind in ("cone", "water"):
-            values = self.covariates.over(view, kind) if kind in wanted else None
+        for kind in ("pressure", "extrapolation", "cone", "water"):
+            over = "pressure" if kind == "extrapolation" else kind
+            values = self.covariates.over(view, over) if kind in effect.form else None
             if values is not None:
                 basis.append((kind, values))
-        if "shape" in wanted:
-            for e in self.hypothesis.effects:
-                values = e.shape(view) if "shape" in e.form else None
-                reference = e.shape(self.data.view) if values is not None else None
-                if values is not None and reference is not None and np.ptp(reference) > 1e-9:
-                    mid = 0.5 * (reference.max() + reference.min())
-                    u = np.clip((values - mid) / (0.5 * np.ptp(reference)), -1.5, 1.5)
-                    basis.append(("shape", u))
+        values = effect.shape(view) if "shape" in effect.form else None
+        reference = effect.shape(self.data.view) if values is not None else None
+        if values is not None and reference is not None and np.ptp(reference) > 1e-9:
+            mid = 0.5 * (reference.max() + reference.min())
+            u = np.clip((values - mid) / (0.5 * np.ptp(reference)), -1.5, 1.5)
+            basis.append(("shape", u))
         if not basis:
             return np.empty((n, 0)), []
         return np.stack([b for _, b in basis], axis=1), [FORM_ERROR[kind] for kind, _ in basis]
@@ -276,41 +281,57 @@ class Forward:
         base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in self.data.outputs}
         view = replace(view, base=base)
         acting = [
-            (effect, p.to_natural(psi[:, s]))
-            for i, (effect, p, s) in enumerate(zip(
-                self.hypothesis.effects, self.hypothesis.effect_priors, self.phi_slices,
-                strict=True,
-            )) if i not in idle
-        ]  # fmt: skip
+            (i, effect, p.to_natural(psi[:, self.phi_slices[i]]))
+            for i, (effect, p) in enumerate(
+                zip(self.hypothesis.effects, self.hypothesis.effect_priors, strict=True)
+            )
+            if i not in idle
+        ]
         form = self._form(view)
         return {name: self._changed(psi, name, view, acting, plain[name], form) for name in plain}
 
     def _changed(
-        self, psi: Array, name: str, view: View, effects: Sequence[tuple[Effect, Array]],
-        plain: Array, form: Array,
+        self, psi: Array, name: str, view: View, effects: Sequence[tuple[int, Effect, Array]],
+        plain: Array, form: Sequence[Array],
     ) -> Array:  # fmt: skip
-        """One output with the effects in it; effects with their natural parameters."""
+        """One output with the effects in it; effects with their natural parameters.
+
+        What an effect adds to the output, given those before it, departs from its formula by a
+        factor of its own.
+        """
         role = self._roles[name]
-        acting = [(effect, phi) for effect, phi in effects if role in effect.outputs]
+        acting = [
+            (effect, phi, self._factor(psi, self.form_slices[name][i], form[i]))
+            for i, effect, phi in effects
+            if role in effect.outputs
+        ]
         if not acting:
             return plain
         simulated = self._simulated[name]
         recorded = simulated.conditions(view)
         columns = self._columns[name]
-        conditions = original = {known: recorded[column] for known, column in columns.items()}
-        for effect, phi in acting:
-            conditions = effect.on_conditions(phi, role, conditions, view)
-        location = plain
-        if conditions is not original:
+        conditions = {known: recorded[column] for known, column in columns.items()}
+        location = ahead = plain
+        for effect, phi, factor in acting:
+            truly = effect.on_conditions(phi, role, conditions, view)
+            if truly is conditions:
+                continue
+            conditions = truly
             t, misfit = psi[:, self.theta_slices[name]], psi[:, self.misfit_slices[name]]
-            true = {columns[known]: values for known, values in conditions.items()}
-            location = simulated.predict_beyond(t, misfit, true)
-        for effect, phi in acting:
-            location = effect.on_output(phi, role, location, view)
-        if form.shape[1]:
-            factor = 1.0 + psi[:, self.form_slices[name]] @ form.T
-            location = plain + (location - plain) * factor
+            there = simulated.predict_beyond(
+                t, misfit, {columns[known]: values for known, values in truly.items()}
+            )
+            location, ahead = location + (there - ahead) * factor, there
+        for effect, phi, factor in acting:
+            changed = effect.on_output(phi, role, location, view)
+            if changed is not location:
+                location = location + (changed - location) * factor
         return location
+
+    @staticmethod
+    def _factor(psi: Array, part: slice, basis: Array) -> Array | float:
+        """By how much what an effect does departs from its formula, shape (k, n)."""
+        return 1.0 + psi[:, part] @ basis.T if part.stop > part.start else 1.0
 
 
 def _append(entries: list[Prior], new: Sequence[Prior]) -> slice:

@@ -73,11 +73,6 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
     """
     data, causes = forward.data, forward.causes
     alone = len(causes) == 1
-    if len(forward.hypothesis.effects) > 1:
-        # The form errors belong to all; each effect's own size is that of its formula.
-        psi = psi.copy()
-        for s in forward.form_slices.values():
-            psi[:, s] = 0.0
     with np.errstate(all="ignore"):
         full, plain = forward.field_and_plain(psi, data.view)
         without = [plain if alone else forward.without(psi, data.view, c) for c in causes]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -54,8 +54,8 @@ _N_BEGUN = 5
 _N_THRESHOLDS = 24
 # Effects of which one is in every pair that is tried, and sets from which larger ones grow.
 _N_PAIR_SEEDS, _N_SETS, _MOST_CAUSES = 6, 3, 4
-# Effects that a set is enlarged by, and guesses from which a larger one is begun.
-_N_ADDED, _N_BEGUN_LARGER = 5, 2
+# Guesses from which a set made of another is begun.
+_N_BEGUN_LARGER = 2
 # Explanations beside which something unlisted is tried as well.
 _N_LEADING, _N_LEADING_SETS = 5, 2
 # An effect that far out in its prior (sds) is fitted with a wider one as well.
@@ -227,19 +227,22 @@ def _sets_and_unlisted(
     ended = _finished(truncated_fits, leading - _HOPELESS, n)
     leading = max(leading, *(_with_prior(f, n) for f in ended))
     sets = ended[first:]
-    members = [best[m] for m in seeds[:_N_ADDED]]
-    grown = sorted(sets, key=lambda f: -_with_prior(f, n))[:_N_SETS]
-    for _ in range(2, _MOST_CAUSES):
-        # Only beside what is in play could a larger set be.
-        grown = [f for f in grown if _with_prior(f, n) > leading - _IN_PLAY]
-        larger = _larger(grown, members)
-        truncated_fits = together(
-            [worker.truncated_joint(h, of, _N_BEGUN_LARGER) for h, of in larger]
-        )
-        found = _finished(truncated_fits, leading - _SEARCHED, n)
-        sets += found
-        leading = max([leading, *(_with_prior(f, n) for f in found)])
-        grown = sorted(found, key=lambda f: -_with_prior(f, n))[:_N_SETS]
+    # What is unlisted takes up what is left of any listed causes: they are compared without it.
+    listed = max(_with_prior(f, n) for f in (*best.values(), *sets))
+    grown = _leading(sets, listed, n)
+    members = [best[m] for m in single]
+    while grown:
+        known = [f.forward.hypothesis.name for f in sets if _with_prior(f, n) > listed - _SEARCHED]
+        changed = worker.begun(_exchanged(grown, members, known), listed)
+        listed = max([listed, *(_with_prior(f, n) for f in changed)])
+        grown = _leading([*grown, *changed], listed, n)
+        larger: list[Fit] = []
+        if len(grown[0].forward.hypothesis.effects) < _MOST_CAUSES:
+            larger = worker.begun(_larger(grown, members), listed)
+        sets += changed + larger
+        listed = max([listed, *(_with_prior(f, n) for f in larger)])
+        grown = _leading(larger, listed, n)
+    leading = max(leading, listed)
     top = sorted(sets, key=lambda f: -_with_prior(f, n))[:_N_LEADING_SETS]
     top = [f for f in top if _with_prior(f, n) > leading - _SEARCHED]
     beside = _with_remainders(worker.data, top)
@@ -268,12 +271,40 @@ def _larger(sets: Sequence[Fit], single: Sequence[Fit]) -> list[_Started]:
     return list(found.values())
 
 
+def _leading(sets: Sequence[Fit], listed: float, odds: Odds) -> list[Fit]:
+    """Sets from which others are made: the best of those in play."""
+    ranked = sorted(sets, key=lambda f: -_with_prior(f, odds))[:_N_SETS]
+    return [f for f in ranked if _with_prior(f, odds) > listed - _IN_PLAY]
+
+
+def _exchanged(
+    sets: Sequence[Fit], single: Sequence[Fit], known: Collection[str]
+) -> list[_Started]:
+    """Sets with one effect of some in the place of another, but for those that are known."""
+    found: dict[str, _Started] = {}
+    alone = {f.forward.hypothesis.name: f.forward.hypothesis for f in single}
+    for a in sets:
+        names = [e.name for e in a.forward.hypothesis.effects]
+        for out in names:
+            kept = [alone[name] for name in names if name != out]
+            for b in single:
+                new = b.forward.hypothesis
+                if new.name in names or not all(_compatible(new, h) for h in kept):
+                    continue
+                h = joined(*kept, new)
+                if h.name not in known:
+                    found.setdefault(h.name, (h, [a]))
+    return list(found.values())
+
+
 def _apart(a: Fit, b: Fit) -> bool:
     """Whether no effect of one explanation holds one of the other already."""
+    return _compatible(a.forward.hypothesis, b.forward.hypothesis)
+
+
+def _compatible(a: Hypothesis, b: Hypothesis) -> bool:
     return not any(
-        e.name in other.holds or other.name in e.holds
-        for e in a.forward.hypothesis.effects
-        for other in b.forward.hypothesis.effects
+        e.name in other.holds or other.name in e.holds for e in a.effects for other in b.effects
     )
 
 
@@ -461,6 +492,13 @@ class _Worker:
             searched[i] += truncated
         return searched
 
+    def begun(self, sets: Sequence[_Started], listed: float) -> list[Fit]:
+        """Fit sets, those fully that come near the best explanation of listed causes."""
+        truncated_fits = together(
+            [self.truncated_joint(h, of, _N_BEGUN_LARGER) for h, of in sets]
+        )
+        return _finished(truncated_fits, listed - _SEARCHED, self.odds)
+
     def truncated_joint(
         self, hypothesis: Hypothesis, members: Sequence[Fit], count: int, skip: int = 0
     ) -> Walk[list[Fit]]:
@@ -475,7 +513,8 @@ class _Worker:
             for o in self.data.outputs:
                 led[forward.theta_slices[o.name]] = member.psi[old.theta_slices[o.name]]
             for e, s in zip(old.hypothesis.effects, old.phi_slices, strict=True):
-                led[place[e.name]] = member.psi[s]
+                if e.name in place:
+                    led[place[e.name]] = member.psi[s]
             if old.shift is not None:
                 led[forward.shift_slice] = member.psi[old.shift_slice]
             known = {e.name for e in old.hypothesis.effects}
