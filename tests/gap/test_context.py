@@ -11,7 +11,7 @@ from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.context import Context, Size, read_context
 from calib.gap.diagnose import diagnose_once
-from calib.gap.which import Odds
+from calib.gap.odds import Odds
 from calib.report.gap_evidence import gap_evidence
 from calib.report.gap_verdict import judge_gap
 from tests.gap.cases import PULL_ONLY, make_case, write_case

@@ -14,7 +14,8 @@ from calib.gap.case import Case, campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import dependences
 from calib.gap.inclusion import inclusion_probability
-from calib.gap.which import Odds, calibrate_lab, probabilities, rank
+from calib.gap.odds import Odds, probabilities
+from calib.gap.which import calibrate_lab, rank
 from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
 

@@ -1,0 +1,252 @@
+"""Where fits of hypotheses begin: at the lab's calibration, or where parts of them have led."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from calib.gap.ascent import Walk, together
+from calib.gap.case import Campaigns
+from calib.gap.discrepancy import Bases
+from calib.gap.effects import Effect
+from calib.gap.fit import Fit, finish, truncated_fit
+from calib.gap.forward import Forward
+from calib.gap.hypotheses import joined
+from calib.gap.hypothesis import Hypothesis
+from calib.gap.noise import Noise
+from calib.gap.odds import Odds
+from calib.gap.residuals import Residuals, residuals_of_all
+from calib.inference.random import generator
+from calib.models.base import Array
+
+__all__ = ["Guesses", "Promise"]
+
+_N_SCREEN = 96
+_N_BEGUN = 5
+_N_THRESHOLDS = 24
+# Guesses at one more effect of a set, and how many of them a fit begins from.
+_N_ADDED, _N_ADDED_BEGUN = 64, 2
+
+
+@dataclass(frozen=True)
+class Promise:
+    """A set of causes that may be worth a fit.
+
+    Parameters
+    ----------
+    hypothesis : Hypothesis
+    log_joint : float
+        Log of likelihood times prior at the best guess, the other parameters a step further on.
+    starts : ndarray, shape (k, d)
+        Guesses, the best first.
+    noise : mapping of str to Noise
+    """
+
+    hypothesis: Hypothesis
+    log_joint: float
+    starts: Array
+    noise: Mapping[str, Noise]
+
+
+class Guesses:
+    """Begins fits of hypotheses of one case.
+
+    Parameters
+    ----------
+    data : Campaigns
+    lab_mode : mapping of str to ndarray
+        Internal parameters of each simulator as the lab calibrated it.
+    noise : mapping of str to Noise
+        Of the laboratory.
+    seed : int
+    odds : Odds
+    """
+
+    def __init__(
+        self, data: Campaigns, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise], seed: int,
+        odds: Odds,
+    ) -> None:  # fmt: skip
+        self.data, self.lab_mode, self.noise, self.seed = data, lab_mode, noise, seed
+        self.odds = odds
+        self._bases: Bases = {}
+
+    def fit(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Fit, ...]]:
+        """Fit from the lab's calibration, by name."""
+        truncated = together([self.truncated(h) for h in hypotheses])
+        fits: dict[str, tuple[Fit, ...]] = {}
+        for found in together([finish(group) for group in truncated]):
+            name = found.forward.hypothesis.name
+            fits[name] = (*fits.get(name, ()), found)
+        return fits
+
+    def truncated(self, hypothesis: Hypothesis) -> Walk[list[Fit]]:
+        """Begin at the lab's calibration, effects at several guesses of their prior."""
+        forward, start = self._forward(hypothesis)
+        if hypothesis.onset_over is not None:
+            return truncated_fit(self.data, forward, self._onset_start(forward, start), self.noise)
+        if not hypothesis.effects:
+            return truncated_fit(self.data, forward, start, self.noise)
+        starts = self._spread(forward, start, _N_SCREEN, range(len(hypothesis.effects)))
+        return truncated_fit(self.data, forward, start, self.noise, starts=starts, count=_N_BEGUN)
+
+    def truncated_joint(
+        self, hypothesis: Hypothesis, members: Sequence[Fit], count: int, skip: int = 0
+    ) -> Walk[list[Fit]]:
+        """Begin where parts of a hypothesis have led, the effects they lack by their prior."""
+        if not members:
+            return self.truncated(hypothesis)
+        forward, start = self._forward(hypothesis)
+        parts = []
+        for member in members:
+            led = _led(forward, start, member)
+            known = {e.name for e in member.forward.hypothesis.effects}
+            lacking = [i for i, e in enumerate(hypothesis.effects) if e.name not in known]
+            size = _N_SCREEN // len(members) if lacking else 1
+            parts.append(self._spread(forward, led, size, lacking))
+        starts = np.concatenate(parts)
+        return truncated_fit(
+            self.data, forward, start, self.noise, starts=starts, count=count, skip=skip
+        )
+
+    def beside(self, kept: Hypothesis, found: Fit, added: Sequence[Hypothesis]) -> list[Promise]:
+        """Guess at sets of what is kept of one that was fitted and one effect more.
+
+        All other parameters take one Gauss-Newton step from each guess: what they can take up is
+        no reason to add an effect.
+
+        Parameters
+        ----------
+        kept : Hypothesis
+            Some of the effects that were fitted, or all of them.
+        found : Fit
+        added : sequence of Hypothesis
+            Single effects.
+        """
+        forward, start = self._forward(kept)
+        psi = _led(forward, start, found)
+        problem = Residuals(self.data, forward)
+        sets = []
+        for h in added:
+            larger, larger_start = self._forward(joined(kept, h))
+            last = [e.name for e in larger.hypothesis.effects].index(h.name)
+            begun = self._spread(larger, _led(larger, larger_start, found), _N_ADDED, [last])
+            there = Residuals(self.data, larger)
+            sets.append((there, there.clip(begun)))
+        asked = [(problem, problem.clip(psi[None])), (problem, problem.around(psi[None])), *sets]
+        raw, moved, *guessed = residuals_of_all(asked)
+        sds = problem.sds(found.noise)
+        slope = problem.jacobian(psi[None], raw, moved)[0] / sds
+        hessian = slope @ slope.T + np.diag(problem.precision**2 + 1e-6 / problem.width**2)
+        off = (psi - problem.loc) * problem.precision**2
+        promises = []
+        for (there, begun), left in zip(sets, guessed, strict=True):
+            gradient = (left / sds) @ slope.T + off
+            step = -np.linalg.solve(hessian, gradient.T).T
+            gained = 0.5 * (gradient * step).sum(axis=1)
+            costs = there.costs(begun, left, sds) + gained
+            costs = np.where(np.isfinite(costs), costs, np.inf)
+            best = np.argsort(costs, kind="stable")[:_N_ADDED_BEGUN]
+            own, here = _places(forward, there.forward)
+            starts = begun[best].copy()
+            starts[:, here] += step[best][:, own]
+            promises.append(
+                Promise(there.forward.hypothesis, -float(costs[best[0]]), starts, found.noise)
+            )
+        return promises
+
+    def truncated_promise(self, promise: Promise) -> Walk[list[Fit]]:
+        """Begin where a promise says."""
+        forward, _ = self._forward(promise.hypothesis)
+        first, count = promise.starts[0], len(promise.starts)
+        return truncated_fit(
+            self.data, forward, first, promise.noise, starts=promise.starts[1:], count=count
+        )
+
+    def _forward(self, hypothesis: Hypothesis) -> tuple[Forward, Array]:
+        scale = {o: n.sigma for o, n in self.noise.items()}
+        forward = Forward(self.data, hypothesis, scale, self.lab_mode, bases=self._bases)
+        start = np.array([p.loc for p in forward.priors.free])
+        for o in self.data.outputs:
+            start[forward.theta_slices[o.name]] = self.lab_mode[o.name]
+        return forward, start
+
+    def _onset_start(self, forward: Forward, start: Array) -> Array:
+        """The threshold, and the step and bend there, that the lab's residuals show best."""
+        lower, upper = (
+            getattr(forward.priors.free[forward.threshold], e) for e in ("lower", "upper")
+        )
+        thresholds = np.linspace(lower, upper, _N_THRESHOLDS)
+        plain = forward.simulator(start[None], self.data.view)
+        left = np.zeros(_N_THRESHOLDS)
+        starts = np.repeat(start[None], _N_THRESHOLDS, axis=0)
+        starts[:, forward.threshold] = thresholds
+        for o in self.data.outputs:
+            if o.name not in forward.smooth_slices:
+                continue
+            sigma = self.noise[o.name].sigma
+            residual = (o.field - plain[o.name][0, o.rows]) / sigma
+            shapes = np.stack(
+                forward.discrepancy.onset(self.data.view, o.name, thresholds), axis=-1
+            )
+            part = forward.smooth_slices[o.name]
+            precision = np.diag(
+                [forward.priors.free[i].scale ** -2.0 for i in range(part.start, part.stop)]
+            )
+            for i, basis in enumerate(shapes[:, o.rows] / sigma):
+                found = np.linalg.solve(basis.T @ basis + precision, basis.T @ residual)
+                starts[i, part] = found
+                left[i] += np.square(residual - basis @ found).sum() + found @ precision @ found
+        best: Array = starts[int(np.argmin(left))]
+        return best
+
+    def _spread(self, forward: Forward, start: Array, size: int, which: Sequence[int]) -> Array:
+        """Guesses that differ in the parameters of some of the effects, by their priors."""
+        hypothesis = forward.hypothesis
+        rng = generator(self.seed, "gap", hypothesis.name, *which)
+        starts = np.repeat(start[None], size, axis=0)
+        for i in which:
+            effect, priors = hypothesis.effects[i], hypothesis.effect_priors[i]
+            drawn = priors.sample(rng, size)
+            if type(effect).begun is not Effect.begun:
+                natural = effect.begun(
+                    priors.to_natural(drawn), self._left(forward, start), self.data.view
+                )
+                drawn = priors.to_internal(natural)
+            starts[:, forward.phi_slices[i]] = drawn
+        return starts
+
+    def _left(self, forward: Forward, start: Array) -> dict[str, Array]:
+        """What a guess leaves of the field's readings, by the role of the output."""
+        predicted = forward.field(start[None], self.data.view)
+        left = {}
+        for o in self.data.outputs:
+            left[o.role] = np.full(predicted[o.name].shape[1], np.nan)
+            left[o.role][o.rows] = o.field - predicted[o.name][0, o.rows]
+        return left
+
+
+def _led(forward: Forward, start: Array, member: Fit) -> Array:
+    """Return a start, moved to where a fit of some parts of a hypothesis has led."""
+    theirs, ours = _places(member.forward, forward)
+    led = start.copy()
+    led[ours] = member.psi[theirs]
+    return led
+
+
+def _places(old: Forward, new: Forward) -> tuple[Array, Array]:
+    """Places of the parameters that two hypotheses share, in the psi of each."""
+    pairs = [(slice(0, old.n_shared), slice(0, new.n_shared))]
+    place = {e.name: i for i, e in enumerate(new.hypothesis.effects)}
+    for i, e in enumerate(old.hypothesis.effects):
+        if e.name in place:
+            j = place[e.name]
+            pairs.append((old.phi_slices[i], new.phi_slices[j]))
+            pairs += [(old.form_slices[o][i], new.form_slices[o][j]) for o in old.form_slices]
+    if old.shift is not None and new.shift is not None:
+        pairs.append((old.shift_slice, new.shift_slice))
+    theirs, ours = (
+        np.concatenate([np.arange(pair[k].start, pair[k].stop) for pair in pairs]) for k in (0, 1)
+    )
+    return theirs, ours
