@@ -26,7 +26,7 @@ from calib.gap.shifts import ShiftMap, shift_map
 from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
 
-__all__ = ["Forward"]
+__all__ = ["FORM_ERROR", "Forward"]
 
 # Relative size by which a formula may misrepresent its effect along one direction: the effect's
 # size, its tilt and bend over slip, its tilt over other conditions. Estimated from the true

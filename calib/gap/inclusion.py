@@ -19,6 +19,7 @@ import numpy as np
 
 from calib.gap.case import Campaigns
 from calib.gap.fit import Fit
+from calib.gap.forward import FORM_ERROR
 from calib.gap.mixture import Mixture
 from calib.gap.noise import noise_conditions
 from calib.gap.where import Region, regions, row_gaps
@@ -30,6 +31,9 @@ __all__ = ["UNLISTED", "Included", "Inclusion", "inclusion", "inclusion_probabil
 
 UNLISTED = "unknown"
 _N_DRAWS = 800
+# What a cause alone is said to do is wrong by so much (relative): what fits the sum of several as
+# well may go to another of them. It changes no share of a cause that acts alone.
+_SIZE_ERROR = FORM_ERROR["size"]
 # Below this the remainder's place is nowhere.
 _SOMEWHERE = 0.1
 
@@ -116,6 +120,7 @@ def _shares(mixed: Mixture, names: list[str]) -> tuple[Array, Array]:
         size = max(60, int(_N_DRAWS * probability))
         rng = generator(mixed.seed, "gap", "shares", fit.forward.hypothesis.name, i)
         rms = _sizes(mixed.data, fit, fit.draws(rng, size))
+        rms *= np.exp(_SIZE_ERROR * rng.standard_normal(rms.shape))
         rms = rms[np.isfinite(rms).all(axis=1) & (rms.sum(axis=1) > 0.0)]
         part = np.zeros((rms.shape[0], len(names)))
         part[:, [names.index(c) for c in causes]] = rms / rms.sum(axis=1, keepdims=True)
