@@ -104,7 +104,7 @@ def test_a_pair_does_what_both_do(data):
 
 def test_form_error_scales_the_effect_and_nothing_else(data):
     forward = Forward(data, single(data, "lug_thrust"), SIGMA)
-    part = forward.form_slices["drawbar_pull"]
+    (part,) = forward.form_slices["drawbar_pull"]
     assert part.stop > part.start
     psi = centre(forward)
     psi[:, part] = 0.5
@@ -147,15 +147,36 @@ def test_every_single_effect_has_a_prior_for_each_parameter(data):
 )
 def test_a_formula_is_trusted_less_along_some_directions(data, effect, sds):
     forward = Forward(data, single(data, effect), SIGMA)
-    for o in data.names:
-        found = [p.scale for p in forward.priors.free[forward.form_slices[o]]]
-        assert found == pytest.approx(sds)
+    for o in data.outputs:
+        (part,) = forward.form_slices[o.name]
+        found = [p.scale for p in forward.priors.free[part]]
+        # Where an effect does nothing there is nothing to depart from.
+        assert found == pytest.approx(sds if o.role in EFFECTS[effect].outputs else [])
 
 
-def test_two_effects_that_depart_over_pressure_do_so_together(data):
-    both = pair(single(data, "pressure_gauge_bias"), single(data, "slip_zero_shift"))
+def test_each_of_two_effects_departs_from_its_own_formula(data):
+    both = pair(single(data, "lug_thrust"), single(data, "sensor_drift"))
     forward = Forward(data, both, SIGMA)
-    assert [p.scale for p in forward.priors.free[forward.form_slices["drawbar_pull"]]] == [0.13]
+    lugs, drift = forward.form_slices["drawbar_pull"]
+    assert [p.scale for p in forward.priors.free[lugs]] == pytest.approx([0.15, 0.1, 0.13])
+    psi = centre(forward)
+    for part, effect in zip(forward.phi_slices, both.effects, strict=True):
+        psi[:, part.start] = 0.1 if effect.name == "lug_thrust" else 0.2
+    straight = forward.field(psi, data.view)["drawbar_pull"]
+    without = {c: forward.without(psi, data.view, c)["drawbar_pull"] for c in forward.causes}
+    departed = psi.copy()
+    departed[:, lugs.start] = 0.5
+    found = forward.field(departed, data.view)["drawbar_pull"]
+    slip = forward.covariates.over(data.view, "slip")
+    of_lugs = (straight - without["lug_thrust"]) * 0.5 * slip
+    np.testing.assert_allclose(found - straight, of_lugs, atol=1e-12)
+    # What it does beside the other is what goes with it, whatever the other's formula.
+    assert np.abs(straight - without["sensor_drift"]).max() > 0.01
+    np.testing.assert_allclose(
+        found - forward.without(departed, data.view, "sensor_drift")["drawbar_pull"],
+        straight - without["sensor_drift"], atol=1e-12,
+    )  # fmt: skip
+    assert drift.stop - drift.start == (0 if not EFFECTS["sensor_drift"].form else 1)
 
 
 def test_an_effect_acts_on_the_outputs_it_names_alone(data):

@@ -40,8 +40,6 @@ def test_each_of_a_pair_has_its_own_size():
     offset, drift = fit.forward.phi_slices
     psi[:, drift.start] = 0.0
     psi[:, offset] = 0.2
-    for part in fit.forward.form_slices.values():
-        psi[:, part] = 0.0
     size = sizes(fit.forward, fit.noise, psi)
     assert size.shape == (1, 2)
     # One column for each effect left out: without the drift nothing changes.

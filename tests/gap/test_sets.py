@@ -1,0 +1,96 @@
+"""Sets of causes: what is shared is kept, what promises most comes first, small parts are found."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.data import table_from_arrays
+from calib.data.quantities import OUTPUTS, physical_role
+from calib.gap.case import Case, campaigns
+from calib.gap.context import Context
+from calib.gap.effects import EFFECTS
+from calib.gap.guesses import Guesses, _led
+from calib.gap.hypotheses import joined, singles
+from calib.gap.inclusion import inclusion_probability
+from calib.gap.odds import Odds
+from calib.gap.sets import _enlarged, _exchanged
+from calib.gap.which import calibrate_lab, rank
+from tests.gap.cases import CHOICE, LARGE, make_case, parameters
+
+CAUSES = ("rate_effect", "rut_rebound", "sensor_drift")
+
+
+def mixed_case() -> Case:
+    """Return a campaign in which three effects act, one on both outputs."""
+    case = make_case("rate_effect")
+    view = campaigns(case).view
+    columns = dict(case.field.columns)
+    for name in ("rut_rebound", "sensor_drift"):
+        for output in case.models:
+            if physical_role(output) in EFFECTS[name].outputs:
+                column = OUTPUTS[output]
+                phi = parameters(name, LARGE[name])
+                log = output == "rut_depth"
+                reading = np.log(columns[column]) if log else columns[column]
+                read = EFFECTS[name].on_output(phi, physical_role(output), reading[None], view)[0]
+                columns[column] = np.exp(read) if log else read
+    return replace(case, name="mixed", field=table_from_arrays(columns))
+
+
+@pytest.fixture(scope="module")
+def guesses() -> Guesses:
+    data = campaigns(mixed_case())
+    mode, noise = calibrate_lab(data, 1)
+    return Guesses(data, mode, noise, 1, Odds.of(len(CHOICE), Context()))
+
+
+@pytest.fixture(scope="module")
+def alone(guesses):
+    return {h.name: h for h in singles(guesses.data, CHOICE)}
+
+
+def fitted(guesses, *causes):
+    (found,) = guesses.fit([joined(*causes)]).values()
+    return found[0]
+
+
+def test_what_two_sets_share_begins_where_it_was_led(guesses, alone):
+    pair = fitted(guesses, alone["rate_effect"], alone["sensor_drift"])
+    (promise,) = guesses.beside(pair.forward.hypothesis, pair, [alone["force_offset"]])
+    assert promise.hypothesis.name == "force_offset+rate_effect+sensor_drift"
+    problem, candidates = next(guesses.truncated_promise(promise))
+    forward = problem.forward
+    # With the new effect at rest and the others where they were, it predicts what the pair did.
+    led = _led(forward, candidates[0], pair)
+    led[forward.phi_slices[0]] = 0.0
+    was = pair.forward.field(pair.psi[None], guesses.data.view)
+    now = forward.field(led[None], guesses.data.view)
+    for name in guesses.data.names:
+        np.testing.assert_allclose(now[name], was[name], rtol=1e-9)
+
+
+def test_of_one_effect_more_that_which_acts_promises_most(guesses, alone):
+    pair = fitted(guesses, alone["rate_effect"], alone["sensor_drift"])
+    promises = _enlarged(guesses, [pair], list(alone.values()))
+    assert len(promises) == len(alone) - 2
+    best = max(promises, key=lambda p: p.log_joint)
+    assert best.hypothesis.name == "+".join(CAUSES)
+
+
+def test_an_effect_that_does_not_act_is_exchanged_for_one_that_does(guesses, alone):
+    wrong = fitted(guesses, alone["rate_effect"], alone["lug_thrust"])
+    promises = _exchanged(guesses, [wrong], list(alone.values()))
+    names = [p.hypothesis.name for p in sorted(promises, key=lambda p: -p.log_joint)]
+    assert set(names[0].split("+")) <= set(CAUSES)
+    assert "lug_thrust+rate_effect" not in names
+
+
+def test_three_causes_are_found_whatever_comes_first_alone():
+    ranking = rank(campaigns(mixed_case()), 1, effects=CHOICE)
+    found = inclusion_probability(ranking.probability)
+    assert [name for name in sorted(found) if found[name] >= 0.5] == list(CAUSES)
+    # A set once, whatever it was made of: a second fit would count its evidence twice.
+    assert len(ranking.fits["+".join(CAUSES)]) == 1
