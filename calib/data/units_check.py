@@ -17,6 +17,8 @@ type Array = NDArray[np.float64]
 # A psi is so many kPa; levels of a design that are so far apart to this part are no coincidence.
 _PSI, _NEAR, _FEW_LEVELS = 6.894757, 2e-3, 6
 _MOST_NAMED = 5
+# A column is too large if all but the largest tenth of it is.
+_MOST = 0.9
 # A column that may be left out is asked after when its name is so like a known one.
 _ALIKE = 0.8
 # The pull of a wheel is a part of its load: small forces that agree on that are of a small wheel.
@@ -38,11 +40,8 @@ def column_notes(table: Table) -> Iterator[str]:
     ----------
     table : Table
     """
-    sizes = {
-        name: float(np.nanmax(np.abs(table[name])))
-        for name in table
-        if name in QUANTITIES and np.isfinite(table[name]).any()
-    }
+    known = [n for n in table if n in QUANTITIES and np.isfinite(table[n]).any()]
+    sizes = {name: float(np.nanmax(np.abs(table[name]))) for name in known}
     low, high = _PULL_OVER_LOAD
     fits = _LOAD in sizes and low * sizes[_LOAD] < sizes.get(_PULL, 0.0) < high * sizes[_LOAD]
     for name, size in sizes.items():
@@ -54,6 +53,9 @@ def column_notes(table: Table) -> Iterator[str]:
             continue
         factor = 1e-3 if size > high else 1e3
         if low <= size <= high or not low <= factor * size <= high:
+            continue
+        # One row that is far too large is that row's fault, not the column's.
+        if size > high and float(np.nanquantile(np.abs(table[name]), _MOST)) < high:
             continue
         yield (
             f"{source_of(table)}, {name}: the largest {quantity.word} is {size:g} "

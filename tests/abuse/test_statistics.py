@@ -142,6 +142,15 @@ def test_forces_of_which_one_is_in_another_unit(
         )
 
 
+def test_one_row_that_is_far_too_large_is_not_the_columns_unit() -> None:
+    pull = np.linspace(0.5, 1.5, 20)
+    pull[7] *= 1e3
+    columns = {"slip_ratio": np.linspace(0.05, 0.6, 20), "drawbar_pull_kn": pull}
+    assert not list(column_notes(table_from_arrays(columns, source="pull.csv")))
+    columns["drawbar_pull_kn"] = 1e3 * np.linspace(0.5, 1.5, 20)
+    assert len(list(column_notes(table_from_arrays(columns, source="pull.csv")))) == 1
+
+
 def test_duplicated_rows(clean: Calibration) -> None:
     twice = Rows.made().take(np.tile(np.arange(N), 2))
     found = twice.calibrated()
