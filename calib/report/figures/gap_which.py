@@ -53,11 +53,13 @@ def which_plate(found: Diagnosis) -> Plate:
     names = order[:_MOST]
     names += [n for n in _SPECIAL if n in p and n not in names]
     tied = in_play(found)
-    fig, axes = panels(
-        1, 1, height=5.2 * len(names) + 3.0, left=66.0, right=16.0, top=3.0, bottom=10.0
-    )
+    # As wide as the margin: longer names, of several causes at once, take two lines or three.
+    labels = [textwrap.fill(short_name(n), 38) for n in names]
+    rows = np.maximum(1.0, [0.66 * (1 + label.count("\n")) for label in labels])
+    total = float(rows.sum())
+    fig, axes = panels(1, 1, height=5.2 * total + 3.0, left=66.0, right=16.0, top=3.0, bottom=10.0)
     ax = axes[0, 0]
-    y = np.arange(len(names))[::-1]
+    y = total - np.cumsum(rows) + 0.5 * rows
     for yi, name in zip(y, names, strict=True):
         leading = name in tied
         colour = (BLUE if name == order[0] else SKY) if leading else "#c9c9c9"
@@ -69,9 +71,8 @@ def which_plate(found: Diagnosis) -> Plate:
             p[name] + 0.01, yi, probability_text(p[name]), va="center", fontsize=7.0,
             fontweight="bold" if leading else "normal",
         )  # fmt: skip
-    # As wide as the margin: longer names, of several causes at once, take two lines.
-    ax.set_yticks(y, [textwrap.fill(short_name(n), 38) for n in names], linespacing=0.95)
-    ax.set_ylim(-0.6, len(names) - 0.4)
+    ax.set_yticks(y, labels, linespacing=0.95)
+    ax.set_ylim(-0.1, total + 0.1)
     ax.set_xlim(0.0, 1.0)
     ax.axvline(0.5, color=GREY, lw=0.7, ls=(0, (4, 2)), zorder=0)
     ax.tick_params(axis="y", length=0.0)

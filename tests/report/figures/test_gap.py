@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -150,6 +151,17 @@ def test_the_longest_names_stay_on_the_paper(found):
     label = figure.axes[0].get_yticklabels()[0]
     assert label.get_text().replace("\n", " ") == short_name(longest)
     assert label.get_window_extent().x0 >= 0.0
+
+
+def test_names_of_several_causes_have_the_room_of_their_lines(found):
+    names = ["+".join(sorted(EFFECTS)[i : i + 4]) for i in range(5)]
+    even = {**dict.fromkeys(names, 0.19), "none": 0.05}
+    many = replace(found, ranking=replace(found.ranking, probability=even))
+    figure = which_plate(many).figure
+    figure.draw_without_rendering()
+    boxes = [label.get_window_extent() for label in figure.axes[0].get_yticklabels()]
+    assert all(label.get_text() for label in figure.axes[0].get_yticklabels())
+    assert all(above.y0 >= below.y1 for above, below in pairwise(boxes))
 
 
 def test_a_tie_is_said_and_hatched(found):
