@@ -300,12 +300,7 @@ def build_problem(
     try:
         bound = model.bind(table.columns)
     except CalibError as error:
-        raise CalibError(
-            error.message,
-            where=", ".join(filter(None, (table.source, error.where))),
-            allowed=error.allowed,
-            mend=error.mend,
-        ) from None
+        raise error.within(table.source) from None
     notes = tuple(
         f"the data have no column {name}, so priors that are relative to it assume {value:g}; give "
         "it if yours differs"
