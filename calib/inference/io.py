@@ -44,6 +44,9 @@ _HASHED = ("posterior.nc", "priors.toml", "data.csv")
 _EMULATOR = "emulator.npz"
 N_PRIOR = 2000
 MAX_CELLS = 8_000_000
+_GATE = ("rhat", "ess_bulk", "ess_tail", "tau")
+# Of the draws, as they are.
+_DRAWS = ("log_evidence", "efficiency", "acceptance", "evaluations")
 
 
 def to_datatree(calibration: Calibration) -> xr.DataTree:
@@ -131,10 +134,7 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         "label": calibration.label,
         "shape": list(calibration.draws.t.shape),
         "mode": calibration.draws.mode.tolist(),
-        "log_evidence": calibration.draws.log_evidence,
-        "efficiency": calibration.draws.efficiency,
-        "acceptance": calibration.draws.acceptance,
-        "evaluations": calibration.draws.evaluations,
+        **{k: getattr(calibration.draws, k) for k in _DRAWS},
         "walkers": calibration.draws.walkers,
         "settings": asdict(calibration.settings),
         "estimates": describe_estimates(calibration.estimates),
@@ -145,7 +145,7 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
             "reasons": list(report.reasons),
             "steps": report.steps,
             "names": list(report.names),
-            **{k: getattr(report, k).tolist() for k in ("rhat", "ess_bulk", "ess_tail", "tau")},
+            **{k: getattr(report, k).tolist() for k in _GATE},
         },
     }
 
@@ -153,13 +153,8 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
 def describe_estimates(estimates: Sequence[PointEstimate]) -> list[dict[str, Any]]:
     """Return what a run folder keeps of the estimates that seeded the sampler."""
     return [
-        {
-            "method": e.method,
-            "theta": e.theta.tolist(),
-            "reported": e.reported,
-            "cost": e.cost,
-            "rmse": e.rmse,
-        }
+        {"method": e.method, "theta": e.theta.tolist()}
+        | {k: getattr(e, k) for k in ("reported", "cost", "rmse")}
         for e in estimates
     ]
 
@@ -306,12 +301,10 @@ def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple
 
 def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:
     gate = meta["gate"]
-    figures = {k: np.array(gate[k]) for k in ("rhat", "ess_bulk", "ess_tail", "tau")}
     report = GateReport(
         names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
-        reasons=tuple(gate["reasons"]), **figures,
+        reasons=tuple(gate["reasons"]), **{k: np.array(gate[k]) for k in _GATE},
     )  # fmt: skip
-    known = ("log_evidence", "efficiency", "acceptance", "evaluations", "seconds")
     return Draws(
         t=t,
         log_prob=log_prob,
@@ -319,7 +312,7 @@ def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:
         mode=np.array(meta["mode"]),
         # Earlier run folders had all walkers stored.
         walkers=meta["walkers"] if "walkers" in meta else t.shape[1],
-        **{k: meta[k] for k in known},
+        **{k: meta[k] for k in (*_DRAWS, "seconds")},
     )
 
 
