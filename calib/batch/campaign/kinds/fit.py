@@ -15,8 +15,7 @@ from pydantic import Field
 from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
 from calib.batch.campaign.place import Place, word
 from calib.batch.folders import read_folder
-from calib.data import Table, read_for_model
-from calib.data.labels import labelled
+from calib.data import Table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
@@ -26,7 +25,7 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
-from calib.report.study_tasks import HoldOut
+from calib.report.study_tasks import HoldOut, read_and_split
 from calib.validation.assumptions import warnings_of
 from calib.validation.validate import validate_held_out
 
@@ -85,9 +84,8 @@ class Fit(Kind[FitSection, FitItem]):
     def load(self, task: Task) -> FitItem:
         """Read the file and bind the model to it."""
         model = get_model(task.settings["model"])
-        table = labelled(read_for_model(task.inputs["data"], (*model.conditions, model.output)))
         kept = _held(task.settings["hold_out"])
-        fitted, held = kept.split(table) if kept else (table, None)
+        fitted, held = read_and_split(task.inputs["data"], (*model.conditions, model.output), kept)
         problem = build_problem(model.name, fitted, task.inputs.get("priors"))
         settings = SamplerSettings(max_steps=task.settings["max_steps"])
         return problem, held, settings, task.settings["posteriors"]
