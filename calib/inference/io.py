@@ -8,7 +8,6 @@ emulated, `emulator.npz`.
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import os
 import shutil
@@ -22,7 +21,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from calib.batch.environment import Environment
+from calib.batch.environment import Environment, sha256
 from calib.data import read_for_model, write_table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
@@ -199,7 +198,7 @@ def save_calibration(
     if emulator is not None:
         save_emulator(emulator, problem.bound.model.name, folder / _EMULATOR)
         hashed.append(_EMULATOR)
-    hashes = {name: _sha256(folder / name) for name in hashed}
+    hashes = {name: sha256((folder / name).read_bytes()) for name in hashed}
     described = {
         **_describe(calibration),
         "seconds": calibration.draws.seconds,
@@ -209,16 +208,11 @@ def save_calibration(
     (folder / "run.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _check_hashes(meta: dict[str, Any], folder: Path) -> None:
     """A run is predicted from only as it was written."""
     for name, expected in meta.get("sha256", {}).items():
         with _damage(folder / name):
-            found = _sha256(folder / name)
+            found = sha256((folder / name).read_bytes())
         if found != expected:
             raise CalibError(
                 "the file has changed since the run was written",

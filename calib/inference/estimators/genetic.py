@@ -267,7 +267,7 @@ def estimate_genetic(
     box : mapping of str to (lower, upper), optional
         As for `calib.inference.estimators.search.search_space`.
     restarts : int
-        Further runs from fresh populations, the best of all being returned. Not in the source: a
+        Further runs from new populations, the best of all being returned. Not in the source: a
         population that has converged on a local optimum never leaves it, however long it runs.
     polish : bool
         Whether least squares from the result follows. Not in the source.
