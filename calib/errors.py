@@ -40,6 +40,11 @@ class CalibError(Exception):
             lines.append(f"  to mend: {self.mend}")
         return "\n".join(lines)
 
+    def within(self, *places: str | None) -> CalibError:
+        """Return the error with what it was found in named before where it was found."""
+        where = ", ".join(filter(None, (*places, self.where)))
+        return CalibError(self.message, where=where, allowed=self.allowed, mend=self.mend)
+
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword-only arguments do not survive the default pickling between worker processes.
         return (_rebuild, (self.message, self.where, self.allowed, self.mend))

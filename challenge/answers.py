@@ -35,7 +35,7 @@ class ShrinkAnswer:
     output : str
         Name of the output.
     actual : float
-        1 - rmse(after) / rmse(before) against the truth on the fresh conditions; 0 without
+        1 - rmse(after) / rmse(before) against the truth on the test conditions; 0 without
         a readable prediction.
     interval : tuple of float, optional
         The stated 90 % interval; None where none was given.

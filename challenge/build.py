@@ -46,7 +46,7 @@ class DrawnCase:
         Design, conditions and readings without mechanisms.
     truth, mechanism : str
         The name of the contract and one sentence.
-    field_truth, fresh_truth : dict
+    field_truth, test_truth : dict
         Noise-free readings as the field really was.
     gap_over_noise : float
         Rms of the gap in noise sd.
@@ -60,7 +60,7 @@ class DrawnCase:
     truth: str
     mechanism: str
     field_truth: Readings
-    fresh_truth: Readings
+    test_truth: Readings
     gap_over_noise: float
     told: Identifiability
     contributions: dict[str, float]
@@ -198,14 +198,14 @@ def _reality(
     return None if reality is None else (reality, reality.mechanisms[0].sentence)
 
 
-def _recalibration_closes(scenario: Scenario, field: Readings, fresh: Readings) -> bool:
-    """Whether the same models with other parameters describe field and fresh."""
+def _recalibration_closes(scenario: Scenario, field: Readings, test: Readings) -> bool:
+    """Whether the same models with other parameters describe field and test."""
     noise = scenario.design.noise
-    fresh_sd = {name: noise.sd(name, value, scenario.fresh.slip) for name, value in fresh.items()}
+    test_sd = {name: noise.sd(name, value, scenario.test.slip) for name, value in test.items()}
     refit = recalibrate(scenario.simulator, scenario.field, field, scenario.field_sd)
     return (
         misfit(refit, scenario.field, field, scenario.field_sd) < LACK_OF_FIT
-        and misfit(refit, scenario.fresh, fresh, fresh_sd) < 2.0 * LACK_OF_FIT
+        and misfit(refit, scenario.test, test, test_sd) < 2.0 * LACK_OF_FIT
     )
 
 
@@ -279,11 +279,11 @@ def try_case(
     if scenario is None or made is None:
         return None
     reality, sentence = made
-    field, fresh = scenario.in_field(reality), scenario.on_fresh(reality)
+    field, test = scenario.in_field(reality), scenario.on_test(reality)
     gap = scenario.gap(field)
-    if not all(np.isfinite(part).all() for part in (*field.values(), *fresh.values())):
+    if not all(np.isfinite(part).all() for part in (*field.values(), *test.values())):
         return None
-    if truth == SHIFT and not _recalibration_closes(scenario, field, fresh):
+    if truth == SHIFT and not _recalibration_closes(scenario, field, test):
         return None
     told = _telling(rng, scenario, gap, truth, kinds)
     if told is None:
@@ -291,4 +291,4 @@ def try_case(
     named = [kind.name for kind in kinds] if truth != UNKNOWN else []
     each = _beside(scenario, reality) if named else []
     contributions = dict(zip(named, each, strict=True))
-    return DrawnCase(scenario, truth, sentence, field, fresh, rms(gap), told, contributions)
+    return DrawnCase(scenario, truth, sentence, field, test, rms(gap), told, contributions)

@@ -1,4 +1,4 @@
-"""The conditions of lab, field and fresh runs that a design calls for."""
+"""The conditions of lab, field and test runs that a design calls for."""
 
 from __future__ import annotations
 

@@ -105,7 +105,7 @@ class Design:
         Levels in the lab.
     lab_rows : int
         Rows in the lab, of which a wheel's campaign runs every level.
-    field_rows, fresh_rows : int
+    field_rows, test_rows : int
         Rows of the field and of the conditions to predict.
     columns : tuple of str
         Names of `Conditions` that are recorded.
@@ -133,7 +133,7 @@ class Design:
     lab_slips: tuple[float, ...]
     lab_rows: int
     field_rows: int
-    fresh_rows: int
+    test_rows: int
     columns: tuple[str, ...]
     varying: tuple[str, ...]
     ground_pressure: bool
@@ -271,7 +271,7 @@ def draw_design(rng: np.random.Generator, tier: Tier, needs: Needs) -> Design:
         lab_slips=slips,
         lab_rows=len(pressures) * len(slips) if wheel else int(rng.integers(24, 46)),
         field_rows=field_rows,
-        fresh_rows=36,
+        test_rows=36,
         columns=columns,
         varying=varying,
         ground_pressure=wheel and (RUT in outputs or rng.random() < 0.7),

@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 from calib.errors import CalibError
-from challenge import (
-    effects_ground,
-    effects_instruments,
-    unlisted_ground,
-    unlisted_instruments,
-    unlisted_wheel,
-)
+from challenge import effects_ground, effects_instruments, unlisted
 from challenge.design import Needs
 from challenge.mechanism import DENSITY, EffectKind
 
 LISTED: dict[str, EffectKind] = {
     kind.name: kind for kind in (*effects_instruments.KINDS, *effects_ground.KINDS)
 }
-UNLISTED: tuple[EffectKind, ...] = (
-    *unlisted_ground.KINDS,
-    *unlisted_wheel.KINDS,
-    *unlisted_instruments.KINDS,
-)
+UNLISTED: tuple[EffectKind, ...] = unlisted.KINDS
 
 # A recalibrated model absorbs these (nearly) whole: a gauge's gain is another pressure
 # dependence, a probe's gain another constant. Only their simplicity tells them apart.

@@ -136,8 +136,8 @@ def case_files(rng: np.random.Generator, case: DrawnCase) -> CaseFiles:
         "noise_sd": _plain(scenario.field_sd),
         "field_truth": _plain(case.field_truth),
         "field_without": _plain(scenario.field_without),
-        "fresh_truth": _plain(case.fresh_truth),
-        "fresh_without": _plain(scenario.fresh_without),
+        "fresh_truth": _plain(case.test_truth),
+        "fresh_without": _plain(scenario.test_without),
         # The name that keys had before scenarios were called so: the same seed, the same key.
         "stage": scenario_record(scenario),
     }
@@ -145,6 +145,6 @@ def case_files(rng: np.random.Generator, case: DrawnCase) -> CaseFiles:
         "case.toml": _case_toml(design),
         "lab.csv": _table(lab),
         "field.csv": _table(field),
-        "fresh.csv": _table(_condition_columns(design, scenario.fresh)),
+        "fresh.csv": _table(_condition_columns(design, scenario.test)),
     }
     return CaseFiles(files, key)

@@ -87,9 +87,9 @@ def simulate(reality: Reality, recorded: Conditions, zero: Array | None = None) 
     """
     true, soil, cone = recorded, reality.soil, reality.cone
     for mechanism in reality.mechanisms:
-        true = mechanism.conditions(true)
+        true = mechanism.true_conditions(true)
     for mechanism in reality.mechanisms:
-        soil = mechanism.soil(soil, true)
+        soil = mechanism.changed_soil(soil, true)
     if zero is None:
         zero = self_propelled_slip(reality.rolling or reality, recorded.inflation_kpa)
     contact, pull = _forces(reality, soil, true, zero)
@@ -99,7 +99,7 @@ def simulate(reality: Reality, recorded: Conditions, zero: Array | None = None) 
         "bulk_density": cone.density(true.cone_index_kpa, true.water_content),
     }
     for mechanism in reality.mechanisms:
-        readings = mechanism.readings(readings, recorded, contact)
+        readings = mechanism.shown(readings, recorded, contact)
     return readings
 
 

@@ -60,78 +60,97 @@ class Conditions:
 CONDITION_NAMES = tuple(field.name for field in fields(Conditions))
 
 
-def _same_conditions(conditions: Conditions) -> Conditions:
-    return conditions
-
-
-def _same_soil(soil: Soil, conditions: Conditions) -> Soil:
-    del conditions
-    return soil
-
-
-def _no_force(contact: Contact, conditions: Conditions) -> Array:
-    del conditions
-    return np.zeros_like(contact.slip)
-
-
-def _same_readings(readings: Readings, conditions: Conditions, contact: Contact) -> Readings:
-    del conditions, contact
-    return readings
-
-
-@dataclass(frozen=True)
-class Mechanism:
-    """One physical cause at one strength.
-
-    Attributes
-    ----------
-    effect : str
-        Name of the effect in the contract.
-    sentence : str
-        What happens, for the key.
-    conditions : callable
-        Recorded conditions to true ones.
-    soil : callable
-        Soil at the true conditions.
-    force : callable
-        Extra longitudinal force on the wheel in kN, positive forward, shape ``(N,)``.
-    load_transfer : float
-        Change of the normal load per drawbar pull.
-    readings : callable
-        Readings to what the instruments show.
-    """
-
-    effect: str
-    sentence: str
-    conditions: Callable[[Conditions], Conditions] = _same_conditions
-    soil: Callable[[Soil, Conditions], Soil] = _same_soil
-    force: Callable[[Contact, Conditions], Array] = _no_force
-    load_transfer: float = 0.0
-    readings: Callable[[Readings, Conditions, Contact], Readings] = _same_readings
-
-
 @dataclass(frozen=True)
 class Family:
-    """A mechanism with its strength left open, one physical variant of an effect.
+    """One physical variant of an effect, its strength left open.
+
+    What it does takes the strength first.
 
     Attributes
     ----------
-    effect, variant : str
-        The effect's name in the contract and which of its physical forms this is.
-    at : callable
-        Mechanism at a strength.
+    variant : str
+        Which of the effect's physical forms this is.
+    sentence : callable
+        What happens at a strength, for the key.
     low, high : float
         Smallest and largest strength in size that are physically sensible.
     signs : tuple of float
         Directions that occur.
+    conditions : callable, optional
+        Recorded conditions to true ones.
+    soil : callable, optional
+        Soil at the true conditions.
+    force : callable, optional
+        Extra longitudinal force on the wheel in kN, positive forward, shape ``(N,)``.
+    readings : callable, optional
+        Readings to what the instruments show, of those that are not as they were.
+    load_transfer : float
+        Change of the normal load per drawbar pull, over the strength.
     """
 
-    effect: str
     variant: str
-    at: Callable[[float], Mechanism]
+    sentence: Callable[[float], str]
     low: float
     high: float
     signs: tuple[float, ...] = (1.0,)
+    conditions: Callable[[float, Conditions], Conditions] | None = None
+    soil: Callable[[float, Soil, Conditions], Soil] | None = None
+    force: Callable[[float, Contact, Conditions], Array] | None = None
+    readings: Callable[[float, Readings, Conditions, Contact], Readings] | None = None
+    load_transfer: float = 0.0
+
+    def at(self, strength: float) -> Mechanism:
+        """Return the mechanism at a strength."""
+        return Mechanism(self, strength)
+
+
+@dataclass(frozen=True)
+class Mechanism:
+    """One physical cause at one strength."""
+
+    family: Family
+    strength: float
+
+    @property
+    def sentence(self) -> str:
+        """What happens, for the key."""
+        return self.family.sentence(self.strength)
+
+    @property
+    def load_transfer(self) -> float:
+        """Change of the normal load per drawbar pull."""
+        return self.family.load_transfer * self.strength
+
+    def true_conditions(self, recorded: Conditions) -> Conditions:
+        """Return the true conditions behind recorded ones."""
+        act = self.family.conditions
+        return recorded if act is None else act(self.strength, recorded)
+
+    def changed_soil(self, soil: Soil, true: Conditions) -> Soil:
+        """Return the soil as it is at the true conditions."""
+        act = self.family.soil
+        return soil if act is None else act(self.strength, soil, true)
+
+    def force(self, contact: Contact, true: Conditions) -> Array | float:
+        """Return the extra longitudinal force in kN, positive forward, shape ``(N,)``."""
+        act = self.family.force
+        return 0.0 if act is None else act(self.strength, contact, true)
+
+    def shown(self, readings: Readings, recorded: Conditions, contact: Contact) -> Readings:
+        """Return what the instruments show."""
+        act = self.family.readings
+        changed = {} if act is None else act(self.strength, readings, recorded, contact)
+        return readings | changed
+
+
+def bump(x: Array, centre: float, width: float) -> Array:
+    """Return a normal curve of height one, any shape."""
+    return np.asarray(np.exp(-0.5 * ((x - centre) / width) ** 2))
+
+
+def step(x: Array, centre: float, width: float) -> Array:
+    """Return a logistic curve from zero to one, any shape."""
+    return np.asarray(1.0 / (1.0 + np.exp(-(x - centre) / width)))
 
 
 @dataclass(frozen=True)

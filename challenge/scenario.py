@@ -34,11 +34,11 @@ class Scenario:
         The design.
     reality : Reality
         The lab's.
-    lab, field, fresh : Conditions
+    lab, field, test : Conditions
         Recorded conditions.
-    field_zero, fresh_zero : array
+    field_zero, test_zero : array
         Slip of the self-propelled point at the conditions, ``(N,)``.
-    lab_readings, field_without, fresh_without : dict
+    lab_readings, field_without, test_without : dict
         Noise-free readings without any mechanism.
     lab_sd, field_sd : dict
         Noise sd per output, ``(N,)``.
@@ -50,12 +50,12 @@ class Scenario:
     reality: Reality
     lab: Conditions
     field: Conditions
-    fresh: Conditions
+    test: Conditions
     field_zero: Array
-    fresh_zero: Array
+    test_zero: Array
     lab_readings: Readings
     field_without: Readings
-    fresh_without: Readings
+    test_without: Readings
     lab_sd: Readings
     field_sd: Readings
     simulator: Simulator
@@ -65,9 +65,9 @@ class Scenario:
         got = simulate(reality, self.field, self.field_zero)
         return {name: got[name] for name in self.design.outputs}
 
-    def on_fresh(self, reality: Reality) -> Readings:
-        """Return noise-free readings of a reality on the fresh conditions."""
-        got = simulate(reality, self.fresh, self.fresh_zero)
+    def on_test(self, reality: Reality) -> Readings:
+        """Return noise-free readings of a reality on the test conditions."""
+        got = simulate(reality, self.test, self.test_zero)
         return {name: got[name] for name in self.design.outputs}
 
     def gap(self, readings: Readings, without: Readings | None = None) -> Array:
@@ -137,10 +137,10 @@ def _try_scenario(
     if lab is None or simulator is None:
         return None
     later = [_measured(reality, design, parts[i], zeros[i]) for i in (1, 2)]
-    field, fresh = later
-    if field is None or fresh is None:
+    field, test = later
+    if field is None or test is None:
         return None
-    worst = max(misfit(simulator, parts[1], *field), misfit(simulator, parts[2], *fresh))
+    worst = max(misfit(simulator, parts[1], *field), misfit(simulator, parts[2], *test))
     if not worst < LACK_OF_FIT:
         return None
     return Scenario(
@@ -148,12 +148,12 @@ def _try_scenario(
         reality=reality,
         lab=parts[0],
         field=parts[1],
-        fresh=parts[2],
+        test=parts[2],
         field_zero=zeros[1],
-        fresh_zero=zeros[2],
+        test_zero=zeros[2],
         lab_readings=lab[0],
         field_without=field[0],
-        fresh_without=fresh[0],
+        test_without=test[0],
         lab_sd=lab[1],
         field_sd=field[1],
         simulator=simulator,
@@ -166,7 +166,7 @@ def draw_scenario(rng: np.random.Generator, tier: Tier, needs: Needs) -> Scenari
     parts = [
         lab_conditions(rng, design),
         field_conditions(rng, design, design.field_rows),
-        field_conditions(rng, design, design.fresh_rows),
+        field_conditions(rng, design, design.test_rows),
     ]
     recorded = {name for name in needs.varies if parts[1].varies(name)}
     if recorded != set(needs.varies):

@@ -97,6 +97,11 @@ class Soil:
             frictional_bearing_kpa=self.frictional_bearing_kpa * support,
         )
 
+    def stronger(self, factor: Array, support: float, cohesion: float, friction: float) -> Soil:
+        """Return the soil with its strength times a factor, to a power for each part of it."""
+        soil = self.scaled(support=factor**support, cohesion=factor**cohesion)
+        return replace(soil, tan_friction=soil.tan_friction * factor**friction)
+
 
 def give(soil: Soil, slip: Array) -> Array:
     """Return how many times deeper the soil lets a slipping wheel sink (1 without slip).

@@ -48,13 +48,11 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """
     out = Path(out)
     check_folder(out, overwrite=overwrite)
-    try:
+    with writing(out):
         out.parent.mkdir(parents=True, exist_ok=True)
         _remove_abandoned(out)
         scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-        lock = _lock(scratch)
-    except OSError as error:
-        raise unwritable(out, str(error.strerror)) from None
+        held = lock(scratch)
     try:
         yield scratch
         scratch.chmod(0o777 & ~_umask())
@@ -68,24 +66,32 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     except OSError as error:
         if error.errno not in _NO_ROOM:
             raise
-        raise unwritable(out, str(error.strerror)) from None
+        raise _unwritable(out, str(error.strerror)) from None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
-        if lock is not None:
-            os.close(lock)
+        if held is not None:
+            os.close(held)
 
 
-def _lock(folder: Path) -> int | None:
-    """Lock a folder for as long as this process lives; None where another holds the lock."""
+def lock(folder: Path) -> int | None:
+    """Lock a folder for as long as this process lives; None on a system or a disk that cannot.
+
+    Raises
+    ------
+    BlockingIOError
+        If another process holds the lock.
+    """
     try:
         import fcntl
-    except ImportError:  # not on this system: nothing is ever taken for abandoned there
+    except ImportError:
         return None
     found = os.open(folder, os.O_RDONLY)
     try:
         fcntl.flock(found, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
+    except OSError as error:
         os.close(found)
+        if isinstance(error, BlockingIOError):
+            raise
         return None
     return found
 
@@ -105,10 +111,10 @@ def _remove_abandoned(out: Path) -> None:
         with contextlib.suppress(OSError):
             if time.time() - path.stat().st_mtime < _YOUNG_SECONDS:
                 continue
-            lock = _lock(path)
-            if lock is not None:
+            held = lock(path)
+            if held is not None:
                 shutil.rmtree(path, ignore_errors=True)
-                os.close(lock)
+                os.close(held)
 
 
 def read_folder(folder: Path) -> dict[str, bytes]:
@@ -127,8 +133,16 @@ def write_whole(path: Path, text: str) -> None:
     part.replace(path)
 
 
-def unwritable(out: Path, why: str) -> CalibError:
-    """Return the error for a folder that cannot be written, and why."""
+@contextmanager
+def writing(out: Path) -> Iterator[None]:
+    """Say of an OSError within the block that a folder cannot be written."""
+    try:
+        yield
+    except OSError as error:
+        raise _unwritable(out, error.strerror or str(error)) from error
+
+
+def _unwritable(out: Path, why: str) -> CalibError:
     return CalibError(
         f"the output folder cannot be written ({why})",
         where=str(out),
@@ -139,12 +153,12 @@ def unwritable(out: Path, why: str) -> CalibError:
 def _check_parent(out: Path) -> None:
     parent = next(p for p in out.absolute().parents if p.exists())
     if not parent.is_dir():
-        raise unwritable(out, f"{parent} is a file")
+        raise _unwritable(out, f"{parent} is a file")
     if not os.access(parent, os.W_OK | os.X_OK):
-        raise unwritable(out, f"no permission to write in {parent}")
+        raise _unwritable(out, f"no permission to write in {parent}")
     left = shutil.disk_usage(parent).free
     if left < _ROOM_BYTES:
-        raise unwritable(out, f"only {left / 1e6:.1f} MB are left on its disk")
+        raise _unwritable(out, f"only {left / 1e6:.1f} MB are left on its disk")
 
 
 def _umask() -> int:
@@ -155,10 +169,8 @@ def _umask() -> int:
 
 def check_folder(out: Path, *, overwrite: bool = False) -> None:
     """Raise a CalibError, before long work, if a folder may not be written, or not replaced."""
-    try:
+    with writing(out):  # a name that is too long, a folder that may not be searched
         exists = out.exists()
-    except OSError as error:  # a name that is too long, a folder that may not be searched
-        raise unwritable(out, str(error.strerror)) from None
     if not exists:
         _check_parent(out)
         return

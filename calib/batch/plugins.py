@@ -49,10 +49,7 @@ def run_file(path: Path, what: str) -> ModuleType:
         spec.loader.exec_module(module)
     except CalibError as error:
         sys.modules.pop(name)
-        found = str(path) if error.where is None else f"{path}, {error.where}"
-        raise CalibError(
-            error.message, where=found, allowed=error.allowed, mend=error.mend
-        ) from None
+        raise error.within(str(path)) from None
     except Exception as error:
         sys.modules.pop(name)
         frames = traceback.extract_tb(error.__traceback__)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from calib.cli import options as opt
 from calib.cli.machine import Json, finish
-from calib.cli.options import Overwrite, Seed, command
 
 if TYPE_CHECKING:
     from calib.he2019.audit import Audit
@@ -21,8 +21,8 @@ def audit(
         Path | None, typer.Option(help="Folder for audit.json, audit.csv, figures and a page.")
     ] = None,
     json: Json = False,
-    seed: Seed = 2019,
-    overwrite: Overwrite = False,
+    seed: opt.Seed = 2019,
+    overwrite: opt.Overwrite = False,
 ) -> None:
     """Audit the published tables of He, Sandu & Osorio (2019): every figure and its verdict."""
     from calib.batch.folders import check_folder, fresh_folder
@@ -38,7 +38,7 @@ def audit(
 
             tell("drawing figures", 0, 1)
             with fresh_folder(out, overwrite=overwrite) as folder:
-                write_audit_page(found, folder, command())
+                write_audit_page(found, folder, opt.command())
             tell("drawing figures", 1, 1)
     _print(found)
     if out is not None:

@@ -8,19 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from calib.cli import options as opt
 from calib.cli.machine import Json, finish
-from calib.cli.options import (
-    CORES,
-    HoldOutOption,
-    MaxSteps,
-    Models,
-    Overwrite,
-    PriorFiles,
-    Seed,
-    Simulators,
-    Workers,
-    command,
-)
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
@@ -34,24 +23,24 @@ def report(
         list[Path] | None, typer.Argument(help="Your CSV files; the embedded data if none.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-report"),
-    seed: Seed = 2019,
-    hold_out: HoldOutOption = None,
+    seed: opt.Seed = 2019,
+    hold_out: opt.HoldOutOption = None,
     model: Annotated[
         list[str] | None, typer.Option(help="Model for its output, not the suggested; repeatable.")
     ] = None,
-    priors: PriorFiles = None,
+    priors: opt.PriorFiles = None,
     only: Annotated[
         list[str] | None, typer.Option(help="Output to report, e.g. drawbar_pull; repeatable.")
     ] = None,
-    overwrite: Overwrite = False,
+    overwrite: opt.Overwrite = False,
     pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
-    max_steps: MaxSteps = 25_600,
+    max_steps: opt.MaxSteps = 25_600,
     posteriors: Annotated[
         bool, typer.Option(help="Keep the posteriors, megabytes of netCDF, in the folder.")
     ] = True,
-    workers: Workers = CORES,
-    plugins: Models = None,
-    simulator: Simulators = None,
+    workers: opt.Workers = opt.CORES,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
     json: Json = False,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
@@ -60,13 +49,12 @@ def report(
 
     check_folder(out, overwrite=overwrite)
     begin_imports(workers)
+    from calib import SamplerSettings, read_table
     from calib.cli.display import progress_bars
     from calib.cli.simulators import say
-    from calib.data import read_table
     from calib.data.labels import labelled
     from calib.data.quantities import OUTPUTS
     from calib.inference.emulation.prepared import prepare
-    from calib.inference.sampling.sampler import SamplerSettings
     from calib.report.contents import work_out
     from calib.report.emulators import EmulatorSection
     from calib.report.study_tasks import HoldOut, fitted_rows, plan_tasks
@@ -110,7 +98,7 @@ def report(
         )  # fmt: skip
         study = found.study
         page = write_report(
-            study, out, settings=settings, command=command(), title=title, sections=found.found,
+            study, out, settings=settings, command=opt.command(), title=title, sections=found.found,
             overwrite=overwrite, posteriors=posteriors, pdf=pdf, progress=tell, pool=side,
         )  # fmt: skip
     for key, result in study.successes.items():
@@ -132,43 +120,36 @@ def fit(
     model: Annotated[str, typer.Option(help="See `calib models`.")],
     out: Annotated[Path, typer.Option(help="Run folder to write.")] = Path("calib-run"),
     priors: Annotated[Path | None, typer.Option(help="Prior file; see `calib priors`.")] = None,
-    seed: Seed = 2019,
-    hold_out: HoldOutOption = None,
-    overwrite: Overwrite = False,
-    max_steps: MaxSteps = 25_600,
-    workers: Workers = CORES,
-    plugins: Models = None,
-    simulator: Simulators = None,
+    seed: opt.Seed = 2019,
+    hold_out: opt.HoldOutOption = None,
+    overwrite: opt.Overwrite = False,
+    max_steps: opt.MaxSteps = 25_600,
+    workers: opt.Workers = opt.CORES,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
     json: Json = False,
 ) -> None:
     """Calibrate one model on one file and save the posterior."""
     from dataclasses import asdict
 
+    from calib import SamplerSettings, build_problem, calibrate, estimate, save_calibration
+    from calib import validate_held_out as validate
     from calib.batch.folders import check_folder, fresh_folder
     from calib.cli.display import posterior_table, progress_bars, verdict_line
     from calib.cli.simulators import say
-    from calib.data import read_for_model
-    from calib.data.labels import labelled
-    from calib.inference.calibration import calibrate
     from calib.inference.emulation.prepared import prepare
-    from calib.inference.estimators import estimate
-    from calib.inference.io import save_calibration
-    from calib.inference.problem import build_problem
     from calib.inference.random import generator
-    from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import get_model
     from calib.report.numbers import format_number
-    from calib.report.study_tasks import HoldOut
+    from calib.report.study_tasks import HoldOut, read_and_split
     from calib.validation.assumptions import warnings_of
     from calib.validation.noise_preference import noise_preference
-    from calib.validation.validate import validate_held_out
 
     chosen = get_model(model)
     check_folder(out, overwrite=overwrite)
     settings = SamplerSettings(max_steps=max_steps)
-    table = labelled(read_for_model(file, (*chosen.conditions, chosen.output)))
     kept = None if hold_out is None else HoldOut.parse(hold_out)
-    fitted, held = kept.split(table) if kept else (table, None)
+    fitted, held = read_and_split(file, (*chosen.conditions, chosen.output), kept)
     with progress_bars() as tell:
         emulation = prepare(
             model, fitted, seed, priors=priors, elsewhere=[] if held is None else [held],
@@ -203,7 +184,7 @@ def fit(
     if preference is not None:
         found["preference"] = asdict(preference)
     if held is not None:
-        scores = validate_held_out(calibration, held).scores
+        scores = validate(calibration, held).scores
         ninety = scores.coverage[0.9]
         print(
             f"held out ({kept}): 90 % band covers {ninety.hits} of {ninety.n}, "
@@ -233,9 +214,9 @@ def predict(
             "instrument that was mended; repeatable."
         ),
     ] = None,
-    overwrite: Overwrite = False,
-    plugins: Models = None,
-    simulator: Simulators = None,
+    overwrite: opt.Overwrite = False,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
     json: Json = False,
 ) -> None:
     """Predict at new conditions: with 50, 90 and 95 % bands; a diagnosis with 90 % bands."""
@@ -245,8 +226,8 @@ def predict(
             where=str(out),
             mend="choose another --out, or pass --overwrite",
         )
+    from calib import load_calibration
     from calib.data import read_for_model
-    from calib.inference.io import load_calibration
     from calib.validation.prediction import predict as predict_at
     from calib.validation.prediction import predict_stacked, prediction_columns
 
@@ -344,7 +325,7 @@ def _number(cell: Any) -> float | str:
 def data(
     name: Annotated[str, typer.Argument(help="he2019 or he2019-gaps")],
     out: Annotated[Path | None, typer.Option(help="Folder to write; its name if none.")] = None,
-    overwrite: Overwrite = False,
+    overwrite: opt.Overwrite = False,
 ) -> None:
     """Write the embedded, reconstructed data as CSV files, or as cases for `calib diagnose`."""
     writers = {"he2019": _write_he2019, "he2019-gaps": _write_he2019_gaps}
@@ -386,8 +367,8 @@ def _write_he2019_gaps(out: Path, overwrite: bool) -> list[Path]:
 def template(
     model: Annotated[str, typer.Argument(help="See `calib models`.")],
     out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
-    plugins: Models = None,
-    simulator: Simulators = None,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
 ) -> None:
     """Write an example CSV of a model to fill in."""
     from calib.models import get_model, template_csv
@@ -402,8 +383,8 @@ def template(
 def priors(
     model: Annotated[str, typer.Argument(help="See `calib models`.")],
     out: Annotated[Path | None, typer.Option(help="TOML to write; printed if none.")] = None,
-    plugins: Models = None,
-    simulator: Simulators = None,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
 ) -> None:
     """Write the shipped priors of a model, to copy and edit."""
     from calib.inference.prior_files import default_priors
@@ -412,7 +393,9 @@ def priors(
     _emit(default_priors(get_model(model).name).read_text(encoding="utf-8"), out)
 
 
-def models(plugins: Models = None, simulator: Simulators = None, json: Json = False) -> None:
+def models(
+    plugins: opt.Models = None, simulator: opt.Simulators = None, json: Json = False
+) -> None:
     """List the models with their equations and columns."""
     from calib.models import MODELS
 

@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
+from calib.cli import options as opt
 from calib.cli.machine import Json, finish
-from calib.cli.options import Models, Scheduler, Simulators, Workers, announce
 
 
 def campaign(
@@ -17,16 +17,16 @@ def campaign(
     out: Annotated[Path, typer.Option(help="Folder of results; resumed if it is there.")] = Path(
         "calib-campaign"
     ),
-    workers: Workers = 2,
-    scheduler: Scheduler = None,
+    workers: opt.Workers = 2,
+    scheduler: opt.Scheduler = None,
     only_list: Annotated[
         bool, typer.Option("--list", help="Check the plan, list its tasks and stop.")
     ] = False,
     overwrite: Annotated[
         bool, typer.Option("--overwrite", help="Do again what was made from other inputs.")
     ] = False,
-    plugins: Models = None,
-    simulator: Simulators = None,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
     json: Json = False,
 ) -> None:
     """Run many fits, diagnoses, challenge cases or SBC replicates as tasks; run again to resume."""
@@ -41,7 +41,7 @@ def campaign(
     with progress_bars() as tell:
         summary = run_campaign(
             planned, out, workers=workers, scheduler=scheduler, overwrite=overwrite,
-            progress=lambda done, n: tell("tasks", done, n), announce=announce,
+            progress=lambda done, n: tell("tasks", done, n), announce=opt.announce,
         )  # fmt: skip
     for name, error in summary.failed.items():
         print(f"calib: {name} failed: {error}", file=sys.stderr)

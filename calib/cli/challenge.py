@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from calib.batch.bench import from_the_bench
-from calib.cli.options import Models, Overwrite, Scheduler, Seed, Workers, announce
+from calib.cli import options as opt
 
 _Cases = Annotated[Path, typer.Argument(help="Folder with cases.")]
 _Key = Annotated[Path, typer.Option(help="Their sealed answers.")]
@@ -21,14 +21,14 @@ verbs = typer.Typer(no_args_is_help=True, help="The blind test of the diagnosis.
 def make(
     out: Annotated[Path, typer.Option(help="Folder for the cases.")],
     key: Annotated[Path, typer.Option(help="File for the sealed answers, outside it.")],
-    seed: Seed,
+    seed: opt.Seed,
     cases: Annotated[int, typer.Option(help="How many.", min=1)] = 300,
     tier: Annotated[
         Literal["both", "easy", "hard", "large"],
         typer.Option(help="Difficulty; large: gaps of 5 to 30 noise sds, up to three causes."),
     ] = "both",
-    workers: Workers = 2,
-    scheduler: Scheduler = None,
+    workers: opt.Workers = 2,
+    scheduler: opt.Scheduler = None,
 ) -> None:
     """Write cases of known cause, and their answers into a sealed key."""
     with from_the_bench("calib challenge make"):
@@ -48,10 +48,10 @@ def make(
 def run(
     folder: _Cases,
     out: Annotated[Path, typer.Option(help="Folder for the diagnoses; resumed if it is there.")],
-    seed: Seed = 1,
-    workers: Workers = 2,
-    scheduler: Scheduler = None,
-    plugins: Models = None,
+    seed: opt.Seed = 1,
+    workers: opt.Workers = 2,
+    scheduler: opt.Scheduler = None,
+    plugins: opt.Models = None,
 ) -> None:
     """Diagnose every case of a folder; run again to resume."""
     from calib.cli.display import progress_bars
@@ -60,7 +60,7 @@ def run(
     cases = case_folders(folder)
     with progress_bars() as tell:
         failed = diagnose_cases(
-            cases, out, seed, workers=workers, scheduler=scheduler, announce=announce,
+            cases, out, seed, workers=workers, scheduler=scheduler, announce=opt.announce,
             progress=lambda done, n: tell("diagnosing", done, n),
         )  # fmt: skip
     for name, error in failed.items():
@@ -76,9 +76,9 @@ def well_specified(
     key: _Key,
     out: Annotated[Path, typer.Option(help="Folder for the well-specified cases.")],
     out_key: Annotated[Path, typer.Option(help="File for their answers, outside it.")],
-    seed: Seed = 1,
-    workers: Workers = 2,
-    scheduler: Scheduler = None,
+    seed: opt.Seed = 1,
+    workers: opt.Workers = 2,
+    scheduler: opt.Scheduler = None,
 ) -> None:
     """Write the same designs again, with effects that act exactly as the diagnosis believes."""
     with from_the_bench("calib challenge well-specified"):
@@ -91,7 +91,7 @@ def well_specified(
     with progress_bars() as tell:
         without = redraw(
             folder, key, out, out_key, partial(well_specified_case, seed), seed=seed,
-            workers=workers, scheduler=scheduler, announce=announce,
+            workers=workers, scheduler=scheduler, announce=opt.announce,
             progress=lambda done, n: tell("drawing cases", done, n),
         )  # fmt: skip
     for name, why in without.items():
@@ -108,7 +108,7 @@ def score(
         str, typer.Option(help="Only cases that measure these, e.g. drawbar_pull,rut_depth.")
     ] = "",
     out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
-    overwrite: Overwrite = False,
+    overwrite: opt.Overwrite = False,
 ) -> None:
     """Compare diagnoses with the sealed answers."""
     with from_the_bench("calib challenge score"):

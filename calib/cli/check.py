@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from calib.cli import options as opt
 from calib.cli.machine import Json, finish
-from calib.cli.options import CORES, Models, Simulators, Workers
 from calib.errors import CalibError
 
 
@@ -20,9 +20,9 @@ def check(
     every: Annotated[
         bool, typer.Option("--all", help="List every number, not only what is not the same.")
     ] = False,
-    workers: Workers = CORES,
-    plugins: Models = None,
-    simulator: Simulators = None,
+    workers: opt.Workers = opt.CORES,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
     json: Json = False,
 ) -> None:
     """Compute a folder's results again from that folder alone and compare everything.

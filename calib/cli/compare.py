@@ -7,47 +7,34 @@ from typing import Annotated
 
 import typer
 
+from calib.cli import options as opt
 from calib.cli.machine import Json, finish
-from calib.cli.options import (
-    CORES,
-    HoldOutOption,
-    MaxSteps,
-    Models,
-    Overwrite,
-    PriorFiles,
-    Seed,
-    Simulators,
-    Workers,
-    command,
-)
 
 
 def compare(
     what: Annotated[list[str], typer.Argument(help="Models, then the CSV: A B my.csv.")],
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-comparison"),
-    priors: PriorFiles = None,
-    seed: Seed = 2019,
-    hold_out: HoldOutOption = None,
-    overwrite: Overwrite = False,
-    max_steps: MaxSteps = 25_600,
-    workers: Workers = CORES,
-    plugins: Models = None,
-    simulator: Simulators = None,
+    priors: opt.PriorFiles = None,
+    seed: opt.Seed = 2019,
+    hold_out: opt.HoldOutOption = None,
+    overwrite: opt.Overwrite = False,
+    max_steps: opt.MaxSteps = 25_600,
+    workers: opt.Workers = opt.CORES,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
     json: Json = False,
 ) -> None:
     """Say which of several models the same data prefer, and what they cannot tell."""
     from calib.batch.folders import check_folder, fresh_folder
     from calib.cli.display import progress_bars
     from calib.cli.simulators import say
-    from calib.data import read_for_model
-    from calib.data.labels import labelled
     from calib.inference.emulation.prepared import prepare
     from calib.inference.prior_files import prior_file_model
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import get_model
     from calib.report.comparison import write_comparison
     from calib.report.page.comparison import text
-    from calib.report.study_tasks import HoldOut
+    from calib.report.study_tasks import HoldOut, read_and_split
     from calib.validation.comparison import check_comparable
     from calib.validation.comparison import compare as find
 
@@ -56,9 +43,8 @@ def compare(
     check_comparable(models)
     chosen = [get_model(name) for name in models]
     needed = {c for m in chosen for c in (*m.conditions, m.output)}
-    table = labelled(read_for_model(Path(file), sorted(needed)))
     kept = None if hold_out is None else HoldOut.parse(hold_out)
-    fitted, held = kept.split(table) if kept else (table, None)
+    fitted, held = read_and_split(Path(file), sorted(needed), kept)
     elsewhere = [] if held is None else [held]
     given = {prior_file_model(path): path for path in priors or ()}
     with progress_bars() as tell:
@@ -75,7 +61,7 @@ def compare(
         )  # fmt: skip
     good = [say(name, emulation) for name, emulation in emulations.items()]
     with fresh_folder(out, overwrite=overwrite) as folder:
-        written = write_comparison(found, folder, command(), hold_out or "")
+        written = write_comparison(found, folder, opt.command(), hold_out or "")
     print(text(written))
     print(out / "index.html")
     finish(0 if found.sound and all(good) else 3, written, folder=str(out))

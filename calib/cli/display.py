@@ -83,18 +83,9 @@ def posterior_table(calibration: Calibration) -> None:
 
     model = calibration.problem.bound.model
     table = RichTable(title=f"{model.name}: posterior of {len(calibration.problem.table)} rows")
-    for heading in (
-        "parameter",
-        "unit",
-        "mean ± sd or median",
-        "95 % HDI",
-        "ESS bulk/tail",
-        "R-hat",
-        "remark",
-    ):
-        table.add_column(
-            heading, justify="left" if heading in ("parameter", "unit", "remark") else "right"
-        )
+    words, numbers = ("parameter", "unit"), ("mean ± sd or median", "95 % HDI", "ESS bulk/tail")
+    for heading in (*words, *numbers, "R-hat", "remark"):
+        table.add_column(heading, justify="left" if heading in (*words, "remark") else "right")
     for s in calibration.summary.values():
         table.add_row(
             s.name, s.unit, centre_text(s),

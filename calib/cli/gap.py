@@ -8,8 +8,8 @@ from typing import Annotated
 
 import typer
 
+from calib.cli import options as opt
 from calib.cli.machine import Json, finish
-from calib.cli.options import CORES, Models, Overwrite, Seed, Simulators, Workers, command
 from calib.errors import CalibError
 
 # What the processes that draw the page import.
@@ -22,14 +22,14 @@ _PAGE = (
 def diagnose(
     case: Annotated[Path | None, typer.Argument(help="Case folder with a case.toml.")] = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-diagnosis"),
-    seed: Seed = 1,
+    seed: opt.Seed = 1,
     run: Annotated[Path | None, typer.Option(help="Run folder of `calib fit`.")] = None,
     field: Annotated[Path | None, typer.Option(help="CSV of the field campaign.")] = None,
     effects: Annotated[Path | None, typer.Option(help="Python file with your effects.")] = None,
-    overwrite: Overwrite = False,
-    workers: Workers = CORES,
-    plugins: Models = None,
-    simulator: Simulators = None,
+    overwrite: opt.Overwrite = False,
+    workers: opt.Workers = opt.CORES,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
     json: Json = False,
 ) -> None:
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
@@ -70,7 +70,7 @@ def diagnose(
     with progress_bars() as tell:
         emulations = prepare_case(given, run, seed, workers, tell)
     told = [say(what, emulation) for what, emulation in emulations]
-    manifest = {"seed": seed, "command": command()}
+    manifest = {"seed": seed, "command": opt.command()}
     own_files = [] if effects is None else [effects]
     with pool(workers, _PAGE, own_files) as side:
         found = find(given, seed, effects={**EFFECTS, **own}, pool=side)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -34,25 +34,17 @@ def _load(paths: list[Path] | None) -> list[Path] | None:
     return paths
 
 
+def _files(name: str, what: str) -> Any:
+    return typer.Option(name, help=f"{what}; repeatable.", callback=_load, is_eager=True)
+
+
 Models = Annotated[
     list[Path] | None,
-    typer.Option(
-        "--models",
-        help="Python file that registers quantities, models or effects of your own; repeatable.",
-        callback=_load,
-        is_eager=True,
-    ),
+    _files("--models", "Python file that registers quantities, models or effects of your own"),
 ]
-
-
 Simulators = Annotated[
     list[Path] | None,
-    typer.Option(
-        "--simulator",
-        help="TOML file of a simulator of your own, whose command is run; repeatable.",
-        callback=_load,
-        is_eager=True,
-    ),
+    _files("--simulator", "TOML file of a simulator of your own, whose command is run"),
 ]
 
 

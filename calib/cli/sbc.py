@@ -8,17 +8,8 @@ from typing import Annotated
 
 import typer
 
+from calib.cli import options as opt
 from calib.cli.machine import Json, finish
-from calib.cli.options import (
-    Models,
-    PriorFiles,
-    Scheduler,
-    Seed,
-    Simulators,
-    Workers,
-    announce,
-    command,
-)
 
 
 def sbc(
@@ -27,12 +18,12 @@ def sbc(
         list[str] | None, typer.Option(help="Model to test; all but slow ones if none; repeatable.")
     ] = None,
     simulations: Annotated[int, typer.Option(help="Campaigns per model.", min=10)] = 300,
-    seed: Seed = 2019,
-    priors: PriorFiles = None,
-    workers: Workers = 2,
-    scheduler: Scheduler = None,
-    plugins: Models = None,
-    simulator: Simulators = None,
+    seed: opt.Seed = 2019,
+    priors: opt.PriorFiles = None,
+    workers: opt.Workers = 2,
+    scheduler: opt.Scheduler = None,
+    plugins: opt.Models = None,
+    simulator: opt.Simulators = None,
     json: Json = False,
 ) -> None:
     """Prove posteriors and bands calibrated on simulated data whose truth is known."""
@@ -46,17 +37,17 @@ def sbc(
 
     slow = [name for name in MODELS if name not in chosen_models()]
     if slow and not model:
-        announce(
+        opt.announce(
             f"left out: {', '.join(slow)}, of which each campaign takes minutes; name them with "
             "--model"
         )
     with progress_bars() as tell:
         score = run_sbc(
             out, models=model or (), simulations=simulations, seed=seed, priors=priors or (),
-            workers=workers, scheduler=scheduler, announce=announce,
+            workers=workers, scheduler=scheduler, announce=opt.announce,
             progress=lambda done, n: tell("simulating and calibrating", done, n),
         )  # fmt: skip
-    page = write_sbc(score, out, asdict(SETTINGS), command())
+    page = write_sbc(score, out, asdict(SETTINGS), opt.command())
     print(text_table(score))
     for of_model in score.models:
         for name, error in of_model.failed.items():

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data.headers import meant
-from calib.data.quantities import QUANTITIES, Quantity
+from calib.data.quantities import QUANTITIES, Quantity, columns_of
 from calib.data.table import Table
 
 type Array = NDArray[np.float64]
@@ -22,8 +22,7 @@ _MOST = 0.9
 # A column that may be left out is asked after when its name is so like a known one.
 _ALIKE = 0.8
 # The pull of a wheel is a part of its load: small forces that agree on that are of a small wheel.
-_PULL, _LOAD, _PULL_OVER_LOAD = "drawbar_pull_kn", "normal_load_kn", (0.01, 3.0)
-_OF_SMALL_WHEELS = (_PULL, _LOAD, "driving_torque_knm")
+_PULL_OVER_LOAD, _OF_SMALL_WHEELS = (0.01, 3.0), ("force", "torque")
 
 
 def unit_notes(table: Table, quantity: Quantity, values: Array) -> list[str]:
@@ -42,14 +41,18 @@ def column_notes(table: Table) -> Iterator[str]:
     """
     known = [n for n in table if n in QUANTITIES and np.isfinite(table[n]).any()]
     sizes = {name: float(np.nanmax(np.abs(table[name]))) for name in known}
+    pull, load = (
+        max((sizes[c] for c in columns_of(role) if c in sizes), default=0.0)
+        for role in ("pull", "load")
+    )
     low, high = _PULL_OVER_LOAD
-    fits = _LOAD in sizes and low * sizes[_LOAD] < sizes.get(_PULL, 0.0) < high * sizes[_LOAD]
+    fits = low * load < pull < high * load
     for name, size in sizes.items():
         quantity = QUANTITIES[name]
         if quantity.largest is None:
             continue
         low, high = quantity.largest
-        if fits and name in _OF_SMALL_WHEELS and size < low:
+        if fits and quantity.kind in _OF_SMALL_WHEELS and size < low:
             continue
         factor = 1e-3 if size > high else 1e3
         if low <= size <= high or not low <= factor * size <= high:

@@ -13,7 +13,7 @@ from typing import Any
 from calib.data.labels import KnownData
 from calib.data.registry import register
 from calib.data.table import Table
-from calib.inference.estimators.methods import Method
+from calib.inference.estimators import Method
 from calib.report.reference import REFERENCES
 from calib.report.sections import Section, SectionKind
 from calib.validation.sbc.designs import DESIGNS

@@ -8,7 +8,6 @@ emulated, `emulator.npz`.
 from __future__ import annotations
 
 import errno
-import hashlib
 import json
 import os
 import shutil
@@ -22,7 +21,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from calib.batch.environment import Environment
+from calib.batch.environment import Environment, sha256
 from calib.data import read_for_model, write_table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
@@ -44,6 +43,9 @@ _HASHED = ("posterior.nc", "priors.toml", "data.csv")
 _EMULATOR = "emulator.npz"
 N_PRIOR = 2000
 MAX_CELLS = 8_000_000
+_GATE = ("rhat", "ess_bulk", "ess_tail", "tau")
+# Of the draws, as they are.
+_DRAWS = ("log_evidence", "efficiency", "acceptance", "evaluations")
 
 
 def to_datatree(calibration: Calibration) -> xr.DataTree:
@@ -131,10 +133,7 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
         "label": calibration.label,
         "shape": list(calibration.draws.t.shape),
         "mode": calibration.draws.mode.tolist(),
-        "log_evidence": calibration.draws.log_evidence,
-        "efficiency": calibration.draws.efficiency,
-        "acceptance": calibration.draws.acceptance,
-        "evaluations": calibration.draws.evaluations,
+        **{k: getattr(calibration.draws, k) for k in _DRAWS},
         "walkers": calibration.draws.walkers,
         "settings": asdict(calibration.settings),
         "estimates": describe_estimates(calibration.estimates),
@@ -145,7 +144,7 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
             "reasons": list(report.reasons),
             "steps": report.steps,
             "names": list(report.names),
-            **{k: getattr(report, k).tolist() for k in ("rhat", "ess_bulk", "ess_tail", "tau")},
+            **{k: getattr(report, k).tolist() for k in _GATE},
         },
     }
 
@@ -153,13 +152,8 @@ def _describe(calibration: Calibration) -> dict[str, Any]:
 def describe_estimates(estimates: Sequence[PointEstimate]) -> list[dict[str, Any]]:
     """Return what a run folder keeps of the estimates that seeded the sampler."""
     return [
-        {
-            "method": e.method,
-            "theta": e.theta.tolist(),
-            "reported": e.reported,
-            "cost": e.cost,
-            "rmse": e.rmse,
-        }
+        {"method": e.method, "theta": e.theta.tolist()}
+        | {k: getattr(e, k) for k in ("reported", "cost", "rmse")}
         for e in estimates
     ]
 
@@ -204,7 +198,7 @@ def save_calibration(
     if emulator is not None:
         save_emulator(emulator, problem.bound.model.name, folder / _EMULATOR)
         hashed.append(_EMULATOR)
-    hashes = {name: _sha256(folder / name) for name in hashed}
+    hashes = {name: sha256((folder / name).read_bytes()) for name in hashed}
     described = {
         **_describe(calibration),
         "seconds": calibration.draws.seconds,
@@ -214,16 +208,11 @@ def save_calibration(
     (folder / "run.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
 def _check_hashes(meta: dict[str, Any], folder: Path) -> None:
     """A run is predicted from only as it was written."""
     for name, expected in meta.get("sha256", {}).items():
         with _damage(folder / name):
-            found = _sha256(folder / name)
+            found = sha256((folder / name).read_bytes())
         if found != expected:
             raise CalibError(
                 "the file has changed since the run was written",
@@ -306,12 +295,10 @@ def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple
 
 def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:
     gate = meta["gate"]
-    figures = {k: np.array(gate[k]) for k in ("rhat", "ess_bulk", "ess_tail", "tau")}
     report = GateReport(
         names=tuple(gate["names"]), steps=gate["steps"], passed=gate["passed"],
-        reasons=tuple(gate["reasons"]), **figures,
+        reasons=tuple(gate["reasons"]), **{k: np.array(gate[k]) for k in _GATE},
     )  # fmt: skip
-    known = ("log_evidence", "efficiency", "acceptance", "evaluations", "seconds")
     return Draws(
         t=t,
         log_prob=log_prob,
@@ -319,7 +306,7 @@ def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:
         mode=np.array(meta["mode"]),
         # Earlier run folders had all walkers stored.
         walkers=meta["walkers"] if "walkers" in meta else t.shape[1],
-        **{k: meta[k] for k in known},
+        **{k: meta[k] for k in (*_DRAWS, "seconds")},
     )
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,20 +37,26 @@ class _Entry(BaseModel):
     default_reference: _Positive = 1.0
 
 
-class _Normal(_Entry):
-    dist: Literal["normal"]
-    mean: _Number
-    sd: _Positive
+class _Bounded(_Entry):
     lower: _Number | None = None
     upper: _Number | None = None
 
 
-class _LogNormal(_Entry):
+class _OnLogarithm(_Entry):
+    lower: _Positive | None = None
+    upper: _Positive | None = None
+
+
+class _Normal(_Bounded):
+    dist: Literal["normal"]
+    mean: _Number
+    sd: _Positive
+
+
+class _LogNormal(_OnLogarithm):
     dist: Literal["lognormal"]
     median: _Positive
     sd_log: _LogSd
-    lower: _Positive | None = None
-    upper: _Positive | None = None
 
 
 class _HalfNormal(_Entry):
@@ -64,12 +70,10 @@ class _Uniform(_Entry):
     upper: _Number
 
 
-class _Gamma(_Entry):
+class _Gamma(_OnLogarithm):
     dist: Literal["gamma"]
     shape: _Positive
     rate: _Positive
-    lower: _Positive | None = None
-    upper: _Positive | None = None
 
 
 class _Fixed(_Entry):
@@ -132,21 +136,8 @@ class DeclaredPriors:
         return self.name
 
 
-class PriorFile(Protocol):
-    """A prior file on disk, or priors that are read like one."""
-
-    @property
-    def name(self) -> str:
-        """Of the file."""
-
-    def read_text(self, encoding: str | None = None) -> str:
-        """Return its text."""
-
-    def read_bytes(self) -> bytes:
-        """Return its bytes."""
-
-    def is_file(self) -> bool:
-        """Whether it is there."""
+# A prior file on disk, or priors that are read like one.
+type PriorFile = Path | DeclaredPriors
 
 
 def default_priors(model_name: str) -> PriorFile:
@@ -168,12 +159,7 @@ def prior_file_model(path: Path) -> str:
     CalibError
         If the file cannot be read or names none.
     """
-    try:
-        model = tomllib.loads(Path(path).read_text(encoding="utf-8")).get("model")
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise CalibError(
-            f"the prior file cannot be read ({error})", where=str(path), mend="correct it"
-        ) from None
+    model = _content(_text(Path(path)), str(path)).get("model")
     if not isinstance(model, str):
         raise CalibError(
             "the prior file does not say which model it is for",
@@ -206,15 +192,27 @@ def read_priors(
     CalibError
         If the file is missing, is not TOML, or gives unknown, missing or impossible entries.
     """
+    return parse_priors(_text(path), str(path), model_name, parameters, references)
+
+
+def _text(path: PriorFile) -> str:
     try:
-        text = path.read_text(encoding="utf-8")
+        return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise CalibError(
             f"the prior file cannot be read ({error})",
             where=str(path),
             mend="give the path of a readable TOML file",
         ) from None
-    return parse_priors(text, str(path), model_name, parameters, references)
+
+
+def _content(text: str, source: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise CalibError(
+            f"the prior file is not valid TOML: {error}", where=source, mend="correct that line"
+        ) from None
 
 
 def prior_references(columns: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
@@ -245,12 +243,7 @@ def parse_priors(
     references: Mapping[str, float],
 ) -> Priors:
     """Check the text of a prior file; see `read_priors`."""
-    try:
-        content = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        raise CalibError(
-            f"the prior file is not valid TOML: {error}", where=source, mend="correct that line"
-        ) from None
+    content = _content(text, source)
     # A misspelt name is reported before its content: it is the likelier mistake.
     if unknown := [key for key in content if key not in _File.model_fields]:
         raise _no_such_key(unknown[0], _File.model_fields, source)
@@ -264,34 +257,27 @@ def parse_priors(
     given = _NOISE | file.parameters
     names = (*parameters[:-1], *noise.parameters, *parameters[-1:])
     entries = tuple(_prior(name, given[name], source, references) for name in names)
-    if noise.family == "student_t":
-        _check_nu(entries[len(parameters) - 1], source)
-    if noise.correlated_along:
-        _check_rho(entries[-2], source)
+    for prior in entries[len(parameters) - 1 : -1]:
+        _check_noise(prior, source)
     return Priors(entries, text, source, noise)
 
 
-def _check_nu(nu: Prior, source: str) -> None:
-    lowest = nu.loc if nu.fixed else nu.lower
-    if not nu.log and not lowest > 0.0:
-        raise CalibError(
-            f"degrees of freedom of {lowest:g} are admitted",
-            where=f"{source}, parameters.nu",
-            allowed="a prior of what is above 0: gamma, lognormal, or with a lower bound > 0",
-            mend="correct this entry",
-        )
-
-
-def _check_rho(rho: Prior, source: str) -> None:
-    low, high = (rho.loc, rho.loc) if rho.fixed else (rho.lower, rho.upper)
-    low, high = np.exp([low, high]) if rho.log else (low, high)
-    if not 0.0 <= low <= high < 1.0:
-        raise CalibError(
-            f"correlations from {low:g} to {high:g} are admitted",
-            where=f"{source}, parameters.rho",
-            allowed="a prior with bounds of at least 0 and below 1",
-            mend="correct this entry",
-        )
+def _check_noise(prior: Prior, source: str) -> None:
+    """Check the range of a parameter of the noise."""
+    low, high = (prior.loc, prior.loc) if prior.fixed else (prior.lower, prior.upper)
+    low, high = np.exp([low, high]) if prior.log else (low, high)
+    if prior.name == "nu" and not (prior.log or low > 0.0):
+        found = f"degrees of freedom of {low:g} are admitted"
+        allowed = "a prior of what is above 0: gamma, lognormal, or with a lower bound > 0"
+    elif prior.name == "rho" and not 0.0 <= low <= high < 1.0:
+        found = f"correlations from {low:g} to {high:g} are admitted"
+        allowed = "a prior with bounds of at least 0 and below 1"
+    else:
+        return
+    raise CalibError(
+        found, where=f"{source}, parameters.{prior.name}", allowed=allowed,
+        mend="correct this entry",
+    )  # fmt: skip
 
 
 def _noise_choice(
@@ -436,13 +422,12 @@ def _no_such_dist(entry: Mapping[str, Any], where: str) -> CalibError:
 
 
 def _prior(name: str, entry: _AnyEntry, source: str, references: Mapping[str, float]) -> Prior:
-    reference = 1.0
-    suffix = ""
+    reference, text = 1.0, _words(entry)
     if entry.relative_to is not None:
         _check_relative(name, entry.relative_to, source)
         reference = references.get(entry.relative_to, entry.default_reference)
-        suffix = f" x {reference:g} ({entry.relative_to})"
-    log, loc, scale, lower, upper, text = _internal(entry, reference)
+        text += f" x {reference:g} ({entry.relative_to})"
+    loc, scale, lower, upper = _internal(entry, reference)
     gamma = (entry.shape, entry.rate) if isinstance(entry, _Gamma) else None
     if gamma is not None and name != "nu":
         raise CalibError(
@@ -457,8 +442,8 @@ def _prior(name: str, entry: _AnyEntry, source: str, references: Mapping[str, fl
             mend="give lower < upper",
         )
     return Prior(
-        name, entry.unit, entry.reason, entry.source, text + suffix, log, loc, scale, lower, upper,
-        gamma,
+        name, entry.unit, entry.reason, entry.source, text, isinstance(entry, _OnLogarithm), loc,
+        scale, lower, upper, gamma,
     )  # fmt: skip
 
 
@@ -472,39 +457,39 @@ def _check_relative(name: str, column: str, source: str) -> None:
         )
 
 
-def _internal(entry: _AnyEntry, reference: float) -> tuple[bool, float, float, float, float, str]:
-    """Return (log, loc, scale, lower, upper, text) of an entry in internal coordinates."""
-    inf = np.inf
+def _internal(entry: _AnyEntry, reference: float) -> tuple[float, float, float, float]:
+    """Return (loc, scale, lower, upper) of an entry in internal coordinates."""
+    low, high = getattr(entry, "lower", None), getattr(entry, "upper", None)
+    if isinstance(entry, _OnLogarithm):
+        reference = 1.0 if isinstance(entry, _Gamma) else reference
+        low, high = (x and float(np.log(x * reference)) for x in (low, high))
+    else:
+        low, high = (x if x is None else x * reference for x in (low, high))
+    low, high = -np.inf if low is None else low, np.inf if high is None else high
     match entry:
-        case _Normal(mean=mean, sd=sd, lower=lower, upper=upper):
-            low = -inf if lower is None else lower * reference
-            high = inf if upper is None else upper * reference
-            text = f"normal({mean:g}, {sd:g})" + _bounds_text(lower, upper)
-            return False, mean * reference, sd * reference, low, high, text
-        case _LogNormal(median=median, sd_log=sd_log, lower=lower, upper=upper):
-            low = -inf if lower is None else float(np.log(lower * reference))
-            high = inf if upper is None else float(np.log(upper * reference))
-            text = f"lognormal({median:g}, {sd_log:g})" + _bounds_text(lower, upper)
-            return True, float(np.log(median * reference)), sd_log, low, high, text
+        case _Normal(mean=mean, sd=sd):
+            return mean * reference, sd * reference, low, high
+        case _LogNormal(median=median, sd_log=sd_log):
+            return float(np.log(median * reference)), sd_log, low, high
         case _HalfNormal(sd=sd):
-            return False, 0.0, sd * reference, 0.0, inf, f"half_normal({sd:g})"
-        case _Uniform(lower=lower, upper=upper):
-            low, high = lower * reference, upper * reference
-            return False, 0.5 * (low + high), inf, low, high, f"uniform({lower:g}, {upper:g})"
-        case _Gamma(shape=shape, rate=rate, lower=lower, upper=upper):
-            low = -inf if lower is None else float(np.log(lower))
-            high = inf if upper is None else float(np.log(upper))
-            text = f"gamma({shape:g}, {rate:g})" + _bounds_text(lower, upper)
+            return 0.0, sd * reference, 0.0, high
+        case _Uniform():
+            return 0.5 * (low + high), np.inf, low, high
+        case _Gamma(shape=shape, rate=rate):
             mean, variance = float(digamma(shape) - np.log(rate)), float(polygamma(1, shape))
-            return True, mean, float(np.sqrt(variance)), low, high, text
+            return mean, float(np.sqrt(variance)), low, high
         case _Fixed(value=value):
-            fixed = value * reference
-            return False, fixed, 0.0, -inf, inf, f"fixed({value:g})"
+            return value * reference, 0.0, low, high
 
 
-def _bounds_text(lower: float | None, upper: float | None) -> str:
-    if lower is None and upper is None:
-        return ""
-    low = "-inf" if lower is None else f"{lower:g}"
-    high = "inf" if upper is None else f"{upper:g}"
-    return f" on [{low}, {high}]"
+def _words(entry: _AnyEntry) -> str:
+    """Write an entry as its distribution with its numbers, and its bounds if there are any."""
+    own = {name: value for name, value in entry if name not in _Entry.model_fields}
+    dist = own.pop("dist")
+    low, high = None, None
+    if dist != "uniform":
+        low, high = own.pop("lower", None), own.pop("upper", None)
+    text = f"{dist}({', '.join(f'{value:g}' for value in own.values())})"
+    if low is None and high is None:
+        return text
+    return f"{text} on [{-np.inf if low is None else low:g}, {np.inf if high is None else high:g}]"

@@ -89,26 +89,31 @@ class Priors:
         return loc, scale, lower, upper, precision
 
     @cached_property
+    def _bounds(self) -> tuple[Array, Array, Mask]:
+        """Bounds in sds, on the side where the mass is accurate, and whether that is the other."""
+        loc, _, lower, upper, precision = self._arrays
+        with np.errstate(invalid="ignore"):
+            a, b = (lower - loc) * precision, (upper - loc) * precision
+        swap = a > 0.0
+        return np.where(swap, -b, a), np.where(swap, -a, b), swap
+
+    @cached_property
     def _gammas(self) -> tuple[tuple[int, float, float], ...]:
         """Place, shape and rate of the gamma distributions."""
         return tuple((j, *p.gamma) for j, p in enumerate(self.free) if p.gamma is not None)
 
     @cached_property
     def _log_normaliser(self) -> float:
-        loc, scale, lower, upper, precision = self._arrays
-        normal = precision > 0.0
+        _, scale, lower, upper, precision = self._arrays
+        a, b, _ = self._bounds
         with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = (lower - loc) * precision, (upper - loc) * precision
-            # The mass between the bounds, in the tail where it is accurate.
-            swap = a > 0.0
-            a, b = np.where(swap, -b, a), np.where(swap, -a, b)
             mass = log_ndtr(b) + np.log1p(-np.exp(log_ndtr(a) - log_ndtr(b)))
             normals = -np.log(scale) - 0.5 * np.log(2.0 * np.pi) - mass
             uniforms = -np.log(upper - lower)
         for j, shape, rate in self._gammas:
             low, high = gammainc(shape, rate * np.exp([lower[j], upper[j]]))
             uniforms[j] = shape * np.log(rate) - gammaln(shape) - np.log(high - low)
-        return float(np.where(normal, normals, uniforms).sum())
+        return float(np.where(precision > 0.0, normals, uniforms).sum())
 
     def log_prob(self, t: Array) -> Array:
         """Log prior density of internal coordinates, (k, d) to (k,); ``-inf`` outside bounds."""
@@ -123,17 +128,13 @@ class Priors:
     def ppf(self, u: Array) -> Array:
         """Map the unit cube to internal coordinates, shape (k, d) to (k, d)."""
         loc, scale, lower, upper, precision = self._arrays
-        normal = precision > 0.0
+        a, b, swap = self._bounds
         with np.errstate(invalid="ignore"):
-            a, b = (lower - loc) * precision, (upper - loc) * precision
-            # In the tail where the normal's mass is accurate, as for the normaliser.
-            swap = a > 0.0
-            a, b = np.where(swap, -b, a), np.where(swap, -a, b)
             below, above = ndtr(a), ndtr(b)
             z = ndtri(below + np.where(swap, 1.0 - u, u) * (above - below))
             normals = loc + scale * np.where(swap, -z, z)
             uniforms = lower + u * (upper - lower)
-            values = np.where(normal, normals, uniforms)
+            values = np.where(precision > 0.0, normals, uniforms)
         for j, shape, rate in self._gammas:
             low, high = gammainc(shape, rate * np.exp([lower[j], upper[j]]))
             x = gammaincinv(shape, low + u[:, j] * (high - low)) / rate

@@ -165,15 +165,17 @@ class Problem:
     def log_likelihood(self, t: Array) -> Array:
         """Log likelihood of internal coordinates, shape (k,); ``-inf`` where undefined."""
         natural = self.theta(t)
-        if self.bound.model.uncertain is not None:
-            return self._uncertain_log_likelihood(natural)
-        if not self.noise.usual:
-            return self._log_likelihood_by_row(natural)
         n, sigma = self.response.size, natural[:, -1]
         # A prior may admit sigma <= 0 or predictions beyond all bounds: they become -inf below.
         with np.errstate(all="ignore"):
-            sse = self.squares(self.of_model(natural))
-            value = -n * (np.log(sigma) + _HALF_LN_2PI) - 0.5 * sse / sigma**2
+            if self.bound.model.uncertain is not None:
+                residuals, variances, curves = self._predicted(natural)
+                value = log_normal(residuals, sigma, variances, curves)
+            elif not self.noise.usual:
+                value = self._log_likelihood_by_row(natural)
+            else:
+                sse = self.squares(self.of_model(natural))
+                value = -n * (np.log(sigma) + _HALF_LN_2PI) - 0.5 * sse / sigma**2
         value += self._sum_ln_jacobian
         return np.where(np.isfinite(value), value, -np.inf)
 
@@ -186,13 +188,6 @@ class Problem:
         location, variances, curves = uncertain(self.of_model(natural), self.conditions)
         return self.response - location, variances, curves
 
-    def _uncertain_log_likelihood(self, natural: Array) -> Array:
-        with np.errstate(all="ignore"):
-            residuals, variances, curves = self._predicted(natural)
-            value = log_normal(residuals, natural[:, -1], variances, curves)
-        value += self._sum_ln_jacobian
-        return np.where(np.isfinite(value), value, -np.inf)
-
     def _log_likelihood_by_row(self, natural: Array) -> Array:
         at_once = max(1, _CELLS // self.response.size)
         value = np.empty(len(natural))
@@ -200,8 +195,7 @@ class Problem:
             some = natural[i : i + at_once]
             rows = self._log_densities(some, Serial.before)
             value[i : i + at_once] = rows.sum(axis=1)
-        value += self._sum_ln_jacobian
-        return np.where(np.isfinite(value), value, -np.inf)
+        return value
 
     def _log_densities(self, natural: Array, given: _Given) -> Array:
         """Log density of the noise of every row given others, where it is correlated, (k, n)."""
@@ -300,12 +294,7 @@ def build_problem(
     try:
         bound = model.bind(table.columns)
     except CalibError as error:
-        raise CalibError(
-            error.message,
-            where=", ".join(filter(None, (table.source, error.where))),
-            allowed=error.allowed,
-            mend=error.mend,
-        ) from None
+        raise error.within(table.source) from None
     notes = tuple(
         f"the data have no column {name}, so priors that are relative to it assume {value:g}; give "
         "it if yours differs"

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.data import Table, hold_out
+from calib.data import Table, hold_out, read_for_model
 from calib.data.headers import parse_header, renamed
+from calib.data.labels import labelled
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.inference.prior_files import prior_file_model
@@ -52,6 +53,14 @@ class HoldOut:
     def split(self, table: Table) -> tuple[Table, Table]:
         """Return the rows that are left, and these; see `calib.data.hold_out`."""
         return hold_out(table, self.column, self.value)
+
+
+def read_and_split(
+    path: Path, columns: Sequence[str], kept: HoldOut | None
+) -> tuple[Table, Table | None]:
+    """Read a file, of which some columns are used; return the rows to fit and those held out."""
+    table = labelled(read_for_model(path, columns))
+    return kept.split(table) if kept else (table, None)
 
 
 @dataclass(frozen=True)

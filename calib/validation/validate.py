@@ -7,6 +7,7 @@ from contextlib import closing
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import logsumexp
 
 from calib.batch.tasks import completed
 from calib.batch.threads import one_thread
@@ -142,7 +143,7 @@ def leave_one_out(
             sample = t[picked]
             elpd[i] = _log_mean(log_weight[i] + log_likelihood[:, i], log_weight[i])
         else:
-            sample = refits[i].sample
+            sample = refits[i][0]
             held = problem.log_likelihood_left_out(sample)[:, i]
             # Without this row, the equation may have no value at it: density zero there.
             defined = np.isfinite(held)
@@ -159,26 +160,14 @@ def leave_one_out(
         "leave_one_out", problem.table, problem.observed, drawn,
         score(drawn, problem.observed, heavy=problem.heavy), k, tuple(refits),
         float(elpd.sum()), float(np.sqrt(n * elpd.var(ddof=1))),
-        tuple(i for i, refit in refits.items() if not refit.passed), elpd,
+        tuple(i for i, (_, passed) in refits.items() if not passed), elpd,
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Left:
-    """A problem without one of its rows, and how to sample it."""
-
-    problem: Problem
-    seed: np.random.SeedSequence
-    mode: Array
-    settings: SamplerSettings | None
-
-
-@dataclass(frozen=True)
-class _Refit:
-    """Draws without one row, shape (N_DRAWS, d), and whether they passed the gate."""
-
-    sample: Array
-    passed: bool
+# A problem without one of its rows, the seed, the mode with it, and how to sample.
+type _Left = tuple[Problem, np.random.SeedSequence, Array, SamplerSettings | None]
+# Draws without one row, shape (N_DRAWS, d), and whether they passed the gate.
+type _Refit = tuple[Array, bool]
 
 
 def _refits(
@@ -188,7 +177,7 @@ def _refits(
     """Fit again without each of some rows."""
     problem, n = calibration.problem, calibration.problem.response.size
     left = {
-        str(i): _Left(
+        str(i): (
             problem.with_table(problem.table.take(np.arange(n) != i)),
             stream(calibration.seed, calibration.label, "refit", i),
             calibration.draws.mode,
@@ -209,14 +198,11 @@ def _refits(
 
 
 def _refit(left: _Left) -> _Refit:
-    again = sample_posterior(
-        left.problem, left.seed, starts=left.mode[None], settings=left.settings
-    )
+    problem, seed, mode, settings = left
+    again = sample_posterior(problem, seed, starts=mode[None], settings=settings)
     picked = np.linspace(0, again.flat.shape[0] - 1, N_DRAWS).astype(int)
-    return _Refit(again.flat[picked], again.report.passed)
+    return again.flat[picked], again.report.passed
 
 
 def _log_mean(log_value: Array, log_weight: Array) -> float:
-    from scipy.special import logsumexp
-
     return float(logsumexp(log_value) - logsumexp(log_weight))

@@ -62,10 +62,7 @@ class Place:
         try:
             yield
         except CalibError as error:
-            where = ", ".join(filter(None, (f"{self.where}, {key}", error.where)))
-            raise CalibError(
-                error.message, where=where, allowed=error.allowed, mend=error.mend
-            ) from None
+            raise error.within(f"{self.where}, {key}") from None
 
     def name(self, path: Path) -> str:
         """Return a path as the plan would name it."""

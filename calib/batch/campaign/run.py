@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +11,15 @@ from calib.batch.campaign.kinds import KINDS, Task
 from calib.batch.campaign.plan import Plan
 from calib.batch.campaign.record import RECORD, describe, discard_changed
 from calib.batch.campaign.summary import NUMBERS, Summary, summarise, write_summary
-from calib.batch.folders import check_folder
+from calib.batch.folders import check_folder, writing
 from calib.batch.tasks import LateItems, check_names, run_folder_tasks
-from calib.errors import CalibError
 from calib.report.numbers import finite
 
 PLAN = "plan.toml"
 
 
-@dataclass(frozen=True)
-class _Item:
-    """All that a worker needs of a task."""
-
-    kind: str
-    seed: int
-    record: Mapping[str, Any]
-    content: Any
+# Kind, seed, record and content of a task: all that a worker needs of it.
+type _Item = tuple[str, int, Mapping[str, Any], Any]
 
 
 def run_campaign(
@@ -70,10 +62,12 @@ def run_campaign(
         check_folder(out)
     records = describe(plan.tasks.values())
     discard_changed(records, results, overwrite=overwrite)
-    _keep_plan(plan, out)
+    with writing(out):
+        out.mkdir(parents=True, exist_ok=True)
+        (out / PLAN).write_bytes(plan.text)
 
     def load(task: Task) -> _Item:
-        return _Item(task.kind, task.seed, records[task.name], KINDS[task.kind].load(task))
+        return task.kind, task.seed, records[task.name], KINDS[task.kind].load(task)
 
     try:
         run_folder_tasks(
@@ -87,18 +81,8 @@ def run_campaign(
     return summary
 
 
-def _keep_plan(plan: Plan, out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        (out / PLAN).write_bytes(plan.text)
-    except OSError as error:
-        raise CalibError(
-            f"the output folder cannot be written ({error.strerror})", where=str(out),
-            mend="choose another --out",
-        ) from None  # fmt: skip
-
-
 def _work(item: _Item) -> dict[str, str | bytes]:
-    work = KINDS[item.kind].work(item.content, item.seed)
+    kind, seed, record, content = item
+    work = KINDS[kind].work(content, seed)
     numbers = json.dumps(finite(work.numbers), indent=1, allow_nan=False) + "\n"
-    return {**work.files, NUMBERS: numbers, RECORD: json.dumps(item.record, indent=1) + "\n"}
+    return {**work.files, NUMBERS: numbers, RECORD: json.dumps(record, indent=1) + "\n"}

@@ -4,11 +4,9 @@
 missing when they are called again; `completed` hands results over as they come and writes nothing.
 """
 
-from calib.batch.tasks.attempt import Finished
-from calib.batch.tasks.items import LateItems
 from calib.batch.tasks.landing import check_names, failed_tasks, read_seconds
 from calib.batch.tasks.run import Outcome, run_folder_tasks, run_tasks
-from calib.batch.tasks.stream import completed
+from calib.batch.tasks.stream import Finished, LateItems, completed
 
 __all__ = [
     "Finished", "LateItems", "Outcome", "check_names", "completed", "failed_tasks",

@@ -22,7 +22,7 @@ from distributed.utils import silence_logging_cmgr
 
 from calib.batch.environment import code_sha256
 from calib.batch.pool import without_interruptions
-from calib.batch.tasks.attempt import Finished, attempt, describe
+from calib.batch.tasks.stream import Finished, attempt, describe
 from calib.errors import CalibError
 
 # Tasks at the scheduler at a time, and bytes of their items: enough for a large cluster, few enough

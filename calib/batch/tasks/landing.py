@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any, Protocol, cast
+from typing import Any
 
-from calib.batch.folders import unwritable
-from calib.batch.tasks.attempt import Finished
+from calib.batch.folders import lock, writing
+from calib.batch.tasks.stream import Finished
 from calib.errors import CalibError
 
 FAILED = "failed.json"
@@ -21,72 +22,44 @@ _SCRATCH = ".landing"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+=-]{0,199}")
 
 
-class Landing[R, C](Protocol):
-    """A way to keep the result of a task.
+@dataclass(frozen=True)
+class Kept[R, C]:
+    """A way to keep the result of a task, in ``<name><suffix>``.
 
     `encode` runs beside the task, so that results that cannot be kept fail their task, and the
-    work is shared; the other two run in the one process that writes.
+    work is shared; `write` runs in the one process that writes, to a path that is not there yet.
     """
 
-    folder: Path
-
-    @staticmethod
-    def encode(result: R) -> C:
-        """Return what is kept of a result; picklable."""
-
-    def path(self, name: str) -> Path:
-        """Return where the result of a task is, if it is there."""
-
-    def write(self, content: C, scratch: Path) -> None:
-        """Write a result to a path that does not exist yet."""
+    suffix: str
+    encode: Callable[[R], C]
+    write: Callable[[Path, C], object]
 
 
-class JsonFiles:
-    """Results that are JSON-able mappings, each in ``<name>.json``."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    @staticmethod
-    def encode(result: Mapping[str, Any]) -> str:
-        """Return JSON text; NaN and infinity, which other programs could not read, are refused."""
-        return json.dumps(result, indent=1, allow_nan=False) + "\n"
-
-    def path(self, name: str) -> Path:
-        """Return the path of a task's file."""
-        return self.folder / f"{name}.json"
-
-    def write(self, content: str, scratch: Path) -> None:
-        """Write a file."""
-        scratch.write_text(content, encoding="utf-8")
+def _json(result: Mapping[str, Any]) -> bytes:
+    """Return JSON text; NaN and infinity, which other programs could not read, are refused."""
+    return (json.dumps(result, indent=1, allow_nan=False) + "\n").encode()
 
 
-class Folders:
-    """Results that are files by relative name, each task's in a folder of its own."""
+def _files(result: Mapping[str, str | bytes]) -> dict[str, bytes]:
+    """Return the files' bytes; a name that leads out of the folder is refused."""
+    for file in result:
+        path = PurePosixPath(file)
+        if path.is_absolute() or ".." in path.parts or not path.parts:
+            raise ValueError(f"a task may not write {file!r}: it is not inside its folder")
+    return {f: c.encode() if isinstance(c, str) else bytes(c) for f, c in result.items()}
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
 
-    @staticmethod
-    def encode(result: Mapping[str, str | bytes]) -> dict[str, bytes]:
-        """Return the files' bytes; a name that leads out of the folder is refused."""
-        for file in result:
-            path = PurePosixPath(file)
-            if path.is_absolute() or ".." in path.parts or not path.parts:
-                raise ValueError(f"a task may not write {file!r}: it is not inside its folder")
-        return {f: c.encode() if isinstance(c, str) else bytes(c) for f, c in result.items()}
+def _write_files(folder: Path, content: Mapping[str, bytes]) -> None:
+    folder.mkdir()
+    for file, data in content.items():
+        path = folder / file
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
 
-    def path(self, name: str) -> Path:
-        """Return the path of a task's folder."""
-        return self.folder / name
 
-    def write(self, content: Mapping[str, bytes], scratch: Path) -> None:
-        """Write a folder."""
-        scratch.mkdir()
-        for file, data in content.items():
-            path = scratch / file
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
+# Results that JSON can hold, each in a file; or files by relative name, each task's in a folder.
+JSON_FILES: Kept[Any, Any] = Kept(".json", _json, Path.write_bytes)
+FOLDERS: Kept[Any, Any] = Kept("", _files, _write_files)
 
 
 def check_names(names: Iterable[str]) -> None:
@@ -102,7 +75,7 @@ def check_names(names: Iterable[str]) -> None:
 
 
 @contextmanager
-def landing_ground[C](landing: Landing[Any, C]) -> Iterator[Callable[[Finished[C]], None]]:
+def landing_ground(folder: Path, kept: Kept[Any, Any]) -> Iterator[Callable[[Finished[Any]], None]]:
     """Yield a function that lands the result of a task that did not fail, atomically.
 
     A process that is killed leaves results that are whole, and at most a scratch folder that the
@@ -114,12 +87,11 @@ def landing_ground[C](landing: Landing[Any, C]) -> Iterator[Callable[[Finished[C
     CalibError
         If the folder cannot be written, or another process is landing results in it.
     """
-    folder = landing.folder
     scratch = folder / _SCRATCH
-    with _io(folder):
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
     with _alone(folder):
-        with _io(folder):
+        with writing(folder):
             shutil.rmtree(scratch, ignore_errors=True)
             scratch.mkdir()
             clock = (folder / SECONDS).open("a+", encoding="utf-8")
@@ -127,14 +99,14 @@ def landing_ground[C](landing: Landing[Any, C]) -> Iterator[Callable[[Finished[C
             if (times := clock.read()) and not times.endswith("\n"):
                 clock.write("\n")  # after a line that a kill has cut short
 
-        def land(task: Finished[C]) -> None:
+        def land(task: Finished[Any]) -> None:
             part = scratch / task.name
-            with _io(folder):
-                landing.write(cast(C, task.result), part)
+            with writing(folder):
+                kept.write(part, task.result)
                 # The time first: whatever has landed has one.
                 clock.write(f"{task.name},{task.seconds:.6f}\n")
                 clock.flush()
-                part.replace(landing.path(task.name))
+                part.replace(folder / f"{task.name}{kept.suffix}")
 
         try:
             yield land
@@ -164,33 +136,21 @@ def read_seconds(folder: Path) -> dict[str, float]:
 
 
 @contextmanager
-def _io(folder: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise unwritable(folder, error.strerror or str(error)) from error
-
-
-@contextmanager
 def _alone(folder: Path) -> Iterator[None]:
     """Hold the folder's lock, which the system releases however the process ends."""
-    if sys.platform == "win32":
-        yield
-        return
-    import fcntl
-    import os
-
-    with _io(folder):
-        handle = os.open(folder, os.O_RDONLY)
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise CalibError(
-                "another process is writing results to this folder",
-                where=str(folder),
-                mend="wait until it ends, or stop it",
-            ) from None
+        with writing(folder):
+            held = lock(folder)
+    except CalibError as error:
+        if not isinstance(error.__cause__, BlockingIOError):
+            raise
+        raise CalibError(
+            "another process is writing results to this folder",
+            where=str(folder),
+            mend="wait until it ends, or stop it",
+        ) from None
+    try:
         yield
     finally:
-        os.close(handle)
+        if held is not None:
+            os.close(held)

@@ -12,13 +12,13 @@ from typing import Any
 
 from calib.batch.tasks.landing import (
     FAILED,
-    Folders,
-    JsonFiles,
-    Landing,
+    FOLDERS,
+    JSON_FILES,
+    Kept,
     check_names,
     landing_ground,
     read_seconds,
-)
+)  # fmt: skip
 from calib.batch.tasks.stream import completed
 
 type Progress = Callable[[int, int], None]
@@ -38,8 +38,8 @@ class Outcome:
     seconds: Mapping[str, float]
 
 
-def run_tasks[I](
-    function: Callable[[I], Mapping[str, Any]],
+def run_tasks[I, R](
+    function: Callable[[I], R],
     items: Mapping[str, I],
     folder: Path,
     *,
@@ -47,6 +47,7 @@ def run_tasks[I](
     scheduler: str | None = None,
     progress: Progress | None = None,
     announce: Callable[[str], None] | None = None,
+    kept: Kept[R, Any] = JSON_FILES,
 ) -> Outcome:
     """Do every task whose result is not there; each gives one JSON file.
 
@@ -70,6 +71,8 @@ def run_tasks[I](
         Called with tasks finished and tasks in all.
     announce : callable, optional
         Called with one line that says where the tasks are done.
+    kept : Kept
+        How results are kept, if not as JSON.
 
     Returns
     -------
@@ -86,54 +89,18 @@ def run_tasks[I](
     Killed at any moment and called again, it does what is missing. Results are the same on any
     number of workers as long as a task draws from its own stream (`calib.inference.random`).
     """
-    return _run(
-        function, items, JsonFiles(Path(folder)), workers=workers, scheduler=scheduler,
-        progress=progress, announce=announce,
-    )  # fmt: skip
-
-
-def run_folder_tasks[I](
-    function: Callable[[I], Mapping[str, str | bytes]],
-    items: Mapping[str, I],
-    folder: Path,
-    *,
-    workers: int = 1,
-    scheduler: str | None = None,
-    progress: Progress | None = None,
-    announce: Callable[[str], None] | None = None,
-) -> Outcome:
-    """Do every task whose result is not there; each gives a folder of files.
-
-    As `run_tasks`, but `function` returns the content of files by their names relative to the
-    task's own folder, ``folder/<name>``, which appears whole or not at all.
-    """
-    return _run(
-        function, items, Folders(Path(folder)), workers=workers, scheduler=scheduler,
-        progress=progress, announce=announce,
-    )  # fmt: skip
-
-
-def _run[I, R, C](
-    function: Callable[[I], R],
-    items: Mapping[str, I],
-    landing: Landing[R, C],
-    *,
-    workers: int,
-    scheduler: str | None,
-    progress: Progress | None,
-    announce: Callable[[str], None] | None,
-) -> Outcome:
+    folder = Path(folder)
     check_names(items)
     tell = progress or (lambda done, planned: None)
-    resumed = tuple(name for name in items if landing.path(name).exists())
+    resumed = tuple(name for name in items if (folder / f"{name}{kept.suffix}").exists())
     found = set(resumed)
     failed: dict[str, str] = {}
     tell(len(found), len(items))
     with (
-        landing_ground(landing) as land,
+        landing_ground(folder, kept) as land,
         closing(
             completed(
-                partial(_encoded, function, landing.encode), items,
+                partial(_encoded, function, kept.encode), items,
                 names=[name for name in items if name not in found],
                 workers=workers, scheduler=scheduler, announce=announce,
             )
@@ -149,15 +116,29 @@ def _run[I, R, C](
                 tell(len(found) + len(failed), len(items))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(
-                f"interrupted; {len(found)} of {len(items)} results are kept in {landing.folder}, "
+                f"interrupted; {len(found)} of {len(items)} results are kept in {folder}, "
                 "and the same command does the others"
             ) from None
         finally:
             failed = {name: failed[name] for name in items if name in failed}
-            _list(failed, landing.folder / FAILED)
-    seconds = read_seconds(landing.folder)
+            _list(failed, folder / FAILED)
+    seconds = read_seconds(folder)
     done = tuple(name for name in items if name in found)
     return Outcome(done, resumed, failed, {n: seconds[n] for n in done if n in seconds})
+
+
+def run_folder_tasks[I](
+    function: Callable[[I], Mapping[str, str | bytes]],
+    items: Mapping[str, I],
+    folder: Path,
+    **where: Any,
+) -> Outcome:
+    """Do every task whose result is not there; each gives a folder of files.
+
+    As `run_tasks`, but `function` returns the content of files by their names relative to the
+    task's own folder, ``folder/<name>``, which appears whole or not at all.
+    """
+    return run_tasks(function, items, folder, kept=FOLDERS, **where)
 
 
 def _encoded[I, R, C](function: Callable[[I], R], encode: Callable[[R], C], item: I) -> C:

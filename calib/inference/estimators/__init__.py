@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from calib.batch.threads import one_thread
+from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.inference.estimators.base import PointEstimate
-from calib.inference.estimators.generation import GeneticSettings
-from calib.inference.estimators.genetic import minimise_genetic
-from calib.inference.estimators.methods import METHODS, Method, method_name
+from calib.inference.estimators.differential_evolution import estimate_differential_evolution
+from calib.inference.estimators.genetic import GeneticSettings, estimate_genetic, minimise_genetic
+from calib.inference.estimators.least_squares import estimate_least_squares
 from calib.inference.problem import Problem
 from calib.models import get_model
 
@@ -20,6 +22,55 @@ __all__ = [
     "METHODS", "GeneticSettings", "Method", "PointEstimate", "compare", "estimate", "method_name",
     "methods_for", "minimise_genetic",
 ]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Method:
+    """A way to estimate the parameters of a model.
+
+    Parameters
+    ----------
+    name : str
+    estimate : callable
+        ``(problem, rng, **settings) -> PointEstimate``.
+    title, short, words : str
+        In a legend, at the head of a narrow column, and in a sentence.
+    models : tuple of str
+        The models it is for; empty for all.
+    place : int
+        Where it stands among the others: the least first.
+    """
+
+    name: str
+    estimate: Callable[..., PointEstimate]
+    title: str
+    short: str
+    words: str
+    models: tuple[str, ...] = ()
+    place: int = 100
+
+    def register(self) -> None:
+        """Have it applied wherever all methods are."""
+        METHODS.add(self)
+
+
+METHODS: Registry[Method] = Registry(
+    "method of estimation",
+    lambda method: method.name,
+    Method("genetic", estimate_genetic, "genetic algorithm", "GA", "the genetic algorithm",
+           place=10),
+    Method(
+        "differential_evolution", estimate_differential_evolution, "differential evolution", "DE",
+        "differential evolution", place=20,
+    ),
+    Method("least_squares", estimate_least_squares, "least squares", "LS",
+           "multi-start least squares", place=30),
+)  # fmt: skip
+
+
+def method_name(name: str) -> str:
+    """Return how a method is called in a legend."""
+    return METHODS[name].title if name in METHODS else name
 
 
 def methods_for(model_name: str) -> tuple[str, ...]:

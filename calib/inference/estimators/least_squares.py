@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import NamedTuple
 
 import numpy as np
@@ -10,14 +9,13 @@ from scipy.optimize import least_squares
 
 from calib.errors import CalibError
 from calib.inference.defined import check_defined
-from calib.inference.estimators.base import PointEstimate, goodness, residuals, sum_of_squares
+from calib.inference.estimators.base import PointEstimate, residuals, sum_of_squares
 from calib.inference.estimators.identified import (
     central_interval,
-    hold_unidentified,
     location,
     representative_rows,
 )  # fmt: skip
-from calib.inference.estimators.search import edge_notes, held_note
+from calib.inference.estimators.search import Found, edge_notes, fit_identified
 from calib.inference.problem import Problem
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
@@ -89,46 +87,28 @@ def estimate_least_squares(
     prior only supplies the starts. Of more than a few thousand rows a representative part is used,
     and the best of what is found is polished on all of them.
     """
-    clock = time.perf_counter()
-    reduced, held = hold_unidentified(problem)
-    if not reduced.names:
-        theta = reduced.of_model(reduced.theta(np.empty((1, 0))))[0]
-        return goodness(
-            problem,
-            "least_squares",
-            theta,
-            n_fitted=0,
-            n_evaluations=1,
-            seconds=time.perf_counter() - clock,
-            notes=("every parameter is fixed", held_note(held)),
-        )
-    rough = _Descent(representative_rows(reduced))
-    polished = [rough.polish(start) for start in _starts(rough, rng, n_screen, n_polish)]
-    best = min(polished, key=lambda p: p.cost)
-    n_agree = sum(p.cost <= best.cost * (1.0 + _PRECISE) + _PRECISE**2 for p in polished)
-    fine = rough
-    if rough.problem is not reduced:
-        fine = _Descent(reduced)
-        best = fine.polish(best.z)
-    x = fine.location + best.z * fine.width
-    lower, upper = np.array([(p.lower, p.upper) for p in reduced.priors.free]).T
-    edges = edge_notes(reduced.names, x, lower, upper, "the prior's bounds")
-    return goodness(
-        problem,
-        "least_squares",
-        reduced.of_model(reduced.theta(x[None]))[0],
-        n_fitted=len(reduced.names),
-        n_evaluations=rough.n_evaluations + (fine.n_evaluations if fine is not rough else 0),
-        seconds=time.perf_counter() - clock,
-        converged=best.converged,
-        notes=(
-            f"{n_agree} of {len(polished)} starts end at the lowest cost",
-            "" if best.converged else "the cost still falls along a valley without end in sight",
-            held_note(held),
-            edges,
-            _far_note(reduced, x),
-        ),
-    )
+
+    def fit(reduced: Problem) -> tuple[Array, Found, str]:
+        rough = _Descent(representative_rows(reduced))
+        polished = [rough.polish(start) for start in _starts(rough, rng, n_screen, n_polish)]
+        best = min(polished, key=lambda p: p.cost)
+        n_agree = sum(p.cost <= best.cost * (1.0 + _PRECISE) + _PRECISE**2 for p in polished)
+        evaluations, fine = rough.n_evaluations, rough
+        if rough.problem is not reduced:
+            fine = _Descent(reduced)
+            best = fine.polish(best.z)
+            evaluations += fine.n_evaluations
+        x = fine.location + best.z * fine.width
+        lower, upper = np.array([(p.lower, p.upper) for p in reduced.priors.free]).T
+        valley = "the cost still falls along a valley without end in sight"
+        said = [f"{n_agree} of {len(polished)} starts end at the lowest cost"]
+        said += [] if best.converged else [valley]
+        edges = edge_notes(reduced.names, x, lower, upper, "the prior's bounds")
+        notes = "; ".join(filter(None, (edges, _far_note(reduced, x))))
+        theta = reduced.of_model(reduced.theta(x[None]))[0]
+        return theta, Found(x, evaluations, best.converged, "; ".join(said)), notes
+
+    return fit_identified(problem, "least_squares", fit)
 
 
 def _far_note(problem: Problem, x: Array) -> str:

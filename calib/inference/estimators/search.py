@@ -150,14 +150,39 @@ def edge_notes(names: tuple[str, ...], x: Array, lower: Array, upper: Array, wha
     return f"{', '.join(stuck)} on the edge of {what}" if stuck else ""
 
 
+def fit_identified(
+    problem: Problem, method: str, fit: Callable[[Problem], tuple[Array, Found, str]]
+) -> PointEstimate:
+    """Hold what the data do not determine, fit the rest, and complete the estimate.
+
+    `fit` returns the model's parameters (d_model,), what was found, and notes on edges.
+    """
+    clock = time.perf_counter()
+    reduced, held = hold_unidentified(problem)
+    if reduced.names:
+        theta, found, edges = fit(reduced)
+    else:
+        theta, edges = reduced.of_model(reduced.theta(np.empty((1, 0))))[0], ""
+        found = Found(np.empty(0), 1, True, "every parameter is fixed")
+    return goodness(
+        problem,
+        method,
+        theta,
+        n_fitted=len(reduced.names),
+        n_evaluations=found.n_evaluations,
+        seconds=time.perf_counter() - clock,
+        converged=found.converged,
+        notes=(found.note, held_note(held), edges),
+    )
+
+
 def search_in_box(
     problem: Problem, method: str, box: Box | None, minimise: Callable[[SearchSpace], Found]
 ) -> PointEstimate:
-    """Hold what the data do not determine, search the rest, and complete the estimate."""
-    clock = time.perf_counter()
-    reduced, held = hold_unidentified(problem)
-    space = search_space(reduced, box)
-    if space.names:
+    """Estimate by a search of the box of what the data determine."""
+
+    def fit(reduced: Problem) -> tuple[Array, Found, str]:
+        space = search_space(reduced, box)
         found = minimise(space)
         if not np.isfinite(space.cost(found.x[None]))[0]:
             raise CalibError(
@@ -166,16 +191,7 @@ def search_in_box(
                 where=problem.table.source,
                 mend="look for impossible conditions in the data, or pass another search box",
             )
-    else:
-        found = Found(np.empty(0), 1, True, "every parameter is fixed")
-    edges = edge_notes(space.names, found.x, space.lower, space.upper, "the search box")
-    return goodness(
-        problem,
-        method,
-        problem.of_model(space.natural(found.x[None]))[0],
-        n_fitted=len(space.names),
-        n_evaluations=found.n_evaluations,
-        seconds=time.perf_counter() - clock,
-        converged=found.converged,
-        notes=(found.note, held_note(held), edges),
-    )
+        edges = edge_notes(space.names, found.x, space.lower, space.upper, "the search box")
+        return problem.of_model(space.natural(found.x[None]))[0], found, edges
+
+    return fit_identified(problem, method, fit)

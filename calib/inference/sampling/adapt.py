@@ -94,8 +94,8 @@ def refit(
     """Fit a proposal to draws (k, d), worth so many, of a chain that the old one left short."""
     weight = np.full(draws.shape[0], 1.0 / draws.shape[0])
     proposal = fit_proposal(old, draws, weight, effective, 1.0, rng)
-    fresh, log_q = proposal.draw(rng, _ROUNDS[-2] * (draws.shape[1] + 5))
-    return proposal, _assess(log_prob(fresh) - log_q)
+    drawn, log_q = proposal.draw(rng, _ROUNDS[-2] * (draws.shape[1] + 5))
+    return proposal, _assess(log_prob(drawn) - log_q)
 
 
 def tempered_moments(draws: Array, log_weight: Array) -> tuple[Array, Array] | None:

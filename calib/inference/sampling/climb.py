@@ -65,7 +65,7 @@ def climb(
     f = cost(z)
     g = gradient(z, f)
     inverse = np.tile(np.eye(d), (z.shape[0], 1, 1))
-    fresh = np.ones(z.shape[0], dtype=bool)
+    blank = np.ones(z.shape[0], dtype=bool)
     left = np.arange(z.shape[0])
     ends, heights = z.copy(), -f
     for _ in range(steps):
@@ -80,17 +80,17 @@ def climb(
         new = np.where(better[:, None], tried[rows, best], z)
         gained = np.where(better, f - value[rows, best], 0.0)
         new_gradient = gradient(new, f - gained)
-        learned = _update(inverse, fresh & better, new - z, new_gradient - g, better)
+        learned = _update(inverse, blank & better, new - z, new_gradient - g, better)
         # A direction that leads nowhere is forgotten; if nothing was known, it is the end.
         inverse[~better] = np.eye(d)
-        done = (~better & fresh) | (~fresh & (gained < tolerance) & (expected < 2.0 * tolerance))
-        fresh = ~better | (fresh & ~learned)
+        done = (~better & blank) | (~blank & (gained < tolerance) & (expected < 2.0 * tolerance))
+        blank = ~better | (blank & ~learned)
         z, f, g = new, f - gained, new_gradient
         ends[left], heights[left] = z, -f
         going = ~done
         if not going.any():
             break
-        left, z, f, g, inverse, fresh = (a[going] for a in (left, z, f, g, inverse, fresh))
+        left, z, f, g, inverse, blank = (a[going] for a in (left, z, f, g, inverse, blank))
     return ends * width, heights
 
 

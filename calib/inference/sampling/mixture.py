@@ -27,14 +27,14 @@ class StudentT:
 
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
-        whiten, constant = self._prepared
+        whiten, constant = self.prepared
         z = whiten @ (t - self.mean).T
         squared = np.einsum("dk,dk->k", z, z)
         power = 0.5 * (self.dof + self.mean.size)
         return np.asarray(constant - power * np.log1p(squared / self.dof))
 
     @cached_property
-    def _prepared(self) -> tuple[Array, float]:
+    def prepared(self) -> tuple[Array, float]:
         """Whitening matrix (d, d), and the log density at the mean."""
         d = self.mean.size
         constant = (
@@ -62,16 +62,10 @@ class Mixture:
     def _stacked(self) -> tuple[Array, Array, Array, Array]:
         """Whitening matrices (m d, d), whitened means (m, d, 1), constants and dof (m, 1)."""
         d, m = self.n_dim, len(self.components)
-        inverses = np.linalg.inv(np.stack([c.cholesky for c in self.components]))
+        inverses = np.stack([c.prepared[0] for c in self.components])
         means = np.stack([c.mean for c in self.components])
         dof = np.array([[c.dof] for c in self.components])
-        constant = (
-            np.log(self.weights)[:, None]
-            + gammaln(0.5 * (dof + d))
-            - gammaln(0.5 * dof)
-            - 0.5 * d * np.log(dof * np.pi)
-            + np.log(np.diagonal(inverses, axis1=1, axis2=2)).sum(axis=1)[:, None]
-        )
+        constant = np.log(self.weights)[:, None] + [[c.prepared[1]] for c in self.components]
         whitened = inverses @ means[:, :, None]
         return inverses.reshape(m * d, d), whitened, constant, dof
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -28,17 +29,10 @@ def prior_widths(priors: Priors) -> Array:
 
 
 def find_mode(
-    log_prob: Callable[[Array], Array],
-    priors: Priors,
-    rng: np.random.Generator,
-    *,
-    starts: Array | None = None,
-    n_screen: int = 400,
-    n_climb: int = 16,
+    log_prob: Callable[[Array], Array], priors: Priors, rng: np.random.Generator, **search: Any
 ) -> Array:
-    """Return the highest of `find_modes` in internal coordinates, shape (d,)."""
-    modes = find_modes(log_prob, priors, rng, starts=starts, n_screen=n_screen, n_climb=n_climb)
-    return modes[0].t
+    """Return the highest of `find_modes`, whose arguments these are, shape (d,)."""
+    return find_modes(log_prob, priors, rng, **search)[0].t
 
 
 @dataclass(frozen=True)

@@ -76,16 +76,16 @@ class PairMove(emcee.moves.Move):  # type: ignore[misc]
                 self._steps = steps = self._ahead(model, steps.held(), None)
         return steps.take(state)
 
-    def _ahead(self, model: Any, held: _Pairs, fresh: _Pairs | None) -> _Steps:
-        """Work out the next steps, with fresh pairs that are left or, without any, new ones."""
-        if fresh is None:
+    def _ahead(self, model: Any, held: _Pairs, new: _Pairs | None) -> _Steps:
+        """Work out the next steps, with pairs that are left or, without any, new ones."""
+        if new is None:
             size = self.pairs * held.side.size
             t, log_jacobian, log_q = self.proposal.draw_pairs(self.rng, size)
             log_prob = model.log_prob_fn(t.reshape(2 * size, -1)).reshape(2, size)
-            fresh = _Pairs.between(t, log_prob, log_jacobian, log_q)
+            new = _Pairs.between(t, log_prob, log_jacobian, log_q)
             # Log odds are what a logistic number stays below with the odds' probability.
-            fresh.side[:] = self.rng.logistic(size=size) < fresh.log_odds
-        return _Steps.work_out(held, fresh, model.random)
+            new.side[:] = self.rng.logistic(size=size) < new.log_odds
+        return _Steps.work_out(held, new, model.random)
 
     def _around(self, model: Any, here: Array, log_prob: Array) -> _Pairs:
         other, log_jacobian, log_q = self.proposal.opposite(here)
@@ -151,7 +151,7 @@ class _Steps:
     Parameters
     ----------
     pairs : _Pairs
-        Those the walkers held, one each, then the fresh ones, one each for every second step.
+        Those the walkers held, one each, then the new ones, one each for every second step.
     start, coords : ndarray, shapes (walkers, d) and (steps, walkers, d)
     log_prob : ndarray, shape (steps, walkers)
     which, side : ndarray of int, shape (steps, walkers)
@@ -169,11 +169,11 @@ class _Steps:
     done: int = 0
 
     @classmethod
-    def work_out(cls, held: _Pairs, fresh: _Pairs, random: Any) -> _Steps:
-        """Take the walkers through all fresh pairs, two steps for each."""
+    def work_out(cls, held: _Pairs, new: _Pairs, random: Any) -> _Steps:
+        """Take the walkers through all new pairs, two steps for each."""
         walkers = held.side.size
-        pairs = held.and_then(fresh)
-        rounds = fresh.side.size // walkers
+        pairs = held.and_then(new)
+        rounds = new.side.size // walkers
         which = np.empty((2 * rounds, walkers), dtype=np.intp)
         side = np.empty((2 * rounds, walkers), dtype=np.intp)
         moved = np.empty((2 * rounds, walkers), dtype=np.bool_)
@@ -181,13 +181,13 @@ class _Steps:
         log_weight, log_odds = pairs.log_weight, np.stack([pairs.log_odds, -pairs.log_odds])
         for i in range(0, 2 * rounds, 2):
             over, accept, again = (np.log1p(-random.rand(walkers)) for _ in range(3))
-            new = np.arange((i // 2 + 1) * walkers, (i // 2 + 2) * walkers)
+            next_ones = np.arange((i // 2 + 1) * walkers, (i // 2 + 2) * walkers)
             # Not the numbers that decide on the point: a pair is refused whatever they are.
-            taken = accept < log_weight[new] - log_weight[here]
+            taken = accept < log_weight[next_ones] - log_weight[here]
             flipped = over < log_odds[at, here]
             moved[i] = taken | flipped
-            which[i] = here = np.where(taken, new, here)
-            side[i] = at = np.where(taken, pairs.side[new], at ^ flipped)
+            which[i] = here = np.where(taken, next_ones, here)
+            side[i] = at = np.where(taken, pairs.side[next_ones], at ^ flipped)
             which[i + 1] = here
             moved[i + 1] = flipped = again < log_odds[at, here]
             side[i + 1] = at = at ^ flipped
@@ -220,7 +220,7 @@ class _Steps:
         return held
 
     def left(self) -> _Pairs | None:
-        """Fresh pairs that no step that was taken has looked at; None if there are none."""
+        """New pairs that no step that was taken has looked at; None if there are none."""
         used = (1 + (self.done + 1) // 2) * self.start.shape[0]
         return self.pairs.of(slice(used, None)) if used < self.pairs.side.size else None
 

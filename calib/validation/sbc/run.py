@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from calib.batch.folders import write_whole
+from calib.batch.folders import write_whole, writing
 from calib.batch.tasks import run_tasks
 from calib.errors import CalibError
 from calib.inference.prior_files import DeclaredPriors, prior_file_model
@@ -83,9 +83,9 @@ def read_records(out: Path, names: Sequence[str]) -> list[dict[str, Any]]:
 
 def _claim(out: Path, run: dict[str, Any]) -> None:
     """Write what is run into the folder, or check that it is the same that is there."""
-    path = Path(out) / _RUN
+    path = out / _RUN
     text = json.dumps(run, indent=1) + "\n"
-    try:
+    with writing(out):
         if path.exists():
             if path.read_text(encoding="utf-8") != text:
                 raise CalibError(
@@ -94,17 +94,11 @@ def _claim(out: Path, run: dict[str, Any]) -> None:
                     mend="choose another --out, or the seed that is there",
                 )
             return
-        if Path(out).exists() and any(p.suffix != ".part" for p in Path(out).iterdir()):
+        if out.exists() and any(p.suffix != ".part" for p in out.iterdir()):
             raise CalibError(
                 "the output folder exists, is not empty and holds no simulation-based calibration",
                 where=str(out),
                 mend="choose another --out",
             )
-        Path(out).mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
         write_whole(path, text)
-    except OSError as error:
-        raise CalibError(
-            f"the output folder cannot be written ({error.strerror})",
-            where=str(out),
-            mend="choose another --out, or change its permissions",
-        ) from None

@@ -7,7 +7,7 @@ import pytest
 
 from calib.errors import CalibError
 from calib.inference.estimators import GeneticSettings, estimate, minimise_genetic
-from calib.inference.estimators.generation import GeneticDraws, descendants, draw_generations
+from calib.inference.estimators.genetic import GeneticDraws, descendants, draw_generations
 
 TABLE_2 = GeneticSettings()
 

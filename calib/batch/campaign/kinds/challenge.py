@@ -6,7 +6,6 @@ They are made by the repository's test bench, which a wheel does not have.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -40,14 +39,8 @@ class ChallengeSection(Section):
     )
 
 
-@dataclass(frozen=True)
-class ChallengeItem:
-    """What a case is made from: its seed, and the hash of the code that makes it, among it."""
-
-    own: np.random.SeedSequence
-    tier: Literal["easy", "hard"]
-    truth: str
-    bench: str
+# A case's seed, tier and truth, and the hash of the code that makes it.
+type ChallengeItem = tuple[np.random.SeedSequence, Literal["easy", "hard"], str, str]
 
 
 class Challenge(Kind[ChallengeSection, ChallengeItem]):
@@ -78,7 +71,7 @@ class Challenge(Kind[ChallengeSection, ChallengeItem]):
         """Return what the case is made from."""
         s = task.settings
         own = np.random.SeedSequence(s["draw_seed"], spawn_key=tuple(s["spawn_key"]))
-        return ChallengeItem(own, s["tier"], s["truth"], s["bench"])
+        return own, s["tier"], s["truth"], s["bench"]
 
     def work(self, item: ChallengeItem, seed: int) -> Work:
         """Make the case, diagnose its files, and mark the diagnosis with its key."""
@@ -86,13 +79,14 @@ class Challenge(Kind[ChallengeSection, ChallengeItem]):
             from challenge.answers import read_answer
             from challenge.make import make_case
 
-        if _bench() != item.bench:
+        own, tier, truth, bench = item
+        if _bench() != bench:
             raise CalibError(
                 "this worker would make other cases", where=_TABLE,
-                allowed=f"the folder `challenge` whose hash is {item.bench}",
+                allowed=f"the folder `challenge` whose hash is {bench}",
                 mend="give the worker the same checkout",
             )  # fmt: skip
-        made = make_case(item.own, item.tier, item.truth)
+        made = make_case(own, tier, truth)
         with TemporaryDirectory() as scratch:
             folder = Path(scratch) / "case"
             made.write(folder)

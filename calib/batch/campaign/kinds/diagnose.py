@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -37,16 +36,8 @@ class DiagnoseSection(Section):
     )
 
 
-@dataclass(frozen=True)
-class DiagnosisItem:
-    """A case, ready to be sent off.
-
-    With the user's file of effects, first, and the prior files beside it.
-    """
-
-    case: Case
-    effects: Mapping[str, bytes]
-    page: bool
+# A case; the user's file of effects, first, and the prior files beside it; whether to write a page.
+type DiagnosisItem = tuple[Case, Mapping[str, bytes], bool]
 
 
 class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
@@ -77,13 +68,14 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
             if label.startswith("effects")
         }
         case = read_case(task.inputs["case.toml"].parent)
-        return DiagnosisItem(case, effects, task.settings["pages"])
+        return case, effects, task.settings["pages"]
 
     def work(self, item: DiagnosisItem, seed: int) -> Work:
         """Diagnose it."""
-        with _effects(item.effects, item.case) as own:
-            found = diagnose(item.case, seed, effects={**EFFECTS, **own})
-            files = written(found, item.effects) | (_page(found, seed) if item.page else {})
+        case, effects, page = item
+        with _effects(effects, case) as own:
+            found = diagnose(case, seed, effects={**EFFECTS, **own})
+            files = written(found, effects) | (_page(found, seed) if page else {})
         return Work(diagnosis_numbers(found), files)
 
 

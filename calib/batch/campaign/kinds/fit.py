@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from itertools import product
 from math import isfinite
 from pathlib import Path
@@ -15,8 +15,7 @@ from pydantic import Field
 from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
 from calib.batch.campaign.place import Place, word
 from calib.batch.folders import read_folder
-from calib.data import Table, read_for_model
-from calib.data.labels import labelled
+from calib.data import Table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
@@ -26,7 +25,7 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
-from calib.report.study_tasks import HoldOut
+from calib.report.study_tasks import HoldOut, read_and_split
 from calib.validation.assumptions import warnings_of
 from calib.validation.validate import validate_held_out
 
@@ -54,14 +53,8 @@ class FitSection(Section):
     )
 
 
-@dataclass(frozen=True)
-class FitItem:
-    """A fit, ready to be sent off: a problem on the rows that are not held out."""
-
-    problem: Problem
-    held: Table | None
-    settings: SamplerSettings
-    posterior: bool
+# A problem on the rows that are not held out, these, how to sample, and whether to keep it.
+type FitItem = tuple[Problem, Table | None, SamplerSettings, bool]
 
 
 class Fit(Kind[FitSection, FitItem]):
@@ -91,29 +84,29 @@ class Fit(Kind[FitSection, FitItem]):
     def load(self, task: Task) -> FitItem:
         """Read the file and bind the model to it."""
         model = get_model(task.settings["model"])
-        table = labelled(read_for_model(task.inputs["data"], (*model.conditions, model.output)))
         kept = _held(task.settings["hold_out"])
-        fitted, held = kept.split(table) if kept else (table, None)
+        fitted, held = read_and_split(task.inputs["data"], (*model.conditions, model.output), kept)
         problem = build_problem(model.name, fitted, task.inputs.get("priors"))
         settings = SamplerSettings(max_steps=task.settings["max_steps"])
-        return FitItem(problem, held, settings, task.settings["posteriors"])
+        return problem, held, settings, task.settings["posteriors"]
 
     def work(self, item: FitItem, seed: int) -> Work:
         """Sample the posterior, and score it on the rows that were held out."""
-        problem, model = item.problem, item.problem.bound.model.name
+        problem, held, settings, posterior = item
+        model = problem.bound.model.name
         point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
-        calibration = calibrate(problem, seed, estimates=(point,), settings=item.settings)
+        calibration = calibrate(problem, seed, estimates=(point,), settings=settings)
         numbers = _numbers(calibration)
         if warnings := warnings_of(problem, calibration.draws.mode):
             numbers["warnings"] = " | ".join(warnings)
-        if item.held is not None:
-            scores = validate_held_out(calibration, item.held).scores
+        if held is not None:
+            scores = validate_held_out(calibration, held).scores
             numbers["held_out"] = {
                 "rows": scores.n, "rmse": scores.rmse,
                 "crps": scores.crps if isfinite(scores.crps) else None,
                 "in_90_percent_band": scores.coverage[0.9].hits,
             }  # fmt: skip
-        return Work(numbers, _run_folder(calibration) if item.posterior else {})
+        return Work(numbers, _run_folder(calibration) if posterior else {})
 
 
 def _priors(section: FitSection, place: Place) -> dict[str, list[tuple[str, Path | None]]]:
