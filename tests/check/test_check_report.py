@@ -16,7 +16,7 @@ from calib.batch.environment import sha256
 from calib.check.check import check
 from calib.check.items import Status
 from calib.errors import CalibError
-from calib.he2019.tasks import he2019_tasks
+from calib.he2019.designs import he2019_tasks
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.contents import work_out

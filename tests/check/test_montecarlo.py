@@ -17,7 +17,7 @@ from calib.check.montecarlo import (
 )
 from calib.check.numbers import compare_entries, flatten
 from calib.data import hold_out
-from calib.he2019.tasks import he2019_tasks
+from calib.he2019.designs import he2019_tasks
 from calib.inference.calibration import calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem

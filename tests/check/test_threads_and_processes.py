@@ -20,9 +20,9 @@ import numpy as np
 import pytest
 
 from calib.he2019.audit import Seeds, audit_json
+from calib.he2019.designs import he2019_tasks
 from calib.he2019.gaps.cases import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
-from calib.he2019.tasks import he2019_tasks
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.contents import work_out
 from calib.report.manifest import file_hashes

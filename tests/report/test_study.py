@@ -17,7 +17,7 @@ from calib.data.labels import labelled
 from calib.he2019.datasets import embedded
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import PUBLISHED
-from calib.he2019.tasks import he2019_tasks
+from calib.he2019.designs import he2019_tasks
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.contents import work_out

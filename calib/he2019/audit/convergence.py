@@ -17,9 +17,8 @@ from scipy.stats import beta
 from calib.batch.pool import Pool
 from calib.batch.threads import one_thread
 from calib.data import Table
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
+from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, number, percent
 from calib.he2019.audit.nearness import pressure_curves, printed_coefficients
-from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import Published
 from calib.inference.estimators import (

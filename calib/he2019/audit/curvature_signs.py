@@ -17,7 +17,7 @@ import numpy as np
 from scipy.optimize import minimize
 
 from calib.batch.threads import one_thread
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
+from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, number
 from calib.he2019.audit.nearness import (
     ASSUMED_SLIPS,
     COEFFICIENTS,
@@ -25,8 +25,7 @@ from calib.he2019.audit.nearness import (
     printed_coefficients,
     references,
 )
-from calib.he2019.audit.quadratics import Signs, printed_signs
-from calib.he2019.audit.words import number
+from calib.he2019.audit.signs import Signs, printed_signs
 from calib.he2019.datasets.drawbar import SLIP_SHIFT
 from calib.he2019.datasets.published import Published
 from calib.inference.random import generator

@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, rounded
+from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, number, percent, rounded
 from calib.he2019.audit.intervals import Interval, exact, exp, log, printed, square
-from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.published import Published
 
 _FAMILY = "Table 1, Eq 1"

@@ -16,11 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, rounded
+from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, number, percent, rounded
 from calib.he2019.audit.intervals import Interval, exact, sin
 from calib.he2019.audit.nearness import ASSUMED_SLIPS, references
 from calib.he2019.audit.pull import coefficients, peak_slip
-from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.published import FittedTable, Published
 from calib.inference.estimators import PointEstimate
 from calib.models.magic_formula import magic_formula

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.batch.threads import one_thread
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
+from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, number, percent
 from calib.he2019.audit.intervals import Interval, printed
 from calib.he2019.audit.nearness import COEFFICIENTS, pressure_curves, printed_coefficients
 from calib.he2019.audit.pull import coefficients, pressure_box, pull, pull_from_slope, quadratic
-from calib.he2019.audit.quadratics import NAMES, nearest, targets
-from calib.he2019.audit.words import number, percent
+from calib.he2019.audit.signs import NAMES, nearest, targets
 from calib.he2019.datasets.published import Published
 from calib.models.base import Array
 from calib.report.labels import joined

@@ -16,9 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import binom, norm
 
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, rounded
+from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, number, percent, rounded
 from calib.he2019.audit.intervals import Interval, exact, log, printed
-from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.published import Published
 from calib.he2019.datasets.rut import SLIPS
 from calib.models.base import Array

@@ -1,24 +1,111 @@
-"""Signs of Tables 3 to 6. The text of the source lost every minus, so each sign is an inference.
+"""Signs of Tables 3 to 6, and the unit of pressure in Table 5.
+
+The text of the source lost every minus, so each sign is an inference.
 
 E: the peak of the pull must lie inside the tested slips, since Eqs 6-9 read it off the curve. With
 E above one the argument of the formula has a maximum of its own, which may stay below what the peak
 needs; that is decided for all coefficients that print alike.
-Table 5: each triple of signs gives its own family of quadratics in pressure; all but one are far
-from Table 4 however the lost digits are chosen.
+
+Table 5: all coefficients that print as c, c' and c'' form a box, and the quadratic is linear in
+them: the smallest possible largest relative deviation from Table 4 at its pressures is a linear
+programme, solved exactly. A reading (of signs, of the unit of pressure) under which even the best
+coefficients of the box are far from Table 4 cannot be what the source fitted.
 """
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping
+from itertools import product
+from types import MappingProxyType
+from typing import NamedTuple
 
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, rounded
+import numpy as np
+from scipy.optimize import linprog
+
+from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, number, percent, rounded
 from calib.he2019.audit.intervals import Interval, exact, exp, log, printed
 from calib.he2019.audit.nearness import ASSUMED_SLIPS
 from calib.he2019.audit.pull import coefficients, largest_pull, peak_slip
-from calib.he2019.audit.quadratics import NAMES, nearest_by_signs, printed_signs
-from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.published import FittedTable, Published
+from calib.models.base import Array
 from calib.models.magic_formula import magic_formula
+
+type Signs = tuple[int, int, int]
+
+NAMES: Mapping[str, tuple[str, str, str]] = MappingProxyType(
+    {"D": ("c1", "c2", "c3"), "BCD": ("c4", "c5", "c6"), "E": ("c7", "c8", "c9")}
+)
+
+
+class Nearest(NamedTuple):
+    """The best a box of coefficients can do.
+
+    The smallest possible largest relative deviation over the pressures, the coefficients (3,) that
+    reach it, and the quadratic there (m,).
+    """
+
+    deviation: float
+    coefficients: Array
+    values: Array
+
+
+def targets(published: Published, what: str) -> tuple[Array, Array]:
+    """Return the pressures of Table 4 (psi) and its D (kN), BCD (kN/%) or E at them."""
+    tables = published.genetic
+    values = [t.values for t in tables.values()]
+    read = {
+        "D": [v["D"] for v in values],
+        "BCD": [v["B"] * v["C"] * v["D"] for v in values],
+        "E": [v["E"] for v in values],
+    }
+    return np.array([float(psi) for psi in tables]), np.array(read[what])
+
+
+def printed_signs(published: Published, what: str) -> Signs:
+    """Return the signs of a quadratic's coefficients as they are read."""
+    a, b, c = (int(np.sign(published.pressure.estimates[n].value)) for n in NAMES[what])
+    return a, b, c
+
+
+def nearest(
+    published: Published, what: str, *, signs: Signs | None = None, psi_per_unit: float = 1.0
+) -> Nearest:
+    """Return the best that coefficients of D, BCD or E printed as in Table 5 can do.
+
+    Signs are as they are read by default; pressure enters in units of so many psi.
+    """
+    figures = [published.pressure.estimates[name] for name in NAMES[what]]
+    read = signs or printed_signs(published, what)
+    middle = [sign * abs(f.value) for sign, f in zip(read, figures, strict=True)]
+    pressures, wanted = targets(published, what)
+    powers = np.vander(pressures / psi_per_unit, 3, increasing=True)
+    scaled = powers / np.abs(wanted)[:, None]
+    ones, sign = np.ones((pressures.size, 1)), np.sign(wanted)
+    found = linprog(
+        [0.0, 0.0, 0.0, 1.0],
+        A_ub=np.block([[scaled, -ones], [-scaled, -ones]]),
+        b_ub=np.concatenate([sign, -sign]),
+        bounds=[
+            *((m - f.half_unit, m + f.half_unit) for m, f in zip(middle, figures, strict=True)),
+            (0.0, None),
+        ],
+    )
+    if found.x is None:  # the largest deviation is free to grow, so this cannot happen
+        raise RuntimeError(f"the linear programme failed: {found.message}")
+    coefficients = np.asarray(found.x[:3])
+    return Nearest(float(found.x[3]), coefficients, np.asarray(powers @ coefficients))
+
+
+def nearest_by_signs(
+    published: Published, what: str, *, psi_per_unit: float = 1.0
+) -> dict[Signs, Nearest]:
+    """Return the best for each of the eight readings of three signs."""
+    readings = list(product((1, -1), repeat=3))
+    return {
+        (a, b, c): nearest(published, what, signs=(a, b, c), psi_per_unit=psi_per_unit)
+        for a, b, c in readings
+    }
+
 
 FAMILY = "Signs"
 
@@ -155,4 +242,44 @@ def signs_of_rut(published: Published) -> Finding:
         "shallower, that of k's exponent kilometres deep.",
         "The size of k depends on the average ground pressures, which are not printed.",
         Basis.PHYSICS,
+    )  # fmt: skip
+
+
+PSI_PER_UNIT: Mapping[str, float] = MappingProxyType(
+    {"psi": 1.0, "kPa": 1.0 / 6.894757, "bar": 100.0 / 6.894757}
+)
+_DECLARED = "kPa"
+
+
+def pressure_unit(published: Published) -> Finding:
+    """Test in which unit of pressure Table 5 can reproduce D and BCD of Table 4."""
+    # The worse of D and BCD under the best of the eight readings of the signs.
+    least = {
+        unit: max(
+            min(n.deviation for n in nearest_by_signs(published, what, psi_per_unit=scale).values())
+            for what in ("D", "BCD")
+        )
+        for unit, scale in PSI_PER_UNIT.items()
+    }
+    possible = [unit for unit, deviation in least.items() if deviation <= FAR]
+    if _DECLARED in possible:
+        verdict = Verdict.CONFIRMED if possible == [_DECLARED] else Verdict.CONSISTENT
+    else:
+        verdict = Verdict.CORRECTED if possible else Verdict.CONTRADICTED
+    best = min(least, key=lambda unit: least[unit])
+    return Finding(
+        "table5_pressure_unit", "Unit of pressure", "Table 5, Eqs 12-15, nomenclature",
+        tuple(f"Table 5: {name}" for what in ("D", "BCD") for name in NAMES[what]),
+        f"inflation pressure enters Eqs 12-15 in {_DECLARED}",
+        "linear programme: the least that D and BCD can deviate from Table 4, over all "
+        "coefficients that print alike and all readings of their signs, in each unit",
+        tuple(
+            Quantity(f"least deviation in {unit}", 100.0 * deviation, "%")
+            for unit, deviation in least.items()
+        ),
+        verdict,
+        f"In {best} Table 5 can come within {percent(least[best], 2)} of Table 4; in {_DECLARED} "
+        f"no coefficients that print alike come nearer than {percent(least[_DECLARED])}, "
+        "whatever their signs.",
+        "", Basis.PRINTED,
     )  # fmt: skip

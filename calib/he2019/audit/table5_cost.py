@@ -14,7 +14,7 @@ import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from calib.batch.threads import one_thread
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
+from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, number
 from calib.he2019.audit.nearness import (
     ASSUMED_SLIPS,
     Reference,
@@ -23,7 +23,6 @@ from calib.he2019.audit.nearness import (
     references,
 )
 from calib.he2019.audit.pull import coefficients, pull
-from calib.he2019.audit.words import number
 from calib.he2019.datasets.published import FittedTable, Published
 from calib.models.base import Array
 from calib.models.magic_formula import magic_formula

@@ -17,14 +17,17 @@ He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003.
 from __future__ import annotations
 
 import hashlib
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data import Table, table_from_arrays
+from calib.data import Table, table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS
+from calib.errors import CalibError
 from calib.gap.case import Case
 from calib.he2019.datasets.embedded import LABEL, load_he2019
 
@@ -225,3 +228,47 @@ def _case(
         conditions = {n: v for n, v in unfitted.columns.items() if n not in OUTPUTS.values()}
         new = _table(conditions, "fresh.csv")
     return Case(name, lab, field, models, new, (RECONSTRUCTED,))
+
+
+def write_cases(gaps: Sequence[PaperGap], out: Path, *, overwrite: bool = False) -> list[Path]:
+    """Write each gap as a case folder, and return the folders.
+
+    With ``case.toml``, ``lab.csv``, ``field.csv`` and, where rows were kept out, ``fresh.csv`` with
+    their conditions and ``fresh_measured.csv`` with their outcomes, which no diagnosis reads.
+
+    Raises
+    ------
+    CalibError, OSError
+        If a folder exists and may not be replaced; if one cannot be made or written to.
+    """
+    folders = [Path(out) / gap.name for gap in gaps]
+    existing = [folder.name for folder in folders if folder.exists()]
+    if existing and not overwrite:
+        raise CalibError(
+            f"{', '.join(existing)} exist there already", where=str(out),
+            mend="choose another --out, or pass --overwrite",
+        )  # fmt: skip
+    for gap, folder in zip(gaps, folders, strict=True):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_table(folder / "lab.csv", gap.case.lab.columns)
+        write_table(folder / "field.csv", gap.case.field.columns)
+        if gap.case.new_conditions is not None and gap.unfitted is not None:
+            write_table(folder / "fresh.csv", gap.case.new_conditions.columns)
+            write_table(folder / "fresh_measured.csv", gap.unfitted.columns)
+        (folder / "case.toml").write_text(_case_toml(gap), encoding="utf-8")
+    return folders
+
+
+def _case_toml(gap: PaperGap) -> str:
+    remarks = (
+        f"{gap.title}. {gap.question}",
+        f"Calibration: {gap.lab_rows}.",
+        f"Field: {gap.field_rows}.",
+        f"{RECONSTRUCTED.capitalize()}. {gap.limits}",
+    )
+    lines = [f"# {line}" for text in remarks for line in textwrap.wrap(text, 96)]
+    lines += ['calibration = "lab.csv"', 'field = "field.csv"']
+    if gap.case.new_conditions is not None:
+        lines.append('predict = "fresh.csv"')
+    lines += ["", "[models]", *(f'{o} = "{m}"' for o, m in gap.case.models.items())]
+    return "\n".join(lines) + "\n"

@@ -12,7 +12,7 @@ from typing import Any
 from markupsafe import Markup
 
 from calib.he2019.audit import Audit, Finding, Quantity, Verdict
-from calib.he2019.audit.files import audit_csv, audit_json
+from calib.he2019.audit.run import audit_csv, audit_json
 from calib.he2019.datasets.published import DOI
 from calib.he2019.figures.audit import audit_plates
 from calib.report.figures.export import png

@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from calib.he2019.gaps.checks import Check, checks
-from calib.he2019.page.checks import check_text
-from calib.he2019.page.gaps import _withheld
+from calib.he2019.gaps.find import Check, checks
+from calib.he2019.page.gaps import _withheld, check_text
 from calib.he2019.sections import FoundGaps
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.gap_rows import short_name
