@@ -67,8 +67,7 @@ def report(
     from calib.data.quantities import OUTPUTS
     from calib.inference.emulation.prepared import prepare
     from calib.inference.sampling.sampler import SamplerSettings
-    from calib.report.contents import work_out
-    from calib.report.emulators import EmulatorSection
+    from calib.report.sections import EmulatorSection, work_out
     from calib.report.study_tasks import HoldOut, fitted_rows, plan_tasks
     from calib.report.writer import write_report
 

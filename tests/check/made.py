@@ -28,12 +28,12 @@ from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import example_csv
 from calib.report.comparison import write_comparison
-from calib.report.contents import work_out
 from calib.report.figures import Plate
 from calib.report.figures.bands import bands_plate
-from calib.report.figures.learned import learned_plate
+from calib.report.figures.posterior import learned_plate
 from calib.report.figures.style import style
 from calib.report.reference import NOTHING, Reference
+from calib.report.sections import work_out
 from calib.report.study import OutputResult, Study
 from calib.report.study_tasks import Task
 from calib.report.writer import write_report

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from calib.check.check import check
-from calib.check.items import Status
+from calib.check.outcome import Status
 from calib.he2019.audit import audit_csv
 from calib.he2019.audit.run import read_findings
 from tests.check.conftest import different, edit_json, findings, seal

@@ -11,17 +11,16 @@ from calib.gap.files import write_diagnosis
 from calib.he2019.figures.gaps import gap_plate
 from calib.he2019.gaps.find import Check, FoundGap, checks, probability_of
 from calib.models import get_model
-from calib.report.figures.export import pdf_bytes, png_size
 from calib.report.figures.gap import gap_plates
 from calib.report.figures.plate import Plate
+from calib.report.figures.style import pdf_bytes, png_size
 from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_rows import short_name
 from calib.report.gap_verdict import odds_text
 from calib.report.labels import percent, short
 from calib.report.numbers import format_value
 from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
-from calib.report.page.pictures import data_uri
-from calib.report.page.template import template
+from calib.report.page.template import data_uri, template
 
 type _Values = Mapping[str, float]
 

@@ -15,9 +15,8 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.gap_rows import short_name
 from calib.report.gap_verdict import odds_text
 from calib.report.labels import short
-from calib.report.manifest import file_hashes
 from calib.report.study import Study
-from calib.report.writer import write_report
+from calib.report.writer import file_hashes, write_report
 from tests.browser import faults
 from tests.report.page.test_page import Reader
 
