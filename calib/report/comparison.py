@@ -36,12 +36,7 @@ _MOST_COLUMNS = 3
 
 
 def comparison_figure(comparison: Comparison) -> Figure:
-    """Draw, for each model, measured rows and the 90 % interval it gives each without it.
-
-    Parameters
-    ----------
-    comparison : Comparison
-    """
+    """Draw, for each model, measured rows and the 90 % interval it gives each without it."""
     candidates = comparison.candidates
     column = _main_condition(comparison)
     x, y = axis_of(column), axis_of(candidates[0].calibration.problem.bound.model.output)

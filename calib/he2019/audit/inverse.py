@@ -18,7 +18,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.data import Table, hold_out
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, number, percent, rounded
+from calib.he2019.audit.finding import (
+    Finding,
+    Quantity,
+    Verdict,
+    finding,
+    rounded,
+)
 from calib.he2019.audit.intervals import Interval, exact, exp, log, printed
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import Figure, Published
@@ -114,7 +120,6 @@ def attenuation(published: Published) -> Interval:
     return exact(1.0) / printed(published.rut_depth.quality["r_squared"])
 
 
-_FAMILY = "Table 6, Eq 22"
 _UNITS = {"n0": "1", "n1": "1", "k": "kPa/m^n"}
 # An exponent off by less than this part would not be worth a correction.
 _WORTH = 0.05
@@ -158,43 +163,25 @@ def inverse_by_print(published: Published) -> Finding:
     low, high = _fitted_lengths(published)
     ratio, exponent = log(printed(low) / printed(high)), n0 + n1 * exact(float(np.mean(SLIPS)))
     by_table, by_means = exp(ratio / exponent), exp(ratio / (exponent * factor))
-    worth = _worth_correcting(published)
     deeper, claimed = (float(r.middle) - 1.0 for r in (by_means, by_table))
-    evidence = (
-        "Regressing the set pressure on the measured rut shrinks the exponents by R^2: by the "
-        f"means of the ruts n0 is {number(float(corrected['n0'].middle))} and n1 "
-        f"{number(float(corrected['n1'].middle))}, and from the lower to the higher pressure ruts "
-        f"deepen by {percent(deeper, 2)}, not {percent(claimed, 2)}."
-        if worth
-        else f"With R^2 = {published.rut_depth.quality['r_squared'].text} the exponents shrink by "
-        f"{percent(float(factor.middle) - 1.0, 2)} only."
-    )
-    return Finding(
-        "table6_inverse_regression", _FAMILY, "Table 6, Eqs 21 and 22",
-        ("Table 6: n0", "Table 6: n1", "Table 6: k", "Table 6: r_squared"),
-        "n0, n1 and k of Eq 22 are the parameters of Eq 21",
-        "the normal equations of Eq 22: the fitted means of the two pressures differ by R^2 of "
-        "what Eq 21 says",
-        (
-            *(
-                rounded(f"{name}, by the means of the ruts", value, _UNITS[name], figures[name])
-                for name, value in corrected.items()
-            ),
-            rounded("rut at 42 psi over rut at 18 psi, by their means", by_means),
-            rounded("the same by Table 6", by_table),
-        ),
-        Verdict.CORRECTED if worth else Verdict.CONFIRMED, evidence,
-        "n0 and n1 are taken to shrink alike; the measured ruts would give each by itself. k takes "
-        "load over contact area for the ground pressure.",
-        Basis.PRINTED,
+    return finding(
+        "table6_inverse_regression",
+        Verdict.CORRECTED if _worth_correcting(published) else Verdict.CONFIRMED,
+        (*(rounded(f"{name}, by the means of the ruts", value, _UNITS[name], figures[name])
+           for name, value in corrected.items()),
+         rounded("rut at 42 psi over rut at 18 psi, by their means", by_means),
+         rounded("the same by Table 6", by_table)),
+        n0=float(corrected["n0"].middle), n1=float(corrected["n1"].middle), deeper=deeper,
+        claimed=claimed, r_squared=published.rut_depth.quality["r_squared"],
+        shrunk=float(factor.middle) - 1.0,
     )  # fmt: skip
 
 
 def _posterior(s: ParameterSummary, printed_figure: Figure) -> Quantity:
-    skewed = s.name == "k"
+    kind, centre = ("median", s.median) if s.name == "k" else ("mean", s.mean)
     return Quantity(
-        f"{s.name}, posterior {'median' if skewed else 'mean'}", s.median if skewed else s.mean,
-        _UNITS[s.name], s.hdi_lower, s.hdi_upper, "95 % HDI", printed_figure.text,
+        f"{s.name}, posterior {kind}", centre, _UNITS[s.name], s.hdi_lower, s.hdi_upper,
+        "95 % HDI", printed_figure.text,
     )  # fmt: skip
 
 
@@ -208,30 +195,19 @@ def inverse_by_likelihood(published: Published, study: InverseStudy) -> Finding:
         for n, u in _UNITS.items()
     ]
     low, middle, high = np.quantile(study.simulated, [0.025, 0.5, 0.975], axis=0).tolist()
-    for j, (name, text) in enumerate(
-        (("n0", figures["n0"].text), ("n1", figures["n1"].text), ("R^2", quality["r_squared"].text))
-    ):
-        found.append(
-            Quantity(f"{name} of Eq 22 in simulated campaigns", middle[j], "1", low[j], high[j],
-                     "95 % of campaigns", text)
-        )  # fmt: skip
+    beside = {"n0": figures["n0"], "n1": figures["n1"], "R^2": quality["r_squared"]}
+    found += [
+        Quantity(f"{name} of Eq 22 in simulated campaigns", middle[j], "1", low[j], high[j],
+                 "95 % of campaigns", figure.text)
+        for j, (name, figure) in enumerate(beside.items())
+    ]  # fmt: skip
     missed = not low[0] <= direct["n0"] <= high[0]
     verdict = Verdict.CORRECTED if missed else Verdict.CONSISTENT
-    s, below = summary["n0"], float(np.mean(study.n0 < figures["n0"].value))
-    return Finding(
-        "table6_likelihood", _FAMILY, "Table 6, Eqs 21 and 22",
-        ("Table 6: n0", "Table 6: n1", "Table 6: k"),
-        "Eq 22 recovers the parameters of Eq 21",
-        "the posterior of ln zt given pgr and s on the reconstructed 18 and 42 psi rows; and Eq 22 "
-        f"on {study.simulated.shape[0]} campaigns simulated from its least-squares estimate",
-        tuple(found), verdict if study.calibration.converged else Verdict.UNTESTABLE,
-        f"Where n0 is {number(direct['n0'])}, Eq 22 returns {number(middle[0])} "
-        f"({number(low[0])} to {number(high[0])} in 95 % of campaigns), which "
-        f"{'leaves the truth out' if missed else 'holds the truth'}; the posterior of n0 is "
-        f"{number(s.mean)} (95 % HDI {number(s.hdi_lower)} to {number(s.hdi_upper)}), "
-        f"{percent(below, 2)} of it below Table 6's {figures['n0'].text}.",
-        "The parameters of the measured ruts; the posterior holds the prior as well.",
-        Basis.RECONSTRUCTED,
+    return finding(
+        "table6_likelihood", verdict if study.calibration.converged else Verdict.UNTESTABLE, found,
+        campaigns=study.simulated.shape[0], direct=direct["n0"], low=low[0], middle=middle[0],
+        high=high[0], missed=missed, n0=summary["n0"], printed=figures["n0"],
+        below=float(np.mean(study.n0 < figures["n0"].value)),
     )  # fmt: skip
 
 
@@ -250,23 +226,11 @@ def prediction_at_30(published: Published, study: InverseStudy) -> Finding:
     slip = 100.0 * float(study.held_out["slip_ratio"][worst])
     most = float(np.abs(by_print).max())
     blind = _worth_correcting(published) and most < 100.0 * largest.value
-    where = "in the middle of the fitted pressures, where a wrong exponent hardly shows"
-    return Finding(
-        "table6_prediction_at_30", _FAMILY, f"Table 6, Eq 21, {held} psi",
-        ("Table 6: held_out_max_relative_error",),
-        f"predicting {held} psi within {percent(largest.value, 2)} validates n0, n1 and k",
-        f"how far the prediction at {held} psi moves when the exponents are corrected: by the "
-        "printed R^2, and by the posterior on reconstructed data",
-        (
-            Quantity("change by 1/R^2", float(np.median(by_print)), "%", float(by_print.min()),
-                     float(by_print.max()), "over slips"),
-            Quantity(f"largest change by the posterior, at {slip:g} % slip", median, "%", low, high,
-                     "95 % posterior, mean rut"),
-        ),
-        Verdict.CORRECTED if blind else Verdict.CONSISTENT,
-        f"Correcting the exponents moves the prediction by {number(most, 2)} % at most by the "
-        f"printed figures, and by {number(median, 2)} % ({number(low, 2)} to {number(high, 2)}) by "
-        "the posterior on reconstructed data"
-        + (f": {held} psi lies {where}." if blind else "."),
-        "A pressure outside those fitted would tell right from wrong exponents.", Basis.SLIPS,
+    return finding(
+        "table6_prediction_at_30", Verdict.CORRECTED if blind else Verdict.CONSISTENT,
+        (Quantity("change by 1/R^2", float(np.median(by_print)), "%", float(by_print.min()),
+                  float(by_print.max()), "over slips"),
+         Quantity(f"largest change by the posterior, at {slip:g} % slip", median, "%", low, high,
+                  "95 % posterior, mean rut")),
+        held=held, largest=largest.value, most=most, median=median, low=low, high=high,
     )  # fmt: skip

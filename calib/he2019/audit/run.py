@@ -25,7 +25,13 @@ from calib.he2019.audit.curvature_signs import (
     study_curvature_signs,
 )
 from calib.he2019.audit.density import density_findings
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
+from calib.he2019.audit.finding import (
+    Basis,
+    Finding,
+    Quantity,
+    Verdict,
+    finding,
+)
 from calib.he2019.audit.geometric import geometric_findings
 from calib.he2019.audit.inverse import InverseStudy, inverse_findings, study_inverse
 from calib.he2019.audit.rounding import RoundingStudy, rounding_findings, study_rounding
@@ -35,29 +41,6 @@ from calib.he2019.audit.table5_cost import bounds, cost_findings
 from calib.he2019.datasets.published import DOI, PUBLISHED, Published
 from calib.inference.calibration import Calibration
 from calib.report.numbers import finite
-
-
-def untested(published: Published) -> Finding:
-    """Name the figures of the test description that no other figure bears on."""
-    setup = published.setup
-    return Finding(
-        "test_description", "Not testable", "test description",
-        (
-            "Setup: tyre_width_mm", "Setup: speed_m_s", "Setup: slip_levels",
-            *(f"Setup: named slip {i}" for i in range(1, len(setup.named_slips) + 1)),
-            "Setup: rebound_slip", "Setup: largest_water_content",
-        ),
-        f"a tyre {setup.tyre_width_mm.text} mm wide at {setup.speed_m_s.text} m/s, "
-        f"{setup.slip_levels.text} slip levels, water contents up to "
-        f"{100.0 * setup.largest_water_content.value:g} %, rebound above "
-        f"{100.0 * setup.rebound_slip.value:g} % slip",
-        "none: no other printed figure depends on them",
-        (), Verdict.UNTESTABLE,
-        "They describe the tests; the slip levels and the shift of zero slip are printed in part "
-        "only, and several verdicts depend on them.",
-        "The raw measurements (Part I of the source).", Basis.PRINTED,
-    )  # fmt: skip
-
 
 type Progress = Callable[[str, int, int], None]
 
@@ -164,7 +147,7 @@ def begin_audit(
             *convergence_findings(published, searched),
             *rut_quality_findings(published, quality),
             *inverse_findings(published, inverse),
-            untested(published),
+            finding("test_description", Verdict.UNTESTABLE, setup=published.setup),
         ]
         tell("testing printed figures", 2, 2)
         order = list(Verdict)

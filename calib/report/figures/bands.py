@@ -171,12 +171,7 @@ _ZOOM = 4.0
 
 
 def prior_predictive_plate(result: OutputResult) -> Plate:
-    """Draw bands of prior predictive measurements at the calibration conditions.
-
-    Parameters
-    ----------
-    result : OutputResult
-    """
+    """Draw bands of prior predictive measurements at the calibration conditions."""
     problem = result.calibration.problem
     x_axis, y_axis = axis_of(x_column(result)), axis_of(problem.bound.model.output)
     shown = [g for g in groups(result) if g.fitted.any()]

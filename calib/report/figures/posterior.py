@@ -168,12 +168,7 @@ def rank_histograms(values: Array, bins: int = N_BINS) -> Array:
 
 
 def ensembles_plate(result: OutputResult) -> Plate:
-    """Draw traces of the ensemble means and rank histograms.
-
-    Parameters
-    ----------
-    result : OutputResult
-    """
+    """Draw traces of the ensemble means and rank histograms."""
     calibration = result.calibration
     draws, free = calibration.draws, calibration.problem.priors.free
     per_row = 2 if len(free) <= 6 else 3

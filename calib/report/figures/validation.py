@@ -48,12 +48,7 @@ _SIGNIFICANT = 0.05
 
 
 def residuals_plate(result: OutputResult) -> Plate:
-    """Draw residuals against prediction and condition, their quantiles, and replicated data.
-
-    Parameters
-    ----------
-    result : OutputResult
-    """
+    """Draw residuals against prediction and condition, their quantiles, and replicated data."""
     fig, axes = panels(2, 2, height=46.0, left=14.0, bottom=22.0, gap_x=17.0, gap_y=15.0)
     problem, other = result.calibration.problem, held_table(result)
     fitted = standardise(result.calibration, problem)
