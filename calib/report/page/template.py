@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import PurePosixPath
 from string import ascii_letters
@@ -18,26 +18,43 @@ from calib.models import BoundModel
 from calib.models.latex import html
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import png_size
-from calib.report.labels import MINUS, axis_of, plain, stem_and_subscript, unbroken
+from calib.report.labels import MINUS, axis_of, joined, plain, stem_and_subscript, unbroken
+from calib.report.numbers import format_number
 
 _HERE = "calib.report.page"
 
 
+def _known(value: float | None, form: str | int = 3) -> str:
+    """Write a number that may be missing, to some digits or by a format."""
+    if value is None:
+        return "undefined"
+    return form.format(value) if isinstance(form, str) else format_number(value, form)
+
+
+_FILTERS: dict[str, Callable[..., str]] = {
+    "unbroken": unbroken,
+    "basename": lambda path: PurePosixPath(path).name,
+    "joined": joined,
+    "known": _known,
+    "g": lambda value: f"{value:g}",
+    "lower_first": lambda text: text[0].lower() + text[1:],
+}
+
+
 @cache
-def template(name: str, package: str = _HERE) -> Template:
+def template(name: str, package: str = _HERE, *, html: bool = True) -> Template:
     """Return a template by the name of its file in a package, which may include those of this one.
 
-    It escapes what it is given; a name that it is not given is an error.
+    For HTML it escapes what it is given; a name that it is not given is an error.
     """
     environment = Environment(
         loader=ChoiceLoader([PackageLoader(p, ".") for p in dict.fromkeys((package, _HERE))]),
-        autoescape=True,
+        autoescape=html,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["unbroken"] = unbroken
-    environment.filters["basename"] = lambda path: PurePosixPath(path).name
+    environment.filters |= _FILTERS
     return environment.get_template(name)
 
 

@@ -72,7 +72,7 @@ def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publ
     version = str(manifest["versions"]["terracalib"])
     paragraphs = methods(manifest, found)
     tables = _latex_tables(found, manifest["settings"]["gate"])
-    said = [sentence for p in paragraphs for sentence in p.sentences]
+    said = [sentence for _, sentences in paragraphs for sentence in sentences]
     keys = cited([*said, *(t.caption for t in tables)])
     references = bibliography(cited(said), version)
     files = {f"tables/{name}.csv": write_csv(t) for name, t in _csv_tables(found).items()}
@@ -82,7 +82,7 @@ def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publ
     files["references.bib"] = bibtex(keys, version)
     return Publication(
         files,
-        tuple((p.heading, " ".join(map(to_text, p.sentences))) for p in paragraphs),
+        tuple((heading, " ".join(map(to_text, sentences))) for heading, sentences in paragraphs),
         tuple(references),
     )
 
@@ -111,9 +111,9 @@ def _latex_tables(found: Sequence[Output], gate: Mapping[str, float]) -> list[La
 
 def _text(paragraphs: Sequence[Paragraph], references: Sequence[str]) -> str:
     blocks = []
-    for p in paragraphs:
-        body = " ".join(map(to_text, p.sentences))
-        blocks.append(_filled(f"{p.heading}. {body}" if p.heading else body))
+    for heading, sentences in paragraphs:
+        body = " ".join(map(to_text, sentences))
+        blocks.append(_filled(f"{heading}. {body}" if heading else body))
     lines = [_filled(line, subsequent_indent="  ") for line in references]
     return "\n\n".join(["Methods", *blocks, "References", "\n".join(lines)]) + "\n"
 
@@ -128,7 +128,7 @@ def _filled(text: str, **kwargs: Any) -> str:
 
 def _tex(paragraphs: Sequence[Paragraph]) -> str:
     lines = ["% \\input this file; the keys cited are in references.bib."]
-    for p in paragraphs:
-        lines += ["", *([f"\\paragraph{{{to_latex(p.heading)}.}}"] if p.heading else [])]
-        lines += [to_latex(sentence) for sentence in p.sentences]
+    for heading, sentences in paragraphs:
+        lines += ["", *([f"\\paragraph{{{to_latex(heading)}.}}"] if heading else [])]
+        lines += [to_latex(sentence) for sentence in sentences]
     return "\n".join(lines) + "\n"
