@@ -6,19 +6,15 @@ What is claimed and how it is tested is in `claims.toml`, in sentences that a `f
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from functools import cache
-from importlib import resources
 from typing import Any
 
-from jinja2 import Environment, StrictUndefined
-
+from calib.he2019 import declared
 from calib.he2019.audit.intervals import Interval
 from calib.he2019.datasets.published import PUBLISHED, Figure
-from calib.report.labels import joined
+from calib.report.page.template import sentences
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -192,10 +188,10 @@ def finding(
     figures: Iterable[str] = (), basis: Basis | None = None, **facts: Any,
 ) -> Finding:  # fmt: skip
     """Judge a claim of `claims.toml`, by its key or one given apart; facts fill its sentences."""
-    entry = _claims()[claim or key]
+    entry = _CLAIMS[claim or key]
 
     def said(part: str) -> str:
-        return " ".join(_sentence(entry.get(part, "")).render(facts, verdict=verdict).split())
+        return _said(entry.get(part, ""), verdict=verdict, **facts)
 
     named = (name for item in (*entry.get("figures", ()), *figures) for name in _expanded(item))
     return Finding(
@@ -203,12 +199,6 @@ def finding(
         tuple(found), verdict, said("evidence"), said("stays_open"),
         basis or Basis[entry["basis"]],
     )  # fmt: skip
-
-
-@cache
-def _claims() -> dict[str, dict[str, Any]]:
-    source = resources.files("calib.he2019.audit") / "claims.toml"
-    return tomllib.loads(source.read_text(encoding="utf-8"))
 
 
 def _expanded(item: str) -> Iterator[str]:
@@ -220,12 +210,9 @@ def _expanded(item: str) -> Iterator[str]:
             yield f"{source.replace('*', str(pressure))}: {name}"
 
 
-_WORDS = Environment(undefined=StrictUndefined)
-_WORDS.filters |= {
-    "number": number,
-    "percent": percent,
-    "joined": joined,
-    "g": lambda value: f"{value:g}",
-    "span": lambda interval: f"{number(float(interval.lower))} to {number(float(interval.upper))}",
-}
-_sentence = cache(_WORDS.from_string)
+def _span(interval: Interval) -> str:
+    return f"{number(float(interval.lower))} to {number(float(interval.upper))}"
+
+
+_CLAIMS = declared("audit/claims.toml")
+_said = sentences(number=number, percent=percent, span=_span)

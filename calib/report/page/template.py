@@ -18,8 +18,17 @@ from calib.models import BoundModel
 from calib.models.latex import html
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import png_size
-from calib.report.labels import MINUS, axis_of, joined, plain, stem_and_subscript, unbroken
-from calib.report.numbers import format_number
+from calib.report.labels import (
+    MINUS,
+    axis_of,
+    joined,
+    percent,
+    plain,
+    short,
+    stem_and_subscript,
+    unbroken,
+)
+from calib.report.numbers import format_number, format_value
 
 _HERE = "calib.report.page"
 
@@ -35,6 +44,9 @@ _FILTERS: dict[str, Callable[..., str]] = {
     "unbroken": unbroken,
     "basename": lambda path: PurePosixPath(path).name,
     "joined": joined,
+    "percent": percent,
+    "short": short,
+    "value": format_value,
     "known": _known,
     "g": lambda value: f"{value:g}",
     "lower_first": lambda text: text[0].lower() + text[1:],
@@ -56,6 +68,14 @@ def template(name: str, package: str = _HERE, *, html: bool = True) -> Template:
     )
     environment.filters |= _FILTERS
     return environment.get_template(name)
+
+
+def sentences(**filters: Callable[..., str]) -> Callable[..., str]:
+    """Return what fills facts into a sentence, a template in a string; its lines are joined."""
+    environment = Environment(undefined=StrictUndefined)
+    environment.filters |= _FILTERS | filters
+    compiled = cache(environment.from_string)
+    return lambda text, **facts: re.sub(r"[ \n]+", " ", compiled(text).render(facts)).strip()
 
 
 def data_uri(image: bytes) -> str:
