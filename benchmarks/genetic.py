@@ -20,7 +20,7 @@ from shared.machine import describe, use_one_core
 from shared.measure import spread
 
 from calib.data import Table, hold_out
-from calib.he2019.tasks import he2019_tasks
+from calib.he2019.designs import he2019_tasks
 from calib.inference.estimators.base import PointEstimate
 from calib.inference.estimators.differential_evolution import estimate_differential_evolution
 from calib.inference.estimators.genetic import estimate_genetic

@@ -33,7 +33,7 @@ __all__ = ["HERE", "Later", "Pool", "begin_imports", "pool", "without_interrupti
 _LOOK_SECONDS = 2.0
 # What a report needs, and what its figures and files import when they are first made.
 _REPORT = (
-    "calib.report.contents", "calib.report.writer", "calib.report.figures.collect",
+    "calib.report.sections", "calib.report.writer", "calib.report.figures.collect",
     "calib.gap.diagnose", "arviz_base", "corner", "h5netcdf", "PIL.Image",
 )  # fmt: skip
 

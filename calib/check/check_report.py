@@ -13,16 +13,17 @@ from calib.check.compare import (
     SUMMARY,
     Again,
     compare_estimates,
+    compare_files,
     compare_numbers,
     count_numbers,
+    moved_parts,
     output_entry,
 )
 from calib.check.derived import verify_derived, verify_form, verify_gaps
-from calib.check.files import compare_files, moved_parts
 from calib.check.inputs import verify_files, verify_hashes, verify_label, verify_priors
-from calib.check.items import Item, Status
 from calib.check.montecarlo import describe
 from calib.check.numbers import read_json
+from calib.check.outcome import Item, Status
 from calib.check.posteriors import GROUP as POSTERIORS
 from calib.check.posteriors import DrawsFile, read_draws, verify_density, verify_summary
 from calib.check.recompute import not_computed, recompute_report, report_tasks

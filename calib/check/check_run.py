@@ -11,9 +11,9 @@ from typing import Any
 from calib.batch.environment import Environment
 from calib.check.inputs import GROUP as INPUTS
 from calib.check.inputs import verify_files, verify_label
-from calib.check.items import Item, Status
 from calib.check.montecarlo import Place, count_drawn, describe, drawn_in_run
 from calib.check.numbers import compare_entries, flatten
+from calib.check.outcome import Item, Status
 from calib.check.posteriors import GROUP as POSTERIORS
 from calib.check.posteriors import compare_posterior, read_draws, summary_of, verify_density
 from calib.check.recompute import estimate_again, not_computed, recompute_run

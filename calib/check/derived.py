@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.check.items import Item, Status
 from calib.check.numbers import flatten, read_json
+from calib.check.outcome import Item, Status
 from calib.check.text import GROUP as TEXT
 from calib.check.text import differing_lines
 from calib.errors import CalibError

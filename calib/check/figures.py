@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from calib.check.items import Item, Status
 from calib.check.numbers import NUMBER
+from calib.check.outcome import Item, Status
 from calib.models.base import Array
 
 GROUP = "figures"

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from calib.batch.environment import sha256
-from calib.check.items import Item, Status
+from calib.check.outcome import Item, Status
 from calib.check.schema import TaskRecord
 from calib.data import Table
 from calib.data.labels import KNOWN_DATA, label_of

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from calib.check.items import Item, Status
 from calib.check.montecarlo import Place
+from calib.check.outcome import Item, Status
 from calib.check.tolerances import ARITHMETIC, Of, Tolerance, natural_scale, tolerance_of
 
 NUMBER = re.compile(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from calib.check.items import Item, Status
+from calib.check.outcome import Item, Status
 from calib.errors import CalibError
 from calib.inference.diagnostics import hdi
 from calib.inference.problem import Problem

@@ -12,7 +12,7 @@ import numpy as np
 
 from calib.batch.pool import HERE, Pool
 from calib.check.inputs import GROUP as INPUTS
-from calib.check.items import Item, Status
+from calib.check.outcome import Item, Status
 from calib.check.schema import Manifest, RunRecord, TaskRecord
 from calib.data import read_table
 from calib.data.quantities import OUTPUTS
@@ -22,8 +22,7 @@ from calib.inference.estimators import PointEstimate, estimate
 from calib.inference.io import save_calibration
 from calib.inference.problem import Problem
 from calib.inference.random import generator
-from calib.report.contents import work_out
-from calib.report.sections import SECTIONS
+from calib.report.sections import SECTIONS, work_out
 from calib.report.study import Progress, Study
 from calib.report.study_tasks import HoldOut, Task
 from calib.report.writer import write_report

@@ -28,8 +28,8 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS
 from calib.report.comparison import FILE as COMPARISON
 from calib.report.comparison import SCHEMA as COMPARISON_SCHEMA
-from calib.report.manifest import SCHEMA as REPORT_SCHEMA
 from calib.report.sections import SECTIONS
+from calib.report.writer import SCHEMA as REPORT_SCHEMA
 
 
 def _inside(path: str) -> str:

@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from calib.batch.environment import sha256
-from calib.check.items import Item, Status
 from calib.check.numbers import NUMBER, without_numbers
+from calib.check.outcome import Item, Status
 
 GROUP = "page and tables"
 _IMAGE = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]*)")

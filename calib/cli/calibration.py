@@ -55,8 +55,7 @@ def report(
     from calib.data.labels import labelled
     from calib.data.quantities import OUTPUTS
     from calib.inference.emulation.prepared import prepare
-    from calib.report.contents import work_out
-    from calib.report.emulators import EmulatorSection
+    from calib.report.sections import EmulatorSection, work_out
     from calib.report.study_tasks import HoldOut, fitted_rows, plan_tasks
     from calib.report.writer import write_report
 
@@ -71,8 +70,8 @@ def report(
         title = "Calibration report"
         sections: Sequence[Section] = ()
     else:
+        from calib.he2019.designs import he2019_tasks
         from calib.he2019.sections import AuditSection, GapsSection
-        from calib.he2019.tasks import he2019_tasks
 
         tasks = he2019_tasks()
         # Beside the user's own data, the source's gaps and tables have no place.
@@ -358,8 +357,7 @@ def _write_he2019(out: Path, overwrite: bool) -> list[Path]:
 
 
 def _write_he2019_gaps(out: Path, overwrite: bool) -> list[Path]:
-    from calib.he2019.gaps.cases import paper_gaps
-    from calib.he2019.gaps.folders import write_cases
+    from calib.he2019.gaps.cases import paper_gaps, write_cases
 
     return write_cases(paper_gaps(), out, overwrite=overwrite)
 

@@ -9,8 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from calib.check.items import Item, Status
-from calib.check.outcome import Outcome
+from calib.check.outcome import Item, Outcome, Status
 
 _MOST = 40
 

@@ -32,8 +32,7 @@ def compare(
     from calib.inference.prior_files import prior_file_model
     from calib.inference.sampling.sampler import SamplerSettings
     from calib.models import get_model
-    from calib.report.comparison import write_comparison
-    from calib.report.page.comparison import text
+    from calib.report.comparison import text, write_comparison
     from calib.report.study_tasks import HoldOut, read_and_split
     from calib.validation.comparison import check_comparable
     from calib.validation.comparison import compare as find

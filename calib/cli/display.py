@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from calib.inference.calibration import Calibration
-from calib.report.posterior_text import centre_text, interval_text
+from calib.report.numbers import centre_text, interval_text
 
 _log = logging.getLogger("calib")
 

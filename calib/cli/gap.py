@@ -15,7 +15,7 @@ from calib.errors import CalibError
 # What the processes that draw the page import.
 _PAGE = (
     "calib.report.page.gap_page", "calib.report.page.diagnosis", "calib.report.figures.gap",
-    "calib.report.figures.export", "PIL.Image",
+    "calib.report.figures.style", "PIL.Image",
 )  # fmt: skip
 
 

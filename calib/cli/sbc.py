@@ -31,8 +31,7 @@ def sbc(
 
     from calib.cli.display import progress_bars
     from calib.models import MODELS
-    from calib.report.page.sbc import text_table
-    from calib.report.sbc import write_sbc
+    from calib.report.sbc import text_table, write_sbc
     from calib.validation.sbc.run import SETTINGS, chosen_models, run_sbc
 
     slow = [name for name in MODELS if name not in chosen_models()]

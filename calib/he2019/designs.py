@@ -1,8 +1,8 @@
-"""The conditions under which the six models are simulated: those of the embedded data.
+"""What is done with the embedded data: the report's calibrations, and designs of simulations.
 
-Only the conditions are taken from the embedded data; every output is simulated. Drawbar pull and
-rut depth are calibrated at 18 and 42 psi and held out at 30 psi, as in the report; the other models
-are held out between the conditions that they are calibrated at.
+Only the conditions are taken from the embedded data for a design; every output is simulated.
+Drawbar pull and rut depth are calibrated at 18 and 42 psi and held out at 30 psi, as in the report;
+the other models are held out between the conditions that they are calibrated at.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from calib.data import hold_out, table_from_arrays
 from calib.he2019.datasets.embedded import load_he2019
 from calib.models import get_model
+from calib.report.study_tasks import HoldOut, Task
 from calib.validation.sbc.designs import Design, ModelDesign
 
 _PSI = "inflation_pressure_psi"
@@ -61,3 +62,17 @@ DESIGNS = (
     ModelDesign("bekker", partial(_held_30_psi, "bekker", "rut_depth")),
     ModelDesign("modified_bekker", partial(_held_30_psi, "modified_bekker", "rut_depth")),
 )  # fmt: skip
+
+
+def he2019_tasks() -> tuple[Task, ...]:
+    """Return the paper's three calibrations on the embedded, reconstructed data.
+
+    The 30 psi rows of drawbar pull and rut depth are held out.
+    """
+    held = HoldOut("inflation_pressure_psi", 30.0)
+    models = {
+        "bulk_density": ("ayers_perumpral", None),
+        "drawbar_pull": ("magic_formula_pressure", held),
+        "rut_depth": ("modified_bekker", held),
+    }
+    return tuple(Task(key, model, load_he2019(key), rows) for key, (model, rows) in models.items())

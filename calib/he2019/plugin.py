@@ -64,7 +64,7 @@ def _audit_again(record: Any) -> Section:
 def _audit_csv(folder: Path, files: Mapping[str, str]) -> dict[str, str]:
     import json
 
-    from calib.he2019.audit.files import audit_csv, read_findings
+    from calib.he2019.audit.run import audit_csv, read_findings
 
     if "audit.json" not in files or not (folder / "audit.json").is_file():
         return {}

@@ -6,25 +6,146 @@ With the rows that were held out and a hash of every file, so that it can be com
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
 
 from calib.batch.environment import Environment
 from calib.data import write_table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.io import load_calibration, save_calibration
-from calib.report.figures.comparison import comparison_figure
-from calib.report.figures.export import png_bytes
-from calib.report.manifest import file_hashes
-from calib.report.numbers import finite
-from calib.report.page.comparison import render
-from calib.report.page.pictures import data_uri
+from calib.models import get_model
+from calib.models.base import Array
+from calib.report.figures.style import BLACK, BLUE, legend_below, panels, png_bytes, style
+from calib.report.labels import axis_of
+from calib.report.numbers import finite, format_number
+from calib.report.page.template import data_uri, template
+from calib.report.writer import file_hashes
 from calib.validation.comparison import Candidate, Comparison, difference
 from calib.validation.prediction import N_DRAWS
 from calib.validation.validate import PARETO_K_MAX
+
+_LEVEL = 0.9
+_MOST_COLUMNS = 3
+
+
+def comparison_figure(comparison: Comparison) -> Figure:
+    """Draw, for each model, measured rows and the 90 % interval it gives each without it."""
+    candidates = comparison.candidates
+    column = _main_condition(comparison)
+    x, y = axis_of(column), axis_of(candidates[0].calibration.problem.bound.model.output)
+    cols = min(_MOST_COLUMNS, len(candidates))
+    rows = -(-len(candidates) // cols)
+    with style():
+        figure, axes = panels(
+            rows, cols, height=58.0, left=15.0, top=9.0, bottom=20.0, gap_x=4.0, gap_y=16.0,
+            sharex=True, sharey=True,
+        )  # fmt: skip
+        for ax, candidate in zip(axes.flat, candidates, strict=False):
+            table = candidate.loo.table
+            place = _spread(x.factor * table[column])
+            low, middle, high = (
+                y.factor * np.quantile(candidate.loo.draws, q, axis=0)
+                for q in (0.5 - _LEVEL / 2.0, 0.5, 0.5 + _LEVEL / 2.0)
+            )
+            bars = ax.vlines(place, low, high, color=BLUE, alpha=0.35, linewidth=1.6)
+            dash = ax.plot(place, middle, "_", color=BLUE, markersize=4.0)[0]
+            dots = ax.plot(place, y.factor * candidate.loo.observed, ".", color=BLACK,
+                           markersize=3.0)[0]  # fmt: skip
+            ax.set_title(_title(comparison, candidate))
+            ax.set_xlabel(x.label)
+        for ax in axes.flat[len(candidates) :]:
+            ax.set_visible(False)
+        for row in axes:
+            row[0].set_ylabel(y.label)
+        legend_below(
+            figure, [dots, dash, bars],
+            ["measured", "median without the row", "90 % interval without the row"], 3,
+        )  # fmt: skip
+    return figure
+
+
+def _main_condition(comparison: Comparison) -> str:
+    """Return the condition of all models that has most values."""
+    models = [c.calibration.problem.bound.model for c in comparison.candidates]
+    table = comparison.candidates[0].loo.table
+    shared = [n for n in models[0].conditions if all(n in m.conditions for m in models)]
+    return max(shared or models[0].conditions, key=lambda n: np.unique(table[n]).size)
+
+
+def _spread(x: Array) -> Array:
+    """Move rows that share a place apart, so that each bar is seen."""
+    room = 0.012 * (np.ptp(x) or 1.0)
+    moved = x.copy()
+    for value in np.unique(x):
+        same = np.flatnonzero(x == value)
+        moved[same] += (
+            room * (np.arange(same.size) - 0.5 * (same.size - 1)) / max(1, same.size**0.5)
+        )
+    return moved
+
+
+def _title(comparison: Comparison, candidate: Candidate) -> str:
+    return f"{candidate.model}, weight {comparison.weights[candidate.model]:.2f}"
+
+
+_HEAD = (
+    "Model", "Below the best, elpd", "Standard error", "Stacking weight", "RMSE", "90 % covers",
+    "Rows fitted again", "Log evidence",
+)  # fmt: skip
+_HELD_HEAD = ("held-out elpd", "held-out RMSE", "held-out CRPS", "held-out 90 % covers")
+
+
+def table(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Return head and rows of the table, from the content of `comparison.json`."""
+    head = [*_HEAD, *(_HELD_HEAD if found["held_out"] else ())]
+    return head, [_row(name, m) for name, m in found["models"].items()]
+
+
+def _row(name: str, m: Mapping[str, Any]) -> list[str]:
+    cells = [
+        name, f"{m['below_best']:.1f}", f"{m['below_best_se']:.1f}", f"{m['weight']:.2f}",
+        format_number(m["rmse"]), f"{100 * m['coverage_90']:.0f} %", str(m["refitted_rows"]),
+        "none" if m["log_evidence"] is None else f"{m['log_evidence']:.1f}",
+    ]  # fmt: skip
+    held = m.get("held_out")
+    if held:
+        density = "none" if held["elpd"] is None else f"{held['elpd']:.1f}"
+        crps = "none" if held["crps"] is None else format_number(held["crps"])
+        cells += [density, format_number(held["rmse"]), crps,
+                  f"{100 * held['coverage_90']:.0f} %"]  # fmt: skip
+    return cells
+
+
+def text(found: Mapping[str, Any]) -> str:
+    """Lay the table out as text, the verdict below it."""
+    head, body = table(found)
+    lines = [head, *body]
+    widths = [max(len(line[j]) for line in lines) for j in range(len(head))]
+    shown = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in lines]
+    return "\n".join([*(line.rstrip() for line in shown), found["verdict"]])
+
+
+def render(found: Mapping[str, Any], image: str, command: Sequence[str]) -> str:
+    """Render the page from the content of `comparison.json` and the figure's data URI."""
+    head, body = table(found)
+    models = [get_model(name) for name in found["models"]]
+    return template("comparison.html.j2").render(
+        found=found,
+        head=head,
+        rows=body,
+        image=image,
+        models=[{"name": m.name, "title": m.title, "equation": m.equation, "source": m.source}
+                for m in models],
+        command=shlex.join(command),
+    )  # fmt: skip
+
 
 SCHEMA = "calib/comparison/2"
 FILE, PAGE, FIGURE, HELD_OUT = (

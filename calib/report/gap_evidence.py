@@ -43,12 +43,7 @@ from calib.report.labels import MINUS, axis_of, joined, short
 
 
 def gap_verdict(found: Diagnosis) -> GapVerdict:
-    """Say in a headline and a few sentences what a diagnosis found; nothing is drawn.
-
-    Parameters
-    ----------
-    found : Diagnosis
-    """
+    """Say in a headline and a few sentences what a diagnosis found; nothing is drawn."""
     return judge_gap(gap_evidence(found))
 
 

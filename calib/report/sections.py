@@ -1,20 +1,30 @@
-"""Parts of a report beside its outputs: a source's own, hung on by its package.
+"""What a report shows: the study, and sections beside its outputs, hung on by their packages.
 
 A section is asked for with what it is to work out, begun where the outputs are, and writes itself:
 files into the report's folder, numbers into ``summary.json``, what it takes to work it out again
-into ``manifest.json``, and a piece of the page.
+into ``manifest.json``, and a piece of the page. That of emulated simulators is here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from calib.batch.pool import Pool
+import numpy as np
+
+from calib.batch.pool import HERE, Pool
 from calib.data.registry import Registry
-from calib.report.study import Progress, Study
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.report.numbers import format_number
+from calib.report.study import Progress, Study, begin_study
+from calib.report.study_tasks import Task
+
+type Document = Mapping[str, Any]
+
+# So many failed runs are shown; the manifest has all.
+_SHOWN = 20
 
 
 @dataclass(frozen=True)
@@ -80,10 +90,76 @@ class SectionKind:
         SECTIONS.add(self)
 
 
-def _emulators_again(record: Any) -> Section:
-    # It needs this module.
-    from calib.report.emulators import EmulatorSection
+@dataclass(frozen=True)
+class EmulatorSection:
+    """What became of the emulations, as their `Emulation.document`, by model."""
 
+    documents: Mapping[str, Document]
+
+    def begin(self, seed: int, pool: Pool) -> Callable[[Study, Progress], FoundEmulators]:
+        """Return what hands them on: they were made before the study."""
+        return lambda study, tell: FoundEmulators(self.documents)
+
+
+@dataclass(frozen=True)
+class FoundEmulators:
+    """The emulations, ready to be written: how many runs, how good, which failed."""
+
+    documents: Mapping[str, Document]
+    name: str = "emulators"
+
+    def summary(self) -> None:
+        """Add nothing to the summary: a check does not run the simulator again."""
+
+    def record(self) -> dict[str, Any]:
+        """Return all there is to know for the manifest."""
+        return {model: dict(document) for model, document in self.documents.items()}
+
+    def begin(
+        self, folder: Path, *, versions: Mapping[str, str], pdf: bool, pool: Pool
+    ) -> Callable[[Progress], Written]:
+        """Return what writes the piece of the page."""
+        return lambda tell: Written(
+            "emulators", "Emulators of slow simulators", "", _emulators_html(self.documents)
+        )
+
+
+def _emulators_html(documents: Mapping[str, Document]) -> str:
+    from calib.report.page.template import template
+
+    failed = [
+        {
+            "model": model,
+            "n": len(d["failed"]),
+            "rows": [
+                (", ".join(f"{v:.4g}" for v in f["parameters"]), f["kind"], f["reason"],
+                 f["printed"].strip()[-200:])
+                for f in d["failed"][:_SHOWN]
+            ],
+        }
+        for model, d in documents.items() if d["failed"]
+    ]  # fmt: skip
+    rows = [_emulator_row(model, d) for model, d in documents.items()]
+    return template("emulators.html.j2").render(rows=rows, failed=failed)
+
+
+def _emulator_row(model: str, d: Document) -> list[str]:
+    held: Document = d["held_out"] or {}
+    seen, inside, shares = "none left", "", "none"
+    if held:
+        pit = np.histogram(held["pit"], bins=4, range=(0.0, 1.0))[0]
+        seen = f"{format_number(held['rmse_in_noise_sds'])} on {held['runs']}"
+        inside = f"{100 * held['covered_90']:.0f} %"
+        shares = ", ".join(f"{100 * part:.0f} %" for part in pit / max(int(pit.sum()), 1))
+    return [
+        model, str(d["runs"]), str(d["nodes"]), seen, inside, shares,
+        format_number(d["between_nodes_error_in_noise_sds"]),
+        format_number(d["simulator_noise_sd"]) if d["simulator_noise_sd"] else "none",
+        "good enough" if d["passed"] else "; ".join(d["reasons"]),
+    ]  # fmt: skip
+
+
+def _emulators_again(record: Any) -> Section:
     if not isinstance(record, Mapping) or not all(isinstance(d, Mapping) for d in record.values()):
         raise ValueError("no record of emulators")
     return EmulatorSection(record)
@@ -92,3 +168,47 @@ def _emulators_again(record: Any) -> Section:
 SECTIONS: Registry[SectionKind] = Registry(
     "section", lambda kind: kind.name, SectionKind("emulators", _emulators_again)
 )
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What `calib.report.writer.write_report` writes: the study, and what its sections found."""
+
+    study: Study
+    found: tuple[Found, ...]
+
+
+def work_out(
+    tasks: Sequence[Task],
+    seed: int,
+    *,
+    settings: SamplerSettings | None = None,
+    sections: Sequence[Section] = (),
+    progress: Progress | None = None,
+    workers: int = 1,
+    pool: Pool = HERE,
+) -> Contents:
+    """Work everything out that a report shows.
+
+    Parameters
+    ----------
+    sections : sequence of Section
+        What the report has beside its outputs.
+    progress : callable, optional
+        Called with what is being done, steps done and steps planned.
+    workers : int
+        Processes for leaving rows out, where outputs are worked out here.
+    pool : Pool, optional
+        Where outputs and sections are worked out, in any order. The numbers depend neither on it
+        nor on `workers`.
+    """
+    tell = progress or (lambda what, done, planned: None)
+    study = begin_study(
+        tasks, seed, pool, settings=settings, progress=progress,
+        workers=workers if pool.here else 1,
+    )  # fmt: skip
+    begun = [section.begin(seed, pool) for section in sections]
+    studied = study(tell)
+    # What was asked for last comes last; what its section has to do here is done meanwhile.
+    found = [finish(studied, tell) for finish in reversed(begun)]
+    return Contents(studied, tuple(reversed(found)))

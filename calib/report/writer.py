@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ from calib.batch.environment import Environment, sha256
 from calib.batch.folders import fresh_folder
 from calib.batch.pool import HERE, Pool
 from calib.data import write_table
+from calib.inference.estimators import GeneticSettings
 from calib.inference.io import to_datatree, write_netcdf
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
@@ -20,14 +21,69 @@ from calib.models.simulators.emulator.files import save_emulator
 from calib.models.simulators.emulator.model import emulator_of
 from calib.report.figures import Plate
 from calib.report.figures.collect import plates
-from calib.report.figures.export import pdf_bytes, png
-from calib.report.manifest import build_manifest, file_hashes
-from calib.report.page.render import render_page
+from calib.report.figures.style import pdf_bytes, png
+from calib.report.page.content import render_page
 from calib.report.publish import publication
 from calib.report.reference import reference_of
 from calib.report.sections import Found
 from calib.report.study import OutputResult, Study
+from calib.report.study_tasks import Task
 from calib.report.summary import summarise
+
+SCHEMA = "calib/manifest/2"
+
+
+def file_hashes(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of every file below a folder but the manifest, by relative path."""
+    return {
+        path.relative_to(folder).as_posix(): sha256(path.read_bytes())
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.relative_to(folder).as_posix() != "manifest.json"
+    }
+
+
+def build_manifest(
+    study: Study,
+    settings: SamplerSettings,
+    command: Sequence[str],
+    inputs: Mapping[str, Mapping[str, Any]],
+    *,
+    title: str = "",
+    environment: Environment | None = None,
+) -> dict[str, Any]:
+    """Return the manifest of a study, its file hashes still to be added.
+
+    `inputs` are for every output the files its data and priors were copied to, and their hashes.
+    ``seconds`` is the one place of a report that holds durations, which no two runs share.
+    """
+    return {
+        "schema": SCHEMA,
+        "title": title,
+        "command": list(command),
+        "seed": study.seed,
+        **(environment or Environment.here()).document(),
+        "settings": json.loads(json.dumps(asdict(settings))),
+        "genetic_algorithm": asdict(GeneticSettings()),
+        "tasks": {k: _task(r.task, inputs[k]) for k, r in study.results.items()},
+        "seconds": {
+            "study": study.seconds,
+            **{
+                key: {**r.seconds, "methods": {e.method: e.seconds for e in r.estimates}}
+                for key, r in study.successes.items()
+            },
+        },
+    }
+
+
+def _task(task: Task, inputs: Mapping[str, Any]) -> dict[str, Any]:
+    held = task.held_out
+    return {
+        "model": task.model,
+        "held_out": None if held is None else {"column": held.column, "value": held.value},
+        "label": task.table.label,
+        **inputs,
+    }
+
 
 type Progress = Callable[[str, int, int], None]
 

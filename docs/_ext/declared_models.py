@@ -11,7 +11,7 @@ from calib.data import read_for_model
 from calib.data.quantities import QUANTITIES
 from calib.inference.prior_files import default_priors, read_priors
 from calib.models import MODELS, Model
-from calib.report.page.equations import parametrisation
+from calib.report.page.template import parametrisation
 
 TITLE = "Models"
 LEAD = (

@@ -22,13 +22,12 @@ import calib.check.check_run as check_run_module
 from calib.batch.environment import sha256
 from calib.check import posteriors
 from calib.check.check import check
-from calib.check.items import Status
-from calib.check.outcome import Outcome
+from calib.check.outcome import Outcome, Status
 from calib.check.recompute import recompute_report, recompute_run
 from calib.he2019 import sections
 from calib.he2019.audit.run import begin_audit
-from calib.report.manifest import file_hashes
 from calib.report.publish import publication
+from calib.report.writer import file_hashes
 from tests.check.kernels import ALL, FEW, Setting
 
 from . import made

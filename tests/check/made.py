@@ -16,9 +16,9 @@ from unittest.mock import patch
 from calib.data import hold_out, read_table
 from calib.he2019.audit import Seeds
 from calib.he2019.datasets.embedded import load_he2019
+from calib.he2019.designs import he2019_tasks
 from calib.he2019.gaps.cases import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
-from calib.he2019.tasks import he2019_tasks
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
@@ -28,12 +28,12 @@ from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import example_csv
 from calib.report.comparison import write_comparison
-from calib.report.contents import work_out
 from calib.report.figures import Plate
 from calib.report.figures.bands import bands_plate
-from calib.report.figures.learned import learned_plate
+from calib.report.figures.posterior import learned_plate
 from calib.report.figures.style import style
 from calib.report.reference import NOTHING, Reference
+from calib.report.sections import work_out
 from calib.report.study import OutputResult, Study
 from calib.report.study_tasks import Task
 from calib.report.writer import write_report

@@ -12,7 +12,7 @@ import pytest
 
 from calib.batch.environment import sha256
 from calib.check.check import check
-from calib.check.items import Status
+from calib.check.outcome import Status
 from calib.errors import CalibError
 from calib.report.comparison import page
 from tests.check.conftest import different, edit_json, findings, seal_run

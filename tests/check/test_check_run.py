@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from calib.check.check import check
-from calib.check.items import Status
+from calib.check.outcome import Status
 from calib.errors import CalibError
 from calib.inference.calibration import calibrate
 from calib.inference.io import load_calibration, save_calibration

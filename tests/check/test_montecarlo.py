@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from calib.check.items import Status
 from calib.check.montecarlo import (
     drawn_in_output,
     drawn_in_run,
@@ -16,13 +15,14 @@ from calib.check.montecarlo import (
     validation_errors,
 )
 from calib.check.numbers import compare_entries, flatten
+from calib.check.outcome import Status
 from calib.data import hold_out
-from calib.he2019.tasks import he2019_tasks
+from calib.he2019.designs import he2019_tasks
 from calib.inference.calibration import calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
 from calib.inference.random import generator
-from calib.report.contents import work_out
+from calib.report.sections import work_out
 from calib.report.summary import summarise
 from calib.validation.scores import score
 from calib.validation.validate import Validation, leave_one_out, validate_held_out

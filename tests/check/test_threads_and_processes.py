@@ -20,15 +20,14 @@ import numpy as np
 import pytest
 
 from calib.he2019.audit import Seeds, audit_json
+from calib.he2019.designs import he2019_tasks
 from calib.he2019.gaps.cases import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
-from calib.he2019.tasks import he2019_tasks
 from calib.inference.sampling.sampler import SamplerSettings
-from calib.report.contents import work_out
-from calib.report.manifest import file_hashes
+from calib.report.sections import work_out
 from calib.report.study_tasks import Task
 from calib.report.summary import summarise
-from calib.report.writer import write_report
+from calib.report.writer import file_hashes, write_report
 from calib.validation.sbc.run import run_sbc
 
 SHORT = SamplerSettings(steps=60, max_steps=60)

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from calib.check.compare import RECORD, SUMMARY, is_document
-from calib.check.items import Status
 from calib.check.numbers import compare_entries, flatten
+from calib.check.outcome import Status
 from calib.check.tolerances import _PATTERNS, TABLE, tolerance_of
 
 REPORT = Path(__file__).resolve().parents[2] / "reports" / "he2019"

@@ -17,7 +17,7 @@ from calib.cli import main
 from calib.inference.prior_files import default_priors
 from calib.models import MODELS, example_csv, template_csv
 from calib.report.figures.collect import plates
-from calib.report.manifest import file_hashes
+from calib.report.writer import file_hashes
 
 RUT = example_csv("modified_bekker")
 PRESSURES = example_csv("magic_formula_pressure")

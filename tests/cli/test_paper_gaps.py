@@ -71,7 +71,7 @@ def test_the_report_of_the_embedded_data_has_the_section(
         asked.append(seed)
         return lambda tell: (found_gaps["plain_bekker"],)
 
-    monkeypatch.setattr("calib.he2019.tasks.he2019_tasks", lambda: ())
+    monkeypatch.setattr("calib.he2019.designs.he2019_tasks", lambda: ())
     monkeypatch.setattr("calib.he2019.sections.begin_gaps", begin)
     monkeypatch.setattr("calib.he2019.sections.begin_audit", lambda *_: lambda *_: audit)
     ran = calib("report", "--out", "rep", "--seed", 5)

@@ -29,7 +29,7 @@ from calib.gap.shifts import (
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.mode import prior_widths
 from calib.models import MODELS as KNOWN
-from calib.report.page.gap_tables import shift_sizes
+from calib.report.page.diagnosis import shift_sizes
 from tests.gap.cases import MODELS, NOISE, PULL_ONLY, campaigns_of, make_case
 
 SIGMA = {o: NOISE[o] for o in MODELS}

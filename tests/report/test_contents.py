@@ -8,13 +8,12 @@ import pytest
 
 from calib.batch.pool import pool
 from calib.he2019.audit import Seeds
+from calib.he2019.designs import he2019_tasks
 from calib.he2019.gaps.cases import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
-from calib.he2019.tasks import he2019_tasks
 from calib.inference.sampling.sampler import SamplerSettings
-from calib.report.contents import work_out
-from calib.report.manifest import file_hashes
-from calib.report.writer import write_report
+from calib.report.sections import work_out
+from calib.report.writer import file_hashes, write_report
 
 SHORT = SamplerSettings(steps=60, max_steps=60)
 

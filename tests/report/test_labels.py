@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.report.figures.learned import _log_ticks
+from calib.report.figures.posterior import _log_ticks
 from calib.report.labels import (
     axis_of,
     joined,

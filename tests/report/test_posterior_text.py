@@ -9,7 +9,7 @@ import pytest
 
 from calib.inference.calibration import Calibration, ParameterSummary
 from calib.inference.diagnostics import hdi, hdi_error, median_error
-from calib.report.posterior_text import centre_text, interval_text, skewed
+from calib.report.numbers import centre_text, interval_text, skewed
 
 
 def summary(mean, sd, low, high, median=2.0) -> ParameterSummary:

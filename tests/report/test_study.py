@@ -17,14 +17,14 @@ from calib.data.labels import labelled
 from calib.he2019.datasets import embedded
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import PUBLISHED
-from calib.he2019.tasks import he2019_tasks
+from calib.he2019.designs import he2019_tasks
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
-from calib.report.contents import work_out
-from calib.report.manifest import build_manifest, file_hashes
+from calib.report.sections import work_out
 from calib.report.study import Failure, OutputResult, Study
 from calib.report.study_tasks import Task, plan_tasks
 from calib.report.summary import summarise
+from calib.report.writer import build_manifest, file_hashes
 from tests.user_tables import pulls, table
 
 

@@ -12,10 +12,9 @@ from PIL import Image
 
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.figures.collect import plates
-from calib.report.manifest import file_hashes
 from calib.report.publish import publication
 from calib.report.study import Study
-from calib.report.writer import write_report
+from calib.report.writer import file_hashes, write_report
 from tests.browser import faults
 
 

@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from calib.data.quantities import OUTPUTS
-from calib.he2019.tasks import he2019_tasks
+from calib.he2019.designs import he2019_tasks
 from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.mode import find_mode
 from calib.validation.outliers import LEVEL, outlying_notes, outlying_rows

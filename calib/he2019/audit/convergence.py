@@ -17,9 +17,13 @@ from scipy.stats import beta
 from calib.batch.pool import Pool
 from calib.batch.threads import one_thread
 from calib.data import Table
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
+from calib.he2019.audit.finding import (
+    Finding,
+    Quantity,
+    Verdict,
+    finding,
+)
 from calib.he2019.audit.nearness import pressure_curves, printed_coefficients
-from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import Published
 from calib.inference.estimators import (
@@ -210,58 +214,28 @@ def _in_printed_coordinates(
 
 def convergence_findings(published: Published, study: GeneticStudy) -> list[Finding]:
     """Judge the convergence of the algorithm, pressure by pressure and jointly."""
-    return [_by_pressure(published, study), _joint(study)]
+    return [_by_pressure(study), _joint(study)]
 
 
-def _by_pressure(published: Published, study: GeneticStudy) -> Finding:
+def _by_pressure(study: GeneticStudy) -> Finding:
     searches = list(study.by_pressure.values())
     everywhere = all(s.arrived == s.costs.size for s in searches)
-    excess = max(float((s.costs / s.optimum - 1.0).max()) for s in searches)
-    hits, n = sum(s.arrived for s in searches), sum(s.costs.size for s in searches)
-    low = min(s.share.lower for s in searches)
-    return Finding(
-        "genetic_by_pressure", "Genetic algorithm", "Table 2, Eqs 10-11, Table 4",
-        (
-            *(f"Table 2: {name}" for name in published.setup.genetic_settings),
-            *(f"{t.source}: {name}" for t in published.genetic.values()
-              for name in (*"BCD", "cost")),
-        ),
-        "with Table 2's settings the genetic algorithm reaches the least cost of each pressure",
-        "its final cost over seeds against the optimum of multi-start least squares, on the "
-        "reconstructed data",
-        tuple(s.share for s in searches),
-        Verdict.CONFIRMED if everywhere else Verdict.CONTRADICTED,
-        f"{hits} of {n} runs end at the optimum, the worst a part of {number(excess, 1)} above it; "
-        f"at each pressure the share of runs that do is {percent(low, 2)} or more (95 % interval).",
-        "On the measured curves there may be other local optima. What the source leaves open of "
-        "the algorithm was filled in here.",
-        Basis.RECONSTRUCTED,
+    return finding(
+        "genetic_by_pressure", Verdict.CONFIRMED if everywhere else Verdict.CONTRADICTED,
+        [s.share for s in searches], hits=sum(s.arrived for s in searches),
+        n=sum(s.costs.size for s in searches), low=min(s.share.lower for s in searches),
+        excess=max(float((s.costs / s.optimum - 1.0).max()) for s in searches),
     )  # fmt: skip
 
 
 def _joint(study: GeneticStudy) -> Finding:
     ours, printed = study.joint, study.printed_coordinates
-    worst = float(printed.costs.max())
-    always = ours.arrived == ours.costs.size and printed.arrived == printed.costs.size
-    stops = (
-        "always" if always else
-        f"{printed.arrived} of {printed.costs.size} do and the others stop at up to "
-        f"{number(worst)}: a cost such as {printed.published} can be such a stop"
-    )  # fmt: skip
-    return Finding(
-        "genetic_joint", "Genetic algorithm", "Table 2, Eq 16, Table 5",
-        ("Table 5: cost", "Table 2: iterations"),
-        "with Table 2's settings the genetic algorithm reaches the least cost of Eqs 12-15",
-        "its final cost over seeds on the reconstructed data, in coordinates at the end pressures "
-        "and in c1 to c9 and b0",
-        (
-            ours.share, printed.share,
-            Quantity("cost in c1 to b0", float(np.median(printed.costs)), "kN^2",
-                     float(printed.costs.min()), worst, "over seeds", printed.published),
-        ),
-        Verdict.CONFIRMED if always else Verdict.CONTRADICTED,
-        f"Searched through values at the end pressures, {ours.arrived} of {ours.costs.size} runs "
-        f"end within 1 % of {number(ours.optimum)} kN^2; searched through c1 to b0, {stops}.",
-        "The coordinates and the search box of the source; other boxes end elsewhere.",
-        Basis.RECONSTRUCTED,
+    costs, worst = printed.costs, float(printed.costs.max())
+    always = ours.arrived == ours.costs.size and printed.arrived == costs.size
+    return finding(
+        "genetic_joint", Verdict.CONFIRMED if always else Verdict.CONTRADICTED,
+        (ours.share, printed.share,
+         Quantity("cost in c1 to b0", float(np.median(costs)), "kN^2", float(costs.min()), worst,
+                  "over seeds", printed.published)),
+        ours=ours, printed=printed, worst=worst,
     )  # fmt: skip

@@ -9,7 +9,7 @@ of each pressure and needs the slips, so it is repeated with other shifts of zer
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 
@@ -17,7 +17,12 @@ import numpy as np
 from scipy.optimize import minimize
 
 from calib.batch.threads import one_thread
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
+from calib.he2019.audit.finding import (
+    Finding,
+    Quantity,
+    Verdict,
+    finding,
+)
 from calib.he2019.audit.nearness import (
     ASSUMED_SLIPS,
     COEFFICIENTS,
@@ -25,8 +30,7 @@ from calib.he2019.audit.nearness import (
     printed_coefficients,
     references,
 )
-from calib.he2019.audit.quadratics import Signs, printed_signs
-from calib.he2019.audit.words import number
+from calib.he2019.audit.signs import Signs, printed_signs, signs_text
 from calib.he2019.datasets.drawbar import SLIP_SHIFT
 from calib.he2019.datasets.published import Published
 from calib.inference.random import generator
@@ -111,72 +115,44 @@ def curvature_signs(published: Published, study: CurvatureStudy) -> list[Finding
     return [_first_two(study, read, best), _last(published, study, read, best, second)]
 
 
-def _written(signs: tuple[int, ...]) -> str:
-    return "(" + ", ".join("+-"[s < 0] for s in signs) + ")"
-
-
-def _quantities(study: CurvatureStudy, readings: list[Signs]) -> tuple[Quantity, ...]:
-    found = []
+def _quantities(study: CurvatureStudy, readings: list[Signs]) -> Iterator[Quantity]:
     for s in readings:
-        shifts = (*study.by_shift.get(s, ()), study.least[s])
-        several = len(shifts) > 1
-        found.append(
-            Quantity(
-                f"least cost with {_written(s)}", study.least[s], "kN^2",
-                min(shifts) if several else float("nan"), max(shifts) if several else float("nan"),
-                "shifts of zero slip from 0 to 4 %" if several else "",
-            )
-        )  # fmt: skip
-    return tuple(found)
+        name, least = f"least cost with {signs_text(s)}", study.least[s]
+        shifts = (*study.by_shift.get(s, ()), least)
+        if len(shifts) == 1:
+            yield Quantity(name, least, "kN^2")
+        else:
+            what = "shifts of zero slip from 0 to 4 %"
+            yield Quantity(name, least, "kN^2", min(shifts), max(shifts), what)
 
 
 def _first_two(study: CurvatureStudy, read: Signs, best: Signs) -> Finding:
     nearest = {
         (a, b): min(study.least[a, b, c] for c in (1, -1)) for a, b in product((1, -1), repeat=2)
     }
-    others = {pair: cost for pair, cost in nearest.items() if pair != best[:2]}
-    rival = min(others, key=lambda pair: others[pair])
+    own, rival = nearest.pop(best[:2]), min(nearest.values())
     excluded = [s for s, cost in study.least_free.items() if cost > study.published_cost]
-    own = best[:2] == read[:2]
-    if own:
-        verdict = Verdict.CONFIRMED if others[rival] > study.published_cost else Verdict.CONSISTENT
-    else:
-        verdict = Verdict.CORRECTED
-    return Finding(
-        "table5_signs_of_c7_c8", "Signs", "Table 5, Eq 15", ("Table 5: c7", "Table 5: c8"),
-        f"c7 and c8 have the signs {_written(read[:2])}, inferred",
-        "the least cost that any data compatible with Table 4 can give to coefficients that print "
-        "alike, for each of the eight readings of c7 to c9",
-        _quantities(study, study.order[:4]), verdict,
-        f"{_written(best[:2])} allows a cost of {number(nearest[best[:2]])} kN^2, any other "
-        f"{number(others[rival])} or more, where {study.published_cost:g} is printed; "
-        f"{len(excluded)} of the 8 readings exceed it even if Table 4 is not an optimum.",
-        "The bound takes Table 4 for the optimum of each pressure and assumes the slips.",
-        Basis.SLIPS,
+    verdict = Verdict.CORRECTED
+    if best[:2] == read[:2]:
+        verdict = Verdict.CONFIRMED if rival > study.published_cost else Verdict.CONSISTENT
+    return finding(
+        "table5_signs_of_c7_c8", verdict, _quantities(study, study.order[:4]),
+        read=signs_text(read[:2]), best=signs_text(best[:2]), own=own, rival=rival,
+        printed=study.published_cost, excluded=len(excluded),
     )  # fmt: skip
 
 
 def _last(
     published: Published, study: CurvatureStudy, read: Signs, best: Signs, second: Signs
 ) -> Finding:
-    figure = published.pressure.estimates["c9"]
-    same = best[:2] == second[:2]
-    always = same and all(
+    always = best[:2] == second[:2] and all(
         a < b for a, b in zip(study.by_shift[best], study.by_shift[second], strict=True)
     )
     verdict = Verdict.UNTESTABLE
     if always:
         verdict = Verdict.CONFIRMED if best[2] == read[2] else Verdict.CORRECTED
-    sign = "positive" if best[2] > 0 else "negative"
-    return Finding(
-        "table5_sign_of_c9", "Signs", "Table 5, Eq 15", ("Table 5: c9",),
-        f"c9 = {figure.text}, its sign open: a negative one brings E nearer to Table 4",
-        "as for c7 and c8, at five shifts of zero slip",
-        _quantities(study, [best, second]), verdict,
-        f"A {sign} c9 brings the pull nearer to Table 4 than the other sign at every shift: the "
-        f"least possible cost is {number(study.least[best])} against "
-        f"{number(study.least[second])} kN^2, and {study.published_cost:g} is printed.",
-        "At the assumed slips neither sign reaches the printed cost, so the slips differ or Table "
-        "4 is not exactly the optimum; with tests bunched near 20 % slip the order could change.",
-        Basis.SLIPS,
+    return finding(
+        "table5_sign_of_c9", verdict, _quantities(study, [best, second]),
+        c9=published.pressure.estimates["c9"], sign="positive" if best[2] > 0 else "negative",
+        least=study.least[best], rival=study.least[second], printed=study.published_cost,
     )  # fmt: skip

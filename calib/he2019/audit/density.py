@@ -8,12 +8,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict, rounded
+from calib.he2019.audit.finding import (
+    Finding,
+    Quantity,
+    Verdict,
+    beside_rival,
+    between,
+    finding,
+    rounded,
+)
 from calib.he2019.audit.intervals import Interval, exact, exp, log, printed, square
-from calib.he2019.audit.words import number, percent
 from calib.he2019.datasets.published import Published
 
-_FAMILY = "Table 1, Eq 1"
 # Cone indices of soils that carry a wheel but let it sink, kPa.
 _CONE_INDEX = Interval(np.array(100.0), np.array(3000.0))
 # Dry bulk density of mineral soils, g/cm^3: 1.0 to 1.9 (Brady & Weil 2016, The Nature and
@@ -50,7 +56,7 @@ def density_findings(published: Published) -> list[Finding]:
     """Judge Table 1."""
     return [
         _exponent(published), _sign_of_C3(published), _unit(published), _quality(published),
-        _unchecked(published),
+        finding("table1_values", Verdict.UNTESTABLE),
     ]  # fmt: skip
 
 
@@ -61,37 +67,21 @@ def _plausible(density: Interval) -> bool:
 
 def _quantity(name: str, density: Interval) -> Quantity:
     what = "over conditions and rounding"
-    return Quantity(name, float("nan"), "g/cm^3", float(density.lower), float(density.upper), what)
+    return between(name, float(density.lower), float(density.upper), "g/cm^3", what)
 
 
 def _exponent(published: Published) -> Finding:
     figure = published.bulk_density.estimates["C1"]
     read, other = density_range(published), density_range(published, exponent=-1)
-    verdict = {
-        (True, False): Verdict.CONFIRMED, (True, True): Verdict.CONSISTENT,
-        (False, True): Verdict.CORRECTED, (False, False): Verdict.CONTRADICTED,
-    }[_plausible(read), _plausible(other)]  # fmt: skip
+    verdict = beside_rival(_plausible(read), _plausible(other))
     wrong = other if verdict is Verdict.CONFIRMED else read
-    most = _most_samples(published, float(wrong.upper))
     power = int(np.floor(np.log10(figure.value)))
-    return Finding(
-        "table1_exponent_of_C1", _FAMILY, "Table 1, Eq 1", ("Table 1: C1",),
-        f"C1 = {figure.text}, the sign of its exponent inferred",
-        f"densities over cone indices of 100 to 3000 kPa and the tested water contents, over all "
-        f"coefficients that print alike, beside those of mineral soils ({_MINERAL[0]} to "
-        f"{_MINERAL[1]} g/cm^3); the printed errors against each other",
-        (
-            _quantity(f"density with an exponent of {power:+d}", read),
-            _quantity(f"density with an exponent of {-power:+d}", other),
-        ),
-        verdict,
-        f"An exponent of {-power if wrong is other else power:+d} gives "
-        f"{number(float(wrong.lower))} to {number(float(wrong.upper))} g/cm^3, which no mineral "
-        f"soil has; at such densities the printed RMSE and largest relative error could stand "
-        f"together only with {most} samples or fewer.",
-        f"The other exponent gives {number(float(read.lower))} to {number(float(read.upper))} "
-        "g/cm^3, a compacted soil; see the unit of cone index.",
-        Basis.PHYSICS,
+    return finding(
+        "table1_exponent_of_C1", verdict,
+        (_quantity(f"density with an exponent of {power:+d}", read),
+         _quantity(f"density with an exponent of {-power:+d}", other)),
+        C1=figure, mineral=_MINERAL, power=-power if wrong is other else power, wrong=wrong,
+        read=read, most=_most_samples(published, float(wrong.upper)),
     )  # fmt: skip
 
 
@@ -111,52 +101,33 @@ def _most_samples(published: Published, densest: float) -> int | str:
 
 
 def _sign_of_C3(published: Published) -> Finding:
-    figure = published.bulk_density.estimates["C3"]
     rmse = published.bulk_density.quality["rmse"].value
     one = Interval(np.array(400.0), np.array(400.0))
     read = density_range(published, cone_index=one)
     other = density_range(published, C3_sign=-1, cone_index=one)
     apart = float(max(other.upper - read.lower, read.upper - other.lower))
-    return Finding(
-        "table1_sign_of_C3", _FAMILY, "Table 1, Eq 1", ("Table 1: C3",),
-        f"C3 = {figure.text}, its sign open",
-        "densities at one cone index over the tested water contents, under either sign, beside "
-        "the printed RMSE",
+    return finding(
+        "table1_sign_of_C3",
+        Verdict.UNTESTABLE if apart <= 2.0 * rmse else Verdict.CONSISTENT,
         (_quantity("density with C3 positive", read), _quantity("density with C3 negative", other),
          Quantity("largest difference", apart, "g/cm^3", published=f"RMSE {rmse:g}")),
-        Verdict.UNTESTABLE if apart <= 2.0 * rmse else Verdict.CONSISTENT,
-        f"The sign moves the density by {number(apart, 2)} g/cm^3 at most, where the RMSE is "
-        f"{rmse:g}, and a shift of C1 takes up most of it.",
-        "Whether soil of one density resists more (positive) or less (negative) when wetter; the "
-        "reconstructed data take the positive sign and cannot decide.",
-        Basis.PHYSICS,
+        C3=published.bulk_density.estimates["C3"], apart=apart, rmse=rmse,
     )  # fmt: skip
 
 
 def _unit(published: Published) -> Finding:
     in_kpa = density_range(published)
-    in_mpa = density_range(
-        published,
-        cone_index=Interval(_CONE_INDEX.lower / _KPA_PER_MPA, _CONE_INDEX.upper / _KPA_PER_MPA),
-    )
+    low, high = (end / _KPA_PER_MPA for end in (_CONE_INDEX.lower, _CONE_INDEX.upper))
+    in_mpa = density_range(published, cone_index=Interval(low, high))
     fine = _plausible(in_kpa), _plausible(in_mpa)
-    verdict = Verdict.UNTESTABLE if all(fine) else Verdict.CONSISTENT
-    if not fine[0]:
-        verdict = Verdict.CORRECTED if fine[1] else Verdict.CONTRADICTED
-    return Finding(
-        "table1_unit_of_cone_index", _FAMILY, "Table 1, Eq 1, nomenclature",
-        ("Table 1: C1", "Table 1: C4"),
-        "cone index enters Eq 1 in kPa",
-        "densities over cone indices of 100 to 3000 kPa, over all coefficients that print alike, "
-        "with cone index in kPa and in MPa",
+    return finding(
+        "table1_unit_of_cone_index",
+        # That only kPa gives a soil would not prove it.
+        {(True, True): Verdict.UNTESTABLE, (True, False): Verdict.CONSISTENT}.get(
+            fine, beside_rival(*fine)
+        ),
         (_quantity("density with kPa", in_kpa), _quantity("density with MPa", in_mpa)),
-        verdict,
-        f"In kPa the tested soil would be {number(float(in_kpa.lower))} to "
-        f"{number(float(in_kpa.upper))} g/cm^3, in MPa {number(float(in_mpa.lower))} to "
-        f"{number(float(in_mpa.upper))}: both are soils, the second the commoner sandy loam.",
-        "One printed density, or one printed cone index, would decide; Table 5 shows that a "
-        "declared unit need not be the one that was used.",
-        Basis.PHYSICS,
+        in_kpa=in_kpa, in_mpa=in_mpa,
     )  # fmt: skip
 
 
@@ -166,44 +137,21 @@ def _quality(published: Published) -> Finding:
         printed(table.quality[name]) for name in ("r_squared", "rmse", "max_relative_error")
     )
     density = density_range(published)
-    p = len(table.estimates)
     # One error squared is no more than all of them: (relative x density)^2 <= RMSE^2 (n - p).
     largest = relative * density
-    fewest = p + float(np.ceil((largest.lower / rmse.upper) ** 2))
+    fewest = len(table.estimates) + float(np.ceil((largest.lower / rmse.upper) ** 2))
     most = _most_samples(published, float(density.upper))
     # The sd of the observed densities, and the factor of cone index that the explained part needs.
     spread = rmse / Interval(*(np.sqrt(1.0 - e) for e in (r_squared.upper, r_squared.lower)))
     explained = np.sqrt(r_squared.upper) * spread.upper / density.lower
     factor = float(np.exp(table.values["C4"] * explained))
     possible = isinstance(most, str) or most >= fewest
-    sensible = factor < 30.0
-    return Finding(
-        "table1_quality", _FAMILY, "Table 1",
-        ("Table 1: r_squared", "Table 1: rmse", "Table 1: max_relative_error"),
-        f"R^2 = {table.quality['r_squared'].text}, RMSE = {table.quality['rmse'].text} g/cm^3 and "
-        f"a largest relative error of {percent(table.quality['max_relative_error'].value)} belong "
-        "to one fit",
-        "what each of the three allows the others to be",
-        (
-            Quantity("samples at least", fewest),
-            rounded("sd of the measured densities", spread, "g/cm^3"),
-            Quantity("factor of cone index per sd of the fitted densities, at most", factor),
-        ),
-        Verdict.CONSISTENT if possible and sensible else Verdict.CONTRADICTED,
-        f"They can stand together with {int(fewest)} samples or more, whose densities vary by "
-        f"{percent(float(spread.middle / density.middle), 2)} (sd) and whose cone indices vary by "
-        f"a factor of {number(factor, 2)} or less about their middle.",
-        "The number of samples is not printed, so the RMSE's convention cannot be checked.",
-        Basis.PHYSICS,
-    )  # fmt: skip
-
-
-def _unchecked(published: Published) -> Finding:
-    return Finding(
-        "table1_values", _FAMILY, "Table 1", ("Table 1: C2", "Table 1: C4"),
-        "C1 to C4 are the least-squares estimates",
-        "none: neither the samples nor their number are printed",
-        (), Verdict.UNTESTABLE,
-        "Any values are the optimum of some data; those used here were made so that these are.",
-        "The measured densities, cone indices and water contents.", Basis.RECONSTRUCTED,
+    return finding(
+        "table1_quality",
+        Verdict.CONSISTENT if possible and factor < 30.0 else Verdict.CONTRADICTED,
+        (Quantity("samples at least", fewest),
+         rounded("sd of the measured densities", spread, "g/cm^3"),
+         Quantity("factor of cone index per sd of the fitted densities, at most", factor)),
+        quality=table.quality, fewest=int(fewest), factor=factor,
+        spread=float(spread.middle / density.middle),
     )  # fmt: skip

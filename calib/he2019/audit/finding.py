@@ -1,13 +1,36 @@
-"""What an audit finds: a published claim, how it was tested, and a verdict with its evidence."""
+"""What an audit finds: a published claim, how it was tested, and a verdict with its evidence.
+
+What is claimed and how it is tested is in `claims.toml`, in sentences that a `finding` completes.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Any
 
+from calib.he2019 import declared
 from calib.he2019.audit.intervals import Interval
-from calib.he2019.datasets.published import Figure
+from calib.he2019.datasets.published import PUBLISHED, Figure
+from calib.report.page.template import sentences
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Write a number to some significant digits, without an exponent where that is readable."""
+    if value == 0.0 or not math.isfinite(value):
+        return f"{value:g}"
+    size = int(f"{abs(value):.{digits - 1}e}".partition("e")[2])
+    if not -4 <= size < 6:
+        return f"{value:.{digits - 1}e}"
+    rounded = round(value, digits - 1 - size)
+    return f"{rounded:.{max(0, digits - 1 - size)}f}"
+
+
+def percent(fraction: float, digits: int = 3) -> str:
+    """Write a fraction as a percentage."""
+    return f"{number(100.0 * fraction, digits)} %"
 
 
 class Verdict(StrEnum):
@@ -110,6 +133,13 @@ def rounded(
     return Quantity(name, value, unit, low, high, "rounding", published.text if published else "")
 
 
+def between(
+    name: str, low: float, high: float, unit: str, interval: str, published: str = ""
+) -> Quantity:
+    """Return a quantity of which only the interval is meant."""
+    return Quantity(name, math.nan, unit, float(low), float(high), interval, published)
+
+
 @dataclass(frozen=True)
 class Finding:
     """One finding: what is claimed, how it was tested, and one sentence of evidence.
@@ -144,3 +174,45 @@ class Finding:
     def reconstructed(self) -> bool:
         """Whether the verdict depends on the reconstruction."""
         return self.basis is Basis.RECONSTRUCTED
+
+
+def beside_rival(read: bool, rival: bool) -> Verdict:
+    """Return what it says of a reading that it, or its rival, passes a test."""
+    if read:
+        return Verdict.CONSISTENT if rival else Verdict.CONFIRMED
+    return Verdict.CORRECTED if rival else Verdict.CONTRADICTED
+
+
+def finding(
+    key: str, verdict: Verdict, found: Iterable[Quantity] = (), *, claim: str = "",
+    figures: Iterable[str] = (), basis: Basis | None = None, **facts: Any,
+) -> Finding:  # fmt: skip
+    """Judge a claim of `claims.toml`, by its key or one given apart; facts fill its sentences."""
+    entry = _CLAIMS[claim or key]
+
+    def said(part: str) -> str:
+        return _said(entry.get(part, ""), verdict=verdict, **facts)
+
+    named = (name for item in (*entry.get("figures", ()), *figures) for name in _expanded(item))
+    return Finding(
+        key, entry["family"], said("where"), tuple(named), said("claim"), said("test"),
+        tuple(found), verdict, said("evidence"), said("stays_open"),
+        basis or Basis[entry["basis"]],
+    )  # fmt: skip
+
+
+def _expanded(item: str) -> Iterator[str]:
+    """Yield each figure of a table by itself, at every pressure where it says so."""
+    source, _, names = item.partition(": ")
+    psi = PUBLISHED.setup.inflation_pressures_psi if "*" in source else ("",)
+    for pressure in psi:
+        for name in names.split() if source.startswith("Table") else [names]:
+            yield f"{source.replace('*', str(pressure))}: {name}"
+
+
+def _span(interval: Interval) -> str:
+    return f"{number(float(interval.lower))} to {number(float(interval.upper))}"
+
+
+_CLAIMS = declared("audit/claims.toml")
+_said = sentences(number=number, percent=percent, span=_span)

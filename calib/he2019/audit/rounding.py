@@ -8,17 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.batch.threads import one_thread
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
+from calib.he2019.audit.finding import (
+    Finding,
+    Quantity,
+    Verdict,
+    between,
+    finding,
+    number,
+)
 from calib.he2019.audit.intervals import Interval, printed
-from calib.he2019.audit.nearness import COEFFICIENTS, pressure_curves, printed_coefficients
+from calib.he2019.audit.nearness import pressure_curves, printed_coefficients
 from calib.he2019.audit.pull import coefficients, pressure_box, pull, pull_from_slope, quadratic
-from calib.he2019.audit.quadratics import NAMES, nearest, targets
-from calib.he2019.audit.words import number, percent
+from calib.he2019.audit.signs import NAMES, nearest, targets
 from calib.he2019.datasets.published import Published
 from calib.models.base import Array
-from calib.report.labels import joined
 
-_FAMILY = "Digits of Table 5"
 # Digits are enough where D is fixed to this part.
 _WANTED = 0.01
 
@@ -82,101 +86,58 @@ def _peak(published: Published) -> Finding:
     spread = [float(r.half_width) / w for r, w in zip(ranges, wanted, strict=True)]
     worst = int(np.argmax(spread))
     best = nearest(published, "D")
-    holds = all(r.holds(w) for r, w in zip(ranges, wanted, strict=True))
-    if not holds:
-        verdict = Verdict.CONTRADICTED
-    else:
+    verdict = Verdict.CONTRADICTED
+    if all(r.holds(w) for r, w in zip(ranges, wanted, strict=True)):
         verdict = Verdict.CORRECTED if max(spread) > _WANTED else Verdict.CONFIRMED
-    c3 = published.pressure.estimates["c3"]
-    p = float(pressures[worst])
-    needed = _WANTED * wanted[worst] / p**2
-    found.append(
-        Quantity("c3 that brings D nearest to Table 4", float(best.coefficients[2]),
-                 "kN/psi^2", published=c3.text)
-    )  # fmt: skip
-    return Finding(
-        "table5_digits_of_D", _FAMILY, "Table 5, Eq 14",
-        tuple(f"Table 5: {name}" for name in NAMES["D"]),
-        "c1, c2 and c3 as printed give the peak pull D",
-        "interval arithmetic over all coefficients that print alike, at the three pressures",
-        tuple(found), verdict,
-        f"The digits leave D at {p:g} psi open by {percent(spread[worst], 2)} either way "
-        f"({number(float(ranges[worst].lower))} to {number(float(ranges[worst].upper))} kN); as "
-        f"printed it is off by {percent(off[worst], 2)}, while c3 = "
-        f"{number(float(best.coefficients[2]), 4)} would bring D to within "
-        f"{percent(best.deviation, 2)} of Table 4 at every pressure.",
-        f"To fix D at {p:g} psi to {percent(_WANTED, 1)}, c3 must be known to "
-        f"{number(needed, 1)} kN/psi^2, against {c3.half_unit:g} as printed.",
-        Basis.PRINTED,
+    c3, best_c3 = published.pressure.estimates["c3"], float(best.coefficients[2])
+    psi = float(pressures[worst])
+    name = "c3 that brings D nearest to Table 4"
+    found.append(Quantity(name, best_c3, "kN/psi^2", published=c3.text))
+    return finding(
+        "table5_digits_of_D", verdict, found, psi=psi, spread=spread[worst], range=ranges[worst],
+        off=off[worst], best_c3=best_c3, deviation=best.deviation, wanted=_WANTED, c3=c3,
+        needed=_WANTED * wanted[worst] / psi**2,
     )  # fmt: skip
 
 
 def _slope_and_curvature(published: Published) -> Finding:
     slope, found = _quadratics(published, "BCD", "kN/%")
     curvature, more = _quadratics(published, "E", "1")
-    _, K4 = targets(published, "BCD")
-    pressures, E4 = targets(published, "E")
+    pressures, K4 = targets(published, "BCD")
+    _, E4 = targets(published, "E")
     spread = max(float(r.half_width) / k for r, k in zip(slope, K4, strict=True))
-    outside = [f"{p:g}" for p, r, e in zip(pressures, curvature, E4, strict=True) if not r.holds(e)]
-    missed = [
-        f"{p:g}" for p, r, k in zip(pressures, slope, K4, strict=True) if not r.holds(float(k))
-    ]
-    verdict = Verdict.CONFIRMED
+    missed, outside = (
+        [f"{p:g}" for p, r, v in zip(pressures, ranges, wanted, strict=True) if not r.holds(v)]
+        for ranges, wanted in ((slope, K4), (curvature, E4))
+    )
+    verdict = Verdict.CORRECTED if spread > _WANTED else Verdict.CONFIRMED
     if outside or missed:
         verdict = Verdict.CONTRADICTED
-    elif spread > _WANTED:
-        verdict = Verdict.CORRECTED
-    return Finding(
-        "table5_digits_of_BCD_and_E", _FAMILY, "Table 5, Eqs 12 and 15",
-        tuple(f"Table 5: {name}" for what in ("BCD", "E") for name in NAMES[what]),
-        "c4 to c9 as printed give the slope BCD and the curvature factor E of Table 4",
-        "interval arithmetic over all coefficients that print alike, at the three pressures",
-        (*found, *more), verdict,
-        f"No coefficients that print alike give Table 4's BCD at {joined(missed or ['any'])} psi "
-        f"or its E at {joined(outside or ['any'])} psi; the digits leave BCD open by up to "
-        f"{percent(spread, 2)}."
-        if outside or missed else
-        f"Table 4's BCD and E can be reached; the digits leave BCD open by up to "
-        f"{percent(spread, 2)}.",
-        "A joint fit with one C need not repeat Table 4 exactly; what it can reach is judged by "
-        "the cost of Table 5.",
-        Basis.PRINTED,
+    return finding(
+        "table5_digits_of_BCD_and_E", verdict, (*found, *more), missed=missed, outside=outside,
+        spread=spread,
     )  # fmt: skip
 
 
 def _curve(published: Published, study: RoundingStudy) -> Finding:
-    found = []
+    found, relative = [], {}
     for psi, allowed in study.allowed.items():
         at = int(np.argmax(allowed.half_width))
         D = published.genetic[psi].values["D"]
+        relative[psi] = float(allowed.half_width.max()) / D
         found.append(
-            Quantity(
-                f"widest range of the pull at {psi} psi", float("nan"), "kN",
-                float(allowed.lower[at]), float(allowed.upper[at]), "rounding",
-                f"{number(D, 4)} peak (Table 4)",
+            between(
+                f"widest range of the pull at {psi} psi", allowed.lower[at], allowed.upper[at],
+                "kN", "rounding", f"{number(D, 4)} peak (Table 4)",
             )
         )  # fmt: skip
-    relative = {
-        psi: float(a.half_width.max()) / published.genetic[psi].values["D"]
-        for psi, a in study.allowed.items()
-    }
     best, worst = min(relative, key=lambda p: relative[p]), max(relative, key=lambda p: relative[p])
     gaps = {p: _gap(study.allowed[p], study.table4[p]) for p in relative}
     outside = [f"by up to {number(gap, 2)} kN at {p} psi" for p, gap in gaps.items() if gap > 0.0]
-    verdict = Verdict.CONFIRMED if relative[worst] <= _WANTED else Verdict.CORRECTED
-    return Finding(
-        "table5_digits_of_pull", _FAMILY, "Table 5, Eqs 3-5 and 12-15",
-        tuple(f"Table 5: {name}" for name in COEFFICIENTS),
-        "Table 5 gives the drawbar pull at any slip and pressure",
-        "exact extremes in BCD and E and an outward-rounded subdivision in C and D, at 151 slips "
-        "up to 75 %, over all coefficients that print alike",
-        tuple(found), verdict,
-        f"The digits leave the pull open by up to {percent(relative[best], 2)} of the peak at "
-        f"{best} psi and {percent(relative[worst], 2)} at {worst} psi"
-        + (f"; Table 4 lies outside that range {joined(outside)}." if outside
-           else "; Table 4 lies inside that range."),
-        "Table 4, pressure by pressure, is the reference to use.",
-        Basis.PRINTED,
+    return finding(
+        "table5_digits_of_pull",
+        Verdict.CONFIRMED if relative[worst] <= _WANTED else Verdict.CORRECTED, found,
+        open=relative, best=best, worst=worst, outside=outside,
     )  # fmt: skip
 
 
@@ -188,31 +149,21 @@ def _gap(allowed: Interval, curve: Interval) -> float:
 
 def _shape(published: Published) -> Finding:
     figure = published.pressure.estimates["b0"]
-    b0 = printed(figure)
-    each = [table.values["C"] for table in published.genetic.values()]
+    b0, each = printed(figure), [table.values["C"] for table in published.genetic.values()]
     low, high = min(each), max(each)
     inside = bool(b0.upper >= low and b0.lower <= high)
-    return Finding(
-        "table5_b0", _FAMILY, "Table 5, Eq 13", ("Table 5: b0",),
-        f"one C = b0 = {figure.text} serves all pressures",
-        "beside the C of each pressure in Table 4, between which a common C must lie",
-        (Quantity("C of Table 4", float("nan"), "1", low, high, "over pressures", figure.text),),
-        Verdict.CONSISTENT if inside else Verdict.CONTRADICTED,
-        f"b0 lies {'between' if inside else 'outside'} Table 4's {low:g} to {high:g}.",
-        "Whether b0 is the best common C needs the measured curves.", Basis.PRINTED,
+    return finding(
+        "table5_b0", Verdict.CONSISTENT if inside else Verdict.CONTRADICTED,
+        [between("C of Table 4", low, high, "1", "over pressures", figure.text)],
+        b0=figure, low=low, high=high,
     )  # fmt: skip
 
 
 def _table4(study: RoundingStudy) -> Finding:
     widest = {psi: float(i.half_width.max()) for psi, i in study.table4.items()}
     worst = max(widest.values())
-    return Finding(
-        "table4_digits", _FAMILY, "Table 4, Eqs 3-5",
-        tuple(f"Table 4, {psi} psi: {name}" for psi in widest for name in "BCDE"),
-        "the digits of Table 4 are enough to evaluate the pull",
-        "exact extremes over all coefficients that print alike, at 151 slips up to 75 %",
-        tuple(Quantity(f"half the widest range at {p} psi", w, "kN") for p, w in widest.items()),
-        Verdict.CONFIRMED if worst < 0.005 else Verdict.CORRECTED,
-        f"Rounding moves the pull by {number(1000.0 * worst, 2)} N at most.",
-        "", Basis.PRINTED,
+    return finding(
+        "table4_digits", Verdict.CONFIRMED if worst < 0.005 else Verdict.CORRECTED,
+        (Quantity(f"half the widest range at {p} psi", w, "kN") for p, w in widest.items()),
+        worst=worst,
     )  # fmt: skip

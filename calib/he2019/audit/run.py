@@ -1,10 +1,15 @@
-"""The whole audit: every family of findings in reading order, with what its figures need."""
+"""The whole audit: every family of findings in reading order, what its figures need, its files."""
 
 from __future__ import annotations
 
+import csv
+import io
+import json
+import math
 from collections import Counter
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
+from typing import Any
 
 from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
@@ -20,18 +25,22 @@ from calib.he2019.audit.curvature_signs import (
     study_curvature_signs,
 )
 from calib.he2019.audit.density import density_findings
-from calib.he2019.audit.finding import Finding, Verdict
+from calib.he2019.audit.finding import (
+    Basis,
+    Finding,
+    Quantity,
+    Verdict,
+    finding,
+)
 from calib.he2019.audit.geometric import geometric_findings
-from calib.he2019.audit.inverse_findings import inverse_findings
-from calib.he2019.audit.inverse_regression import InverseStudy, study_inverse
-from calib.he2019.audit.pressure_unit import pressure_unit
+from calib.he2019.audit.inverse import InverseStudy, inverse_findings, study_inverse
 from calib.he2019.audit.rounding import RoundingStudy, rounding_findings, study_rounding
 from calib.he2019.audit.rut_quality import QualityStudy, rut_quality_findings, study_quality
-from calib.he2019.audit.signs import signs
+from calib.he2019.audit.signs import pressure_unit, signs
 from calib.he2019.audit.table5_cost import bounds, cost_findings
-from calib.he2019.audit.untested import untested
-from calib.he2019.datasets.published import PUBLISHED, Published
+from calib.he2019.datasets.published import DOI, PUBLISHED, Published
 from calib.inference.calibration import Calibration
+from calib.report.numbers import finite
 
 type Progress = Callable[[str, int, int], None]
 
@@ -138,7 +147,7 @@ def begin_audit(
             *convergence_findings(published, searched),
             *rut_quality_findings(published, quality),
             *inverse_findings(published, inverse),
-            untested(published),
+            finding("test_description", Verdict.UNTESTABLE, setup=published.setup),
         ]
         tell("testing printed figures", 2, 2)
         order = list(Verdict)
@@ -148,3 +157,67 @@ def begin_audit(
         )
 
     return finish
+
+
+SCHEMA = "calib/audit/1"
+_COLUMNS = (
+    "key", "verdict", "where", "claim", "test", "found", "evidence", "stays_open", "basis",
+    "depends_on_reconstruction",
+)  # fmt: skip
+
+
+def audit_json(audit: Audit) -> str:
+    """Return an audit as JSON; intervals that do not exist are null."""
+    content = {
+        "schema": SCHEMA,
+        "source": f"doi:{DOI}",
+        "seed": audit.seed,
+        "verdicts": {verdict.value: verdict.meaning for verdict in Verdict},
+        "counts": {verdict.value: n for verdict, n in audit.counts.items()},
+        "findings": [_finding(f) for f in audit.findings],
+    }
+    return json.dumps(content, indent=1, allow_nan=False) + "\n"
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    shown = asdict(finding)
+    shown["found"] = [finite(asdict(q)) for q in finding.found]
+    shown["depends_on_reconstruction"] = finding.reconstructed
+    shown["caveat"] = finding.basis.caveat
+    return shown
+
+
+def read_findings(content: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """Return the findings in what `audit_json` writes; else a KeyError, TypeError or ValueError."""
+    return tuple(_read(entry) for entry in content["findings"])
+
+
+def _read(entry: Mapping[str, Any]) -> Finding:
+    known = {f.name: entry[f.name] for f in fields(Finding)}
+    found = tuple(Quantity(**_with_nan(q)) for q in known["found"])
+    return Finding(
+        **{
+            **known,
+            "figures": tuple(known["figures"]),
+            "found": found,
+            "verdict": Verdict(known["verdict"]),
+            "basis": Basis(known["basis"]),
+        }
+    )
+
+
+def _with_nan(entry: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: math.nan if value is None else value for key, value in entry.items()}
+
+
+def audit_csv(findings: Iterable[Finding]) -> str:
+    """Return findings as CSV, one row for each."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for f in findings:
+        writer.writerow([
+            f.key, f.verdict.value, f.where, f.claim, f.test, "; ".join(map(str, f.found)),
+            f.evidence, f.stays_open, f.basis.value, "yes" if f.reconstructed else "no",
+        ])  # fmt: skip
+    return out.getvalue()

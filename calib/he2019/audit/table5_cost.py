@@ -14,7 +14,14 @@ import numpy as np
 from scipy.optimize import least_squares, minimize
 
 from calib.batch.threads import one_thread
-from calib.he2019.audit.finding import Basis, Finding, Quantity, Verdict
+from calib.he2019.audit.finding import (
+    Basis,
+    Finding,
+    Quantity,
+    Verdict,
+    between,
+    finding,
+)
 from calib.he2019.audit.nearness import (
     ASSUMED_SLIPS,
     Reference,
@@ -23,12 +30,9 @@ from calib.he2019.audit.nearness import (
     references,
 )
 from calib.he2019.audit.pull import coefficients, pull
-from calib.he2019.audit.words import number
 from calib.he2019.datasets.published import FittedTable, Published
 from calib.models.base import Array
 from calib.models.magic_formula import magic_formula
-
-_FAMILY = "Cost of Table 5"
 
 _BINS = 75
 _LARGEST_SLIP = float(_BINS)
@@ -167,50 +171,23 @@ def joint_cost(published: Published, reconstructed_optimum: float, at_most: Boun
     figure = published.pressure.quality["cost"]
     separate = [table.quality["cost"] for table in published.genetic.values()]
     floor = sum(f.value - f.half_unit for f in separate)
-    anywhere, assumed, optimal = at_most
     low, high = figure.value - figure.half_unit, figure.value + figure.half_unit
-    if high < floor or low > anywhere:
-        verdict, basis = Verdict.CONTRADICTED, Basis.PRINTED
-    elif low > assumed:
-        verdict, basis = Verdict.CONTRADICTED, Basis.SLIPS
-    else:
-        verdict, basis = Verdict.CONSISTENT, Basis.SLIPS
-    if high < floor:
-        evidence = (
-            f"It is below {number(floor)} kN^2, the sum of Table 4's costs, which a joint fit "
-            "cannot undercut"
-        )
-    elif low > anywhere:
-        evidence = (
-            f"Whatever the measured pulls, and at any {published.setup.slip_levels.text} slips up "
-            f"to {_LARGEST_SLIP:g} % that are 1 % apart, some curves of Eqs 12-15 near Table 4 "
-            f"cost {number(anywhere, 4)} kN^2 at most: the printed {figure.text} is not a minimum"
-        )
-    else:
-        evidence = (
-            f"At the assumed slips the minimum lies between {number(floor)} and "
-            f"{number(assumed)} kN^2"
-        )
-    return Finding(
-        "table5_joint_cost", _FAMILY, "Table 5, Eq 16",
-        ("Table 5: cost", *(f"{t.source}: cost" for t in published.genetic.values())),
-        f"the least total cost of Eqs 12-15 over all pressures is {figure.text} kN^2",
-        "the cost of the best curves with one C on any data that have Table 4's costs (triangle "
-        "inequality), at any slips and at the assumed ones",
-        (
-            Quantity("minimum at any slips", float("nan"), "kN^2", floor, anywhere,
-                     "bounds for any data with Table 4's costs", figure.text),
-            Quantity("minimum at the assumed slips", float("nan"), "kN^2", floor, assumed,
-                     "bounds for any data with Table 4's costs", figure.text),
-            Quantity("and if Table 4 is optimal", float("nan"), "kN^2", floor, optimal,
-                     "bounds", figure.text),
-            Quantity("minimum on the reconstructed data", reconstructed_optimum, "kN^2",
-                     published=figure.text),
-        ),
-        verdict, evidence + ".",
-        "What stopped the search short of the minimum: the box, the coordinates or the "
-        "generations of the genetic algorithm.",
-        basis,
+    below, above = high < floor, low > at_most.anywhere
+    contradicted = below or above or low > at_most.assumed
+    each = (
+        ("minimum at any slips", at_most.anywhere, "bounds for any data with Table 4's costs"),
+        ("minimum at the assumed slips", at_most.assumed,
+         "bounds for any data with Table 4's costs"),
+        ("and if Table 4 is optimal", at_most.optimal, "bounds"),
+    )  # fmt: skip
+    name = "minimum on the reconstructed data"
+    return finding(
+        "table5_joint_cost", Verdict.CONTRADICTED if contradicted else Verdict.CONSISTENT,
+        (*(between(what, floor, most, "kN^2", kind, figure.text) for what, most, kind in each),
+         Quantity(name, reconstructed_optimum, "kN^2", published=figure.text)),
+        basis=Basis.PRINTED if below or above else None, printed=figure, floor=floor, below=below,
+        above=above, levels=published.setup.slip_levels.text, largest_slip=_LARGEST_SLIP,
+        anywhere=at_most.anywhere, assumed=at_most.assumed,
     )  # fmt: skip
 
 
@@ -224,27 +201,16 @@ def cost_as_printed(published: Published) -> Finding:
     strict, _ = joint_bounds(both, known, ASSUMED_SLIPS, optimal=True)
     refused = [bool((bound > figure.value + figure.half_unit).all()) for bound in (least, strict)]
     named = [f"c9 = {c9:+g}" for c9 in both[:, 8]]
+    what = "any data with Table 4's costs"
     found = [
-        Quantity(f"cost with {name}", float("nan"), "kN^2", low, high,
-                 "any data with Table 4's costs", figure.text)
-        for name, low, high in zip(named, least.tolist(), largest.tolist(), strict=True)
-    ]  # fmt: skip
+        between(f"cost with {name}", low, high, "kN^2", what, figure.text)
+        for name, low, high in zip(named, least, largest, strict=True)
+    ]
     found += [
         Quantity(f"least with {name} if Table 4 is optimal", low, "kN^2", published=figure.text)
         for name, low in zip(named, strict.tolist(), strict=True)
     ]
-    at_least, anyway = (
-        " and ".join(number(float(b)) for b in bounds) for bounds in (strict, least)
-    )
-    return Finding(
-        "table5_cost_as_printed", _FAMILY, "Table 5, Eq 16", ("Table 5: cost",),
-        f"the coefficients as printed cost {figure.text} kN^2",
-        "the least and largest cost of the printed digits as they stand on any data that have "
-        "Table 4's costs (triangle inequality), and the least if Table 4 is their optimum",
-        tuple(found), Verdict.CONTRADICTED if any(refused) else Verdict.CONSISTENT,
-        f"As they stand the digits cost at least {at_least} kN^2 with {' and '.join(named)}, if "
-        f"Table 4 is the optimum of each pressure ({anyway} even if it is not); {figure.text} is "
-        "printed.",
-        "The cost belongs to coefficients with more digits than are printed.",
-        Basis.SLIPS,
+    return finding(
+        "table5_cost_as_printed", Verdict.CONTRADICTED if any(refused) else Verdict.CONSISTENT,
+        found, printed=figure, strict=strict.tolist(), least=least.tolist(), named=named,
     )  # fmt: skip

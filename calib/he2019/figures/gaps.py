@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from calib.data.quantities import OUTPUTS
 from calib.he2019.gaps.find import FoundGap
 from calib.models.base import Array
-from calib.report.figures.gap_which import probability_text
+from calib.report.figures.gap import probability_text
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLUE,

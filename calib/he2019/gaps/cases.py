@@ -17,15 +17,19 @@ He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003.
 from __future__ import annotations
 
 import hashlib
+import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data import Table, table_from_arrays
+from calib.data import Table, table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS
+from calib.errors import CalibError
 from calib.gap.case import Case
+from calib.he2019 import declared
 from calib.he2019.datasets.embedded import LABEL, load_he2019
 
 RECONSTRUCTED = "the data are reconstructed from published results; they are not measurements"
@@ -34,8 +38,12 @@ _RUT = (
     "inflation_pressure_psi", "average_ground_pressure_kpa", "slip_ratio", "rut_depth_mm",
 )  # fmt: skip
 _PULL = ("inflation_pressure_psi", "slip_ratio", "drawbar_pull_kn")
+_PULL_MODEL = {"drawbar_pull": "magic_formula_pressure"}
 # The wheel hardly slips up to this one: the two smallest nominal slips.
 _TOWED = 0.03
+
+
+_WORDS = declared("gaps/gaps.toml")
 
 
 @dataclass(frozen=True)
@@ -73,6 +81,14 @@ def paper_gaps() -> tuple[PaperGap, ...]:
     return (_plain_bekker(), _nominal_slip(), _held_out_pull(), _post_peak())
 
 
+def _gap(
+    case: Case, unfitted: Table | None = None, variants: Mapping[str, Case] | None = None
+) -> PaperGap:
+    words = _WORDS[case.name]
+    said = {key: " ".join(text.split()) for key, text in words.items()}
+    return PaperGap(case.name, case=case, unfitted=unfitted, variants=variants or {}, **said)
+
+
 def _plain_bekker() -> PaperGap:
     data = load_he2019("rut_depth")
     towed, at_30 = data["slip_ratio"] < _TOWED, data["inflation_pressure_psi"] == 30.0
@@ -81,81 +97,33 @@ def _plain_bekker() -> PaperGap:
         "plain_bekker", {"rut_depth": "bekker"}, _rows(data, towed, _RUT, "lab.csv"),
         _rows(data, ~towed & ~at_30, _RUT, "field.csv"), unfitted,
     )  # fmt: skip
-    return PaperGap(
-        case.name,
-        "Plain Bekker against the rut data",
-        "Plain Bekker (Eqs 17, 19, 20) knows the ground pressure and nothing of slip. Calibrated "
-        "where the wheel hardly slips and used at slips up to 20 %, what does it lack?",
-        "all three pressures at nominal slips of 0 and 2.5 %",
-        "18 and 42 psi at slips from 5 to 20 %",
-        "The ruts are reconstructed from Table 6, whose n1 put the slip sinkage into them. To find "
-        "it shows that the diagnosis recovers a known effect, by name and by size, from so few "
-        "rows; it is no evidence about the soil. The scatter is of the published size but drawn.",
-        case,
-        "slip_sinkage",
-        unfitted,
-    )
+    return _gap(case, unfitted)
 
 
 def _nominal_slip() -> PaperGap:
     data = load_he2019("drawbar_pull")
-    psi = data["inflation_pressure_psi"]
     # By the order of the slips at each pressure; the field has the row at nominal zero.
     first = _slip_level(data) % 2 == 0
-    at_30 = psi == 30.0
-    unfitted = _rows(data, first & at_30, _PULL, "fresh.csv", nominal=True)
-    model = {"drawbar_pull": "magic_formula_pressure"}
+    at_30 = data["inflation_pressure_psi"] == 30.0
 
     def case(name: str, field_rows: NDArray[np.bool_], *, nominal: bool) -> Case:
         return _case(
-            name, model, _rows(data, ~field_rows, _PULL, "lab.csv"),
+            name, _PULL_MODEL, _rows(data, ~field_rows, _PULL, "lab.csv"),
             _rows(data, field_rows & ~at_30, _PULL, "field.csv", nominal=nominal),
             _rows(data, field_rows & at_30, _PULL, "fresh.csv", nominal=nominal),
         )  # fmt: skip
 
-    return PaperGap(
-        "nominal_slip",
-        "Nominal slips against the redefined zero",
-        "The source found a pull at zero nominal slip, blamed the rolling radius and shifted the "
-        "slips. A model (Eqs 12-15) calibrated on shifted slips meets rows whose slips are still "
-        "nominal: does the diagnosis find the radius?",
-        "every second slip level (nominal 2.5, 7.5, … 70 %) at all pressures, slips redefined",
-        "the other levels (nominal 0, 5, … 60 %) at 18 and 42 psi, slips nominal",
-        "The source does not say how far it shifted its slips: the 2 percentage points are this "
-        "project's assumption, so their recovery tests the diagnosis, not the source. It shifted "
-        "all slips alike, whereas a wrong radius shifts them by less as they grow; where the "
-        "curve is flat the data hardly see the difference. By Table 4 the noise at 18 psi is more "
-        "than twice that at the other pressures; a diagnosis that takes it as equal states the "
-        "shift too narrowly, which is why the halves are swapped too.",
-        case("nominal_slip", first, nominal=True),
-        "slip_zero_shift",
-        unfitted,
-        {
-            "halves swapped": case("nominal_slip_swapped", ~first, nominal=True),
-            "slips given back": case("nominal_slip_given_back", first, nominal=False),
-        },
-    )
+    variants = {
+        "halves swapped": case("nominal_slip_swapped", ~first, nominal=True),
+        "slips given back": case("nominal_slip_given_back", first, nominal=False),
+    }
+    unfitted = _rows(data, first & at_30, _PULL, "fresh.csv", nominal=True)
+    return _gap(case("nominal_slip", first, nominal=True), unfitted, variants)
 
 
 def _held_out_pull() -> PaperGap:
     data = load_he2019("drawbar_pull")
-    at_30 = data["inflation_pressure_psi"] == 30.0
-    return PaperGap(
-        "held_out_pull",
-        "Drawbar pull at 30 psi, held out",
-        "Calibrated at 18 and 42 psi, the model (Eqs 12-15) is used at 30 psi. Is what it misses "
-        "there a gap, or no more than two pressures leave open?",
-        "18 and 42 psi, all slips",
-        "30 psi, all slips",
-        "The level of the pull at 30 psi is the source's (Table 4), the scatter about it is drawn. "
-        "Two pressures cannot determine the quadratics of Eqs 12-15, so the curvature between "
-        "them is the prior's, and the 14 rows are one curve: they can show a gap only if it is "
-        "larger than that prior allows.",
-        _case(
-            "held_out_pull", {"drawbar_pull": "magic_formula_pressure"},
-            _rows(data, ~at_30, _PULL, "lab.csv"), _rows(data, at_30, _PULL, "field.csv"),
-        ),
-    )  # fmt: skip
+    return _gap(_split("held_out_pull", data, data["inflation_pressure_psi"] == 30.0))
 
 
 def _post_peak() -> PaperGap:
@@ -163,34 +131,23 @@ def _post_peak() -> PaperGap:
     at_18 = data["inflation_pressure_psi"] == 18.0
     level = _slip_level(data)
     peak = int(level[at_18][np.argmax(data["drawbar_pull_kn"][at_18])])
-
-    def case(name: str, later: int) -> Case:
-        beyond = at_18 & (level > peak + later)
-        return _case(
-            name, {"drawbar_pull": "magic_formula_pressure"},
-            _rows(data, ~beyond, _PULL, "lab.csv"), _rows(data, beyond, _PULL, "field.csv"),
-        )  # fmt: skip
-
-    return PaperGap(
-        "post_peak_18_psi",
-        "18 psi past the peak",
-        "The source says that the curvature of the pull past its peak at 18 psi is not captured by "
-        "the Magic Formula, whatever its parameters. Calibrated on everything else, does the model "
-        "(Eqs 12-15) miss there, and what would explain it?",
-        "30 and 42 psi at all slips, 18 psi up to its largest pull",
-        "18 psi at larger slips",
-        "The source prints no numbers of that curvature. Its size here follows from Table 4's cost "
-        "at 18 psi, its shape was chosen in the reconstruction: a cause named here would be one of "
-        "our making. The rising branch leaves the curve past the peak wide open. Larger noise at "
-        "18 psi would look the same as a gap, for the diagnosis takes the noise as equal at all "
-        "pressures. Rows of 18 psi alone make no case: the Magic Formula needs those up to 17 % "
-        "slip to be calibrated at all, which leaves nothing of the peak to be missed.",
-        case("post_peak_18_psi", 0),
-        variants={
-            "field begins one slip level later": case("post_peak_later", 1),
-            "field begins two slip levels later": case("post_peak_latest", 2),
-        },
+    found, later, latest = (
+        _split(name, data, at_18 & (level > peak + i))
+        for i, name in enumerate(("post_peak_18_psi", "post_peak_later", "post_peak_latest"))
     )
+    variants = {
+        "field begins one slip level later": later,
+        "field begins two slip levels later": latest,
+    }
+    return _gap(found, variants=variants)
+
+
+def _split(name: str, data: Table, field_rows: NDArray[np.bool_]) -> Case:
+    """Make a case of the pull model whose field is some rows, and its laboratory the others."""
+    return _case(
+        name, _PULL_MODEL, _rows(data, ~field_rows, _PULL, "lab.csv"),
+        _rows(data, field_rows, _PULL, "field.csv"),
+    )  # fmt: skip
 
 
 def _slip_level(data: Table) -> NDArray[np.int64]:
@@ -225,3 +182,47 @@ def _case(
         conditions = {n: v for n, v in unfitted.columns.items() if n not in OUTPUTS.values()}
         new = _table(conditions, "fresh.csv")
     return Case(name, lab, field, models, new, (RECONSTRUCTED,))
+
+
+def write_cases(gaps: Sequence[PaperGap], out: Path, *, overwrite: bool = False) -> list[Path]:
+    """Write each gap as a case folder, and return the folders.
+
+    With ``case.toml``, ``lab.csv``, ``field.csv`` and, where rows were kept out, ``fresh.csv`` with
+    their conditions and ``fresh_measured.csv`` with their outcomes, which no diagnosis reads.
+
+    Raises
+    ------
+    CalibError, OSError
+        If a folder exists and may not be replaced; if one cannot be made or written to.
+    """
+    folders = [Path(out) / gap.name for gap in gaps]
+    existing = [folder.name for folder in folders if folder.exists()]
+    if existing and not overwrite:
+        raise CalibError(
+            f"{', '.join(existing)} exist there already", where=str(out),
+            mend="choose another --out, or pass --overwrite",
+        )  # fmt: skip
+    for gap, folder in zip(gaps, folders, strict=True):
+        folder.mkdir(parents=True, exist_ok=True)
+        write_table(folder / "lab.csv", gap.case.lab.columns)
+        write_table(folder / "field.csv", gap.case.field.columns)
+        if gap.case.new_conditions is not None and gap.unfitted is not None:
+            write_table(folder / "fresh.csv", gap.case.new_conditions.columns)
+            write_table(folder / "fresh_measured.csv", gap.unfitted.columns)
+        (folder / "case.toml").write_text(_case_toml(gap), encoding="utf-8")
+    return folders
+
+
+def _case_toml(gap: PaperGap) -> str:
+    remarks = (
+        f"{gap.title}. {gap.question}",
+        f"Calibration: {gap.lab_rows}.",
+        f"Field: {gap.field_rows}.",
+        f"{RECONSTRUCTED.capitalize()}. {gap.limits}",
+    )
+    lines = [f"# {line}" for text in remarks for line in textwrap.wrap(text, 96)]
+    lines += ['calibration = "lab.csv"', 'field = "field.csv"']
+    if gap.case.new_conditions is not None:
+        lines.append('predict = "fresh.csv"')
+    lines += ["", "[models]", *(f'{o} = "{m}"' for o, m in gap.case.models.items())]
+    return "\n".join(lines) + "\n"

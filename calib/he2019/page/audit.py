@@ -12,16 +12,14 @@ from typing import Any
 from markupsafe import Markup
 
 from calib.he2019.audit import Audit, Finding, Quantity, Verdict
-from calib.he2019.audit.files import audit_csv, audit_json
+from calib.he2019.audit.run import audit_csv, audit_json
 from calib.he2019.datasets.published import DOI
 from calib.he2019.figures.audit import audit_plates
-from calib.report.figures.export import png
 from calib.report.figures.plate import Plate
+from calib.report.figures.style import png
 from calib.report.labels import unbroken
 from calib.report.numbers import NOTHING, format_number
-from calib.report.page.equations import unit_html
-from calib.report.page.pictures import picture
-from calib.report.page.template import template
+from calib.report.page.template import picture, template, unit_html
 
 _TITLE = "Audit of the published tables: He, Sandu & Osorio (2019)"
 _MINUS = "\N{MINUS SIGN}"

@@ -8,21 +8,37 @@ from typing import Any
 
 from calib.batch.pool import Pool
 from calib.gap.files import write_diagnosis
+from calib.he2019 import declared
 from calib.he2019.figures.gaps import gap_plate
-from calib.he2019.gaps.checks import checks, probability_of
-from calib.he2019.gaps.find import FoundGap
-from calib.he2019.page.checks import check_text
+from calib.he2019.gaps.find import Check, FoundGap, checks, probability_of
 from calib.models import get_model
-from calib.report.figures.export import pdf_bytes, png_size
 from calib.report.figures.gap import gap_plates
 from calib.report.figures.plate import Plate
+from calib.report.figures.style import pdf_bytes, png_size
 from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_rows import short_name
 from calib.report.gap_verdict import odds_text
 from calib.report.labels import short
 from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
-from calib.report.page.pictures import data_uri
-from calib.report.page.template import template
+from calib.report.page.template import data_uri, sentences, template
+
+_CHECKS = declared("page/checks.toml")
+# Numbers that not every check of a kind has.
+_ABSENT = dict.fromkeys(("rmse_before_mm", "rmse_after_mm", "largest_relative_after"), 0.0)
+_said = sentences(odds=odds_text)
+
+
+def check_text(check: Check) -> tuple[str, str]:
+    """Return the heading of a check and what it found."""
+    words = _CHECKS.get(check.name)
+    if words is not None:
+        return words["heading"], _said(words["text"], **{**_ABSENT, **check.values})
+    # The same question asked otherwise: the probabilities.
+    named = ((k.removeprefix("probability_"), p) for k, p in check.values.items() if k != "rows")
+    listed = ", ".join(f"{short_name(name)} {odds_text(p)}" for name, p in named)
+    heading = check.name.replace("_", " ").capitalize()
+    return heading, f"{check.values['rows']:.0f} field rows: {listed}"
+
 
 type Progress = Callable[[str, int, int], None]
 type ToPng = Callable[[Plate], bytes]

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from calib.report.figures.bands import bands_plate
+from calib.report.figures.bands import (
+    bands_plate,
+    cone_and_water,
+    density_plate,
+    prior_predictive_plate,
+)
 from calib.report.figures.corner import corner_plate
-from calib.report.figures.density import cone_and_water, density_plate
-from calib.report.figures.ensembles import ensembles_plate
 from calib.report.figures.estimates import by_pressure_plate, estimates_plate
-from calib.report.figures.learned import learned_plate
 from calib.report.figures.plate import Plate, draw_all
-from calib.report.figures.prior_predictive import prior_predictive_plate
-from calib.report.figures.residuals import residuals_plate
-from calib.report.figures.validation import validation_plate
+from calib.report.figures.posterior import ensembles_plate, learned_plate
+from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 

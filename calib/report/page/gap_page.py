@@ -6,16 +6,13 @@ wait.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from calib.batch.pool import HERE, Pool
 from calib.gap.diagnose import Diagnosis
 from calib.report.figures.plate import Plate
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 # Places of figures, in reading order, that take as long to draw as all others.
 _HALF = (1, 2, 3)
@@ -44,8 +41,8 @@ def _drawn(found: Diagnosis, half: bool) -> dict[int, tuple[Plate, bytes]]:
     """Draw one half of the figures; return each by its place, without its canvas and as a file."""
     from dataclasses import replace
 
-    from calib.report.figures.export import png
     from calib.report.figures.gap import GAP_FIGURES, gap_plates
+    from calib.report.figures.style import png
 
     places = {name: i for i, name in enumerate(GAP_FIGURES) if (i in _HALF) is half}
     plates = gap_plates(found, tuple(places))

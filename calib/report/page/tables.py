@@ -10,9 +10,16 @@ import numpy as np
 from markupsafe import Markup
 
 from calib.inference.estimators import PointEstimate, method_name
-from calib.report.numbers import NOTHING, format_as_printed, format_like, format_number
-from calib.report.page.equations import symbol_html, unit_html
-from calib.report.posterior_text import centre_text, interval_text, skewed
+from calib.report.numbers import (
+    NOTHING,
+    centre_text,
+    format_as_printed,
+    format_like,
+    format_number,
+    interval_text,
+    skewed,
+)
+from calib.report.page.template import symbol_html, unit_html
 from calib.report.reference import NOTHING as NONE
 from calib.report.reference import Figure, FittedTable, Reference
 from calib.report.study import OutputResult

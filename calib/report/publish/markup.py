@@ -3,18 +3,172 @@
 A sentence is plain text with marks: ``[@key]`` or ``[@key; @other]`` cites, ``[$name]`` is a
 parameter's symbol, ``[u:unit]`` a unit, ``[=model]`` a model's equation, and backquotes enclose
 file names, hashes and commands. `to_text` writes it for any editor, `to_latex` for LaTeX.
+
+The references are read from `references.bib`. Authors, volumes and pages are those that the
+packages and journals give themselves (the citation files of NumPy, SciPy, Matplotlib, emcee and
+corner, the bibliography shipped with ArviZ).
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+import unicodedata
+from collections.abc import Iterable, Mapping
+from functools import cache
+from importlib import resources
 
 from calib.models import get_model
 from calib.models.latex import text
-from calib.report.labels import joined, plain, symbol, unbroken, unit_plain
-from calib.report.publish.latex import escape, latex_unit
-from calib.report.publish.references import short_citation
+from calib.report.labels import joined, plain, symbol, unbroken, unit_plain, unit_text
+
+_SPECIAL = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+    "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "<": "$<$", ">": "$>$", "|": "$|$", '"': "''",
+}  # fmt: skip
+_SIGNS = {
+    "\N{MINUS SIGN}": "$-$",
+    "\N{PLUS-MINUS SIGN}": r"$\pm$",
+    "\N{MULTIPLICATION SIGN}": r"$\times$",
+    "\N{LESS-THAN OR EQUAL TO}": r"$\le$",
+    "\N{GREATER-THAN OR EQUAL TO}": r"$\ge$",
+    "\N{EN DASH}": "--",
+    "\N{EM DASH}": "---",
+    "\N{HORIZONTAL ELLIPSIS}": r"\ldots{}",
+    "\N{LEFT SINGLE QUOTATION MARK}": "`",
+    "\N{RIGHT SINGLE QUOTATION MARK}": "'",
+    "\N{LEFT DOUBLE QUOTATION MARK}": "``",
+    "\N{RIGHT DOUBLE QUOTATION MARK}": "''",
+    "\N{DEGREE SIGN}": r"$^{\circ}$",
+    "\N{MICRO SIGN}": r"$\mu$",
+    "\N{NO-BREAK SPACE}": "~",
+    "\N{CHECK MARK}": r"\rlap{$^{\ast}$}",
+}
+# Letters that LaTeX has by their names; it lacks those that look Latin.
+_NAMES = frozenset(
+    {
+        "ALPHA", "BETA", "GAMMA", "DELTA", "EPSILON", "ZETA", "ETA", "THETA", "IOTA", "KAPPA",
+        "MU", "NU", "XI", "PI", "RHO", "SIGMA", "TAU", "PHI", "CHI", "PSI", "OMEGA",
+    }
+)  # fmt: skip
+_CAPITALS = frozenset({"GAMMA", "DELTA", "THETA", "XI", "PI", "SIGMA", "PHI", "PSI", "OMEGA"})
+_RAISED = "\N{SUPERSCRIPT MINUS}⁰¹²³⁴⁵⁶⁷⁸⁹"
+_TO_PLAIN = str.maketrans(_RAISED, "-0123456789")
+
+
+def escape(text: str) -> str:
+    """Return any text as LaTeX sets it.
+
+    Raised digits, signs and Greek letters become mathematics, letters that LaTeX's default encoding
+    lacks lose their accents, and what is left of others is a question mark.
+    """
+    raised = re.split(f"([{_RAISED}]+)", text)
+    return "".join(
+        f"$^{{{part.translate(_TO_PLAIN)}}}$" if k % 2 else "".join(map(_letter, part))
+        for k, part in enumerate(raised)
+    )
+
+
+def _letter(letter: str) -> str:
+    known = _SPECIAL.get(letter) or _SIGNS.get(letter) or _greek(letter)
+    if known is not None:
+        return known
+    if letter.isascii():
+        return letter if letter.isprintable() else " "
+    if "\u00c0" <= letter <= "\u00ff":  # Latin-1, without the signs
+        return letter
+    plain = unicodedata.normalize("NFKD", letter).encode("ascii", "ignore").decode()
+    return "".join(map(_letter, plain)) or "?"
+
+
+def _greek(letter: str) -> str | None:
+    script, _, name = unicodedata.name(letter, "").partition(" LETTER ")
+    if script == "GREEK SMALL" and name in _NAMES:
+        return f"$\\{name.lower()}$"
+    if script == "GREEK CAPITAL" and name in _CAPITALS:
+        return f"$\\{name.capitalize()}$"
+    return None
+
+
+def latex_unit(unit: str) -> str:
+    """Return a unit with its powers raised; a dash where there is none."""
+    return unit_text(unit).replace("%", r"\%").replace("\N{EN DASH}", "--")
+
+
+OWN = "calib"
+_ENTRY = re.compile(r"@(\w+)\{(\w+),\n(.*?)\n\}", re.DOTALL)
+_FIELD = re.compile(r"^  (\w+) = \{(.*)\},?$", re.MULTILINE)
+_ACCENTS = {"'": "\u0301", '"': "\u0308", "^": "\u0302", ".": "\u0307", "`": "\u0300"}
+_NAMED = 3
+
+
+@cache
+def _source() -> str:
+    return (resources.files("calib.report.publish") / "references.bib").read_text(encoding="utf-8")
+
+
+@cache
+def entries() -> Mapping[str, Mapping[str, str]]:
+    """Return the fields of every reference by its key, as BibTeX has them."""
+    return {key: dict(_FIELD.findall(body)) for _, key, body in _ENTRY.findall(_source())}
+
+
+def bibtex(keys: Iterable[str], version: str) -> str:
+    """Return the cited references as BibTeX, this package with its version."""
+    wanted = list(keys)
+    found = [match[0] for match in _ENTRY.finditer(_source()) if match[2] in wanted]
+    own = (
+        f"@misc{{{OWN},\n  author = {{{{The calib authors}}}},\n"
+        "  title = {calib: probabilistic calibration of tyre-soil models},\n"
+        f"  note = {{Version {version}}}\n}}"
+    )
+    return "\n\n".join([*found, *([own] if OWN in wanted else [])]) + "\n"
+
+
+def short_citation(key: str) -> str:
+    """Return a citation in a sentence: ``Harris et al. 2020``."""
+    if key == OWN:
+        return "The calib authors"
+    entry = entries()[key]
+    names = [_spelled(name).partition(",")[0] for name in entry["author"].split(" and ")]
+    who = f"{names[0]} et al." if len(names) > 2 else " and ".join(names)
+    return f"{who} {entry['year']}"
+
+
+def bibliography(keys: Iterable[str], version: str) -> list[str]:
+    """Return the cited references as lines of text, sorted by author and year."""
+    lines = [_line(entries()[key]) for key in keys if key != OWN]
+    if OWN in list(keys):
+        lines.append(
+            f"The calib authors. calib: probabilistic calibration of tyre-soil models. Version "
+            f"{version}."
+        )
+    return sorted(lines, key=str.casefold)
+
+
+def _line(entry: Mapping[str, str]) -> str:
+    names = [_spelled(name) for name in entry["author"].split(" and ")]
+    who = "; ".join(names[:_NAMED]) + ("; et al." if len(names) > _NAMED else "")
+    number = f"({entry['number']})" if "number" in entry else ""
+    pages = entry["pages"].replace("--", "\N{EN DASH}")
+    where = f"doi:{entry['doi']}" if "doi" in entry else entry["url"]
+    title = _spelled(entry["title"])
+    return (
+        f"{who} ({entry['year']}) {title}. {_spelled(entry['journal'])} {entry['volume']}{number}, "
+        f"{pages}. {where}"
+    )
+
+
+def _spelled(text: str) -> str:
+    """Turn BibTeX's spelling into letters."""
+    accented = re.sub(
+        r"""\{\\(['"^.`])(\w)\}""",
+        lambda m: unicodedata.normalize("NFC", m[2] + _ACCENTS[m[1]]),
+        text,
+    )
+    known = accented.replace(r"$\widehat{R}$", "R-hat").replace(r"\&", "&")
+    return known.replace("--", "\N{EN DASH}").replace("{", "").replace("}", "")
+
 
 _MARK = re.compile(r"\[@([^\]]+)\]|\[\$(\w+)\]|\[u:([^\]]*)\]|\[=(\w+)\]|`([^`]*)`")
 

@@ -1,13 +1,16 @@
-"""What tables and methods read of a manifest and a summary, with names and types."""
+"""What tables and methods read of a manifest and a summary, and a table as CSV and LaTeX."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import csv
+import io
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 from calib.inference.calibration import ParameterSummary
 from calib.models import get_model
+from calib.report.publish.markup import to_latex
 
 _NAN = float("nan")
 
@@ -68,7 +71,7 @@ class Output:
     @property
     def posterior(self) -> tuple[ParameterSummary, ...]:
         """Summaries of all parameters."""
-        return tuple(_summary(name, entry) for name, entry in self.found["posterior"].items())
+        return tuple(_read_summary(name, entry) for name, entry in self.found["posterior"].items())
 
 
 def outputs(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Output]:
@@ -80,7 +83,7 @@ def outputs(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> list[Out
     ]
 
 
-def _summary(name: str, entry: Mapping[str, Any]) -> ParameterSummary:
+def _read_summary(name: str, entry: Mapping[str, Any]) -> ParameterSummary:
     """Read a posterior summary back; what JSON has no number for is NaN."""
     spelled = {**entry, "sd_ratio": entry["posterior_to_prior_sd"]}
     numbers: dict[str, Any] = {
@@ -89,3 +92,71 @@ def _summary(name: str, entry: Mapping[str, Any]) -> ParameterSummary:
         if f.name != "name"
     }
     return ParameterSummary(name=name, **numbers)
+
+
+@dataclass(frozen=True)
+class CsvTable:
+    """Rows for programs: numbers in ASCII, units in a column or in the header."""
+
+    head: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+@dataclass(frozen=True)
+class LatexTable:
+    """Rows for print, in groups with a rule between them; a wide table is in a small font.
+
+    The label names its file too. Caption, head and cells have marks, see
+    `calib.report.publish.markup`; `columns` is LaTeX's column specification.
+    """
+
+    label: str
+    caption: str
+    columns: str
+    head: tuple[str, ...]
+    groups: tuple[tuple[tuple[str, ...], ...], ...]
+    small: bool = False
+
+
+def write_csv(table: CsvTable) -> str:
+    """Return a table as CSV (RFC 4180, but for line ends)."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(table.head)
+    writer.writerows(table.rows)
+    return text.getvalue()
+
+
+def write_latex(table: LatexTable) -> str:
+    """Return a table as a LaTeX float that needs the package booktabs."""
+    body = "\n    \\midrule\n".join(
+        "\n".join(f"    {_latex_row(row, table.columns)}" for row in group)
+        for group in table.groups
+        if group
+    )
+    return "\n".join(
+        [
+            "% Needs \\usepackage{booktabs}; the references cited are in references.bib.",
+            "\\begin{table}",
+            "  \\centering",
+            "  \\footnotesize" if table.small else "  \\small",
+            f"  \\caption{{{to_latex(table.caption)}}}",
+            f"  \\label{{tab:{table.label.replace('_', '-')}}}",
+            f"  \\begin{{tabular}}{{{table.columns}}}",
+            "    \\toprule",
+            f"    {_latex_row(table.head, table.columns)}",
+            "    \\midrule",
+            body,
+            "    \\bottomrule",
+            "  \\end{tabular}",
+            "\\end{table}",
+            "",
+        ]
+    )
+
+
+def _latex_row(cells: Sequence[str], columns: str) -> str:
+    # Justified text in a narrow column has gaps; after \raggedright a row's end is spelt out.
+    ragged = "\\raggedright " if "p{" in columns else ""
+    first, *others = map(to_latex, cells)
+    return " & ".join([first, *(ragged + cell for cell in others)]) + r" \tabularnewline"

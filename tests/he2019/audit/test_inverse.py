@@ -9,13 +9,15 @@ import pytest
 
 from calib.data import hold_out
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.inverse_findings import (
+from calib.he2019.audit.inverse import (
+    attenuation,
     inverse_by_likelihood,
     inverse_by_print,
     inverse_findings,
     prediction_at_30,
+    simulate_inverse,
+    study_inverse,
 )
-from calib.he2019.audit.inverse_regression import attenuation, simulate_inverse, study_inverse
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import PUBLISHED
 from calib.he2019.estimators.rut_regression import rut_regression

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.pressure_unit import pressure_unit
-from calib.he2019.audit.quadratics import NAMES, targets
+from calib.he2019.audit.signs import NAMES, pressure_unit, targets
 from calib.he2019.datasets.published import PUBLISHED
 from tests.he2019.audit.altered import altered
 

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from calib.he2019.audit.quadratics import NAMES, nearest, nearest_by_signs, targets
+from calib.he2019.audit.signs import NAMES, nearest, nearest_by_signs, targets
 from calib.he2019.datasets.published import PUBLISHED
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from calib.he2019.audit import Basis, Quantity, Seeds, Verdict, audit_csv, audit_json, run_audit
-from calib.he2019.audit.words import number, percent
+from calib.he2019.audit.finding import number, percent
 from calib.he2019.datasets.published import PUBLISHED
 from tests.he2019.audit.altered import flipped, printed_figures
 

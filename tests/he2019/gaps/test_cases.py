@@ -18,8 +18,7 @@ from calib.gap.diagnose import diagnose
 from calib.gap.files import document
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import PUBLISHED
-from calib.he2019.gaps.cases import PaperGap, paper_gaps
-from calib.he2019.gaps.folders import write_cases
+from calib.he2019.gaps.cases import PaperGap, paper_gaps, write_cases
 from calib.models import get_model
 from calib.models.bekker import rut_depth as eq_21
 

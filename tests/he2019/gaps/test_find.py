@@ -11,9 +11,15 @@ from scipy.stats import f as f_distribution
 
 from calib.batch.pool import HERE
 from calib.gap.diagnose import verdict
-from calib.he2019.gaps.checks import Check, checks, probability_of
-from calib.he2019.gaps.find import begin_gaps, simulator_sd, unfitted_errors
-from calib.he2019.gaps.summary import summarise_gaps
+from calib.he2019.gaps.find import (
+    Check,
+    begin_gaps,
+    checks,
+    probability_of,
+    simulator_sd,
+    summarise_gaps,
+    unfitted_errors,
+)
 from calib.inference.calibration import calibrate
 from calib.models.bekker import rut_depth as eq_21
 from calib.models.magic_formula import magic_formula

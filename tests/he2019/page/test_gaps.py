@@ -8,17 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from calib.he2019.gaps.checks import Check, checks
-from calib.he2019.page.checks import check_text
-from calib.he2019.page.gaps import _withheld
+from calib.he2019.gaps.find import Check, checks
+from calib.he2019.page.gaps import _withheld, check_text
 from calib.he2019.sections import FoundGaps
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.gap_rows import short_name
 from calib.report.gap_verdict import odds_text
 from calib.report.labels import short
-from calib.report.manifest import file_hashes
 from calib.report.study import Study
-from calib.report.writer import write_report
+from calib.report.writer import file_hashes, write_report
 from tests.browser import faults
 from tests.report.page.test_page import Reader
 

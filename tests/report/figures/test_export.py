@@ -6,8 +6,7 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from calib.report.figures.export import png_bytes, png_size
-from calib.report.figures.style import style
+from calib.report.figures.style import png_bytes, png_size, style
 
 
 def _figure(title: str) -> Figure:

@@ -13,8 +13,8 @@ from matplotlib.collections import PathCollection
 from calib.gap.effects import EFFECTS
 from calib.gap.where import Region
 from calib.report.figures import gap as collect
-from calib.report.figures.gap import gap_plates
-from calib.report.figures.gap_which import (
+from calib.report.figures.gap import (
+    gap_plates,
     in_play,
     placebo_plate,
     placebos,

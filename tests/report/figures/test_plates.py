@@ -14,17 +14,14 @@ from matplotlib.collections import LineCollection
 from calib.data import table_from_arrays
 from calib.he2019.figures.reference import HE2019
 from calib.report.figures import collect
-from calib.report.figures.bands import bands_plate
+from calib.report.figures.bands import bands_plate, prior_predictive_plate
 from calib.report.figures.collect import plates
 from calib.report.figures.corner import corner_plate
-from calib.report.figures.ensembles import ensembles_plate, rank_histograms
 from calib.report.figures.estimates import distances, estimates_plate
-from calib.report.figures.learned import learned_plate
 from calib.report.figures.plate import Plate
-from calib.report.figures.prior_predictive import prior_predictive_plate
-from calib.report.figures.residuals import residuals_plate
+from calib.report.figures.posterior import ensembles_plate, learned_plate, rank_histograms
 from calib.report.figures.style import style
-from calib.report.figures.validation import validation_plate
+from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.reference import NOTHING
 from calib.report.rows import groups, signs_along, smooth_bands
 from calib.validation.residuals import standardise

@@ -19,7 +19,6 @@ from matplotlib.text import Text
 from calib.he2019.figures.reference import HE2019
 from calib.report.figures.bands import FILLS
 from calib.report.figures.collect import plates
-from calib.report.figures.export import pdf_bytes, png_bytes
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
@@ -32,6 +31,8 @@ from calib.report.figures.style import (
     MIDDLE_MM,
     SINGLE_MM,
     SMALLEST_PT,
+    pdf_bytes,
+    png_bytes,
     style,
 )
 
@@ -180,7 +181,7 @@ def test_a_pdf_has_true_type_fonts_and_its_size_in_print(drawn):
 def test_a_pdf_does_not_depend_on_the_process(capsys):
     code = (
         "import hashlib\n"
-        "from calib.report.figures.export import pdf_bytes\n"
+        "from calib.report.figures.style import pdf_bytes\n"
         "from calib.report.figures.style import panels, style\n"
         "with style():\n"
         "    figure, axes = panels(1, 1, height=30.0)\n"

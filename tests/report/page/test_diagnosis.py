@@ -27,15 +27,15 @@ from calib.report.gap_verdict import (
     odds_text,
     repeats_needed,
 )
-from calib.report.page.diagnosis import render_diagnosis
-from calib.report.page.gap_page import write_page
-from calib.report.page.gap_tables import (
+from calib.report.page.diagnosis import (
     conditions_text,
     hypothesis_groups,
     parameter_rows,
     parameter_text,
     prior_text,
+    render_diagnosis,
 )
+from calib.report.page.gap_page import write_page
 from tests.browser import faults
 from tests.gap.cases import PULL_ONLY, diagnosis_of, make_case, pull_diagnosis
 from tests.report.page.test_page import Reader

@@ -15,23 +15,21 @@ from calib.inference.noise import Noise, NoiseChoice
 from calib.models import MODELS
 from calib.models.base import BoundModel
 from calib.report.figures import Plate
-from calib.report.figures.export import png_size
-from calib.report.page.content import failed_section
-from calib.report.page.equations import (
+from calib.report.figures.style import png_size
+from calib.report.page.content import failed_section, render_page, repeats_words, validation_facts
+from calib.report.page.tables import (
+    estimates_grid,
+    posterior_rows,
+    pressure_grids,
+    sensitivity_grid,
+)
+from calib.report.page.template import (
     equation,
     likelihood,
     parametrisation,
     prose,
     symbol_html,
     unit_html,
-)
-from calib.report.page.facts import repeats_words, validation_facts
-from calib.report.page.render import render_page
-from calib.report.page.tables import (
-    estimates_grid,
-    posterior_rows,
-    pressure_grids,
-    sensitivity_grid,
 )
 from calib.report.sections import Written
 from calib.report.study import Failure, Study

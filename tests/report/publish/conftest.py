@@ -7,10 +7,10 @@ from typing import Any
 import pytest
 
 from calib.inference.sampling.sampler import SamplerSettings
-from calib.report.manifest import build_manifest
 from calib.report.publish import Publication, publication
 from calib.report.study import Failure, Study
 from calib.report.summary import summarise
+from calib.report.writer import build_manifest
 
 
 def records(results: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -8,8 +8,15 @@ from hypothesis import strategies as st
 
 from calib.models import MODELS
 from calib.report.numbers import TIMES
-from calib.report.publish.latex import escape, latex_unit
-from calib.report.publish.markup import cited, joined_symbols, to_latex, to_text, with_symbols
+from calib.report.publish.markup import (
+    cited,
+    escape,
+    joined_symbols,
+    latex_unit,
+    to_latex,
+    to_text,
+    with_symbols,
+)
 from tests.report.publish.reader import check
 
 

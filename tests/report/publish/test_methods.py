@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from calib.report.publish import publication
-from calib.report.publish.references import entries
+from calib.report.publish.markup import entries
 from tests.report.publish.reader import check
 
 NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)*")

@@ -9,7 +9,7 @@ from importlib.metadata import metadata, version
 import pytest
 
 from calib.he2019.datasets.published import DOI
-from calib.report.publish.references import bibliography, bibtex, entries, short_citation
+from calib.report.publish.markup import bibliography, bibtex, entries, short_citation
 
 DOIS = {
     "He_2019": DOI,

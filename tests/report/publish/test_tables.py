@@ -12,9 +12,8 @@ import pytest
 
 from calib.he2019.datasets.published import PUBLISHED
 from calib.inference.calibration import ParameterSummary
-from calib.report.numbers import last_place
+from calib.report.numbers import interval_text, last_place
 from calib.report.page.tables import posterior_rows
-from calib.report.posterior_text import interval_text
 from calib.report.publish import publication
 from calib.report.publish.records import outputs
 from tests.report.publish.reader import check, columns, rows

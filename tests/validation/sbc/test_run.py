@@ -14,7 +14,7 @@ from calib.errors import CalibError
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings
-from calib.report.page.sbc import text_table, verdict
+from calib.report.sbc import text_table, verdict
 from calib.validation.sbc.run import run_sbc
 from tests.browser import Browser, faults
 
