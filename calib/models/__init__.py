@@ -7,11 +7,14 @@ from calib.errors import CalibError
 from calib.models.ayers_perumpral import AYERS_PERUMPRAL, AYERS_PERUMPRAL_VOLUMETRIC
 from calib.models.base import Array, BoundModel, Conditions, Model, References
 from calib.models.bekker import BEKKER, MODIFIED_BEKKER
+from calib.models.elliptic_contact import ELLIPTIC_CONTACT
 from calib.models.janosi_hanamoto import JANOSI_HANAMOTO
+from calib.models.maclaurin import MACLAURIN_RUT
 from calib.models.magic_formula import MAGIC_FORMULA
 from calib.models.magic_formula_pressure import MAGIC_FORMULA_PRESSURE
 from calib.models.mobility import BRIXIUS, WISMER_LUTH
 from calib.models.plate_sinkage import BEKKER_PLATE, LYASKO, REECE
+from calib.models.upadhyaya import UPADHYAYA
 from calib.models.wong_reece import WONG_REECE_PULL, WONG_REECE_SINKAGE, WONG_REECE_TORQUE
 
 __all__ = [
@@ -31,8 +34,11 @@ MODELS: Registry[Model] = Registry(
     BEKKER_PLATE,
     REECE,
     LYASKO,
+    MACLAURIN_RUT,
     WISMER_LUTH,
     BRIXIUS,
+    UPADHYAYA,
+    ELLIPTIC_CONTACT,
     JANOSI_HANAMOTO,
     WONG_REECE_PULL,
     WONG_REECE_TORQUE,

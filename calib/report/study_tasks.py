@@ -78,8 +78,9 @@ def choose_model(output: str, table: Table) -> str:
     """Pick the model of an output (a key of `OUTPUTS`) that suits a table.
 
     Of the models whose conditions are all there it is the one that makes use of most of those that
-    vary; of several such, the one of fewest parameters, then of fewest conditions, then the one
-    known first. Which of them the data prefer, `calib.compare` says.
+    vary; of several such, one that is not slow, the one of fewest conditions that do not vary, of
+    fewest parameters, of fewest conditions, then the one known first. Which of them the data
+    prefer, `calib.compare` says.
 
     Raises
     ------
@@ -91,7 +92,13 @@ def choose_model(output: str, table: Table) -> str:
     if suited:
         varied = {c for m in suited for c in m.conditions if np.unique(table[c]).size > 1}
         uses = [
-            (len(varied & set(m.conditions)), -len(m.parameters), -len(m.conditions))
+            (
+                len(varied & set(m.conditions)),
+                not m.slow,
+                -len(set(m.conditions) - varied),
+                -len(m.parameters),
+                -len(m.conditions),
+            )
             for m in suited
         ]
         return suited[uses.index(max(uses))].name

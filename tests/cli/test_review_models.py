@@ -18,14 +18,16 @@ from tests.cli.test_cli import calib as calib
 # Too few steps to pass the gate: what is tried is that every verb comes to its end.
 FEW = ["--max-steps", 100, "--workers", 1]
 QUICK = [
-    "wismer_luth", "brixius", "reece", "bekker_plate", "lyasko", "janosi_hanamoto",
+    "wismer_luth", "brixius", "reece", "bekker_plate", "lyasko", "janosi_hanamoto", "upadhyaya",
+    "elliptic_contact", "maclaurin_rut",
 ]  # fmt: skip
 SLOW = ["wong_reece_pull", "wong_reece_torque", "wong_reece_sinkage"]
 # Beside which a model is compared; torque and shear stress have one model each.
 BESIDE = {
     "wismer_luth": "brixius", "brixius": "wismer_luth", "reece": "bekker_plate",
     "bekker_plate": "bekker", "lyasko": "modified_bekker", "wong_reece_pull": "wismer_luth",
-    "wong_reece_sinkage": "lyasko",
+    "wong_reece_sinkage": "lyasko", "upadhyaya": "magic_formula",
+    "elliptic_contact": "upadhyaya", "maclaurin_rut": "bekker",
 }  # fmt: skip
 
 

@@ -31,6 +31,11 @@ THETA = {
     "brixius": {
         "c1": (0.4, 1.0), "c2": (0.05, 0.2), "c3": (4.0, 11.0), "c4": (0.5, 2.0), "c5": (0.2, 1.0),
     },
+    "upadhyaya": {"p20": (0.1, 0.8), "r": (-0.05, 0.2), "c": (2.0, 20.0)},
+    "elliptic_contact": {
+        "mu": (0.2, 1.2), "share": (0.0, 0.9), "K": (1.0, 40.0), "rho": (0.01, 0.3),
+    },
+    "maclaurin_rut": {"z_ref": (3.0, 200.0), "m": (0.5, 2.0), "q": (0.0, 1.0)},
     "janosi_hanamoto": {"c": (0.0, 10.0), "phi": (10.0, 40.0), "K": (3.0, 30.0)},
     **{f"wong_reece_{part}": _RIGID_WHEEL for part in ("pull", "torque", "sinkage")},
     "ayers_perumpral": {
@@ -52,13 +57,16 @@ CONDITIONS = {
     "tyre_diameter_m": (0.8, 1.4),
     "tyre_deflection_mm": (10.0, 60.0),
     "section_height_mm": (150.0, 300.0),
+    "contact_length_mm": (120.0, 350.0),
+    "contact_width_mm": (100.0, 300.0),
     "plate_width_mm": (50.0, 300.0),
     "normal_stress_kpa": (5.0, 100.0),
     "shear_displacement_mm": (0.0, 60.0),
 }
 REFERENCES = {
     "p_mid_psi": 30.0, "p_half_psi": 12.0, "p_ref_kpa": 120.0, "ci_ref_kpa": 700.0,
-    "water_ref": 0.08, "b_ref_mm": 120.0,
+    "water_ref": 0.08, "b_ref_mm": 120.0, "contact_pressure_ref_kpa": 90.0, "numeric_ref": 80.0,
+    "flattened_ref": 0.06, "diameter_ref": 1.1,
 }  # fmt: skip
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from calib.errors import CalibError
@@ -100,6 +101,39 @@ def scalar_brixius(p, c):
     return c["normal_load_kn"] * (gross - resistance)
 
 
+def scalar_upadhyaya(p, c):
+    return c["normal_load_kn"] * p["a"] * (1.0 - p["b"] * math.exp(-p["c"] * c["slip_ratio"]))
+
+
+def scalar_maclaurin_rut(p, c):
+    b, d = c["tyre_width_m"], c["tyre_diameter_m"]
+    area = (b * d) ** (1.0 - p["q"] / 2.0) * (c["tyre_deflection_mm"] / 1000.0) ** p["q"]
+    number = c["cone_index_kpa"] * area / c["normal_load_kn"]
+    return 1000.0 * p["k"] * d / number ** p["m"]
+
+
+def scalar_elliptic_contact(p, c):
+    """The stress added up over the ellipse: along chords in closed form, across them by Gauss."""
+    half_length = c["contact_length_mm"] / 2000.0
+    half_width = c["contact_width_mm"] / 2000.0
+    pressure = c["normal_load_kn"] / (math.pi * half_length * half_width)
+    strength = p["c"] + pressure * math.tan(math.radians(p["phi"]))
+    slip, K = abs(c["slip_ratio"]), p["K"] / 1000.0
+
+    def along(y: float) -> float:
+        chord = 2.0 * half_length * math.sqrt(1.0 - (y / half_width) ** 2)
+        if slip == 0.0:
+            return 0.0
+        return strength * (chord + K / slip * math.expm1(-slip * chord / K))
+
+    # In the angle about the centre chords end smoothly.
+    thrust = quad(
+        lambda t: along(half_width * math.sin(t)) * half_width * math.cos(t),
+        -math.pi / 2.0, math.pi / 2.0, epsabs=0.0, epsrel=1e-12,
+    )[0]  # fmt: skip
+    return math.copysign(thrust, c["slip_ratio"]) - p["rho"] * c["normal_load_kn"]
+
+
 def scalar_janosi_hanamoto(p, c):
     strength = p["c"] + c["normal_stress_kpa"] * math.tan(math.radians(p["phi"]))
     return strength * (1.0 - math.exp(-c["shear_displacement_mm"] / p["K"]))
@@ -111,6 +145,9 @@ SCALAR = {
     "lyasko": scalar_lyasko,
     "wismer_luth": scalar_wismer_luth,
     "brixius": scalar_brixius,
+    "upadhyaya": scalar_upadhyaya,
+    "maclaurin_rut": scalar_maclaurin_rut,
+    "elliptic_contact": scalar_elliptic_contact,
     "janosi_hanamoto": scalar_janosi_hanamoto,
     "magic_formula": scalar_magic_formula,
     "magic_formula_pressure": scalar_magic_formula_pressure,

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.special import i1, modstruve
 
 from calib.errors import CalibError
 from calib.models import MODELS, Array, BoundModel, Conditions, Model
+from calib.models.elliptic_contact import mobilised
 from calib.models.magic_formula_pressure import coefficients_at
 from tests.models.ranges import THETA, draw
 
@@ -227,6 +229,87 @@ def test_the_implicit_solver_handles_thousands_of_vectors_at_once() -> None:
     assert np.abs(residual[defined]).max() < 1e-10
     # Only densities beyond 0.1 to 5 g/cm3 are left out; in these ranges, almost none.
     assert defined.mean() > 0.99
+
+
+@FEW
+@given(seed=SEEDS)
+def test_upadhyayas_form_at_no_slip_at_a_fifth_and_at_its_limit(seed: int) -> None:
+    bound, theta, conditions = draw(seed, "upadhyaya", n=3)
+    conditions["slip_ratio"] = np.array([0.0, 0.2, 1e4])
+    coefficient = bound.predict(theta, conditions) / conditions["normal_load_kn"]
+    p20, r, _ = theta.T
+    a = bound.report(theta)["a"]
+    np.testing.assert_allclose(coefficient, np.stack([-r, p20, a], axis=1), rtol=1e-12)
+
+
+def test_upadhyayas_form_with_b_of_one_has_no_pull_without_slip() -> None:
+    bound = MODELS["upadhyaya"].bind(
+        {"slip_ratio": np.array([0.0]), "normal_load_kn": np.array([5.0])}
+    )
+    theta = bound.theta({"a": 0.6, "b": 1.0, "c": 8.0})
+    assert theta[1] == 0.0
+    steep = {"slip_ratio": np.array([0.0, 1e-6]), "normal_load_kn": np.full(2, 5.0)}
+    pull = bound.predict(theta, steep)[0]
+    assert pull[0] == 0.0
+    assert pull[1] / 1e-6 == pytest.approx(5.0 * 0.6 * 8.0, rel=1e-5)
+
+
+def test_the_mobilised_part_of_an_elliptic_contact_is_bessel_and_struve() -> None:
+    q = np.geomspace(1e-3, 8.0, 40)
+    bessel = 1.0 - 2.0 / q * (i1(q) - modstruve(1, q))
+    np.testing.assert_allclose(mobilised(q), bessel, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(mobilised(-q), -mobilised(q), rtol=1e-15)
+    # Half of the mean chord, 4/(3 pi) of the length, is what the soil is sheared by at first.
+    np.testing.assert_allclose(mobilised(np.array([1e-6])) / 1e-6, 4.0 / (3.0 * np.pi), rtol=1e-5)
+    # Far out all but the edge: no jump where the series takes over, and nothing below it.
+    far = np.linspace(30.0, 40.0, 2001)
+    slope = np.diff(mobilised(far)) / np.diff(far)
+    expected = 4.0 / np.pi / (0.5 * (far[1:] + far[:-1])) ** 2
+    np.testing.assert_allclose(slope, expected, rtol=0.01)
+    np.testing.assert_allclose(mobilised(np.array([1e6])), 1.0 - 4e-6 / np.pi, rtol=1e-12)
+
+
+@FEW
+@given(seed=SEEDS)
+def test_an_elliptic_contact_that_slides_has_the_strength_of_its_area(seed: int) -> None:
+    bound, theta, conditions = draw(seed, "elliptic_contact")
+    theta[:, 2] = 1e-9
+    conditions["slip_ratio"] = np.abs(conditions["slip_ratio"]) + 0.01
+    soil = {name: v[:, None] for name, v in bound.report(theta).items()}
+    load = conditions["normal_load_kn"]
+    area = np.pi / 4e6 * conditions["contact_length_mm"] * conditions["contact_width_mm"]
+    strength = area * soil["c"] + load * np.tan(np.radians(soil["phi"]))
+    np.testing.assert_allclose(
+        bound.predict(theta, conditions), strength - soil["rho"] * load, rtol=1e-6, atol=1e-9
+    )
+
+
+def test_at_one_pressure_cohesion_and_friction_cannot_be_told_apart() -> None:
+    conditions = {
+        "slip_ratio": np.array([0.05, 0.1, 0.3]), "normal_load_kn": np.full(3, 5.0),
+        "contact_length_mm": np.full(3, 250.0), "contact_width_mm": np.full(3, 180.0),
+    }  # fmt: skip
+    bound = MODELS["elliptic_contact"].bind(conditions)
+    theta = np.array([[0.6, 0.0, 14.0, 0.1], [0.6, 0.9, 14.0, 0.1]])
+    pulls = bound.predict(theta, conditions)
+    np.testing.assert_allclose(pulls[0], pulls[1], rtol=1e-12)
+    assert bound.report(theta)["phi"][0] > bound.report(theta)["phi"][1] + 20.0
+
+
+@FEW
+@given(seed=SEEDS)
+def test_maclaurins_ruts_are_z_ref_at_the_means_and_scale_with_the_tyre(seed: int) -> None:
+    bound, theta, conditions = draw(seed, "maclaurin_rut")
+    bound = bound.model.bind(conditions)
+    means = {c: np.exp(np.log(v).mean(keepdims=True)) for c, v in conditions.items()}
+    np.testing.assert_allclose(bound.predict(theta, means)[:, 0], theta[:, 0], rtol=1e-12)
+    # At the same mobility number, on twice the tyre: twice as deep.
+    large = {
+        c: v * {"cone_index_kpa": 1.0, "normal_load_kn": 4.0}.get(c, 2.0)
+        for c, v in conditions.items()
+    }
+    ratio = bound.predict(theta, large) / bound.predict(theta, conditions)
+    np.testing.assert_allclose(ratio, 2.0, rtol=1e-9)
 
 
 def test_every_model_has_a_range_to_be_tested_over() -> None:

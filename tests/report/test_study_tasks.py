@@ -170,9 +170,12 @@ def test_among_models_that_use_the_same_the_one_of_fewest_parameters_is_chosen()
     rows = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
     table = table_from_arrays(dict(zip(lines[0].split(","), rows.T, strict=True)))
     assert choose_model("drawbar_pull", table) == "wismer_luth"
-    # A cone index that is the same in all rows does not speak for the slower rigid wheel.
+    # A cone index that is the same in all rows does not speak for the slower rigid wheel, nor for
+    # a model that needs it.
     soft = table.columns["cone_index_kpa"] == 600.0
-    same = table.take(soft)
-    assert choose_model("drawbar_pull", same) == "wismer_luth"
+    assert choose_model("drawbar_pull", table.take(soft)) == "upadhyaya"
+    # One load beside does not speak for a model that needs a load.
+    one = table.take(soft & (table.columns["normal_load_kn"] == 6.0))
+    assert choose_model("drawbar_pull", one) == "magic_formula"
     with pytest.raises(CalibError, match="janosi_hanamoto: normal_stress_kpa, shear_displ"):
         choose_model("shear_stress", table)
