@@ -8,7 +8,7 @@ OUT ?= out/he2019
 # Small matrices: threads of the linear algebra would only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: report reference test test-slow browser docs bench lint format release-check clean
+.PHONY: report reference test test-slow coverage browser docs bench lint format release-check clean
 
 report: $(READY)
 	$(BIN)/calib report --out $(OUT) --overwrite
@@ -23,6 +23,14 @@ test: $(READY)
 
 test-slow: $(READY)
 	$(BIN)/python -m pytest -m slow
+
+# Lines and branches of calib that the tests of `make test` run, in every process that they start.
+coverage: export COVERAGE_FILE := $(CURDIR)/out/coverage/data
+coverage: $(READY)
+	rm -rf out/coverage && mkdir -p out/coverage
+	$(BIN)/python -m coverage run -m pytest -n auto --dist loadfile
+	$(BIN)/python -m coverage combine -q
+	$(BIN)/python -m coverage report --skip-covered
 
 # What tests open pages in, and what looks at them there; they are left out without. As root, on Debian.
 browser:

@@ -194,7 +194,8 @@ def _stop(executor: ProcessPoolExecutor) -> None:
     """End processes at once, and the server that may just be importing what they need."""
     server = getattr(forkserver._forkserver, "_forkserver_pid", None)
     if server is not None:
-        os.kill(server, signal.SIGTERM)
+        with suppress(ProcessLookupError):  # one before it was stopped, and is gone
+            os.kill(server, signal.SIGTERM)
     for process in list((executor._processes or {}).values()):
         process.terminate()
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import time
-from multiprocessing import active_children
+from multiprocessing import active_children, forkserver
 from pathlib import Path
 
 import pytest
@@ -58,6 +59,16 @@ def test_an_interruption_ends_the_processes_at_their_work() -> None:
     for process in working:
         process.join(60.0)
         assert process.exitcode
+
+
+def test_a_server_that_is_gone_hides_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that an earlier pool ended, whose place no other has taken yet."""
+    gone = subprocess.Popen(["true"])
+    gone.wait()
+    monkeypatch.setattr("calib.batch.pool._serve", lambda: None)
+    monkeypatch.setattr(forkserver._forkserver, "_forkserver_pid", gone.pid)
+    with pytest.raises(CalibError, match="of the work"), pool(2):
+        raise CalibError("of the work")
 
 
 @pytest.mark.parametrize("workers", [1, 2])
