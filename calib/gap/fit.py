@@ -183,6 +183,7 @@ def _laplace(
     evidence = log_likelihood + log_prior + 0.5 * d * np.log(2 * np.pi) - 0.5 * log_det
     evidence += _bounds_correction(problem, psi, gradient, covariance)
     evidence += sum(ln_prior(n) for n in ascent.noise.values())
+    covariance = _within(problem, covariance)
     n_lab = {o.name: o.problem.response.size for o in problem.data.outputs}
     return Fit(
         problem.forward, psi, covariance, ascent.noise,
@@ -191,20 +192,35 @@ def _laplace(
     )  # fmt: skip
 
 
+def _within(problem: Residuals, covariance: Array) -> Array:
+    """Return a covariance in which no bounded coordinate is wider than between its bounds."""
+    sd, bounded = np.sqrt(np.diag(covariance)), 0.5 * (problem.upper - problem.lower)
+    shrunk = np.minimum(bounded / sd, 1.0)
+    return np.asarray(shrunk[:, None] * covariance * shrunk)
+
+
 def _bounds_correction(problem: Residuals, psi: Array, gradient: Array, covariance: Array) -> float:
-    """Mass of the normal that lies inside the bounds, one coordinate at a time."""
+    """Log of the mass of the normal that lies inside the bounds, one coordinate at a time.
+
+    One that is held at a bound has a slope there, which moves its normal beyond it.
+    """
     sd = np.sqrt(np.diag(covariance))
+    held = problem.blocked(psi[None], -gradient[None])[0]
     total = 0.0
     for i in np.flatnonzero(np.isfinite(problem.lower) | np.isfinite(problem.upper)).tolist():
-        to_low, to_high = (psi[i] - problem.lower[i]) / sd[i], (problem.upper[i] - psi[i]) / sd[i]
-        if min(to_low, to_high) < 0.01:
-            # Held at a bound with a slope: a one-sided exponential-normal integral.
-            slope = abs(gradient[i]) * sd[i]
-            total += min(0.5 * slope**2 + float(log_ndtr(-slope)), 0.0)
-        else:
-            inside = 1.0 - np.exp(log_ndtr(-to_low)) - np.exp(log_ndtr(-to_high))
-            total += float(np.log(max(inside, 1e-6)))
+        slope = float(gradient[i] * sd[i]) if held[i] else 0.0
+        low = (problem.lower[i] - psi[i]) / sd[i] + slope
+        high = (problem.upper[i] - psi[i]) / sd[i] + slope
+        total += 0.5 * slope**2 + _ln_mass(low, high)
     return total
+
+
+def _ln_mass(low: float, high: float) -> float:
+    """Log of the standard normal's mass between two ends."""
+    if low + high > 0.0:  # in its other tail, where differences are exact
+        low, high = -high, -low
+    ln_high = float(log_ndtr(high))
+    return ln_high + float(np.log(max(-np.expm1(float(log_ndtr(low)) - ln_high), 1e-300)))
 
 
 def log_joint(fit: Fit, psi: Array) -> Array:

@@ -12,20 +12,23 @@ from calib.gap.forward import Forward
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, ln_prior, noise_conditions_of_lab
 from calib.gap.refine import refine
-from calib.inference.priors import Priors
+from calib.inference.priors import Prior, Priors
 from tests.custom_problems import normal, problem_of
 from tests.gap.cases import PULL_ONLY, make_case
 
 
-def straight_line(seed: int) -> Campaigns:
-    """Ten readings in the laboratory and seven in the field, none of them with a gap."""
+def straight_line(seed: int, *idle: Prior) -> Campaigns:
+    """Ten readings in the laboratory and seven in the field, none of them with a gap.
+
+    On parameters that are idle nothing depends.
+    """
     few = campaigns(make_case(models=PULL_ONLY, n_lab=10, n_field=7))
     rng = np.random.default_rng(seed)
     slips = np.linspace(0.0, 0.6, 10), few.view.slip()
     pulls = [0.3 + 0.8 * s + 0.04 * rng.standard_normal(s.size) for s in slips]
     sigma = normal("sigma", np.log(0.05), 0.8, log=True)
-    priors = [normal("a", 0.0, 1.0), normal("b", 0.5, 2.0), sigma]
-    problem = problem_of(lambda a, b, slip: a + b * slip, priors, slips[0], pulls[0])
+    priors = [normal("a", 0.0, 1.0), normal("b", 0.5, 2.0), *idle, sigma]
+    problem = problem_of(lambda a, b, *more: a + b * more[-1], priors, slips[0], pulls[0])
     own = Priors(problem.priors.entries[:-1])
     o = OutputData("drawbar_pull", problem, own, np.arange(7), pulls[1])
     at = {o.name: noise_conditions_of_lab(problem.table, few.view)}
@@ -46,3 +49,20 @@ def test_at_its_noise_the_evidence_is_that_of_the_closed_form(seed: int):
     # In a linear model Laplace's is exact; of 23,000 weighted draws the error is about 0.01.
     assert found.log_evidence == pytest.approx(exact, abs=1e-4)
     assert refine(found, 1).log_evidence == pytest.approx(exact, abs=0.03)
+
+
+@pytest.mark.parametrize("start", [0.1, 0.1005, 0.5, 0.899, 0.9])
+def test_what_nothing_depends_on_changes_no_evidence(start: float):
+    def evidence(data: Campaigns, begun: list[float]) -> tuple[float, float]:
+        forward = Forward(data, Hypothesis("none"), {"drawbar_pull": 0.04})
+        found = fit(data, forward, np.array(begun), {"drawbar_pull": Noise(0.04)})
+        refined = refine(found, 1)
+        assert refined.sample is not None
+        return found.log_evidence, refined.log_evidence
+
+    # As the change point of a step that falls between two runs.
+    idle = Prior("c", "1", "a test", "nobody", "uniform", False, 0.5, np.inf, 0.1, 0.9)
+    without = evidence(straight_line(1), [0.0, 0.5])
+    found = evidence(straight_line(1, idle), [0.0, 0.5, start])
+    assert found[0] == pytest.approx(without[0], abs=0.01)
+    assert found[1] == pytest.approx(without[1], abs=0.05)
