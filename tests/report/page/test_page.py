@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from calib.data import read_table
 from calib.he2019.figures.reference import HE2019
 from calib.inference.noise import Noise, NoiseChoice
-from calib.models import MODELS
-from calib.models.base import BoundModel
+from calib.models import MODELS, example_csv
 from calib.report.figures import Plate
 from calib.report.figures.style import png_size
 from calib.report.page.content import failed_section, render_page, repeats_words, validation_facts
@@ -309,10 +309,10 @@ def test_validation_facts_have_the_numbers(rut):
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_every_model_has_an_equation_and_a_parametrisation(name):
-    references = {"ci_ref_kpa": 500.0, "water_ref": 0.06, "p_ref_kpa": 140.0, "p_mid_psi": 30.0,
-                  "p_half_psi": 12.0, "b_ref_mm": 120.0}  # fmt: skip
-    bound = BoundModel(MODELS[name], references)
+def test_every_model_has_an_equation_and_a_parametrisation(name, tmp_path):
+    example = tmp_path / "example.csv"
+    example.write_text(example_csv(name))
+    bound = MODELS[name].bind(read_table(example))
     assert "<i>" in equation(bound)
     text = parametrisation(bound)
     assert "{" not in text

@@ -11,15 +11,15 @@ GREEK = {
 }  # fmt: skip
 COMMANDS = {
     "allowbreak", "arctan", "ast", "begin", "bottomrule", "caption", "centering", "chi", "cite",
-    "cos", "exp", "int", "sqrt", "tan",
+    "cos", "exp", "frac", "int", "sqrt", "tan",
     "end", "footnotesize", "gamma", "label", "ldots", "le", "ge", "mathrm", "midrule", "mu",
     "paragraph", "pm", "raggedright", "rlap", "sigma", "sin", "small", "tabularnewline", "tau",
     "textasciicircum", "textbackslash", "texttt", "textwidth", "theta", "times", "toprule",
     "textasciitilde", "circ", *GREEK,
 }  # fmt: skip
 MATH_ONLY = {
-    "arctan", "ast", "circ", "cos", "exp", "int", "le", "ge", "mathrm", "pm", "sin", "sqrt", "tan",
-    "times", *GREEK,
+    "arctan", "ast", "circ", "cos", "exp", "frac", "int", "le", "ge", "mathrm", "pm", "sin", "sqrt",
+    "tan", "times", *GREEK,
 }  # fmt: skip
 
 
