@@ -44,6 +44,8 @@ NAMED = 0.5
 _WORTH_SAYING = 0.05
 # Parts the field rows are left out in, where there are no other conditions to judge by.
 _FOLDS = 5
+# Effective draws in each: they weigh predictions, in which an error of 0.03 nats is not seen.
+_OF_A_FOLD = 1000
 
 
 @dataclass(frozen=True, repr=False)
@@ -273,7 +275,7 @@ def _unseen(
 ) -> dict[str, Array]:
     """Predict all rows of a field campaign from those that a case still has."""
     part = campaigns(case)
-    ranking = rank(part, seed, effects=effects, lab=lab, design=design)
+    ranking = rank(part, seed, effects=effects, lab=lab, design=design, plenty=_OF_A_FOLD)
     return mixture(part, ranking, seed).at(view).means
 
 

@@ -26,23 +26,27 @@ from calib.inference.sampling.adapt import tempered_moments
 from calib.inference.sampling.mixture import StudentT, log_sum
 from calib.models.base import Array
 
-__all__ = ["refine"]
+__all__ = ["PLENTY", "refine"]
 
 _ROUNDS, _SIZE, _FINAL, _KEPT = 5, 3000, 8000, 500
 # Tails heavy enough for the long ends of sizes that an exponent makes up for.
 _DOF = 6.0
-# Fewer effective draws than this do not replace the normal; with this many the evidence is within
-# 0.016 nats (one sd), and further rounds would not be seen in any probability.
-_ENOUGH, _PLENTY = 120.0, 4000.0
+# Fewer effective draws than this do not replace the normal.
+_ENOUGH = 120.0
+# With this many the evidence is within 0.016 nats (one sd), and further rounds would not be seen in
+# any probability.
+PLENTY = 4000
 
 
-def refine(fit: Fit, seed: int) -> Fit:
+def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
     """Return a fit with draws of its posterior and the evidence that they give.
 
     Parameters
     ----------
     fit : Fit
     seed : int
+    plenty : int, optional
+        Effective draws that end the rounds.
 
     Returns
     -------
@@ -66,7 +70,7 @@ def refine(fit: Fit, seed: int) -> Fit:
             return fit
         weight = np.exp(log_weight - total)
         effective = 1.0 / np.square(weight).sum()
-        if effective >= _PLENTY:
+        if effective >= plenty:
             break
         moved = tempered_moments(pool.draws, log_weight)
         if moved is None:

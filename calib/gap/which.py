@@ -27,7 +27,7 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.isolate import Isolability, isolability
 from calib.gap.noise import Noise
 from calib.gap.odds import Odds, probabilities, with_prior
-from calib.gap.refine import refine
+from calib.gap.refine import PLENTY, refine
 from calib.gap.relevance import relevance
 from calib.gap.sets import IN_PLAY, sets_and_unlisted
 from calib.inference.defined import check_defined
@@ -109,6 +109,7 @@ def rank(
     effects: Mapping[str, Effect] = EFFECTS,
     lab: Lab | None = None,
     design: Isolability | None = None,
+    plenty: int = PLENTY,
 ) -> Ranking:
     """Fit every hypothesis and rank them.
 
@@ -121,6 +122,8 @@ def rank(
         If `calibrate_lab` has been called before.
     design : Isolability, optional
         What the design could show, if it is known from a campaign that has all of these rows.
+    plenty : int, optional
+        Effective draws of a posterior, and draws for its relevance, that are enough.
     """
     able, unable = split_testable(data, {**effects, **dependences(data)})
     lab_mode, noise = lab or calibrate_lab(data, seed)
@@ -143,7 +146,7 @@ def rank(
     for name, more in guesses.fit([wider(h) for h in far]).items():
         fits[name] += more
     fits |= sets_and_unlisted(guesses, [h.name for h in single if h.name not in beside], fits)
-    fits, scores = _scored(fits, guesses.odds, seed)
+    fits, scores = _scored(fits, guesses.odds, seed, plenty)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
     probability = probabilities(log_evidence, guesses.odds)
     return Ranking(fits, scores, log_evidence, probability, unable, lab_mode, design, guesses.odds)
@@ -171,7 +174,7 @@ def _far_out(found: Fit) -> bool:
 
 
 def _scored(
-    fits: Mapping[str, tuple[Fit, ...]], odds: Odds, seed: int
+    fits: Mapping[str, tuple[Fit, ...]], odds: Odds, seed: int, plenty: int
 ) -> tuple[dict[str, tuple[Fit, ...]], dict[str, tuple[float, ...]]]:
     """Score every variant, and by draws of their posteriors those that are still in play."""
     promise = {name: [with_prior(f, odds) for f in group] for name, group in fits.items()}
@@ -190,8 +193,8 @@ def _scored(
         beside = max(values) - _BESIDE
         for i, value in enumerate(values):
             if value > beside and value + odds.ln_prior(name) > least:
-                refined[name][i] = refine(fits[name][i], seed)
-                values[i] = _score(refined[name][i], seed, _CAREFUL)
+                refined[name][i] = refine(fits[name][i], seed, plenty)
+                values[i] = _score(refined[name][i], seed, min(plenty, _CAREFUL))
     return (
         {name: tuple(group) for name, group in refined.items()},
         {name: tuple(values) for name, values in scores.items()},

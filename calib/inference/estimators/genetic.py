@@ -184,71 +184,106 @@ def minimise_genetic_runs(
     `minimise_genetic`; a run's result does not depend on the others.
     """
     s = settings or GeneticSettings()
-    runs = [_Run(lower, upper, rng, s) for rng in rngs]
-    going = list(runs)
-    new = cost(np.concatenate([run.population for run in going]))
-    for run, costs in zip(going, new.reshape(len(going), s.NP), strict=True):
-        run.begin(costs)
+    runs = _Runs(lower, upper, rngs, s)
+    runs.begin(cost(runs.population))
     for generation in range(s.max_iterations):
-        children = np.concatenate([run.descend(generation) for run in going])
-        new = cost(children).reshape(len(going), s.NP)
-        apart = children.reshape(len(going), s.NP, -1)
-        for run, mine, costs in zip(going, apart, new, strict=True):
-            run.select(mine, costs)
-        going = [run for run in going if run.calm < s.patience]
-        if not going:
+        children = runs.descend(generation)
+        runs.select(children, cost(children))
+        if not runs.going.size:
             break
-    return [run.result() for run in runs]
+    return [r for r in runs.results if r is not None]
 
 
-class _Run:
-    """A population on its way."""
+class _Runs:
+    """Populations on their way, one after the other in one array: shapes (runs NP, d)."""
 
     def __init__(
-        self, lower: Array, upper: Array, rng: np.random.Generator, settings: GeneticSettings
+        self,
+        lower: Array,
+        upper: Array,
+        rngs: Sequence[np.random.Generator],
+        settings: GeneticSettings,
     ) -> None:
-        self._lower, self._upper, self._rng, self._settings = lower, upper, rng, settings
-        self.population = lower + (upper - lower) * rng.random((settings.NP, lower.size))
-        self._costs: Array = np.empty(0)
-        self._history: list[float] = []
-        self._lead, self._floor, self.calm = 0, 0.0, 0
+        self._lower, self._upper, self._rngs, self._settings = lower, upper, rngs, settings
+        shape = settings.NP, lower.size
+        self.population = lower + (upper - lower) * np.concatenate([r.random(shape) for r in rngs])
+        self.results: list[GeneticResult | None] = [None] * len(rngs)
+        self.going = np.arange(len(rngs))
+        self._history: list[list[float]] = [[] for _ in rngs]
+        self._calm = np.zeros(len(rngs), dtype=np.intp)
 
     def begin(self, costs: Array) -> None:
-        """Take over the costs of the first population."""
+        """Take over the costs of the first populations."""
         self._costs = np.array(costs)
-        self._lead = int(costs.argmin())
-        self._history.append(float(costs[self._lead]))
         # An exact fit has no lowest cost to compare with: the costs' rounding then ends the run.
-        finite = costs[np.isfinite(costs)]
-        self._floor = 1e-24 * float(np.median(finite)) if finite.size else 0.0
+        each = [own[np.isfinite(own)] for own in self._costs.reshape(self.going.size, -1)]
+        self._floor = np.array([1e-24 * float(np.median(o)) if o.size else 0.0 for o in each])
+        self._note()
 
     def descend(self, generation: int) -> Array:
-        """Make the descendants of a generation, shape (NP, d)."""
+        """Make the descendants of a generation."""
         row = generation % _BLOCK
         if row == 0:
-            self._block = draw_generations(self._rng, _BLOCK, self._lower.size, self._settings)
+            self._block = self._draw()
         draws = GeneticDraws(*(part[row] for part in self._block))
-        best, F = self.population[self._lead], self._settings.F
+        best, F = self.population[self._lead].repeat(self._settings.NP, axis=0), self._settings.F
         return descendants(self.population, best, draws, F, self._lower, self._upper)
 
+    def _draw(self) -> GeneticDraws:
+        """Draw a block of generations of all runs, each from its own stream."""
+        each = [
+            draw_generations(self._rngs[i], _BLOCK, self._lower.size, self._settings)
+            for i in self.going.tolist()
+        ]
+        at = range(0, self._costs.size, self._settings.NP)
+        return GeneticDraws(
+            np.concatenate([d.first + start for d, start in zip(each, at, strict=True)], axis=1),
+            np.concatenate([d.second + start for d, start in zip(each, at, strict=True)], axis=1),
+            np.concatenate([d.crossed for d in each], axis=1),
+            np.concatenate([d.mutation for d in each], axis=1),
+        )
+
     def select(self, children: Array, costs: Array) -> None:
-        """Let descendants replace their parents where they are fitter."""
+        """Let descendants replace their parents where they are fitter; end what has converged."""
         fitter = costs < self._costs
         self.population[fitter] = children[fitter]
         self._costs[fitter] = costs[fitter]
-        self._lead = int(self._costs.argmin())
-        lowest = float(self._costs[self._lead])
-        self._history.append(lowest)
+        lowest = self._note()
         tolerated = lowest * (1.0 + self._settings.tolerance) + self._floor
-        self.calm = self.calm + 1 if self._costs.max() <= tolerated < np.inf else 0
+        largest = self._costs.reshape(self.going.size, -1).max(axis=1)
+        self._calm = np.where((largest <= tolerated) & (tolerated < np.inf), self._calm + 1, 0)
+        n = len(self._history[self.going[0]])
+        ended = (self._calm >= self._settings.patience) | (n > self._settings.max_iterations)
+        if ended.any():
+            self._end(ended)
 
-    def result(self) -> GeneticResult:
-        """Return where it ended."""
-        history = np.array(self._history)
-        return GeneticResult(
-            self.population[self._lead].copy(), self._history[-1],
-            self._settings.NP * history.size, history, self.calm == self._settings.patience,
-        )  # fmt: skip
+    def _note(self) -> Array:
+        """Note the best of each population and its cost."""
+        costs = self._costs.reshape(self.going.size, -1)
+        best = costs.argmin(axis=1)
+        self._lead = best + costs.shape[1] * np.arange(self.going.size)
+        lowest = self._costs[self._lead]
+        for i, cost in zip(self.going, lowest.tolist(), strict=True):
+            self._history[i].append(cost)
+        return np.asarray(lowest)
+
+    def _end(self, ended: NDArray[np.bool_]) -> None:
+        size = self._settings.NP
+        for j in np.flatnonzero(ended):
+            history = np.array(self._history[self.going[j]])
+            self.results[self.going[j]] = GeneticResult(
+                self.population[self._lead[j]].copy(), float(history[-1]), size * history.size,
+                history, bool(self._calm[j] == self._settings.patience),
+            )  # fmt: skip
+        left, rows = ~ended, np.repeat(~ended, size)
+        shift = size * (np.cumsum(ended) - ended)[left].repeat(size)
+        self.population, self._costs = self.population[rows], self._costs[rows]
+        first, second, crossed, mutation = self._block
+        self._block = GeneticDraws(
+            first[:, rows] - shift, second[:, rows] - shift, crossed[:, rows], mutation[:, rows]
+        )
+        self.going, self._calm, self._floor = self.going[left], self._calm[left], self._floor[left]
+        self._lead = self._lead[left] - size * (np.cumsum(ended) - ended)[left]
 
 
 def estimate_genetic(

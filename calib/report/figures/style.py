@@ -195,9 +195,10 @@ def png_bytes(figure: Figure) -> bytes:
     with style():
         figure.savefig(full, format="raw", dpi=_DPI)
     width, height = (int(inches * _DPI) for inches in figure.get_size_inches())
-    image = Image.frombytes("RGBA", (width, height), full.getvalue())
+    full_colour = Image.frombytes("RGBA", (width, height), full.getvalue())
     # With its resolution, by which a text processor takes it over at its size in print.
-    image.convert("RGB").quantize(256).save(small, format="png", dpi=(_DPI, _DPI))
+    image = full_colour.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
+    image.save(small, format="png", dpi=(_DPI, _DPI))
     return small.getvalue()
 
 
