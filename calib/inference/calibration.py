@@ -65,10 +65,6 @@ class Calibration:
     label: str
     estimates: tuple[PointEstimate, ...] = ()
     settings: SamplerSettings = field(default_factory=SamplerSettings)
-    summary: Mapping[str, ParameterSummary] = field(init=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "summary", _summarise(self))
 
     def __repr__(self) -> str:
         state = "converged" if self.converged else "NOT CONVERGED"
@@ -79,6 +75,11 @@ class Calibration:
     def converged(self) -> bool:
         """Whether the gate was passed."""
         return self.draws.report.passed
+
+    @cached_property
+    def summary(self) -> Mapping[str, ParameterSummary]:
+        """Of every parameter that varies, sampled and published."""
+        return _summarise(self)
 
     @cached_property
     def natural(self) -> Array:
@@ -209,7 +210,9 @@ def calibrate(
     draws = sample_posterior(
         problem, stream(seed, label, "sample"), starts=starts, settings=chosen, progress=progress
     )
-    return Calibration(problem, draws, seed, label, estimates, chosen)
+    found = Calibration(problem, draws, seed, label, estimates, chosen)
+    _ = found.summary  # here, and not in every process that it goes to
+    return found
 
 
 def _starts(problem: Problem, estimates: tuple[PointEstimate, ...]) -> Array:

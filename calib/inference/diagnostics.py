@@ -12,7 +12,6 @@ from importlib import import_module
 from typing import Any, Literal
 
 import numpy as np
-from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import ndtri
 
 from calib.models.base import Array
@@ -91,6 +90,8 @@ def autocorrelation_time(chain: Array, c: float = 5.0) -> Array:
 
     The window is the first that spans five of them (Sokal). NaN if a walker never moved.
     """
+    from scipy.fft import irfft, next_fast_len, rfft  # late: a quarter of a second
+
     _, steps, d = chain.shape
     size = next_fast_len(2 * steps, real=True)
     tau = np.empty(d)

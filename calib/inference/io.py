@@ -16,10 +16,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path, PurePath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import xarray as xr
 
 from calib.batch.environment import Environment, sha256
 from calib.data import read_for_model, write_table
@@ -37,6 +36,9 @@ from calib.models import BoundModel, get_model
 from calib.models.base import Array
 from calib.models.simulators.emulator.files import load_emulator, save_emulator
 from calib.models.simulators.emulator.model import emulated_model, emulator_of
+
+if TYPE_CHECKING:
+    import xarray as xr
 
 SCHEMA = "calib/run/1"
 _HASHED = ("posterior.nc", "priors.toml", "data.csv")
@@ -240,7 +242,9 @@ def load_calibration(folder: Path) -> Calibration:
     with _damage(folder / "posterior.nc"):
         t, log_prob = _read_posterior(folder / "posterior.nc", problem.priors, shape)
     with _damage(folder / "run.json"):
-        return Calibration(problem, _draws(meta, t, log_prob), seed, label)
+        found = Calibration(problem, _draws(meta, t, log_prob), seed, label)
+        _ = found.parameters  # what cannot be reported is damaged as well
+        return found
 
 
 @contextmanager
@@ -277,18 +281,21 @@ def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
 
 def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Return the internal coordinates, of a shape, and their log densities."""
-    with xr.open_datatree(path, engine="h5netcdf") as tree:
-        posterior = tree["posterior"].to_dataset()
+    # As HDF5: xarray takes longer to import than the rest of a prediction.
+    from h5netcdf import File
+
+    with File(path, "r") as file:
+        posterior = file["posterior"].variables
         natural = np.stack(
             [
                 np.full(shape[:-1], p.loc)
                 if p.fixed
-                else posterior[p.name].values.reshape(shape[:-1])
+                else np.asarray(posterior[p.name][...]).reshape(shape[:-1])
                 for p in priors.entries
             ],
             axis=-1,
         )
-        log_prob = np.asarray(tree["sample_stats"].to_dataset()["lp"].values.reshape(shape[:-1]))
+        log_prob = np.asarray(file["sample_stats"].variables["lp"][...]).reshape(shape[:-1])
     t = priors.to_internal(natural.reshape(-1, natural.shape[-1]), margin=0.0).reshape(shape)
     return t, log_prob
 

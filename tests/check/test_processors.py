@@ -14,7 +14,7 @@ import pytest
 from calib.check.check import check
 from calib.gap.forward import Forward
 from calib.inference.problem import Problem
-from calib.inference.sampling import sampler
+from calib.inference.sampling import ensemble as ensembles
 from tests.check.conftest import different
 from tests.check.kernels import ALL, KERNELS, Setting, skip_what_crashes
 
@@ -59,7 +59,7 @@ def test_chains_that_part_ways_are_judged_by_their_monte_carlo_error(
     report: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each density that walkers are moved by is off in its fifth digit, by chance."""
-    rng, moved = np.random.default_rng(1), sampler.Ensemble
+    rng, moved = np.random.default_rng(1), ensembles.Ensemble
 
     def ensemble(log_prob, *args, **kwargs):
         def noisy(t: np.ndarray) -> np.ndarray:
@@ -68,7 +68,7 @@ def test_chains_that_part_ways_are_judged_by_their_monte_carlo_error(
 
         return moved(noisy, *args, **kwargs)
 
-    monkeypatch.setattr(sampler, "Ensemble", ensemble)
+    monkeypatch.setattr(ensembles, "Ensemble", ensemble)
     outcome = check(report)
     assert different(outcome) == {}
     assert outcome.draws_differ

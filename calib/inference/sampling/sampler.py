@@ -13,7 +13,6 @@ from calib.errors import CalibError
 from calib.inference.estimators.identified import representative_rows
 from calib.inference.problem import Problem
 from calib.inference.sampling.adapt import Guess, adapt, refit
-from calib.inference.sampling.ensemble import GOOD, POOR, Ensemble
 from calib.inference.sampling.gate import Gate, GateReport, judge
 from calib.inference.sampling.mode import Mode, find_modes
 from calib.inference.sampling.proposal import Proposal
@@ -186,6 +185,9 @@ def sample_density(
     began : float, optional
         ``time.perf_counter()`` at which the work began.
     """
+    # emcee takes half a second to import, which predicting from a posterior does without.
+    from calib.inference.sampling.ensemble import GOOD, POOR, Ensemble
+
     began = time.perf_counter() if began is None else began
     count = log_prob if isinstance(log_prob, _Counter) else _Counter(log_prob)
     walkers = settings.n_walkers(first[0].mean.size)

@@ -114,11 +114,9 @@ def test_the_limits_are_those_of_the_gate() -> None:
 
 
 def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    from calib.inference.sampling import sampler as module
-
-    sampled = module.Ensemble.run
+    sampled = Ensemble.run
     made: list[object] = []
-    init = module.Ensemble.__init__
+    init = Ensemble.__init__
 
     def remember(self, *args, **kwargs):
         init(self, *args, **kwargs)
@@ -129,8 +127,8 @@ def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.Monkey
         if self is made[1]:
             t[1:] = t[:1]
 
-    monkeypatch.setattr(module.Ensemble, "__init__", remember)
-    monkeypatch.setattr(module.Ensemble, "run", stuck)
+    monkeypatch.setattr(Ensemble, "__init__", remember)
+    monkeypatch.setattr(Ensemble, "run", stuck)
     settings = SamplerSettings(max_steps=200)
     draws = run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=settings)
     assert len(made) == 4
