@@ -36,7 +36,7 @@ def test_cases_are_made_diagnosed_and_scored(calib: Calib) -> None:  # noqa: F81
 
 
 def test_cases_are_drawn_again_as_the_diagnosis_believes(
-    calib: Calib,
+    calib: Calib,  # noqa: F811
     blind_test: BlindTest,
 ) -> None:
     given = ("challenge", "well-specified", blind_test.cases, "--key", blind_test.key)
