@@ -32,6 +32,17 @@ def test_independent_draws_pass() -> None:
     assert np.all(np.abs(report.ess_bulk / 16_000 - 1.0) < 0.1)
 
 
+def test_what_is_just_reached_is_enough() -> None:
+    found = convergence(good())
+    ess_min, tau = float(min(found.ess_bulk.min(), found.ess_tail.min())), 4.0
+    limits = {"rhat_max": float(found.rhat.max()), "ess_min": ess_min, "taus_min": 200 / tau}
+    assert judged(good(), tau, **limits).passed
+    for name, value in limits.items():
+        beyond = np.nextafter(value, 0.0 if name == "rhat_max" else np.inf)
+        (reason, *_) = judged(good(), tau, **{**limits, name: float(beyond)}).reasons
+        assert reason
+
+
 def broken(how: str) -> np.ndarray:
     draws = good()
     rng = np.random.default_rng(2)
