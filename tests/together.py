@@ -21,7 +21,7 @@ GROUPS = (
      "report/page/test_page.py"),
     ("batch/tasks/test_cluster.py",),
     ("inference/sampling/test_sampler.py",),
-    ("challenge/test_make.py", "gap/test_well_specified.py"),
+    ("challenge/test_make.py", "gap/test_well_specified.py", "cli/test_challenge.py"),
     ("cli/test_cli.py",),
     ("validation/sbc/test_run.py",),
     ("report/test_contents.py",),

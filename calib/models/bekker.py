@@ -21,7 +21,7 @@ LN_MM_PER_M = float(np.log(1000.0))
 
 def rut_depth(
     pressure_kpa: Array, slip_ratio: Array | float, k: Array | float, n0: Array | float,
-    n1: Array | float = 0.0,
+    n1: Array | float,
 ) -> Array:  # fmt: skip
     """Evaluate Eq 21, zt = (pgr/k)^(1/(n0 + n1 s)), in metres.
 

@@ -11,6 +11,7 @@ import pytest
 from calib.data.quantities import role_of
 from calib.gap.effects import EFFECTS, View
 from calib.gap.effects.base import saturating
+from calib.gap.effects.dependence import DependsOn
 from calib.inference.prior_files import default_priors, read_priors
 from calib.models.latex import text
 from tests.gap.cases import make_case, parameters, simulate
@@ -266,6 +267,34 @@ def test_soil_effects_vanish_at_the_laboratorys_covariate(view):
         for output in ("pull", "sinkage"):
             change = apply(name, dict.fromkeys(SIZES[name], 0.2), output, same)
             np.testing.assert_allclose(change, 0.0, atol=1e-12)
+
+
+def test_motion_resistance_is_of_the_load_and_rises_along_the_covariate(view):
+    for name in ("multipass_compaction", "rate_effect", "moisture_softening"):
+        change = apply(name, {"resistance": 0.02}, "pull", view)[0]
+        h = EFFECTS[name].covariate(view)
+        np.testing.assert_allclose(change, 0.02 * h * view.load_kn, atol=1e-12)
+        assert np.abs(h).max() > 0.1
+
+
+def test_dependence_on_a_condition_is_its_equation(view):
+    """On a temperature: its difference over half its range; the pull has an additive part."""
+    warm = replace(
+        view, lab={**view.lab, "tyre_temperature_c": 20.0},
+        conditions={**view.conditions, "tyre_temperature_c": np.linspace(20.0, 40.0, 20)},
+    )  # fmt: skip
+    logs = {"pull": False, "sinkage": True}
+    effect = DependsOn("tyre_temperature_c", "tyre_temperature_c", logs, 10.0)
+    assert effect.parameters == (
+        "pull_slope", "pull_bend", "sinkage_slope", "sinkage_bend", "pull_offset",
+    )  # fmt: skip
+    u = effect.covariate(warm)
+    np.testing.assert_allclose(u, np.linspace(0.0, 2.0, 20))
+    phi = np.array([[0.3, -0.1, 0.2, 0.05, 0.02]])
+    pull = effect.on_output(phi, "pull", np.full((1, 20), 1.5), warm)[0]
+    np.testing.assert_allclose(pull, 1.5 * np.exp(0.3 * u - 0.1 * u**2) + 0.02 * u * 5.0)
+    rut = effect.on_output(phi, "sinkage", np.full((1, 20), 3.0), warm)[0]
+    np.testing.assert_allclose(rut, 3.0 + 0.2 * u + 0.05 * u**2)
 
 
 @pytest.mark.parametrize("name", EFFECTS)

@@ -160,6 +160,25 @@ def test_density_may_change_beyond_a_water_content_or_a_cone_index(water):
     assert ("cone", ("bulk_density",)) in onsets
 
 
+def test_what_a_density_model_is_bent_by_has_no_mean_over_the_laboratory():
+    """Products of conditions from -1 to 1, a square without its mean; of a cone index its log."""
+    data = campaigns(density_campaigns())
+    (o,), simulated = data.outputs, data.simulated["bulk_density"]
+    assert simulated.n_bends == 3
+    wet, cone = (o.problem.conditions[n] for n in ("gravimetric_water_content", "cone_index_kpa"))
+    u = (np.arange(200) + 0.5) / 200
+    at = {
+        "gravimetric_water_content": np.repeat(wet.min() + u * np.ptp(wet), 200),
+        "cone_index_kpa": np.tile(cone.min() * (cone.max() / cone.min()) ** u, 200),
+    }
+    t = np.tile([p.loc for p in o.priors.free], (4, 1))
+    found = simulated.predict(t, np.vstack([np.zeros(3), np.eye(3)]), at)
+    bends = found[1:] - found[0]
+    np.testing.assert_allclose(bends.mean(axis=1), 0.0, atol=1e-4)
+    # 1 - 1/3 at the ends of a square, 1 at those of a product.
+    np.testing.assert_allclose(sorted(np.abs(bends).max(axis=1)), [2 / 3, 2 / 3, 1.0], rtol=0.02)
+
+
 def test_wheels_know_no_onset_over_probes(data):
     assert not {h.onset_over for h in unknowns(data)} & {"water", "cone"}
 

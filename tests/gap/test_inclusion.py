@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calib.gap.diagnose import verdict
-from calib.gap.inclusion import inclusion_probability
+from calib.gap.inclusion import _shares, inclusion_probability
 from tests.gap.cases import CHOICE, LARGE, diagnosis_of
 
 
@@ -43,6 +45,19 @@ def test_shares_sum_to_one_and_probabilities_are_those_of_the_ranking(name):
     if name is not None:
         assert found.inclusion.acting == [name]
         assert found.inclusion.causes[name].share > 0.5
+
+
+def test_a_draw_weighs_what_its_explanation_does():
+    """However many draws an explanation has, they weigh together what it is probable."""
+    found = diagnosis_of("force_offset")
+    names = ["force_offset", "lug_thrust", "sensor_drift"]
+    fits = tuple(found.ranking.best(name) for name in names)
+    mixed = replace(found.corrected.mixture, fits=fits, probability=(0.7, 0.25, 0.05))
+    shares, weight = _shares(mixed, names)
+    for i, probability in enumerate(mixed.probability):
+        its = shares[:, i] == 1.0
+        assert its.sum() >= 50
+        assert weight[its].sum() == pytest.approx(probability)
 
 
 def test_sets_do_not_depend_on_the_order_of_the_effects():

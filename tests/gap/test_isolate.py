@@ -78,6 +78,21 @@ def test_what_parameters_can_imitate_is_absorbed():
     assert noisy.absorbed["force_offset"] != design.absorbed["force_offset"]
 
 
+def test_far_below_the_noise_the_prior_leaves_nothing_to_absorb_with():
+    """Whatever the size of a signature in noise sds, the share of it is in range and continuous."""
+    data = campaigns_of(None, "pull")
+    few = singles(data, {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")})
+    mode = {"drawbar_pull": ranking_of_pull().lab_mode["drawbar_pull"]}
+    shares = [
+        isolability(data, few, mode, {"drawbar_pull": Noise(sd, 0.0)}, 1).absorbed
+        for sd in (3.0, 30.0, 300.0)
+    ]
+    for name in ("force_offset", "sensor_drift"):
+        first, second, third = (share[name] for share in shares)
+        assert first > second > third >= 0.0
+        assert third < 0.01
+
+
 def test_more_rows_show_smaller_effects():
     few = {n: EFFECTS[n] for n in ("force_offset", "lug_thrust")}
     models = {"drawbar_pull": "magic_formula"}

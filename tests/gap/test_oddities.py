@@ -78,6 +78,21 @@ def test_columns_that_were_swapped_pull_more_than_the_wheel_carries():
     assert found.count("means nothing") == 2
 
 
+@pytest.mark.parametrize(("share", "odd"), [(0.9, False), (1.2, True)])
+def test_a_pull_above_the_load_is_named(share, odd):
+    case = make_case(None)
+    load = case.field["normal_load_kn"]
+    assert ("times the normal load" in said(changed(case, **{PULL: share * load}))) is odd
+
+
+def test_small_readings_of_both_campaigns_are_in_one_unit():
+    """What counts is their ratio."""
+    case = make_case(None)
+    lab = table_from_arrays({**case.lab.columns, "slip_ratio": 0.01 * case.lab["slip_ratio"]})
+    both = changed(replace(case, lab=lab), slip_ratio=0.01 * case.field["slip_ratio"])
+    assert "another unit" not in said(both)
+
+
 def test_new_conditions_without_a_needed_one_are_refused_by_file():
     case = make_case(None)
     fresh = table_without(case.field, "slip_ratio")

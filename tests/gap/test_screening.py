@@ -11,6 +11,7 @@ from calib.errors import CalibError
 from calib.gap.case import campaigns
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
+from calib.gap.screening import LAB_OUTLIER, OUTLIER
 from tests.gap.cases import PULL_ONLY, make_case
 
 FEW = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}
@@ -35,6 +36,22 @@ def test_a_gigantic_outlier_is_set_aside_and_changes_nothing_else(campaign, effe
     said = f"{campaign}.csv, line 6 (drawbar_pull_kn = {value:.4g}): more than"
     assert any(said in warning for warning in told)
     assert ranking.order[0] == (effect or "none")
+
+
+@pytest.mark.parametrize(("campaign", "bar"), [("lab", LAB_OUTLIER), ("field", OUTLIER)])
+def test_an_outlier_that_could_be_a_reading_is_left_out_too(campaign, bar):
+    case = make_case(None, models=PULL_ONLY)
+    table = getattr(case, campaign)
+    pull = table["drawbar_pull_kn"]
+    row = int(np.argmax(pull))
+    data, ranking, told = screened_ranking(spoiled(case, campaign, row, 3.0), 1, FEW)
+    (said,) = told
+    assert f"line {table.lines[row]} (drawbar_pull_kn = {3.0 * pull[row]:.4g})" in said
+    assert f"more than {bar:g} noise sds off whatever the hypothesis" in said
+    (o,) = data.outputs
+    left = o.problem.response if campaign == "lab" else o.field
+    assert left.tolist() == np.delete(pull, row).tolist()
+    assert ranking.order[0] == "none"
 
 
 def test_a_clean_case_is_left_as_it_is():

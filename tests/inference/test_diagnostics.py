@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 from arviz_stats.base import array_stats
 
-from calib.inference.diagnostics import autocorrelation_time, convergence, ess
+from calib.inference.diagnostics import (
+    autocorrelation_time,
+    convergence,
+    ess,
+    hdi_error,
+    median_error,
+)
 
 
 def sticky(seed: int, shape: tuple[int, ...], share: float) -> np.ndarray:
@@ -55,3 +61,12 @@ def test_a_walker_that_never_moved_has_no_autocorrelation_time() -> None:
     chain[3, :, 1] = 0.7
     assert np.isfinite(autocorrelation_time(chain)[0])
     assert np.isnan(autocorrelation_time(chain)[1])
+
+
+def test_errors_are_the_scatter_of_parts_over_a_root_of_their_number() -> None:
+    """Parts that differ by a shift alone; the ends of an interval go with the cube root."""
+    shifts = np.array([0.0, 1.0, 3.0, 4.0, 4.5, 6.0, 6.5, 7.0])
+    parts = np.random.default_rng(5).gamma(2.0, 1.0, 400) + shifts[:, None]
+    scatter = float(shifts.std(ddof=1))
+    np.testing.assert_allclose(hdi_error(parts, 0.9), [scatter / 2.0, scatter / 2.0])
+    assert median_error(parts) == pytest.approx(scatter / np.sqrt(8.0))

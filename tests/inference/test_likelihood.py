@@ -59,6 +59,19 @@ def test_a_condition_is_evaluated_once_however_often_it_was_measured() -> None:
     assert sum(float(tile.repeats.sum()) for tile in squares.tiles) == 5000
 
 
+@pytest.mark.parametrize("column", ["inflation_pressure_psi", "slip_ratio"])
+def test_a_tile_has_one_value_of_the_condition_of_fewest(column: str) -> None:
+    """What the equation does with it is then done once for the tile."""
+    bound, _, conditions, response = data("magic_formula_pressure", 7, 3000)
+    few = np.random.default_rng(7).choice(conditions[column][:5], 3000)
+    squares = Squares.of(bound, {**conditions, column: few}, response)
+    assert [t.response.size for t in squares.tiles] == np.unique(few, return_counts=True)[
+        1
+    ].tolist()
+    for tile in squares.tiles:
+        assert min(np.ptp(v) for v in tile.rows.values()) == 0.0
+
+
 def test_repeats_that_agree_leave_nothing_within() -> None:
     bound, theta, conditions, _ = data("modified_bekker", 2, 300, levels=4)
     exact = bound.location(theta[:1], conditions)[0]

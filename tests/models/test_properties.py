@@ -215,6 +215,18 @@ def test_a_density_outside_the_bracket_has_no_value() -> None:
     assert np.isnan(location[1])
 
 
+def test_a_density_just_outside_the_bracket_has_none_either() -> None:
+    bound, theta, _ = draw(1, "ayers_perumpral_volumetric")
+    p = {name: v[0] for name, v in bound.report(theta).items()}
+    density = np.array([0.0999, 0.1001, 4.99, 5.01, 0.09, 6.0])
+    water = np.full(density.size, 0.1)
+    index = p["A1"] * density ** p["A2"] / (p["A3"] + (water / density - p["A4"]) ** 2)
+    at = {"cone_index_kpa": index, "volumetric_water_content": water}
+    found = bound.predict(theta[:1], at)[0]
+    np.testing.assert_allclose(found[1:3], density[1:3], rtol=1e-9)
+    assert np.isnan(found[[0, 3, 4, 5]]).all()
+
+
 def test_the_implicit_solver_handles_thousands_of_vectors_at_once() -> None:
     bound, theta, conditions = draw(6, "ayers_perumpral_volumetric", k=4000, n=7)
     density = bound.predict(theta, conditions)

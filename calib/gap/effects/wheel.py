@@ -42,10 +42,6 @@ class BulldozingResistance(Effect):
         sunk = np.minimum(view.sinkage(), 20.0) ** exponent
         return np.asarray(location - view.load_kn * resistance * sunk * (1.0 + growth * slip))
 
-    def shape(self, view: View) -> Array | None:
-        """Slip."""
-        return view.slip()
-
 
 class LugThrust(Effect):
     """Lugs shear soil beside and between them: thrust W t (1 - exp(-s/s0)); they also dig."""
@@ -77,10 +73,6 @@ class LugThrust(Effect):
         if output == "sinkage":
             return np.asarray(location + phi[:, 2:3] * slip)
         return location
-
-    def shape(self, view: View) -> Array | None:
-        """Slip."""
-        return view.slip()
 
 
 class SlipSinkage(Effect):
@@ -118,10 +110,6 @@ class SlipSinkage(Effect):
             return np.asarray(location - view.load_kn * phi[:, 2:3] * extra)
         return location
 
-    def shape(self, view: View) -> Array | None:
-        """Slip."""
-        return view.slip()
-
 
 class RutRebound(Effect):
     """Part of the sinkage springs back: ln z - a0 - a g(s), g growing as s^c and levelling off."""
@@ -151,10 +139,6 @@ class RutRebound(Effect):
         grown = saturating(slip, phi[:, 2:3], phi[:, 3:4])
         return np.asarray(location - phi[:, :1] - phi[:, 1:2] * grown)
 
-    def shape(self, view: View) -> Array | None:
-        """Slip."""
-        return view.slip()
-
 
 class PostPeakSoftening(Effect):
     """Shear strength falls past its peak: pull (1 - a (1 - exp(-(s - sp)/s1))) beyond slip sp."""
@@ -179,10 +163,6 @@ class PostPeakSoftening(Effect):
             return location
         beyond = np.maximum(view.slip() - phi[:, 1:2], 0.0) / phi[:, 2:3]
         return np.asarray(location * (1.0 - phi[:, :1] * -np.expm1(-beyond)))
-
-    def shape(self, view: View) -> Array | None:
-        """Slip."""
-        return view.slip()
 
 
 class LoadTransfer(Effect):

@@ -32,6 +32,19 @@ def test_independent_draws_pass() -> None:
     assert np.all(np.abs(report.ess_bulk / 16_000 - 1.0) < 0.1)
 
 
+@pytest.mark.parametrize(("drift", "lowest"), [(0.0, "tail"), (0.6, "bulk")])
+def test_what_is_just_reached_is_enough(drift: float, lowest: str) -> None:
+    draws = good() + np.linspace(0.0, drift, 200)[:, None]
+    found = convergence(draws)
+    ess_min = {"bulk": float(found.ess_bulk.min()), "tail": float(found.ess_tail.min())}
+    assert min(ess_min, key=lambda which: ess_min[which]) == lowest
+    limits = {"rhat_max": float(found.rhat.max()), "ess_min": ess_min[lowest], "taus_min": 50.0}
+    assert judged(draws, 4.0, **limits).passed
+    for name, value in limits.items():
+        beyond = np.nextafter(value, 0.0 if name == "rhat_max" else np.inf)
+        assert not judged(draws, 4.0, **{**limits, name: float(beyond)}).passed
+
+
 def broken(how: str) -> np.ndarray:
     draws = good()
     rng = np.random.default_rng(2)

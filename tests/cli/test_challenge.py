@@ -1,0 +1,48 @@
+"""The blind test from the command line: cases made, diagnosed, drawn again, scored."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from tests.blind import BlindTest
+from tests.cli.test_cli import Calib, calib  # noqa: F401
+
+
+def test_cases_are_made_diagnosed_and_scored(calib: Calib) -> None:  # noqa: F811
+    made = calib("challenge", "make", "--out", "cases", "--key", "sealed/key.json", "--seed", 8,
+                 "--cases", 1, "--tier", "easy", "--workers", 1)  # fmt: skip
+    assert made.code == 0, made.err
+    digest = json.loads(Path("cases/manifest.json").read_text())
+    assert made.out.startswith("1 cases in cases; the key's SHA-256 is ")
+    assert made.out.split()[-1] in json.dumps(digest)
+    # A case that cannot be diagnosed is named, and does not stop the others.
+    Path("cases/damaged").mkdir()
+    Path("cases/damaged/case.toml").write_text("name = ")
+    ran = calib("challenge", "run", "cases", "--out", "found", "--workers", 1)
+    assert ran.code == 1
+    assert "calib: damaged failed: " in ran.err
+    assert ran.out == "1 of 2 cases diagnosed in found\n"
+    (case,) = (p.name for p in Path("found").iterdir() if p.is_dir())
+    scored = calib("challenge", "score", "cases", "--results", "found", "--key", "sealed/key.json",
+                   "--out", "score")  # fmt: skip
+    assert scored.code == 0, scored.err
+    table = Path("score/score.txt").read_text()
+    assert scored.out == f"{table}score\n"
+    assert {p.name for p in Path("score").iterdir()} == {
+        "score.txt", "levels.png", "reliability_easy.png"
+    }  # fmt: skip
+    assert (Path("found") / case / "diagnosis.json").exists()
+
+
+def test_cases_are_drawn_again_as_the_diagnosis_believes(
+    calib: Calib,  # noqa: F811
+    blind_test: BlindTest,
+) -> None:
+    given = ("challenge", "well-specified", blind_test.cases, "--key", blind_test.key)
+    drawn = calib(*given, "--out", "cases", "--out-key", "key.json", "--workers", 1)
+    assert drawn.code == 0, drawn.err
+    assert drawn.out.startswith("well-specified cases in cases;")
+    names = {p.name for p in blind_test.cases.iterdir() if p.is_dir()}
+    assert {p.name for p in Path("cases").iterdir() if p.is_dir()} == names
+    assert set(json.loads(Path("key.json").read_text())["cases"]) == names

@@ -1,0 +1,78 @@
+"""What a report says of emulated simulators."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from calib.batch.pool import HERE
+from calib.report.sections import SECTIONS, EmulatorSection
+
+GOOD: dict[str, Any] = {
+    "runs": 60, "nodes": 12, "between_nodes_error_in_noise_sds": 0.0123, "simulator_noise_sd": 0.0,
+    "passed": True, "reasons": [], "failed": [],
+    "held_out": {"runs": 20, "rmse_in_noise_sds": 0.0456, "covered_90": 0.95,
+                 "pit": [0.1, 0.2, 0.3, 0.9, 1.0]},
+}  # fmt: skip
+CRASHES = [
+    {"parameters": [1.0, 2.5e6], "kind": "exit", "reason": f"exit code {i}", "printed": "<no> mesh"}
+    for i in range(25)
+]
+BAD: dict[str, Any] = {
+    **GOOD, "passed": False, "reasons": ["too few runs", "too coarse"], "simulator_noise_sd": 0.3,
+    "held_out": None, "failed": CRASHES,
+}  # fmt: skip
+
+
+class Tables(HTMLParser):
+    """Cells of each row of each table."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tables: list[list[list[str]]] = []
+        self.feed(html)
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        if tag == "table":
+            self.tables.append([])
+        elif tag == "tr":
+            self.tables[-1].append([])
+        elif tag in ("td", "th"):
+            self.tables[-1][-1].append("")
+
+    def handle_data(self, data: str) -> None:
+        if self.lasttag in ("td", "th"):
+            self.tables[-1][-1][-1] += data
+
+
+def section(documents: dict[str, dict[str, Any]]) -> Any:
+    return EmulatorSection(documents).begin(1, HERE)(None, None)
+
+
+def test_emulators_and_failed_runs_are_listed() -> None:
+    found = section({"good": GOOD, "bad": BAD})
+    written = found.begin(Path(), versions={}, pdf=False, pool=HERE)(None)
+    assert written.anchor == "emulators"
+    emulators, failed = Tables(written.html).tables
+    assert emulators[1:] == [
+        ["good", "60", "12", "0.0456 on 20", "95 %", "40 %, 20 %, 0 %, 40 %", "0.0123", "none",
+         "good enough"],
+        ["bad", "60", "12", "none left", "", "none", "0.0123", "0.300", "too few runs; too coarse"],
+    ]  # fmt: skip
+    assert "25 runs of bad failed" in written.html
+    assert "The first 20:" in written.html
+    assert "<no>" not in written.html
+    assert failed[1:] == [["1, 2.5e+06", "exit", f"exit code {i}", "<no> mesh"] for i in range(20)]
+
+
+def test_the_record_makes_the_section_again() -> None:
+    found = section({"bad": BAD})
+    assert found.summary() is None
+    again = SECTIONS.get("emulators").again
+    assert again(found.record()) == EmulatorSection({"bad": BAD})
+    for none in (None, [], {"bad": 3}):
+        with pytest.raises(ValueError, match="no record"):
+            again(none)
