@@ -27,7 +27,7 @@ from calib.errors import CalibError
 from calib.gap.case import Case
 from calib.gap.diagnose import screened_ranking, verdict
 from calib.gap.effects import EFFECTS
-from calib.gap.inclusion import inclusion_probability
+from calib.gap.inclusion import UNLISTED, inclusion_probability
 from calib.models import get_model
 from challenge.score import Proportion
 
@@ -214,7 +214,7 @@ def table(paths: list[Path]) -> str:
         called = Proportion(sum(f["verdict"] != "none" for f in group), len(group))
         sure = sum(f["none"] < 0.1 for f in group)
         listed = sum(
-            any(p >= 0.5 for k, p in f["inclusion"].items() if k != "unlisted") for f in group
+            any(p >= 0.5 for k, p in f["inclusion"].items() if k != UNLISTED) for f in group
         )
         low, high = called.interval
         seconds = np.mean([f["seconds"] for f in group])
