@@ -273,10 +273,10 @@ def compare_files(again: Again, moved: Moved) -> list[Item]:
         *({n: (folder / n).read_bytes() for n in there} for folder in (again.folder, again.made))
     )
     listed = set(again.manifest.files) - {SUMMARY, *derived_files(again.manifest.files)}
-    strangers = sorted(
-        n for n in listed - made
-        if not (again.made / n).is_file() and not n.startswith(f"{COMPARED}/")
-    )  # fmt: skip
+    if "comparison" in again.manifest.sections:
+        # Checked as a folder of `calib compare`.
+        listed = {name for name in listed if not name.startswith(f"{COMPARED}/")}
+    strangers = sorted(n for n in listed - made if not (again.made / n).is_file())
     return items + [_absent(again, n, "this version makes no such file") for n in strangers]
 
 

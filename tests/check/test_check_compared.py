@@ -96,6 +96,14 @@ def test_what_does_not_belong_together_is_found(
     assert named in {i.name for i in outcome.items if i.status is Status.DIFFERENT}
 
 
+def test_a_folder_that_no_section_is_of_is_a_stranger(untouched: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "report"
+    shutil.copytree(untouched, folder)
+    edit_json(folder / "manifest.json", lambda m: m.pop("comparison"))
+    found = {i.name for i in check(folder).items if i.status is Status.DIFFERENT}
+    assert {"compared/index.html", "index.html"} <= found
+
+
 def test_what_cannot_be_compared_in_a_report_is_refused(tmp_path: Path) -> None:
     (tmp_path / "plates.csv").write_text(example_csv("reece"))
     tasks = plan_tasks([read_table(tmp_path / "plates.csv")])
