@@ -13,7 +13,16 @@ from calib.check.check_comparison import check_comparison
 from calib.check.check_report import check_report
 from calib.check.check_run import check_run
 from calib.check.outcome import Outcome
-from calib.check.schema import ComparisonRecord, Manifest, Record, RunRecord, read_folder
+from calib.check.schema import (
+    ComparisonRecord,
+    Manifest,
+    Record,
+    RunRecord,
+    read_comparison,
+    read_folder,
+)
+from calib.errors import CalibError
+from calib.report.compared import FOLDER
 from calib.report.study import Progress
 
 
@@ -56,7 +65,7 @@ def check(
             case Manifest():
                 kind = "report"
                 items, allowed = check_report(
-                    record, folder, scratch, here, tell, quick=quick, pool=pool
+                    record, folder, scratch, here, tell, quick=quick, pool=pool, workers=workers
                 )
             case ComparisonRecord():
                 kind = "comparison"
@@ -84,6 +93,9 @@ def _not_converged(record: Record, folder: Path) -> tuple[str, ...]:
             gate: Any = record.document["gate"]
             return () if gate["passed"] else (record.model,)
         models = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["models"]
-        return tuple(m["model"] for m in models.values() if not m["sampling"]["converged"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        missed = [m["model"] for m in models.values() if not m["sampling"]["converged"]]
+        if "comparison" in record.sections:
+            missed += read_comparison(folder / FOLDER).unsound
+        return tuple(dict.fromkeys(missed))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, CalibError):
         return ()

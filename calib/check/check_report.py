@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from calib.batch.environment import Environment
 from calib.batch.pool import HERE, Pool
+from calib.check.check_comparison import check_comparison
 from calib.check.compare import (
     RECORD,
     SUMMARY,
@@ -27,10 +31,15 @@ from calib.check.outcome import Item, Status
 from calib.check.posteriors import GROUP as POSTERIORS
 from calib.check.posteriors import DrawsFile, read_draws, verify_density, verify_summary
 from calib.check.recompute import not_computed, recompute_report, report_tasks
-from calib.check.schema import Manifest
+from calib.check.schema import Manifest, read_comparison
 from calib.check.text import verify_images
+from calib.data import Table, read_table
+from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.inference.problem import build_problem
+from calib.models import get_model
+from calib.report.compared import FOLDER
+from calib.report.comparison import HELD_OUT
 from calib.report.study import Progress
 from calib.report.study_tasks import Task, fitted_rows
 
@@ -46,6 +55,7 @@ def check_report(
     *,
     quick: bool,
     pool: Pool = HERE,
+    workers: int = 1,
 ) -> tuple[list[Item], str]:
     """Return what was found in a report, and what Monte Carlo error was allowed, in words.
 
@@ -73,10 +83,61 @@ def check_report(
             again = Again(manifest, folder, scratch / "again", study, here)
             numbers = compare_numbers(again)
             items += numbers + compare_files(again, moved_parts(numbers))
+        if "comparison" in manifest.sections:
+            items += _compared(
+                manifest, folder, scratch / "compared", here, progress, tasks, quick=quick,
+                workers=workers,
+            )  # fmt: skip
     items += verify_form(folder) + verify_gaps(folder, summary, same_code=same_code)
     record = read_json(folder / RECORD)
     items += verify_derived(folder, manifest.files, record, summary, same_code=same_code)
     return items, allowed
+
+
+def _compared(
+    manifest: Manifest, folder: Path, scratch: Path, here: Environment, progress: Progress,
+    tasks: tuple[Task, ...], *, quick: bool, workers: int,
+) -> list[Item]:  # fmt: skip
+    """Check the comparison of models in a report: of its rows and seed, stated as it was found."""
+    scratch.mkdir()
+    record = read_comparison(folder / FOLDER)
+    found, _ = check_comparison(
+        record, folder / FOLDER, scratch, here, progress, quick=quick, workers=workers
+    )
+    items = [
+        replace(item, name=f"{FOLDER}/{item.name}", group=f"{FOLDER}: {item.group}")
+        for item in found
+    ]
+    stated: Any = manifest.sections["comparison"]
+    same = isinstance(stated, dict) and stated == {
+        key: value for key, value in record.document.items() if key in stated
+    }
+    items.append(_agrees(same and {"models", "verdict", "seed"} <= stated.keys(),
+                         "manifest.json: comparison", "what its comparison.json has"))  # fmt: skip
+    output = get_model(next(iter(record.models))).output
+    fitted = {OUTPUTS[task.output]: fitted_rows(task) for task in tasks}
+    rows, held = fitted.get(output, (None, None))
+    kept = [(folder / FOLDER / "runs" / name / "data.csv", rows) for name in record.models]
+    if record.held_out or held is not None:
+        kept.append((folder / FOLDER / HELD_OUT, held))
+    own = record.seed == manifest.seed and all(_of_rows(path, table) for path, table in kept)
+    items.append(_agrees(own, f"{FOLDER}/comparison.json", "of the report's own rows and seed"))
+    return items
+
+
+def _agrees(same: bool, name: str, what: str) -> Item:
+    status = Status.IDENTICAL if same else Status.DIFFERENT
+    return Item(FOLDER, name, status, note=what if same else f"it is not {what}")
+
+
+def _of_rows(path: Path, table: Table | None) -> bool:
+    """Whether a file has the rows of a table."""
+    if table is None:
+        return False
+    kept = read_table(path, allow_missing=tuple(OUTPUTS.values())).columns
+    return kept.keys() == table.columns.keys() and all(
+        np.array_equal(values, table[name], equal_nan=True) for name, values in kept.items()
+    )
 
 
 def _left_out(manifest: Manifest) -> list[Item]:

@@ -23,6 +23,7 @@ from calib.check.schema import Manifest
 from calib.check.text import GROUP as TEXT
 from calib.check.text import compare_page, own_pictures
 from calib.check.tolerances import ORDER_OF_MAGNITUDE
+from calib.report.compared import FOLDER as COMPARED
 from calib.report.study import Progress, Study, estimate_task
 from calib.report.study_tasks import Task
 from calib.report.summary import summarise_estimates
@@ -272,6 +273,9 @@ def compare_files(again: Again, moved: Moved) -> list[Item]:
         *({n: (folder / n).read_bytes() for n in there} for folder in (again.folder, again.made))
     )
     listed = set(again.manifest.files) - {SUMMARY, *derived_files(again.manifest.files)}
+    if "comparison" in again.manifest.sections:
+        # Checked as a folder of `calib compare`.
+        listed = {name for name in listed if not name.startswith(f"{COMPARED}/")}
     strangers = sorted(n for n in listed - made if not (again.made / n).is_file())
     return items + [_absent(again, n, "this version makes no such file") for n in strangers]
 
@@ -305,7 +309,10 @@ def _about(again: Again, name: str, section: str) -> set[str]:
         return {f"gap: {name.split('/')[1]}"}
     tasks = set(again.manifest.tasks)
     gaps = {f"gap: {gap}" for gap in _names(again.manifest.sections.get("paper_gaps"))}
-    parts: Mapping[str, set[str]] = {"paper-gaps": gaps, "audit": {"audit"}}
+    parts: Mapping[str, set[str]] = {
+        # A comparison's words are those of the manifest's own numbers.
+        "paper-gaps": gaps, "audit": {"audit"}, "comparison": set(),
+    }  # fmt: skip
     return parts.get(section, {section} & tasks or tasks)
 
 

@@ -211,6 +211,11 @@ def read_run(folder: Path) -> RunRecord:
     return _run(_content(folder / "run.json"), folder / "run.json")
 
 
+def read_comparison(folder: Path) -> ComparisonRecord:
+    """Read what a comparison inside a report says of itself; see `read_folder`."""
+    return _comparison(_content(folder / COMPARISON), folder / COMPARISON)
+
+
 def _content(path: Path) -> Any:
     try:
         return json.loads(path.read_text(encoding="utf-8"))

@@ -17,6 +17,7 @@ from pathlib import Path
 from calib.batch.environment import sha256
 from calib.check.numbers import NUMBER, without_numbers
 from calib.check.outcome import Item, Status
+from calib.report.compared import FOLDER as COMPARED
 
 GROUP = "page and tables"
 _IMAGE = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]*)")
@@ -47,11 +48,9 @@ def verify_images(page: str, folder: Path) -> list[Item]:
 
 
 def _figures(folder: Path) -> dict[str, str]:
-    """Names of the PNG files of a folder by their hashes."""
-    return {
-        sha256(path.read_bytes()): path.relative_to(folder).as_posix()
-        for path in sorted(folder.rglob("*.png"))
-    }
+    """Names of the PNG files of a folder by their hashes; a comparison in it has its own page."""
+    names = (path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*.png")))
+    return {sha256((folder / n).read_bytes()): n for n in names if not n.startswith(f"{COMPARED}/")}
 
 
 def _hash(encoded: str) -> str:

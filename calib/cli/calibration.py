@@ -32,6 +32,10 @@ def report(
     only: Annotated[
         list[str] | None, typer.Option(help="Output to report, e.g. drawbar_pull; repeatable.")
     ] = None,
+    compare: Annotated[
+        list[str] | None,
+        typer.Option(help="Model to compare with others on the same rows; two or more times."),
+    ] = None,
     overwrite: opt.Overwrite = False,
     pdf: Annotated[bool, typer.Option("--pdf", help="Figures also as PDF, for print.")] = False,
     max_steps: opt.MaxSteps = 25_600,
@@ -49,12 +53,15 @@ def report(
 
     check_folder(out, overwrite=overwrite)
     begin_imports(workers)
+    from dataclasses import replace
+
     from calib import SamplerSettings, read_table
     from calib.cli.display import progress_bars
     from calib.cli.simulators import say
     from calib.data.labels import labelled
     from calib.data.quantities import OUTPUTS
     from calib.inference.emulation.prepared import prepare
+    from calib.inference.prior_files import prior_file_model
     from calib.report.sections import EmulatorSection, work_out
     from calib.report.study_tasks import HoldOut, fitted_rows, plan_tasks
     from calib.report.writer import write_report
@@ -78,13 +85,23 @@ def report(
         sections = (GapsSection(), AuditSection())
         title = "Calibration report: He, Sandu & Osorio (2019), reconstructed data"
     settings = SamplerSettings(max_steps=max_steps)
+    to_prepare = {task.model: (task, task.prior_path) for task in tasks}
+    if compare:
+        from calib.report.compared import plan_comparison
+
+        comparison = plan_comparison(
+            tasks, compare, {prior_file_model(path): path for path in priors or ()}
+        )
+        comparison = replace(comparison, settings=settings, command=opt.command(), workers=workers)
+        to_prepare |= {name: (comparison.task, comparison.priors.get(name)) for name in compare}
+        sections = (*sections, comparison)
     with progress_bars() as tell:
         emulations = {
-            task.model: prepare(
-                task.model, fitted_rows(task)[0], seed, priors=task.prior_path,
-                elsewhere=[task.table], workers=workers, progress=tell,
+            name: prepare(
+                name, fitted_rows(task)[0], seed, priors=path, elsewhere=[task.table],
+                workers=workers, progress=tell,
             )
-            for task in tasks
+            for name, (task, path) in to_prepare.items()
         }  # fmt: skip
     good = [say(model, emulation) for model, emulation in emulations.items()]
     made = {model: e.document() for model, e in emulations.items() if e is not None}
@@ -110,6 +127,10 @@ def report(
         print(f"{key}: FAILED: {failure.error}", file=sys.stderr)
     print(page)
     converged = all(r.calibration.converged for r in study.successes.values())
+    for section in found.found:
+        if section.name == "comparison":
+            print(section.record()["verdict"])
+            converged &= bool(section.record()["converged"])
     code = 1 if study.failures else 0 if converged and all(good) else 3
     finish(code, out / "summary.json", folder=str(out))
 

@@ -2,7 +2,8 @@
 
 A section is asked for with what it is to work out, begun where the outputs are, and writes itself:
 files into the report's folder, numbers into ``summary.json``, what it takes to work it out again
-into ``manifest.json``, and a piece of the page. That of emulated simulators is here.
+into ``manifest.json``, and a piece of the page. That of emulated simulators is here, that of
+compared models in `calib.report.compared`.
 """
 
 from __future__ import annotations
@@ -165,9 +166,16 @@ def _emulators_again(record: Any) -> Section:
     return EmulatorSection(record)
 
 
+def _comparison_again(record: Any) -> Section:
+    from calib.report.compared import stated_again
+
+    return stated_again(record)
+
+
 SECTIONS: Registry[SectionKind] = Registry(
-    "section", lambda kind: kind.name, SectionKind("emulators", _emulators_again)
-)
+    "section", lambda kind: kind.name, SectionKind("emulators", _emulators_again),
+    SectionKind("comparison", _comparison_again),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -232,7 +232,8 @@ def check_comparable(models: Sequence[str]) -> None:
         raise CalibError(
             f"there is nothing to compare in {', '.join(models) or 'no model'}",
             allowed="two or more models, each once",
-            mend="name them before the file: calib compare MODEL MODEL my.csv",
+            mend="name two or more: calib compare MODEL MODEL my.csv, or calib report my.csv "
+            "--compare MODEL --compare MODEL",
         )
     outputs = {name: get_model(name).output for name in models}
     if len(set(outputs.values())) > 1:

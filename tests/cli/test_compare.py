@@ -36,6 +36,22 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
     assert "run `calib compare` again" in broken.err
 
 
+def test_a_report_has_it_as_a_section(calib: Calib) -> None:
+    Path("plates.csv").write_text(example_csv("reece"))
+    made = calib("report", "plates.csv", "--compare", "reece", "--compare", "bekker_plate",
+                 "--hold-out", "plate_width_mm=80", "--out", "r", *FEW)  # fmt: skip
+    assert made.code in (0, 3), made.err
+    found = json.loads(Path("r/compared/comparison.json").read_text())
+    assert found["verdict"] in made.out
+    assert found["held_out"] == "plate_width_mm = 80"
+    assert (
+        json.loads(Path("r/manifest.json").read_text())["comparison"]["models"] == found["models"]
+    )
+    told = calib("check", "r", "--quick")
+    assert told.code == 0, told.out
+    assert calib("predict", "r/compared", "--at", "plates.csv").code == made.code
+
+
 def test_the_page_holds_in_a_browser(calib: Calib, browser: Browser) -> None:
     Path("plates.csv").write_text(example_csv("reece"))
     made = calib("compare", "reece", "bekker_plate", "plates.csv", "--out", "c", *FEW)
