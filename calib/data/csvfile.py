@@ -140,8 +140,6 @@ def _is_number(cell: str) -> bool:
 def write_table(
     path: str | os.PathLike[str],
     columns: Mapping[str, ArrayLike | Sequence[str]],
-    *,
-    decimals: int | Mapping[str, int] | None = None,
 ) -> None:
     """Write columns as CSV, whole or not at all.
 
@@ -151,18 +149,14 @@ def write_table(
         File to write; its folder must exist. An existing file is replaced.
     columns : mapping of str to (n,) array
         Column name, with its unit, to values. Text is written as it is, whole numbers without
-        a point, NaN as an empty cell.
-    decimals : int or mapping of str to int, optional
-        Decimal places, of all columns or by name; by default as many as reading the same
-        number back takes.
+        a point, others with as many digits as reading them back takes, NaN as an empty cell.
 
     Raises
     ------
     CalibError
         If the columns differ in length or the file cannot be written.
     """
-    places = decimals if isinstance(decimals, Mapping) else dict.fromkeys(columns, decimals)
-    cells = {name: _format(values, places.get(name)) for name, values in columns.items()}
+    cells = {name: _format(values) for name, values in columns.items()}
     lengths = {name: len(column) for name, column in cells.items()}
     if len(set(lengths.values())) > 1:
         raise CalibError(
@@ -189,14 +183,10 @@ def write_table(
             scratch.unlink(missing_ok=True)
 
 
-def _format(values: ArrayLike | Sequence[str], places: int | None) -> list[str]:
+def _format(values: ArrayLike | Sequence[str]) -> list[str]:
     array: np.ndarray[Any, np.dtype[Any]] = np.atleast_1d(np.asarray(values))
     if array.dtype.kind not in "fiub":
         return [str(value) for value in array.tolist()]
     if array.dtype.kind != "f":
         return [str(int(value)) for value in array.tolist()]
-    if places is None:
-        return ["" if math.isnan(value) else repr(value) for value in array.tolist()]
-    # Adding zero turns the -0.0 of a small negative number into 0.0.
-    rounded = (np.round(array, places) + 0.0).tolist()
-    return ["" if math.isnan(value) else f"{value:.{places}f}" for value in rounded]
+    return ["" if math.isnan(value) else repr(value) for value in array.tolist()]

@@ -41,8 +41,7 @@ from calib.he2019.audit.table5_cost import bounds, cost_findings
 from calib.he2019.datasets.published import DOI, PUBLISHED, Published
 from calib.inference.calibration import Calibration
 from calib.report.numbers import finite
-
-type Progress = Callable[[str, int, int], None]
+from calib.report.study import Progress
 
 
 @dataclass(frozen=True, eq=False)

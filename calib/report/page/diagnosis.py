@@ -31,8 +31,6 @@ from calib.report.gap_evidence import (
     where_fact,
 )
 from calib.report.gap_rows import (
-    best_fit,
-    best_of,
     output_axis,
     output_word,
     short_name,
@@ -126,7 +124,7 @@ def _row(found: Diagnosis, name: str, left: dict[str, float]) -> dict[str, Any]:
 
 
 def _sizes(found: Diagnosis, name: str) -> list[Markup]:
-    fit = best_fit(found, name)
+    fit = found.ranking.best(name)
     hypothesis = fit.forward.hypothesis
     if hypothesis.shift > 0.0:
         return shift_sizes(found.data.outputs, fit)
@@ -153,7 +151,7 @@ def parameter_rows(found: Diagnosis) -> list[list[str]]:
     for name in found.ranking.order:
         if p[name] < _POSSIBLE:
             continue
-        hypothesis = best_fit(found, name).forward.hypothesis
+        hypothesis = found.ranking.best(name).forward.hypothesis
         for effect, priors in zip(hypothesis.effects, hypothesis.effect_priors, strict=True):
             for prior in priors.free:
                 words = prior.name.replace("_", " ")
@@ -291,7 +289,7 @@ def render_diagnosis(
         title=f"Sim-to-real gap: {case.name}",
         verdict=verdict,
         mark=TONE_MARKS[verdict.tone],
-        probability=round(100.0 * found.ranking.probability[best_of(found)]),
+        probability=round(100.0 * found.ranking.probability[found.ranking.order[0]]),
         figures={p.name: picture(p, images.get(f"{p.name}.png", b""), p.caption) for p in plates},
         facts=_case_facts(found),
         warnings=found.warnings,
@@ -302,7 +300,7 @@ def render_diagnosis(
         relevant_in_pair=f"{RELEVANT_IN_PAIR:g}",
         parameters=parameter_rows(found),
         simulators=simulators(found),
-        best=title_of(found, best_of(found)),
+        best=title_of(found, found.ranking.order[0]),
         not_testable=[
             [short_name(n), title_of(found, n), reason]
             for n, reason in found.ranking.not_testable.items()
@@ -355,7 +353,7 @@ def _case_facts(found: Diagnosis) -> list[tuple[str, str]]:
     """What was compared with what."""
     case, facts = found.data.case, []
     for o in found.data.outputs:
-        noise = found.ranking.best(best_of(found)).noise[o.name]
+        noise = found.ranking.best(found.ranking.order[0]).noise[o.name]
         axis = output_axis(found, o.name)
         grows = ""
         if noise.rho > 0.0:
