@@ -19,8 +19,8 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.simulators.emulator.files import save_emulator
 from calib.models.simulators.emulator.model import emulator_of
-from calib.report.figures import Plate
 from calib.report.figures.collect import plates
+from calib.report.figures.plate import Plate
 from calib.report.figures.style import pdf_bytes, png
 from calib.report.page.content import render_page
 from calib.report.publish import publication

@@ -193,20 +193,14 @@ def read_findings(content: Mapping[str, Any]) -> tuple[Finding, ...]:
 
 def _read(entry: Mapping[str, Any]) -> Finding:
     known = {f.name: entry[f.name] for f in fields(Finding)}
-    found = tuple(Quantity(**_with_nan(q)) for q in known["found"])
-    return Finding(
-        **{
-            **known,
-            "figures": tuple(known["figures"]),
-            "found": found,
-            "verdict": Verdict(known["verdict"]),
-            "basis": Basis(known["basis"]),
-        }
-    )
-
-
-def _with_nan(entry: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: math.nan if value is None else value for key, value in entry.items()}
+    known["figures"] = tuple(known["figures"])
+    found: list[dict[str, Any]] = [
+        {key: math.nan if value is None else value for key, value in q.items()}
+        for q in known["found"]
+    ]
+    known["found"] = tuple(Quantity(**q) for q in found)
+    known["verdict"], known["basis"] = Verdict(known["verdict"]), Basis(known["basis"])
+    return Finding(**known)
 
 
 def audit_csv(findings: Iterable[Finding]) -> str:

@@ -18,7 +18,7 @@ from calib.report.figures.style import pdf_bytes, png, png_size
 from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_rows import short_name
 from calib.report.gap_verdict import odds_text
-from calib.report.labels import short
+from calib.report.labels import percent, percent_range
 from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
 from calib.report.page.template import data_uri, sentences, template
 from calib.report.study import Progress
@@ -90,7 +90,7 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
     gap, found = result.gap, result.found
     verdict = gap_verdict(found)
     ranking = found.ranking
-    case = found.data.case
+    best, case = ranking.order[0], found.data.case
     return {
         "name": gap.name,
         "title": gap.title,
@@ -106,7 +106,7 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
         "headline": verdict.headline,
         "facts": [fact for fact in verdict.facts if fact[0] != "Next"],
         "withheld": _withheld(result),
-        "best": f"{short_name(ranking.order[0])} ({odds_text(_best(result))})",
+        "best": f"{short_name(best)} ({odds_text(ranking.probability[best])})",
         "shrink": _shrink(result),
         "checks": [check_text(check) for check in checks(result)],
         "limits": gap.limits,
@@ -119,11 +119,6 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
 
 def _upper(text: str) -> str:
     return text[0].upper() + text[1:]
-
-
-def _best(result: FoundGap) -> float:
-    ranking = result.found.ranking
-    return float(ranking.probability[ranking.order[0]])
 
 
 def _withheld(result: FoundGap) -> str:
@@ -146,5 +141,4 @@ def _shrink(result: FoundGap) -> str:
     s = result.found.shrink.get(result.output)
     if s is None:
         return "no gap that could shrink"
-    low, high = (f"{100.0 * v:.0f}".replace("-", "\N{MINUS SIGN}") for v in s.interval)
-    return f"{short(100.0 * s.fraction)} % ({low} to {high} %)"
+    return f"{percent(s.fraction)} ({percent_range(s.interval)})"

@@ -14,7 +14,7 @@ import numpy as np
 from markupsafe import Markup
 
 from calib.models import get_model
-from calib.report.figures import Plate
+from calib.report.figures.plate import Plate
 from calib.report.labels import axis_of, percent, short
 from calib.report.numbers import TIMES, format_number, format_value
 from calib.report.page.tables import (

@@ -28,7 +28,6 @@ from calib.report.gap_evidence import (
     gap_evidence,
     region_words,
     shrink_facts,
-    where_fact,
 )
 from calib.report.gap_rows import (
     output_axis,
@@ -44,7 +43,7 @@ from calib.report.gap_verdict import (
     odds_text,
     repeats_needed,
 )
-from calib.report.labels import MINUS, percent, short
+from calib.report.labels import MINUS, percent, percent_range, short
 from calib.report.numbers import format_number, format_value
 from calib.report.page.template import equation, parametrisation, picture, prose, template
 
@@ -334,18 +333,16 @@ def _cause_rows(evidence: GapEvidence) -> list[dict[str, str]]:
 
 
 def _region_row(found: Diagnosis, region: Region) -> list[str]:
-    fact = where_fact(found, region)
     place, gap = region_words(found, region)
-    p = fact.probability
+    p = region.probability
     return [output_word(region.output), place, gap, f"{p:.2f}" if p < 0.995 else "> 0.99"]
 
 
 def _shrink_rows(found: Diagnosis) -> list[list[str]]:
     rows = []
     for f in shrink_facts(found):
-        low, high = (f"{100.0 * v:.0f}".replace("-", MINUS) for v in f.interval)
         fraction = f"{100.0 * f.fraction:.0f} %".replace("-", MINUS)
-        rows.append([f.output, f.before, f.after, f.floor, fraction, f"{low} to {high} %"])
+        rows.append([f.output, f.before, f.after, f.floor, fraction, percent_range(f.interval)])
     return rows
 
 
