@@ -211,7 +211,7 @@ def _in_printed_coordinates(
     return np.array([run.cost for run in minimise_genetic_runs(cost, *box, streams, settings)])
 
 
-def convergence_findings(published: Published, study: GeneticStudy) -> list[Finding]:
+def convergence_findings(study: GeneticStudy) -> list[Finding]:
     """Judge the convergence of the algorithm, pressure by pressure and jointly."""
     return [_by_pressure(study), _joint(study)]
 

@@ -143,7 +143,7 @@ def begin_audit(
             pressure_unit(published),
             *cost_findings(published, searched.joint.optimum, at_most),
             *rounding_findings(published, rounding),
-            *convergence_findings(published, searched),
+            *convergence_findings(searched),
             *rut_quality_findings(published, quality),
             *inverse_findings(published, inverse),
             finding("test_description", Verdict.UNTESTABLE, setup=published.setup),

@@ -138,7 +138,7 @@ MARKS: Mapping[str, str] = {
     Level.FAILED: "\N{HEAVY BALLOT X}",
 }
 
-# Which exception carried a message is the programmer's business.
+# The class of an exception says nothing to a reader of the page.
 _CLASS_NAME = re.compile(r"^(?:[A-Za-z_][\w.]*(?:Error|Exception): )+")
 
 
