@@ -74,7 +74,7 @@ def check(
                 )
             case RunRecord():
                 kind = "run"
-                items, allowed = check_run(record, folder, scratch, here, tell, quick=quick)
+                items, allowed = check_run(record, folder, scratch, tell, quick=quick)
     differing = record.environment.differences(here)
     return Outcome(
         str(folder), kind, quick, tuple(items), differing, allowed, _not_converged(record, folder)

@@ -8,7 +8,6 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from calib.batch.environment import Environment
 from calib.check.inputs import GROUP as INPUTS
 from calib.check.inputs import verify_files, verify_label
 from calib.check.montecarlo import Place, count_drawn, describe, drawn_in_run
@@ -34,7 +33,6 @@ def check_run(
     record: RunRecord,
     folder: Path,
     scratch: Path,
-    here: Environment,
     progress: Progress,
     *,
     quick: bool,

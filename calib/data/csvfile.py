@@ -18,7 +18,10 @@ from numpy.typing import ArrayLike
 
 from calib.errors import CalibError
 
-_A_CSV = "a CSV file in UTF-8: a line of column names, then one line per row"
+
+def _no_csv(found: str, where: str, mend: str) -> CalibError:
+    allowed = "a CSV file in UTF-8: a line of column names, then one line per row"
+    return CalibError(found, where=where, allowed=allowed, mend=mend)
 
 
 @dataclass(frozen=True)
@@ -52,17 +55,12 @@ def open_csv(path: str | os.PathLike[str]) -> CsvFile:
     rows = _rows(text, delimiter, source)
     line, header = next(rows, (0, []))
     if not header:
-        raise CalibError(
-            "the file is empty", where=source, allowed=_A_CSV,
-            mend="`calib template MODEL` writes an example",
-        )  # fmt: skip
+        raise _no_csv("the file is empty", source, "`calib template MODEL` writes an example")
     if all(map(_is_number, header)):
-        raise CalibError(
-            "the first line holds numbers, not column names",
-            where=f"{source}, line {line}",
-            allowed=_A_CSV,
-            mend="put a line of column names such as slip_ratio,drawbar_pull_kn on top",
-        )
+        raise _no_csv(
+            "the first line holds numbers, not column names", f"{source}, line {line}",
+            "put a line of column names such as slip_ratio,drawbar_pull_kn on top",
+        )  # fmt: skip
     names = tuple(cell.strip() for cell in header)
     return CsvFile(source, names, line, delimiter, hashlib.sha256(raw).hexdigest(), rows)
 
@@ -73,39 +71,27 @@ def _read_bytes(source: str) -> bytes:
     except FileNotFoundError:
         near = sorted(p.name for p in Path(source).parent.glob("*.csv"))[:5]
         beside = f"; its folder holds {', '.join(near)}" if near else ""
-        raise CalibError(
-            "there is no such file", where=source, allowed=_A_CSV,
-            mend=f"check the path{beside}",
-        ) from None  # fmt: skip
+        raise _no_csv("there is no such file", source, f"check the path{beside}") from None
     except IsADirectoryError:
-        raise CalibError(
-            "this is a folder, not a file", where=source, allowed=_A_CSV,
-            mend="name a CSV file inside it",
-        ) from None  # fmt: skip
+        mend = "name a CSV file inside it"
+        raise _no_csv("this is a folder, not a file", source, mend) from None
     except (OSError, ValueError) as error:
-        raise CalibError(
-            f"the file cannot be read ({error})", where=source, allowed=_A_CSV,
-            mend="check the path and the permissions",
-        ) from None  # fmt: skip
+        mend = "check the path and the permissions"
+        raise _no_csv(f"the file cannot be read ({error})", source, mend) from None
 
 
 def _decode(raw: bytes, source: str) -> str:
     mend = "save it again as CSV in UTF-8 (Excel: `CSV UTF-8`)"
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise CalibError("the file is in UTF-16", where=source, allowed=_A_CSV, mend=mend)
+        raise _no_csv("the file is in UTF-16", source, mend)
     if raw.startswith(b"PK\x03\x04") or b"\x00" in raw:
-        raise CalibError(
-            "this is a binary file, such as a workbook, not text",
-            where=source, allowed=_A_CSV, mend=mend,
-        )  # fmt: skip
+        raise _no_csv("this is a binary file, such as a workbook, not text", source, mend)
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        raise CalibError(
-            f"byte 0x{raw[error.start]:02x} is not UTF-8",
-            where=f"{source}, line {line}", allowed=_A_CSV, mend=mend,
-        ) from None  # fmt: skip
+        found = f"byte 0x{raw[error.start]:02x} is not UTF-8"
+        raise _no_csv(found, f"{source}, line {line}", mend) from None
 
 
 def _delimiter(text: str) -> str:
@@ -121,12 +107,10 @@ def _rows(text: str, delimiter: str, source: str) -> Iterator[tuple[int, list[st
             if any(map(str.strip, row)):
                 yield reader.line_num, row
     except csv.Error as error:
-        raise CalibError(
-            f"the line cannot be split into cells ({error})",
-            where=f"{source}, line {reader.line_num}",
-            allowed=_A_CSV,
-            mend="look for a quotation mark that is opened and not closed",
-        ) from None
+        raise _no_csv(
+            f"the line cannot be split into cells ({error})", f"{source}, line {reader.line_num}",
+            "look for a quotation mark that is opened and not closed",
+        ) from None  # fmt: skip
 
 
 def _is_number(cell: str) -> bool:
@@ -140,8 +124,6 @@ def _is_number(cell: str) -> bool:
 def write_table(
     path: str | os.PathLike[str],
     columns: Mapping[str, ArrayLike | Sequence[str]],
-    *,
-    decimals: int | Mapping[str, int] | None = None,
 ) -> None:
     """Write columns as CSV, whole or not at all.
 
@@ -151,18 +133,14 @@ def write_table(
         File to write; its folder must exist. An existing file is replaced.
     columns : mapping of str to (n,) array
         Column name, with its unit, to values. Text is written as it is, whole numbers without
-        a point, NaN as an empty cell.
-    decimals : int or mapping of str to int, optional
-        Decimal places, of all columns or by name; by default as many as reading the same
-        number back takes.
+        a point, others with as many digits as reading them back takes, NaN as an empty cell.
 
     Raises
     ------
     CalibError
         If the columns differ in length or the file cannot be written.
     """
-    places = decimals if isinstance(decimals, Mapping) else dict.fromkeys(columns, decimals)
-    cells = {name: _format(values, places.get(name)) for name, values in columns.items()}
+    cells = {name: _format(values) for name, values in columns.items()}
     lengths = {name: len(column) for name, column in cells.items()}
     if len(set(lengths.values())) > 1:
         raise CalibError(
@@ -189,14 +167,10 @@ def write_table(
             scratch.unlink(missing_ok=True)
 
 
-def _format(values: ArrayLike | Sequence[str], places: int | None) -> list[str]:
+def _format(values: ArrayLike | Sequence[str]) -> list[str]:
     array: np.ndarray[Any, np.dtype[Any]] = np.atleast_1d(np.asarray(values))
     if array.dtype.kind not in "fiub":
         return [str(value) for value in array.tolist()]
     if array.dtype.kind != "f":
         return [str(int(value)) for value in array.tolist()]
-    if places is None:
-        return ["" if math.isnan(value) else repr(value) for value in array.tolist()]
-    # Adding zero turns the -0.0 of a small negative number into 0.0.
-    rounded = (np.round(array, places) + 0.0).tolist()
-    return ["" if math.isnan(value) else f"{value:.{places}f}" for value in rounded]
+    return ["" if math.isnan(value) else repr(value) for value in array.tolist()]

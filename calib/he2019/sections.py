@@ -14,7 +14,6 @@ from calib.he2019.gaps.cases import PaperGap, paper_gaps
 from calib.he2019.gaps.find import FoundGap, begin_gaps, summarise_gaps
 from calib.he2019.page.audit import write_audit
 from calib.he2019.page.gaps import begin_gaps_section
-from calib.report.figures.style import png
 from calib.report.sections import Written
 from calib.report.study import Progress, Study
 
@@ -50,9 +49,7 @@ class FoundGaps:
         self, folder: Path, *, versions: Mapping[str, str], pdf: bool, pool: Pool
     ) -> Callable[[Progress], Written]:
         """Ask for figures and pages."""
-        finish = begin_gaps_section(
-            self.results, folder, png, versions=versions, pdf=pdf, pool=pool
-        )
+        finish = begin_gaps_section(self.results, folder, versions=versions, pdf=pdf, pool=pool)
         return lambda tell: Written(
             "paper-gaps", "Where the paper's own models miss", "reconstructed data", finish(tell)
         )

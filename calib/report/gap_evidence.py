@@ -17,8 +17,6 @@ from calib.gap.where import Region
 from calib.models import get_model
 from calib.report.gap_rows import (
     OutputRows,
-    best_fit,
-    best_of,
     output_axis,
     output_rows,
     output_word,
@@ -50,7 +48,7 @@ def gap_verdict(found: Diagnosis) -> GapVerdict:
 def gap_evidence(found: Diagnosis) -> GapEvidence:
     """Collect what the verdict is made from."""
     ranking = found.ranking
-    best = best_of(found)
+    best = found.ranking.order[0]
     design = ranking.isolability
     case_context = found.data.case.context
     alike = [
@@ -123,7 +121,7 @@ def region_words(found: Diagnosis, region: Region) -> tuple[str, str]:
 
 def _leading_regions(found: Diagnosis) -> list[Region]:
     """One region of each output, along a condition of the best hypothesis if there is one."""
-    effects = best_fit(found, best_of(found)).forward.hypothesis.effects
+    effects = found.ranking.best(found.ranking.order[0]).forward.hypothesis.effects
     wanted = {found.data.view.column(role) for e in effects for role in e.covariates}
     leading = []
     for o in found.data.outputs:
@@ -197,7 +195,7 @@ def _matter(found: Diagnosis, names: Sequence[str]) -> set[str]:
     models = found.data.case.models.values()
     matters = {role_of(c) for m in models for c in get_model(m).conditions}
     for name in names:
-        h = best_fit(found, name).forward.hypothesis
+        h = found.ranking.best(name).forward.hypothesis
         if h.smooth_outputs:
             return {role_of(c) for c in found.data.view.conditions}
         matters |= {c for effect in h.effects for c in effect.covariates}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -12,7 +12,6 @@ from calib.data.quantities import OUTPUTS, role_of
 from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import EFFECTS
-from calib.gap.fit import Fit
 from calib.gap.where import Region
 from calib.models.base import Array
 from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of
@@ -84,16 +83,6 @@ def output_word(output: str) -> str:
     return output.replace("_", " ")
 
 
-def best_fit(found: Diagnosis, name: str) -> Fit:
-    """Return the most probable variant of a hypothesis."""
-    return found.ranking.best(name)
-
-
-def best_of(found: Diagnosis) -> str:
-    """Return the most probable hypothesis."""
-    return found.ranking.order[0]
-
-
 @dataclass(frozen=True)
 class OutputRows:
     """Field rows of one output, as they are drawn, arrays of shape (n,).
@@ -120,23 +109,24 @@ def output_rows(found: Diagnosis) -> list[OutputRows]:
     gathered = []
     view, truth = found.data.view, found.truth
     for o, gap in zip(found.data.outputs, found.gaps, strict=True):
+        axis = output_axis(found, o.name)
         theta = o.priors.to_natural(found.ranking.lab_mode[o.name][None])
         before = o.problem.bound.predict(theta, o.problem.bound.model.select(view.conditions))[0]
         gathered.append(
             OutputRows(
                 o.name,
-                output_axis(found, o.name),
+                axis,
                 o.rows,
-                found.data.case.field[OUTPUTS[o.name]][o.rows],
-                np.asarray(before)[o.rows],
-                truth.mean(truth.truth[o.name])[o.rows],
-                truth.mean(truth.noise[o.name])[o.rows],
-                gap.gap,
-                gap.sd,
+                axis.scale(found.data.case.field[OUTPUTS[o.name]][o.rows]),
+                axis.scale(np.asarray(before)[o.rows]),
+                axis.scale(truth.mean(truth.truth[o.name])[o.rows]),
+                axis.scale(truth.mean(truth.noise[o.name])[o.rows]),
+                axis.scale(gap.gap),
+                axis.scale(gap.sd),
                 gap.probability,
             )
         )
-    return [_rescaled(own) for own in gathered]
+    return gathered
 
 
 def output_axis(found: Diagnosis, output: str) -> Axis:
@@ -148,22 +138,6 @@ def output_axis(found: Diagnosis, output: str) -> Axis:
     ):
         return Axis(axis.name, "N", 1000.0)
     return axis
-
-
-def _rescaled(own: OutputRows) -> OutputRows:
-    """Put the values on the scale of the axis."""
-    if own.axis.factor == 1.0:
-        return own
-    scale = own.axis.scale
-    return replace(
-        own,
-        measured=scale(own.measured),
-        before=scale(own.before),
-        after=scale(own.after),
-        noise=scale(own.noise),
-        gap=scale(own.gap),
-        sd=scale(own.sd),
-    )
 
 
 def panel_groups(

@@ -20,7 +20,6 @@ from calib.models import get_model
 from calib.models.base import Array
 from calib.report.gap_rows import (
     EVERYWHERE,
-    best_fit,
     output_axis,
     output_word,
     region_text,
@@ -49,7 +48,7 @@ def size_sentences(found: Diagnosis, name: str) -> list[str]:
     """Say what a fitted hypothesis amounts to on the field's conditions; ``none`` has no size."""
     if name == "none":
         return []
-    fit = best_fit(found, name)
+    fit = found.ranking.best(name)
     psi = fit.draws(generator(found.seed, "gap", "size", name), _N_DRAWS)
     changes = _changes(found, fit, psi)
     effects = fit.forward.hypothesis.effects
@@ -70,7 +69,7 @@ def size_sentences(found: Diagnosis, name: str) -> list[str]:
 
 def where_to_look(found: Diagnosis) -> str:
     """Say which measurements would show what an effect that is not listed goes along with."""
-    fit = best_fit(found, "unknown")
+    fit = found.ranking.best("unknown")
     h = fit.forward.hypothesis
     # Runs cannot be repeated at their place in the order, and waves have their largest gaps apart.
     places = [] if h.smooth_over == "ripple" else found.regions

@@ -14,10 +14,7 @@ from calib.report.numbers import NOTHING, format_number
 NO_UNIT = NOTHING
 MINUS = "\N{MINUS SIGN}"
 
-_GREEK = {"sigma": r"\sigma", "gamma": r"\gamma", "nu": r"\nu", "theta": r"\theta"}
-
-
-_GREEK_PLAIN = {
+_GREEK = {
     "sigma": "\N{GREEK SMALL LETTER SIGMA}",
     "gamma": "\N{GREEK SMALL LETTER GAMMA}",
     "nu": "\N{GREEK SMALL LETTER NU}",
@@ -77,14 +74,14 @@ def stem_and_subscript(name: str) -> tuple[str, str]:
 def symbol(name: str) -> str:
     """Return a parameter's symbol in mathtext: ``K_lo`` as K with a subscript."""
     stem, below = stem_and_subscript(name)
-    stem = _GREEK.get(stem, stem)
+    stem = f"\\{stem}" if stem in _GREEK else stem
     return f"${stem}_\\mathrm{{{below}}}$" if below else f"${stem}$"
 
 
 def plain(name: str) -> str:
     """Return a parameter's symbol for a sentence."""
     stem, _, below = name.partition("_")
-    stem = _GREEK_PLAIN.get(stem, stem)
+    stem = _GREEK.get(stem, stem)
     return f"{stem}_{below}" if below else stem
 
 
@@ -118,6 +115,12 @@ def short(value: float, digits: int = 2) -> str:
 def percent(fraction: float) -> str:
     """Write a fraction as a percentage with two significant digits."""
     return f"{short(100.0 * fraction)} %"
+
+
+def percent_range(ends: tuple[float, float]) -> str:
+    """Write two fractions as whole percentages, from one to the other."""
+    low, high = (f"{100.0 * end:.0f}".replace("-", MINUS) for end in ends)
+    return f"{low} to {high} %"
 
 
 def joined(words: list[str]) -> str:

@@ -60,12 +60,7 @@ def _output(result: OutputResult) -> dict[str, Any]:
         **({"warnings": list(result.warnings)} if result.warnings else {}),
         **summarise_estimates(result.estimates, result.by_pressure),
         "priors": {
-            p.name: {
-                "unit": p.unit,
-                "distribution": p.text,
-                "reason": p.reason,
-                "source": p.source,
-            }
+            p.name: {"unit": p.unit, "distribution": p.text, **_picked(p, "reason", "source")}
             for p in problem.priors.entries
         },
         "posterior": _posterior(result.calibration),
@@ -87,9 +82,7 @@ def _noise(noise: Noise, preference: NoisePreference | None) -> dict[str, Any]:
             "correlated_along": noise.choice.correlated_along or None,
             "against_normal": {
                 "elpd_difference": preference.elpd,
-                "se": preference.se,
-                "preferred": preference.preferred,
-                "sentence": preference.sentence,
+                **_picked(preference, "se", "preferred", "sentence"),
             },
         }
     }
@@ -122,15 +115,15 @@ def _range(values: Array) -> dict[str, float]:
 
 def _fit(e: PointEstimate) -> dict[str, Any]:
     return {
-        "cost": e.cost,
-        "cost_unit": e.cost_unit,
-        "rmse": e.rmse,
-        "rmse_unit": e.rmse_unit,
-        "r_squared": e.r_squared,
+        **_picked(e, "cost", "cost_unit", "rmse", "rmse_unit", "r_squared"),
         "evaluations": e.n_evaluations,
-        "converged": e.converged,
-        "note": e.note,
+        **_picked(e, "converged", "note"),
     }
+
+
+def _picked(found: object, *names: str) -> dict[str, Any]:
+    """Return some attributes by their names."""
+    return {name: getattr(found, name) for name in names}
 
 
 def _posterior(calibration: Calibration) -> dict[str, Any]:
@@ -149,13 +142,7 @@ def _sensitivity(result: OutputResult) -> dict[str, Any]:
             "power_scaling_threshold": SENSITIVITY_MIN,
         },
         "parameters": {
-            name: {
-                "contraction": s.contraction,
-                "prior": s.prior,
-                "likelihood": s.likelihood,
-                "identified": s.identified,
-                "reading": s.reading,
-            }
+            name: _picked(s, "contraction", "prior", "likelihood", "identified", "reading")
             for name, s in result.sensitivity.items()
         },
     }
@@ -178,10 +165,7 @@ def _validation(result: OutputResult) -> dict[str, Any]:
 
 def _scores(s: Scores) -> dict[str, Any]:
     return {
-        "n": s.n,
-        "rmse": s.rmse,
-        "crps": s.crps,
-        "max_relative_error": s.max_relative_error,
+        **_picked(s, "n", "rmse", "crps", "max_relative_error"),
         "n_relative_error_above_6_percent": int((abs(s.relative_error) > 0.06).sum()),
         "coverage": {f"{100 * level:g}": c.proportion for level, c in s.coverage.items()},
         "coverage_interval": {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,14 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.simulators.emulator.files import save_emulator
 from calib.models.simulators.emulator.model import emulator_of
-from calib.report.figures import Plate
 from calib.report.figures.collect import plates
+from calib.report.figures.plate import Plate
 from calib.report.figures.style import pdf_bytes, png
 from calib.report.page.content import render_page
 from calib.report.publish import publication
 from calib.report.reference import reference_of
 from calib.report.sections import Found
-from calib.report.study import OutputResult, Study
+from calib.report.study import OutputResult, Progress, Study
 from calib.report.study_tasks import Task
 from calib.report.summary import summarise
 
@@ -83,9 +83,6 @@ def _task(task: Task, inputs: Mapping[str, Any]) -> dict[str, Any]:
         "label": task.table.label,
         **inputs,
     }
-
-
-type Progress = Callable[[str, int, int], None]
 
 
 def write_report(

@@ -37,8 +37,7 @@ from calib.inference.estimators.search import search_space
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.models.base import Array
-
-type _Progress = Callable[[str, int, int], None]
+from calib.report.study import Progress
 
 _BOX = 30.0
 _C_RANGE = (1.0, 2.0)
@@ -109,7 +108,7 @@ def printed_settings(published: Published) -> GeneticSettings:
 
 def begin_convergence(
     published: Published, seed: int, seeds: Seeds, pool: Pool
-) -> Callable[[_Progress], GeneticStudy]:
+) -> Callable[[Progress], GeneticStudy]:
     """Ask for the searches over seeds, on the reconstructed data; return what waits for them."""
     settings = printed_settings(published)
     box = _printed_box(published)
@@ -126,7 +125,7 @@ def begin_convergence(
     }  # fmt: skip
     planned = seeds.by_pressure * len(by_pressure) + seeds.joint + seeds.printed_coordinates
 
-    def finish(tell: _Progress) -> GeneticStudy:
+    def finish(tell: Progress) -> GeneticStudy:
         what = "genetic algorithm over seeds"
         alone = {}
         for i, (psi, piece) in enumerate(by_pressure.items()):
@@ -212,7 +211,7 @@ def _in_printed_coordinates(
     return np.array([run.cost for run in minimise_genetic_runs(cost, *box, streams, settings)])
 
 
-def convergence_findings(published: Published, study: GeneticStudy) -> list[Finding]:
+def convergence_findings(study: GeneticStudy) -> list[Finding]:
     """Judge the convergence of the algorithm, pressure by pressure and jointly."""
     return [_by_pressure(study), _joint(study)]
 

@@ -26,6 +26,7 @@ from calib.he2019.audit.finding import (
     rounded,
 )
 from calib.he2019.audit.intervals import Interval, exact, exp, log, printed
+from calib.he2019.audit.rut_quality import fitted_lengths
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import Figure, Published
 from calib.he2019.datasets.rut import SLIPS
@@ -138,18 +139,11 @@ def _worth_correcting(published: Published) -> bool:
     return float(attenuation(published).middle) - 1.0 > _WORTH
 
 
-def _fitted_lengths(published: Published) -> tuple[Figure, Figure]:
-    """Return the contact lengths of the lower and the higher pressure fitted."""
-    setup = published.setup
-    low, high = (p for p in setup.inflation_pressures_psi if p != setup.held_out_psi)
-    return setup.contact_length_mm[low], setup.contact_length_mm[high]
-
-
 def _corrected_k(published: Published) -> Interval:
     """Return k by the means of the ruts: ln k follows from the exponents and the mean of ln pgr."""
     setup, width = published.setup, printed(published.setup.contact_width_mm)
     load = exact(1e6 * setup.normal_load_kn.value)
-    one, other = (log(load / (width * printed(f))) for f in _fitted_lengths(published))
+    one, other = (log(load / (width * length)) for length in fitted_lengths(published))
     middle = exact(0.5) * (one + other)
     k = printed(published.rut_depth.estimates["k"])
     return exp(middle - (middle - log(k)) * attenuation(published))
@@ -160,8 +154,8 @@ def inverse_by_print(published: Published) -> Finding:
     figures, factor = published.rut_depth.estimates, attenuation(published)
     n0, n1 = printed(figures["n0"]), printed(figures["n1"])
     corrected = {"n0": n0 * factor, "n1": n1 * factor, "k": _corrected_k(published)}
-    low, high = _fitted_lengths(published)
-    ratio, exponent = log(printed(low) / printed(high)), n0 + n1 * exact(float(np.mean(SLIPS)))
+    low, high = fitted_lengths(published)
+    ratio, exponent = log(low / high), n0 + n1 * exact(float(np.mean(SLIPS)))
     by_table, by_means = exp(ratio / exponent), exp(ratio / (exponent * factor))
     deeper, claimed = (float(r.middle) - 1.0 for r in (by_means, by_table))
     return finding(

@@ -41,8 +41,7 @@ from calib.he2019.audit.table5_cost import bounds, cost_findings
 from calib.he2019.datasets.published import DOI, PUBLISHED, Published
 from calib.inference.calibration import Calibration
 from calib.report.numbers import finite
-
-type Progress = Callable[[str, int, int], None]
+from calib.report.study import Progress
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +143,7 @@ def begin_audit(
             pressure_unit(published),
             *cost_findings(published, searched.joint.optimum, at_most),
             *rounding_findings(published, rounding),
-            *convergence_findings(published, searched),
+            *convergence_findings(searched),
             *rut_quality_findings(published, quality),
             *inverse_findings(published, inverse),
             finding("test_description", Verdict.UNTESTABLE, setup=published.setup),
@@ -194,20 +193,14 @@ def read_findings(content: Mapping[str, Any]) -> tuple[Finding, ...]:
 
 def _read(entry: Mapping[str, Any]) -> Finding:
     known = {f.name: entry[f.name] for f in fields(Finding)}
-    found = tuple(Quantity(**_with_nan(q)) for q in known["found"])
-    return Finding(
-        **{
-            **known,
-            "figures": tuple(known["figures"]),
-            "found": found,
-            "verdict": Verdict(known["verdict"]),
-            "basis": Basis(known["basis"]),
-        }
-    )
-
-
-def _with_nan(entry: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: math.nan if value is None else value for key, value in entry.items()}
+    known["figures"] = tuple(known["figures"])
+    found: list[dict[str, Any]] = [
+        {key: math.nan if value is None else value for key, value in q.items()}
+        for q in known["found"]
+    ]
+    known["found"] = tuple(Quantity(**q) for q in found)
+    known["verdict"], known["basis"] = Verdict(known["verdict"]), Basis(known["basis"])
+    return Finding(**known)
 
 
 def audit_csv(findings: Iterable[Finding]) -> str:

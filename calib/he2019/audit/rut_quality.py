@@ -56,10 +56,11 @@ class QualityStudy:
         return np.asarray(self.n[meet])
 
 
-def _fitted(published: Published) -> tuple[int, int]:
-    low, high = (p for p in published.setup.inflation_pressures_psi
-                 if p != published.setup.held_out_psi)  # fmt: skip
-    return low, high
+def fitted_lengths(published: Published) -> tuple[Interval, Interval]:
+    """Return the contact lengths (mm) of the lower and the higher pressure fitted."""
+    setup = published.setup
+    low, high = (p for p in setup.inflation_pressures_psi if p != setup.held_out_psi)
+    return printed(setup.contact_length_mm[low]), printed(setup.contact_length_mm[high])
 
 
 def log_pressure_ratio(published: Published, n: Array, share: float = 0.5) -> Interval:
@@ -78,7 +79,7 @@ def log_pressure_ratio(published: Published, n: Array, share: float = 0.5) -> In
 
 def study_quality(published: Published) -> QualityStudy:
     """Compare the two ways to ln(pgr42/pgr18)."""
-    low, high = (printed(published.setup.contact_length_mm[p]) for p in _fitted(published))
+    low, high = fitted_lengths(published)
     n = np.arange(len(published.rut_depth.estimates) + 1.0, _N_MAX + 1.0)
     return QualityStudy(n, log_pressure_ratio(published, n), log(low / high), 2 * len(SLIPS))
 

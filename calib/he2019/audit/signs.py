@@ -108,10 +108,9 @@ def nearest_by_signs(
     published: Published, what: str, *, psi_per_unit: float = 1.0
 ) -> dict[Signs, Nearest]:
     """Return the best for each of the eight readings of three signs."""
-    readings = list(product((1, -1), repeat=3))
     return {
         (a, b, c): nearest(published, what, signs=(a, b, c), psi_per_unit=psi_per_unit)
-        for a, b, c in readings
+        for a, b, c in product((1, -1), repeat=3)
     }
 
 

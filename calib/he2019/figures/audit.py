@@ -203,7 +203,8 @@ def digits_plate(audit: Audit) -> Plate:
         handles["all coefficients that print as Table 5"] = ax.fill_between(
             study.slips, allowed.lower, allowed.upper, color="#bcd6ea", lw=0.0
         )
-        _edges(ax, study.slips, allowed.lower, allowed.upper)
+        for edge in (allowed.lower, allowed.upper):
+            ax.plot(study.slips, edge, color=BLUE, lw=0.6)
         curve = study.as_printed[psi]
         if np.isfinite(curve).all():
             (handles["Table 5 as printed"],) = ax.plot(
@@ -224,11 +225,6 @@ def digits_plate(audit: Audit) -> Plate:
         "a few newtons too wide, never too narrow."
     )
     return Plate(fig, "audit_digits", caption, "What the digits of Table 5 leave open")
-
-
-def _edges(ax: Axes, x: Array, low: Array, high: Array) -> None:
-    for edge in (low, high):
-        ax.plot(x, edge, color=BLUE, lw=0.6)
 
 
 _SHOWN = 1500

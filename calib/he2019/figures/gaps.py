@@ -76,7 +76,7 @@ def _plate(result: FoundGap) -> Plate:
     _which(which, result)
     handles, labels = _key(pressure, kept_out=kept_out)
     legend_below(fig, handles, labels, 3)
-    return Plate(fig, result.gap.name, _caption(result, own, kept_out=kept_out), result.gap.title)
+    return Plate(fig, result.gap.name, _caption(own, kept_out=kept_out), result.gap.title)
 
 
 def _noise_band(ax: Axes, x: Array, own: OutputRows) -> None:
@@ -177,7 +177,7 @@ def _marker(psi: float) -> str:
     return MARKERS[_PRESSURES.index(float(psi))]
 
 
-def _caption(result: FoundGap, own: OutputRows, *, kept_out: bool) -> str:
+def _caption(own: OutputRows, *, kept_out: bool) -> str:
     before, after = (
         short(float(np.sqrt(np.mean((own.measured - v) ** 2)))) for v in (own.before, own.after)
     )

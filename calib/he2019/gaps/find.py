@@ -24,13 +24,12 @@ from calib.inference.sampling.adapt import Guess, adapt
 from calib.inference.sampling.mode import find_modes
 from calib.models.base import Array
 from calib.models.bekker import rut_depth as eq_21
+from calib.report.study import Progress
 
 _N_DRAWS = 20_000
 _NEGLIGIBLE = 1e-9
 # Fewer effective draws do not give an sd to 5 %.
 _LEAST_ESS = 400.0
-
-type Progress = Callable[[str, int, int], None]
 
 
 @dataclass(frozen=True)

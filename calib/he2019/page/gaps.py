@@ -14,13 +14,14 @@ from calib.he2019.gaps.find import Check, FoundGap, checks, probability_of
 from calib.models import get_model
 from calib.report.figures.gap import gap_plates
 from calib.report.figures.plate import Plate
-from calib.report.figures.style import pdf_bytes, png_size
+from calib.report.figures.style import pdf_bytes, png, png_size
 from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_rows import short_name
 from calib.report.gap_verdict import odds_text
-from calib.report.labels import short
+from calib.report.labels import percent, percent_range
 from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
 from calib.report.page.template import data_uri, sentences, template
+from calib.report.study import Progress
 
 _CHECKS = declared("page/checks.toml")
 # Numbers that not every check of a kind has.
@@ -40,14 +41,9 @@ def check_text(check: Check) -> tuple[str, str]:
     return heading, f"{check.values['rows']:.0f} field rows: {listed}"
 
 
-type Progress = Callable[[str, int, int], None]
-type ToPng = Callable[[Plate], bytes]
-
-
 def begin_gaps_section(
     results: Sequence[FoundGap],
     folder: Path,
-    to_png: ToPng,
     *,
     versions: Mapping[str, str],
     pdf: bool,
@@ -58,7 +54,7 @@ def begin_gaps_section(
     The folder has ``figures/``; it gets ``figures/gap_NAME.png``, as PDF too if asked, and
     ``gaps/NAME/``, each what `calib diagnose` writes, its figures inside the page only.
     """
-    pieces = [pool.submit(_write_gap, r, folder, to_png, versions, pdf) for r in results]
+    pieces = [pool.submit(_write_gap, r, folder, versions, pdf) for r in results]
 
     def finish(tell: Progress) -> str:
         blocks = []
@@ -72,10 +68,10 @@ def begin_gaps_section(
 
 
 def _write_gap(
-    result: FoundGap, folder: Path, to_png: ToPng, versions: Mapping[str, str], pdf: bool
+    result: FoundGap, folder: Path, versions: Mapping[str, str], pdf: bool
 ) -> dict[str, Any]:
     plate = gap_plate(result)
-    image = to_png(plate)
+    image = png(plate)
     (folder / "figures" / f"gap_{plate.name}.png").write_bytes(image)
     if pdf and plate.figure is not None:
         file = folder / "figures" / f"gap_{plate.name}.pdf"
@@ -84,7 +80,7 @@ def _write_gap(
     inner.mkdir(parents=True)
     write_diagnosis(result.found, inner)
     drawn = gap_plates(result.found)
-    images = {f"{p.name}.png": to_png(p) for p in drawn if p.figure is not None}
+    images = {f"{p.name}.png": png(p) for p in drawn if p.figure is not None}
     page = render_diagnosis(result.found, drawn, images, manifest={"versions": versions})
     (inner / "index.html").write_text(page, encoding="utf-8")
     return _block(result, plate, image)
@@ -94,7 +90,7 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
     gap, found = result.gap, result.found
     verdict = gap_verdict(found)
     ranking = found.ranking
-    case = found.data.case
+    best, case = ranking.order[0], found.data.case
     return {
         "name": gap.name,
         "title": gap.title,
@@ -110,7 +106,7 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
         "headline": verdict.headline,
         "facts": [fact for fact in verdict.facts if fact[0] != "Next"],
         "withheld": _withheld(result),
-        "best": f"{short_name(ranking.order[0])} ({odds_text(_best(result))})",
+        "best": f"{short_name(best)} ({odds_text(ranking.probability[best])})",
         "shrink": _shrink(result),
         "checks": [check_text(check) for check in checks(result)],
         "limits": gap.limits,
@@ -123,11 +119,6 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
 
 def _upper(text: str) -> str:
     return text[0].upper() + text[1:]
-
-
-def _best(result: FoundGap) -> float:
-    ranking = result.found.ranking
-    return float(ranking.probability[ranking.order[0]])
 
 
 def _withheld(result: FoundGap) -> str:
@@ -150,5 +141,4 @@ def _shrink(result: FoundGap) -> str:
     s = result.found.shrink.get(result.output)
     if s is None:
         return "no gap that could shrink"
-    low, high = (f"{100.0 * v:.0f}".replace("-", "\N{MINUS SIGN}") for v in s.interval)
-    return f"{short(100.0 * s.fraction)} % ({low} to {high} %)"
+    return f"{percent(s.fraction)} ({percent_range(s.interval)})"

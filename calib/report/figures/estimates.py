@@ -191,8 +191,8 @@ def by_pressure_plate(result: OutputResult, *, reference: Reference = NOTHING) -
     Parameters
     ----------
     result : OutputResult
-    published : bool
-        Whether to ring Tables 3 and 4.
+    reference : Reference, optional
+        Whose figures are ringed.
     """
     pressures = list(result.by_pressure)
     if not pressures:

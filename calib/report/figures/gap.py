@@ -33,7 +33,7 @@ from calib.report.figures.style import (
     note,
     panels,
 )
-from calib.report.gap_rows import best_fit, best_of, output_word, short_name
+from calib.report.gap_rows import output_word, short_name
 from calib.report.labels import MINUS, NO_UNIT, axis_of, joined, percent, short
 
 
@@ -159,8 +159,8 @@ def _design_caption(design: Isolability) -> str:
 
 def left_over_plate(found: Diagnosis) -> Plate:
     """Draw standardised residuals of the best hypothesis over slip and run order."""
-    name = best_of(found)
-    fit = best_fit(found, name)
+    name = found.ranking.order[0]
+    fit = found.ranking.best(name)
     conditions = found.data.view.conditions
     known = (found.data.view.column(role) for role in ("slip", "order"))
     columns = [c for c in known if c]
@@ -296,14 +296,14 @@ def placebos(found: Diagnosis) -> Placebo:
     they are put on the noise of the best hypothesis first.
     """
     at = noise_conditions(found.data.view)
-    best = best_fit(found, best_of(found))
+    best = found.ranking.best(found.ranking.order[0])
     rows = {o.name: o.rows for o in found.data.outputs}
     reference = {o: n.sd(at.rows(rows[o])) for o, n in best.noise.items()}
     left = {}
     for name in found.ranking.fits:
-        if "+" in name and name != best_of(found):
+        if "+" in name and name != found.ranking.order[0]:
             continue
-        fit = best_fit(found, name)
+        fit = found.ranking.best(name)
         left[name] = _rms(
             [
                 r * fit.noise[o].sd(at.rows(rows[o])) / reference[o]
@@ -327,7 +327,7 @@ def placebo_plate(found: Diagnosis) -> Plate:
     """Draw what wrong hypotheses would have left of the gap."""
     placebo = placebos(found)
     order = sorted(placebo.left, key=lambda n: placebo.left[n])
-    named = best_of(found)
+    named = found.ranking.order[0]
     fig, axes = panels(
         1, 1, height=4.2 * len(order) + 3.0, left=62.0, right=16.0, top=7.0, bottom=10.0
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ from calib.report.gap_rows import (
     panel_groups,
     region_text,
 )
-from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of, percent, short
+from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of, percent, percent_range, short
 
 _BAND = "#e6e6e6"
 _MOST_CONDITIONS = 6
@@ -131,10 +132,8 @@ def _abscissa(found: Diagnosis) -> tuple[Array, Any]:
 
 
 def _in_noise(own: OutputRows) -> OutputRows:
-    return OutputRows(
-        own.name, own.axis, own.rows, own.measured, own.before, own.after,
-        np.ones_like(own.noise), own.gap / own.noise, own.sd / own.noise, own.probability,
-    )  # fmt: skip
+    noise = own.noise
+    return replace(own, noise=np.ones_like(noise), gap=own.gap / noise, sd=own.sd / noise)
 
 
 def _limits(own: OutputRows) -> tuple[float, float]:
@@ -333,16 +332,11 @@ def _bars(ax: Axes, found: Diagnosis, own: OutputRows) -> None:
     ax.text(
         1.47, s.noise_floor + 0.012 * top, "noise", ha="right", va="bottom", fontsize=SMALLEST_PT
     )
-    text = f"shrinks by {100.0 * s.fraction:.0f} %\n({_interval(s.interval)})"
+    text = f"shrinks by {100.0 * s.fraction:.0f} %\n({percent_range(s.interval)})"
     ax.text(0.5, 0.985, text, ha="center", va="top", fontsize=7.0, transform=ax.transAxes)
     ax.set_xlim(-0.5, 1.5)
     ax.set_xticks([0.0, 1.0], ["before", "after"])
     ax.tick_params(axis="x", length=0.0)
-
-
-def _interval(interval: tuple[float, float]) -> str:
-    low, high = (f"{100.0 * v:.0f}".replace("-", MINUS) for v in interval)
-    return f"{low} to {high} %"
 
 
 def _shrink_caption(found: Diagnosis, outputs: list[OutputRows]) -> str:
@@ -355,7 +349,7 @@ def _shrink_caption(found: Diagnosis, outputs: list[OutputRows]) -> str:
         parts.append(
             f"{output_word(o.name)} from {short(s.rmse_before)} to {short(s.rmse_after)} "
             f"{o.axis.unit} rms, noise {short(s.noise_floor)} {o.axis.unit}, a shrink of "
-            f"{percent(s.fraction)} (90 % interval {_interval(s.interval)})"
+            f"{percent(s.fraction)} (90 % interval {percent_range(s.interval)})"
         )
     place = (
         "at new conditions, which were not fitted"

@@ -14,7 +14,7 @@ import numpy as np
 from markupsafe import Markup
 
 from calib.models import get_model
-from calib.report.figures import Plate
+from calib.report.figures.plate import Plate
 from calib.report.labels import axis_of, percent, short
 from calib.report.numbers import TIMES, format_number, format_value
 from calib.report.page.tables import (
@@ -138,7 +138,7 @@ MARKS: Mapping[str, str] = {
     Level.FAILED: "\N{HEAVY BALLOT X}",
 }
 
-# Which exception carried a message is the programmer's business.
+# The class of an exception says nothing to a reader of the page.
 _CLASS_NAME = re.compile(r"^(?:[A-Za-z_][\w.]*(?:Error|Exception): )+")
 
 

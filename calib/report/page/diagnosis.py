@@ -28,11 +28,8 @@ from calib.report.gap_evidence import (
     gap_evidence,
     region_words,
     shrink_facts,
-    where_fact,
 )
 from calib.report.gap_rows import (
-    best_fit,
-    best_of,
     output_axis,
     output_word,
     short_name,
@@ -46,7 +43,7 @@ from calib.report.gap_verdict import (
     odds_text,
     repeats_needed,
 )
-from calib.report.labels import MINUS, percent, short
+from calib.report.labels import MINUS, percent, percent_range, short
 from calib.report.numbers import format_number, format_value
 from calib.report.page.template import equation, parametrisation, picture, prose, template
 
@@ -126,7 +123,7 @@ def _row(found: Diagnosis, name: str, left: dict[str, float]) -> dict[str, Any]:
 
 
 def _sizes(found: Diagnosis, name: str) -> list[Markup]:
-    fit = best_fit(found, name)
+    fit = found.ranking.best(name)
     hypothesis = fit.forward.hypothesis
     if hypothesis.shift > 0.0:
         return shift_sizes(found.data.outputs, fit)
@@ -153,7 +150,7 @@ def parameter_rows(found: Diagnosis) -> list[list[str]]:
     for name in found.ranking.order:
         if p[name] < _POSSIBLE:
             continue
-        hypothesis = best_fit(found, name).forward.hypothesis
+        hypothesis = found.ranking.best(name).forward.hypothesis
         for effect, priors in zip(hypothesis.effects, hypothesis.effect_priors, strict=True):
             for prior in priors.free:
                 words = prior.name.replace("_", " ")
@@ -291,7 +288,7 @@ def render_diagnosis(
         title=f"Sim-to-real gap: {case.name}",
         verdict=verdict,
         mark=TONE_MARKS[verdict.tone],
-        probability=round(100.0 * found.ranking.probability[best_of(found)]),
+        probability=round(100.0 * found.ranking.probability[found.ranking.order[0]]),
         figures={p.name: picture(p, images.get(f"{p.name}.png", b""), p.caption) for p in plates},
         facts=_case_facts(found),
         warnings=found.warnings,
@@ -302,7 +299,7 @@ def render_diagnosis(
         relevant_in_pair=f"{RELEVANT_IN_PAIR:g}",
         parameters=parameter_rows(found),
         simulators=simulators(found),
-        best=title_of(found, best_of(found)),
+        best=title_of(found, found.ranking.order[0]),
         not_testable=[
             [short_name(n), title_of(found, n), reason]
             for n, reason in found.ranking.not_testable.items()
@@ -336,18 +333,16 @@ def _cause_rows(evidence: GapEvidence) -> list[dict[str, str]]:
 
 
 def _region_row(found: Diagnosis, region: Region) -> list[str]:
-    fact = where_fact(found, region)
     place, gap = region_words(found, region)
-    p = fact.probability
+    p = region.probability
     return [output_word(region.output), place, gap, f"{p:.2f}" if p < 0.995 else "> 0.99"]
 
 
 def _shrink_rows(found: Diagnosis) -> list[list[str]]:
     rows = []
     for f in shrink_facts(found):
-        low, high = (f"{100.0 * v:.0f}".replace("-", MINUS) for v in f.interval)
         fraction = f"{100.0 * f.fraction:.0f} %".replace("-", MINUS)
-        rows.append([f.output, f.before, f.after, f.floor, fraction, f"{low} to {high} %"])
+        rows.append([f.output, f.before, f.after, f.floor, fraction, percent_range(f.interval)])
     return rows
 
 
@@ -355,7 +350,7 @@ def _case_facts(found: Diagnosis) -> list[tuple[str, str]]:
     """What was compared with what."""
     case, facts = found.data.case, []
     for o in found.data.outputs:
-        noise = found.ranking.best(best_of(found)).noise[o.name]
+        noise = found.ranking.best(found.ranking.order[0]).noise[o.name]
         axis = output_axis(found, o.name)
         grows = ""
         if noise.rho > 0.0:

@@ -104,7 +104,7 @@ class CsvTable:
 
 @dataclass(frozen=True)
 class LatexTable:
-    """Rows for print, in groups with a rule between them; a wide table is in a small font.
+    """Rows for print, in groups with a rule between them.
 
     The label names its file too. Caption, head and cells have marks, see
     `calib.report.publish.markup`; `columns` is LaTeX's column specification.
@@ -115,7 +115,6 @@ class LatexTable:
     columns: str
     head: tuple[str, ...]
     groups: tuple[tuple[tuple[str, ...], ...], ...]
-    small: bool = False
 
 
 def write_csv(table: CsvTable) -> str:
@@ -139,7 +138,7 @@ def write_latex(table: LatexTable) -> str:
             "% Needs \\usepackage{booktabs}; the references cited are in references.bib.",
             "\\begin{table}",
             "  \\centering",
-            "  \\footnotesize" if table.small else "  \\small",
+            "  \\footnotesize",
             f"  \\caption{{{to_latex(table.caption)}}}",
             f"  \\label{{tab:{table.label.replace('_', '-')}}}",
             f"  \\begin{{tabular}}{{{table.columns}}}",

@@ -133,7 +133,6 @@ def estimates_latex(o: Output) -> LatexTable | None:
             tuple(tuple(row) for name, row in cells.items() if name not in _QUALITY),
             tuple(tuple(row) for name, row in cells.items() if name in _QUALITY),
         ),
-        small=True,
     )  # fmt: skip
 
 
@@ -192,7 +191,6 @@ def pressure_latex(o: Output) -> LatexTable | None:
         columns="llrrrrr",
         head=("Pressure", "Method", *head),
         groups=tuple(groups),
-        small=True,
     )  # fmt: skip
 
 
@@ -252,7 +250,6 @@ def posterior_latex(o: Output) -> LatexTable:
         head=("Parameter", "Posterior", "95 % HDI", "ESS bulk", "ESS tail", "R-hat",
               "sd/prior sd"),
         groups=(tuple(map(_latex_row, derived)), tuple(map(_latex_row, sampled))),
-        small=True,
     )  # fmt: skip
 
 
@@ -293,7 +290,6 @@ def priors_latex(o: Output) -> LatexTable:
              *(with_symbols(p[k], o.found["priors"]) for k in ("reason", "source")))
             for name, p in o.found["priors"].items()
         ),),
-        small=True,
     )  # fmt: skip
 
 
@@ -378,7 +374,6 @@ def validation_latex(outputs: Sequence[Output]) -> LatexTable:
         head=("Output", "Rows", "n", "RMSE", "CRPS", "Error (%)",
               *(f"in {level} %" for level in _LEVELS), "elpd"),
         groups=(tuple(rows),),
-        small=True,
     )  # fmt: skip
 
 
@@ -428,5 +423,4 @@ def convergence_latex(outputs: Sequence[Output], gate: Mapping[str, float]) -> L
         groups=(tuple(
             (o.name, *_convergence(o), "yes" if o.converged else "NO") for o in outputs
         ),),
-        small=True,
     )  # fmt: skip

@@ -30,7 +30,7 @@ def study():
 
 
 def judged(study):
-    return {f.key: f.verdict for f in convergence_findings(PUBLISHED, study)}
+    return {f.key: f.verdict for f in convergence_findings(study)}
 
 
 def search(*costs: float) -> Search:

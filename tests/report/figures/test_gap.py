@@ -23,7 +23,6 @@ from calib.report.figures.gap import (
 )
 from calib.report.gap_rows import (
     EVERYWHERE,
-    best_fit,
     output_axis,
     output_rows,
     panel_groups,
@@ -126,7 +125,7 @@ def test_captions_count_what_the_records_say(found, drawn):
         assert region_text(found, region) in drawn["where_conditions"].caption
     beyond = sum(
         int((np.abs(r) > 2.0).sum())
-        for r in best_fit(found, "sensor_drift").field_residuals.values()
+        for r in found.ranking.best("sensor_drift").field_residuals.values()
     )
     assert f"{beyond} of 54 lie beyond" in drawn["left_over"].caption
 
@@ -178,7 +177,7 @@ def test_a_tie_is_said_and_hatched(found):
 def test_placebos_are_on_one_noise(found):
     placebo = placebos(found)
     best = found.ranking.order[0]
-    residual = np.concatenate(list(best_fit(found, best).field_residuals.values()))
+    residual = np.concatenate(list(found.ranking.best(best).field_residuals.values()))
     assert placebo.left[best] == pytest.approx(np.sqrt(np.mean(np.square(residual))))
     # A wrong hypothesis inflates its own noise: on its own scale it would look as good.
     assert placebo.left["none"] > 1.3 * placebo.left[best]
