@@ -7,7 +7,7 @@ import os
 import pickle
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from contextlib import closing, contextmanager, suppress
 from functools import partial
 from importlib.metadata import version
@@ -16,7 +16,7 @@ from multiprocessing import active_children
 from typing import Any
 
 import dask
-from distributed import Client, Future, LocalCluster, as_completed
+from distributed import Client, LocalCluster, as_completed
 from distributed.scheduler import KilledWorker
 from distributed.utils import silence_logging_cmgr
 
@@ -94,10 +94,12 @@ def _gather[I, R](
         yield from sent.fill(items, waiting)
         if not len(sent):
             return
-        for name, future, result in sent.come():
-            if future.status == "finished":
+        # By what came, not by the future's status: the worker that held a result may have died
+        # since, and the scheduler have begun the task anew.
+        for name, result in sent.come():
+            if isinstance(result, Finished):
                 yield result
-            elif future.status != "error":
+            elif isinstance(result, CancelledError):
                 raise _lost()
             elif isinstance(result[1], KilledWorker):
                 killed.append(name)
@@ -157,12 +159,16 @@ class _Sent:
             self._out[key] = name, len(item)
             self._bytes += len(item)
 
-    def come(self) -> Iterator[tuple[str, Future[Any], Any]]:
-        """Wait for tasks to come to their end; yield name, future and result of each."""
+    def come(self) -> Iterator[tuple[str, Any]]:
+        """Wait for tasks to come to their end; yield name and result of each.
+
+        The result is what the task returned, type, error and traceback of what befell it, or a
+        `CancelledError` if the scheduler was lost.
+        """
         for future, result in self._coming.next_batch():
             name, size = self._out.pop(future.key)
             self._bytes -= size
-            yield name, future, result
+            yield name, result
 
 
 def _seal(item: object) -> bytes:
