@@ -79,6 +79,8 @@ def one_thread() -> str:
     return in_a_process(1)
 
 
+# One of the settings in which the reference report is checked has two threads as well.
+@pytest.mark.slow
 @pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="this machine has one core")
 def test_two_threads_of_linear_algebra_give_the_same_numbers(one_thread: str) -> None:
     assert in_a_process(2) == one_thread
