@@ -70,12 +70,17 @@ def test_format_value(mean, sd, text):
     assert format_value(mean, sd) == text
 
 
+def exponent_at_two_digits(value: float) -> int:
+    """Of a number as it is written: 0.995 is 1.0, though the float lies just below."""
+    written = Decimal(repr(value))
+    return round(written, 1 - written.adjusted()).adjusted()
+
+
 @given(finite, spread)
 @example(1.75, 0.995)
 def test_no_more_is_lost_than_the_sd_allows(mean, sd):
     shown_mean, shown_sd = read(format_value(mean, sd))
-    # The sd as it is written: 0.995 is 1.0 to two digits, though the float lies just below.
-    unit = 10.0 ** (round(Decimal(repr(sd)), 1 - Decimal(repr(sd)).adjusted()).adjusted() - 1)
+    unit = 10.0 ** (exponent_at_two_digits(sd) - 1)
     slack = 1.0 + 1e-6
     assert abs(shown_mean - mean) <= 0.5 * unit * slack + 1e-12 * abs(mean)
     assert abs(shown_sd - sd) <= 0.5 * unit * slack
@@ -120,7 +125,7 @@ def test_an_end_that_is_nothing_is_zero():
 
 def unit_of(uncertainty: float, mcse: float) -> float:
     """The rule, written a second time: two digits of the uncertainty, none below the error."""
-    size = math.floor(math.log10(float(f"{uncertainty:.1e}")))
+    size = exponent_at_two_digits(uncertainty)
     fine, coarse = 10.0 ** (size - 1), 10.0**size
     return fine if fine >= mcse else coarse
 
