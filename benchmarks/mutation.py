@@ -1,6 +1,7 @@
 """Whether the tests notice a small error: the code is changed at random, one place at a time.
 
     python benchmarks/mutation.py --of 40 --seed 22           # goes on where it was stopped
+    python benchmarks/mutation.py --of 9 9 6 36 --seed 24     # so many of each area
     python benchmarks/mutation.py --seed 22 --again FILE:K    # one that survived, once more
     python benchmarks/mutation.py --seed 22 --table           # what was found so far
 
@@ -27,6 +28,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import cache_from_source
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -44,7 +46,7 @@ ALSO = {
     "models/": "models/test_equations.py models/test_published.py models/test_properties.py "
     "models/test_examples.py extension/test_extension.py",
     "models/latex": "report/publish/test_latex.py",
-    "models/magic_formula": "inference/estimators/test_genetic.py",
+    "models/magic_formula": "inference/estimators/test_genetic.py report/test_study.py",
     "models/wong_reece": "models/test_rigid_wheel.py",
     "inference/likelihood": "inference/test_problem.py inference/test_conjugate.py",
     "inference/diagnostics": "inference/sampling/test_gate.py inference/sampling/test_walk.py "
@@ -157,14 +159,14 @@ def area_of(file: str) -> str:
     return next(area for area in AREAS if any(place.file == file for place in places(area)))
 
 
-def drawn(of: int, seed: int) -> list[Place]:
-    """Draw so many changes of each area, the areas by turns."""
+def drawn(of: list[int], seed: int) -> list[Place]:
+    """Draw so many changes of each area, or as many of all, the areas by turns."""
     rng = np.random.default_rng(seed)
     each = []
-    for area in AREAS:
+    for area, n in zip(AREAS, of if len(of) > 1 else of * len(AREAS), strict=True):
         every = places(area)
-        each.append([every[i] for i in rng.permutation(len(every))[:of]])
-    return [place for turn in zip(*each, strict=True) for place in turn]
+        each.append([every[i] for i in rng.permutation(len(every))[:n]])
+    return [place for turn in zip_longest(*each) for place in turn if place]
 
 
 def tests_of(file: str) -> tuple[str, ...]:
@@ -260,7 +262,7 @@ def wilson(k: int, n: int) -> tuple[float, float]:
 def main() -> None:
     """Judge what was drawn and not judged yet, or some once more; or show what was found."""
     ask = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    ask.add_argument("--of", type=int, default=40, help="places of each area")
+    ask.add_argument("--of", type=int, nargs="+", default=[40], help="places of each area")
     ask.add_argument("--seed", type=int, default=22)
     ask.add_argument("--again", nargs="+", default=(), help="FILE:K to judge once more")
     ask.add_argument("--table", action="store_true")

@@ -231,6 +231,20 @@ def test_a_condition_that_differs_between_the_campaigns_only_is_said_to_be_insep
     assert any("cannot be separated" in w for w in found.warnings)
 
 
+def test_a_condition_of_a_small_range_may_be_depended_on(data):
+    """Of a water content the whole range is a tenth; of one that is constant there is none."""
+    for spread, there in ((0.1, True), (0.0, False)):
+        case = data.case
+        lab, field = (
+            table_from_arrays(
+                {**t.columns, "gravimetric_water_content": 0.1 + spread * np.linspace(0, 1, len(t))}
+            )
+            for t in (case.lab, case.field)
+        )
+        found = dependences(campaigns(replace(case, lab=lab, field=field)))
+        assert any("water" in name for name in found) == there
+
+
 def test_a_condition_that_a_simulator_knows_is_no_dependence(data):
     assert "depends_on_inflation_pressure" not in {
         name for name, e in dependences(data).items() if "pull" in e.outputs

@@ -71,6 +71,26 @@ def test_rows_of_one_place_in_the_run_order_are_named_by_line():
     assert "the same run_order" not in copied
 
 
+@pytest.mark.parametrize("spread", [0.4, 4.0])
+def test_a_state_that_varies_in_the_calibration_alone_is_asked_after(spread):
+    """Whatever its unit makes of its size: a speed from 0.8 m/s to 1.2 m/s varies as well."""
+    case = make_case(None)
+
+    def with_speeds(lab, field):
+        tables = (
+            table_from_arrays({**t.columns, "speed_m_s": 1.0 + spread * part * ramp(t)})
+            for t, part in ((case.lab, lab), (case.field, field))
+        )
+        return replace(case, **dict(zip(("lab", "field"), tables, strict=True)))
+
+    def ramp(table):
+        return np.linspace(-0.2, 0.2, len(table))
+
+    assert "were the two swapped" in said(with_speeds(1.0, 0.0))
+    for lab, field in ((1.0, 1.0), (0.0, 1.0), (0.0, 0.0)):
+        assert "were the two swapped" not in said(with_speeds(lab, field))
+
+
 def test_columns_that_were_swapped_pull_more_than_the_wheel_carries():
     case = make_case(None)
     found = said(changed(case, **{PULL: case.field[RUT], RUT: case.field[PULL]}))
