@@ -25,7 +25,9 @@ def diagnose(
     seed: opt.Seed = 1,
     run: Annotated[Path | None, typer.Option(help="Run folder of `calib fit`.")] = None,
     field: Annotated[Path | None, typer.Option(help="CSV of the field campaign.")] = None,
-    effects: Annotated[Path | None, typer.Option(help="Python file with your effects.")] = None,
+    effects: Annotated[
+        Path | None, typer.Option(help="Python file with effects of this diagnosis alone.")
+    ] = None,
     overwrite: opt.Overwrite = False,
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
