@@ -7,10 +7,10 @@
 
 Of each area of `AREAS` so many places are drawn: a comparison, an operator, a number, a truth
 value, a condition, a sign or what a function returns. Each change is made in a copy of the
-project, and the tests of its module run there up to the first that fails: it was killed. So was
-one that takes five times the tests' processor time: it hangs. Not drawn from are messages,
-annotations, decorators and the guards `strict=`, `repr=` and `compare=`, of which no result
-depends. Each result is a line of `out/mutation/SEED.jsonl`; `reports/mutation.md` explains them.
+project, and the tests of its module run there up to the first that fails: it was killed. Where
+none fails, all of its room run. So was one that takes five times the tests' processor time: it
+hangs. Not drawn from are messages, annotations, decorators and the guards `strict=`, `repr=` and
+`compare=`, of which no result depends. Each result is a line of `out/mutation/SEED.jsonl`; `reports/mutation.md` explains them.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ ALSO = {
     "inference/likelihood": "inference/test_problem.py inference/test_conjugate.py",
     "inference/diagnostics": "inference/sampling/test_gate.py inference/sampling/test_walk.py "
     "report/test_posterior_text.py validation/test_sensitivity.py",
-    "gap/effects/": "gap/test_effects.py gap/test_forward.py gap/test_load_effects.py "
-    "gap/test_declared.py gap/test_which.py",
+    "gap/effects/": "gap/test_effect_equations.py gap/test_effects.py gap/test_forward.py "
+    "gap/test_load_effects.py gap/test_declared.py gap/test_which.py",
     "gap/ascent": "gap/test_fit.py",
     "gap/corrected": "gap/test_case.py",
     "gap/diagnose": "gap/test_case.py gap/test_hypotheses.py gap/test_files.py",
@@ -212,19 +212,25 @@ class Copy:
         return took
 
     def judge(self, place: Place) -> dict[str, object]:
-        """Make a change, run the tests of its module, and take it back."""
-        path, tests = self.root / place.file, tests_of(place.file)
+        """Make a change, run the tests of its module, then of its room, and take it back."""
+        path = self.root / place.file
         text = path.read_text(encoding="utf-8")
         new, kind, line, what = changed(text, place.k)
-        limit = 5.0 * self.usual(tests) + 20.0
-        try:
-            write(path, new)
-            code, took, said = self.run(tests, limit)
-        finally:
-            write(path, text)
+        code, total, said = 0, 0.0, ""
+        room = Path(place.file).relative_to("calib").parts[0]
+        for tests in (tests_of(place.file), (room,)):
+            limit = 5.0 * self.usual(tests) + 20.0
+            try:
+                write(path, new)
+                code, took, said = self.run(tests, limit)
+            finally:
+                write(path, text)
+            total += took
+            if code:
+                break
         fate = "survived" if code == 0 else "hung" if code < 0 else "killed"
         return {**vars(place), "kind": kind, "line": line, "what": what, "fate": fate,
-                "seconds": round(took, 1), "said": "" if code == 0 else said}  # fmt: skip
+                "seconds": round(total, 1), "said": "" if code == 0 else said}  # fmt: skip
 
 
 def write(path: Path, text: str) -> None:

@@ -54,9 +54,12 @@ def commands(block: Block, run: Calib, page: str) -> list[Ran]:
         if not words:
             continue
         assert words[0] == "calib", f"{page}: {line}"
+        words, into = (words[:-2], words[-1]) if ">" in words else (words, "")
         alone = ["--workers", "1"] if words[1] in ALONE and "--workers" not in words else []
         ran = run(*words[1:], *alone)
         assert ran.code == block.exit_code, f"{page}: {line}\n{ran.out}\n{ran.err}"
+        if into:
+            Path(into).write_text(ran.out, encoding="utf-8")
         found.append(ran)
     return found
 
