@@ -2,15 +2,16 @@
 
     python benchmarks/mutation.py --of 40 --seed 22           # goes on where it was stopped
     python benchmarks/mutation.py --of 9 9 6 36 --seed 24     # so many of each area
-    python benchmarks/mutation.py --seed 22 --again FILE:K    # one that survived, once more
+    python benchmarks/mutation.py --seed 22 --again FILE:K --room  # one that survived, once more
     python benchmarks/mutation.py --seed 22 --table           # what was found so far
 
 Of each area of `AREAS` so many places are drawn: a comparison, an operator, a number, a truth
 value, a condition, a sign or what a function returns. Each change is made in a copy of the
-project, and the tests of its module run there up to the first that fails: it was killed. Where
-none fails, all of its room run. So was one that takes five times the tests' processor time: it
-hangs. Not drawn from are messages, annotations, decorators and the guards `strict=`, `repr=` and
-`compare=`, of which no result depends. Each result is a line of `out/mutation/SEED.jsonl`; `reports/mutation.md` explains them.
+project, and the tests of its module run there up to the first that fails: it was killed. So was
+one that takes five times the tests' processor time: it hangs. With --room those of its room run
+where none of these fails. Not drawn from are messages, annotations, decorators and the guards
+`strict=`, `repr=` and `compare=`, of which no result depends. Each result is a line of
+`out/mutation/SEED.jsonl`; `reports/mutation.md` explains them.
 """
 
 from __future__ import annotations
@@ -211,14 +212,14 @@ class Copy:
             raise SystemExit(f"the tests fail without a change: {said}")
         return took
 
-    def judge(self, place: Place) -> dict[str, object]:
-        """Make a change, run the tests of its module, then of its room, and take it back."""
+    def judge(self, place: Place, *, room: bool) -> dict[str, object]:
+        """Make a change, run the tests of its module, perhaps of its room, and take it back."""
         path = self.root / place.file
         text = path.read_text(encoding="utf-8")
         new, kind, line, what = changed(text, place.k)
         code, total, said = 0, 0.0, ""
-        room = Path(place.file).relative_to("calib").parts[0]
-        for tests in (tests_of(place.file), (room,)):
+        rooms = [(Path(place.file).parts[1],)] if room else []
+        for tests in (tests_of(place.file), *rooms):
             limit = 5.0 * self.usual(tests) + 20.0
             try:
                 write(path, new)
@@ -270,6 +271,7 @@ def main() -> None:
     ask = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     ask.add_argument("--of", type=int, nargs="+", default=[40], help="places of each area")
     ask.add_argument("--seed", type=int, default=22)
+    ask.add_argument("--room", action="store_true", help="where none fails, all of the room's")
     ask.add_argument("--again", nargs="+", default=(), help="FILE:K to judge once more")
     ask.add_argument("--table", action="store_true")
     asked = ask.parse_args()
@@ -289,7 +291,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="calib-mutation-") as folder:
         copy = Copy(Path(folder))
         for place in again or first:
-            result = copy.judge(place)
+            result = copy.judge(place, room=asked.room)
             with file.open("a", encoding="utf-8") as lines:
                 lines.write(json.dumps(result) + "\n")
 

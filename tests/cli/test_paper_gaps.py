@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 from pathlib import Path
@@ -9,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from calib.batch.environment import sha256
+from calib.cli.gap import diagnose as cli_diagnose
+from calib.gap.diagnose import diagnose
 from tests.cli.test_cli import Calib, assert_refused, calib, contents  # noqa: F401
 
 
@@ -79,3 +82,9 @@ def test_the_report_of_the_embedded_data_has_the_section(
     assert asked == [5]
     assert set(json.loads(Path("rep/summary.json").read_text())["paper_gaps"]) == {"plain_bekker"}
     assert 'id="paper-gaps"' in Path("rep/index.html").read_text()
+
+
+def test_in_python_a_diagnosis_is_the_commands() -> None:
+    """Without a seed both draw the same."""
+    default = inspect.signature(cli_diagnose).parameters["seed"].default
+    assert inspect.signature(diagnose).parameters["seed"].default == default

@@ -120,3 +120,17 @@ def test_noise_does_not_depend_on_the_unit_of_a_parameter(problems):
         found.append([noise.sigma for each in noises for noise in each.values()])
     np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
     np.testing.assert_allclose(found[2], found[0], rtol=1e-6)
+
+
+def test_derivatives_are_taken_within_a_small_part_of_a_prior(problems):
+    """Not beyond a bound either: beside the upper one they are taken backwards."""
+    for problem in problems:
+        psi = drawn(problem, 2)
+        d = psi.shape[1]
+        steps = problem.around(psi).reshape(2, d, d) - psi[:, None]
+        off = steps[:, ~np.eye(d, dtype=bool)]
+        np.testing.assert_array_equal(off, 0.0)
+        sizes = np.abs(np.diagonal(steps, axis1=1, axis2=2)) / problem.width
+        np.testing.assert_allclose(sizes, 1e-4, rtol=1e-3)
+        top = np.where(np.isfinite(problem.upper), problem.upper, psi[:1])
+        assert (problem.around(top) <= problem.upper).all()

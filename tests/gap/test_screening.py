@@ -11,7 +11,7 @@ from calib.errors import CalibError
 from calib.gap.case import campaigns
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
-from calib.gap.screening import LAB_OUTLIER, OUTLIER
+from calib.gap.screening import LAB_OUTLIER, OUTLIER, _most
 from tests.gap.cases import PULL_ONLY, make_case
 
 FEW = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}
@@ -92,3 +92,8 @@ def test_few_rows_are_counted_before_any_is_set_aside(rows):
     few = replace(case, field=case.field.take(np.arange(rows)))
     with pytest.raises(CalibError, match=f"{rows} field rows with drawbar_pull_kn"):
         screened_ranking(few, 1, FEW)
+
+
+@pytest.mark.parametrize(("rows", "most"), [(3, 1), (19, 1), (20, 2), (57, 5)])
+def test_a_tenth_of_the_rows_may_be_outliers_and_one_always(rows, most):
+    assert _most(rows) == most
