@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -224,3 +226,29 @@ def test_beyond_the_pressures_of_both_campaigns_the_pull_goes_on_straight(data):
     for beyond in (3.0, 9.0):
         np.testing.assert_allclose(pull(beyond, high), pull(0.0, high) + slope * beyond)
         np.testing.assert_allclose(pull(low - beyond, high), pull(low, high) - slope * beyond)
+
+
+@pytest.mark.parametrize("beyond", [False, True])
+@pytest.mark.parametrize(
+    "effect", ["lug_thrust", "multipass_compaction", "slip_zero_shift", "pressure_gauge_bias"]
+)
+def test_a_form_error_is_of_the_functions_it_is_named_for(data, effect, beyond):
+    """1 + c1 u + c2 (3 u^2 - 1)/2 + c3 v + c4 w over slip, pressure and its own covariate."""
+    forward = Forward(data, single(data, effect), SIGMA)
+    acting, view = EFFECTS[effect], data.view
+    if beyond:
+        wider = {c: v.mean() + 1.4 * (v - v.mean()) for c, v in view.conditions.items()}
+        wider["pass_number"] = view.conditions["pass_number"] * 3.0
+        view = replace(view, conditions=wider)
+    slip, pressure = (forward.covariates.over(view, what) for what in ("slip", "pressure"))
+    written = []
+    if "slip" in acting.form:
+        written += [slip, (3.0 * slip**2 - 1.0) / 2.0]
+    if {"pressure", "extrapolation"} & set(acting.form):
+        written += [pressure]
+    if "shape" in acting.form:
+        reference, own = (np.log(v.conditions["pass_number"]) for v in (data.view, view))
+        middle = (reference.max() + reference.min()) / 2.0
+        written += [np.clip((own - middle) / (np.ptp(reference) / 2.0), -1.5, 1.5)]
+    (basis,) = forward._form(view)
+    np.testing.assert_allclose(basis, np.stack(written, axis=1), atol=1e-12)
