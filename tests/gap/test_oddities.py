@@ -45,6 +45,16 @@ def test_a_misspelt_column_is_asked_after():
     assert found.endswith("a column is not used: 'tyre_widht_m': did you mean tyre_width_m?")
 
 
+def test_outputs_that_are_not_there_are_told_by_others():
+    case = make_case(None)
+    without = table_without(case.field, PULL)
+    assert "have no" not in "\n".join(oddities(case.lab, without, case.models))
+    holed = np.array(case.field[RUT])
+    holed[[2, 5]] = np.nan
+    field = replace(case.field, columns={**case.field.columns, RUT: holed})
+    assert "2 of 27 field rows have no rut_depth" in said(replace(case, field=field))
+
+
 @pytest.mark.parametrize("what", sorted(NAMES))
 def test_another_unit_is_named_with_its_factor(what):
     column, factor, units = NAMES[what]
