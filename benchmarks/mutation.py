@@ -247,6 +247,8 @@ def table(rows: list[dict[str, object]]) -> None:
         judged.setdefault((str(row["file"]), int(str(row["k"]))), []).append(row)
     for area in AREAS:
         mine = [rows for rows in judged.values() if rows[0]["area"] == area]
+        if not mine:
+            continue
         cells = [area, str(len(places(area))), str(len(mine))]
         for when in (0, -1):
             killed = sum(rows[when]["fate"] != "survived" for rows in mine)

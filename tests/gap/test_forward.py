@@ -9,7 +9,7 @@ import pytest
 
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import effect_priors, pair, singles, unknowns
+from calib.gap.hypotheses import effect_priors, pair, shifts, singles, unknowns, with_remainder
 from calib.gap.hypothesis import Hypothesis
 from calib.inference.priors import Prior, Priors
 from tests.gap.cases import NOISE, campaigns_of
@@ -252,3 +252,34 @@ def test_a_form_error_is_of_the_functions_it_is_named_for(data, effect, beyond):
         written += [np.clip((own - middle) / (np.ptp(reference) / 2.0), -1.5, 1.5)]
     (basis,) = forward._form(view)
     np.testing.assert_allclose(basis, np.stack(written, axis=1), atol=1e-12)
+
+
+def test_without_a_cause_the_others_stay(data):
+    """Of a shift with something besides: either alone, and neither is the simulator."""
+    for h in with_remainder(data, shifts(data)[0]):
+        forward = Forward(data, h, SIGMA, {o.name: centre_of(o) for o in data.outputs})
+        rng = np.random.default_rng(2)
+        psi = centre(forward)
+        free = [slice(forward.shift_slice.start, forward.shift_slice.stop),
+                *forward.smooth_slices.values()]  # fmt: skip
+        for part in free:
+            psi[:, part] = 0.1 * rng.standard_normal((2, part.stop - part.start))
+        assert forward.causes == ("parameter_shift", "unknown")
+        unshifted, known = psi.copy(), psi.copy()
+        unshifted[:, forward.shift_slice] = 0.0
+        for part in forward.smooth_slices.values():
+            known[:, part] = 0.0
+        both, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
+        for left_out, other in (("parameter_shift", unshifted), ("unknown", known)):
+            found, expected = forward.without(psi, data.view, left_out), forward.field(
+                other, data.view)  # fmt: skip
+            for o in data.names:
+                np.testing.assert_array_equal(found[o], expected[o])
+            assert any(not np.allclose(found[o], both[o]) for o in data.names)
+        neither = forward.without(psi, data.view, "parameter_shift", "unknown")
+        for o in data.names:
+            np.testing.assert_allclose(neither[o], plain[o], rtol=1e-12)
+
+
+def centre_of(output) -> np.ndarray:
+    return np.array([p.loc for p in output.priors.free])

@@ -51,6 +51,18 @@ def test_shares_of_a_name_sum_to_one(data):
     assert {h.name for h in beside} == {"force_offset+unknown"}
 
 
+@pytest.mark.parametrize("outputs", ["both", "pull"])
+def test_nothing_unlisted_is_counted_twice(outputs):
+    found = unknowns(campaigns_of(None, outputs))
+    kinds = [
+        (h.smooth, h.smooth_over, h.smooth_decay, h.onset_over, h.smooth_outputs) for h in found
+    ]
+    assert len(set(kinds)) == len(kinds)
+    touched = {h.smooth_outputs for h in found}
+    pull, rut = ("drawbar_pull",), ("rut_depth",)
+    assert touched == ({pull} if outputs == "pull" else {pull, rut, pull + rut})
+
+
 def test_a_wider_prior_has_the_same_middle(data):
     (single,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
     wide = wider(single)
