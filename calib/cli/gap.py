@@ -67,7 +67,7 @@ def diagnose(
     files: dict[str, bytes] = {}
     if effects is not None:
         check_on_case(own, given, effects)
-        paths = [effects, *(effects.with_name(f"{name}.toml") for name in own)]
+        paths = [effects, *(e.prior_file for e in own.values() if e.prior_file is not None)]
         files = {path.name: path.read_bytes() for path in paths}
     with progress_bars() as tell:
         emulations = prepare_case(given, run, seed, workers, tell)
