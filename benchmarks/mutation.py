@@ -1,15 +1,17 @@
 """Whether the tests notice a small error: the code is changed at random, one place at a time.
 
     python benchmarks/mutation.py --of 40 --seed 22           # goes on where it was stopped
-    python benchmarks/mutation.py --seed 22 --again FILE:K    # one that survived, once more
+    python benchmarks/mutation.py --of 9 9 6 36 --seed 24     # so many of each area
+    python benchmarks/mutation.py --seed 22 --again FILE:K --room  # one that survived, once more
     python benchmarks/mutation.py --seed 22 --table           # what was found so far
 
 Of each area of `AREAS` so many places are drawn: a comparison, an operator, a number, a truth
 value, a condition, a sign or what a function returns. Each change is made in a copy of the
 project, and the tests of its module run there up to the first that fails: it was killed. So was
-one that takes five times the tests' processor time: it hangs. Not drawn from are messages,
-annotations, decorators and the guards `strict=`, `repr=` and `compare=`, of which no result
-depends. Each result is a line of `out/mutation/SEED.jsonl`; `reports/mutation.md` explains them.
+one that takes five times the tests' processor time: it hangs. With --room those of its room run
+where none of these fails. Not drawn from are messages, annotations, decorators and the guards
+`strict=`, `repr=` and `compare=`, of which no result depends. Each result is a line of
+`out/mutation/SEED.jsonl`; `reports/mutation.md` explains them.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import cache_from_source
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -44,13 +47,13 @@ ALSO = {
     "models/": "models/test_equations.py models/test_published.py models/test_properties.py "
     "models/test_examples.py extension/test_extension.py",
     "models/latex": "report/publish/test_latex.py",
-    "models/magic_formula": "inference/estimators/test_genetic.py",
+    "models/magic_formula": "inference/estimators/test_genetic.py report/test_study.py",
     "models/wong_reece": "models/test_rigid_wheel.py",
     "inference/likelihood": "inference/test_problem.py inference/test_conjugate.py",
     "inference/diagnostics": "inference/sampling/test_gate.py inference/sampling/test_walk.py "
     "report/test_posterior_text.py validation/test_sensitivity.py",
-    "gap/effects/": "gap/test_effects.py gap/test_forward.py gap/test_load_effects.py "
-    "gap/test_declared.py gap/test_which.py",
+    "gap/effects/": "gap/test_effect_equations.py gap/test_effects.py gap/test_forward.py "
+    "gap/test_load_effects.py gap/test_declared.py gap/test_which.py",
     "gap/ascent": "gap/test_fit.py",
     "gap/corrected": "gap/test_case.py",
     "gap/diagnose": "gap/test_case.py gap/test_hypotheses.py gap/test_files.py",
@@ -157,14 +160,14 @@ def area_of(file: str) -> str:
     return next(area for area in AREAS if any(place.file == file for place in places(area)))
 
 
-def drawn(of: int, seed: int) -> list[Place]:
-    """Draw so many changes of each area, the areas by turns."""
+def drawn(of: list[int], seed: int) -> list[Place]:
+    """Draw so many changes of each area, or as many of all, the areas by turns."""
     rng = np.random.default_rng(seed)
     each = []
-    for area in AREAS:
+    for area, n in zip(AREAS, of if len(of) > 1 else of * len(AREAS), strict=True):
         every = places(area)
-        each.append([every[i] for i in rng.permutation(len(every))[:of]])
-    return [place for turn in zip(*each, strict=True) for place in turn]
+        each.append([every[i] for i in rng.permutation(len(every))[:n]])
+    return [place for turn in zip_longest(*each) for place in turn if place]
 
 
 def tests_of(file: str) -> tuple[str, ...]:
@@ -209,20 +212,26 @@ class Copy:
             raise SystemExit(f"the tests fail without a change: {said}")
         return took
 
-    def judge(self, place: Place) -> dict[str, object]:
-        """Make a change, run the tests of its module, and take it back."""
-        path, tests = self.root / place.file, tests_of(place.file)
+    def judge(self, place: Place, *, room: bool) -> dict[str, object]:
+        """Make a change, run the tests of its module, perhaps of its room, and take it back."""
+        path = self.root / place.file
         text = path.read_text(encoding="utf-8")
         new, kind, line, what = changed(text, place.k)
-        limit = 5.0 * self.usual(tests) + 20.0
-        try:
-            write(path, new)
-            code, took, said = self.run(tests, limit)
-        finally:
-            write(path, text)
+        code, total, said = 0, 0.0, ""
+        rooms = [(Path(place.file).parts[1],)] if room else []
+        for tests in (tests_of(place.file), *rooms):
+            limit = 5.0 * self.usual(tests) + 20.0
+            try:
+                write(path, new)
+                code, took, said = self.run(tests, limit)
+            finally:
+                write(path, text)
+            total += took
+            if code:
+                break
         fate = "survived" if code == 0 else "hung" if code < 0 else "killed"
         return {**vars(place), "kind": kind, "line": line, "what": what, "fate": fate,
-                "seconds": round(took, 1), "said": "" if code == 0 else said}  # fmt: skip
+                "seconds": round(total, 1), "said": "" if code == 0 else said}  # fmt: skip
 
 
 def write(path: Path, text: str) -> None:
@@ -238,6 +247,8 @@ def table(rows: list[dict[str, object]]) -> None:
         judged.setdefault((str(row["file"]), int(str(row["k"]))), []).append(row)
     for area in AREAS:
         mine = [rows for rows in judged.values() if rows[0]["area"] == area]
+        if not mine:
+            continue
         cells = [area, str(len(places(area))), str(len(mine))]
         for when in (0, -1):
             killed = sum(rows[when]["fate"] != "survived" for rows in mine)
@@ -260,8 +271,9 @@ def wilson(k: int, n: int) -> tuple[float, float]:
 def main() -> None:
     """Judge what was drawn and not judged yet, or some once more; or show what was found."""
     ask = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
-    ask.add_argument("--of", type=int, default=40, help="places of each area")
+    ask.add_argument("--of", type=int, nargs="+", default=[40], help="places of each area")
     ask.add_argument("--seed", type=int, default=22)
+    ask.add_argument("--room", action="store_true", help="where none fails, all of the room's")
     ask.add_argument("--again", nargs="+", default=(), help="FILE:K to judge once more")
     ask.add_argument("--table", action="store_true")
     asked = ask.parse_args()
@@ -281,7 +293,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="calib-mutation-") as folder:
         copy = Copy(Path(folder))
         for place in again or first:
-            result = copy.judge(place)
+            result = copy.judge(place, room=asked.room)
             with file.open("a", encoding="utf-8") as lines:
                 lines.write(json.dumps(result) + "\n")
 

@@ -13,7 +13,7 @@ from calib.cli.machine import Json, finish
 
 
 def campaign(
-    plan: Annotated[Path, typer.Argument(help="TOML file with the tasks (see the README).")],
+    plan: Annotated[Path, typer.Argument(help="TOML file with the tasks: docs/formats/inputs.md.")],
     out: Annotated[Path, typer.Option(help="Folder of results; resumed if it is there.")] = Path(
         "calib-campaign"
     ),

@@ -25,7 +25,9 @@ def diagnose(
     seed: opt.Seed = 1,
     run: Annotated[Path | None, typer.Option(help="Run folder of `calib fit`.")] = None,
     field: Annotated[Path | None, typer.Option(help="CSV of the field campaign.")] = None,
-    effects: Annotated[Path | None, typer.Option(help="Python file with your effects.")] = None,
+    effects: Annotated[
+        Path | None, typer.Option(help="Python file with effects of this diagnosis alone.")
+    ] = None,
     overwrite: opt.Overwrite = False,
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
@@ -65,7 +67,7 @@ def diagnose(
     files: dict[str, bytes] = {}
     if effects is not None:
         check_on_case(own, given, effects)
-        paths = [effects, *(effects.with_name(f"{name}.toml") for name in own)]
+        paths = [effects, *(e.prior_file for e in own.values() if e.prior_file is not None)]
         files = {path.name: path.read_bytes() for path in paths}
     with progress_bars() as tell:
         emulations = prepare_case(given, run, seed, workers, tell)

@@ -17,6 +17,7 @@ from scipy.special import ndtri
 from calib.models.base import Array
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}
+_WINDOW = 5.0
 
 
 def _stats() -> Any:
@@ -85,7 +86,7 @@ def _normal_scores(x: Array) -> Array:
     return scores.reshape(x.shape)
 
 
-def autocorrelation_time(chain: Array, c: float = 5.0) -> Array:
+def autocorrelation_time(chain: Array) -> Array:
     """Integrated autocorrelation time in steps, shape (walkers, steps, d) to (d,), as emcee's.
 
     The window is the first that spans five of them (Sokal). NaN if a walker never moved.
@@ -103,8 +104,8 @@ def autocorrelation_time(chain: Array, c: float = 5.0) -> Array:
         covariance[np.ptp(chain[..., j], axis=1) == 0.0] = 0.0
         with np.errstate(invalid="ignore"):
             taus = 2.0 * np.cumsum((covariance / covariance[:, :1]).mean(axis=0)) - 1.0
-        inside = np.arange(steps) < c * taus
-        tau[j] = taus[inside.argmin() if inside.any() else -1]
+        # The sum over all lags is zero, so that the window ends; without a time all are NaN.
+        tau[j] = taus[(np.arange(steps) < _WINDOW * taus).argmin()]
     return tau
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 from pathlib import Path
@@ -9,6 +10,8 @@ from pathlib import Path
 import pytest
 
 from calib.batch.environment import sha256
+from calib.cli.gap import diagnose as cli_diagnose
+from calib.gap.diagnose import diagnose
 from tests.cli.test_cli import Calib, assert_refused, calib, contents  # noqa: F401
 
 
@@ -79,3 +82,78 @@ def test_the_report_of_the_embedded_data_has_the_section(
     assert asked == [5]
     assert set(json.loads(Path("rep/summary.json").read_text())["paper_gaps"]) == {"plain_bekker"}
     assert 'id="paper-gaps"' in Path("rep/index.html").read_text()
+
+
+def test_in_python_a_diagnosis_is_the_commands() -> None:
+    """Without a seed both draw the same."""
+    default = inspect.signature(cli_diagnose).parameters["seed"].default
+    assert inspect.signature(diagnose).parameters["seed"].default == default
+
+
+EFFECTS = '''
+import calib
+
+class SoftPatch(calib.Effect):
+    name = "soft_patch"
+    title = "the last runs were on softer ground"
+    parameters = ("deeper",)
+    outputs = ("sinkage",)
+    form = ("size",)
+    priors = """
+model = "soft_patch"
+
+[parameters.deeper]
+dist = "normal"
+mean = 0.0
+sd = 0.2
+unit = "1"
+reason = "ruts a fifth deeper"
+source = "assumed"
+"""
+
+    def on_output(self, phi, output, location, view):
+        return location + phi[:, :1] * (view.slip() > 0.15)
+'''
+
+
+def test_a_diagnosis_with_an_effect_of_ones_own_is_predicted_from_with_it(calib: Calib) -> None:  # noqa: F811
+    assert calib("data", "he2019-gaps", "--out", "gaps").code == 0
+    Path("mine.py").write_text(EFFECTS)
+    made = calib("diagnose", "gaps/plain_bekker", "--effects", "mine.py", "--out", "found")
+    assert made.code == 0, made.err
+    found = json.loads(Path("found/diagnosis.json").read_text())
+    assert "soft_patch" in found["inclusion"]
+    recorded = json.loads(Path("found/inputs.json").read_text())["effects"]
+    assert recorded == {"mine.py": sha256(Path("mine.py").read_bytes())}
+    fresh = Path("gaps/plain_bekker/fresh.csv")
+    whole = calib("predict", "found", "--at", fresh, "--effects", "mine.py", "--out", "p.csv")
+    assert whole.code == 0, whole.err
+    assert whole.err == ""
+    rows = Path("p.csv").read_text().splitlines()
+    assert len(rows) == len(fresh.read_text().splitlines())
+    assert "rut_depth_mm" in rows[0]
+    # Beyond what either campaign covered it is said of each condition in how many rows.
+    head, first, *_ = fresh.read_text().splitlines()
+    names, cells = head.split(","), first.split(",")
+    cells[names.index("slip_ratio")] = "0.9"
+    Path("far.csv").write_text(f"{head}\n{first}\n{','.join(cells)}\n")
+    far = calib("predict", "found", "--at", "far.csv", "--effects", "mine.py")
+    assert far.code == 0, far.err
+    assert "outside what either campaign covered: slip_ratio in 1 rows" in far.err
+    without = calib("predict", "found", "--at", fresh)
+    assert (without.code, "soft_patch" in without.err) in {(0, False), (2, True)}
+
+
+def test_what_is_to_be_diagnosed_has_to_be_clear(calib: Calib) -> None:  # noqa: F811
+    for given in ((), ("case", "--run", "run"), ("--run", "run"), ("--field", "field.csv")):
+        told = calib("diagnose", *given, "--out", "found")
+        assert_refused(told, ["it is not clear what to diagnose", "--run RUN together with"])
+    assert not Path("found").exists()
+
+
+def test_effects_are_of_a_diagnosis_alone(calib: Calib) -> None:  # noqa: F811
+    assert calib("template", "bekker", "--out", "ruts.csv").code == 0
+    assert calib("fit", "ruts.csv", "--model", "bekker", "--out", "run").code == 0
+    for option in (("--effects", "mine.py"), ("--without", "force_offset")):
+        told = calib("predict", "run", "--at", "ruts.csv", *option)
+        assert_refused(told, ["there is no diagnosis, which alone has effects", "run"])

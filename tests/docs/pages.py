@@ -21,10 +21,9 @@ _MARK = re.compile(r"^(?:%|<!--)\s*(slow|not run|exit \d)\b")
 
 @dataclass(frozen=True)
 class Block:
-    """A block with its language (a directive's name in braces), options and marks."""
+    """A block with its language, caption and marks."""
 
     language: str
-    argument: str
     text: str
     line: int
     caption: str = ""
@@ -58,7 +57,7 @@ def blocks(text: str) -> Iterator[Block]:
 
 
 def _block(head: str, inside: list[str], line: int, marks: frozenset[str]) -> Block:
-    language, _, argument = head.strip().partition(" ")
+    language = head.strip().partition(" ")[0]
     caption, first = "", 0
     if language.startswith("{"):
         options = [re.match(r":([\w-]+):\s*(.*)$", text) for text in inside]
@@ -67,4 +66,4 @@ def _block(head: str, inside: list[str], line: int, marks: frozenset[str]) -> Bl
         while first < len(inside) and not inside[first].strip():
             first += 1
     text = "".join(f"{part}\n" for part in inside[first:])
-    return Block(language.strip("{}"), argument, text, line + first, caption, marks)
+    return Block(language.strip("{}"), text, line + first, caption, marks)

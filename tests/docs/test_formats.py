@@ -1,4 +1,4 @@
-"""The page of the result files names every key that the committed files have."""
+"""The pages of the files name every key: of the committed results, and of a simulator file."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from calib.check.schema import RunRecord
+from calib.models.simulators.files import SimulatorFile
 from tests.docs.pages import DOCS, ROOT
 
 REPORTS = ROOT / "reports"
@@ -56,3 +57,29 @@ def test_the_keys_of_a_run_are_told() -> None:
         "schema",
     }
     assert fields <= set(re.findall(r"`(\w+)`", of_run))
+
+
+def of_simulators() -> dict[str, str]:
+    """Return what the table of a simulator file's keys says of each: its default."""
+    page = (DOCS / "simulators.md").read_text(encoding="utf-8")
+    found: dict[str, str] = {}
+    for line in page.partition("## Every key of the file")[2].splitlines():
+        if line.startswith("| `"):
+            keys, _, default = line.split(" | ")[:3]
+            names = re.findall(r"`\[?(\w+(?:\.[a-z]+)?)", keys)
+            found |= dict.fromkeys(names, default.strip("` "))
+    return found
+
+
+def test_every_key_of_a_simulator_file_is_told_with_its_default() -> None:
+    told = of_simulators()
+    fields = dict(SimulatorFile.model_fields)
+    budget = fields["emulator"].annotation.model_fields
+    fields |= {f"emulator.{name}": field for name, field in budget.items()}
+    assert set(told) == set(fields)
+    plain = {
+        name: json.dumps(field.default)
+        for name, field in fields.items()
+        if isinstance(field.default, (str, int, float, bool)) and name != "cache"
+    }
+    assert {name: told[name] for name in plain} == plain

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.test_cli import Calib, Ran
-from tests.docs.pages import PAGES, Block, blocks
+from tests.docs.pages import PAGES, ROOT, Block, blocks
 
 BLOCKS = {page: list(blocks(path.read_text(encoding="utf-8"))) for page, path in PAGES.items()}
 RUN = ("console", "python")
@@ -27,7 +27,7 @@ def follow(page: str, run: Calib, *, slow: bool) -> None:
         if "not run" in block.marks or (block.slow and not slow):
             printed = ""
         elif block.caption:
-            write(block, PAGES[page].parent)
+            write(block)
         elif block.language == "console":
             printed = "".join(ran.out + ran.err for ran in commands(block, run, page))
         elif block.language == "python":
@@ -41,13 +41,10 @@ def follow(page: str, run: Calib, *, slow: bool) -> None:
             compare(block, printed, page)
 
 
-def write(block: Block, folder: Path) -> None:
-    text = block.text
-    if block.language == "literalinclude":
-        text = (folder / block.argument).read_text(encoding="utf-8")
+def write(block: Block) -> None:
     path = Path(block.caption)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
+    path.write_text(block.text, encoding="utf-8")
 
 
 def commands(block: Block, run: Calib, page: str) -> list[Ran]:
@@ -57,9 +54,12 @@ def commands(block: Block, run: Calib, page: str) -> list[Ran]:
         if not words:
             continue
         assert words[0] == "calib", f"{page}: {line}"
+        words, into = (words[:-2], words[-1]) if ">" in words else (words, "")
         alone = ["--workers", "1"] if words[1] in ALONE and "--workers" not in words else []
         ran = run(*words[1:], *alone)
         assert ran.code == block.exit_code, f"{page}: {line}\n{ran.out}\n{ran.err}"
+        if into:
+            Path(into).write_text(ran.out, encoding="utf-8")
         found.append(ran)
     return found
 
@@ -86,6 +86,13 @@ def test_a_page_does_what_it_says(page: str, run: Calib) -> None:
 @pytest.mark.parametrize("page", [p for p, found in BLOCKS.items() if any(b.slow for b in found)])
 def test_a_page_does_what_it_says_to_the_end(page: str, run: Calib) -> None:
     follow(page, run, slow=True)
+
+
+def test_files_of_a_users_own_are_on_the_page_as_they_are_tested() -> None:
+    """Where the sources of the pages are read, nothing would be included."""
+    shown = {b.caption: b.text for b in BLOCKS["docs/extend.md"] if b.caption}
+    for name in ("wheel_torque.py", "load_sensitivity.py"):
+        assert shown[name] == (ROOT / "tests" / "extension" / name).read_text(encoding="utf-8")
 
 
 PAGE = """\

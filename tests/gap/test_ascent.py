@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import numpy as np
 import pytest
 
@@ -99,3 +101,36 @@ def test_the_log_density_is_the_same_in_parts(data, problems):
     whole = log_joint(truncated[0], psi)
     some = np.array([0, 1023, 1024, 2047, 2048, 2499])
     np.testing.assert_allclose(log_joint(truncated[0], psi[some]), whole[some], rtol=1e-9)
+
+
+def test_noise_does_not_depend_on_the_unit_of_a_parameter(problems):
+    """A parameter in a unit a thousand times smaller: its prior is as much wider."""
+    problem = problems[0]
+    psi = drawn(problem, 2)
+    raw = problem.raw(psi)
+    around = problem.raw(problem.around(psi))
+    sds = problem.sds({o: Noise(s) for o, s in SIGMA.items()})
+    found = []
+    for unit in (1.0, 1e-3, 1e3):
+        other = copy(problem)
+        other.width = problem.width / unit
+        scaled = unit * problem.jacobian(psi, raw, around) / sds
+        hessian = scaled @ scaled.swapaxes(1, 2) + np.diag(other.width**-2.0)
+        noises = other.update_noises(raw, scaled, hessian)
+        found.append([noise.sigma for each in noises for noise in each.values()])
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
+    np.testing.assert_allclose(found[2], found[0], rtol=1e-6)
+
+
+def test_derivatives_are_taken_within_a_small_part_of_a_prior(problems):
+    """Not beyond a bound either: beside the upper one they are taken backwards."""
+    for problem in problems:
+        psi = drawn(problem, 2)
+        d = psi.shape[1]
+        steps = problem.around(psi).reshape(2, d, d) - psi[:, None]
+        off = steps[:, ~np.eye(d, dtype=bool)]
+        np.testing.assert_array_equal(off, 0.0)
+        sizes = np.abs(np.diagonal(steps, axis1=1, axis2=2)) / problem.width
+        np.testing.assert_allclose(sizes, 1e-4, rtol=1e-3)
+        top = np.where(np.isfinite(problem.upper), problem.upper, psi[:1])
+        assert (problem.around(top) <= problem.upper).all()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -143,6 +144,21 @@ def test_without_pressures_the_exponent_is_a_half():
         for t in (case.lab, case.field)
     ]
     assert campaigns(Case("bare", *bare, PULL_ONLY)).view.ground_exponent == 0.5
+
+
+@pytest.mark.parametrize(
+    ("field", "refused"), [(1.0, False), (0.02, False), (0.005, True), (200.0, True)]
+)
+@pytest.mark.parametrize("unit", [1e-4, 1.0])
+def test_outputs_a_hundred_times_apart_are_refused_however_small_they_are(unit, field, refused):
+    case = make_case(models=PULL_ONLY)
+    lab, there = (
+        replace(t, columns={**t.columns, "drawbar_pull_kn": f * t["drawbar_pull_kn"]})
+        for t, f in ((case.lab, unit), (case.field, unit * field))
+    )
+    scaled = replace(case, lab=lab, field=there)
+    with pytest.raises(CalibError, match="a factor of 100") if refused else nullcontext():
+        campaigns(scaled)
 
 
 def test_field_rows_that_are_the_calibrations_are_counted():

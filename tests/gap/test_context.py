@@ -60,6 +60,9 @@ def test_a_known_size_takes_the_place_of_the_prior():
             "both suspected and excluded",
         ),
         ("sizes = {force_offset = {offset = {mean = 1.0, sd = 0.0}}}", "greater than 0"),
+        ("sizes = {force_offset = {offset = {mean = nan, sd = 1.0}}}", "finite number"),
+        ("sizes = {force_offset = {offset = {mean = 1.0, sd = nan}}}", "finite number"),
+        ("suspected = {lug_thrust = nan}", "finite number"),
     ],
 )
 def test_what_is_wrong_with_a_context_is_named(tmp_path, table, words):

@@ -56,3 +56,17 @@ def test_pressure_on_the_ground_stands_for_that_in_the_tyre():
     ground = covariates.scaled(data.view, "average_ground_pressure_kpa")
     assert ground is not None
     np.testing.assert_array_equal(covariates.over(data.view, "pressure"), ground)
+
+
+def test_each_view_has_its_own_values_on_the_scale():
+    """The field's are kept for the next who asks, those of other conditions are not."""
+    data = campaigns(make_case(models=PULL_ONLY))
+    covariates = Covariates(data)
+    slip = data.case.field["slip_ratio"]
+    field = covariates.scaled(data.view, "slip_ratio")
+    for shift in (0.01, 0.05):
+        view = replace(data.view, conditions={**data.view.conditions, "slip_ratio": slip + shift})
+        found = covariates.scaled(view, "slip_ratio")
+        both = np.concatenate([data.case.lab["slip_ratio"], slip])
+        np.testing.assert_allclose(found - field, 2.0 * shift / np.ptp(both), rtol=1e-9)
+        np.testing.assert_array_equal(covariates.scaled(data.view, "slip_ratio"), field)

@@ -117,3 +117,114 @@ def test_without_an_order_nothing_is_kept_of_the_run_before(data):
     n = data.view.slip().size
     unknown = replace(data.view, conditions={**data.view.conditions, "run_order": np.full(n, 7.0)})
     assert not found.at(np.ones((1, 1)), np.empty(0), unknown, "drawbar_pull").any()
+
+
+DECAY = 3.0
+
+
+def cosines(u: np.ndarray, most: int, scale: float) -> list[tuple[np.ndarray, float]]:
+    """cos(j pi (u + 1)/2) of rms about one, the less probable the shorter its waves."""
+    return [
+        (
+            np.sqrt(2.0) * np.cos(j * np.pi * (np.clip(u, -1.2, 1.2) + 1.0) / 2.0),
+            scale / (1.0 + (j / DECAY) ** 2),
+        )
+        for j in range(1, most + 1)
+    ]
+
+
+def written_again(found: Discrepancy, view, over: str) -> list[tuple[np.ndarray, float]]:
+    """The terms of a discrepancy of the pull: functions of the rows, and their sds."""
+    u = {
+        what: found.covariates.over(view, what)
+        for what in ("slip", "order", "pressure", "speed", "passes", "load")
+    }
+    levels = {
+        what: np.unique(values).size
+        for what in u
+        if (values := found.covariates.over(found.data.view, what)) is not None
+    }
+    one = [(np.ones(len(u["slip"])), 1.0)]
+    if over in ("level", "sinkage"):
+        name = "drawbar_pull" if over == "level" else "rut_depth"
+        o = next(o for o in found.data.outputs if o.name == name)
+        theta = o.priors.to_natural(found.lab_mode[name][None])
+
+        def predicted(at) -> np.ndarray:
+            return o.problem.bound.location(theta, o.problem.bound.model.select(at.conditions))[0]
+
+        reference = predicted(found.data.view)
+        level = 2.0 * (predicted(view) - reference.min()) / np.ptp(reference) - 1.0
+        return one + cosines(np.clip(level, -1.5, 1.5), 8, 0.8)
+    if over == "order":
+        return one + cosines(u["order"], 12, 0.7)
+    if over in ("pressure", "speed", "passes"):
+        terms = cosines(u[over], min(levels[over] - 1, 6), 0.8)
+        level = written_level(found, view)
+        return [*one, *terms, (level, 0.5), *((level * b, 0.6 * w) for b, w in terms)]
+    slips = cosines(u["slip"], 10, 0.7)
+    terms = list(slips)
+    if over == "all":
+        terms += cosines(u["order"], 6, 0.5)
+    bends = 2 if over == "all" else 1
+    for b, w in cosines(u["pressure"], min(levels["pressure"] - 1, bends), 0.5):
+        terms += [(b, w), *((b * s, w * v) for s, v in slips[:4])]
+    if over == "all":
+        for what in ("speed", "passes", "load"):
+            if u[what] is not None:
+                terms += [*cosines(u[what], 3, 0.4), (u[what] * u["slip"], 0.4)]
+    return one + terms
+
+
+def written_level(found: Discrepancy, view) -> np.ndarray:
+    o = next(o for o in found.data.outputs if o.name == "drawbar_pull")
+    theta = o.priors.to_natural(found.lab_mode["drawbar_pull"][None])
+    select = o.problem.bound.model.select
+    at, reference = (
+        o.problem.bound.location(theta, select(v.conditions))[0] for v in (view, found.data.view)
+    )
+    return np.clip(2.0 * (at - reference.min()) / np.ptp(reference) - 1.0, -1.5, 1.5)
+
+
+@pytest.mark.parametrize(
+    "over", ["slip", "level", "sinkage", "order", "pressure", "speed", "passes", "all"]
+)
+@pytest.mark.parametrize("beyond", [False, True])
+def test_terms_are_those_of_its_equations(data, over, beyond):
+    """At the field's conditions and beyond them; what the terms are, and how large they may be."""
+    found = of(data, smooth_over=over, smooth_decay=DECAY)
+    view = data.view
+    if beyond:
+        wider = {c: v.mean() + 1.3 * (v - v.mean()) for c, v in view.conditions.items()}
+        view = replace(view, conditions=wider)
+    terms = written_again(found, view, over)
+    sds = found.sds("drawbar_pull")
+    np.testing.assert_allclose(sds, [w for _, w in terms])
+    basis = found.at(np.eye(sds.size), np.empty(0), view, "drawbar_pull")
+    np.testing.assert_allclose(basis, [b for b, _ in terms], atol=1e-12)
+
+
+def test_below_a_pressure_it_is_a_step_and_a_part_of_the_pull(data):
+    found = of(data, onset_over="low_pressure")
+    psi = data.view.conditions["inflation_pressure_psi"]
+    step, part = found.onset(data.view, "drawbar_pull", np.array([0.0]))
+    # On a scale on which 18 psi is 1 and 42 psi is -1; half way at its threshold.
+    np.testing.assert_allclose(step[0, psi < 20.0], 1.0, atol=1e-6)
+    np.testing.assert_allclose(step[0, psi > 40.0], 0.0, atol=1e-6)
+    level = written_level(found, data.view)
+    np.testing.assert_allclose(part, step * level)
+    u = found.onset_covariate(data.view, "drawbar_pull")
+    there = found.onset(data.view, "drawbar_pull", u[:1])
+    assert there[0][0, 0] == pytest.approx(0.5)
+
+
+def test_an_onset_rises_by_its_width(data):
+    """A logistic step of width 0.06, and a bend whose slope is that step."""
+    found = of(data, onset_over="slip")
+    u = found.onset_covariate(data.view, "drawbar_pull")
+    for threshold in (-0.3, 0.2):
+        step, bend = found.onset(data.view, "drawbar_pull", np.array([threshold]))
+        np.testing.assert_allclose(step[0], 1.0 / (1.0 + np.exp(-(u - threshold) / 0.06)))
+        np.testing.assert_allclose(
+            bend[0], 0.06 * np.log1p(np.exp((u - threshold) / 0.06)), rtol=1e-9, atol=1e-12
+        )

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from scipy.integrate import quad
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 from scipy.stats import multivariate_t
@@ -14,7 +16,8 @@ from scipy.stats import multivariate_t
 from calib.data import table_from_arrays
 from calib.gap.case import Campaigns, Case, campaigns
 from calib.gap.effects import EFFECTS
-from calib.gap.fit import Fit, fit
+from calib.gap.fit import Fit, _ln_mass, fit
+from calib.gap.fit import log_joint as joint
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
 from calib.gap.hypothesis import Hypothesis
@@ -164,3 +167,32 @@ def test_noise_of_a_soft_tyre_is_seen(kappa: float):
     assert found.rho == 0.0
     # 180 readings less a dozen parameters: 5.5 %.
     assert found.sigma == pytest.approx(0.02, rel=0.17)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(-1.0, 2.0), (-0.5, 0.1), (8.0, 9.0), (-9.0, -8.0), (20.0, np.inf),
+                      (-np.inf, -20.0), (-np.inf, np.inf), (3.0, 3.0001)],
+)  # fmt: skip
+def test_the_mass_between_two_ends_is_exact_in_either_tail(low, high):
+    """Against the integral of the density over its value at the end that is nearer the middle."""
+    nearest = min(max(0.0, low), high)
+    ends = (max(low, -40.0), min(high, 40.0))
+    inside = sorted({*ends, nearest, *np.clip([nearest - 0.5, nearest + 0.5], *ends)})
+    total = sum(
+        quad(lambda x: np.exp(0.5 * (nearest**2 - x**2)), a, b, epsabs=0.0, epsrel=1e-11)[0]
+        for a, b in pairwise(inside)
+    )
+    expected = np.log(total) - 0.5 * nearest**2 - 0.5 * np.log(2.0 * np.pi)
+    assert _ln_mass(low, high) == pytest.approx(expected, abs=1e-9)
+
+
+def test_the_joint_density_is_likelihood_times_prior_at_every_draw(data, fitted):
+    """More draws than are evaluated at once; beyond a bound it is none."""
+    rng = np.random.default_rng(6)
+    psi = fitted.draws(rng, 1500)
+    found = joint(fitted, psi)
+    np.testing.assert_allclose(found, log_joint(data, fitted, psi), rtol=1e-9, atol=1e-6)
+    assert np.isfinite(found).mean() > 0.99
+    bounded = next(i for i, p in enumerate(fitted.forward.priors.free) if np.isfinite(p.lower))
+    psi[1, bounded] = fitted.forward.priors.free[bounded].lower - 0.1
+    assert np.flatnonzero(~np.isfinite(joint(fitted, psi[:3]))).tolist() == [1]

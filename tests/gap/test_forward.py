@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import effect_priors, pair, singles, unknowns
+from calib.gap.hypotheses import effect_priors, pair, shifts, singles, unknowns, with_remainder
 from calib.gap.hypothesis import Hypothesis
 from calib.inference.priors import Prior, Priors
 from tests.gap.cases import NOISE, campaigns_of
@@ -224,3 +226,60 @@ def test_beyond_the_pressures_of_both_campaigns_the_pull_goes_on_straight(data):
     for beyond in (3.0, 9.0):
         np.testing.assert_allclose(pull(beyond, high), pull(0.0, high) + slope * beyond)
         np.testing.assert_allclose(pull(low - beyond, high), pull(low, high) - slope * beyond)
+
+
+@pytest.mark.parametrize("beyond", [False, True])
+@pytest.mark.parametrize(
+    "effect", ["lug_thrust", "multipass_compaction", "slip_zero_shift", "pressure_gauge_bias"]
+)
+def test_a_form_error_is_of_the_functions_it_is_named_for(data, effect, beyond):
+    """1 + c1 u + c2 (3 u^2 - 1)/2 + c3 v + c4 w over slip, pressure and its own covariate."""
+    forward = Forward(data, single(data, effect), SIGMA)
+    acting, view = EFFECTS[effect], data.view
+    if beyond:
+        wider = {c: v.mean() + 1.4 * (v - v.mean()) for c, v in view.conditions.items()}
+        wider["pass_number"] = view.conditions["pass_number"] * 3.0
+        view = replace(view, conditions=wider)
+    slip, pressure = (forward.covariates.over(view, what) for what in ("slip", "pressure"))
+    written = []
+    if "slip" in acting.form:
+        written += [slip, (3.0 * slip**2 - 1.0) / 2.0]
+    if {"pressure", "extrapolation"} & set(acting.form):
+        written += [pressure]
+    if "shape" in acting.form:
+        reference, own = (np.log(v.conditions["pass_number"]) for v in (data.view, view))
+        middle = (reference.max() + reference.min()) / 2.0
+        written += [np.clip((own - middle) / (np.ptp(reference) / 2.0), -1.5, 1.5)]
+    (basis,) = forward._form(view)
+    np.testing.assert_allclose(basis, np.stack(written, axis=1), atol=1e-12)
+
+
+def test_without_a_cause_the_others_stay(data):
+    """Of a shift with something besides: either alone, and neither is the simulator."""
+    for h in with_remainder(data, shifts(data)[0]):
+        forward = Forward(data, h, SIGMA, {o.name: centre_of(o) for o in data.outputs})
+        rng = np.random.default_rng(2)
+        psi = centre(forward)
+        free = [slice(forward.shift_slice.start, forward.shift_slice.stop),
+                *forward.smooth_slices.values()]  # fmt: skip
+        for part in free:
+            psi[:, part] = 0.1 * rng.standard_normal((2, part.stop - part.start))
+        assert forward.causes == ("parameter_shift", "unknown")
+        unshifted, known = psi.copy(), psi.copy()
+        unshifted[:, forward.shift_slice] = 0.0
+        for part in forward.smooth_slices.values():
+            known[:, part] = 0.0
+        both, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
+        for left_out, other in (("parameter_shift", unshifted), ("unknown", known)):
+            found, expected = forward.without(psi, data.view, left_out), forward.field(
+                other, data.view)  # fmt: skip
+            for o in data.names:
+                np.testing.assert_array_equal(found[o], expected[o])
+            assert any(not np.allclose(found[o], both[o]) for o in data.names)
+        neither = forward.without(psi, data.view, "parameter_shift", "unknown")
+        for o in data.names:
+            np.testing.assert_allclose(neither[o], plain[o], rtol=1e-12)
+
+
+def centre_of(output) -> np.ndarray:
+    return np.array([p.loc for p in output.priors.free])

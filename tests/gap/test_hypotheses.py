@@ -51,6 +51,18 @@ def test_shares_of_a_name_sum_to_one(data):
     assert {h.name for h in beside} == {"force_offset+unknown"}
 
 
+@pytest.mark.parametrize("outputs", ["both", "pull"])
+def test_nothing_unlisted_is_counted_twice(outputs):
+    found = unknowns(campaigns_of(None, outputs))
+    kinds = [
+        (h.smooth, h.smooth_over, h.smooth_decay, h.onset_over, h.smooth_outputs) for h in found
+    ]
+    assert len(set(kinds)) == len(kinds)
+    touched = {h.smooth_outputs for h in found}
+    pull, rut = ("drawbar_pull",), ("rut_depth",)
+    assert touched == ({pull} if outputs == "pull" else {pull, rut, pull + rut})
+
+
 def test_a_wider_prior_has_the_same_middle(data):
     (single,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
     wide = wider(single)
@@ -229,6 +241,20 @@ def test_a_condition_that_differs_between_the_campaigns_only_is_said_to_be_insep
     found = diagnose_once(with_load(np.array([5.0]), np.array([8.0]), 1.0), 1)
     assert inseparable(found.data, dependences(found.data)["depends_on_normal_load"])
     assert any("cannot be separated" in w for w in found.warnings)
+
+
+def test_a_condition_of_a_small_range_may_be_depended_on(data):
+    """Of a water content the whole range is a tenth; of one that is constant there is none."""
+    for spread, there in ((0.1, True), (0.0, False)):
+        case = data.case
+        lab, field = (
+            table_from_arrays(
+                {**t.columns, "gravimetric_water_content": 0.1 + spread * np.linspace(0, 1, len(t))}
+            )
+            for t in (case.lab, case.field)
+        )
+        found = dependences(campaigns(replace(case, lab=lab, field=field)))
+        assert any("water" in name for name in found) == there
 
 
 def test_a_condition_that_a_simulator_knows_is_no_dependence(data):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.gap.diagnose import verdict
-from calib.gap.inclusion import _shares, inclusion_probability
+from calib.gap.inclusion import _shares, _where, inclusion_probability
 from tests.gap.cases import CHOICE, LARGE, diagnosis_of
 
 
@@ -74,3 +74,15 @@ def test_sets_do_not_depend_on_the_order_of_the_effects():
     for name, p in one.probability.items():
         assert other.probability[name] == pytest.approx(p, abs=0.02)
     assert np.isfinite(list(one.log_evidence.values())).any()
+
+
+def test_where_the_unlisted_lies_is_asked_of_the_explanations_that_have_it():
+    """A listed cause beside it, however probable, has no say; without any there is nowhere."""
+    found = diagnosis_of("lug_thrust")
+    unknown, listed = (found.ranking.best(name) for name in ("unknown", "lug_thrust"))
+    mixed = replace(found.corrected.mixture, fits=(unknown,), probability=(1.0,))
+    alone = _where(found.data, mixed)
+    assert alone
+    both = replace(mixed, fits=(unknown, listed), probability=(0.3, 0.7))
+    assert _where(found.data, both) == alone
+    assert _where(found.data, replace(mixed, fits=(listed,))) == ()

@@ -13,11 +13,12 @@ from scipy.stats import norm
 from calib.data import table_from_arrays
 from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS
-from calib.gap.hypotheses import singles
+from calib.gap.hypotheses import LN_PRIOR, singles
 from calib.gap.isolate import ALIKE, isolability, smallest_shown
 from calib.gap.noise import Noise
 from calib.gap.relevance import RELEVANT
 from calib.gap.which import rank
+from calib.inference.sampling.mode import prior_widths
 from tests.gap.cases import CHOICE, campaigns_of, make_case, ranking_of
 
 
@@ -135,3 +136,44 @@ def test_the_smallest_size_shown_is_that_of_the_bayes_factor():
     assert found == pytest.approx(threshold + norm.ppf(0.8) * sd, abs=0.01)
     assert smallest_shown(prior, 1e-3, ln_odds) == pytest.approx(0.5 * RELEVANT, abs=0.02)
     assert smallest_shown(prior[prior < RELEVANT], sd, ln_odds) == np.inf
+
+
+def test_absorbed_is_what_the_calibrated_parameters_can_take_up():
+    """Of an offset, by least squares: with J S J' worked out again by differences of differences.
+
+    An offset d is d/sigma in every row; what is left of its square is g' (1 + J S J')^-1 g.
+    """
+    data = campaigns_of(None, "pull")
+    (o,) = data.outputs
+    mode, sigma = ranking_of_pull().lab_mode[o.name], 0.03
+    scale = o.problem.priors.entries[-1]
+    at = np.append(mode, np.log(sigma) if scale.log else sigma)
+    width = 2e-3 * prior_widths(o.problem.priors)
+    d = at.size
+
+    def curvature(i, j):
+        a, b = width[i] * np.eye(d)[i], width[j] * np.eye(d)[j]
+        points = np.stack([at + a + b, at + a - b, at - a + b, at - a - b])
+        return -(o.problem.log_prob(points) @ [1.0, -1.0, -1.0, 1.0]) / (4.0 * width[i] * width[j])
+
+    covariance = np.linalg.inv([[curvature(i, j) for j in range(d)] for i in range(d)])
+    conditions = o.problem.bound.model.select(data.view.conditions)
+
+    def field(psi):
+        return o.problem.bound.location(o.priors.to_natural(psi[None]), conditions)[0, o.rows]
+
+    steps = np.diag(width[:-1])
+    jacobian = np.stack([(field(mode + s) - field(mode - s)) / (2.0 * s.sum()) for s in steps])
+    jacobian = jacobian.T / sigma
+    c = np.eye(o.rows.size) + jacobian @ covariance[:-1, :-1] @ jacobian.T
+    one = np.ones(o.rows.size)
+    left = one @ np.linalg.solve(c, one)
+    single = singles(data, {"force_offset": EFFECTS["force_offset"]})
+    design = isolability(data, single, {o.name: mode}, {o.name: Noise(sigma, 0.0)}, 1)
+    assert design.absorbed["force_offset"] == pytest.approx(1.0 - left / one.size, rel=0.01)
+    # Smallest size: its estimate has the sd 1/sqrt(left), its size is |d|/sigma.
+    prior = np.abs(single[0].effect_priors[0].sample(np.random.default_rng(3), 4096)[:, 0]) / sigma
+    ln_odds = np.log(10.0) + LN_PRIOR["none"] - LN_PRIOR["single"]
+    expected = smallest_shown(prior, left**-0.5, ln_odds)
+    # Of one thousand draws against four thousand others.
+    assert design.detectable["force_offset"] == pytest.approx(expected, rel=0.05)

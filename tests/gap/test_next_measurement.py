@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
-from calib.gap.next_measurement import next_measurements
+from calib.gap.next_measurement import _candidates, _gain, next_measurements
 from tests.gap.cases import campaigns_of, ranking_of
 
 
@@ -54,3 +55,54 @@ def test_three_in_play_give_three_pairs():
 def test_the_same_seed_gives_the_same_conditions():
     data, ranking = campaigns_of("sensor_drift"), tied("sensor_drift", "sensor_drift", "none")
     assert next_measurements(data, ranking, 2) == next_measurements(data, ranking, 2)
+
+
+def test_the_gain_is_half_the_symmetric_divergence_of_two_normals():
+    rng = np.random.default_rng(4)
+    mean, other = rng.standard_normal((2, 2, 400))
+    var, another = rng.uniform(0.2, 3.0, (2, 2, 400))
+
+    def divergence(m, v, n, w):
+        return 0.5 * (v / w + (n - m) ** 2 / w - 1.0 + np.log(w / v))
+
+    a, b = (
+        {name: (m[i], v[i]) for i, name in enumerate(("drawbar_pull", "rut_depth"))}
+        for m, v in ((mean, var), (other, another))
+    )
+    both = divergence(mean, var, other, another) + divergence(other, another, mean, var)
+    np.testing.assert_allclose(_gain(a, b), 0.5 * both.sum(axis=0))
+    np.testing.assert_allclose(_gain(a, a), 0.0, atol=1e-12)
+
+
+def test_candidates_are_after_the_campaign_at_slips_of_any_size_and_pressures_that_go_together():
+    data = campaigns_of(None)
+    found = _candidates(data, np.random.default_rng(1))
+    field, lab = data.view.conditions, data.case.lab.columns
+    outputs = {"drawbar_pull_kn", "rut_depth_mm"}
+    assert set(found) == set(field) - outputs
+    assert {v.shape for v in found.values()} == {(400,)}
+    np.testing.assert_array_equal(found["run_order"], data.view.order_range[1])
+    slip = found["slip_ratio"]
+    both = np.append(field["slip_ratio"], lab["slip_ratio"])
+    assert np.unique(slip).size == 400
+    # Evenly: the ends of 400 draws are within a twentieth of those of the range.
+    assert both.min() <= slip.min() < both.min() + 0.05 * np.ptp(both)
+    assert both.max() - 0.05 * np.ptp(both) < slip.max() <= both.max()
+    assert set(found["speed_m_s"]) == {*field["speed_m_s"], *lab["speed_m_s"]}
+    names = ("inflation_pressure_psi", "average_ground_pressure_kpa")
+    rows = set(zip(*(field[n] for n in names), strict=True))
+    assert set(zip(*(found[n] for n in names), strict=True)) == rows
+
+
+def test_at_most_three_in_play_are_told_apart_and_none_that_is_improbable():
+    data = campaigns_of("sensor_drift")
+    names = ["sensor_drift", "force_offset", "none", "lug_thrust"]
+    ranking = ranking_of("sensor_drift")
+    p = dict.fromkeys(ranking.probability, 0.0) | dict(
+        zip(names, (0.5, 0.3, 0.15, 0.05), strict=True)
+    )
+    pairs = {m.separates for m in next_measurements(data, replace(ranking, probability=p), 1)}
+    assert pairs == set(combinations(names[:3], 2))
+    p |= {"force_offset": 0.03, "none": 0.029, "lug_thrust": 0.0}
+    (one,) = next_measurements(data, replace(ranking, probability=p), 1)
+    assert one.separates == ("sensor_drift", "force_offset")

@@ -73,3 +73,11 @@ def test_it_is_the_most_probable_of_all_it_could_be():
     best = log_posterior(most_probable(squared[None], rows)[0])
     others = [Noise(s, r, k) for s in np.linspace(0.3, 3.0, 400) for r in RHO for k in KAPPA]
     assert best >= max(map(log_posterior, others)) - 1e-9
+
+
+def test_how_a_noise_grows_has_a_probability_beforehand_and_all_have_one():
+    grown = [Noise(0.1, rho, kappa) for rho in RHO for kappa in KAPPA]
+    assert np.exp([ln_prior(n) for n in grown]).sum() == pytest.approx(1.0)
+    # No growth at all is believed before any other.
+    assert ln_prior(Noise(0.1)) == max(map(ln_prior, grown))
+    assert np.exp(ln_prior(Noise(0.1))) == pytest.approx(0.35)

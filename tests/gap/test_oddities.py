@@ -14,8 +14,8 @@ from calib.gap.case import campaigns
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
 from calib.gap.noise import noise_conditions
-from calib.gap.oddities import oddities
-from tests.gap.cases import MODELS, make_case, table_without
+from calib.gap.oddities import _times, oddities
+from tests.gap.cases import MODELS, PULL_ONLY, make_case, table_without
 
 PULL, RUT = OUTPUTS["drawbar_pull"], OUTPUTS["rut_depth"]
 NAMES = {
@@ -45,6 +45,16 @@ def test_a_misspelt_column_is_asked_after():
     assert found.endswith("a column is not used: 'tyre_widht_m': did you mean tyre_width_m?")
 
 
+def test_outputs_that_are_not_there_are_told_by_others():
+    case = make_case(None)
+    without = table_without(case.field, PULL)
+    assert "have no" not in "\n".join(oddities(case.lab, without, case.models))
+    holed = np.array(case.field[RUT])
+    holed[[2, 5]] = np.nan
+    field = replace(case.field, columns={**case.field.columns, RUT: holed})
+    assert "2 of 27 field rows have no rut_depth" in said(replace(case, field=field))
+
+
 @pytest.mark.parametrize("what", sorted(NAMES))
 def test_another_unit_is_named_with_its_factor(what):
     column, factor, units = NAMES[what]
@@ -69,6 +79,26 @@ def test_rows_of_one_place_in_the_run_order_are_named_by_line():
     )
     assert "copies of another" in copied
     assert "the same run_order" not in copied
+
+
+@pytest.mark.parametrize("spread", [0.4, 4.0])
+def test_a_state_that_varies_in_the_calibration_alone_is_asked_after(spread):
+    """Whatever its unit makes of its size: a speed from 0.8 m/s to 1.2 m/s varies as well."""
+    case = make_case(None)
+
+    def with_speeds(lab, field):
+        tables = (
+            table_from_arrays({**t.columns, "speed_m_s": 1.0 + spread * part * ramp(t)})
+            for t, part in ((case.lab, lab), (case.field, field))
+        )
+        return replace(case, **dict(zip(("lab", "field"), tables, strict=True)))
+
+    def ramp(table):
+        return np.linspace(-0.2, 0.2, len(table))
+
+    assert "were the two swapped" in said(with_speeds(1.0, 0.0))
+    for lab, field in ((1.0, 1.0), (0.0, 1.0), (0.0, 0.0)):
+        assert "were the two swapped" not in said(with_speeds(lab, field))
 
 
 def test_columns_that_were_swapped_pull_more_than_the_wheel_carries():
@@ -112,3 +142,65 @@ def test_readings_left_far_off_are_named_by_line():
     data, _, told = screened_ranking(changed(case, **{PULL: pull}), 1, few)
     warnings = "\n".join(told)
     assert f"line {data.case.field.lines[row]} (+" in warnings
+
+
+def with_columns(case, *, lab=None, field=None):
+    parts = {"lab": lab or {}, "field": field or {}}
+    return replace(case, **{
+        name: replace(getattr(case, name), columns={**getattr(case, name).columns, **columns})
+        for name, columns in parts.items()
+    })  # fmt: skip
+
+
+@pytest.mark.parametrize(("factor", "odd"), [(3.9, False), (4.1, True)])
+@pytest.mark.parametrize("way", ["more", "less"])
+def test_outputs_are_odd_from_four_times_on_whatever_their_size(factor, odd, way):
+    case = make_case(None, models=PULL_ONLY)
+    for unit in (1e-5, 1e-2):
+        lab = unit * np.linspace(1.0, 3.0, len(case.lab))
+        field = 2.0 * unit * (factor if way == "more" else 1.0 / factor)
+        found = said(with_columns(
+            case, lab={PULL: lab}, field={PULL: np.full(len(case.field), field)}
+        ))  # fmt: skip
+        assert (f"{PULL}: typically" in found) == odd
+        assert (f"{factor:.3g} times {way}" in found) == odd
+
+
+@pytest.mark.parametrize(("factor", "odd"), [(9.8, False), (10.2, True)])
+@pytest.mark.parametrize("way", ["more", "less"])
+def test_conditions_of_overlapping_ranges_are_odd_from_ten_times_on(factor, odd, way):
+    case = make_case(None)
+    psi = "inflation_pressure_psi"
+    lab, field = (np.full(len(t), 2.0) for t in (case.lab, case.field))
+    field *= factor if way == "more" else 1.0 / factor
+    # One row each of the other's, so that neither lies beyond the other.
+    lab[0], field[0] = field[1], lab[1]
+    found = said(with_columns(case, lab={psi: lab}, field={psi: field}))
+    assert (f"{factor:.3g} times {way}" in found) == odd
+    assert ("in another unit" in found) == odd
+
+
+@pytest.mark.parametrize(("ratio", "odd"), [(0.98, False), (1.02, True)])
+def test_a_wheel_pulls_no_more_than_it_carries(ratio, odd):
+    case = make_case(None, models=PULL_ONLY)
+    for name in ("lab", "field"):
+        table = getattr(case, name)
+        load = np.full(len(table), 2.0)
+        # In both directions, and a few rows beyond: what is typical counts.
+        pull = ratio * load * np.resize([1.0, -1.0], len(table))
+        pull[:4] *= 3.0
+        found = said(with_columns(case, **{name: {"normal_load_kn": load, PULL: pull}}))
+        assert ("times the normal load" in found) == odd
+
+
+@pytest.mark.parametrize(
+    "units", ["psi and kPa", "inches and mm", "lbf and N", "mm and cm", "kgf and N"]
+)
+def test_a_factor_near_that_of_two_units_is_called_so(units):
+    factor = {
+        "psi and kPa": 6.895, "inches and mm": 25.4, "lbf and N": 4.448, "mm and cm": 10.0, "kgf and N": 9.807,
+    }[units]  # fmt: skip
+    lab = np.full(9, 3.0)
+    for off, like in ((1.0, True), (1.12, True), (0.88, True), (1.2, False), (0.8, False)):
+        for field in (lab * factor * off, lab / (factor * off)):
+            assert (units in _times(lab, field)) == like

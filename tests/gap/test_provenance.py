@@ -81,3 +81,24 @@ def test_effects_of_ones_own_are_recorded_and_not_resumed_without_them(diagnosed
     (out / "case-0" / INPUTS).write_bytes(record)
     with pytest.raises(CalibError, match="made with effects of one's own"):
         check_resumable([case], out, 1)
+
+
+@pytest.mark.parametrize(
+    ("table", "kinds"),
+    [
+        ("", None),
+        ('[covariates]\ntyre_temperature_c = "number"\nshift = "category"\n',
+         {"tyre_temperature_c": "number", "shift": "category"}),
+        ('[covariates]\nshift = ["a", "b"]\n', {"shift": "category"}),
+    ],
+)  # fmt: skip
+def test_declared_columns_are_recorded_by_their_kind(tmp_path, table, kinds):
+    case = write_case(make_case(models=PULL_ONLY, n_lab=15, n_field=12), tmp_path / "case")
+    for name in ("lab.csv", "field.csv"):
+        head, *rows = (case / name).read_text().splitlines()
+        rows = [f"{row},{20 + i},{'ab'[i % 2]}" for i, row in enumerate(rows)]
+        (case / name).write_text("\n".join([f"{head},tyre_temperature_c,shift", *rows]) + "\n")
+    with (case / "case.toml").open("a") as file:
+        file.write(table)
+    assert case_hashes(case)["covariates"] == kinds
+    assert json.loads(inputs_record(read_case(case), 1)).get("covariates") == kinds

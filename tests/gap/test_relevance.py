@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import unknowns
@@ -72,3 +73,28 @@ def test_a_discrepancy_of_both_outputs_is_as_large_as_where_it_is_smallest():
     psi[1, forward.smooth_slices["rut_depth"].start] = 0.1
     # Ten noise sds of the pull, of the rut none and two.
     np.testing.assert_allclose(sizes(forward, noise, psi)[:, 0], [0.0, 2.0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("case", ["force_offset", None])
+def test_it_is_the_posterior_share_of_relevant_sizes_over_the_prior_share(case):
+    """Of an offset both are shares of a normal beyond 1.5 noise sds on either side."""
+    fit = fit_of(case, "force_offset")
+    (part,) = fit.forward.phi_slices
+    (prior,) = fit.forward.hypothesis.effect_priors[0].free
+    at = noise_conditions(fit.forward.data.view)
+    rows = fit.forward.data.outputs[0].rows
+    bar = 1.5 / np.sqrt(np.mean(np.square(1.0 / fit.noise["drawbar_pull"].sd(at.rows(rows)))))
+
+    def beyond(mean, sd):
+        return norm.sf(bar, mean, sd) + norm.cdf(-bar, mean, sd)
+
+    # A form error of the size would make it another's.
+    assert not any(s.stop > s.start for each in fit.forward.form_slices.values() for s in each)
+    n = 20_000
+    draws = fit.draws(np.random.default_rng(2), n)[:, part.start]
+    after = beyond(draws.mean(), draws.std())
+    found = relevance(fit, 1, n)
+    shares = (after * n + 0.2) / (n + 0.4), beyond(prior.loc, prior.scale)
+    # Sds of a logarithm of a share: of the posterior, where it is small, some draws.
+    sd = np.sqrt((1.0 - shares[0]) / (n * shares[0]) + (1.0 - shares[1]) / (n * shares[1]))
+    assert found == pytest.approx(np.log(shares[0] / shares[1]), abs=5.0 * sd + 0.02)

@@ -11,7 +11,7 @@ from calib.errors import CalibError
 from calib.gap.case import campaigns
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
-from calib.gap.screening import LAB_OUTLIER, OUTLIER
+from calib.gap.screening import _IMPOSSIBLE, LAB_OUTLIER, OUTLIER, _most, _possible
 from tests.gap.cases import PULL_ONLY, make_case
 
 FEW = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}
@@ -92,3 +92,25 @@ def test_few_rows_are_counted_before_any_is_set_aside(rows):
     few = replace(case, field=case.field.take(np.arange(rows)))
     with pytest.raises(CalibError, match=f"{rows} field rows with drawbar_pull_kn"):
         screened_ranking(few, 1, FEW)
+
+
+@pytest.mark.parametrize(("rows", "most"), [(3, 1), (19, 1), (20, 2), (57, 5)])
+def test_a_tenth_of_the_rows_may_be_outliers_and_one_always(rows, most):
+    assert _most(rows) == most
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-3, 1e3])
+def test_what_cannot_be_a_reading_is_so_in_any_unit(unit):
+    """Beyond twenty times the range of the middle eighty hundredths of the calibration."""
+    case = make_case(None, models=PULL_ONLY)
+    lab = unit * case.lab["drawbar_pull_kn"]
+    low, middle, high = np.quantile(lab, (0.1, 0.5, 0.9))
+    field = unit * np.array(case.field["drawbar_pull_kn"])
+    field[[3, 8]] = middle - _IMPOSSIBLE * (high - low) * np.array([1.01, 0.99])
+    lab, field = (
+        replace(t, columns={**t.columns, "drawbar_pull_kn": v})
+        for t, v in ((case.lab, lab), (case.field, field))
+    )
+    found, (said,) = _possible(field, replace(case, lab=lab))
+    assert np.flatnonzero(np.isnan(found["drawbar_pull_kn"])).tolist() == [3]
+    assert "no reading at all" in said

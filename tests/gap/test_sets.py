@@ -12,8 +12,9 @@ from calib.data.quantities import OUTPUTS, physical_role
 from calib.gap.case import Case, campaigns
 from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
-from calib.gap.guesses import Guesses, _led
-from calib.gap.hypotheses import joined, singles
+from calib.gap.forward import Forward
+from calib.gap.guesses import Guesses, _led, _places
+from calib.gap.hypotheses import joined, shifts, singles, with_remainder
 from calib.gap.inclusion import inclusion_probability
 from calib.gap.odds import Odds
 from calib.gap.sets import _enlarged, _exchanged
@@ -94,3 +95,24 @@ def test_three_causes_are_found_whatever_comes_first_alone():
     assert [name for name in sorted(found) if found[name] >= 0.5] == list(CAUSES)
     # A set once, whatever it was made of: a second fit would count its evidence twice.
     assert len(ranking.fits["+".join(CAUSES)]) == 1
+
+
+def test_a_shift_with_something_besides_begins_where_it_was_led_by_itself(guesses):
+    """And with something besides, a listed effect; of neither the other's is taken over."""
+    data = guesses.data
+    (offset,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
+
+    def names(hypothesis):
+        forward = Forward(data, hypothesis, {"drawbar_pull": 0.03, "rut_depth": 0.05})
+        return forward, [p.name for p in forward.priors.free]
+
+    for alone in (shifts(data)[0], offset):
+        old, known = names(alone)
+        new, all_of_them = names(with_remainder(data, alone)[0])
+        theirs, ours = _places(old, new)
+        assert theirs.tolist() == list(range(old.n_dim))
+        assert [all_of_them[i] for i in ours] == known
+        assert len(set(ours.tolist())) == old.n_dim < new.n_dim
+    other, _ = names(shifts(data)[0])
+    theirs, ours = _places(old, other)
+    assert theirs.tolist() == ours.tolist() == list(range(old.n_shared))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from calib.gap.mixture import Truth
+from calib.gap.mixture import Truth, mixture
 from calib.gap.where import regions, row_gaps
-from tests.gap.cases import campaigns_of, diagnosis_of
+from tests.gap.cases import campaigns_of, diagnosis_of, ranking_of
 
 NOISE = 0.05
 
@@ -121,3 +123,18 @@ def test_a_drift_lies_at_the_end():
     )
     rut = found.gaps[1]
     assert rut.probability.max() < 0.1
+
+
+def test_what_is_left_out_of_a_mixture_leaves_the_rest_their_odds():
+    """Of 0.6, 0.2 and a remainder of the least probable, the first two are drawn as 3 to 1."""
+    ranking = ranking_of("force_offset")
+    first, second, *rest = sorted(ranking.fits)
+    probability = {first: 0.6, second: 0.2} | dict.fromkeys(rest, 0.2 / len(rest) ** 2)
+    scores = {name: (0.0, *[-50.0] * (len(fits) - 1)) for name, fits in ranking.fits.items()}
+    few = {first: 0.6, second: 0.2} | dict.fromkeys(rest, 1e-3)
+    for given in (probability, few):
+        ranked = replace(ranking, probability=given, scores=scores)
+        found = mixture(campaigns_of("force_offset"), ranked, 1)
+        assert sum(found.probability) == pytest.approx(1.0)
+        assert found.probability[0] == pytest.approx(3.0 * found.probability[1])
+    assert len(found.fits) == 2

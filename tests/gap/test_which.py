@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import dependences
 from calib.gap.inclusion import inclusion_probability
 from calib.gap.odds import Odds, probabilities
-from calib.gap.which import calibrate_lab, rank
+from calib.gap.which import _score, calibrate_lab, rank
 from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
 
@@ -228,3 +229,14 @@ def test_rows_without_a_value_are_refused_by_line(braked, lines):
 def changed(table):
     columns = {**table.columns, "drawbar_pull_kn": 1.1 * table["drawbar_pull_kn"]}
     return table_from_arrays(columns)
+
+
+def test_a_score_is_evidence_times_relevance_times_share(monkeypatch):
+    fit = ranking_of("force_offset").fits["force_offset"][0]
+    hypothesis = replace(fit.forward.hypothesis, share=0.3)
+    forward = copy(fit.forward)
+    forward.hypothesis = hypothesis
+    shared = replace(fit, forward=forward)
+    monkeypatch.setattr("calib.gap.which.relevance", lambda *_: -2.0)
+    assert _score(shared, 1, 100) == pytest.approx(fit.log_evidence - 2.0 + np.log(0.3))
+    assert _score(shared, 1, 0) == pytest.approx(fit.log_evidence + np.log(0.3))

@@ -12,7 +12,9 @@ from calib.inference.diagnostics import (
     convergence,
     ess,
     hdi_error,
+    mcse,
     median_error,
+    tail_shape,
 )
 
 
@@ -70,3 +72,31 @@ def test_errors_are_the_scatter_of_parts_over_a_root_of_their_number() -> None:
     scatter = float(shifts.std(ddof=1))
     np.testing.assert_allclose(hdi_error(parts, 0.9), [scatter / 2.0, scatter / 2.0])
     assert median_error(parts) == pytest.approx(scatter / np.sqrt(8.0))
+
+
+def test_four_steps_are_enough_and_three_are_not() -> None:
+    draws = sticky(6, (4, 5, 4, 2), 1.0)
+    assert np.isfinite(convergence(draws).rhat).all()
+    for found in vars(convergence(draws[:, :, :3])).values():
+        assert np.isnan(found).all()
+
+
+def test_errors_of_independent_draws_are_the_textbooks() -> None:
+    """Of n normal draws the mean errs by s / sqrt n, the sd by s / sqrt 2n, the median more."""
+    chains = np.random.default_rng(7).normal(0.0, [2.0, 5.0], (4, 5000, 2))
+    mean, sd, median = (mcse(chains, method) for method in ("mean", "sd", "median"))
+    root = np.array([2.0, 5.0]) / np.sqrt(20_000)
+    # Of the effective size, estimated over some dozen lags, and of a density: some percent.
+    np.testing.assert_allclose(mean, root, rtol=0.1)
+    np.testing.assert_allclose(sd, root / np.sqrt(2.0), rtol=0.1)
+    np.testing.assert_allclose(median, root * np.sqrt(np.pi / 2.0), rtol=0.2)
+
+
+def test_the_shape_of_a_tail_is_that_of_its_pareto_distribution() -> None:
+    """A generalised Pareto tail of shape 0.8 beside one of uniform draws, which have none."""
+    rng = np.random.default_rng(8)
+    heavy = (rng.random((4, 5000)) ** -0.8 - 1.0) / 0.8
+    found = tail_shape(np.stack([heavy, -heavy, rng.random((4, 5000))], axis=-1))
+    # 3 sqrt n draws of a tail: an sd of (1 + k) / sqrt 424 = 0.09.
+    np.testing.assert_allclose(found[:2], 0.8, atol=0.3)
+    assert found[2] < 0.0

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from calib.models import MODELS
+from calib.models.bekker import rut_depth
 from calib.models.magic_formula_pressure import coefficients_at
 
 TABLE_4 = {
@@ -79,3 +80,25 @@ def test_table_1_gives_plausible_densities_with_a_negative_exponent_only() -> No
     assert 1.8 < by_hand[0] < by_hand[1] < 1.95
     wrong_sign = bound.theta(printed | {"C1": 5.934e10})
     assert np.all(bound.predict(wrong_sign, conditions) < 0.7)
+
+
+def test_a_rut_depth_carries_the_pressure_that_made_it() -> None:
+    """p = k z^(n0 + n1 s), and a metre at p = k whatever the exponent."""
+    slip = np.array([0.0, 0.1, 0.2])
+    z = rut_depth(np.array([60.0, 120.0, 200.0]), slip, 3.306e5, 1.996, 1.266)
+    np.testing.assert_allclose(3.306e5 * z ** (1.996 + 1.266 * slip), [60.0, 120.0, 200.0])
+    np.testing.assert_allclose(rut_depth(np.full(3, 80.0), slip, 80.0, 1.2, 0.7), 1.0)
+
+
+def test_a_rut_whose_exponent_is_not_positive_has_no_value() -> None:
+    """n0 + n1 s is 0.5, 0 and -0.5: at 0 the limit would be no rut or one without end."""
+    conditions = {
+        "average_ground_pressure_kpa": np.array([100.0, 150.0, 200.0]),
+        "slip_ratio": np.array([0.0, 0.25, 0.5]),
+    }
+    bound = MODELS["modified_bekker"].bind(conditions)
+    found = bound.predict(np.array([[20.0, 0.5, -2.0]]), conditions)
+    np.testing.assert_array_equal(np.isfinite(found), [[True, False, False]])
+    assert np.isnan(found[0, 1:]).all()
+    # The least exponent is zero.
+    assert np.isnan(bound.predict(np.array([[20.0, 1.0, -2.0]]), conditions)[0, 2])

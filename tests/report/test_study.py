@@ -48,6 +48,26 @@ def test_an_output_column_without_a_value_fails_alone() -> None:
     assert "0 rows cannot calibrate" in found.error
 
 
+def test_estimates_are_of_the_rows_that_the_source_estimated_from(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """He et al. (2019): drawbar pull at all pressures, rut depth without the one in the middle."""
+    rows: dict[str, int] = {}
+
+    def counted(problem, *_):
+        rows[problem.bound.model.name] = len(problem.table)
+        return ()
+
+    monkeypatch.setattr(study_module, "_all_methods", counted)
+    tasks = {task.output: task for task in he2019_tasks()}
+    for output in ("drawbar_pull", "rut_depth"):
+        study_module.estimate_task(tasks[output], 1)
+    pull, rut = tasks["drawbar_pull"], tasks["rut_depth"]
+    assert rows["magic_formula_pressure"] == len(pull.table)
+    outer = rut.table["inflation_pressure_psi"] != 30
+    assert rows["modified_bekker"] == outer.sum() < len(rut.table)
+
+
 # Results
 
 

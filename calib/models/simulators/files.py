@@ -31,7 +31,7 @@ class _Budget(BaseModel):
     nodes: int | None = Field(default=None, ge=2)
 
 
-class _File(BaseModel):
+class SimulatorFile(BaseModel):
     """What a simulator file may say; exactly one of run, python, url and table."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
@@ -92,7 +92,7 @@ def read_simulator(path: Path) -> Simulated:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
     try:
-        file = _File.model_validate(content)
+        file = SimulatorFile.model_validate(content)
     except ValidationError as error:
         raise _explain(error, path) from None
     priors = "\n".join(written(name, table) for name, table in file.parameters.items())
@@ -115,7 +115,7 @@ def read_simulator(path: Path) -> Simulated:
 def _explain(error: ValidationError, path: Path) -> CalibError:
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
-    known = list((_Budget if key.startswith("emulator.") else _File).model_fields)
+    known = list((_Budget if key.startswith("emulator.") else SimulatorFile).model_fields)
     mend = "correct it"
     if first["type"] == "extra_forbidden":
         near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
@@ -130,7 +130,7 @@ def _explain(error: ValidationError, path: Path) -> CalibError:
     )
 
 
-def _ranges(file: _File, path: Path) -> dict[str, tuple[float, float]]:
+def _ranges(file: SimulatorFile, path: Path) -> dict[str, tuple[float, float]]:
     """Ranges by canonical condition; they are given by the simulator's own names, in its units."""
     from calib.data.headers import parse_header
 
@@ -148,7 +148,7 @@ def _ranges(file: _File, path: Path) -> dict[str, tuple[float, float]]:
     return found
 
 
-def _way(file: _File, path: Path) -> Way:
+def _way(file: SimulatorFile, path: Path) -> Way:
     given = [key for key in _WAYS if getattr(file, key)]
     if len(given) != 1:
         raise CalibError(
@@ -156,13 +156,13 @@ def _way(file: _File, path: Path) -> Way:
             where=str(path), allowed=f"exactly one of {', '.join(_WAYS)}",
             mend="give one of them",
         )  # fmt: skip
-    makers: dict[str, Callable[[_File, Path], Way]] = {
+    makers: dict[str, Callable[[SimulatorFile, Path], Way]] = {
         "run": _command, "python": _callable, "url": _umbridge, "table": _of_table,
     }  # fmt: skip
     return makers[given[0]](file, path)
 
 
-def _command(file: _File, path: Path) -> CommandWay:
+def _command(file: SimulatorFile, path: Path) -> CommandWay:
     arguments = tuple(shlex.split(file.run))
     template = ""
     if file.input == "template" or file.template:
@@ -185,7 +185,7 @@ def _command(file: _File, path: Path) -> CommandWay:
     return way
 
 
-def _template(file: _File, path: Path) -> str:
+def _template(file: SimulatorFile, path: Path) -> str:
     where = path.parent / file.template
     try:
         template = where.read_text(encoding="utf-8")
@@ -200,7 +200,7 @@ def _template(file: _File, path: Path) -> str:
     return template
 
 
-def _callable(file: _File, path: Path) -> CallableWay:
+def _callable(file: SimulatorFile, path: Path) -> CallableWay:
     script, _, name = file.python.rpartition(":")
     function = getattr(run_file(path.parent / script, "simulator"), name, None)
     if not callable(function):
@@ -213,7 +213,7 @@ def _callable(file: _File, path: Path) -> CallableWay:
     return CallableWay(function, tuple(file.outputs), file.batched, limit)
 
 
-def _umbridge(file: _File, path: Path) -> UmbridgeWay:
+def _umbridge(file: SimulatorFile, path: Path) -> UmbridgeWay:
     if not file.model:
         raise CalibError(
             "the model of the server is not named", where=f"{path}, model",
@@ -223,7 +223,7 @@ def _umbridge(file: _File, path: Path) -> UmbridgeWay:
     return UmbridgeWay(file.url, file.model, tuple(file.outputs), rows, file.limit)
 
 
-def _of_table(file: _File, path: Path) -> TableWay:
+def _of_table(file: SimulatorFile, path: Path) -> TableWay:
     where = path.parent / file.table
     try:
         content = where.read_bytes()

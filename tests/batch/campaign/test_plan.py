@@ -86,6 +86,18 @@ def test_the_documentations_plan_is_one(tmp_path):
     assert {t.kind for t in tasks} == {"fit", "diagnose", "challenge", "sbc"} == set(KINDS)
 
 
+@pytest.mark.parametrize("inside", [True, False])
+def test_an_effects_priors_are_in_its_class_or_beside_its_file(tmp_path, inside):
+    text = '[[diagnose]]\nname = "a"\ncases = ["cases/*"]\neffects = "my_effects.py"\n'
+    plan = make_site(tmp_path / "site", text)
+    own = EFFECT.replace("    parameters", f'    priors = """{WIND}"""\n    parameters', 1)
+    (plan.parent / "my_effects.py").write_text(own if inside else EFFECT)
+    if not inside:
+        (plan.parent / "wind.toml").write_text(WIND)
+    for task in read_plan(plan).tasks.values():
+        assert ("effects, wind.toml" in task.inputs) != inside
+
+
 FIT = '[[fit]]\nname = "a"\ndata = ["data/*.csv"]\nmodels = ["bekker"]\n'
 CASES = '[[challenge]]\nname = "a"\ndraw_seed = 1\n'
 

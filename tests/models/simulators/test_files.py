@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from calib.errors import CalibError
-from calib.models.simulators.files import read_simulator
-from calib.models.simulators.registered import from_callable, models_of
+from calib.models import MODELS
+from calib.models.simulators.files import read_simulator, register_file
+from calib.models.simulators.registered import SIMULATED, from_callable, models_of, simulated_by
+from calib.models.simulators.ways import UmbridgeWay
 from tests.models.simulators.examples import PRIORS, pull, write_program
 
 
@@ -72,3 +75,65 @@ def test_a_python_function_in_a_file(tmp_path: Path) -> None:
     file.write_text(file.read_text().replace("own_wheel.py:f", "own_wheel.py:g"))
     with pytest.raises(CalibError, match="there is no function 'g'"):
         read_simulator(file)
+
+
+def by(folder: Path, way: str) -> Path:
+    """A simulator file that is carried out in another way."""
+    file = write_program(folder)
+    lines = [line for line in file.read_text().splitlines() if not line.startswith("run =")]
+    file.write_text("\n".join([lines[0], way, *lines[1:]]) + "\n")
+    return file
+
+
+def test_a_table_of_runs_is_known_by_its_content(tmp_path: Path) -> None:
+    file = by(tmp_path, 'table = "runs.csv"')
+    with pytest.raises(CalibError, match="the table of runs cannot be read"):
+        read_simulator(file)
+    digests = []
+    for value in (1.0, 2.0):
+        (tmp_path / "runs.csv").write_text(f"mu,s0,s,w,pull\n0.5,0.1,10,4,{value}\n")
+        found = read_simulator(file)
+        assert not found.simulator.way.runs
+        digests.append(found.simulator.digest)
+    assert digests[0] != digests[1]
+
+
+def test_a_server_needs_the_name_of_its_model(tmp_path: Path) -> None:
+    with pytest.raises(CalibError, match="the model of the server is not named"):
+        read_simulator(by(tmp_path, 'url = "http://localhost:1"'))
+    for rows, called in (("all", "config"), ("each", "each")):
+        text = f'url = "http://localhost:1"\nmodel = "m"\nrows = "{rows}"\nlimit = 7.0'
+        way = read_simulator(by(tmp_path, text)).simulator.way
+        assert isinstance(way, UmbridgeWay)
+        assert (way.rows, way.limit, way.columns) == (called, 7.0, ("pull",))
+
+
+def test_the_same_file_is_registered_once_and_a_changed_one_refused(tmp_path: Path) -> None:
+    file = write_program(tmp_path, name='"registered_wheel"')
+    try:
+        found = register_file(file)
+        assert register_file(file) is found
+        assert simulated_by("registered_wheel") is found
+        changed = write_program(tmp_path, name='"registered_wheel"', rows='"each"')
+        with pytest.raises(CalibError, match="there is a model 'registered_wheel' already"):
+            register_file(changed)
+    finally:
+        SIMULATED.discard("registered_wheel")
+        MODELS.discard("registered_wheel")
+
+
+def test_a_slow_one_is_not_run_for_each_draw_and_a_quick_one_is(tmp_path: Path) -> None:
+    conditions = {"slip_ratio": np.array([0.1, 0.3]), "normal_load_kn": np.array([4.0, 5.0])}
+    theta = np.array([[0.5, 0.1], [0.7, 0.2], [-1.0, 0.1]])
+    (slow,) = models_of(read_simulator(write_program(tmp_path)).simulator)
+    assert slow.predict is not None
+    with pytest.raises(CalibError, match="is not run for each parameter vector"):
+        slow.predict(theta, conditions)
+    fails = "assert p['mu'] > 0"
+    quick = write_program(tmp_path, extra=fails, emulate="false", retries="0")
+    (model,) = models_of(read_simulator(quick).simulator)
+    assert model.predict is not None
+    found = model.predict(theta, conditions)
+    # Where it fails there is no value.
+    np.testing.assert_allclose(found[:2], pull(theta[:2], conditions))
+    assert np.isnan(found[2]).all()

@@ -52,8 +52,9 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
         if section.effects is not None:
             path = place.file("effects", section.effects)
             extra["effects"] = path
-            for name in load_effects(path):
-                extra[f"effects, {name}.toml"] = path.with_name(f"{name}.toml")
+            for name, effect in load_effects(path).items():
+                if effect.prior_file is not None:
+                    extra[f"effects, {name}.toml"] = effect.prior_file
         for case in place.find("cases", section.cases, holding="case.toml"):
             settings = {
                 "case": place.name(case), "effects": section.effects, "pages": section.pages
