@@ -20,14 +20,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.stats import binomtest
 
 from calib.data.quantities import role_of
 from calib.inference.calibration import Calibration
 from calib.report.labels import axis_of, joined, percent, plain, short
 from calib.report.rows import held_table, signs_along, x_column
 from calib.report.study import OutputResult, judged
-from calib.validation.joint import coverage_probability, effective_rows, hits
+from calib.validation.joint import binomial_p, coverage_probability, effective_rows, hits
 from calib.validation.residuals import standardise
 from calib.validation.roles import MOVED, PRIOR, role
 from calib.validation.validate import Validation
@@ -138,11 +137,6 @@ class Verdict:
     headline: str
     trust: str
     doubt: str
-
-
-def binomial_p(hits: int, n: int, level: float = 0.9) -> float:
-    """Probability of so few hits or fewer among n independent rows."""
-    return float(binomtest(hits, n, level, alternative="less").pvalue) if n else float("nan")
 
 
 def judge_evidence(e: Evidence) -> Verdict:
@@ -258,7 +252,7 @@ def gather(result: OutputResult) -> Evidence:
         effective=effective_rows(v.draws) if complete else float("nan"),
         rmse=v.scores.rmse,
         unit=axis_of(problem.bound.model.output).unit,
-        max_relative_error=_largest(v.scores.relative_error),
+        max_relative_error=v.scores.max_relative_error,
         prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
         two_pressures=quadratic and np.unique(problem.table[parabolic]).size == 2,
         skill=1.0 - v.scores.rmse**2 / scatter if scatter > 0.0 else float("nan"),
@@ -295,11 +289,6 @@ def _at_pressures(result: OutputResult) -> str:
     axis, x = axis_of(column), axis_of(along)
     words = joined([axis.value_text(float(p)) for p in np.unique(problem.table[column])])
     return f"{words} {axis.unit} for {x.name.lower()} {x.range_text(problem.table[along])}"
-
-
-def _largest(relative: np.ndarray) -> float:
-    judged = np.abs(relative[np.isfinite(relative)])
-    return float(judged.max()) if judged.size else float("nan")
 
 
 def _range_words(result: OutputResult) -> str:

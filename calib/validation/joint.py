@@ -9,6 +9,7 @@ for independent rows.
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import bdtr
 
 from calib.models.base import Array
 
@@ -37,6 +38,11 @@ def coverage_probability(draws: Array, hits: int, level: float) -> float:
     covered = (np.abs(_pit_of_draws(draws) - 0.5) <= 0.5 * level).sum(axis=1)
     # The draw that was observed counts among those possible, so it is never 0.
     return float((1 + (covered <= hits).sum()) / (1 + covered.size))
+
+
+def binomial_p(hits: int, n: int, level: float = 0.9) -> float:
+    """Probability of so few hits or fewer among n independent rows; NaN of none."""
+    return float(bdtr(hits, n, level)) if n else float("nan")
 
 
 def hits(draws: Array, observed: Array, level: float) -> int:

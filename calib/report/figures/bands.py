@@ -37,12 +37,11 @@ from calib.report.rows import (
     group_column,
     groups,
     held_table,
-    smooth_bands,
     x_column,
 )
 from calib.report.study import OutputResult
 from calib.validation.joint import hits
-from calib.validation.prediction import Bands
+from calib.validation.prediction import Bands, median_change, smooth_bands
 
 # Lighter outwards, also in greyscale.
 FILLS = {0.95: "#dfebf5", 0.9: "#bcd6ea", 0.5: "#86b5d9"}
@@ -131,9 +130,8 @@ def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -
 
 def observed_words(result: OutputResult) -> str:
     """Say what the bands covered of the fitted rows and of those not fitted."""
-    low, high = np.nanquantile(result.posterior_predictive, [0.05, 0.95], axis=0)
     observed = result.calibration.problem.observed
-    inside = int(((observed >= low) & (observed <= high)).sum())
+    inside = hits(result.posterior_predictive, observed, 0.9)
     c = result.validation.scores.coverage[0.9]
     other = "held-out points" if held_table(result) is not None else "points when each is left out"
     return (
@@ -336,17 +334,9 @@ def _ends(*values: Array) -> Array:
 
 
 def _density_caption(result: OutputResult) -> str:
-    problem, (cone, water) = result.calibration.problem, _columns(result)
-    axis = axis_of(problem.bound.model.output)
-    conditions = {
-        name: np.median(problem.table[name]) * np.ones(2) for name in problem.bound.model.conditions
-    }
-    ci = np.quantile(problem.table[cone], [0.1, 0.9])
-    wet = np.quantile(problem.table[water], [0.1, 0.9])
-    effect = [
-        np.diff(smooth_bands(result.calibration, {**conditions, name: ends})[0].median)[0]
-        for name, ends in ((cone, ci), (water, wet))
-    ]
+    cone, water = _columns(result)
+    axis = axis_of(result.calibration.problem.bound.model.output)
+    effect = [median_change(result.calibration, name) for name in (cone, water)]
     words = observed_words(result)
     return (
         f"{words[0].upper()}{words[1:]}. Between the 10 % and 90 % points of the data, cone index "

@@ -8,10 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
-from scipy.stats import gaussian_kde, rankdata
+from scipy.stats import gaussian_kde
 
 from calib.inference.calibration import Calibration
-from calib.inference.priors import Prior
+from calib.inference.diagnostics import N_BINS, rank_histograms, rank_scatter
+from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
@@ -75,7 +76,7 @@ def _prior_posterior(ax: Axes, prior: Prior, t: Array, mark: float | None) -> di
     low, high = _range(prior, t)
     x = np.linspace(low, high, 300)
     drawn = np.exp(x) if prior.log else x
-    density = _prior_density(prior, x)
+    density = np.exp(Priors((prior,)).log_prob(x[:, None]))
     handles: dict[str, Any] = {
         "prior": ax.fill_between(drawn, density / density.max(), color="#dddddd", lw=0.0)
     }
@@ -119,15 +120,6 @@ def _range(prior: Prior, t: Array) -> tuple[float, float]:
     return max(low, prior.lower - pad), min(high, prior.upper + pad)
 
 
-def _prior_density(prior: Prior, x: Array) -> Array:
-    inside = (x >= prior.lower) & (x <= prior.upper)
-    if prior.gamma is not None:
-        shape, rate = prior.gamma
-        return np.where(inside, np.exp(shape * (x - prior.loc) - rate * np.exp(x)), 0.0)
-    z = (x - prior.loc) / prior.scale if np.isfinite(prior.scale) else np.zeros_like(x)
-    return np.where(inside, np.exp(-0.5 * z * z), 0.0)
-
-
 def _learned_caption(calibration: Calibration) -> str:
     found: dict[str, list[str]] = {}
     for prior in calibration.problem.priors.free:
@@ -143,28 +135,6 @@ def _learned_caption(calibration: Calibration) -> str:
         f"{'; '.join(parts)}. The data taught most about {plain(sharpest)}, whose sd shrank to "
         f"{short(ratios[sharpest])} of the prior's (the sd ratio)."
     )
-
-
-N_BINS = 20
-
-
-def rank_histograms(values: Array, bins: int = N_BINS) -> Array:
-    """Histograms of the ranks of each ensemble's draws among all draws, relative to uniform.
-
-    Parameters
-    ----------
-    values : ndarray, shape (ensembles, n)
-    bins : int
-
-    Returns
-    -------
-    ndarray, shape (ensembles, bins)
-        All near 1 where the ensembles sample the same distribution.
-    """
-    rank = rankdata(values, method="ordinal").reshape(values.shape).astype(np.int64)
-    which = ((rank - 1) * bins) // values.size
-    counts = np.stack([np.bincount(row, minlength=bins) for row in which])
-    return np.asarray(counts * bins / values.shape[1], dtype=np.float64)
 
 
 def ensembles_plate(result: OutputResult) -> Plate:
@@ -238,7 +208,7 @@ def _trace(ax: Axes, natural: Array) -> dict[str, Any]:
 def _ranks(ax: Axes, values: Array, effective: float) -> None:
     """Rank histograms with the scatter that the effective sample size allows."""
     heights = rank_histograms(values)
-    half = 1.96 * np.sqrt(max(0.0, N_BINS - 1.0) / max(effective, 1.0))
+    half = rank_scatter(effective)
     ax.fill_between([0.0, 1.0], max(0.0, 1.0 - half), 1.0 + half, color="#e4e4e4", lw=0.0)
     edges = np.linspace(0.0, 1.0, N_BINS + 1)
     for e, row in enumerate(heights):
