@@ -17,6 +17,8 @@ from scipy.special import ndtri
 from calib.models.base import Array
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}
+# Autocorrelation times that are summed over.
+_WINDOW = 5.0
 
 
 def _stats() -> Any:
@@ -85,7 +87,7 @@ def _normal_scores(x: Array) -> Array:
     return scores.reshape(x.shape)
 
 
-def autocorrelation_time(chain: Array, c: float = 5.0) -> Array:
+def autocorrelation_time(chain: Array) -> Array:
     """Integrated autocorrelation time in steps, shape (walkers, steps, d) to (d,), as emcee's.
 
     The window is the first that spans five of them (Sokal). NaN if a walker never moved.
@@ -103,7 +105,7 @@ def autocorrelation_time(chain: Array, c: float = 5.0) -> Array:
         covariance[np.ptp(chain[..., j], axis=1) == 0.0] = 0.0
         with np.errstate(invalid="ignore"):
             taus = 2.0 * np.cumsum((covariance / covariance[:, :1]).mean(axis=0)) - 1.0
-        inside = np.arange(steps) < c * taus
+        inside = np.arange(steps) < _WINDOW * taus
         tau[j] = taus[inside.argmin() if inside.any() else -1]
     return tau
 

@@ -25,9 +25,9 @@ def ks_distance(pit: Array) -> Array:
     return np.asarray(np.maximum(above.max(axis=-1), below.max(axis=-1)))
 
 
-def pit_half_width(draws: Array, level: float = 0.95) -> float:
-    """Half the width of the simultaneous band that PIT values of possible rows (size, n) are in."""
-    return float(np.quantile(ks_distance(_pit_of_draws(draws)), level))
+def pit_half_width(draws: Array) -> float:
+    """Half the width of the band that 95 % of the PIT values of possible rows (size, n) stay in."""
+    return float(np.quantile(ks_distance(_pit_of_draws(draws)), 0.95))
 
 
 def coverage_probability(draws: Array, hits: int, level: float) -> float:

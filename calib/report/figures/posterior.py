@@ -36,6 +36,7 @@ from calib.report.study import OutputResult
 from calib.validation.roles import MOVED, PRIOR, ROLES, role
 
 _KDE_DRAWS = 3000
+_MOST_TICKS = 4
 
 
 def learned_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
@@ -103,14 +104,14 @@ def _prior_posterior(ax: Axes, prior: Prior, t: Array, mark: float | None) -> di
     return handles
 
 
-def _log_ticks(low: float, high: float, most: int = 4) -> list[float]:
-    """Return up to `most` round values: 1, 2, 5 times powers of ten, or powers alone."""
+def _log_ticks(low: float, high: float) -> list[float]:
+    """Return a few round values: 1, 2, 5 times powers of ten, or powers alone."""
     powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     for steps in ((1, 2, 5), (1, 3), (1,)):
         found = [s * 10.0**k for k in powers for s in steps if low <= s * 10.0**k <= high]
-        if len(found) <= most:
+        if len(found) <= _MOST_TICKS:
             return found
-    return found[:: -(-len(found) // most)]
+    return found[:: -(-len(found) // _MOST_TICKS)]
 
 
 def _range(prior: Prior, t: Array) -> tuple[float, float]:
