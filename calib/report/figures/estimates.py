@@ -214,7 +214,7 @@ def _coefficient(
         printed = zip(reference.alone.values(), (-0.2, 0.0), "os", strict=False)
         for table, at, shape in printed:
             if psi in table:
-                label = f"published ({table[round(psi)].source.partition(',')[0]})"
+                label = f"published ({table[round(psi)].place})"
                 (handles[label],) = ax.plot(
                     i + at, table[round(psi)].values[name], shape, mfc="none", mec=ORANGE,
                     mew=1.2, ms=8.0,
@@ -237,7 +237,6 @@ def _pressure_caption(result: OutputResult, reference: Reference) -> str:
         cost = f"{psi:g} psi {short(best.cost, 3)} kN²"
         beside = reference.beside("genetic", psi)
         if beside is not None:
-            source = beside.source.partition(",")[0]
-            cost += f" ({source}: {beside.quality['cost'].text})"
+            cost += f" ({beside.place}: {beside.quality['cost'].text})"
         parts.append(cost)
     return f"Lowest cost of a pressure fitted alone: {'; '.join(parts)}."
