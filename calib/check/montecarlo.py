@@ -12,7 +12,7 @@ from scipy.stats import norm
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import mcse, tail_shape
 from calib.models.base import Array
-from calib.validation.scores import LEVELS, RELATIVE_ERROR_FLOOR
+from calib.validation.scores import LEVELS, RELATIVE_ERROR_FAR, RELATIVE_ERROR_FLOOR
 from calib.validation.validate import Validation
 
 MONTE_CARLO = "Monte Carlo"
@@ -170,7 +170,9 @@ def validation_errors(
     relative = median[large] / np.abs(observed[large])
     if relative.size:
         errors["validation", "max_relative_error"] = float(relative.max())
-        near = np.abs(np.abs(scores.relative_error[large]) - 0.06) <= multiple * relative
+        near = (
+            np.abs(np.abs(scores.relative_error[large]) - RELATIVE_ERROR_FAR) <= multiple * relative
+        )
         errors["validation", "n_relative_error_above_6_percent"] = near.sum() / multiple
     for level in LEVELS:
         edges = 0.5 + 0.5 * level * np.array([-1.0, 1.0])

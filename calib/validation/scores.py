@@ -16,6 +16,8 @@ from calib.models.base import Array
 LEVELS = (0.5, 0.9, 0.95)
 # Relative errors of a pull near zero say nothing: rows below this part of the largest are left out.
 RELATIVE_ERROR_FLOOR = 0.05
+# Rows that are farther off than this are counted.
+RELATIVE_ERROR_FAR = 0.06
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,11 @@ class Scores:
         """Largest absolute relative error; NaN where every observation is near zero."""
         defined = self.relative_error[~np.isnan(self.relative_error)]
         return float(np.abs(defined).max()) if defined.size else float("nan")
+
+    @property
+    def n_far(self) -> int:
+        """How many rows have a relative error of more than 6 %."""
+        return int((np.abs(self.relative_error) > RELATIVE_ERROR_FAR).sum())
 
 
 def crps(draws: Array, observed: Array) -> Array:

@@ -321,8 +321,7 @@ def _validation_caption(result: OutputResult) -> str:
     who = f"{s.n} held-out rows" if held else f"{s.n} rows, each predicted without itself,"
     left = f" ({missing} rows near zero are not judged)" if missing else ""
     cover = "; ".join(f"{100 * c.level:g} % band {c.hits} of {c.n}" for c in s.coverage.values())
-    above = int((np.abs(s.relative_error) > 0.06).sum())
-    many = "no row" if above == 0 else "1 row" if above == 1 else f"{above} rows"
+    many = "no row" if s.n_far == 0 else "1 row" if s.n_far == 1 else f"{s.n_far} rows"
     text = (
         f"Over {who}{label} the median is wrong by {short(s.rmse)} {axis.unit} rms and by "
         f"{percent(s.max_relative_error)} at most{left}, {many} by more than 6 %. "
