@@ -70,14 +70,7 @@ def scatter_points(ax: Axes, x: Array, y: Array, *, held: bool) -> Any:
 
 
 def bands_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
-    """Draw the predictive bands of an output along slip or pressure.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose fit is added.
-    """
+    """Draw the predictive bands of an output along slip or pressure, beside a published fit."""
     problem = result.calibration.problem
     x_axis, y_axis = axis_of(x_column(result)), axis_of(problem.bound.model.output)
     shown = groups(result)
@@ -237,10 +230,7 @@ _COLOURS = ListedColormap(mpl.colormaps["YlGnBu"](np.linspace(0.35, 1.0, 128)))
 def density_plate(result: OutputResult) -> Plate:
     """Draw density against cone index, coloured by water content, and predicted against observed.
 
-    Parameters
-    ----------
-    result : OutputResult
-        Of one of the two density models.
+    A CalibError says that the model is not of density by cone index and water content.
     """
     fig, axes = panels(
         1, 2, height=64.0, bottom=22.0, left=14.0, gap_x=30.0, right=3.0, top=4.0

@@ -40,14 +40,7 @@ _LISTED = 5
 
 
 def estimates_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
-    """Draw every method's estimate of every published parameter, in posterior sds.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose figures are added.
-    """
+    """Draw every method's estimate of every published parameter, in posterior sds."""
     calibration = result.calibration
     reported = [k for k, v in calibration.reported.items() if np.ptp(v) > 0.0]
     model = calibration.problem.bound.model
@@ -156,14 +149,7 @@ def _outside(result: OutputResult, name: str, value: float) -> bool:
 
 
 def by_pressure_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate | None:
-    """Draw B, C, D and E of each pressure by method; None where pressures were not fitted alone.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose figures are ringed.
-    """
+    """Draw B, C, D and E of each pressure by method; None where pressures were not fitted alone."""
     pressures = list(result.by_pressure)
     if not pressures:
         return None

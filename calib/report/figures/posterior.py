@@ -40,14 +40,7 @@ _MOST_TICKS = 4
 
 
 def learned_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
-    """Draw prior and posterior densities of every sampled parameter.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose figures are marked.
-    """
+    """Draw prior and posterior of every sampled parameter, and mark published ones."""
     calibration = result.calibration
     free = calibration.problem.priors.free
     marks = reference.sampled(calibration.problem.bound)

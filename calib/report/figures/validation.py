@@ -202,14 +202,7 @@ def _spread_words(result: OutputResult, fitted: Standardised) -> str:
 
 
 def validation_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
-    """Draw how predictions of unseen rows fared, in four panels.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose errors and stated limits are added.
-    """
+    """Draw how predictions of unseen rows fared, in four panels, beside a source's errors."""
     fig, axes = panels(2, 2, height=52.0, left=15.0, bottom=22.0, gap_x=17.0, gap_y=15.0, top=10.0)
     if (
         cone_and_water(result.calibration.problem.bound.model)
