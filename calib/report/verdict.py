@@ -108,7 +108,6 @@ class Evidence:
     neighbours: int
     along: str
     inside: str
-    label: str = ""
     unseen_at: Where = Where.AT
     at_pressures: str = "the two calibrated pressures"
     prior_hits: int = 0
@@ -234,7 +233,6 @@ def gather(result: OutputResult) -> Evidence:
     held = held_table(result) is not None
     complete = bool(np.isfinite(v.draws).all(axis=1).any())
     parabolic = problem.bound.model.parabolic_in
-    quadratic = bool(parabolic)
     changes, neighbours = signs_along(result, standardise(calibration, problem).residual)
     scatter = float(np.mean(np.square(v.observed - problem.observed.mean())))
     return Evidence(
@@ -254,15 +252,14 @@ def gather(result: OutputResult) -> Evidence:
         unit=axis_of(problem.bound.model.output).unit,
         max_relative_error=v.scores.max_relative_error,
         prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
-        two_pressures=quadratic and np.unique(problem.table[parabolic]).size == 2,
+        two_pressures=bool(parabolic) and np.unique(problem.table[parabolic]).size == 2,
         skill=1.0 - v.scores.rmse**2 / scatter if scatter > 0.0 else float("nan"),
         sign_changes=changes,
         neighbours=neighbours,
         along=axis_of(x_column(result)).name.lower(),
         inside=_range_words(result),
-        label=problem.table.label,
-        unseen_at=_unseen_at(result) if quadratic and held else Where.AT,
-        at_pressures=_at_pressures(result) if quadratic else "",
+        unseen_at=_unseen_at(result) if parabolic and held else Where.AT,
+        at_pressures=_at_pressures(result) if parabolic else "",
         prior_hits=hits(result.prior_predictive, problem.observed, 0.95),
         prior_n=problem.observed.size,
         suspects=(
@@ -270,7 +267,7 @@ def gather(result: OutputResult) -> Evidence:
             if role_of(problem.bound.model.output) == "pull"
             else "the units"
         ),
-        notes=tuple(getattr(problem, "notes", ())),
+        notes=problem.notes,
     )
 
 
