@@ -96,11 +96,18 @@ def coverage(draws: Array, observed: Array, level: float) -> Coverage:
     low, high = np.quantile(draws, [0.5 - level / 2.0, 0.5 + level / 2.0], axis=0)
     hits = int(((observed >= low) & (observed <= high)).sum())
     n = int(observed.size)
+    return Coverage(level, hits, n, *jeffreys(hits, n))
+
+
+def jeffreys(hits: int, n: int) -> tuple[float, float]:
+    """Return the 95 % Jeffreys interval of a proportion, closed at the ends of all or none.
+
+    After Brown, Cai & DasGupta (2001), doi:10.1214/ss/1009213286.
+    """
     # Quantiles of the beta distribution, without SciPy's statistics, which are slow to import.
     a, b = hits + 0.5, n - hits + 0.5
-    lower = 0.0 if hits == 0 else float(betaincinv(a, b, 0.025))
-    upper = 1.0 if hits == n else float(betaincinv(a, b, 0.975))
-    return Coverage(level, hits, n, lower, upper)
+    low = 0.0 if hits == 0 else float(betaincinv(a, b, 0.025))
+    return low, 1.0 if hits == n else float(betaincinv(a, b, 0.975))
 
 
 def score(draws: Array, observed: Array, *, heavy: bool = False) -> Scores:
