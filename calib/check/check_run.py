@@ -12,7 +12,7 @@ from calib.check.inputs import GROUP as INPUTS
 from calib.check.inputs import verify_files, verify_label
 from calib.check.montecarlo import Place, count_drawn, describe, drawn_in_run
 from calib.check.numbers import compare_entries, flatten
-from calib.check.outcome import Item, Status
+from calib.check.outcome import Item, Status, mostly_different
 from calib.check.posteriors import GROUP as POSTERIORS
 from calib.check.posteriors import compare_posterior, read_draws, summary_of, verify_density
 from calib.check.recompute import estimate_again, not_computed, recompute_run
@@ -123,8 +123,7 @@ def _group(path: Place) -> str:
 def _blame(items: list[Item]) -> list[Item]:
     """Name the input that the recorded numbers cannot have been computed from."""
     mode = [item for item in items if item.name.startswith(f"{_RECORD}: mode.")]
-    different = sum(item.status is Status.DIFFERENT for item in mode)
-    if different <= 0.5 * len(mode):
+    if not mostly_different(mode):
         return []
     note = "the posterior mode in run.json does not follow from the data and priors here"
     return [Item(INPUTS, f"{_DATA} or {_PRIORS}", Status.DIFFERENT, note=note)]

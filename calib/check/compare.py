@@ -16,7 +16,7 @@ from calib.check.figures import compare_figure, compare_pictures, compare_prints
 from calib.check.inputs import GROUP as INPUTS
 from calib.check.montecarlo import MONTE_CARLO, Place, count_drawn, drawn_in_output
 from calib.check.numbers import SAME_WORDS, compare_entries, flatten, read_json
-from calib.check.outcome import Item, Status
+from calib.check.outcome import ROUNDED, Item, Status, mostly_different
 from calib.check.posteriors import GROUP as POSTERIORS
 from calib.check.posteriors import compare_posterior
 from calib.check.schema import Manifest
@@ -35,6 +35,9 @@ _VERIFIED = ("sha256", "shipped")
 _POINTS = ("estimates", "fit", "by_pressure")
 _CHAIN = ("posterior", "prior_sensitivity", "validation", "sampling")
 _SEARCHES = ("(genetic", "(differential_evolution")
+# Below this part of itself a number has only been rounded otherwise.
+_ROUNDED_PART = 1e-6
+_INPUTS = ("data/", "priors/")
 
 
 @dataclass(frozen=True)
@@ -152,19 +155,13 @@ def _blame(manifest: Manifest, key: str, items: list[Item]) -> list[Item]:
     own = [item for item in items if part_of(item.group) == key]
     points = [item for item in own if ": estimates" in item.group]
     strict = [item for item in points if not any(search in item.group for search in _SEARCHES)]
-    if _mostly_different(strict):
+    if mostly_different(strict):
         note = "most estimates in summary.json do not follow from these rows"
         return [Item(INPUTS, task.data.file, Status.DIFFERENT, note=note)]
-    if _mostly_different([item for item in own if ".sampling.mode." in item.name]):
+    if mostly_different([item for item in own if ".sampling.mode." in item.name]):
         note = "the posterior mode in summary.json does not follow from these priors and the data"
         return [Item(INPUTS, task.priors.file, Status.DIFFERENT, note=note)]
     return []
-
-
-def _mostly_different(items: list[Item]) -> bool:
-    numbers = [item for item in items if isinstance(item.recorded, float)]
-    different = sum(item.status is Status.DIFFERENT for item in numbers)
-    return different > 0.5 * len(numbers)
 
 
 def _record(again: Again) -> list[Item]:
@@ -209,12 +206,6 @@ def _cell(text: Any) -> Any:
         return text
 
 
-# Below this part of what is allowed, or of itself, a number has only been rounded otherwise.
-_ROUNDED = 1e-3
-_ROUNDED_PART = 1e-6
-_INPUTS = ("data/", "priors/")
-
-
 @dataclass(frozen=True)
 class Moved:
     """Parts of a report with entries that moved by more than rounding.
@@ -245,7 +236,7 @@ def _moved(item: Item) -> bool:
     if abs(item.recorded - item.found) <= _ROUNDED_PART * abs(item.found):
         return False
     drawn = item.note == MONTE_CARLO
-    return not drawn or item.share is None or item.share > _ROUNDED
+    return not drawn or item.share is None or item.share > ROUNDED
 
 
 def compare_files(again: Again, moved: Moved) -> list[Item]:

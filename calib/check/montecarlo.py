@@ -6,13 +6,17 @@ of the predictive distributions they are scores of.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.stats import norm
 
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import mcse, tail_shape
 from calib.models.base import Array
-from calib.validation.scores import LEVELS, RELATIVE_ERROR_FLOOR
+from calib.validation.comparison import Comparison
+from calib.validation.scores import LEVELS, RELATIVE_ERROR_FAR, RELATIVE_ERROR_FLOOR
 from calib.validation.validate import Validation
 
 MONTE_CARLO = "Monte Carlo"
@@ -60,6 +64,12 @@ def count_drawn(calibration: Calibration, n_validated: int = 0) -> int:
     return 6 * len(calibration.parameters) + 1 + (n_validated + 14 if n_validated else 0)
 
 
+def count_compared(comparison: Comparison) -> int:
+    """Return how many numbers of a comparison follow from posterior draws, those of runs too."""
+    held = sum(4 for c in comparison.candidates if c.held is not None)
+    return held + sum(8 + c.rows.size + count_drawn(c.calibration) for c in comparison.candidates)
+
+
 def drawn_in_output(
     calibration: Calibration, validation: Validation, n: int, steps: object
 ) -> dict[Place, float | None]:
@@ -68,22 +78,51 @@ def drawn_in_output(
     Of the whole report n numbers follow from posterior draws; `steps` is the recorded length of the
     other run.
     """
-    times = multiple(n) * of_difference(calibration, steps)
+    times = multiple(n) * _of_difference(calibration, steps)
     errors = posterior_errors(calibration)
     errors |= validation_errors(calibration, validation, times)
-    return scaled(errors, times)
+    return _scaled(errors, times)
 
 
 def drawn_in_run(calibration: Calibration, steps: object) -> dict[Place, float | None]:
     """Return the same for a run, and the posterior sds that its mode is judged by."""
     errors = posterior_errors(calibration)
     errors["log_evidence",] = errors.pop(("sampling", "log_evidence"))
-    times = multiple(count_drawn(calibration)) * of_difference(calibration, steps)
+    times = multiple(count_drawn(calibration)) * _of_difference(calibration, steps)
     sds = enumerate(calibration.draws.flat.std(axis=0).tolist())
-    return scaled(errors, times) | {("mode", str(j)): sd for j, sd in sds}
+    return _scaled(errors, times) | {("mode", str(j)): sd for j, sd in sds}
 
 
-def left_out(calibration: Calibration) -> tuple[Array, Array]:
+def drawn_in_comparison(
+    comparison: Comparison, best: str, steps: Mapping[str, object]
+) -> dict[Place, float | None]:
+    """Return what Monte Carlo error allows to a comparison's numbers, by paths below ``models``.
+
+    Differences are from the model `best`; `steps` are recorded lengths of the other runs, by model.
+    """
+    moved = {c.model: _RowErrors.of(c.calibration) for c in comparison.candidates}
+    first = next(c for c in comparison.candidates if c.model == best)
+    n, found = count_compared(comparison), dict[Place, float | None]()
+    for c in comparison.candidates:
+        times = multiple(n) * _of_difference(c.calibration, steps.get(c.model))
+        of_sum = np.hypot(moved[c.model].of_sum(), moved[best].of_sum())
+        spread = _lever_of(first.rows - c.rows)
+        of_spread = np.hypot(moved[c.model].along(spread), moved[best].along(spread))
+        errors = _scores(validation_errors(c.calibration, c.loo, times), moved[c.model].heavy)
+        errors["below_best",] = float(of_sum)
+        errors["below_best_se",] = float(of_spread)
+        errors["log_evidence",] = posterior_errors(c.calibration)["sampling", "log_evidence"]
+        for i, error in enumerate(moved[c.model].each.tolist()):
+            errors["elpd_rows", str(i)] = error
+        if c.held is not None:
+            held = _scores(validation_errors(c.calibration, c.held, times), 1.0)
+            held["elpd",] = _held_error(c.calibration, c.held)
+            errors |= {("held_out", *place): size for place, size in held.items()}
+        found |= {(c.model, *k): size for k, size in _scaled(errors, times).items()}
+    return found
+
+
+def _left_out(calibration: Calibration) -> tuple[Array, Array]:
     """Influence of each draw on -ln E[1/p(y_i | theta)], (draws, n), and that itself, (n,)."""
     rows = calibration.problem.log_likelihood_left_out(calibration.draws.flat)
     inverse = np.exp(rows.min(axis=0) - rows)
@@ -91,14 +130,14 @@ def left_out(calibration: Calibration) -> tuple[Array, Array]:
     return influence, rows.min(axis=0) - np.log(inverse.mean(axis=0))
 
 
-def lever_of(elpd: Array) -> Array:
+def _lever_of(elpd: Array) -> Array:
     """Derivatives of sqrt(n var) of some rows by each of them."""
     n = elpd.size
     spread = float(np.sqrt(n * elpd.var(ddof=1)))
     return n * (elpd - elpd.mean()) / ((n - 1) * spread) if spread > 0.0 else np.zeros(n)
 
 
-def of_difference(calibration: Calibration, steps: object) -> float:
+def _of_difference(calibration: Calibration, steps: object) -> float:
     """Error of the difference of two runs over that of this one, should the other be shorter."""
     ratio = 1.0
     if isinstance(steps, int | float) and steps > 0:
@@ -106,7 +145,7 @@ def of_difference(calibration: Calibration, steps: object) -> float:
     return float(np.sqrt(1.0 + np.clip(ratio, 1.0, 4.0)))
 
 
-def scaled(errors: dict[Place, float | None], times: float) -> dict[Place, float | None]:
+def _scaled(errors: dict[Place, float | None], times: float) -> dict[Place, float | None]:
     """Return so many times the errors, of those that exist."""
     return {place: None if error is None else times * error for place, error in errors.items()}
 
@@ -154,8 +193,7 @@ def validation_errors(
     """
     draws, observed, scores = validation.draws, validation.observed, validation.scores
     n_draws, n = draws.shape
-    ess = min(float(s.ess_bulk) for s in calibration.summary.values())
-    part = float(np.sqrt(1.0 / n_draws + 1.0 / ess))
+    part = float(np.sqrt(1.0 / n_draws + 1.0 / _least_ess(calibration)))
     p = np.clip(scores.pit, 4.0 / n_draws, 1.0 - 4.0 / n_draws)
     pit = np.sqrt(p * (1.0 - p)) * part
     slope = (np.quantile(draws, 0.55, axis=0) - np.quantile(draws, 0.45, axis=0)) / 0.1
@@ -170,7 +208,9 @@ def validation_errors(
     relative = median[large] / np.abs(observed[large])
     if relative.size:
         errors["validation", "max_relative_error"] = float(relative.max())
-        near = np.abs(np.abs(scores.relative_error[large]) - 0.06) <= multiple * relative
+        near = (
+            np.abs(np.abs(scores.relative_error[large]) - RELATIVE_ERROR_FAR) <= multiple * relative
+        )
         errors["validation", "n_relative_error_above_6_percent"] = near.sum() / multiple
     for level in LEVELS:
         edges = 0.5 + 0.5 * level * np.array([-1.0, 1.0])
@@ -181,7 +221,10 @@ def validation_errors(
         for end in ("0", "1"):
             errors["validation", "coverage_interval", f"{100 * level:g}", end] = 1.5 * moved
     if validation.method == "leave_one_out":
-        errors |= _elpd_errors(calibration, ess)
+        influence, elpd = _left_out(calibration)
+        rows = _RowErrors(influence, float(np.sqrt(_least_ess(calibration))))
+        errors["validation", "elpd"] = rows.of_sum()
+        errors["validation", "elpd_se"] = rows.along(_lever_of(elpd))
     return errors
 
 
@@ -208,12 +251,64 @@ def _crps_influence(draws: Array, observed: Array) -> float:
     return float((np.abs(draws - observed) - apart).mean(axis=1).std())
 
 
-def _elpd_errors(calibration: Calibration, ess: float) -> dict[Place, float | None]:
-    """Of the sum over rows of -ln E[1/p(y_i | theta)] and of its spread, by their influence."""
-    influence, elpd = left_out(calibration)
-    lever = lever_of(elpd)
-    root = np.sqrt(ess)
-    return {
-        ("validation", "elpd"): float(influence.sum(axis=1).std() / root),
-        ("validation", "elpd_se"): float((influence @ lever).std() / root),
-    }
+@dataclass(frozen=True, eq=False)
+class _RowErrors:
+    """Monte Carlo errors of the log density of each row without it.
+
+    From the influence of each draw (draws, n), of mean zero, and the root of the effective sample
+    size.
+    """
+
+    influence: Array
+    root: float
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> _RowErrors:
+        """Of a calibrated model."""
+        return cls(_left_out(calibration)[0], float(np.sqrt(_least_ess(calibration))))
+
+    @property
+    def each(self) -> Array:
+        """Of each row, shape (n,)."""
+        return np.asarray(self.influence.std(axis=0) / self.root)
+
+    @property
+    def heavy(self) -> float:
+        """Root of the draws over those that they are worth for the row of the fewest."""
+        return float(np.sqrt(1.0 + np.square(self.influence).mean(axis=0).max()))
+
+    def of_sum(self) -> float:
+        """Of the sum over the rows."""
+        return self.along(np.ones(self.influence.shape[1]))
+
+    def along(self, lever: Array) -> float:
+        """Of the rows times a lever, summed."""
+        return float((self.influence @ lever).std() / self.root)
+
+
+def _scores(errors: Mapping[Place, float | None], heavy: float) -> dict[Place, float | None]:
+    """Those of a validation's errors that a comparison states, as it names them.
+
+    They are `heavy` times as large as those of draws that all weigh the same.
+    """
+    found: dict[Place, float | None] = {
+        (name,): errors["validation", name] for name in ("elpd", "elpd_se")
+        if ("validation", name) in errors
+    }  # fmt: skip
+    for name in ("rmse", "crps"):
+        error = errors["validation", name]
+        found[name,] = None if error is None else heavy * error
+    found["coverage_90",] = errors["validation", "coverage", "90"]
+    return found
+
+
+def _held_error(calibration: Calibration, held: Validation) -> float:
+    """Of the log of the mean density of each held-out row, summed."""
+    rows = calibration.problem.with_table(held.table).log_likelihood_rows(calibration.draws.flat)
+    density = np.exp(np.where(np.isfinite(rows), rows, -np.inf) - np.nanmax(rows, axis=0))
+    influence = (density / density.mean(axis=0)).sum(axis=1)
+    return float(influence.std() / np.sqrt(_least_ess(calibration)))
+
+
+def _least_ess(calibration: Calibration) -> float:
+    return min(float(s.ess_bulk) for s in calibration.summary.values())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, Literal
@@ -52,9 +52,16 @@ class Item:
         return float(abs(self.recorded - self.found) / self.allowed)
 
 
+def mostly_different(items: Sequence[Item]) -> bool:
+    """Whether more than half of the numbers among some items are different."""
+    numbers = [item for item in items if isinstance(item.recorded, float)]
+    different = sum(item.status is Status.DIFFERENT for item in numbers)
+    return different > 0.5 * len(numbers)
+
+
 SCHEMA = "calib/check/1"
 # Below this part of what is allowed, the draws are the same ones and rounding differs.
-_ROUNDED = 1e-3
+ROUNDED = 1e-3
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,7 @@ class Outcome:
     def draws_differ(self) -> bool:
         """Whether the posterior was drawn by other random draws than those recorded."""
         return any(
-            item.note == MONTE_CARLO and item.share is not None and item.share > _ROUNDED
+            item.note == MONTE_CARLO and item.share is not None and item.share > ROUNDED
             for item in self.of(Status.WITHIN)
         )
 

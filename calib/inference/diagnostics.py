@@ -17,6 +17,7 @@ from scipy.special import ndtri
 from calib.models.base import Array
 
 _AXES = {"chain_axis": 0, "draw_axis": 1}
+# Autocorrelation times that are summed over.
 _WINDOW = 5.0
 
 
@@ -154,6 +155,48 @@ def hdi_error(batches: Array, prob: float) -> Array:
 def median_error(batches: Array) -> float:
     """Monte Carlo standard error of the median of draws in nearly independent parts, (g, m)."""
     return float(np.median(batches, axis=-1).std(ddof=1) / np.sqrt(batches.shape[0]))
+
+
+N_BINS = 20
+
+
+def rank_histograms(values: Array) -> Array:
+    """Histograms of the ranks of each ensemble's draws among all draws, relative to uniform.
+
+    Of values (ensembles, n), shape (ensembles, `N_BINS`); all near 1 where the ensembles sample the
+    same distribution.
+    """
+    order = values.ravel().argsort(kind="stable")
+    which = np.empty(values.size, dtype=np.int64)
+    which[order] = np.arange(values.size) * N_BINS // values.size
+    counts = [np.bincount(row, minlength=N_BINS) for row in which.reshape(values.shape)]
+    return np.asarray(np.stack(counts) * N_BINS / values.shape[1], dtype=np.float64)
+
+
+def rank_scatter(effective: float) -> float:
+    """Half the 95 % range of a rank histogram's bin about 1, from so many effective draws."""
+    return float(1.96 * np.sqrt((N_BINS - 1.0) / max(effective, 1.0)))
+
+
+# A positive parameter whose interval spans this factor is looked at by its logarithm.
+_WIDE = 4.0
+
+
+def distances(
+    draws: Array, values: Array, interval: tuple[float, float]
+) -> tuple[Array, Array, bool]:
+    """Express values (k,), and an interval, as distances from the mean of draws in their sds.
+
+    And say whether logarithms were taken, as they are of positive parameters that span decades; a
+    value without one has the distance NaN.
+    """
+    low, high = interval
+    log = bool(low > 0.0 and high > _WIDE * low)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        to = np.log if log else np.asarray
+        t, x = to(draws[draws > 0.0] if log else draws), to(np.asarray(values, dtype=float))
+    mean, sd = t.mean(), t.std()
+    return (x - mean) / sd, (to(np.array(interval)) - mean) / sd, log
 
 
 def psis(log_ratio: Array) -> tuple[Array, Array]:

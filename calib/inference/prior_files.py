@@ -104,13 +104,12 @@ class _File(BaseModel):
     parameters: dict[str, _AnyEntry]
 
 
-_FILE: TypeAdapter[_File] = TypeAdapter(_File)
 _NOISE = TypeAdapter(dict[str, _AnyEntry]).validate_python(tomllib.loads(DEFAULT_PRIORS))
 
 
 def json_schema() -> dict[str, Any]:
     """Return the JSON schema of a prior file."""
-    return _FILE.json_schema()
+    return _File.model_json_schema()
 
 
 @dataclass(frozen=True)
@@ -250,7 +249,7 @@ def parse_priors(
     noise = _noise_choice(content, source, parameters)
     _check_names(content, source, model_name, parameters, noise.parameters)
     try:
-        file = _FILE.validate_python(content)
+        file = _File.model_validate(content)
     except ValidationError as error:
         raise _explain(error, source) from None
     _check_units(file, source, model_name)

@@ -16,6 +16,7 @@ import numpy as np
 
 from calib.models.base import Array, Columns, Conditions, Model, References, Rows
 
+PRESSURE, WIDTH = "average_ground_pressure_kpa", "plate_width_mm"
 LN_MM_PER_M = float(np.log(1000.0))
 
 
@@ -41,9 +42,11 @@ def rut_depth(
     return np.asarray((pressure_kpa / k) ** (1.0 / (n0 + n1 * slip_ratio)))
 
 
-def _prepare(conditions: Conditions, references: References) -> Rows:
-    ln_pressure = np.log(conditions["average_ground_pressure_kpa"] / references["p_ref_kpa"])
-    rows = {"ln_pressure": ln_pressure}
+def prepare(conditions: Conditions, references: References) -> Rows:
+    """Return what sinkages need: ln of the relative pressure, and width and slip if there are."""
+    rows = {"ln_pressure": np.log(conditions[PRESSURE] / references["p_ref_kpa"])}
+    if WIDTH in conditions:
+        rows["wider"] = conditions[WIDTH] / references["b_ref_mm"]
     return rows | ({"slip": conditions["slip_ratio"]} if "slip_ratio" in conditions else {})
 
 
@@ -59,8 +62,14 @@ def _ln_rut_mm(
     return ln_z
 
 
-def _references(conditions: Conditions) -> dict[str, float]:
-    return {"p_ref_kpa": float(np.exp(np.log(conditions["average_ground_pressure_kpa"]).mean()))}
+def bind_references(conditions: Conditions) -> dict[str, float]:
+    """Return the geometric means of the pressure, and of the width of plates if there is one."""
+    names = {"p_ref_kpa": PRESSURE, "b_ref_mm": WIDTH}
+    return {
+        name: float(np.exp(np.log(conditions[column]).mean()))
+        for name, column in names.items()
+        if column in conditions
+    }
 
 
 def _location_bekker(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
@@ -75,46 +84,48 @@ def _location_modified(columns: Columns, rows: Rows, references: References, wor
     return _ln_rut_mm(rows["ln_pressure"], exponent, z_ref, n0, work)
 
 
-def _k(z_ref_mm: Array, n0: Array, references: References) -> Array:
-    return np.asarray(references["p_ref_kpa"] * (z_ref_mm / 1000.0) ** -n0)
+def modulus(z_ref: Array, n: Array, references: References, width_mm: float = 1000.0) -> Array:
+    """Return k (kPa) of p = k (z/b)^n by its sinkage z_ref (mm) at the mean pressure."""
+    return np.asarray(references["p_ref_kpa"] * (z_ref / width_mm) ** -n)
 
 
-def _z_ref(k: float, n0: float, references: References) -> float:
-    return float(1000.0 * (references["p_ref_kpa"] / k) ** (1.0 / n0))
+def sinkage(k: float, n: float, references: References, width_mm: float = 1000.0) -> float:
+    """Return the sinkage (mm) at the mean pressure by k (kPa), the inverse of `modulus`."""
+    return float(width_mm * (references["p_ref_kpa"] / k) ** (1.0 / n))
 
 
 def _report_bekker(theta: Array, references: References) -> dict[str, Array]:
     z_ref, n = theta.T
-    return {"n": n, "k": _k(z_ref, n, references)}
+    return {"n": n, "k": modulus(z_ref, n, references)}
 
 
 def _report_modified(theta: Array, references: References) -> dict[str, Array]:
     z_ref, n0, n1 = theta.T
-    return {"n0": n0, "n1": n1, "k": _k(z_ref, n0, references)}
+    return {"n0": n0, "n1": n1, "k": modulus(z_ref, n0, references)}
 
 
 def _theta_bekker(reported: Mapping[str, float], references: References) -> Array:
-    return np.array([_z_ref(reported["k"], reported["n"], references), reported["n"]])
+    return np.array([sinkage(reported["k"], reported["n"], references), reported["n"]])
 
 
 def _theta_modified(reported: Mapping[str, float], references: References) -> Array:
     n0 = reported["n0"]
-    return np.array([_z_ref(reported["k"], n0, references), n0, reported["n1"]])
+    return np.array([sinkage(reported["k"], n0, references), n0, reported["n1"]])
 
 
 BEKKER = Model(
     name="bekker",
     title="Bekker pressure-sinkage",
     output="rut_depth_mm",
-    conditions=("average_ground_pressure_kpa",),
+    conditions=(PRESSURE,),
     parameters=("z_ref", "n"),
     reported={"n": "1", "k": "kPa/m^n"},
     response="log",
     location=_location_bekker,
     report_theta=_report_bekker,
     theta_from_reported=_theta_bekker,
-    bind_references=_references,
-    prepare=_prepare,
+    bind_references=bind_references,
+    prepare=prepare,
     latex=(
         r"$z_0 = (p_\mathrm{gr}/k)^{1/n}$",
         r"$k = k_\mathrm{c}/b + k_\phi$",
@@ -148,15 +159,15 @@ MODIFIED_BEKKER = Model(
     name="modified_bekker",
     title="Bekker with slip sinkage",
     output="rut_depth_mm",
-    conditions=("average_ground_pressure_kpa", "slip_ratio"),
+    conditions=(PRESSURE, "slip_ratio"),
     parameters=("z_ref", "n0", "n1"),
     reported={"n0": "1", "n1": "1", "k": "kPa/m^n"},
     response="log",
     location=_location_modified,
     report_theta=_report_modified,
     theta_from_reported=_theta_modified,
-    bind_references=_references,
-    prepare=_prepare,
+    bind_references=bind_references,
+    prepare=prepare,
     latex=(
         r"$z_\mathrm{t} = (p_\mathrm{gr}/k)^{1/(n_0 + n_1 s)}$",
         r"$k = k_\mathrm{c}/b + k_\phi$",

@@ -13,28 +13,12 @@ on ln z.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 
-from calib.models.base import Array, Columns, Conditions, Model, References, Rows
-
-_P, _B = "average_ground_pressure_kpa", "plate_width_mm"
-
-
-def _mean(values: Array) -> float:
-    return float(np.exp(np.log(values).mean()))
-
-
-def _references(conditions: Conditions) -> dict[str, float]:
-    pressure = {"p_ref_kpa": _mean(conditions[_P])}
-    return pressure | ({"b_ref_mm": _mean(conditions[_B])} if _B in conditions else {})
-
-
-def _prepare(conditions: Conditions, references: References) -> Rows:
-    rows = {"ln_pressure": np.log(conditions[_P] / references["p_ref_kpa"])}
-    if _B in conditions:
-        rows["wider"] = conditions[_B] / references["b_ref_mm"]
-    return rows | ({"slip": conditions["slip_ratio"]} if "slip_ratio" in conditions else {})
+from calib.models.base import Array, Columns, Model, References, Rows
+from calib.models.bekker import PRESSURE, WIDTH, bind_references, modulus, prepare, sinkage
 
 
 def _bekker(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
@@ -56,29 +40,21 @@ def _lyasko(columns: Columns, rows: Rows, references: References, work: Array) -
     return np.asarray(np.log(z_ref) + rows["ln_pressure"] / n + deeper)
 
 
-def _modulus(z_ref: Array, n: Array, references: References, width_mm: float = 1000.0) -> Array:
-    return np.asarray(references["p_ref_kpa"] * (z_ref / width_mm) ** -n)
-
-
-def _z_ref(k: float, n: float, references: References, width_mm: float = 1000.0) -> float:
-    return float(width_mm * (references["p_ref_kpa"] / k) ** (1.0 / n))
-
-
 def _report_bekker(theta: Array, references: References) -> dict[str, Array]:
     z_ref, n, share = theta.T
-    k = _modulus(z_ref, n, references)
+    k = modulus(z_ref, n, references)
     return {"n": n, "kc": share * k * references["b_ref_mm"] / 1000.0, "kphi": (1.0 - share) * k}
 
 
 def _theta_bekker(reported: Mapping[str, float], references: References) -> Array:
     n, by_width = reported["n"], reported["kc"] / (references["b_ref_mm"] / 1000.0)
     k = by_width + reported["kphi"]
-    return np.array([_z_ref(k, n, references), n, by_width / k])
+    return np.array([sinkage(k, n, references), n, by_width / k])
 
 
 def _report_reece(theta: Array, references: References) -> dict[str, Array]:
     z_ref, n, share = theta.T
-    k = _modulus(z_ref, n, references, references["b_ref_mm"])
+    k = modulus(z_ref, n, references, references["b_ref_mm"])
     return {"n": n, "k1": (1.0 - share) * k, "k2": share * k / references["b_ref_mm"] * 1000.0}
 
 
@@ -86,39 +62,43 @@ def _theta_reece(reported: Mapping[str, float], references: References) -> Array
     width = references["b_ref_mm"]
     by_width = reported["k2"] * width / 1000.0
     k = reported["k1"] + by_width
-    return np.array([_z_ref(k, reported["n"], references, width), reported["n"], by_width / k])
+    return np.array([sinkage(k, reported["n"], references, width), reported["n"], by_width / k])
 
 
 def _report_lyasko(theta: Array, references: References) -> dict[str, Array]:
     z_ref, n, a = theta.T
-    return {"n": n, "k": _modulus(z_ref, n, references), "a": a}
+    return {"n": n, "k": modulus(z_ref, n, references), "a": a}
 
 
 def _theta_lyasko(reported: Mapping[str, float], references: References) -> Array:
     n = reported["n"]
-    return np.array([_z_ref(reported["k"], n, references), n, reported["a"]])
+    return np.array([sinkage(reported["k"], n, references), n, reported["a"]])
 
 
-_OF_WIDTHS = (
-    "The sinkage z_ref at {p_ref_kpa:.4g} kPa and a width of {b_ref_mm:.4g} mm (means of the "
-    "data) is sampled in the place of the modulus, which is almost collinear with n, and "
-    "beside it the part of the modulus there that depends on the width; the published "
-    "constants follow."
+_plate = partial(
+    Model,
+    output="rut_depth_mm",
+    conditions=(PRESSURE, WIDTH),
+    parameters=("z_ref", "n", "share"),
+    response="log",
+    bind_references=bind_references,
+    prepare=prepare,
+    letters="[$p] the pressure (kPa), [$z] the sinkage and [$b] the width of the plate (m)",
+    parametrisation=(
+        "The sinkage z_ref at {p_ref_kpa:.4g} kPa and a width of {b_ref_mm:.4g} mm (means of the "
+        "data) is sampled in the place of the modulus, which is almost collinear with n, and "
+        "beside it the part of the modulus there that depends on the width; the published "
+        "constants follow."
+    ),
 )
 
-BEKKER_PLATE = Model(
+BEKKER_PLATE = _plate(
     name="bekker_plate",
     title="Bekker under plates of several widths",
-    output="rut_depth_mm",
-    conditions=(_P, _B),
-    parameters=("z_ref", "n", "share"),
     reported={"n": "1", "kc": "kPa/m^(n-1)", "kphi": "kPa/m^n"},
-    response="log",
     location=_bekker,
     report_theta=_report_bekker,
     theta_from_reported=_theta_bekker,
-    bind_references=_references,
-    prepare=_prepare,
     latex=(r"$p = (k_\mathrm{c}/b + k_\phi) z^n$",),
     source="Bekker (1956), Theory of Land Locomotion; Wong (2008), Theory of Ground Vehicles",
     applies=(
@@ -126,8 +106,6 @@ BEKKER_PLATE = Model(
         "k_c and k_phi cannot be told apart. The moduli depend on the exponent by their "
         "units, so they carry over to another soil only together with it."
     ),
-    letters="[$p] the pressure (kPa), [$z] the sinkage and [$b] the width of the plate (m)",
-    parametrisation=_OF_WIDTHS,
     example="""\
 average_ground_pressure_kpa,plate_width_mm,rut_depth_mm
 5,60,3.221
@@ -145,19 +123,13 @@ average_ground_pressure_kpa,plate_width_mm,rut_depth_mm
 """,
 )
 
-REECE = Model(
+REECE = _plate(
     name="reece",
     title="Reece pressure-sinkage",
-    output="rut_depth_mm",
-    conditions=(_P, _B),
-    parameters=("z_ref", "n", "share"),
     reported={"n": "1", "k1": "kPa", "k2": "kPa/m"},
-    response="log",
     location=_reece,
     report_theta=_report_reece,
     theta_from_reported=_theta_reece,
-    bind_references=_references,
-    prepare=_prepare,
     latex=(r"$p = (k_1 + k_2 b)(z/b)^n$",),
     source="Reece (1965), Proc. Inst. Mech. Eng. 180(2A), 45-66; Wong & Reece (1967)",
     applies=(
@@ -165,8 +137,6 @@ REECE = Model(
         "with width where friction carries the plate and do not where cohesion does. Not "
         "for layered soil or a box whose walls are within a few plate widths."
     ),
-    letters="[$p] the pressure (kPa), [$z] the sinkage and [$b] the width of the plate (m)",
-    parametrisation=_OF_WIDTHS,
     example="""\
 average_ground_pressure_kpa,plate_width_mm,rut_depth_mm
 5,60,3.955
@@ -188,15 +158,15 @@ LYASKO = Model(
     name="lyasko",
     title="Lyasko slip sinkage",
     output="rut_depth_mm",
-    conditions=(_P, "slip_ratio"),
+    conditions=(PRESSURE, "slip_ratio"),
     parameters=("z_ref", "n", "a"),
     reported={"n": "1", "k": "kPa/m^n", "a": "1"},
     response="log",
     location=_lyasko,
     report_theta=_report_lyasko,
     theta_from_reported=_theta_lyasko,
-    bind_references=_references,
-    prepare=_prepare,
+    bind_references=bind_references,
+    prepare=prepare,
     latex=(r"$z = (p/k)^{1/n}(1 + s)/(1 - a s)$",),
     source="Lyasko (2010), J. Terramechanics 47(1), 21-31",
     applies=(

@@ -23,7 +23,7 @@ from calib.inference.io import load_calibration, save_calibration
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.figures.style import BLACK, BLUE, legend_below, panels, png_bytes, style
-from calib.report.labels import axis_of
+from calib.report.labels import aligned, axis_of
 from calib.report.numbers import finite, format_number
 from calib.report.page.template import data_uri, template
 from calib.report.writer import file_hashes
@@ -58,7 +58,8 @@ def comparison_figure(comparison: Comparison) -> Figure:
             dash = ax.plot(place, middle, "_", color=BLUE, markersize=4.0)[0]
             dots = ax.plot(place, y.factor * candidate.loo.observed, ".", color=BLACK,
                            markersize=3.0)[0]  # fmt: skip
-            ax.set_title(_title(comparison, candidate))
+            weight = comparison.weights[candidate.model]
+            ax.set_title(f"{candidate.model}, weight {weight:.2f}")
             ax.set_xlabel(x.label)
         for ax in axes.flat[len(candidates) :]:
             ax.set_visible(False)
@@ -89,10 +90,6 @@ def _spread(x: Array) -> Array:
             room * (np.arange(same.size) - 0.5 * (same.size - 1)) / max(1, same.size**0.5)
         )
     return moved
-
-
-def _title(comparison: Comparison, candidate: Candidate) -> str:
-    return f"{candidate.model}, weight {comparison.weights[candidate.model]:.2f}"
 
 
 _HEAD = (
@@ -126,24 +123,21 @@ def _row(name: str, m: Mapping[str, Any]) -> list[str]:
 def text(found: Mapping[str, Any]) -> str:
     """Lay the table out as text, the verdict below it."""
     head, body = table(found)
-    lines = [head, *body]
-    widths = [max(len(line[j]) for line in lines) for j in range(len(head))]
-    shown = ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in lines]
-    return "\n".join([*(line.rstrip() for line in shown), found["verdict"]])
+    return "\n".join([*aligned([head, *body]), found["verdict"]])
 
 
-def render(found: Mapping[str, Any], image: str, command: Sequence[str]) -> str:
-    """Render the page from the content of `comparison.json` and the figure's data URI."""
+def page(found: Mapping[str, Any], image: bytes) -> str:
+    """Return the page of a comparison, from the content of `comparison.json` and the figure."""
     head, body = table(found)
     models = [get_model(name) for name in found["models"]]
     return template("comparison.html.j2").render(
         found=found,
         head=head,
         rows=body,
-        image=image,
+        image=data_uri(image),
         models=[{"name": m.name, "title": m.title, "equation": m.equation, "source": m.source}
                 for m in models],
-        command=shlex.join(command),
+        command=shlex.join(found["command"]),
     )  # fmt: skip
 
 
@@ -200,11 +194,6 @@ def _model(comparison: Comparison, c: Candidate, best: Candidate) -> dict[str, A
             "coverage_90": c.held.scores.coverage[0.9].proportion,
         }
     return found
-
-
-def page(found: Mapping[str, Any], image: bytes) -> str:
-    """Return the page of a comparison, from the content of `comparison.json` and the figure."""
-    return render(found, data_uri(image), found["command"])
 
 
 def write_comparison(

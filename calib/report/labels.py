@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -131,3 +132,10 @@ def joined(words: list[str]) -> str:
 def unbroken(text: str) -> str:
     """Keep numbers and their units on one line."""
     return re.sub(r"(\d) (%|kN|mm|psi|kPa|g/cm³|rows?\b)", "\\1\N{NO-BREAK SPACE}\\2", text)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lay rows of a table out as lines of text whose columns begin below each other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(map(str.ljust, row, widths)) for row in rows)
+    return [line.rstrip() for line in lines]

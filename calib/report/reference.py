@@ -61,6 +61,16 @@ class FittedTable:
     note: str = ""
 
     @property
+    def figures(self) -> dict[str, Figure]:
+        """The estimates, and the goodness of fit."""
+        return {**self.estimates, **self.quality}
+
+    @property
+    def place(self) -> str:
+        """Where they are printed, in short."""
+        return self.source.partition(",")[0]
+
+    @property
     def values(self) -> dict[str, float]:
         """The estimates as numbers."""
         return {name: figure.value for name, figure in self.estimates.items()}

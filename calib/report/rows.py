@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtri
 
 from calib.data.quantities import columns_of, role_of
 from calib.data.table import Table
-from calib.inference.calibration import Calibration
-from calib.inference.random import generator
 from calib.models.base import Array
 from calib.report.labels import Axis, axis_of
 from calib.report.study import OutputResult
-from calib.validation.prediction import Bands, bands
 from calib.validation.residuals import sign_changes
 
 MAX_PANELS = 6
-_N_DRAWS = 1000
 _GRID = 100
 
 
@@ -150,22 +144,3 @@ def grid(result: OutputResult, group: Group) -> dict[str, Array]:
             outside = np.empty(0) if held is None else held[name][group.held_out]
             conditions[name] = np.full(_GRID, np.median(np.append(inside, outside)))
     return conditions
-
-
-def smooth_bands(
-    calibration: Calibration, conditions: Mapping[str, Array], *, prior: bool = False
-) -> tuple[Bands, Bands]:
-    """Bands of the mean output and of a measurement along a curve, of posterior or prior.
-
-    Each draw has one noise value for the whole curve, so that its quantiles are smooth in x.
-    """
-    problem = calibration.problem
-    rng = generator(calibration.seed, calibration.label, "figures")
-    t = problem.priors.sample(rng, _N_DRAWS) if prior else calibration.subset(_N_DRAWS)
-    natural = problem.theta(t)
-    size = natural.shape[0]
-    z = ndtri((rng.permutation(size) + 0.5) / size)[:, None]
-    location = problem.draw_location(natural, conditions, rng)
-    noise = problem.noise.of_normal(natural, conditions, z)
-    back = problem.bound.from_response
-    return bands(back(location)), bands(back(location + noise))

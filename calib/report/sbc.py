@@ -29,7 +29,7 @@ from calib.report.figures.style import (
     png_bytes,
     style,
 )
-from calib.report.labels import MINUS, short, symbol
+from calib.report.labels import MINUS, aligned, short, symbol
 from calib.report.numbers import finite
 from calib.report.page.template import data_uri, template
 from calib.validation.sbc.designs import design_of
@@ -206,10 +206,7 @@ def _section(m: ModelScore, score: SbcScore, images: Mapping[str, str]) -> dict[
 
 def text_table(score: SbcScore) -> str:
     """Lay a run out as text."""
-    rows = [list(_HEAD), *(_row(m) for m in score.models)]
-    widths = [max(len(row[j]) for row in rows) for j in range(len(_HEAD))]
-    lines = ["  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) for row in rows]
-    return "\n".join([*(line.rstrip() for line in lines), verdict(score)])
+    return "\n".join([*aligned([_HEAD, *(_row(m) for m in score.models)]), verdict(score)])
 
 
 SCHEMA = "calib/sbc/1"

@@ -166,7 +166,7 @@ def _validation(result: OutputResult) -> dict[str, Any]:
 def _scores(s: Scores) -> dict[str, Any]:
     return {
         **_picked(s, "n", "rmse", "crps", "max_relative_error"),
-        "n_relative_error_above_6_percent": int((abs(s.relative_error) > 0.06).sum()),
+        "n_relative_error_above_6_percent": s.n_far,
         "coverage": {f"{100 * level:g}": c.proportion for level, c in s.coverage.items()},
         "coverage_interval": {
             f"{100 * level:g}": [c.lower, c.upper] for level, c in s.coverage.items()

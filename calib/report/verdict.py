@@ -20,14 +20,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
-from scipy.stats import binomtest
 
 from calib.data.quantities import role_of
 from calib.inference.calibration import Calibration
 from calib.report.labels import axis_of, joined, percent, plain, short
 from calib.report.rows import held_table, signs_along, x_column
 from calib.report.study import OutputResult, judged
-from calib.validation.joint import coverage_probability, effective_rows, hits
+from calib.validation.joint import binomial_p, coverage_probability, effective_rows, hits
 from calib.validation.residuals import standardise
 from calib.validation.roles import MOVED, PRIOR, role
 from calib.validation.validate import Validation
@@ -109,7 +108,6 @@ class Evidence:
     neighbours: int
     along: str
     inside: str
-    label: str = ""
     unseen_at: Where = Where.AT
     at_pressures: str = "the two calibrated pressures"
     prior_hits: int = 0
@@ -138,11 +136,6 @@ class Verdict:
     headline: str
     trust: str
     doubt: str
-
-
-def binomial_p(hits: int, n: int, level: float = 0.9) -> float:
-    """Probability of so few hits or fewer among n independent rows."""
-    return float(binomtest(hits, n, level, alternative="less").pvalue) if n else float("nan")
 
 
 def judge_evidence(e: Evidence) -> Verdict:
@@ -240,7 +233,6 @@ def gather(result: OutputResult) -> Evidence:
     held = held_table(result) is not None
     complete = bool(np.isfinite(v.draws).all(axis=1).any())
     parabolic = problem.bound.model.parabolic_in
-    quadratic = bool(parabolic)
     changes, neighbours = signs_along(result, standardise(calibration, problem).residual)
     scatter = float(np.mean(np.square(v.observed - problem.observed.mean())))
     return Evidence(
@@ -258,17 +250,16 @@ def gather(result: OutputResult) -> Evidence:
         effective=effective_rows(v.draws) if complete else float("nan"),
         rmse=v.scores.rmse,
         unit=axis_of(problem.bound.model.output).unit,
-        max_relative_error=_largest(v.scores.relative_error),
+        max_relative_error=v.scores.max_relative_error,
         prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
-        two_pressures=quadratic and np.unique(problem.table[parabolic]).size == 2,
+        two_pressures=bool(parabolic) and np.unique(problem.table[parabolic]).size == 2,
         skill=1.0 - v.scores.rmse**2 / scatter if scatter > 0.0 else float("nan"),
         sign_changes=changes,
         neighbours=neighbours,
         along=axis_of(x_column(result)).name.lower(),
         inside=_range_words(result),
-        label=problem.table.label,
-        unseen_at=_unseen_at(result) if quadratic and held else Where.AT,
-        at_pressures=_at_pressures(result) if quadratic else "",
+        unseen_at=_unseen_at(result) if parabolic and held else Where.AT,
+        at_pressures=_at_pressures(result) if parabolic else "",
         prior_hits=hits(result.prior_predictive, problem.observed, 0.95),
         prior_n=problem.observed.size,
         suspects=(
@@ -276,7 +267,7 @@ def gather(result: OutputResult) -> Evidence:
             if role_of(problem.bound.model.output) == "pull"
             else "the units"
         ),
-        notes=tuple(getattr(problem, "notes", ())),
+        notes=problem.notes,
     )
 
 
@@ -295,11 +286,6 @@ def _at_pressures(result: OutputResult) -> str:
     axis, x = axis_of(column), axis_of(along)
     words = joined([axis.value_text(float(p)) for p in np.unique(problem.table[column])])
     return f"{words} {axis.unit} for {x.name.lower()} {x.range_text(problem.table[along])}"
-
-
-def _largest(relative: np.ndarray) -> float:
-    judged = np.abs(relative[np.isfinite(relative)])
-    return float(judged.max()) if judged.size else float("nan")
 
 
 def _range_words(result: OutputResult) -> str:

@@ -9,6 +9,7 @@ for independent rows.
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import bdtr
 
 from calib.models.base import Array
 
@@ -24,9 +25,9 @@ def ks_distance(pit: Array) -> Array:
     return np.asarray(np.maximum(above.max(axis=-1), below.max(axis=-1)))
 
 
-def pit_half_width(draws: Array, level: float = 0.95) -> float:
-    """Half the width of the simultaneous band that PIT values of possible rows (size, n) are in."""
-    return float(np.quantile(ks_distance(_pit_of_draws(draws)), level))
+def pit_half_width(draws: Array) -> float:
+    """Half the width of the band that 95 % of the PIT values of possible rows (size, n) stay in."""
+    return float(np.quantile(ks_distance(_pit_of_draws(draws)), 0.95))
 
 
 def coverage_probability(draws: Array, hits: int, level: float) -> float:
@@ -37,6 +38,11 @@ def coverage_probability(draws: Array, hits: int, level: float) -> float:
     covered = (np.abs(_pit_of_draws(draws) - 0.5) <= 0.5 * level).sum(axis=1)
     # The draw that was observed counts among those possible, so it is never 0.
     return float((1 + (covered <= hits).sum()) / (1 + covered.size))
+
+
+def binomial_p(hits: int, n: int, level: float = 0.9) -> float:
+    """Probability of so few hits or fewer among n independent rows; NaN of none."""
+    return float(bdtr(hits, n, level)) if n else float("nan")
 
 
 def hits(draws: Array, observed: Array, level: float) -> int:

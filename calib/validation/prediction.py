@@ -25,6 +25,7 @@ N_DRAWS = 4000
 MIN_DEFINED = 0.95
 _ROWS_AT_ONCE = 2000
 _NOISE_REPEATS = 4
+_N_SMOOTH = 1000
 
 
 @dataclass(frozen=True)
@@ -190,6 +191,33 @@ def bands(draws: Array) -> Bands:
         dict(zip(LEVELS, quantiles[1 : 1 + k], strict=True)),
         dict(zip(LEVELS, quantiles[1 + k :], strict=True)),
     )
+
+
+def smooth_bands(
+    calibration: Calibration, conditions: Mapping[str, Array], *, prior: bool = False
+) -> tuple[Bands, Bands]:
+    """Bands of the mean output and of a measurement along a curve, of posterior or prior.
+
+    Each draw has one noise value for the whole curve, so that its quantiles are smooth in x.
+    """
+    problem = calibration.problem
+    rng = generator(calibration.seed, calibration.label, "figures")
+    t = problem.priors.sample(rng, _N_SMOOTH) if prior else calibration.subset(_N_SMOOTH)
+    natural = problem.theta(t)
+    size = natural.shape[0]
+    z = ndtri((rng.permutation(size) + 0.5) / size)[:, None]
+    location = problem.draw_location(natural, conditions, rng)
+    noise = problem.noise.of_normal(natural, conditions, z)
+    back = problem.bound.from_response
+    return bands(back(location)), bands(back(location + noise))
+
+
+def median_change(calibration: Calibration, column: str) -> float:
+    """Change of the median from the 10 to the 90 % point of a condition, medians of the others."""
+    calibrated = calibration.problem.conditions
+    at = {name: np.full(2, np.median(values)) for name, values in calibrated.items()}
+    at[column] = np.quantile(calibrated[column], [0.1, 0.9])
+    return float(np.diff(smooth_bands(calibration, at)[0].median)[0])
 
 
 def prediction_columns(prediction: Prediction, table: Table) -> dict[str, Array | list[str]]:

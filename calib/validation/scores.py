@@ -16,6 +16,8 @@ from calib.models.base import Array
 LEVELS = (0.5, 0.9, 0.95)
 # Relative errors of a pull near zero say nothing: rows below this part of the largest are left out.
 RELATIVE_ERROR_FLOOR = 0.05
+# Rows that are farther off than this are counted.
+RELATIVE_ERROR_FAR = 0.06
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,11 @@ class Scores:
         defined = self.relative_error[~np.isnan(self.relative_error)]
         return float(np.abs(defined).max()) if defined.size else float("nan")
 
+    @property
+    def n_far(self) -> int:
+        """How many rows have a relative error of more than 6 %."""
+        return int((np.abs(self.relative_error) > RELATIVE_ERROR_FAR).sum())
+
 
 def crps(draws: Array, observed: Array) -> Array:
     """Continuous ranked probability score of each observation, shape (n,).
@@ -89,11 +96,18 @@ def coverage(draws: Array, observed: Array, level: float) -> Coverage:
     low, high = np.quantile(draws, [0.5 - level / 2.0, 0.5 + level / 2.0], axis=0)
     hits = int(((observed >= low) & (observed <= high)).sum())
     n = int(observed.size)
+    return Coverage(level, hits, n, *jeffreys(hits, n))
+
+
+def jeffreys(hits: int, n: int) -> tuple[float, float]:
+    """Return the 95 % Jeffreys interval of a proportion, closed at the ends of all or none.
+
+    After Brown, Cai & DasGupta (2001), doi:10.1214/ss/1009213286.
+    """
     # Quantiles of the beta distribution, without SciPy's statistics, which are slow to import.
     a, b = hits + 0.5, n - hits + 0.5
-    lower = 0.0 if hits == 0 else float(betaincinv(a, b, 0.025))
-    upper = 1.0 if hits == n else float(betaincinv(a, b, 0.975))
-    return Coverage(level, hits, n, lower, upper)
+    low = 0.0 if hits == 0 else float(betaincinv(a, b, 0.025))
+    return low, 1.0 if hits == n else float(betaincinv(a, b, 0.975))
 
 
 def score(draws: Array, observed: Array, *, heavy: bool = False) -> Scores:

@@ -125,7 +125,7 @@ def test_numbers_of_other_seeds_move_by_their_errors(output: str) -> None:
     for path in judged:
         predicted = [e[path] for e in errors if e[path] is not None]
         ratio[path] = np.std([v[path] for v in values], ddof=1) / np.mean(predicted)
-    # Of 12 seeds an sd is known to a fifth; the allowance has a factor of 1.5 for the rest.
+    # Of 12 seeds an sd is known to a fifth; the tolerance has a factor of 1.5 for the rest.
     found = np.array(list(ratio.values()))
     assert np.median(found) == pytest.approx(0.95, abs=0.3)
     assert found.max() < 2.2, max(ratio, key=lambda path: ratio[path])

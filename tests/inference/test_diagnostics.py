@@ -10,10 +10,13 @@ from arviz_stats.base import array_stats
 from calib.inference.diagnostics import (
     autocorrelation_time,
     convergence,
+    distances,
     ess,
+    hdi,
     hdi_error,
     mcse,
     median_error,
+    rank_histograms,
     tail_shape,
 )
 
@@ -100,3 +103,30 @@ def test_the_shape_of_a_tail_is_that_of_its_pareto_distribution() -> None:
     # 3 sqrt n draws of a tail: an sd of (1 + k) / sqrt 424 = 0.09.
     np.testing.assert_allclose(found[:2], 0.8, atol=0.3)
     assert found[2] < 0.0
+
+
+def test_rank_histograms_see_an_ensemble_that_is_off() -> None:
+    rng = np.random.default_rng(1)
+    values = rng.standard_normal((4, 2000))
+    even = rank_histograms(values)
+    assert even.mean() == pytest.approx(1.0)
+    assert np.abs(even - 1.0).max() < 0.5
+    values[0] += 1.0
+    assert rank_histograms(values)[0, -1] > 2.0
+
+
+def test_distances_are_in_posterior_sds() -> None:
+    draws = np.random.default_rng(0).normal(10.0, 2.0, 20_000)
+    distance, interval, log = distances(draws, np.array([14.0, np.nan]), hdi(draws, 0.95))
+    assert distance[0] == pytest.approx(2.0, abs=0.05)
+    assert np.isnan(distance[1])
+    assert interval == pytest.approx([-1.96, 1.96], abs=0.06)
+    assert not log
+
+
+def test_distances_of_a_wide_positive_parameter_are_logarithmic() -> None:
+    draws = np.exp(np.random.default_rng(0).normal(0.0, 2.0, 20_000))
+    distance, _, log = distances(draws, np.array([np.exp(2.0), -1.0]), hdi(draws, 0.95))
+    assert log
+    assert distance[0] == pytest.approx(1.0, abs=0.05)
+    assert np.isnan(distance[1])

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import calib
-from calib.report.verdict import Evidence, Level, Where, binomial_p, gather, judge_evidence
+from calib.report.verdict import Evidence, Level, Where, gather, judge_evidence
+from calib.validation.joint import binomial_p
 
 FINE = Evidence(
     converged=True,
@@ -138,12 +139,6 @@ def test_parameters_set_by_the_prior_are_named_even_where_all_is_fine():
 def test_an_error_that_cannot_be_judged_is_not_printed():
     evidence = replace(FINE, hits=6, low_coverage_p=0.001, max_relative_error=float("nan"))
     assert "at most" not in judge_evidence(evidence).trust
-
-
-def test_binomial_p():
-    assert binomial_p(14, 14) == pytest.approx(1.0)
-    assert binomial_p(9, 14) == pytest.approx(0.0092, abs=0.0005)
-    assert np.isnan(binomial_p(0, 0))
 
 
 def test_evidence_of_the_held_out_pressure(drawbar):

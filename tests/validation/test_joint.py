@@ -7,6 +7,7 @@ import pytest
 from scipy.stats import binom, kstwo
 
 from calib.validation.joint import (
+    binomial_p,
     coverage_probability,
     effective_rows,
     ks_distance,
@@ -58,3 +59,10 @@ def test_ks_distance_of_known_values():
     assert ks_distance(np.array([0.5])) == pytest.approx(0.5)
     assert ks_distance(np.array([0.25, 0.75])) == pytest.approx(0.25)
     assert ks_distance(np.array([[0.9, 0.95], [0.25, 0.75]])) == pytest.approx([0.9, 0.25])
+
+
+def test_binomial_p():
+    assert binomial_p(14, 14) == pytest.approx(1.0)
+    assert binomial_p(9, 14) == pytest.approx(0.0092, abs=0.0005)
+    assert binomial_p(9, 14, 0.5) == pytest.approx(binom.cdf(9, 14, 0.5), rel=1e-12)
+    assert np.isnan(binomial_p(0, 0))

@@ -11,7 +11,14 @@ from scipy import stats
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
-from calib.validation.prediction import bands, predict, prediction_columns, predictive_draws
+from calib.validation.prediction import (
+    bands,
+    median_change,
+    predict,
+    prediction_columns,
+    predictive_draws,
+    smooth_bands,
+)
 from calib.validation.scores import LEVELS
 from calib.validation.validate import leave_one_out
 
@@ -208,3 +215,28 @@ def test_no_band_where_the_model_has_no_value_for_much_of_the_posterior(
     assert np.isnan(found.predictive.median[1])
     assert np.isnan(found.parameter.upper[0.9][1])
     assert "no value" in prediction_columns(found, far)["outside_calibrated_range"][1]
+
+
+def test_smooth_bands_nest_and_match_the_draws(rut_calibration: Calibration) -> None:
+    conditions = {"average_ground_pressure_kpa": np.full(5, 140.0),
+                  "slip_ratio": np.linspace(0, 0.2, 5)}  # fmt: skip
+    mean, measured = smooth_bands(rut_calibration, conditions)
+    for outer, inner in ((0.95, 0.9), (0.9, 0.5)):
+        assert (measured.lower[outer] < measured.lower[inner]).all()
+        assert (measured.upper[outer] > measured.upper[inner]).all()
+    assert (mean.upper[0.9] < measured.upper[0.9]).all()
+    assert (np.diff(mean.median) > 0).all()
+    natural = rut_calibration.problem.theta(rut_calibration.draws.flat)
+    exact = rut_calibration.problem.bound.predict(natural[:, :-1], conditions)
+    assert mean.median == pytest.approx(np.median(exact, axis=0), rel=0.01)
+
+
+def test_the_median_changes_as_the_equation_does(rut_calibration: Calibration) -> None:
+    problem = rut_calibration.problem
+    ends = np.quantile(problem.table["slip_ratio"], [0.1, 0.9])
+    pressure = np.median(problem.table["average_ground_pressure_kpa"])
+    at = {"average_ground_pressure_kpa": np.full(2, pressure), "slip_ratio": ends}
+    natural = problem.theta(rut_calibration.draws.flat)
+    low, high = np.median(problem.bound.predict(natural[:, :-1], at), axis=0)
+    assert median_change(rut_calibration, "slip_ratio") == pytest.approx(high - low, rel=0.02)
+    assert median_change(rut_calibration, "average_ground_pressure_kpa") > 0.0

@@ -12,7 +12,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.stats import beta
 
 from calib.batch.pool import Pool
 from calib.batch.threads import one_thread
@@ -38,6 +37,7 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.models.base import Array
 from calib.report.study import Progress
+from calib.validation.scores import jeffreys
 
 _BOX = 30.0
 _C_RANGE = (1.0, 2.0)
@@ -75,10 +75,8 @@ class Search:
     def share(self) -> Quantity:
         """Part of the seeds that arrived, with its 95 % Jeffreys interval."""
         hits, n = self.arrived, self.costs.size
-        low = 0.0 if hits == 0 else float(beta.ppf(0.025, hits + 0.5, n - hits + 0.5))
-        high = 1.0 if hits == n else float(beta.ppf(0.975, hits + 0.5, n - hits + 0.5))
-        return Quantity(f"seeds that reach the optimum, {self.name}", hits / n, "1", low, high,
-                        f"95 % Jeffreys, {hits} of {n}")  # fmt: skip
+        return Quantity(f"seeds that reach the optimum, {self.name}", hits / n, "1",
+                        *jeffreys(hits, n), f"95 % Jeffreys, {hits} of {n}")  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,8 @@ from calib.he2019.audit.intervals import Interval, arctan, exact, printed, sin, 
 from calib.he2019.datasets.published import FittedTable, Published
 from calib.models.base import Array
 
+_C_CELLS = 2
+
 
 class Coefficients(NamedTuple):
     """Intervals of B (1/%) or K (kN/%), C, D (kN) and E."""
@@ -77,9 +79,7 @@ def pull(slip_percent: Array, box: Coefficients) -> Interval:
     return box.D * sin(box.C * arctan(_argument(u, box.E)))
 
 
-def pull_from_slope(
-    slip_percent: Array, box: Coefficients, *, cells: int = 400, C_cells: int = 2
-) -> Interval:
+def pull_from_slope(slip_percent: Array, box: Coefficients, *, cells: int = 400) -> Interval:
     """Return an enclosure of the pull (kN) where K = BCD is printed (Table 5).
 
     D and C are cut into cells. For K positive, C between 1 and 2, E at most 1, D of either sign;
@@ -90,11 +90,11 @@ def pull_from_slope(
     holds_zero = bool(box.D.lower <= 0.0 <= box.D.upper)
     ends = sorted(abs(float(end)) for end in (box.D.lower, box.D.upper))
     D_edges = np.linspace(0.0 if holds_zero else ends[0], ends[1], cells + 1)
-    C_edges = np.linspace(float(box.C.lower), float(box.C.upper), C_cells + 1)
+    C_edges = np.linspace(float(box.C.lower), float(box.C.upper), _C_CELLS + 1)
     x = np.asarray(slip_percent, dtype=np.float64)[:, None, None]
     D = Interval(D_edges[None, :-1, None], D_edges[None, 1:, None])
     C = Interval(C_edges[None, None, :-1], C_edges[None, None, 1:])
-    shape = (x.size, cells, C_cells)
+    shape = (x.size, cells, _C_CELLS)
     rise = box.stiffness * exact(x)
     product = C * D
     with np.errstate(divide="ignore", invalid="ignore"):

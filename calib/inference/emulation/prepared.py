@@ -24,6 +24,8 @@ from calib.models.simulators.registered import SIMULATED, Simulated, simulated_b
 from calib.models.simulators.runs import RunKeeper
 from calib.models.simulators.ways import TableWay
 
+_MORE = 100
+
 type Progress = Callable[[str, int, int], None]
 
 
@@ -122,15 +124,9 @@ def prepare(
 
 
 def prepare_field(
-    model: str,
-    field: Table,
-    seed: int,
-    *,
-    more: int = 100,
-    workers: int = 1,
-    progress: Progress | None = None,
+    model: str, field: Table, seed: int, *, workers: int = 1, progress: Progress | None = None
 ) -> Emulation | None:
-    """Have an emulator in use serve a field campaign as well, with `more` runs at the most.
+    """Have an emulator in use serve a field campaign as well, with 100 more runs at the most.
 
     None where no run can be made: of no slow simulator, or of a table of runs.
     """
@@ -139,8 +135,8 @@ def prepare_field(
         return None
     problem = build_problem(model, field)
     settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
-    keeper = _keeper(found, workers, None, progress, more)
-    emulation = extend(emulator, problem, keeper, seed, settings=settings, more=more)
+    keeper = _keeper(found, workers, None, progress, _MORE)
+    emulation = extend(emulator, problem, keeper, seed, settings=settings, more=_MORE)
     load_files([_kept(found, model, emulation)])
     return emulation
 

@@ -17,19 +17,13 @@ _WORST = 1e100
 
 
 def estimate_differential_evolution(
-    problem: Problem,
-    rng: np.random.Generator,
-    *,
-    box: Box | None = None,
-    polish: bool = True,
-    tol: float = 0.01,
-    popsize: int = 15,
-    maxiter: int = 1000,
+    problem: Problem, rng: np.random.Generator, *, box: Box | None = None, **settings: Any
 ) -> PointEstimate:
     """Minimise the sum of squares by `scipy.optimize.differential_evolution`.
 
     A generation is one batched model evaluation. The box is as for
-    `calib.inference.estimators.search.search_space`, the other settings are SciPy's.
+    `calib.inference.estimators.search.search_space`, the other settings are SciPy's, and
+    so are their defaults.
     """
 
     def minimise(space: SearchSpace) -> Found:
@@ -49,10 +43,7 @@ def estimate_differential_evolution(
             vectorized=True,
             updating="deferred",
             rng=rng,
-            polish=polish,
-            tol=tol,
-            popsize=popsize,
-            maxiter=maxiter,
+            **settings,
         )
         return Found(np.asarray(result.x), evaluated, bool(result.success))
 

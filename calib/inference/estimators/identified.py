@@ -21,6 +21,8 @@ from calib.models.base import Array
 _FLAT = 1e-6
 _N_POINTS = 8
 _STEP = 1e-4
+_TAIL = 0.5 * (1.0 - 0.998)
+_MOST_ROWS = 4000
 
 
 def location(problem: Problem) -> Array:
@@ -28,24 +30,23 @@ def location(problem: Problem) -> Array:
     return np.array([np.clip(p.loc, p.lower, p.upper) for p in problem.priors.free])
 
 
-def central_interval(problem: Problem, mass: float = 0.998) -> tuple[Array, Array]:
-    """Bounds of the prior's central intervals, internal, each of shape (n_dim,)."""
-    tail = 0.5 * (1.0 - mass)
-    ends = np.repeat([[tail], [1.0 - tail]], problem.n_dim, axis=1)
+def central_interval(problem: Problem) -> tuple[Array, Array]:
+    """Bounds of the prior's central 99.8 %, internal, each of shape (n_dim,)."""
+    ends = np.repeat([[_TAIL], [1.0 - _TAIL]], problem.n_dim, axis=1)
     low, high = problem.priors.ppf(ends)
     return low, high
 
 
-def representative_rows(problem: Problem, most: int = 4000) -> Problem:
-    """Return the problem on at most about `most` rows that span every condition.
+def representative_rows(problem: Problem) -> Problem:
+    """Return the problem on at most about 4000 rows that span every condition.
 
     Whatever is needed to find the neighbourhood of the optimum, a few thousand rows show.
     """
     n = len(problem.table)
-    if n <= most:
+    if n <= _MOST_ROWS:
         return problem
     conditions = list(problem.conditions.values())
-    pick = np.linspace(0, n - 1, most // len(conditions)).round().astype(int)
+    pick = np.linspace(0, n - 1, _MOST_ROWS // len(conditions)).round().astype(int)
     rows = np.unique(np.concatenate([np.argsort(c, kind="stable")[pick] for c in conditions]))
     return problem.with_table(problem.table.take(rows))
 

@@ -37,12 +37,11 @@ from calib.report.rows import (
     group_column,
     groups,
     held_table,
-    smooth_bands,
     x_column,
 )
 from calib.report.study import OutputResult
 from calib.validation.joint import hits
-from calib.validation.prediction import Bands
+from calib.validation.prediction import Bands, median_change, smooth_bands
 
 # Lighter outwards, also in greyscale.
 FILLS = {0.95: "#dfebf5", 0.9: "#bcd6ea", 0.5: "#86b5d9"}
@@ -71,14 +70,7 @@ def scatter_points(ax: Axes, x: Array, y: Array, *, held: bool) -> Any:
 
 
 def bands_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
-    """Draw the predictive bands of an output along slip or pressure.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose fit is added.
-    """
+    """Draw the predictive bands of an output along slip or pressure, beside a published fit."""
     problem = result.calibration.problem
     x_axis, y_axis = axis_of(x_column(result)), axis_of(problem.bound.model.output)
     shown = groups(result)
@@ -131,9 +123,8 @@ def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -
 
 def observed_words(result: OutputResult) -> str:
     """Say what the bands covered of the fitted rows and of those not fitted."""
-    low, high = np.nanquantile(result.posterior_predictive, [0.05, 0.95], axis=0)
     observed = result.calibration.problem.observed
-    inside = int(((observed >= low) & (observed <= high)).sum())
+    inside = hits(result.posterior_predictive, observed, 0.9)
     c = result.validation.scores.coverage[0.9]
     other = "held-out points" if held_table(result) is not None else "points when each is left out"
     return (
@@ -239,10 +230,7 @@ _COLOURS = ListedColormap(mpl.colormaps["YlGnBu"](np.linspace(0.35, 1.0, 128)))
 def density_plate(result: OutputResult) -> Plate:
     """Draw density against cone index, coloured by water content, and predicted against observed.
 
-    Parameters
-    ----------
-    result : OutputResult
-        Of one of the two density models.
+    A CalibError says that the model is not of density by cone index and water content.
     """
     fig, axes = panels(
         1, 2, height=64.0, bottom=22.0, left=14.0, gap_x=30.0, right=3.0, top=4.0
@@ -336,17 +324,9 @@ def _ends(*values: Array) -> Array:
 
 
 def _density_caption(result: OutputResult) -> str:
-    problem, (cone, water) = result.calibration.problem, _columns(result)
-    axis = axis_of(problem.bound.model.output)
-    conditions = {
-        name: np.median(problem.table[name]) * np.ones(2) for name in problem.bound.model.conditions
-    }
-    ci = np.quantile(problem.table[cone], [0.1, 0.9])
-    wet = np.quantile(problem.table[water], [0.1, 0.9])
-    effect = [
-        np.diff(smooth_bands(result.calibration, {**conditions, name: ends})[0].median)[0]
-        for name, ends in ((cone, ci), (water, wet))
-    ]
+    cone, water = _columns(result)
+    axis = axis_of(result.calibration.problem.bound.model.output)
+    effect = [median_change(result.calibration, name) for name in (cone, water)]
     words = observed_words(result)
     return (
         f"{words[0].upper()}{words[1:]}. Between the 10 % and 90 % points of the data, cone index "

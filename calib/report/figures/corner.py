@@ -78,14 +78,7 @@ class _Cells:
 
 
 def corner_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
-    """Draw every pair of sampled parameters.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose figures are marked.
-    """
+    """Draw every pair of sampled parameters, and mark published ones."""
     draws, priors, wide = _sampled(result.calibration)
     marks = reference.sampled(result.calibration.problem.bound)
     at = [

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
-from calib.inference.diagnostics import hdi
+from calib.inference.diagnostics import distances
 from calib.inference.estimators import PointEstimate, method_name
 from calib.models.base import Array
 from calib.models.magic_formula_pressure import coefficients_at
@@ -29,75 +29,33 @@ from calib.report.labels import NO_UNIT, joined, parameter_label, plain, short, 
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 
-__all__ = ["by_pressure_plate", "distances", "estimates_plate"]
-
 _KNOWN = (
     "geometric", "genetic", "differential_evolution", "least_squares", "published_regression",
 )  # fmt: skip
 _LOOKS = {name: (MARKERS[i], CYCLE[i]) for i, name in enumerate(_KNOWN)}
 # Estimates farther off than this many posterior sds are drawn at the edge.
 _EDGE = 5.0
-_WIDE = 4.0
 # Calibrated pressures that a legend lists one by one, at most.
 _LISTED = 5
 
 
-def distances(draws: Array, values: Array) -> tuple[Array, Array, bool]:
-    """Express values as distances from the posterior mean in posterior sds.
-
-    Parameters
-    ----------
-    draws : ndarray, shape (m,)
-        Of the posterior.
-    values : ndarray, shape (k,)
-
-    Returns
-    -------
-    distance : ndarray, shape (k,)
-        NaN where a logarithm does not exist.
-    interval : ndarray, shape (2,)
-        The 95 % HDI of the posterior, in the same unit.
-    log : bool
-        Whether logarithms were taken, as they are of positive parameters that span decades.
-    """
-    low, high = hdi(np.asarray(draws), 0.95)
-    log = bool(low > 0.0 and high > _WIDE * low)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        to = np.log if log else np.asarray
-        t, x = to(draws[draws > 0.0] if log else draws), to(np.asarray(values, dtype=float))
-    mean, sd = t.mean(), t.std()
-    return (x - mean) / sd, (to(np.array([low, high])) - mean) / sd, log
-
-
 def estimates_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
-    """Draw every method's estimate of every published parameter, in posterior sds.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose figures are added.
-    """
+    """Draw every method's estimate of every published parameter, in posterior sds."""
     calibration = result.calibration
-    reported = {k: v for k, v in calibration.reported.items() if np.ptp(v) > 0.0}
+    reported = [k for k, v in calibration.reported.items() if np.ptp(v) > 0.0]
     model = calibration.problem.bound.model
     printed = reference.parameters(model.name)
     fig, axes = panels(
-        1,
-        1,
-        height=max(34.0, 8.0 * len(reported)),
-        width=MIDDLE_MM,
-        left=18.0,
-        bottom=22.0,
+        1, 1, height=max(34.0, 8.0 * len(reported)), width=MIDDLE_MM, left=18.0, bottom=22.0,
         top=3.0,
-    )
+    )  # fmt: skip
     ax: Axes = axes[0, 0]
     handles: dict[str, Any] = {}
     names, reach = [], 2.5
-    for i, (name, draws) in enumerate(reported.items()):
+    for i, name in enumerate(reported):
         values = [e.reported[name] for e in result.estimates]
         values.append(printed[name].value if name in printed else np.nan)
-        distance, interval, log = distances(draws.ravel(), np.array(values))
+        distance, interval, log = _distances(result, name, values)
         reach = max(reach, *np.abs(interval), np.nanmax(np.abs(distance), initial=0.0))
         (handles["posterior, 95 % HDI"],) = ax.plot(
             interval, [i, i], color="#c4c4c4", lw=4.0, solid_capstyle="butt"
@@ -114,6 +72,14 @@ def estimates_plate(result: OutputResult, *, reference: Reference = NOTHING) -> 
     ax.set_ylabel(f"Parameter ({NO_UNIT})")
     legend_below(fig, list(handles.values()), list(handles), 3)
     return Plate(fig, "estimates", _caption(result, reported, reference), "Point estimates")
+
+
+def _distances(
+    result: OutputResult, name: str, values: Sequence[float]
+) -> tuple[Array, Array, bool]:
+    s = result.calibration.summary[name]
+    draws = result.calibration.reported[name].ravel()
+    return distances(draws, np.array(values), (s.hdi_lower, s.hdi_upper))
 
 
 def _row(
@@ -146,16 +112,13 @@ def _dot(ax: Axes, d: float, y: float, marker: str, colour: str, *, ring: bool =
     return dot
 
 
-def _caption(result: OutputResult, reported: Mapping[str, Array], reference: Reference) -> str:
+def _caption(result: OutputResult, names: Sequence[str], reference: Reference) -> str:
     lowest = min((e.cost for e in result.estimates), default=0.0)
     # Of costs that are equal but for their rounding, that of the most exact method: it comes last.
     best = next((e for e in reversed(result.estimates) if e.cost <= lowest * (1.0 + 1e-9)), None)
     if best is None:
         return "No method gave an estimate."
-    names = list(reported)
-    off = {
-        n: float(distances(reported[n].ravel(), np.array([best.reported[n]]))[0][0]) for n in names
-    }
+    off = {n: float(_distances(result, n, [best.reported[n]])[0][0]) for n in names}
     far = max(names, key=lambda n: abs(off[n]))
     distance = abs(off[far])
     how = f"within {short(distance)}" if distance < 100.0 else "up to more than 100"
@@ -186,14 +149,7 @@ def _outside(result: OutputResult, name: str, value: float) -> bool:
 
 
 def by_pressure_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate | None:
-    """Draw B, C, D and E of each pressure by method; None where pressures were not fitted alone.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose figures are ringed.
-    """
+    """Draw B, C, D and E of each pressure by method; None where pressures were not fitted alone."""
     pressures = list(result.by_pressure)
     if not pressures:
         return None
@@ -244,7 +200,7 @@ def _coefficient(
         printed = zip(reference.alone.values(), (-0.2, 0.0), "os", strict=False)
         for table, at, shape in printed:
             if psi in table:
-                label = f"published ({table[round(psi)].source.partition(',')[0]})"
+                label = f"published ({table[round(psi)].place})"
                 (handles[label],) = ax.plot(
                     i + at, table[round(psi)].values[name], shape, mfc="none", mec=ORANGE,
                     mew=1.2, ms=8.0,
@@ -267,7 +223,6 @@ def _pressure_caption(result: OutputResult, reference: Reference) -> str:
         cost = f"{psi:g} psi {short(best.cost, 3)} kN²"
         beside = reference.beside("genetic", psi)
         if beside is not None:
-            source = beside.source.partition(",")[0]
-            cost += f" ({source}: {beside.quality['cost'].text})"
+            cost += f" ({beside.place}: {beside.quality['cost'].text})"
         parts.append(cost)
     return f"Lowest cost of a pressure fitted alone: {'; '.join(parts)}."

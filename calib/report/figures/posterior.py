@@ -8,10 +8,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator, NullLocator
-from scipy.stats import gaussian_kde, rankdata
+from scipy.stats import gaussian_kde
 
 from calib.inference.calibration import Calibration
-from calib.inference.priors import Prior
+from calib.inference.diagnostics import N_BINS, rank_histograms, rank_scatter
+from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
@@ -35,17 +36,11 @@ from calib.report.study import OutputResult
 from calib.validation.roles import MOVED, PRIOR, ROLES, role
 
 _KDE_DRAWS = 3000
+_MOST_TICKS = 4
 
 
 def learned_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
-    """Draw prior and posterior densities of every sampled parameter.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose figures are marked.
-    """
+    """Draw prior and posterior of every sampled parameter, and mark published ones."""
     calibration = result.calibration
     free = calibration.problem.priors.free
     marks = reference.sampled(calibration.problem.bound)
@@ -75,7 +70,7 @@ def _prior_posterior(ax: Axes, prior: Prior, t: Array, mark: float | None) -> di
     low, high = _range(prior, t)
     x = np.linspace(low, high, 300)
     drawn = np.exp(x) if prior.log else x
-    density = _prior_density(prior, x)
+    density = np.exp(Priors((prior,)).log_prob(x[:, None]))
     handles: dict[str, Any] = {
         "prior": ax.fill_between(drawn, density / density.max(), color="#dddddd", lw=0.0)
     }
@@ -102,14 +97,14 @@ def _prior_posterior(ax: Axes, prior: Prior, t: Array, mark: float | None) -> di
     return handles
 
 
-def _log_ticks(low: float, high: float, most: int = 4) -> list[float]:
-    """Return up to `most` round values: 1, 2, 5 times powers of ten, or powers alone."""
+def _log_ticks(low: float, high: float) -> list[float]:
+    """Return a few round values: 1, 2, 5 times powers of ten, or powers alone."""
     powers = range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1)
     for steps in ((1, 2, 5), (1, 3), (1,)):
         found = [s * 10.0**k for k in powers for s in steps if low <= s * 10.0**k <= high]
-        if len(found) <= most:
+        if len(found) <= _MOST_TICKS:
             return found
-    return found[:: -(-len(found) // most)]
+    return found[:: -(-len(found) // _MOST_TICKS)]
 
 
 def _range(prior: Prior, t: Array) -> tuple[float, float]:
@@ -117,15 +112,6 @@ def _range(prior: Prior, t: Array) -> tuple[float, float]:
     low, high = min(prior.loc - span, t.min()), max(prior.loc + span, t.max())
     pad = 0.02 * (high - low)
     return max(low, prior.lower - pad), min(high, prior.upper + pad)
-
-
-def _prior_density(prior: Prior, x: Array) -> Array:
-    inside = (x >= prior.lower) & (x <= prior.upper)
-    if prior.gamma is not None:
-        shape, rate = prior.gamma
-        return np.where(inside, np.exp(shape * (x - prior.loc) - rate * np.exp(x)), 0.0)
-    z = (x - prior.loc) / prior.scale if np.isfinite(prior.scale) else np.zeros_like(x)
-    return np.where(inside, np.exp(-0.5 * z * z), 0.0)
 
 
 def _learned_caption(calibration: Calibration) -> str:
@@ -143,28 +129,6 @@ def _learned_caption(calibration: Calibration) -> str:
         f"{'; '.join(parts)}. The data taught most about {plain(sharpest)}, whose sd shrank to "
         f"{short(ratios[sharpest])} of the prior's (the sd ratio)."
     )
-
-
-N_BINS = 20
-
-
-def rank_histograms(values: Array, bins: int = N_BINS) -> Array:
-    """Histograms of the ranks of each ensemble's draws among all draws, relative to uniform.
-
-    Parameters
-    ----------
-    values : ndarray, shape (ensembles, n)
-    bins : int
-
-    Returns
-    -------
-    ndarray, shape (ensembles, bins)
-        All near 1 where the ensembles sample the same distribution.
-    """
-    rank = rankdata(values, method="ordinal").reshape(values.shape).astype(np.int64)
-    which = ((rank - 1) * bins) // values.size
-    counts = np.stack([np.bincount(row, minlength=bins) for row in which])
-    return np.asarray(counts * bins / values.shape[1], dtype=np.float64)
 
 
 def ensembles_plate(result: OutputResult) -> Plate:
@@ -238,7 +202,7 @@ def _trace(ax: Axes, natural: Array) -> dict[str, Any]:
 def _ranks(ax: Axes, values: Array, effective: float) -> None:
     """Rank histograms with the scatter that the effective sample size allows."""
     heights = rank_histograms(values)
-    half = 1.96 * np.sqrt(max(0.0, N_BINS - 1.0) / max(effective, 1.0))
+    half = rank_scatter(effective)
     ax.fill_between([0.0, 1.0], max(0.0, 1.0 - half), 1.0 + half, color="#e4e4e4", lw=0.0)
     edges = np.linspace(0.0, 1.0, N_BINS + 1)
     for e, row in enumerate(heights):

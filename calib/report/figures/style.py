@@ -179,27 +179,28 @@ def png(plate: Plate) -> bytes:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """Render a figure, with a palette of 256 colours: a third of the size, no visible loss.
-
-    Parameters
-    ----------
-    figure : Figure
-        Drawn in the project's style.
-    """
+    """Render a figure, with a palette of 256 colours: a third of the size, no visible loss."""
     from PIL import Image
 
-    _set_powers(figure)
-    full, small = io.BytesIO(), io.BytesIO()
     # Bare pixels: as PNG they would be compressed only to be read again.
     _Canvas(figure)
-    with style():
-        figure.savefig(full, format="raw", dpi=_DPI)
+    pixels = _saved(figure, format="raw", dpi=_DPI)
     width, height = (int(inches * _DPI) for inches in figure.get_size_inches())
-    full_colour = Image.frombytes("RGBA", (width, height), full.getvalue())
+    full_colour = Image.frombytes("RGBA", (width, height), pixels)
     # With its resolution, by which a text processor takes it over at its size in print.
     image = full_colour.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
+    small = io.BytesIO()
     image.save(small, format="png", dpi=(_DPI, _DPI))
     return small.getvalue()
+
+
+def _saved(figure: Figure, **form: Any) -> bytes:
+    """Return a figure as a file of some form, drawn in the project's style."""
+    _set_powers(figure)
+    content = io.BytesIO()
+    with style():
+        figure.savefig(content, **form)
+    return content.getvalue()
 
 
 def _set_powers(figure: Figure) -> None:
@@ -217,15 +218,5 @@ def png_size(image: bytes) -> tuple[int, int]:
 
 
 def pdf_bytes(figure: Figure) -> bytes:
-    """Render a figure as PDF: fonts inside as TrueType, no date, so that its hash repeats.
-
-    Parameters
-    ----------
-    figure : Figure
-        Drawn in the project's style.
-    """
-    _set_powers(figure)
-    content = io.BytesIO()
-    with style():
-        figure.savefig(content, format="pdf", metadata={"CreationDate": None})
-    return content.getvalue()
+    """Render a figure as PDF: fonts inside as TrueType, no date, so that its hash repeats."""
+    return _saved(figure, format="pdf", metadata={"CreationDate": None})

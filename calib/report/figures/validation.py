@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from scipy.stats import beta, levene, norm, shapiro
 
 from calib.data.quantities import role_of
 from calib.models.base import Array
@@ -39,11 +38,15 @@ from calib.report.rows import (
 )
 from calib.report.study import OutputResult
 from calib.validation.joint import effective_rows, ks_distance, pit_half_width
-from calib.validation.residuals import Standardised, standardise
+from calib.validation.residuals import (
+    Standardised,
+    normal_order,
+    normality_p,
+    spreads,
+    standardise,
+)
 from calib.validation.validate import PARETO_K_MAX
 
-# Rows of a group whose spread is compared, at least.
-_FEWEST = 5
 _SIGNIFICANT = 0.05
 
 
@@ -118,10 +121,7 @@ def _groups(result: OutputResult) -> list[Group]:
 
 
 def _quantiles(ax: Axes, residual: Array) -> None:
-    n = residual.size
-    i = np.arange(1, n + 1)
-    theory = norm.ppf((i - 0.375) / (n + 0.25))
-    low, high = (norm.ppf(beta.ppf(p, i, n + 1 - i)) for p in (0.025, 0.975))
+    theory, low, high = normal_order(residual.size)
     ax.fill_between(theory, low, high, color="#e4e4e4", lw=0.0)
     ax.plot(theory, theory, color=GREY, lw=0.9, ls=DASHES[2])
     ax.plot(theory, np.sort(residual), "o", color=BLUE, ms=3.8, mec="white", mew=0.4)
@@ -152,7 +152,7 @@ def _residuals_caption(
     result: OutputResult, fitted: Standardised, held: Standardised | None
 ) -> str:
     n, large = fitted.residual.size, int((np.abs(fitted.residual) > 2.0).sum())
-    p = float(shapiro(fitted.residual).pvalue) if n >= 3 else float("nan")
+    p = normality_p(fitted.residual)
     runs, pairs = signs_along(result, fitted.residual)
     beyond = "As normal scores, b" if result.calibration.problem.noise.student else "B"
     text = (
@@ -183,17 +183,16 @@ def _spread_words(result: OutputResult, fitted: Standardised) -> str:
     problem = result.calibration.problem
     if role_of(group_column(result) or "") != "pressure" or problem.noise.column:
         return ""
-    log = problem.bound.model.response == "log"
-    raw = problem.response - problem.bound.to_response(fitted.predicted)
-    found = [(g.title, raw[g.fitted]) for g in groups(result, most=False)]
-    found = [(title, r) for title, r in found if r.size >= _FEWEST]
-    if len(found) < 2:
+    found = groups(result, most=False)
+    sd, p = spreads(problem, fitted.predicted, (g.fitted for g in found))
+    if np.isnan(p):
         return ""
-    p = float(levene(*(r for _, r in found)).pvalue)
     if not p < _SIGNIFICANT:
         return f" Their spread does not tell the pressures apart (Levene p = {short(p)})."
-    unit = "of ln output" if log else axis_of(problem.bound.model.output).unit
-    sds = sorted(((float(r.std(ddof=1)), title) for title, r in found), reverse=True)
+    model = problem.bound.model
+    unit = "of ln output" if model.response == "log" else axis_of(model.output).unit
+    named = zip(sd.tolist(), (g.title for g in found), strict=True)
+    sds = sorted(((s, title) for s, title in named if s > 0.0), reverse=True)
     listed = joined([f"{short(sd)} {unit} at {title}" for sd, title in sds])
     return (
         f" Their sd differs between pressures: {listed} (Levene p = {short(p)}); one "
@@ -203,14 +202,7 @@ def _spread_words(result: OutputResult, fitted: Standardised) -> str:
 
 
 def validation_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:
-    """Draw how predictions of unseen rows fared, in four panels.
-
-    Parameters
-    ----------
-    result : OutputResult
-    reference : Reference, optional
-        Whose errors and stated limits are added.
-    """
+    """Draw how predictions of unseen rows fared, in four panels, beside a source's errors."""
     fig, axes = panels(2, 2, height=52.0, left=15.0, bottom=22.0, gap_x=17.0, gap_y=15.0, top=10.0)
     if (
         cone_and_water(result.calibration.problem.bound.model)
@@ -322,8 +314,7 @@ def _validation_caption(result: OutputResult) -> str:
     who = f"{s.n} held-out rows" if held else f"{s.n} rows, each predicted without itself,"
     left = f" ({missing} rows near zero are not judged)" if missing else ""
     cover = "; ".join(f"{100 * c.level:g} % band {c.hits} of {c.n}" for c in s.coverage.values())
-    above = int((np.abs(s.relative_error) > 0.06).sum())
-    many = "no row" if above == 0 else "1 row" if above == 1 else f"{above} rows"
+    many = "no row" if s.n_far == 0 else "1 row" if s.n_far == 1 else f"{s.n_far} rows"
     text = (
         f"Over {who}{label} the median is wrong by {short(s.rmse)} {axis.unit} rms and by "
         f"{percent(s.max_relative_error)} at most{left}, {many} by more than 6 %. "

@@ -59,9 +59,7 @@ def validation_facts(result: OutputResult, effective: float, low_p: float) -> li
             "Largest relative error",
             at_row + (f" ({left} rows near zero left out)" if left else ""),
         ])  # fmt: skip
-        facts.append(
-            ["Rows off by more than 6 %", f"{int((judged > 0.06).sum())} of {judged.size}"]
-        )
+        facts.append(["Rows off by more than 6 %", f"{s.n_far} of {judged.size}"])
     if_independent = ", were the rows independent" if effective < 0.5 * s.n else ""
     for level, c in s.coverage.items():
         share, low, high = (f"{100 * x:.0f}" for x in (c.proportion, c.lower, c.upper))

@@ -140,18 +140,20 @@ def _estimate_row(
     row: list[Any] = [symbol_html(name), unit_html(unit)]
     if table:
         row.append(format_like(printed.value, printed.text) if printed else NOTHING)
-    for e in result.estimates:
-        value = e.reported[name]
-        if printed is None:
-            row.append(format_number(value, 4))
-        else:
-            row.append(_ticked(format_as_printed(value, printed.text), printed.agrees(value)))
+    row += [_cell(e.reported[name], printed) for e in result.estimates]
     s = result.calibration.summary[name]
     if skewed(s):
         row.append(Markup("{}<br>HDI {}").format(centre_text(s), interval_text(s)))
     else:
         row.append(centre_text(s))
     return row
+
+
+def _cell(value: float, printed: Figure | None) -> Any:
+    """An estimate in the digits of what was printed, with a tick if it is the same."""
+    if printed is None:
+        return format_number(value, 4)
+    return _ticked(format_as_printed(value, printed.text), printed.agrees(value))
 
 
 def _ticked(text: str, agrees: bool) -> Markup:
@@ -188,28 +190,16 @@ def pressure_grids(result: OutputResult, *, reference: Reference = NONE) -> list
         rows = []
         for e in estimates:
             beside = reference.beside(e.method, psi)
-            rows.append(_pressure_row(method_name(e.method), e, beside))
+            printed = beside.figures if beside else {}
+            values = {**{k: e.reported[k] for k in "BCDE"}, "cost": e.cost}
+            cells = [_cell(v, printed.get(k)) for k, v in values.items()]
+            rows.append([method_name(e.method), *cells])
             if beside is not None and e.method in reference.alone:
-                shown = {**beside.estimates, **beside.quality}
-                printed = [shown[k] for k in (*"BCDE", "cost")]
-                cells = [_ticked(format_like(f.value, f.text), False) for f in printed]
-                rows.append([f"published ({beside.source.partition(',')[0]})", *cells])
+                shown = (printed[k] for k in values)
+                cells = [_ticked(format_like(f.value, f.text), False) for f in shown]
+                rows.append([f"published ({beside.place})", *cells])
         head: list[Any] = ["Method", *(Markup("<i>{}</i>").format(k) for k in "BCDE"), "Cost (kN²)"]
         head[1] += " (1/%)"
         head[3] += " (kN)"
         grids.append(Grid(f"{psi:g} psi alone", head, rows, [], []))
     return grids
-
-
-def _pressure_row(name: str, e: PointEstimate, beside: FittedTable | None) -> list[Any]:
-    values = {**{k: e.reported[k] for k in "BCDE"}, "cost": e.cost}
-    if beside is None:
-        return [name, *(format_number(v, 4) for v in values.values())]
-    printed = {**beside.estimates, **beside.quality}
-    return [
-        name,
-        *(
-            _ticked(format_like(v, printed[k].text), printed[k].agrees(v))
-            for k, v in values.items()
-        ),
-    ]

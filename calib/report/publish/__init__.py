@@ -14,9 +14,9 @@ from typing import Any
 from calib.report.publish.markup import bibliography, bibtex, cited, to_latex, to_text
 from calib.report.publish.methods import Paragraph, methods
 from calib.report.publish.records import (
-    CsvTable,
     LatexTable,
     Output,
+    Row,
     outputs,
     write_csv,
     write_latex,
@@ -75,7 +75,7 @@ def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publ
     said = [sentence for _, sentences in paragraphs for sentence in sentences]
     keys = cited([*said, *(t.caption for t in tables)])
     references = bibliography(cited(said), version)
-    files = {f"tables/{name}.csv": write_csv(t) for name, t in _csv_tables(found).items()}
+    files = {f"tables/{name}.csv": write_csv(t) for name, t in _csv_tables(found).items() if t}
     files |= {f"tables/{t.label}.tex": write_latex(t) for t in tables}
     files["methods.txt"] = _text(paragraphs, references)
     files["methods.tex"] = _tex(paragraphs)
@@ -87,7 +87,7 @@ def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publ
     )
 
 
-def _csv_tables(found: Sequence[Output]) -> dict[str, CsvTable]:
+def _csv_tables(found: Sequence[Output]) -> dict[str, list[Row]]:
     return {
         "posterior": posterior_csv(found),
         "estimates": estimates_csv(found),

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
 from calib.inference.calibration import ParameterSummary
 from calib.models import get_model
 from calib.report.publish.markup import to_latex
+from calib.report.reference import Reference, reference_of
+
+type Row = Mapping[str, str]
+"""Cells by the head of their column."""
 
 _NAN = float("nan")
 
@@ -44,6 +48,11 @@ class Output:
         return str(self.found["data"]["label"])
 
     @property
+    def reference(self) -> Reference:
+        """What was printed on these data."""
+        return reference_of(self.label)
+
+    @property
     def data_words(self) -> str:
         """What to call the data."""
         return f"{self.label} data" if self.label else "data"
@@ -67,6 +76,11 @@ class Output:
         """Whether point estimates are of more rows than the posterior: the source's were."""
         data = self.found["data"]
         return get_model(self.model).estimates_all_rows and bool(data["n_all"] > data["n"])
+
+    @property
+    def n_estimated(self) -> int:
+        """Of how many rows the point estimates are."""
+        return int(self.found["data"]["n_all" if self.estimates_use_all_rows else "n"])
 
     @property
     def posterior(self) -> tuple[ParameterSummary, ...]:
@@ -95,43 +109,37 @@ def _read_summary(name: str, entry: Mapping[str, Any]) -> ParameterSummary:
 
 
 @dataclass(frozen=True)
-class CsvTable:
-    """Rows for programs: numbers in ASCII, units in a column or in the header."""
-
-    head: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-
-
-@dataclass(frozen=True)
 class LatexTable:
-    """Rows for print, in groups with a rule between them.
+    """Rows for print, cells by the head of their column, in groups with a rule between them.
 
-    The label names its file too. Caption, head and cells have marks, see
+    The label names its file too. Caption, heads and cells have marks, see
     `calib.report.publish.markup`; `columns` is LaTeX's column specification.
     """
 
     label: str
     caption: str
     columns: str
-    head: tuple[str, ...]
-    groups: tuple[tuple[tuple[str, ...], ...], ...]
+    groups: Sequence[Sequence[Row]]
 
 
-def write_csv(table: CsvTable) -> str:
-    """Return a table as CSV (RFC 4180, but for line ends)."""
+def write_csv(rows: Sequence[Row]) -> str:
+    """Return rows for programs as CSV (RFC 4180, but for line ends).
+
+    Numbers are in ASCII, units in a column or in the header.
+    """
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(table.head)
-    writer.writerows(table.rows)
+    writer = csv.DictWriter(text, rows[0], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
     return text.getvalue()
 
 
 def write_latex(table: LatexTable) -> str:
     """Return a table as a LaTeX float that needs the package booktabs."""
+    groups = [group for group in table.groups if group]
     body = "\n    \\midrule\n".join(
-        "\n".join(f"    {_latex_row(row, table.columns)}" for row in group)
-        for group in table.groups
-        if group
+        "\n".join(f"    {_latex_row(row.values(), table.columns)}" for row in group)
+        for group in groups
     )
     return "\n".join(
         [
@@ -143,7 +151,7 @@ def write_latex(table: LatexTable) -> str:
             f"  \\label{{tab:{table.label.replace('_', '-')}}}",
             f"  \\begin{{tabular}}{{{table.columns}}}",
             "    \\toprule",
-            f"    {_latex_row(table.head, table.columns)}",
+            f"    {_latex_row(groups[0][0], table.columns)}",
             "    \\midrule",
             body,
             "    \\bottomrule",
@@ -154,7 +162,7 @@ def write_latex(table: LatexTable) -> str:
     )
 
 
-def _latex_row(cells: Sequence[str], columns: str) -> str:
+def _latex_row(cells: Iterable[str], columns: str) -> str:
     # Justified text in a narrow column has gaps; after \raggedright a row's end is spelt out.
     ragged = "\\raggedright " if "p{" in columns else ""
     first, *others = map(to_latex, cells)

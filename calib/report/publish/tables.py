@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from calib.inference.calibration import ParameterSummary
@@ -25,13 +25,9 @@ from calib.report.numbers import (
     skewed,
 )
 from calib.report.publish.markup import in_brackets, with_symbols
-from calib.report.publish.records import CsvTable, LatexTable, Output
-from calib.report.reference import Figure, FittedTable, reference_of
+from calib.report.publish.records import LatexTable, Output, Row
+from calib.report.reference import Figure
 
-_HEAD = (
-    "output", "model", "rows", "n_rows", "quantity", "unit", "method", "value", "published",
-    "published_in", "same_printed_digits",
-)  # fmt: skip
 _ALONE = {"B": "1/%", "C": "1", "D": "kN", "E": "1", "cost": "kN^2"}
 _QUALITY = {"cost": "Sum of squares", "rmse": "RMSE", "r_squared": "R²"}
 
@@ -40,17 +36,9 @@ def _short(method: str) -> str:
     return METHODS[method].short if method in METHODS else method
 
 
-def _printed(o: Output) -> FittedTable | None:
-    return reference_of(o.label).table(o.model)
-
-
 def _varying(o: Output) -> dict[str, str]:
     """Published parameters that were not held fixed, with their units."""
     return {k: u for k, u in get_model(o.model).reported.items() if k in o.found["posterior"]}
-
-
-def _n_rows(o: Output) -> int:
-    return int(o.found["data"]["n_all" if o.estimates_use_all_rows else "n"])
 
 
 def _digits(value: float | None, printed: Figure | None) -> str:
@@ -59,44 +47,53 @@ def _digits(value: float | None, printed: Figure | None) -> str:
     return format_number(value, 4) if printed is None else format_as_printed(value, printed.text)
 
 
-def _rows_of(o: Output) -> Iterator[tuple[str, str, str, float | None, Figure | None, str]]:
-    """Yield (quantity, unit, method, value, printed figure, its table) of all rows together."""
-    table = _printed(o)
-    source, quality = (table.source, reference_of(o.label).quality(o.model)) if table else ("", {})
+type _Estimate = tuple[str, str, str, float | None, Figure | None, str]
+"""Quantity, unit, method, value, printed figure, and where that is."""
+
+
+def _together(o: Output) -> Iterator[_Estimate]:
+    """Yield the estimates from all rows together, and how well they fit."""
+    table, quality = o.reference.table(o.model), o.reference.quality(o.model)
+    shown, source = ({**table.estimates, **quality}, table.source) if table else ({}, "")
     for method, values in o.found["estimates"].items():
         fit = o.found["fit"][method]
         units = {"cost": fit["cost_unit"], "rmse": fit["rmse_unit"], "r_squared": "1"}
-        for name, unit in _varying(o).items():
-            printed = table.estimates.get(name) if table else None
-            yield name, unit, method, values[name], printed, source
-        for name in _QUALITY:
-            yield name, units[name], method, fit[name], quality.get(name), source
+        for name, unit in (_varying(o) | units).items():
+            value = (fit if name in _QUALITY else values)[name]
+            yield name, unit, method, value, shown.get(name), source
 
 
-def estimates_csv(outputs: Sequence[Output]) -> CsvTable:
+def _alone(o: Output) -> Iterator[tuple[str, list[_Estimate]]]:
+    """Yield each pressure, and the estimates of each method from its rows alone."""
+    for pressure, by_method in o.found["by_pressure"].items():
+        for method, values in by_method.items():
+            beside = o.reference.beside(method, _psi(pressure))
+            shown, place = (beside.figures, beside.place) if beside else ({}, "")
+            yield pressure, [(k, u, method, values[k], shown.get(k), place)
+                             for k, u in _ALONE.items()]  # fmt: skip
+
+
+def _psi(pressure: str) -> float:
+    return float(pressure.partition(" ")[0])
+
+
+def estimates_csv(outputs: Sequence[Output]) -> list[Row]:
     """Return every estimate of every output: all rows together, then each pressure alone."""
-    rows = []
+    rows: list[Row] = []
     for o in outputs:
-        for found in _rows_of(o):
-            rows.append((o.key, o.model, "together", str(_n_rows(o)), *_csv_cells(*found)))
-        for psi, by_method in o.found["by_pressure"].items():
-            for method, values in by_method.items():
-                beside = _beside(o, psi, method)
-                shown = {**beside.estimates, **beside.quality} if beside else {}
-                source = beside.source.partition(",")[0] if beside else ""
-                for name, unit in _ALONE.items():
-                    cells = _csv_cells(name, unit, method, values[name], shown.get(name), source)
-                    rows.append((o.key, "magic_formula", psi, "", *cells))
-    return CsvTable(_HEAD, tuple(rows))
-
-
-def _csv_cells(
-    name: str, unit: str, method: str, value: float | None, printed: Figure | None, source: str
-) -> tuple[str, ...]:
-    beside = ("", "", "")
-    if printed is not None and value is not None:
-        beside = (printed.text, source, "yes" if printed.agrees(value) else "no")
-    return (name, unit, method, ascii_text(_digits(value, printed)), *beside)
+        found = [(o.model, "together", str(o.n_estimated), e) for e in _together(o)]
+        found += [("magic_formula", at, "", e) for at, estimates in _alone(o) for e in estimates]
+        for model, at, n, (name, unit, method, value, printed, source) in found:
+            row = {
+                "output": o.key, "model": model, "rows": at, "n_rows": n, "quantity": name,
+                "unit": unit, "method": method, "value": ascii_text(_digits(value, printed)),
+                "published": "", "published_in": "", "same_printed_digits": "",
+            }  # fmt: skip
+            if printed is not None and value is not None:
+                row |= {"published": printed.text, "published_in": source}
+                row["same_printed_digits"] = "yes" if printed.agrees(value) else "no"
+            rows.append(row)
+    return rows
 
 
 def estimates_latex(o: Output) -> LatexTable | None:
@@ -104,17 +101,18 @@ def estimates_latex(o: Output) -> LatexTable | None:
     methods = list(o.found["estimates"])
     if not methods:
         return None
-    table = _printed(o)
+    table = o.reference.table(o.model)
     posterior = {s.name: s for s in o.posterior}
-    cells: dict[str, list[str]] = {}
-    for name, unit, _, value, printed, _ in _rows_of(o):
-        known = [format_like(printed.value, printed.text) if printed else NOTHING] if table else []
-        row = cells.setdefault(name, [_name_cell(name, unit), *known])
-        row.append(_ticked(value, printed))
+    cells: dict[str, dict[str, str]] = {}
+    for name, unit, method, value, printed, source in _together(o):
+        row = cells.setdefault(name, {"Parameter": _name_cell(name, unit)})
+        if table:
+            row[source] = format_like(printed.value, printed.text) if printed else NOTHING
+        row[_short(method)] = _ticked(value, printed)
     for name, row in cells.items():
-        row.append(_posterior(posterior[name]) if name in posterior else NOTHING)
+        row["Posterior"] = _posterior(posterior[name]) if name in posterior else NOTHING
     data = o.found["data"]
-    rows = f"all {_n_rows(o)}" if o.estimates_use_all_rows else str(_n_rows(o))
+    rows = f"all {o.n_estimated}" if o.estimates_use_all_rows else str(o.n_estimated)
     beside = f", beside its {table.source}" if table else ""
     star = " An asterisk: equal to the source in every printed digit." if table else ""
     return LatexTable(
@@ -125,15 +123,11 @@ def estimates_latex(o: Output) -> LatexTable | None:
             f"deviation, or median and 95 % highest-density interval). {_explained(methods)}{star}"
         ),
         columns=f"l{'r' * (len(methods) + 1 + bool(table))}",
-        head=(
-            "Parameter", *([table.source] if table else []),
-            *(_short(m) for m in methods), "Posterior",
-        ),
-        groups=(
-            tuple(tuple(row) for name, row in cells.items() if name not in _QUALITY),
-            tuple(tuple(row) for name, row in cells.items() if name in _QUALITY),
-        ),
-    )  # fmt: skip
+        groups=[
+            [row for name, row in cells.items() if (name in _QUALITY) is fit]
+            for fit in (False, True)
+        ],
+    )
 
 
 def _explained(methods: Sequence[str]) -> str:
@@ -154,31 +148,25 @@ def _ticked(value: float | None, printed: Figure | None) -> str:
     return _digits(value, printed) + mark
 
 
-def _beside(o: Output, pressure: str, method: str) -> FittedTable | None:
-    return reference_of(o.label).beside(method, float(pressure.partition(" ")[0]))
-
-
 def pressure_latex(o: Output) -> LatexTable | None:
     """Return the Magic Formula at each pressure alone; None for other models."""
-    groups = []
-    for pressure, by_method in o.found["by_pressure"].items():
-        group = []
-        for method, values in by_method.items():
-            beside = _beside(o, pressure, method)
-            shown = {**beside.estimates, **beside.quality} if beside else {}
-            group.append((pressure, method_name(method),
-                          *(_ticked(values[k], shown.get(k)) for k in _ALONE)))  # fmt: skip
-        for tables in reference_of(o.label).alone.values():
-            table = tables.get(round(float(pressure.partition(" ")[0])))
-            if table is not None:
-                figures = {**table.estimates, **table.quality}
-                group.append((pressure, f"published ({table.source.partition(',')[0]})",
-                              *(format_like(figures[k].value, figures[k].text)
-                                for k in _ALONE)))  # fmt: skip
-        groups.append(tuple(group))
+    groups: dict[str, list[Row]] = {}
+    names = [_name_cell(k, u) for k, u in _ALONE.items()]
+
+    def add(pressure: str, method: str, cells: Iterable[str]) -> None:
+        named = dict(zip(names, cells, strict=True))
+        groups.setdefault(pressure, []).append({"Pressure": pressure, "Method": method} | named)
+
+    for pressure, found in _alone(o):
+        add(pressure, method_name(found[0][2]), (_ticked(e[3], e[4]) for e in found))
+    for pressure in groups:
+        for tables in o.reference.alone.values():
+            if (table := tables.get(round(_psi(pressure)))) is not None:
+                printed = (table.figures[k] for k in _ALONE)
+                add(pressure, f"published ({table.place})",
+                    (format_like(figure.value, figure.text) for figure in printed))  # fmt: skip
     if not groups:
         return None
-    head = (f"{_QUALITY.get(k) or f'[${k}]'}{in_brackets(u)}" for k, u in _ALONE.items())
     return LatexTable(
         label=f"estimates_by_pressure_{o.key}",
         caption=(
@@ -189,43 +177,35 @@ def pressure_latex(o: Output) -> LatexTable | None:
                if o.label else "")
         ),
         columns="llrrrrr",
-        head=("Pressure", "Method", *head),
-        groups=tuple(groups),
+        groups=list(groups.values()),
     )  # fmt: skip
 
 
-_POSTERIOR_HEAD = (
-    "output", "model", "parameter", "unit", "mean", "sd", "mcse_mean", "median", "hdi95_lower",
-    "hdi95_upper", "ess_bulk", "ess_tail", "rhat", "posterior_sd_over_prior_sd", "converged",
-)  # fmt: skip
-
-
-def posterior_csv(outputs: Sequence[Output]) -> CsvTable:
+def posterior_csv(outputs: Sequence[Output]) -> list[Row]:
     """Return the posterior summaries of all outputs, one row for every parameter."""
-    return CsvTable(
-        _POSTERIOR_HEAD,
-        tuple((o.key, o.model, *_csv_row(s, o)) for o in outputs for s in o.posterior),
-    )
+    return [_csv_row(s, o) for o in outputs for s in o.posterior]
 
 
-def _csv_row(s: ParameterSummary, o: Output) -> tuple[str, ...]:
+def _csv_row(s: ParameterSummary, o: Output) -> Row:
     last = last_place(s.sd, s.mcse_mean)
     low, high = end_places(s)
-    return (
-        s.name,
-        s.unit,
-        ascii_number(s.mean, last),
-        ascii_number(s.sd, last),
-        ascii_text(format_number(s.mcse_mean, 2)),
-        ascii_number(s.median, centre_place(s)),
-        ascii_number(s.hdi_lower, low),
-        ascii_number(s.hdi_upper, high),
-        f"{s.ess_bulk:.0f}",
-        f"{s.ess_tail:.0f}",
-        f"{s.rhat:.4f}",
-        ascii_text(format_number(s.sd_ratio, 2)),
-        "yes" if o.converged else "no",
-    )
+    return {
+        "output": o.key,
+        "model": o.model,
+        "parameter": s.name,
+        "unit": s.unit,
+        "mean": ascii_number(s.mean, last),
+        "sd": ascii_number(s.sd, last),
+        "mcse_mean": ascii_text(format_number(s.mcse_mean, 2)),
+        "median": ascii_number(s.median, centre_place(s)),
+        "hdi95_lower": ascii_number(s.hdi_lower, low),
+        "hdi95_upper": ascii_number(s.hdi_upper, high),
+        "ess_bulk": f"{s.ess_bulk:.0f}",
+        "ess_tail": f"{s.ess_tail:.0f}",
+        "rhat": f"{s.rhat:.4f}",
+        "posterior_sd_over_prior_sd": ascii_text(format_number(s.sd_ratio, 2)),
+        "converged": "yes" if o.converged else "no",
+    }
 
 
 def posterior_latex(o: Output) -> LatexTable:
@@ -247,29 +227,30 @@ def posterior_latex(o: Output) -> LatexTable:
             f"prior.{below}"
         ),
         columns="lrrrrrr",
-        head=("Parameter", "Posterior", "95 % HDI", "ESS bulk", "ESS tail", "R-hat",
-              "sd/prior sd"),
-        groups=(tuple(map(_latex_row, derived)), tuple(map(_latex_row, sampled))),
-    )  # fmt: skip
+        groups=[[_latex_row(s) for s in group] for group in (derived, sampled)],
+    )
 
 
-def _latex_row(s: ParameterSummary) -> tuple[str, ...]:
-    ratio = format_number(s.sd_ratio, 2) if s.sd_ratio == s.sd_ratio else NOTHING
-    return (
-        f"[${s.name}]{in_brackets(s.unit)}", centre_text(s), interval_text(s), f"{s.ess_bulk:.0f}",
-        f"{s.ess_tail:.0f}", f"{s.rhat:.3f}", ratio,
-    )  # fmt: skip
+def _latex_row(s: ParameterSummary) -> Row:
+    return {
+        "Parameter": f"[${s.name}]{in_brackets(s.unit)}",
+        "Posterior": centre_text(s),
+        "95 % HDI": interval_text(s),
+        "ESS bulk": f"{s.ess_bulk:.0f}",
+        "ESS tail": f"{s.ess_tail:.0f}",
+        "R-hat": f"{s.rhat:.3f}",
+        "sd/prior sd": format_number(s.sd_ratio, 2),
+    }
 
 
-def priors_csv(outputs: Sequence[Output]) -> CsvTable:
+def priors_csv(outputs: Sequence[Output]) -> list[Row]:
     """Return the priors of all outputs."""
-    head = ("output", "model", "parameter", "unit", "distribution", "reason", "source",
-            "file_sha256")  # fmt: skip
-    return CsvTable(head, tuple(
-        (o.key, o.model, name, p["unit"], p["distribution"], p["reason"], p["source"],
-         o.task["priors"]["sha256"])
+    return [
+        {"output": o.key, "model": o.model, "parameter": name,
+         **{k: p[k] for k in ("unit", "distribution", "reason", "source")},
+         "file_sha256": o.task["priors"]["sha256"]}
         for o in outputs for name, p in o.found["priors"].items()
-    ))  # fmt: skip
+    ]  # fmt: skip
 
 
 def priors_latex(o: Output) -> LatexTable:
@@ -283,13 +264,13 @@ def priors_latex(o: Output) -> LatexTable:
             "on [lower, upper] where truncated."
         ),
         columns=r"lp{0.2\textwidth}p{0.36\textwidth}p{0.24\textwidth}",
-        head=("Parameter", "Distribution", "Reason", "Source"),
-        groups=(tuple(
-            (f"[${name}]{in_brackets(p['unit'])}", p["distribution"].replace(
-                " x ", " \N{MULTIPLICATION SIGN} "),
-             *(with_symbols(p[k], o.found["priors"]) for k in ("reason", "source")))
+        groups=[[
+            {"Parameter": f"[${name}]{in_brackets(p['unit'])}",
+             "Distribution": p["distribution"].replace(" x ", " \N{MULTIPLICATION SIGN} "),
+             **{k.capitalize(): with_symbols(p[k], o.found["priors"])
+                for k in ("reason", "source")}}
             for name, p in o.found["priors"].items()
-        ),),
+        ]],
     )  # fmt: skip
 
 
@@ -304,61 +285,58 @@ def _hits(v: Mapping[str, Any], level: str) -> int:
     return round(float(v["coverage"][level]) * int(v["n"]))
 
 
-def _scale(o: Output) -> tuple[str, float]:
-    """Unit in which an output is shown, and the factor to it."""
-    axis = axis_of(o.found["output"])
-    return axis.unit, axis.factor
+def _errors(o: Output) -> list[str]:
+    """Return RMSE and CRPS in the unit of `axis_of`, and the largest relative error in per cent."""
+    v, factor = o.found["validation"], axis_of(o.found["output"]).factor
+    wanted = (("rmse", factor, 3), ("crps", factor, 3), ("max_relative_error", 100.0, 2))
+    return [NOTHING if v[k] is None else format_number(f * v[k], n) for k, f, n in wanted]
 
 
-def validation_csv(outputs: Sequence[Output]) -> CsvTable:
+def validation_csv(outputs: Sequence[Output]) -> list[Row]:
     """Return the scores of every output on rows that were not fitted."""
-    head = ["output", "model", "method", "held_out", "n", "unit", "rmse", "crps",
-            "max_relative_error_percent", "n_relative_error_above_6_percent"]  # fmt: skip
-    for level in _LEVELS:
-        head += [f"covered_{level}", f"coverage_{level}_percent",
-                 f"coverage_{level}_jeffreys95_lower_percent",
-                 f"coverage_{level}_jeffreys95_upper_percent"]  # fmt: skip
-    head += ["elpd", "elpd_se", "largest_pareto_k", "n_refitted"]
-    return CsvTable(tuple(head), tuple(map(_validation_row, outputs)))
+    return [_validation_row(o) for o in outputs]
 
 
-def _validation_row(o: Output) -> tuple[str, ...]:
+def _validation_row(o: Output) -> Row:
     v = o.found["validation"]
-    unit, factor = _scale(o)
-    worst = v["max_relative_error"]
-    cells = [
-        o.key, o.model, v["method"], o.held_out, str(v["n"]), unit,
-        *(ascii_text(_number(None if v[k] is None else factor * v[k])) for k in ("rmse", "crps")),
-        ascii_text(_number(None if worst is None else 100.0 * worst, 2)),
-        str(v["n_relative_error_above_6_percent"]),
-    ]  # fmt: skip
+    rmse, crps, worst = map(ascii_text, _errors(o))
+    above = "n_relative_error_above_6_percent"
+    cells = {
+        "output": o.key, "model": o.model, "method": v["method"], "held_out": o.held_out,
+        "n": str(v["n"]), "unit": axis_of(o.found["output"]).unit, "rmse": rmse, "crps": crps,
+        "max_relative_error_percent": worst, above: str(v[above]),
+    }  # fmt: skip
     for level in _LEVELS:
-        shares = (v["coverage"][level], *v["coverage_interval"][level])
-        cells += [str(_hits(v, level)), *(f"{100.0 * share:.0f}" for share in shares)]
+        cells[f"covered_{level}"] = str(_hits(v, level))
+        low, high, *_ = v["coverage_interval"][level]
+        ends = {"": v["coverage"][level], "jeffreys95_lower_": low, "jeffreys95_upper_": high}
+        for end, share in ends.items():
+            cells[f"coverage_{level}_{end}percent"] = f"{100.0 * share:.0f}"
     elpd, se = v.get("elpd"), v.get("elpd_se")
     last = last_place(se) if se else 0
-    cells += ["" if x is None else ascii_number(x, last) for x in (elpd, se)]
-    cells += [ascii_text(_number(v.get("largest_pareto_k"), 2)), str(len(v.get("refitted", ())))]
-    return tuple(cells)
+    return cells | {
+        "elpd": "" if elpd is None else ascii_number(elpd, last),
+        "elpd_se": "" if se is None else ascii_number(se, last),
+        "largest_pareto_k": ascii_text(_number(v.get("largest_pareto_k"), 2)),
+        "n_refitted": str(len(v.get("refitted", ()))),
+    }
+
+
+def _scores(o: Output) -> Row:
+    v = o.found["validation"]
+    elpd = v.get("elpd")
+    return {
+        "Output": f"{o.name} ({axis_of(o.found['output']).unit})",
+        "Rows": f"held out: {o.held_out}" if o.held_out else "leave-one-out",
+        "n": str(v["n"]),
+        **dict(zip(("RMSE", "CRPS", "Error (%)"), _errors(o), strict=True)),
+        **{f"in {level} %": str(_hits(v, level)) for level in _LEVELS},
+        "elpd": NOTHING if elpd is None else format_value(elpd, v["elpd_se"] or 0.0),
+    }
 
 
 def validation_latex(outputs: Sequence[Output]) -> LatexTable:
     """Return the scores of every output on rows that were not fitted."""
-    rows = []
-    for o in outputs:
-        v = o.found["validation"]
-        unit, factor = _scale(o)
-        worst = v["max_relative_error"]
-        elpd = v.get("elpd")
-        rows.append((
-            f"{o.name} ({unit})",
-            f"held out: {o.held_out}" if o.held_out else "leave-one-out",
-            str(v["n"]),
-            *(_number(None if v[k] is None else factor * v[k]) for k in ("rmse", "crps")),
-            _number(None if worst is None else 100.0 * worst, 2),
-            *(str(_hits(v, level)) for level in _LEVELS),
-            NOTHING if elpd is None else format_value(elpd, v["elpd_se"] or 0.0),
-        ))  # fmt: skip
     labels = sorted({o.label for o in outputs if o.label})
     words = f" ({', '.join(labels)} data)" if labels else ""
     return LatexTable(
@@ -371,39 +349,39 @@ def validation_latex(outputs: Sequence[Output]) -> LatexTable:
             "CRPS in the unit of the output."
         ),
         columns="llrrrrrrrr",
-        head=("Output", "Rows", "n", "RMSE", "CRPS", "Error (%)",
-              *(f"in {level} %" for level in _LEVELS), "elpd"),
-        groups=(tuple(rows),),
-    )  # fmt: skip
+        groups=[[_scores(o) for o in outputs]],
+    )
 
 
-def convergence_csv(outputs: Sequence[Output]) -> CsvTable:
+def convergence_csv(outputs: Sequence[Output]) -> list[Row]:
     """Return what the convergence gate saw."""
-    head = ("output", "model", "passed", "ensembles", "walkers", "steps", "largest_rhat",
-            "smallest_ess_bulk", "smallest_ess_tail", "smallest_steps_over_tau",
-            "acceptance_percent", "density_evaluations", "log_evidence")  # fmt: skip
-    return CsvTable(head, tuple(
-        (o.key, o.model, "yes" if o.converged else "no", *map(ascii_text, _convergence(o)),
-         ascii_text(_number(o.found["sampling"]["log_evidence"], 4)))
+    return [
+        {"output": o.key, "model": o.model, "passed": "yes" if o.converged else "no",
+         **{name: ascii_text(text) for name, text in _convergence(o).items()},
+         "log_evidence": ascii_text(_number(o.found["sampling"]["log_evidence"], 4))}
         for o in outputs
-    ))  # fmt: skip
+    ]  # fmt: skip
 
 
-def _convergence(o: Output) -> tuple[str, ...]:
+def _convergence(o: Output) -> Row:
     s = o.found["sampling"]
     gate = s["gate"]
     rhat = gate["largest_rhat"]
-    return (
-        str(s["ensembles"]),
-        str(s["walkers"]),
-        str(s["steps"]),
-        NOTHING if rhat is None else f"{rhat:.4f}",
-        *(NOTHING if gate[k] is None else f"{gate[k]:.0f}"
-          for k in ("smallest_ess_bulk", "smallest_ess_tail")),
-        _number(gate["smallest_steps_over_tau"], 3),
-        f"{100.0 * s['acceptance']:.0f}",
-        str(s["evaluations"]),
-    )  # fmt: skip
+    return {
+        **{k: str(s[k]) for k in ("ensembles", "walkers", "steps")},
+        "largest_rhat": NOTHING if rhat is None else f"{rhat:.4f}",
+        **{k: NOTHING if gate[k] is None else f"{gate[k]:.0f}"
+           for k in ("smallest_ess_bulk", "smallest_ess_tail")},
+        "smallest_steps_over_tau": _number(gate["smallest_steps_over_tau"], 3),
+        "acceptance_percent": f"{100.0 * s['acceptance']:.0f}",
+        "density_evaluations": str(s["evaluations"]),
+    }  # fmt: skip
+
+
+_SEEN = (
+    "Ensembles", "Walkers", "Steps", "R-hat", "ESS bulk", "ESS tail",
+    "Steps/\N{GREEK SMALL LETTER TAU}", "Accepted (%)", "Evaluations",
+)  # fmt: skip
 
 
 def convergence_latex(outputs: Sequence[Output], gate: Mapping[str, float]) -> LatexTable:
@@ -418,9 +396,9 @@ def convergence_latex(outputs: Sequence[Output], gate: Mapping[str, float]) -> L
             f"{gate['taus_min']:g}), accepted proposals, evaluations of the density."
         ),
         columns="lrrrrrrrrrl",
-        head=("Output", "Ensembles", "Walkers", "Steps", "R-hat", "ESS bulk", "ESS tail",
-              "Steps/\N{GREEK SMALL LETTER TAU}", "Accepted (%)", "Evaluations", "Passed"),
-        groups=(tuple(
-            (o.name, *_convergence(o), "yes" if o.converged else "NO") for o in outputs
-        ),),
+        groups=[[
+            {"Output": o.name, **dict(zip(_SEEN, _convergence(o).values(), strict=True)),
+             "Passed": "yes" if o.converged else "NO"}
+            for o in outputs
+        ]],
     )  # fmt: skip

@@ -17,13 +17,13 @@ from calib.report.figures import collect
 from calib.report.figures.bands import bands_plate, prior_predictive_plate
 from calib.report.figures.collect import plates
 from calib.report.figures.corner import corner_plate
-from calib.report.figures.estimates import distances, estimates_plate
+from calib.report.figures.estimates import estimates_plate
 from calib.report.figures.plate import Plate
-from calib.report.figures.posterior import ensembles_plate, learned_plate, rank_histograms
+from calib.report.figures.posterior import ensembles_plate, learned_plate
 from calib.report.figures.style import style
 from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.reference import NOTHING
-from calib.report.rows import groups, signs_along, smooth_bands
+from calib.report.rows import groups, signs_along
 from calib.validation.residuals import standardise
 from calib.validation.roles import BOTH, DATA, MOVED, PRIOR, role_of
 
@@ -135,20 +135,6 @@ def test_published_figures_on_the_sampled_scale(drawbar):
     assert set(marks) <= set(drawbar.calibration.problem.names)
 
 
-def test_smooth_bands_nest_and_match_the_draws(rut):
-    conditions = {"average_ground_pressure_kpa": np.full(5, 140.0),
-                  "slip_ratio": np.linspace(0, 0.2, 5)}  # fmt: skip
-    mean, measured = smooth_bands(rut.calibration, conditions)
-    for outer, inner in ((0.95, 0.9), (0.9, 0.5)):
-        assert (measured.lower[outer] < measured.lower[inner]).all()
-        assert (measured.upper[outer] > measured.upper[inner]).all()
-    assert (mean.upper[0.9] < measured.upper[0.9]).all()
-    assert (np.diff(mean.median) > 0).all()
-    natural = rut.calibration.problem.theta(rut.calibration.draws.flat)
-    exact = rut.calibration.problem.bound.predict(natural[:, :-1], conditions)
-    assert mean.median == pytest.approx(np.median(exact, axis=0), rel=0.01)
-
-
 def test_validation_caption_has_the_scores(rut):
     s = rut.validation.scores
     caption = validation_plate(rut, reference=HE2019).caption
@@ -171,36 +157,9 @@ def test_leave_one_out_shows_pareto_k(density):
                                   "(Pareto k above 0.7).")  # fmt: skip
 
 
-def test_rank_histograms_see_an_ensemble_that_is_off():
-    rng = np.random.default_rng(1)
-    values = rng.standard_normal((4, 2000))
-    even = rank_histograms(values)
-    assert even.mean() == pytest.approx(1.0)
-    assert np.abs(even - 1.0).max() < 0.5
-    values[0] += 1.0
-    assert rank_histograms(values)[0, -1] > 2.0
-
-
 def test_ensembles_caption_says_when_the_gate_is_not_passed(rut, unconverged):
     assert "agree" in ensembles_plate(rut).caption
     assert "do NOT pass" in ensembles_plate(unconverged).caption
-
-
-def test_distances_are_in_posterior_sds():
-    draws = np.random.default_rng(0).normal(10.0, 2.0, 20_000)
-    distance, interval, log = distances(draws, np.array([14.0, np.nan]))
-    assert distance[0] == pytest.approx(2.0, abs=0.05)
-    assert np.isnan(distance[1])
-    assert interval == pytest.approx([-1.96, 1.96], abs=0.06)
-    assert not log
-
-
-def test_distances_of_a_wide_positive_parameter_are_logarithmic():
-    draws = np.exp(np.random.default_rng(0).normal(0.0, 2.0, 20_000))
-    distance, _, log = distances(draws, np.array([np.exp(2.0), -1.0]))
-    assert log
-    assert distance[0] == pytest.approx(1.0, abs=0.05)
-    assert np.isnan(distance[1])
 
 
 def test_estimates_caption_names_the_published_figures_outside(rut):
