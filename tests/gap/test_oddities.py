@@ -198,7 +198,8 @@ def test_a_wheel_pulls_no_more_than_it_carries(ratio, odd):
 )
 def test_a_factor_near_that_of_two_units_is_called_so(units):
     factor = {
-        "psi and kPa": 6.895, "inches and mm": 25.4, "lbf and N": 4.448, "mm and cm": 10.0, "kgf and N": 9.807,
+        "psi and kPa": 6.895, "inches and mm": 25.4, "lbf and N": 4.448, "mm and cm": 10.0,
+        "kgf and N": 9.807,
     }[units]  # fmt: skip
     lab = np.full(9, 3.0)
     for off, like in ((1.0, True), (1.12, True), (0.88, True), (1.2, False), (0.8, False)):
