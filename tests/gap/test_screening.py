@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from calib.errors import CalibError
 from calib.gap.case import campaigns
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
-from calib.gap.screening import _IMPOSSIBLE, LAB_OUTLIER, OUTLIER, _most, _possible
+from calib.gap.screening import _IMPOSSIBLE, LAB_OUTLIER, OUTLIER, _lab_residuals, _most, _possible
+from calib.gap.which import calibrate_lab
 from tests.gap.cases import PULL_ONLY, make_case
 
 FEW = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "lug_thrust")}
@@ -114,3 +116,12 @@ def test_what_cannot_be_a_reading_is_so_in_any_unit(unit):
     found, (said,) = _possible(field, replace(case, lab=lab))
     assert np.flatnonzero(np.isnan(found["drawbar_pull_kn"])).tolist() == [3]
     assert "no reading at all" in said
+
+
+def test_residuals_of_the_laboratory_are_in_sds_of_a_normal():
+    """Whose middle half lies within 0.6745 of them, whatever the outliers."""
+    case = spoiled(make_case(None, models=PULL_ONLY), "lab", 3, 9.0)
+    data = campaigns(case)
+    mode = calibrate_lab(data, 1)[0]["drawbar_pull"]
+    z = _lab_residuals(data.outputs[0], mode)
+    assert np.median(np.abs(z - np.median(z))) == pytest.approx(norm.ppf(0.75), rel=1e-4)

@@ -17,7 +17,7 @@ from calib.gap.guesses import Guesses, _led, _places
 from calib.gap.hypotheses import joined, shifts, singles, with_remainder
 from calib.gap.inclusion import inclusion_probability
 from calib.gap.odds import Odds
-from calib.gap.sets import _enlarged, _exchanged
+from calib.gap.sets import _apart, _enlarged, _exchanged
 from calib.gap.which import calibrate_lab, rank
 from tests.gap.cases import CHOICE, LARGE, make_case, parameters
 
@@ -116,3 +116,14 @@ def test_a_shift_with_something_besides_begins_where_it_was_led_by_itself(guesse
     other, _ = names(shifts(data)[0])
     theirs, ours = _places(old, other)
     assert theirs.tolist() == ours.tolist() == list(range(old.n_shared))
+
+
+def test_an_effect_that_holds_another_is_not_set_beside_it(guesses):
+    """A step with the same error before and after it is an offset; the order does not matter."""
+    names = ("sensor_step", "force_offset", "lug_thrust")
+    step, offset, lugs = singles(guesses.data, {n: EFFECTS[n] for n in names})
+    assert not _apart(step, offset)
+    assert not _apart(offset, step)
+    assert not _apart(joined(step, lugs), offset)
+    assert _apart(step, lugs)
+    assert _apart(offset, lugs)

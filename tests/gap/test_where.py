@@ -138,3 +138,12 @@ def test_what_is_left_out_of_a_mixture_leaves_the_rest_their_odds():
         assert sum(found.probability) == pytest.approx(1.0)
         assert found.probability[0] == pytest.approx(3.0 * found.probability[1])
     assert len(found.fits) == 2
+
+
+def test_no_region_is_along_a_condition_that_is_the_same_in_all_rows(data):
+    load = data.view.conditions["normal_load_kn"]
+    assert not np.ptp(load)
+    truth = truth_with(np.full(load.size, -0.2))
+    found = regions(data, truth, row_gaps(data, truth))
+    assert found
+    assert not any("normal_load_kn" in region.conditions for region in found)
