@@ -5,7 +5,8 @@ effect in the place of another, and enlarged by one, as long as that gives sets 
 search in both directions, whose result does not depend on where a set came from.
 
 Alone an effect may have to be larger than its prior says, to make up for others that act as well.
-In a set it has its usual prior, and a wider one besides only if it is as large there.
+Sets are looked for with the priors that their effects had alone, for wide ones miss nothing. Where
+its effects are not as large in a set, their usual priors count, else both do.
 """
 
 from __future__ import annotations
@@ -59,27 +60,27 @@ def sets_and_unlisted(
         Of everything that is one cause, or none; of several those with their usual priors first.
     """
     n = guesses.odds
-    usual = {name: group[0].forward.hypothesis for name, group in fits.items()}
-    priors = {name: h.effect_priors[0] for name, h in usual.items() if h.effects}
-    sized = partial(_as_sized, guesses, priors)
+    first = (group[0].forward.hypothesis for group in fits.values())
+    usual = {h.name: h.effect_priors[0] for h in first if h.effects}
+    sized = partial(_as_sized, guesses, usual)
     best = {name: max(group, key=partial(with_prior, odds=n)) for name, group in fits.items()}
     alone = sorted((best[m] for m in best if m != "none"), key=lambda f: -with_prior(f, n))
     others: list[_Started] = [(h, []) for h in unknowns(guesses.data)]
     others += _with_remainders(guesses, alone[:_N_LEADING])
-    pairs = _pairs(single, usual, best)
+    pairs = _pairs(single, best)
     truncated_fits = together(
         [guesses.truncated_joint(h, members, 1) for h, members in others + pairs]
     )
     leading = max(
         _promise(truncated, n) for truncated in (*((f,) for f in best.values()), *truncated_fits)
     )
-    first = len(others)
-    truncated_fits[first:] = _begun_again(guesses, pairs, truncated_fits[first:], leading)
+    n_others = len(others)
+    truncated_fits[n_others:] = _begun_again(guesses, pairs, truncated_fits[n_others:], leading)
     ended = _finished(truncated_fits, leading - _HOPELESS, n)
-    unlisted, sets = (sized(part, leading) for part in (ended[:first], ended[first:]))
+    unlisted, sets = (sized(part, leading) for part in (ended[:n_others], ended[n_others:]))
     # What is unlisted takes up what any listed causes leave: these are compared without it.
     listed = max(with_prior(f, n) for f in (*best.values(), *sets))
-    sets += _stepwise(guesses, [usual[m] for m in single], priors, sets, listed)
+    sets += _stepwise(guesses, [best[m] for m in single], usual, sets, listed)
     sets = _best_of_each(sets)
     leading = max(leading, *(with_prior(f, n) for f in (*unlisted, *sets)))
     top = _leading(sets, leading - _SEARCHED, n)[:_N_LEADING_SETS]
@@ -132,15 +133,13 @@ def _with_remainders(guesses: Guesses, causes: Sequence[Fit]) -> list[_Started]:
     return [(h, [f]) for f in causes for h in with_remainder(guesses.data, f.forward.hypothesis)]
 
 
-def _pairs(
-    single: Sequence[str], usual: Mapping[str, Hypothesis], best: Mapping[str, Fit]
-) -> list[_Started]:
+def _pairs(single: Sequence[str], best: Mapping[str, Fit]) -> list[_Started]:
     """Pairs that hold one of the best single effects."""
     seeds = sorted(single, key=lambda m: -best[m].log_evidence)[:_N_PAIR_SEEDS]
     found: list[_Started] = []
     for i, a in enumerate(single):
         for b in single[i + 1 :]:
-            one, other = usual[a], usual[b]
+            one, other = (best[m].forward.hypothesis for m in (a, b))
             if (a in seeds or b in seeds) and _apart(one, other):
                 found.append((joined(one, other), [best[a], best[b]]))
     return found
@@ -167,13 +166,14 @@ def _begun_again(
 
 def _stepwise(
     guesses: Guesses,
-    alone: Sequence[Hypothesis],
+    single: Sequence[Fit],
     usual: Mapping[str, Priors],
     pairs: Sequence[Fit],
     listed: float,
 ) -> list[Fit]:
     """Sets made of the best pairs by exchange and enlargement, those made of these, and so on."""
     n = guesses.odds
+    alone = [f.forward.hypothesis for f in single]
     searched = {f.forward.hypothesis.name for f in pairs if with_prior(f, n) > listed - _SEARCHED}
     grown, made = _leading(pairs, listed - IN_PLAY, n), list[Fit]()
 
@@ -204,19 +204,11 @@ def _leading(sets: Sequence[Fit], least: float, odds: Odds) -> list[Fit]:
 def _exchanged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis]) -> list[Promise]:
     """Guess at sets with one effect of some in the place of another."""
     promises = []
-    usual = {h.name: h.effect_priors[0] for h in alone}
     for found in sets:
-        whole = found.forward.hypothesis
-        names = {e.name for e in whole.effects}
-        large = [
-            e.name
-            for e, p in zip(whole.effects, whole.effect_priors, strict=True)
-            if p != usual[e.name]
-        ]
+        names = {e.name for e in found.forward.hypothesis.effects}
         members = [h for h in alone if h.name in names]
         for out in members:
-            rest = joined(*(h for h in members if h is not out))
-            kept = resized(rest, usual, [n for n in large if n != out.name])
+            kept = joined(*(h for h in members if h is not out))
             added = [h for h in alone if h.name not in names and _apart(h, kept)]
             promises += guesses.beside(kept, found, added)
     return promises
