@@ -6,6 +6,7 @@ import csv
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import compress, product
 from pathlib import Path
 from typing import Any
 
@@ -138,23 +139,32 @@ class CaseAnswer:
         return self.ranked[0][1] if self.ranked else 0.0
 
     @property
+    def right(self) -> frozenset[str]:
+        """What counts as the truth: it may leave out causes that add too little to be asked for."""
+        causes = self.truth.split("+")
+        weak = {c.name for c in self.causes if c.contribution > 0.0 and c.acts is None}
+        kept = [[True, False] if name in weak else [True] for name in causes]
+        sets = ("+".join(compress(causes, chosen)) for chosen in product(*kept))
+        return frozenset(name for name in sets if name)
+
+    @property
     def truth_probability(self) -> float:
         """Probability given to the truth."""
-        return dict(self.ranked).get(self.truth, 0.0)
+        return min(sum(p for name, p in self.ranked if name in self.right), 1.0)
 
     def among_first(self, count: int) -> bool:
         """Whether the truth is among the first hypotheses."""
-        return self.truth in [name for name, _ in self.ranked[:count]]
+        return any(name in self.right for name, _ in self.ranked[:count])
 
     @property
     def brier(self) -> float:
         """Sum over hypotheses of the squared miss of the probability; 1 for a failed case."""
-        others = sum(p**2 for name, p in self.ranked if name != self.truth)
+        others = sum(p**2 for name, p in self.ranked if name not in self.right)
         return others + (1.0 - self.truth_probability) ** 2
 
     def confidently_wrong(self, at: float = 0.9) -> bool:
         """Whether a wrong hypothesis has at least this probability."""
-        return any(p >= at for name, p in self.ranked if name != self.truth)
+        return any(p >= at for name, p in self.ranked if name not in self.right)
 
 
 def auc(score: Array, positive: NDArray[np.bool_]) -> float | None:

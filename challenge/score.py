@@ -227,7 +227,7 @@ def _reliability(answers: list[CaseAnswer]) -> tuple[ReliabilityBin, ...]:
     for i in range(_BINS):
         inside = [a for a in answers if min(int(a.confidence * _BINS), _BINS - 1) == i]
         mean = float(np.mean([a.confidence for a in inside])) if inside else float("nan")
-        correct = _share(inside, lambda a: a.called == a.truth)
+        correct = _share(inside, lambda a: a.called in a.right)
         bins.append(ReliabilityBin(float(edges[i]), float(edges[i + 1]), mean, correct))
     return tuple(bins)
 

@@ -34,6 +34,7 @@ __all__ = [
     "inseparable",
     "joined",
     "pair",
+    "resized",
     "shifts",
     "singles",
     "split_testable",
@@ -257,15 +258,34 @@ def with_remainder(data: Campaigns, causes: Hypothesis) -> list[Hypothesis]:
     ]
 
 
+def resized(causes: Hypothesis, usual: Mapping[str, Priors], large: Collection[str]) -> Hypothesis:
+    """Return effects of which some may be several times as large as priors say, the others not.
+
+    Parameters
+    ----------
+    causes : Hypothesis
+    usual : mapping of str to Priors
+        Of each effect, by name.
+    large : collection of str
+        Effects that may be larger than their usual priors say.
+    """
+    names = [e.name for e in causes.effects]
+    were = sum(p != usual[n] for n, p in zip(names, causes.effect_priors, strict=True))
+    priors = tuple(_wide(usual[n]) if n in large else usual[n] for n in names)
+    return replace(causes, effect_priors=priors, share=causes.share * WIDE ** (len(large) - were))
+
+
 def wider(single: Hypothesis) -> Hypothesis:
     """Return an effect whose size may be several times as large as its prior says."""
-    (priors,) = single.effect_priors
+    return resized(single, {single.name: single.effect_priors[0]}, [single.name])
+
+
+def _wide(priors: Priors) -> Priors:
     entries = tuple(
         p if p.fixed else replace(p, scale=p.scale * (WIDER_LOG if p.log else WIDER))
         for p in priors.entries
     )
-    wide = Priors(entries, priors.text, priors.source)
-    return replace(single, effect_priors=(wide,), share=single.share * WIDE)
+    return Priors(entries, priors.text, priors.source)
 
 
 def shifts(data: Campaigns) -> list[Hypothesis]:

@@ -3,6 +3,10 @@
 Pairs that hold one of the best single effects come first. The best sets are then changed, one
 effect in the place of another, and enlarged by one, as long as that gives sets in play: a stepwise
 search in both directions, whose result does not depend on where a set came from.
+
+Alone an effect may have to be larger than its prior says, to make up for others that act as well.
+Sets are looked for with the priors that their effects had alone, for wide ones miss nothing. Where
+its effects are not as large in a set, their usual priors count, else both do.
 """
 
 from __future__ import annotations
@@ -13,11 +17,12 @@ from functools import partial
 from calib.gap.ascent import together
 from calib.gap.fit import Fit, finish
 from calib.gap.guesses import Guesses, Promise
-from calib.gap.hypotheses import joined, unknowns, with_remainder
+from calib.gap.hypotheses import joined, resized, unknowns, with_remainder
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.odds import Odds, with_prior
+from calib.inference.priors import Priors
 
-__all__ = ["IN_PLAY", "sets_and_unlisted"]
+__all__ = ["IN_PLAY", "far_out", "sets_and_unlisted"]
 
 # A hypothesis, and fits of parts of it.
 type _Started = tuple[Hypothesis, list[Fit]]
@@ -34,6 +39,8 @@ _N_LEADING, _N_LEADING_SETS = 5, 2
 _HOPELESS = 15.0
 # One within so many nats is begun from more guesses: a pair has many modes.
 _SEARCHED = 8.0
+# An effect that far out in its prior (sds) is fitted with a wider one as well.
+_FAR_OUT = 2.0
 # A hypothesis is in play within so many nats of the best.
 IN_PLAY = 4.0
 _N_BEGUN = 5
@@ -50,9 +57,12 @@ def sets_and_unlisted(
     single : sequence of str
         Effects that sets are made of.
     fits : mapping of str to tuple of Fit
-        Of everything that is one cause, or none.
+        Of everything that is one cause, or none; of several those with their usual priors first.
     """
     n = guesses.odds
+    first = (group[0].forward.hypothesis for group in fits.values())
+    usual = {h.name: h.effect_priors[0] for h in first if h.effects}
+    sized = partial(_as_sized, guesses, usual)
     best = {name: max(group, key=partial(with_prior, odds=n)) for name, group in fits.items()}
     alone = sorted((best[m] for m in best if m != "none"), key=lambda f: -with_prior(f, n))
     others: list[_Started] = [(h, []) for h in unknowns(guesses.data)]
@@ -64,18 +74,20 @@ def sets_and_unlisted(
     leading = max(
         _promise(truncated, n) for truncated in (*((f,) for f in best.values()), *truncated_fits)
     )
-    first = len(others)
-    truncated_fits[first:] = _begun_again(guesses, pairs, truncated_fits[first:], leading)
+    n_others = len(others)
+    truncated_fits[n_others:] = _begun_again(guesses, pairs, truncated_fits[n_others:], leading)
     ended = _finished(truncated_fits, leading - _HOPELESS, n)
-    sets = ended[first:]
+    unlisted, sets = (sized(part, leading) for part in (ended[:n_others], ended[n_others:]))
     # What is unlisted takes up what any listed causes leave: these are compared without it.
     listed = max(with_prior(f, n) for f in (*best.values(), *sets))
-    sets = _best_of_each([*sets, *_stepwise(guesses, [best[m] for m in single], sets, listed)])
-    leading = max(leading, *(with_prior(f, n) for f in ended + sets))
-    top = sorted(sets, key=lambda f: -with_prior(f, n))[:_N_LEADING_SETS]
-    beside = _with_remainders(guesses, [f for f in top if with_prior(f, n) > leading - _SEARCHED])
+    sets += _stepwise(guesses, [best[m] for m in single], usual, sets, listed)
+    sets = _best_of_each(sets)
+    leading = max(leading, *(with_prior(f, n) for f in (*unlisted, *sets)))
+    top = _leading(sets, leading - _SEARCHED, n)[:_N_LEADING_SETS]
+    beside = _with_remainders(guesses, top)
     truncated_fits = together([guesses.truncated_joint(h, of, 1) for h, of in beside])
-    everything = [*ended[:first], *sets, *_finished(truncated_fits, leading - _HOPELESS, n)]
+    ended = sized(_finished(truncated_fits, leading - _HOPELESS, n), leading)
+    everything = _best_of_each([*unlisted, *sets, *ended])
     by_name: dict[str, tuple[Fit, ...]] = {}
     for found in everything:
         name = found.forward.hypothesis.name
@@ -83,11 +95,37 @@ def sets_and_unlisted(
     return by_name
 
 
+def far_out(found: Fit, effect: int, priors: Priors) -> bool:
+    """Whether an effect of a fit, by its place, is larger than its usual priors say."""
+    sizes = found.psi[found.forward.phi_slices[effect]]
+    return any(abs(t - p.loc) > _FAR_OUT * p.scale for t, p in zip(sizes, priors.free, strict=True))
+
+
+def _as_sized(
+    guesses: Guesses, usual: Mapping[str, Priors], fits: Sequence[Fit], leading: float
+) -> list[Fit]:
+    """Fits, and those in play once more with the priors that their effects' sizes ask for."""
+    there = {f.forward.hypothesis for f in fits}
+    asked: list[_Started] = []
+    for found in fits:
+        h = found.forward.hypothesis
+        if not h.effects or with_prior(found, guesses.odds) < leading - _SEARCHED:
+            continue
+        large = [e.name for i, e in enumerate(h.effects) if far_out(found, i, usual[e.name])]
+        for some in ([], large):
+            other = resized(h, usual, some)
+            if other not in there:
+                there.add(other)
+                asked.append((other, [found]))
+    truncated_fits = together([guesses.truncated_joint(h, of, 1) for h, of in asked])
+    return [*fits, *_finished(truncated_fits, leading - _SEARCHED, guesses.odds)]
+
+
 def _best_of_each(fits: Sequence[Fit]) -> list[Fit]:
     """Of several fits of a hypothesis that of the most evidence."""
-    best: dict[str, Fit] = {}
+    best: dict[Hypothesis, Fit] = {}
     for f in sorted(fits, key=lambda f: -f.log_evidence):
-        best.setdefault(f.forward.hypothesis.name, f)
+        best.setdefault(f.forward.hypothesis, f)
     return list(best.values())
 
 
@@ -127,30 +165,40 @@ def _begun_again(
 
 
 def _stepwise(
-    guesses: Guesses, single: Sequence[Fit], pairs: Sequence[Fit], listed: float
+    guesses: Guesses,
+    single: Sequence[Fit],
+    usual: Mapping[str, Priors],
+    pairs: Sequence[Fit],
+    listed: float,
 ) -> list[Fit]:
     """Sets made of the best pairs by exchange and enlargement, those made of these, and so on."""
     n = guesses.odds
     alone = [f.forward.hypothesis for f in single]
     searched = {f.forward.hypothesis.name for f in pairs if with_prior(f, n) > listed - _SEARCHED}
-    grown, made = _leading(pairs, listed, n), list[Fit]()
+    grown, made = _leading(pairs, listed - IN_PLAY, n), list[Fit]()
+
+    def fitted(promises: Sequence[Promise]) -> list[Fit]:
+        return _as_sized(guesses, usual, _fitted(guesses, promises, searched, listed), listed)
+
     while grown:
-        changed = _fitted(guesses, _exchanged(guesses, grown, alone), searched, listed)
+        changed = fitted(_exchanged(guesses, grown, alone))
         listed = max([listed, *(with_prior(f, n) for f in changed)])
-        grown = _leading([*grown, *changed], listed, n)
+        grown = _leading([*grown, *changed], listed - IN_PLAY, n)
         larger: list[Fit] = []
         if len(grown[0].forward.hypothesis.effects) < _MOST_CAUSES:
-            larger = _fitted(guesses, _enlarged(guesses, grown, alone), searched, listed)
+            larger = fitted(_enlarged(guesses, grown, alone))
         made += changed + larger
         listed = max([listed, *(with_prior(f, n) for f in larger)])
-        grown = _leading(larger, listed, n)
+        grown = _leading(larger, listed - IN_PLAY, n)
     return made
 
 
-def _leading(sets: Sequence[Fit], listed: float, odds: Odds) -> list[Fit]:
-    """Sets from which others are made: the best of those in play."""
-    ranked = sorted(sets, key=lambda f: -with_prior(f, odds))[:_N_SETS]
-    return [f for f in ranked if with_prior(f, odds) > listed - IN_PLAY]
+def _leading(sets: Sequence[Fit], least: float, odds: Odds) -> list[Fit]:
+    """The best fits of the best sets, those that others are made from."""
+    best: dict[str, Fit] = {}
+    for f in sorted(sets, key=lambda f: -with_prior(f, odds)):
+        best.setdefault(f.forward.hypothesis.name, f)
+    return [f for f in best.values() if with_prior(f, odds) > least][:_N_SETS]
 
 
 def _exchanged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis]) -> list[Promise]:

@@ -29,7 +29,7 @@ from calib.gap.noise import Noise
 from calib.gap.odds import Odds, probabilities, with_prior
 from calib.gap.refine import PLENTY, refine
 from calib.gap.relevance import relevance
-from calib.gap.sets import IN_PLAY, sets_and_unlisted
+from calib.gap.sets import IN_PLAY, far_out, sets_and_unlisted
 from calib.inference.defined import check_defined
 from calib.inference.random import generator
 from calib.inference.sampling.mode import find_mode
@@ -39,8 +39,6 @@ __all__ = ["Lab", "Ranking", "calibrate_lab", "rank"]
 
 # Internal parameters of each simulator, and its noise.
 type Lab = tuple[dict[str, Array], dict[str, Noise]]
-# An effect that far out in its prior (sds) is fitted with a wider one as well.
-_FAR_OUT = 2.0
 # Draws of the prior by which a row is tried.
 _N_TRIED = 32
 _IDLE = "it changes nothing that the models of this case predict"
@@ -142,7 +140,7 @@ def rank(
     odds = Odds.of(len(single) - len(beside), context)
     guesses = Guesses(data, lab_mode, noise, seed, odds)
     fits = guesses.fit([Hypothesis("none"), *shifts(data), *single])
-    far = [h for h in single if _far_out(fits[h.name][0])]
+    far = [h for h in single if far_out(fits[h.name][0], 0, h.effect_priors[0])]
     for name, more in guesses.fit([wider(h) for h in far]).items():
         fits[name] += more
     fits |= sets_and_unlisted(guesses, [h.name for h in single if h.name not in beside], fits)
@@ -163,14 +161,6 @@ def _check_names(context: Context, known: set[str]) -> None:
             allowed=", ".join(sorted(known)) + "; parameter_shift may be suspected",
             mend="correct the name, or leave it out",
         )
-
-
-def _far_out(found: Fit) -> bool:
-    """Whether an effect is larger than its prior says."""
-    part = found.forward.phi_slices[0]
-    priors = found.forward.priors.free[part]
-    off = [abs(t - p.loc) / p.scale for t, p in zip(found.psi[part], priors, strict=True)]
-    return max(off, default=0.0) > _FAR_OUT
 
 
 def _scored(

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from scipy.stats import norm
 
-from challenge.answers import _ranked, read_answer
+from challenge.answers import CaseAnswer, CauseAnswer, _ranked, read_answer
 from tests.challenge.test_score import entry
 
 
@@ -46,3 +46,30 @@ def test_listed_causes_with_something_unlisted_besides_are_those_causes():
     ranked = _ranked({"effects": effects})
     assert dict(ranked) == pytest.approx({"lug_thrust": 0.7, "unknown": 0.2, "a+b": 0.1})
     assert ranked[0][0] == "lug_thrust"
+
+
+def mixed(weak: float, ranked: dict[str, float]) -> CaseAnswer:
+    """Return the answer to a case of two causes, the second of which adds so many noise sds."""
+    causes = tuple(
+        CauseAnswer(name, 0.5, sds, 0.5, (0.0, 1.0))
+        for name, sds in (("lug_thrust", 8.0), ("rut_rebound", weak), ("force_offset", 0.0))
+    )
+    said = tuple(sorted(ranked.items(), key=lambda item: -item[1]))
+    return CaseAnswer(
+        "case-000", "large", "lug_thrust+rut_rebound", "effect", said, None, (), (), causes=causes
+    )
+
+
+def test_a_cause_too_weak_to_be_asked_for_may_be_left_out():
+    ranked = {"lug_thrust": 0.9, "lug_thrust+rut_rebound": 0.06, "rut_rebound": 0.04}
+    found = mixed(1.2, ranked)
+    assert found.right == {"lug_thrust", "lug_thrust+rut_rebound"}
+    assert found.among_first(1)
+    assert not found.confidently_wrong()
+    assert found.truth_probability == pytest.approx(0.96)
+    assert found.brier == pytest.approx(2 * 0.04**2)
+    # One that adds more may not, nor may one be named that does not act.
+    missed = mixed(1.3, ranked)
+    assert not missed.among_first(1)
+    assert missed.confidently_wrong()
+    assert mixed(1.2, {"force_offset+lug_thrust": 0.95}).confidently_wrong()

@@ -17,6 +17,7 @@ from calib.gap.hypotheses import (
     dependences,
     inseparable,
     joined,
+    resized,
     shifts,
     singles,
     unknowns,
@@ -70,6 +71,18 @@ def test_a_wider_prior_has_the_same_middle(data):
         assert (b.loc, b.lower, b.upper) == (a.loc, a.lower, a.upper)
         assert b.scale > a.scale
     assert wide.share == pytest.approx(0.1 * single.share)
+
+
+def test_of_a_set_some_may_be_large_and_none_again(data):
+    few = singles(data, {n: EFFECTS[n] for n in ("force_offset", "lug_thrust")})
+    pair, usual = joined(*few), {h.name: h.effect_priors[0] for h in few}
+    large = resized(pair, usual, ["lug_thrust"])
+    assert large.effect_priors == (usual["force_offset"], wider(few[1]).effect_priors[0])
+    assert large.share == pytest.approx(0.1 * pair.share)
+    assert resized(large, usual, ["force_offset", "lug_thrust"]).share == pytest.approx(0.01)
+    again = resized(large, usual, [])
+    assert again.effect_priors == pair.effect_priors
+    assert again.share == pytest.approx(pair.share)
 
 
 def test_effects_are_joined_in_alphabetical_order(data):

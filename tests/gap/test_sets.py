@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS, physical_role
@@ -14,11 +15,9 @@ from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
 from calib.gap.guesses import Guesses, _led, _places
-from calib.gap.hypotheses import joined, shifts, singles, with_remainder
-from calib.gap.inclusion import inclusion_probability
-from calib.gap.odds import Odds
-from calib.gap.sets import _apart, _enlarged, _exchanged
+from calib.gap.hypotheses import joined, resized, shifts, singles, with_remainder
 from calib.gap.which import calibrate_lab, rank
+from calib.inference.priors import Priors
 from tests.gap.cases import CHOICE, LARGE, make_case, parameters
 
 CAUSES = ("rate_effect", "rut_rebound", "sensor_drift")
@@ -43,7 +42,11 @@ def mixed_case() -> Case:
 
 @pytest.fixture(scope="module")
 def guesses() -> Guesses:
-    data = campaigns(mixed_case())
+    return guesses_of(mixed_case())
+
+
+def guesses_of(case: Case) -> Guesses:
+    data = campaigns(case)
     mode, noise = calibrate_lab(data, 1)
     return Guesses(data, mode, noise, 1, Odds.of(len(CHOICE), Context()))
 
@@ -87,6 +90,40 @@ def test_an_effect_that_does_not_act_is_exchanged_for_one_that_does(guesses, alo
     names = [p.hypothesis.name for p in sorted(promises, key=lambda p: -p.log_joint)]
     assert set(names[0].split("+")) <= set(CAUSES)
     assert "lug_thrust+rate_effect" not in names
+
+
+def test_a_set_has_usual_priors_where_its_effects_are_not_large(guesses, alone):
+    # Alone each may have had to be large, to make up for the other.
+    usual = {h.name: h.effect_priors[0] for h in alone.values()}
+    pair = joined(alone["rate_effect"], alone["force_offset"])
+    (wide,) = guesses.fit([resized(pair, usual, ["force_offset", "rate_effect"])]).values()
+    assert not any(far_out(wide[0], i, p) for i, p in enumerate(pair.effect_priors))
+    found = _as_sized(guesses, usual, wide, with_prior(wide[0], guesses.odds))
+    assert [f.forward.hypothesis for f in found] == [wide[0].forward.hypothesis, pair]
+    # The data are no worse met, with priors that spread the same mass less widely.
+    assert with_prior(found[1], guesses.odds) > with_prior(wide[0], guesses.odds) + np.log(100.0)
+
+
+def test_of_an_effect_that_is_large_in_a_set_both_priors_count_as_they_should(alone):
+    guesses = guesses_of(make_case("force_offset"))
+    usual = {h.name: h.effect_priors[0] for h in alone.values()}
+    (entry,) = usual["force_offset"].free
+    narrow = Priors((replace(entry, scale=0.04),))  # the offset is three sds of it
+    usual["force_offset"] = narrow
+    single = replace(alone["force_offset"], effect_priors=(narrow,))
+    (pair,) = guesses.fit([joined(single, alone["rate_effect"])]).values()
+    assert far_out(pair[0], 0, narrow)
+    found = _as_sized(guesses, usual, pair, with_prior(pair[0], guesses.odds))
+    assert [f.forward.hypothesis.share for f in found] == pytest.approx([1.0, 0.1])
+    # What the usual prior's evidence is of the wider one's: the mean, over the posterior with the
+    # wider one, of the ratio of the priors.
+    offset = found[1].forward.phi_slices[0].start
+    middle, sd = found[1].psi[offset], np.sqrt(found[1].covariance[offset, offset])
+    x = middle + sd * np.linspace(-8.0, 8.0, 4001)
+    ratio = np.exp(norm.logpdf(x, scale=0.04) - norm.logpdf(x, scale=0.16))
+    expected = np.average(ratio, weights=norm.pdf(x, middle, sd))
+    gained = found[1].log_evidence - found[0].log_evidence
+    assert gained == pytest.approx(-np.log(expected), abs=0.1)
 
 
 def test_three_causes_are_found_whatever_comes_first_alone():
