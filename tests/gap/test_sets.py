@@ -16,6 +16,9 @@ from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
 from calib.gap.guesses import Guesses, _led, _places
 from calib.gap.hypotheses import joined, resized, shifts, singles, with_remainder
+from calib.gap.inclusion import inclusion_probability
+from calib.gap.odds import Odds, with_prior
+from calib.gap.sets import _apart, _as_sized, _enlarged, _exchanged, far_out
 from calib.gap.which import calibrate_lab, rank
 from calib.inference.priors import Priors
 from tests.gap.cases import CHOICE, LARGE, make_case, parameters
