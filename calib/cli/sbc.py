@@ -20,6 +20,10 @@ def sbc(
     simulations: Annotated[int, typer.Option(help="Campaigns per model.", min=10)] = 300,
     seed: opt.Seed = 2019,
     priors: opt.PriorFiles = None,
+    data: Annotated[
+        Path | None,
+        typer.Option(help="CSV at whose conditions to simulate, not those of the example."),
+    ] = None,
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
     plugins: opt.Models = None,
@@ -43,7 +47,7 @@ def sbc(
     with progress_bars() as tell:
         score = run_sbc(
             out, models=model or (), simulations=simulations, seed=seed, priors=priors or (),
-            workers=workers, scheduler=scheduler, announce=opt.announce,
+            data=data, workers=workers, scheduler=scheduler, announce=opt.announce,
             progress=lambda done, n: tell("simulating and calibrating", done, n),
         )  # fmt: skip
     page = write_sbc(score, out, asdict(SETTINGS), opt.command())

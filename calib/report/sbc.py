@@ -32,7 +32,6 @@ from calib.report.figures.style import (
 from calib.report.labels import MINUS, aligned, short, symbol
 from calib.report.numbers import finite
 from calib.report.page.template import data_uri, template
-from calib.validation.sbc.designs import design_of
 from calib.validation.sbc.score import LEVEL, ModelScore, Quantity, SbcScore
 from calib.validation.sbc.uniformity import ecdf_band
 
@@ -188,7 +187,7 @@ def _section(m: ModelScore, score: SbcScore, images: Mapping[str, str]) -> dict[
     return {
         "name": m.model,
         "title": get_model(m.model).title,
-        "design": design_of(m.model).text,
+        "design": m.design,
         "image": images[m.model],
         "replicates": m.replicates,
         "unconverged": m.unconverged,
@@ -227,7 +226,7 @@ def document(score: SbcScore, settings: dict[str, Any]) -> dict[str, Any]:
 
 def _model(m: ModelScore, adjusted: dict[tuple[str, str], float]) -> dict[str, Any]:
     return {
-        "design": design_of(m.model).text,
+        "design": m.design,
         "replicates": m.replicates,
         "failed": dict(m.failed),
         "not_converged": m.unconverged,

@@ -5,10 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
+import pytest
+
 from calib.models import example_csv
 from tests.browser import Browser, faults
 from tests.cli.test_cli import Calib
 from tests.cli.test_cli import calib as calib
+from tests.inference.emulation.test_emulate import as_before as as_before
+from tests.models.simulators.examples import lab, write_program
 
 FEW = ["--max-steps", 800, "--workers", 1]
 
@@ -50,6 +55,37 @@ def test_a_report_has_it_as_a_section(calib: Calib) -> None:
     told = calib("check", "r", "--quick")
     assert told.code == 0, told.out
     assert calib("predict", "r/compared", "--at", "plates.csv").code == made.code
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fitted", ["wheel", "upadhyaya"])
+def test_a_report_compares_an_emulated_simulator_with_a_closed_form(
+    calib: Calib, fitted: str
+) -> None:
+    columns = lab(np.random.default_rng(1))
+    np.savetxt("lab.csv", np.stack(list(columns.values()), axis=1), delimiter=",",
+               header=",".join(columns), comments="")  # fmt: skip
+    simulator = write_program(Path())
+    made = calib("report", "lab.csv", "--model", fitted, "--compare", "wheel",
+                 "--compare", "upadhyaya", "--simulator", simulator, "--out", "r",
+                 "--hold-out", "normal_load_kn=5", "--workers", 1, "--max-steps", 3200)  # fmt: skip
+    assert made.code in (0, 3), made.err
+    assert "wheel: emulated from" in made.out
+    found = json.loads(Path("r/compared/comparison.json").read_text())
+    assert found["verdict"] in made.out
+    assert set(found["models"]) == {"wheel", "upadhyaya"}
+    assert all(m["held_out"]["rows"] == 6 for m in found["models"].values())
+    # The data are of the simulator's own equation, of which the noise is 0.03 kN.
+    assert found["models"]["wheel"]["held_out"]["rmse"] < 0.06
+    manifest = json.loads(Path("r/manifest.json").read_text())
+    assert manifest["comparison"]["models"] == found["models"]
+    assert manifest["emulators"]["wheel"]["passed"]
+    told = calib("check", "r", "--quick", "--simulator", simulator)
+    assert told.code == 0, told.out + told.err
+    bands = calib("predict", "r/compared", "--at", "lab.csv", "--simulator", simulator,
+                  "--out", "bands.csv")  # fmt: skip
+    assert bands.code in (0, 3), bands.err
+    assert len(Path("bands.csv").read_text().splitlines()) == 19
 
 
 def test_the_page_holds_in_a_browser(calib: Calib, browser: Browser) -> None:

@@ -61,11 +61,20 @@ class ModelDesign:
 DESIGNS: Registry[ModelDesign] = Registry("design", lambda design: design.model)
 
 
-def design_of(model_name: str) -> Design:
-    """Return the design of a model; a CalibError if it has neither a design nor an example."""
+def design_of(model_name: str, data: Path | None = None) -> Design:
+    """Return the design of a model, or that of a campaign's CSV if one is given.
+
+    Raises
+    ------
+    CalibError
+        If it has neither a design nor an example, or the file cannot be read.
+    """
     model = get_model(model_name)
     known = DESIGNS.get(model.name)
-    design = known.make() if known is not None else _of_example(model)
+    if data is not None:
+        design = _of_file(model, data, str(data))
+    else:
+        design = known.make() if known is not None else _of_example(model)
     # For noise that is correlated along a run, if the priors ask for it.
     order = {"run_order": np.arange(1.0, len(design.table) + 1.0)}
     return replace(design, table=replace(design.table, columns=order | dict(design.table.columns)))
@@ -76,8 +85,12 @@ def _of_example(model: Model) -> Design:
     with TemporaryDirectory() as folder:
         path = Path(folder) / f"{model.name}.csv"
         path.write_text(example_csv(model.name), encoding="utf-8")
-        table = read_for_model(path, (*model.conditions, model.output))
+        return _of_file(model, path, "the model's example")
+
+
+def _of_file(model: Model, path: Path, where: str) -> Design:
+    table = read_for_model(path, (*model.conditions, model.output))
     held = {name: 0.5 * (v[1:] + v[:-1]) for name, v in model.select(table.columns).items()}
     n = len(table)
-    text = f"{n} conditions of the model's example; held out: {n - 1} midway between them"
+    text = f"{n} conditions of {where}; held out: {n - 1} midway between them"
     return Design(model.name, table, held, text)

@@ -6,7 +6,7 @@ A replicate is a pure function of its item, so it can run anywhere and in any or
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from calib.inference.sampling.sampler import Draws, SamplerSettings
 from calib.models.base import Array
 from calib.validation.prediction import predict
 from calib.validation.sbc.designs import Design, design_of
+from calib.validation.sbc.emulated import MOST_TRUTHS, emulate_campaign, run_each, slow_simulator
 from calib.validation.sbc.simulate import Simulated, simulate
 from calib.validation.scores import LEVELS
 
@@ -31,13 +32,25 @@ _KEPT_STEPS = 5
 
 @dataclass(frozen=True)
 class Item:
-    """What a replicate, by its number, needs; the seed is of the whole run."""
+    """What a replicate, by its number, needs; the seed is of the whole run.
+
+    The design is the model's own if none is given. A slow simulator's runs are spread over the
+    workers of this machine, or of a scheduler.
+    """
 
     model: str
     index: int
     seed: int
     settings: SamplerSettings = field(default_factory=SamplerSettings)
     priors: PriorFile | None = None
+    design: Design | None = None
+    workers: int = 1
+    scheduler: str | None = None
+
+    @property
+    def where(self) -> Design:
+        """Where the model is measured."""
+        return self.design or design_of(self.model)
 
 
 def replicate(item: Item) -> dict[str, Any]:
@@ -47,6 +60,12 @@ def replicate(item: Item) -> dict[str, Any]:
     band covered.
     """
     case = simulated(item)
+    emulator_fails: tuple[str, ...] = ()
+    if slow_simulator(item.model) is not None:
+        emulation = emulate_campaign(
+            case.problem, case.held, item.seed, item.workers, item.scheduler
+        )
+        case, emulator_fails = replace(case, problem=emulation.problem), emulation.reasons
     calibration = calibrated(case, item)
     report = calibration.draws.report
     return {
@@ -54,19 +73,26 @@ def replicate(item: Item) -> dict[str, Any]:
         "index": item.index,
         "seed": item.seed,
         "attempts": case.attempts,
-        "converged": report.passed,
-        "reasons": list(report.reasons),
+        # Of a posterior by an emulator that is not good enough a user is told as much.
+        "converged": report.passed and not emulator_fails,
+        "reasons": [*report.reasons, *emulator_fails],
         "steps": report.steps,
         "extended": report.steps > item.settings.steps,
-        **measure(case, calibration, design_of(item.model)),
+        **measure(case, calibration, item.where),
     }
 
 
 def simulated(item: Item) -> Simulated:
     """Return the campaign of an item."""
-    design = design_of(item.model)
+    design = item.where
     template = build_problem(item.model, design.table, item.priors)
-    return simulate(template, design, generator(item.seed, "sbc", item.model, item.index))
+    rng = generator(item.seed, "sbc", item.model, item.index)
+    slow = slow_simulator(item.model)
+    if slow is None:
+        return simulate(template, design, rng)
+    asking = run_each(template, slow, item.workers, item.scheduler)
+    found = simulate(asking, design, rng, attempts=MOST_TRUTHS)
+    return replace(found, problem=template.with_table(found.problem.table))
 
 
 def calibrated(case: Simulated, item: Item) -> Calibration:
@@ -81,6 +107,7 @@ def calibrated(case: Simulated, item: Item) -> Calibration:
 def measure(case: Simulated, calibration: Calibration, design: Design) -> dict[str, Any]:
     """Rank the truth and count what the bands covered."""
     return {
+        "design": design.text,
         "ranks": ranks(case, calibration, design.watched),
         **_coverage(case, calibration),
     }
@@ -102,11 +129,15 @@ def ranks(case: Simulated, calibration: Calibration, watched: int) -> dict[str, 
         noise = calibration.problem.noise.draw(natural, row, rng, 1)[:, 0]
         noisy = response(drawn["prediction"]) + noise
         drawn["measurement"] = calibration.problem.bound.from_response(noisy)
+    # Of a slow simulator the truth is its run, which its emulator only comes near.
+    true["prediction"] = case.location[watched : watched + 1]
     true["measurement"] = case.measured[watched : watched + 1]
     found = {}
     for name, values in drawn.items():
         finite = values[np.isfinite(values)]
-        if np.isfinite(true[name][0]):
+        # A truth that is excluded is below all draws.
+        excluded = name == "log_likelihood" and true[name][0] == -np.inf
+        if excluded or np.isfinite(true[name][0]):
             found[name] = [int((finite < true[name][0]).sum()), int(finite.size)]
     return found
 

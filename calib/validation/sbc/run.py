@@ -14,6 +14,8 @@ from calib.errors import CalibError
 from calib.inference.prior_files import DeclaredPriors, prior_file_model
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS, get_model
+from calib.validation.sbc.designs import design_of
+from calib.validation.sbc.emulated import most_runs, slow_simulator
 from calib.validation.sbc.replicate import Item, replicate
 from calib.validation.sbc.score import SbcScore, score
 
@@ -32,6 +34,7 @@ def run_sbc(
     seed: int,
     settings: SamplerSettings = SETTINGS,
     priors: Sequence[Path] = (),
+    data: Path | None = None,
     workers: int = 1,
     scheduler: str | None = None,
     progress: Callable[[int, int], None] | None = None,
@@ -40,13 +43,16 @@ def run_sbc(
     """Simulate, calibrate and rank; what is there already is not done again.
 
     The folder's ``replicates`` gets one JSON file for each replicate of each model, by default of
-    all that are not slow. A prior file says which model it is for. The others are as for
-    `calib.batch.tasks.run_tasks`.
+    all that are not slow. A prior file says which model it is for; `data`, a CSV, at which
+    conditions to simulate, if not at those of the models' examples. The others are as for
+    `calib.batch.tasks.run_tasks`. With a slow simulator among the models campaigns are done one
+    after the other, and `workers` or `scheduler` make its runs: they share one folder of runs.
 
     Raises
     ------
     CalibError
-        If there is no such model, or the folder holds a run of another seed or other settings.
+        If there is no such model, it is a table of runs, or the folder holds a run of another seed
+        or other settings.
     """
     names = chosen_models(models)
     # As text: replicates may run where the files are not.
@@ -56,15 +62,30 @@ def run_sbc(
             f"there are priors of {', '.join(unused)}, which is not among the models",
             allowed=", ".join(names), mend="name it with --model, or leave its priors out",
         )  # fmt: skip
-    said = {"priors": {model: p.text for model, p in given.items()}} if given else {}
+    said: dict[str, Any] = (
+        {"priors": {model: p.text for model, p in given.items()}} if given else {}
+    )
+    slow = [model for model in names if slow_simulator(model) is not None]
+    asked = slow if data is None else names
+    designs = {model: design_of(model, data) for model in asked}
+    if data is not None:
+        said["data"] = Path(data).read_text("utf-8")
+    told = [most_runs(model, designs[model], simulations) for model in slow]
     _claim(out, {"seed": seed, "settings": asdict(settings), **said})
+    if announce is not None:
+        for line in told:
+            announce(line)
+    spread: dict[str, Any] = {"workers": workers, "scheduler": scheduler}
     items = {
-        f"{model}-{i:04d}": Item(model, i, seed, settings, given.get(model))
+        f"{model}-{i:04d}": Item(
+            model, i, seed, settings, given.get(model), None if data is None else designs[model],
+            **(spread if model in slow else {}),
+        )
         for model in names
         for i in range(simulations)
-    }
+    }  # fmt: skip
     outcome = run_tasks(
-        replicate, items, out / REPLICATES, workers=workers, scheduler=scheduler,
+        replicate, items, out / REPLICATES, **({} if slow else spread),
         progress=progress, announce=announce,
     )  # fmt: skip
     return score(read_records(out, outcome.done), seed, simulations, outcome.failed)

@@ -77,6 +77,8 @@ class ModelScore:
 
     Parameters
     ----------
+    design : str
+        Where it was measured, in words.
     unconverged, extended : int
         Posteriors that did not pass the gate even when extended, and all that were extended. The
         former are left out of ranks and coverage, as a user is told not to use them: a choice
@@ -90,6 +92,7 @@ class ModelScore:
     """
 
     model: str
+    design: str
     replicates: int
     unconverged: int
     extended: int
@@ -168,6 +171,7 @@ def score_model(
     names = dict.fromkeys(name for r in records for name in r["ranks"])
     return ModelScore(
         model=model,
+        design=records[0].get("design", ""),
         replicates=len(records),
         unconverged=len(records) - len(good),
         extended=sum(r["extended"] for r in records),

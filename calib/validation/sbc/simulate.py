@@ -43,7 +43,9 @@ class Simulated:
     attempts: int
 
 
-def simulate(template: Problem, design: Design, rng: np.random.Generator) -> Simulated:
+def simulate(
+    template: Problem, design: Design, rng: np.random.Generator, attempts: int = _MOST_ATTEMPTS
+) -> Simulated:
     """Simulate a campaign at the design's conditions.
 
     Parameters for which the equation has no value at some row have no likelihood: the posterior
@@ -57,7 +59,7 @@ def simulate(template: Problem, design: Design, rng: np.random.Generator) -> Sim
         If the model has no value at the design, however often the prior is asked.
     """
     bound = template.bound
-    for attempt in range(1, _MOST_ATTEMPTS + 1):
+    for attempt in range(1, attempts + 1):
         truth = template.priors.sample(rng, 1)
         natural = template.theta(truth)
         noisy = _noisy(template, natural, template.conditions, template.draw_noise(natural, rng))[1]
@@ -69,7 +71,7 @@ def simulate(template: Problem, design: Design, rng: np.random.Generator) -> Sim
                 measured, attempt,
             )  # fmt: skip
     raise CalibError(
-        f"the prior of {bound.model.name} gave no data in {_MOST_ATTEMPTS} draws",
+        f"the prior of {bound.model.name} gave no data in {attempts} draws",
         where=template.priors.source,
         mend="look for conditions at which the model has no value",
     )

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import re
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+import calib
 from calib.batch.campaign import read_plan
 from calib.batch.campaign.kinds import KINDS
 from calib.errors import CalibError
 from calib.inference.prior_files import default_priors
+from calib.models import MODELS
+from calib.models.simulators.registered import SIMULATED
 from tests.batch.campaign.sites import EFFECT, NAMES, WIND, make_site
+from tests.models.simulators.examples import PRIORS, pull
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "formats" / "inputs.md"
 
@@ -142,6 +148,34 @@ def test_a_plan_that_will_not_do_says_where_and_what_would(folder, text, said):
         planned(folder, text)
     for part in ("plan.toml", *said):
         assert part in str(caught.value)
+
+
+@pytest.fixture
+def emulated() -> Iterator[str]:
+    declared = calib.from_callable(
+        pull, parameters=PRIORS, conditions=("slip_ratio", "normal_load_kn"),
+        output="drawbar_pull_kn", name="slow_wheel", emulate=True,
+    )  # fmt: skip
+    calib.register(declared)
+    yield declared.name
+    MODELS.discard(declared.name)
+    SIMULATED.discard(declared.name)
+
+
+def test_a_simulator_that_has_to_be_emulated_is_sent_to_its_verb(folder, emulated):
+    with pytest.raises(CalibError, match=r"\[\[fit\]\], models(.|\n)*use calib fit"):
+        planned(folder, FIT.replace("bekker", emulated))
+    sbc = f'[[sbc]]\nname = "a"\nsimulations = 2\ndraw_seed = 1\nmodels = ["{emulated}"]\n'
+    with pytest.raises(CalibError, match=r"\[\[sbc\]\], models(.|\n)*use calib sbc"):
+        planned(folder, sbc)
+    case = folder / "cases" / "slow"
+    shutil.copytree(next((folder / "cases").iterdir()), case)
+    text = (case / "case.toml").read_text()
+    (case / "case.toml").write_text(re.sub('(drawbar_pull = )"[^"]*"', f'\\1"{emulated}"', text))
+    planned(folder, '[[diagnose]]\nname = "a"\ncases = ["cases/slow"]')
+    (task,) = read_plan(folder / "plan.toml").tasks.values()
+    with pytest.raises(CalibError, match=r"case.toml, \[models\](.|\n)*use calib diagnose"):
+        KINDS["diagnose"].load(task)
 
 
 def test_two_tasks_of_one_name_are_refused(folder):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,6 +11,8 @@ from typing import Any, ClassVar
 from pydantic import BaseModel, ConfigDict, Field
 
 from calib.batch.campaign.place import Place
+from calib.errors import CalibError
+from calib.models.simulators.registered import simulated_by
 
 
 class Section(BaseModel):
@@ -108,3 +110,25 @@ class Kind[S: Section, I](ABC):
         CalibError
             If it cannot be done; the task then counts as failed, and the others go on.
         """
+
+
+def refuse_slow_simulators(models: Iterable[str], where: str, verb: str) -> None:
+    """Refuse simulators that have to be emulated.
+
+    Tasks are done side by side, each from its inputs alone, while the runs of a simulator are made
+    and kept in one folder, for one process at a time.
+
+    Raises
+    ------
+    CalibError
+        Naming the first such model and the verb that can do it.
+    """
+    for model in models:
+        found = simulated_by(model)
+        if found is not None and found.simulator.emulate:
+            raise CalibError(
+                f"the simulator {found.name} behind {model} has to be emulated, which the tasks of "
+                "a campaign cannot do side by side", where=where,
+                allowed="closed forms, and simulators with emulate = false",
+                mend=f"use {verb}, which spreads the runs themselves over --workers",
+            )  # fmt: skip

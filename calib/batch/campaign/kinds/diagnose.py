@@ -10,7 +10,14 @@ from typing import Any
 
 from pydantic import Field
 
-from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
+from calib.batch.campaign.kinds.base import (
+    Kind,
+    Planned,
+    Section,
+    Task,
+    Work,
+    refuse_slow_simulators,
+)  # fmt: skip
 from calib.batch.campaign.place import Place
 from calib.batch.folders import read_folder
 from calib.gap.batch import written
@@ -68,7 +75,9 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
             for label, path in task.inputs.items()
             if label.startswith("effects")
         }
-        case = read_case(task.inputs["case.toml"].parent)
+        path = task.inputs["case.toml"]
+        case = read_case(path.parent)
+        refuse_slow_simulators(case.models.values(), f"{path}, [models]", "calib diagnose")
         return case, effects, task.settings["pages"]
 
     def work(self, item: DiagnosisItem, seed: int) -> Work:

@@ -12,7 +12,14 @@ from typing import Any
 
 from pydantic import Field
 
-from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
+from calib.batch.campaign.kinds.base import (
+    Kind,
+    Planned,
+    Section,
+    Task,
+    Work,
+    refuse_slow_simulators,
+)  # fmt: skip
 from calib.batch.campaign.place import Place, word
 from calib.batch.folders import read_folder
 from calib.data import Table
@@ -66,6 +73,7 @@ class Fit(Kind[FitSection, FitItem]):
     def plan(self, section: FitSection, place: Place) -> Iterator[Planned]:
         """Yield a task for each file, model, prior file and hold-out."""
         priors = _priors(section, place)
+        refuse_slow_simulators(priors, f"{place.where}, models", "calib fit")
         with place.telling("hold_out"):
             for text in section.hold_out:
                 _held(text)

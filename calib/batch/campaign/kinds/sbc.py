@@ -8,7 +8,14 @@ from dataclasses import asdict
 
 from pydantic import Field
 
-from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
+from calib.batch.campaign.kinds.base import (
+    Kind,
+    Planned,
+    Section,
+    Task,
+    Work,
+    refuse_slow_simulators,
+)  # fmt: skip
 from calib.batch.campaign.place import Place
 from calib.models import get_model
 from calib.validation.sbc.replicate import Item, replicate
@@ -38,6 +45,7 @@ class Sbc(Kind[SbcSection, Item]):
         """Yield a task for each replicate."""
         with place.telling("models"):
             names = [get_model(name).name for name in section.models]
+        refuse_slow_simulators(names, f"{place.where}, models", "calib sbc")
         for model in names:
             for i in range(section.simulations):
                 yield Planned(
