@@ -21,7 +21,8 @@ _OURS = ("manifest.json", "run.json", "diagnosis.json", "score.txt", "audit.json
 _WRITTEN = (
     *_OURS, "index.html", "summary.json", "figures", "data", "priors", "gaps", "case",
     "corrected.json", "fresh_prediction.csv", "priors.toml", "data.csv", "tables", "methods.txt",
-    "methods.tex", "references.bib", "audit.csv", "inputs.json", "runs",
+    "methods.tex", "references.bib", "audit.csv", "inputs.json", "runs", "emulator.npz",
+    "emulators", "compared", "held_out.csv",
 )  # fmt: skip
 
 _YOUNG_SECONDS = 60.0

@@ -43,6 +43,10 @@ if TYPE_CHECKING:
 SCHEMA = "calib/run/1"
 _HASHED = ("posterior.nc", "priors.toml", "data.csv")
 _EMULATOR = "emulator.npz"
+# Draws of a run whose log density is worked out again as it is read. It may be off by so many
+# nats, far more than rounding and far less than what moves a prediction, and for one of the draws
+# by more: one that lies on a bound may be rounded beyond it.
+_N_COMPARED, _SAME_NATS = 8, 1e-3
 N_PRIOR = 2000
 MAX_CELLS = 8_000_000
 _GATE = ("rhat", "ess_bulk", "ess_tail", "tau")
@@ -230,7 +234,7 @@ def load_calibration(folder: Path) -> Calibration:
     Raises
     ------
     CalibError
-        If the folder is not one, or a file in it is damaged.
+        If the folder is not one, a file in it is damaged, or the model has changed since.
     """
     folder = Path(folder)
     meta = _read_meta(folder)
@@ -242,9 +246,26 @@ def load_calibration(folder: Path) -> Calibration:
     with _damage(folder / "posterior.nc"):
         t, log_prob = _read_posterior(folder / "posterior.nc", problem.priors, shape)
     with _damage(folder / "run.json"):
+        _check_model(problem, t, log_prob, folder)
         found = Calibration(problem, _draws(meta, t, log_prob), seed, label)
         _ = found.parameters  # what cannot be reported is damaged as well
         return found
+
+
+def _check_model(problem: Problem, t: Array, log_prob: Array, folder: Path) -> None:
+    """A run is predicted from only by the model that it was fitted with."""
+    flat = t.reshape(-1, t.shape[-1])
+    some = np.linspace(0, len(flat) - 1, _N_COMPARED).astype(int)
+    with np.errstate(all="ignore"):
+        off = np.abs(problem.log_prob(flat[some]) - log_prob.reshape(-1)[some])
+    if np.count_nonzero(off < _SAME_NATS) < _N_COMPARED - 1:
+        raise CalibError(
+            f"the model {problem.bound.model.name} no longer gives its draws the densities that "
+            "the run was saved with: its formula, or that of its noise, has changed since",
+            where=str(folder),
+            allowed="the model as it was when the run was made",
+            mend="pass the model's file as it was then, or run `calib fit` again",
+        )
 
 
 @contextmanager

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from calib.batch.folders import check_folder
 from calib.models import example_csv
 from tests.browser import Browser, faults
 from tests.cli.test_cli import Calib
@@ -52,6 +53,8 @@ def test_a_report_has_it_as_a_section(calib: Calib) -> None:
     assert (
         json.loads(Path("r/manifest.json").read_text())["comparison"]["models"] == found["models"]
     )
+    for folder in ("r", "r/compared"):
+        check_folder(Path(folder), overwrite=True)
     told = calib("check", "r", "--quick")
     assert told.code == 0, told.out
     assert calib("predict", "r/compared", "--at", "plates.csv").code == made.code

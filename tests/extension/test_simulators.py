@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 import calib
+from calib.batch.folders import check_folder
 from calib.data.registry import Registry
 from calib.gap.case import Case
 from calib.models import MODELS
@@ -98,6 +99,7 @@ def test_a_slow_command_that_fails_now_and_then_gives_the_same(run: Calib) -> No
     fitted = run("fit", "lab.csv", "--model", "wheel", *own, "--out", "run", "--workers", 1, *FEW)
     assert fitted.code == 0, fitted.err
     assert "wheel: emulated from" in fitted.out
+    check_folder(Path("run"), overwrite=True)
     same_posterior("run", exact("lab.csv"))
     made = len(list(Path("wheel.runs").rglob("*-[01].json")))
     assert made <= 100
@@ -135,6 +137,7 @@ def test_a_report_and_its_check(run: Calib) -> None:
     page = Path("report/index.html").read_text()
     assert "Emulators of slow simulators" in page
     record = json.loads(Path("report/manifest.json").read_text())["emulators"]["wheel"]
+    check_folder(Path("report"), overwrite=True)
     assert record["passed"]
     assert record["held_out"]["runs"] == 20
     checked = run("check", "report", *own, "--workers", 1)
@@ -217,6 +220,7 @@ def test_a_compiled_program_from_file_to_verdict(run: Calib) -> None:
     write_table("field.csv", field(np.random.default_rng(4)))
     fitted = run("fit", "lab.csv", "--model", "wheel", *own, "--out", "run", "--workers", 1, *FEW)
     assert fitted.code == 0, fitted.err
+    check_folder(Path("run"), overwrite=True)
     same_posterior("run", exact("lab.csv"))
     found = run("diagnose", "--run", "run", "--field", "field.csv", *own, "--out", "gap",
                 "--workers", 1)  # fmt: skip
@@ -262,6 +266,7 @@ def test_a_model_behind_a_server(run: Calib) -> None:
         server.kill()
         server.wait()
     assert fitted.code == 0, fitted.err
+    check_folder(Path("run"), overwrite=True)
     same_posterior("run", exact("lab.csv"))
     # With the server gone the message says so, and the runs that were made are kept.
     kept = len(list(Path("wheel.runs").rglob("*-0.json")))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import arviz as az
@@ -13,10 +14,12 @@ import pytest
 
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
+from calib.inference import io
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.io import load_calibration, save_calibration, to_datatree
 from calib.inference.problem import build_problem
 from calib.inference.sampling.sampler import SamplerSettings
+from calib.models import MODELS
 from calib.validation.prediction import predict
 from calib.validation.validate import leave_one_out
 
@@ -70,6 +73,21 @@ def test_everything_else_survives_too(rut_calibration: Calibration, loaded: Cali
     assert loaded.problem.bound.references == rut_calibration.problem.bound.references
     for name, values in rut_calibration.problem.table.columns.items():
         np.testing.assert_array_equal(loaded.problem.table[name], values)
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1.0, False), (1.0 + 1e-12, False), (1.001, True)])
+def test_a_model_that_has_changed_is_told(
+    saved: Path, monkeypatch: pytest.MonkeyPatch, factor: float, told: bool
+) -> None:
+    """Its prediction would be another, in silence; rounding on another processor is none."""
+    model = MODELS["modified_bekker"]
+    changed = replace(model, location=lambda *args: model.location(*args) + np.log(factor))
+    monkeypatch.setattr(io, "get_model", lambda name: changed)
+    if not told:
+        load_calibration(saved)
+        return
+    with pytest.raises(CalibError, match="modified_bekker no longer gives its draws"):
+        load_calibration(saved)
 
 
 def test_reconstructed_data_stay_labelled_so(loaded: Calibration) -> None:
