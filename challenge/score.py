@@ -8,9 +8,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import beta
 
 from calib.errors import CalibError
-from calib.validation.scores import jeffreys
 from challenge.answers import FAILED, CaseAnswer, auc, read_answer
 from challenge.design import TIERS
 from challenge.mechanism import NONE, UNKNOWN
@@ -42,8 +42,19 @@ class Proportion:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Jeffreys 95 % interval, see `calib.validation.scores.jeffreys`; all of nothing."""
-        return jeffreys(self.successes, self.n) if self.n else (0.0, 1.0)
+        """Jeffreys 95 % interval, closed at the ends where all or none succeed [1]_.
+
+        References
+        ----------
+        .. [1] L. D. Brown, T. T. Cai, A. DasGupta, Statistical Science 16 (2001) 101-133,
+           doi 10.1214/ss/1009213286.
+        """
+        if not self.n:
+            return 0.0, 1.0
+        a, b = self.successes + 0.5, self.n - self.successes + 0.5
+        low = 0.0 if self.successes == 0 else float(beta.ppf(0.025, a, b))
+        high = 1.0 if self.successes == self.n else float(beta.ppf(0.975, a, b))
+        return low, high
 
 
 @dataclass(frozen=True)
