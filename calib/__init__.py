@@ -134,6 +134,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return import_module("importlib.metadata").version("terracalib")
     if name not in _HOME:
         raise AttributeError(f"module 'calib' has no attribute {name!r}")
     return getattr(import_module(_HOME[name]), name)

@@ -248,8 +248,9 @@ def predict(
         )
     from calib import load_calibration
     from calib.data import read_for_model
+    from calib.models.simulators.emulator.model import emulator_of
+    from calib.validation.prediction import MIN_DEFINED, predict_stacked, prediction_columns
     from calib.validation.prediction import predict as predict_at
-    from calib.validation.prediction import predict_stacked, prediction_columns
 
     if (run / "corrected.json").exists():
         _predict_corrected(run, at, out, effects, without or [])
@@ -281,7 +282,16 @@ def predict(
         columns["converged"] = ["no"] * len(table)
     outside = sum(bool(flags) for flags in prediction.outside)
     if outside:
-        print(f"calib: {outside} rows lie outside the calibrated range", file=sys.stderr)
+        lie = "row lies" if outside == 1 else "rows lie"
+        print(f"calib: {outside} {lie} outside the calibrated range", file=sys.stderr)
+    undefined = int((prediction.defined < MIN_DEFINED).sum())
+    if undefined:
+        emulated = any(emulator_of(c.problem.bound.model) is not None for _, c in parts)
+        why = (
+            "; an emulator ends where its runs do: give [ranges] in the simulator file, and fit "
+            "again" if emulated else ": the model has none there for much of the posterior"
+        )  # fmt: skip
+        print(f"calib: no value (nan) at {undefined} of {len(table)} rows{why}", file=sys.stderr)
     _give(columns, out)
     finish(0 if converged else 3, {"columns": _lists(columns)}, outside=outside)
 

@@ -90,7 +90,7 @@ def test_fit_predict_and_read_the_numbers(calib: Calib, he2019: Path, tmp_path: 
     lines = [line.split(",") for line in printed.out.splitlines()]
     header, *rows = lines
     assert len(rows) == 4
-    assert "1 rows lie outside the calibrated range" in printed.err
+    assert "1 row lies outside the calibrated range" in printed.err
     assert [row[-1] for row in rows] == ["", "", "", "slip_ratio"]
     number = {name: [float(row[i]) for row in rows] for i, name in enumerate(header[:-1])}
     # Within 10 % of Eq 21 at Table 6: the likelihood differs from the published regression.
@@ -104,7 +104,7 @@ def test_fit_predict_and_read_the_numbers(calib: Calib, he2019: Path, tmp_path: 
     written = calib("predict", "run", "--at", "at.csv", "--out", "bands.csv")
     assert written.code == 0
     assert written.out == "4 rows written to bands.csv\n"
-    assert "1 rows lie outside the calibrated range" in written.err
+    assert "1 row lies outside the calibrated range" in written.err
     assert Path("bands.csv").read_text().splitlines()[0].split(",") == header
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import typer
 
+import calib as package
 from calib.cli.examples import EXAMPLES
 from calib.cli.verbs import app
 from calib.models import MODELS, example_csv
@@ -117,6 +118,7 @@ def test_no_example_is_of_nothing() -> None:
 
 def test_the_version(calib: Calib) -> None:
     assert calib("--version").out == f"calib {version('terracalib')}\n"
+    assert package.__version__ == version("terracalib")
 
 
 def test_more_is_said_when_asked_for(calib: Calib, run: Path) -> None:

@@ -105,6 +105,11 @@ def test_a_slow_command_that_fails_now_and_then_gives_the_same(run: Calib) -> No
     assert made <= 100
     predicted = run("predict", "run", "--at", "field.csv", *own)
     assert predicted.code == 0, predicted.err
+    write_table(
+        "far.csv", {"slip_ratio": np.array([0.2, 0.2]), "normal_load_kn": np.array([4.0, 1e3])}
+    )
+    far = run("predict", "run", "--at", "far.csv", *own)
+    assert "no value (nan) at 1 of 2 rows; an emulator ends where its runs do" in far.err
     # Nothing is run to check: the emulator is in the folder.
     checked = run("check", "run", *own, "--workers", 1)
     assert checked.code == 0, checked.out

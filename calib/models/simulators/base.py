@@ -109,6 +109,8 @@ class Simulator:
         Whether it is too slow to be evaluated by the sampler itself.
     ranges : mapping of str to (float, float)
         Bounds within which it may be asked, by canonical condition.
+    made_of : tuple of str
+        SHA-256 of what its results depend on beside what it is run by: libraries, tables of soils.
     """
 
     name: str
@@ -124,12 +126,14 @@ class Simulator:
     deterministic: bool = True
     emulate: bool = True
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    made_of: tuple[str, ...] = ()
 
     @property
     def digest(self) -> str:
         """SHA-256 of whatever its results depend on besides parameters and conditions."""
         what = [self.way.identity, list(self.parameters), dict(self.conditions)]
         what += [[o.header, o.column] for o in self.outputs]
+        what += [list(self.made_of)] if self.made_of else []
         return hashlib.sha256(json.dumps(what).encode()).hexdigest()
 
     def canonical(self, header: str) -> str:

@@ -53,6 +53,7 @@ class SimulatorFile(BaseModel):
     deterministic: bool = True
     emulate: bool = True
     cache: str = ""
+    files: tuple[str, ...] = ()
     conditions: dict[str, str] = Field(min_length=1)
     outputs: dict[str, str] = Field(min_length=1)
     patterns: dict[str, str] = {}
@@ -102,7 +103,7 @@ def read_simulator(path: Path) -> Simulated:
             folder=path.parent / (file.cache or f"{path.stem}.runs"),
             budget=file.emulator.model_dump(), title=file.title, source=file.source,
             limit=file.limit, retries=file.retries, deterministic=file.deterministic,
-            emulate=file.emulate, ranges=_ranges(file, path),
+            emulate=file.emulate, ranges=_ranges(file, path), made_of=_made_of(file, path),
         )  # fmt: skip
     except CalibError as error:
         where = str(path) if error.where is None else f"{path}, {error.where}"
@@ -183,6 +184,22 @@ def _command(file: SimulatorFile, path: Path) -> CommandWay:
             mend="build or install it, or correct its path",
         )  # fmt: skip
     return way
+
+
+def _made_of(file: SimulatorFile, path: Path) -> tuple[str, ...]:
+    """Return the SHA-256 of each file that the program reads or calls, as far as they are named."""
+    found = []
+    for name in file.files:
+        try:
+            content = (path.parent / name).read_bytes()
+        except OSError as error:
+            raise CalibError(
+                f"the file {name!r} cannot be read ({error.strerror})", where=f"{path}, files",
+                allowed="files that the simulator is made of, relative to this one",
+                mend="correct the path, or leave it out",
+            ) from None  # fmt: skip
+        found.append(hashlib.sha256(content).hexdigest())
+    return tuple(found)
 
 
 def _template(file: SimulatorFile, path: Path) -> str:

@@ -210,6 +210,18 @@ def test_what_a_command_is_made_of_is_its_identity(tmp_path: Path) -> None:
     assert read_simulator(file).simulator.digest != before
 
 
+def test_files_that_a_program_calls_are_of_its_identity_if_they_are_named(tmp_path: Path) -> None:
+    file = write_program(tmp_path, files='["soil.csv"]')
+    with pytest.raises(CalibError, match=r"file 'soil.csv' cannot be read"):
+        read_simulator(file)
+    soil = tmp_path / "soil.csv"
+    soil.write_text("cohesion\n3.0\n")
+    before = read_simulator(file).simulator.digest
+    assert read_simulator(file).simulator.digest == before
+    soil.write_text("cohesion\n4.0\n")
+    assert read_simulator(file).simulator.digest != before
+
+
 class _Handler(BaseHTTPRequestHandler):
     """An UM-Bridge server in a few lines, with a mood that the model's name sets."""
 
