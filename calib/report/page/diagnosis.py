@@ -144,7 +144,7 @@ def _sizes(found: Diagnosis, name: str) -> list[Markup]:
 
 
 def parameter_rows(found: Diagnosis) -> list[list[str]]:
-    """Say what the parameters of the effects that are not ruled out mean, and their priors."""
+    """Say what parameters of effects that are not ruled out mean, their priors, and after whom."""
     p = found.ranking.probability
     rows: dict[tuple[str, str], list[str]] = {}
     for name in found.ranking.order:
@@ -159,8 +159,8 @@ def parameter_rows(found: Diagnosis) -> list[list[str]]:
                     .replace("_kn)", ")")
                     .replace("_", " ")
                 )
-                row = [short_name(effect.name), words, prior.reason, text + _unit_of(prior)]
-                rows.setdefault((effect.name, prior.name), row)
+                said = (words, prior.reason, text + _unit_of(prior), prior.source)
+                rows.setdefault((effect.name, prior.name), [short_name(effect.name), *said])
     return list(rows.values())
 
 

@@ -334,11 +334,12 @@ def test_what_the_parameters_are_can_be_read_on_the_page(found, page):
     _, _, reader = page
     rows = {(row[0], row[1]): row[2:] for row in parameter_rows(found)}
     assert len(rows) == len(parameter_rows(found))
-    meaning, prior = rows["sensor drift", "curvature"]
+    meaning, prior, source = rows["sensor drift", "curvature"]
     assert meaning.startswith("1 is linear in run order")
     assert prior == "lognormal(1, 0.6)"
     assert rows["sensor drift", "drift"][1].endswith(" \N{MULTIPLICATION SIGN} 5 (normal load) kN")
-    for words in (meaning, "sampled through its values at the lowest (", "psi"):
+    assert all(row[2] for row in rows.values())
+    for words in (meaning, source, "sampled through its values at the lowest (", "psi"):
         assert words in reader.text
     ruled_out = {n for n, p in found.ranking.probability.items() if p < 0.01 and "+" not in n}
     in_play = {
