@@ -136,6 +136,16 @@ def test_a_good_effect_passes_the_trial(tmp_path):
     check_effects(load_effects(path), make_case("force_offset"))
 
 
+def test_wrong_priors_in_the_class_are_looked_for_there(tmp_path):
+    own = REGISTERED.replace("[parameters.force]", "[parameters.gust]")
+    path = write(tmp_path, own, None)
+    with pytest.raises(CalibError, match="unknown parameter gust") as caught:
+        check_effects(load_effects(path), make_case("force_offset"))
+    assert "mine.py, priors of the effect cross_wind, [parameters]" in str(caught.value)
+    assert "cross_wind.toml" not in str(caught.value)
+    assert "shipped" not in str(caught.value)
+
+
 REGISTERED = "import calib\n" + CODE.replace(
     "    def on_output", f'    priors = """{PRIOR}"""\n\n    def on_output'
 )

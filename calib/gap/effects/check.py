@@ -7,7 +7,6 @@ A mistake that the fits would swallow (a misspelt method, a wrong shape) would o
 from __future__ import annotations
 
 import difflib
-import sys
 import traceback
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
@@ -16,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.batch.plugins import declared_in
 from calib.data.quantities import QUANTITIES, role_of
 from calib.errors import CalibError
 from calib.gap.case import Campaigns, Case, OutputData, campaigns
@@ -205,7 +205,8 @@ def _call[R](function: Callable[..., R], effect: Effect, *args: Any) -> R:
     except CalibError:
         raise
     except Exception as error:
-        frames, path = traceback.extract_tb(error.__traceback__), _file(effect).resolve()
+        frames = traceback.extract_tb(error.__traceback__)
+        path = Path(declared_in(type(effect))).resolve()
         line = next(
             (f.lineno for f in reversed(frames) if Path(f.filename).resolve() == path), None
         )
@@ -228,10 +229,4 @@ def _role_of_column(name: str) -> str:
 
 
 def _place(effect: Effect) -> str:
-    return f"{_file(effect)}, effect {effect.name}"
-
-
-def _file(effect: Effect) -> Path:
-    """Return the file that defines an effect; the name of its module, if that is in none."""
-    module = type(effect).__module__
-    return Path(getattr(sys.modules.get(module), "__file__", None) or module)
+    return f"{declared_in(type(effect))}, effect {effect.name}"
