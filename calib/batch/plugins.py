@@ -100,6 +100,17 @@ def _load(path: Path) -> None:
         run_file(path, "models")
 
 
+def declared_in(declared: object) -> str:
+    """Return the file of a user's function or class, or its module where that has no file.
+
+    Nothing for calib's own, and for what is neither function nor class.
+    """
+    module = str(getattr(declared, "__module__", ""))
+    if module.startswith("calib.") or not hasattr(declared, "__qualname__"):
+        return ""
+    return str(getattr(sys.modules.get(module), "__file__", None) or module)
+
+
 def load_installed(group: str) -> None:
     """Load what installed packages declare as entry points of a group, once.
 

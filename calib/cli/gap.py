@@ -46,7 +46,7 @@ def diagnose(
     from calib.gap.case import case_from_run, read_case
     from calib.gap.diagnose import diagnose as find
     from calib.gap.effects import EFFECTS
-    from calib.gap.effects.check import check_on_case
+    from calib.gap.effects.check import check_effects
     from calib.gap.effects.load import load_effects
     from calib.gap.files import write_diagnosis
     from calib.gap.provenance import INPUTS, inputs_record
@@ -66,16 +66,18 @@ def diagnose(
     own = {} if effects is None else load_effects(effects)
     files: dict[str, bytes] = {}
     if effects is not None:
-        check_on_case(own, given, effects)
         paths = [effects, *(e.prior_file for e in own.values() if e.prior_file is not None)]
         files = {path.name: path.read_bytes() for path in paths}
+    considered = {**EFFECTS, **own}
+    # The diagnosis looks at them too, but only after simulators have been emulated.
+    check_effects(considered, given)
     with progress_bars() as tell:
         emulations = prepare_case(given, run, seed, workers, tell)
     told = [say(what, emulation) for what, emulation in emulations]
     manifest = {"seed": seed, "command": opt.command()}
     own_files = [] if effects is None else [effects]
     with pool(workers, _PAGE, own_files) as side:
-        found = find(given, seed, effects={**EFFECTS, **own}, pool=side)
+        found = find(given, seed, effects=considered, pool=side)
         from calib.report.page.gap_page import write_page
 
         with fresh_folder(out, overwrite=overwrite) as folder:

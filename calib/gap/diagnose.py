@@ -15,6 +15,7 @@ from calib.gap.context import Context
 from calib.gap.corrected import Corrected, conditions_outside
 from calib.gap.declared import new_values
 from calib.gap.effects import EFFECTS, Effect, View
+from calib.gap.effects.check import check_effects
 from calib.gap.hypotheses import dependences, inseparable
 from calib.gap.inclusion import UNLISTED, Inclusion, inclusion, inclusion_probability
 from calib.gap.isolate import Isolability
@@ -127,7 +128,8 @@ def diagnose(
     Raises
     ------
     CalibError
-        If the case cannot be diagnosed: an output or a condition is missing, too few rows.
+        If the case cannot be diagnosed: an output or a condition is missing, too few rows; or
+        an effect that is not calib's own does not do what an effect must.
     """
     if not isinstance(case, Case):
         case = read_case(Path(case))
@@ -140,6 +142,7 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
 
     Unless there are other conditions to predict, `with_unseen_rows` has to follow.
     """
+    check_effects(effects, case)
     data, ranking, said = screened_ranking(case, seed, effects)
     mixed = mixture(data, ranking, seed)
     truth = mixed.at(data.view)

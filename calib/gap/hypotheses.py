@@ -17,8 +17,8 @@ from calib.gap.effects.dependence import DependsOn, DiffersBy
 from calib.gap.hypothesis import Hypothesis, OnsetOver, SmoothOver
 from calib.gap.shifts import ShiftAs
 from calib.inference.prior_files import (
-    DeclaredPriors,
     PriorFile,
+    declared_priors,
     default_priors,
     prior_references,
     read_priors,
@@ -113,7 +113,7 @@ def effect_priors(data: Campaigns, effect: Effect) -> Priors:
     """Read an effect's priors, forces relative to the case's load."""
     file: PriorFile = effect.prior_file or default_priors(f"effects/{effect.name}")
     if effect.priors:
-        file = DeclaredPriors(f"{effect.name}.toml", effect.priors)
+        file = declared_priors("effect", effect.name, effect.priors, type(effect))
     references = prior_references(data.case.lab.columns) | {"normal_load_kn": data.view.load_kn}
     return read_priors(file, effect.name, effect.parameters, references)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from scipy.special import digamma, polygamma
 
+from calib.batch.plugins import declared_in
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.inference.noise import DEFAULT_PRIORS, USUAL, Along, Family, NoiseChoice
@@ -114,10 +115,14 @@ def json_schema() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class DeclaredPriors:
-    """Priors that a model or an effect declares as text, read as a file is."""
+    """Priors that a model or an effect declares as text, read as a file is.
+
+    `place` is where a user finds them, if that is no file of this name.
+    """
 
     name: str
     text: str
+    place: str = ""
 
     def read_text(self, encoding: str | None = None) -> str:
         """Return the text."""
@@ -139,11 +144,17 @@ class DeclaredPriors:
 type PriorFile = Path | DeclaredPriors
 
 
+def declared_priors(what: str, name: str, text: str, declared: object) -> DeclaredPriors:
+    """Return the priors of a model or an effect that `declared`, a function or class, is of."""
+    place = ", ".join(filter(None, (declared_in(declared), f"priors of the {what} {name}")))
+    return DeclaredPriors(f"{name}.toml", text, place)
+
+
 def default_priors(model_name: str) -> PriorFile:
     """Return a model's priors: those it declares, else the file that is shipped."""
     known = MODELS.get(model_name)
     if known is not None and known.priors:
-        return DeclaredPriors(f"{model_name}.toml", known.priors)
+        return declared_priors("model", model_name, known.priors, known.predict)
     packaged = Path(str(resources.files("calib"))) / "_priors"
     # An editable install has no packaged copy: the priors then lie beside the package.
     folder = packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "priors"
@@ -191,7 +202,9 @@ def read_priors(
     CalibError
         If the file is missing, is not TOML, or gives unknown, missing or impossible entries.
     """
-    return parse_priors(_text(path), str(path), model_name, parameters, references)
+    place = path.place if isinstance(path, DeclaredPriors) else ""
+    priors = parse_priors(_text(path), place or str(path), model_name, parameters, references)
+    return replace(priors, source=str(path)) if place else priors
 
 
 def _text(path: PriorFile) -> str:
@@ -342,9 +355,14 @@ def _check_names(
             found,
             where=f"{source}, [parameters]",
             allowed=", ".join(parameters),
-            mend=f"{_meant(unknown, missing)}give exactly these parameters; copy the shipped file "
-            "and edit it",
+            mend=f"{_meant(unknown, missing)}give exactly these parameters{_example(model_name)}",
         )
+
+
+def _example(model_name: str) -> str:
+    shipped = default_priors(model_name)
+    there = isinstance(shipped, Path) and shipped.is_file()
+    return "; copy the shipped file and edit it" if there else ""
 
 
 def _check_units(file: _File, source: str, model_name: str) -> None:

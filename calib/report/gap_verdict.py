@@ -26,6 +26,7 @@ TIE = 0.2
 _MOST_TIED = 4
 # ln 20: the evidence that makes odds of twenty to one.
 _ENOUGH_NATS = math.log(20.0)
+_PREDICT = "calib predict DIAGNOSIS --at NEW.csv"
 
 
 class Tone(StrEnum):
@@ -310,18 +311,43 @@ def _how_far(e: GapEvidence) -> str:
     return "; ".join(parts) + where
 
 
-def _next(e: GapEvidence) -> list[tuple[str, str]]:
-    """Say what would show the unknown, or separate the first two unless the first is certain."""
-    if e.look and e.verdict == "unknown":
-        return [("Next", e.look)]
+def advice(e: GapEvidence) -> str:
+    """Say what to do that is no measurement between causes; nothing where one comes first."""
+    if e.verdict == "unknown":
+        return e.look
+    if e.verdict != "effect":
+        return ""
     faults = [c.words for c in e.acting if c.instrument]
-    if faults and e.verdict == "effect":
-        return [
-            ("Next", f"Check the instrument before the model ({joined(faults)}): zero and span, "
-             "and an early run once more. What is predicted with the cause is the reading, not the "
-             "truth"),
-        ]  # fmt: skip
-    if not e.next_facts or e.ranked[0].probability >= SURE:
+    if faults:
+        return (
+            f"check the instrument before the model ({joined(faults)}): zero and span, and an "
+            "early run once more. What is predicted with the cause is the reading, not the truth"
+        )
+    if _measure_first(e):
+        return ""
+    missing = [c.words for c in e.acting if c.name != "parameter_shift"]
+    if not missing:
+        return (
+            "fit the field's rows too, and look at what changed in the soil. Until then predict "
+            f"with the other parameter values: {_PREDICT}"
+        )
+    causes = "cause" if len(missing) == 1 else "causes"
+    return (
+        f"predict with the {causes} in the model ({joined(missing)}): {_PREDICT}. Or put "
+        f"{'it' if len(missing) == 1 else 'them'} into the simulator, and calibrate that again"
+    )
+
+
+def _measure_first(e: GapEvidence) -> bool:
+    return bool(e.next_facts) and e.ranked[0].probability < SURE
+
+
+def _next(e: GapEvidence) -> list[tuple[str, str]]:
+    """Say what to do, or what would separate the first two unless the first is certain."""
+    text = advice(e)
+    if text:
+        return [("Next", text)]
+    if not _measure_first(e):
         return []
     n = max(e.next_facts, key=lambda fact: (_leading(e, fact), fact.gain_nats))
     repeats = repeats_needed(n.gain_nats)

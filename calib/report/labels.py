@@ -58,7 +58,7 @@ def axis_of(column: str) -> Axis:
     if quantity is None:
         return Axis(column.replace("_", " ").capitalize(), NO_UNIT)
     unit = quantity.unit.replace("**", "^").replace("*", " ").replace("dimensionless", NO_UNIT)
-    return Axis(quantity.title, *(quantity.shown or (unit, 1.0)))
+    return Axis(quantity.title, *(quantity.shown or (degrees(unit), 1.0)))
 
 
 def stem_and_subscript(name: str) -> tuple[str, str]:
@@ -86,18 +86,23 @@ def plain(name: str) -> str:
     return f"{stem}_{below}" if below else stem
 
 
+def degrees(unit: str) -> str:
+    """Write degrees of temperature, ``degC`` to the program, with their sign."""
+    return re.sub(r"\bdeg(?=[CF]\b)", "\N{DEGREE SIGN}", unit)
+
+
 def unit_text(unit: str) -> str:
     """Return a unit in mathtext: powers raised; an en dash where there is none."""
     if unit in ("1", "", "dimensionless"):
         return NO_UNIT
-    return re.sub(r"\^(-?\w+)", r"$^{\1}$", unit)
+    return re.sub(r"\^(-?\w+)", r"$^{\1}$", degrees(unit))
 
 
 def unit_plain(unit: str) -> str:
     """Return a unit for a sentence: small powers as superscripts, nothing where there is none."""
     if unit in ("1", "", "dimensionless"):
         return ""
-    return unit.replace("^2", "²").replace("^3", "³")
+    return degrees(unit).replace("^2", "²").replace("^3", "³")
 
 
 def parameter_label(name: str, unit: str, *, log: bool = False) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from calib.data.quantities import QUANTITIES, columns_of
 from calib.inference.priors import Prior
-from calib.report.labels import symbol
+from calib.report.labels import degrees, symbol
 
 _SPECIAL = re.compile(r"([\\*_{}\[\]<>|$~])")
 
@@ -52,7 +52,7 @@ def unit(text: str) -> str:
     """Write a unit as people do; a dash where there is none."""
     if text in ("1", "", "dimensionless"):
         return "\N{EN DASH}"
-    return words(text.replace("**", "^").replace("*", " "))
+    return words(degrees(text.replace("**", "^").replace("*", " ")))
 
 
 def priors_table(priors: Iterable[Prior]) -> str:

@@ -5,16 +5,23 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from calib.check.schema import RunRecord
+from calib.data.quantities import QUANTITIES
+from calib.gap.effects import View
 from calib.models.simulators.files import SimulatorFile
 from tests.docs.pages import DOCS, ROOT
 
 REPORTS = ROOT / "reports"
 RESULTS = (DOCS / "formats" / "results.md").read_text(encoding="utf-8")
+EXTEND = (DOCS / "extend.md").read_text(encoding="utf-8")
+# Of the program's own, before any test adds to them.
+ROLES = {q.physical: (column, q.role) for column, q in QUANTITIES.items()}
 # Below these keys, how many levels of keys are names of one's own: outputs, methods, parameters.
 NAMES = {"models": 1, "estimates": 2, "fit": 1, "priors": 1, "posterior": 1, "parameters": 1,
          "shrink": 1, "quantities": 1, "inclusion": 1}  # fmt: skip
@@ -83,3 +90,40 @@ def test_every_key_of_a_simulator_file_is_told_with_its_default() -> None:
         if isinstance(field.default, (str, int, float, bool)) and name != "cache"
     }
     assert {name: told[name] for name in plain} == plain
+
+
+def test_every_role_of_an_effect_is_told_with_its_column() -> None:
+    section = EXTEND.partition("### Roles\n")[2].partition("\n### ")[0]
+    table, _, others = section.partition("All others")
+    rows = re.findall(r"^\| `(\w+)` \| `(\w+)`.*\| `(\w+)`[^|]*\|$", table, re.M)
+    renamed = {role: column for role, column, _ in rows}
+    outputs, _, conditions = others.partition(" One of ")[0].partition("; the conditions")
+    named = dict.fromkeys(re.findall(r"`(\w+)`", outputs), "outputs")
+    named |= dict.fromkeys(re.findall(r"`(\w+)`", conditions), "covariates")
+    told = {role: place for role, _, place in rows} | named
+    assert told == {
+        role: "outputs" if kind == "output" else "covariates" for role, (_, kind) in ROLES.items()
+    }
+    assert renamed == {role: ROLES[role][0] for role in renamed}
+    assert {role for role in named if QUANTITIES[ROLES[role][0]].stem != role} == set()
+
+
+def test_what_a_view_gives_is_what_its_table_says() -> None:
+    section = EXTEND.partition("### What `view` gives\n")[2]
+    table = section.partition("`covariates = ()`")[0]
+    view = View(
+        conditions={"slip_ratio": np.array([0.1, -0.2]), "soil_heat": np.array([3.0, 4.0])},
+        lab={"slip_ratio": 0.2}, load_kn=4.0, ground_exponent=1.0, order_range=(1.0, 9.0),
+    )  # fmt: skip
+    told = re.findall(r"^\| `view\.(\w+)", table, re.M)
+    assert told == ["of", "lab_of", "slip", "sinkage", "column", "load_kn", "order_range"]
+    assert view.of("slip").shape == view.slip().shape == (2,)
+    with pytest.raises(KeyError):
+        view.of("speed")
+    assert (view.lab_of("slip", 9.0), view.lab_of("speed", 9.0)) == (0.2, 9.0)
+    np.testing.assert_allclose(view.sinkage(), [[1.1, 1.0]])
+    predicted = replace(view, base={"sinkage": np.array([[30.0, 60.0]] * 3)})
+    np.testing.assert_allclose(predicted.sinkage(), [[1.0, 2.0]] * 3)
+    assert (view.column("slip"), view.column("speed")) == ("slip_ratio", None)
+    bare = replace(view, conditions={"speed_m_s": np.ones(2)})
+    np.testing.assert_array_equal(bare.slip(), [0.0, 0.0])

@@ -4,9 +4,12 @@ from pathlib import Path
 
 import pytest
 
+from calib.batch.plugins import run_file
 from calib.errors import CalibError
 from calib.gap.case import campaigns
-from calib.gap.effects.check import check_on_case
+from calib.gap.diagnose import diagnose
+from calib.gap.effects import EFFECTS
+from calib.gap.effects.check import check_effects
 from calib.gap.effects.load import load_effects
 from calib.gap.hypotheses import effect_priors
 from tests.gap.cases import make_case
@@ -123,11 +126,53 @@ def test_what_an_effect_declares_wrongly_is_named(tmp_path, old, new, words):
 def test_an_effect_that_cannot_be_evaluated_is_refused(tmp_path, code, words):
     path = write(tmp_path, CODE.replace(RETURN, code))
     with pytest.raises(CalibError) as caught:
-        check_on_case(load_effects(path), make_case("force_offset"), path)
+        check_effects(load_effects(path), make_case("force_offset"))
     assert words in str(caught.value)
     assert "mine.py, effect cross_wind" in str(caught.value)
 
 
 def test_a_good_effect_passes_the_trial(tmp_path):
     path = write(tmp_path)
-    check_on_case(load_effects(path), make_case("force_offset"), path)
+    check_effects(load_effects(path), make_case("force_offset"))
+
+
+def test_wrong_priors_in_the_class_are_looked_for_there(tmp_path):
+    own = REGISTERED.replace("[parameters.force]", "[parameters.gust]")
+    path = write(tmp_path, own, None)
+    with pytest.raises(CalibError, match="unknown parameter gust") as caught:
+        check_effects(load_effects(path), make_case("force_offset"))
+    assert "mine.py, priors of the effect cross_wind, [parameters]" in str(caught.value)
+    assert "cross_wind.toml" not in str(caught.value)
+    assert "shipped" not in str(caught.value)
+
+
+REGISTERED = "import calib\n" + CODE.replace(
+    "    def on_output", f'    priors = """{PRIOR}"""\n\n    def on_output'
+)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("phi[:, :1]", "phii[:, :1]", "it does not run: NameError"),
+        ("phi[:, :1]", 'view.of("temperature")', "it does not run: KeyError: 'temperature'"),
+        ("location + phi[:, :1]", "phi[:, 0]", "an array of float64 of shape (8,)"),
+        ("def on_output", "def on_ouput", "was on_output meant?"),
+        ('outputs = ("pull",)', 'outputs = ("drawbar_pull",)', "by its physical role, 'pull'"),
+        (
+            "    outputs",
+            '    covariates = ("soil_temp",)\n    outputs',
+            "unknown name 'soil_temp' in covariates",
+        ),
+    ],
+)
+def test_an_effect_that_a_file_registers_is_checked_as_well(tmp_path, old, new, words):
+    code = REGISTERED.replace(old, new) + "\n\ncalib.register(CrossWind())\n"
+    try:
+        run_file(write(tmp_path, code, None), "models")
+        with pytest.raises(CalibError) as caught:
+            diagnose(make_case("force_offset"))
+    finally:
+        EFFECTS.discard("cross_wind")
+    assert words in str(caught.value)
+    assert "mine.py, effect cross_wind" in str(caught.value)

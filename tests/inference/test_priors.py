@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import quad
 
+from calib.batch.plugins import run_file
 from calib.errors import CalibError
 from calib.inference.prior_files import (
     default_priors,
@@ -394,3 +396,40 @@ def test_a_misspelt_key_of_the_likelihood_is_named() -> None:
     with pytest.raises(CalibError, match="did you mean family by famly") as refused:
         parse_priors('model = "m"\n[likelihood]\nfamly = 1\n', "my.toml", "m", ("sigma",), {})
     assert refused.value.where == "my.toml, [likelihood]"
+
+
+def test_priors_that_a_model_declares_are_looked_for_in_its_file(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(DECLARED)
+    try:
+        run_file(path, "models")
+        with pytest.raises(CalibError, match="there is no distribution 'gaussian'") as caught:
+            read_priors(default_priors("flat_pull"), "flat_pull", ("a", "sigma"), {})
+        assert f"{path}, priors of the model flat_pull, parameters.a: " in str(caught.value)
+        known = MODELS["flat_pull"]
+        MODELS.discard("flat_pull")
+        replace(known, priors=known.priors.replace("gaussian", "normal")).register()
+        read = read_priors(default_priors("flat_pull"), "flat_pull", ("a", "sigma"), {})
+        assert read.source == "flat_pull.toml"
+    finally:
+        MODELS.discard("flat_pull")
+
+
+DECLARED = '''
+import calib
+
+
+def predict(theta, conditions):
+    return theta[:, :1] + 0.0 * conditions["slip_ratio"]
+
+
+calib.register(calib.Model(
+    name="flat_pull", title="The same pull at every slip", output="drawbar_pull_kn",
+    conditions=("slip_ratio",), parameters=("a",), predict=predict, latex=("$P = a$",),
+    source="nobody", priors="""
+model = "flat_pull"
+[parameters]
+a = {dist = "gaussian", mean = 1.0, sd = 1.0, unit = "kN", reason = "a test", source = "nobody"}
+sigma = {dist = "half_normal", sd = 1.0, unit = "kN", reason = "a test", source = "nobody"}
+"""))
+'''

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.data.quantities import QUANTITIES, Quantity
 from calib.report.figures.posterior import _log_ticks
 from calib.report.labels import (
     axis_of,
@@ -12,8 +13,11 @@ from calib.report.labels import (
     plain,
     short,
     symbol,
+    unit_plain,
     unit_text,
 )
+from calib.report.page.template import unit_html
+from calib.report.publish.markup import latex_unit
 
 MINUS = "\N{MINUS SIGN}"
 TIMES = "\N{MULTIPLICATION SIGN}"
@@ -46,8 +50,22 @@ def test_symbols():
 def test_units():
     assert unit_text("g/cm^3") == "g/cm$^{3}$"
     assert unit_text("kPa (g/cm^3)^-C4") == "kPa (g/cm$^{3}$)$^{-C4}$"
+    assert unit_text("kPa/degC^2") == "kPa/°C$^{2}$"
+    assert unit_plain("degF") == "°F"
+    assert latex_unit("degC") == r"$^{\circ}$C"
+    assert unit_html("degC") == "°C"
     assert parameter_label("n0", "1").endswith("(\N{EN DASH})")
     assert parameter_label("C2", "1", log=True).startswith("log$_{10}$")
+
+
+def test_temperatures_have_the_sign_of_degrees():
+    heat = Quantity("soil_heat", "soil_heat_c", "temperature", "degC", "condition", "how warm",
+                    suffixes={"c": "degC"})  # fmt: skip
+    QUANTITIES.add(heat)
+    try:
+        assert axis_of("soil_heat_c").label == "Soil heat (°C)"
+    finally:
+        QUANTITIES.discard("soil_heat_c")
 
 
 def test_slip_is_drawn_in_percent():

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.batch.plugins import declared_in
 from calib.data.quantities import QUANTITIES, role_of
 from calib.errors import CalibError
 from calib.gap.case import Campaigns, Case, OutputData, campaigns
@@ -25,7 +26,7 @@ from calib.gap.hypothesis import Hypothesis
 from calib.inference.random import generator
 from calib.models.base import Array
 
-__all__ = ["check_declared", "check_on_case"]
+__all__ = ["check_declared", "check_effects"]
 
 # Draws of the priors that an effect is evaluated with.
 _TRIALS = 8
@@ -36,22 +37,49 @@ _METHODS = tuple(name for name in _BASE if callable(getattr(Effect, name)))
 _FORMS = ("size", "slip", "pressure", "cone", "water", "shape", "extrapolation")
 
 
-def check_declared(effect: Effect, path: Path) -> None:
+def check_effects(effects: Mapping[str, Effect], case: Case) -> None:
+    """Check those effects that are not calib's own, and evaluate them once on a case.
+
+    It is the same whether a file of a diagnosis, a registered file, an installed package or a
+    caller brought them.
+
+    Parameters
+    ----------
+    effects : mapping of str to Effect
+        All that a diagnosis is to consider.
+    case : Case
+
+    Raises
+    ------
+    CalibError
+        If one declares what there is not, raises, returns something else than numbers of the right
+        shape, or changes nothing.
+    """
+    own = [e for e in effects.values() if not type(e).__module__.startswith("calib.")]
+    for effect in own:
+        check_declared(effect)
+    if own:
+        data = campaigns(case)
+        for effect in own:
+            if _call(effect.not_testable, effect, data.view, data.roles) is None:
+                _check_testable(effect, data)
+
+
+def check_declared(effect: Effect) -> None:
     """Check what can be seen without data.
 
     Parameters
     ----------
     effect : Effect
-    path : Path
-        Of the file that defines it.
 
     Raises
     ------
     CalibError
         If the name is taken, an output, covariate or form is unknown, or a method is misspelt.
     """
-    where = _place(path, effect)
-    if effect.name in EFFECTS:
+    where = _place(effect)
+    taken = EFFECTS.get(effect.name)
+    if taken is not None and type(taken) is not type(effect):
         raise CalibError(
             "the name is that of an effect of calib's own", where=where,
             allowed=f"any name but {', '.join(EFFECTS)}", mend="give it another name",
@@ -94,33 +122,10 @@ def _check_attribute(name: str, value: object, where: str) -> None:
         )  # fmt: skip
 
 
-def check_on_case(effects: Mapping[str, Effect], case: Case, path: Path) -> None:
-    """Evaluate effects once on a case, at draws of their priors.
-
-    Parameters
-    ----------
-    effects : mapping of str to Effect
-        Those of a file.
-    case : Case
-    path : Path
-        The file.
-
-    Raises
-    ------
-    CalibError
-        If one raises, returns something else than numbers of the right shape, or changes nothing.
-    """
-    data = campaigns(case)
-    for effect in effects.values():
-        where = _place(path, effect)
-        if _call(effect.not_testable, path, where, data.view, data.roles) is None:
-            _check_testable(effect, data, path, where)
-
-
-def _check_testable(effect: Effect, data: Campaigns, path: Path, where: str) -> None:
+def _check_testable(effect: Effect, data: Campaigns) -> None:
     hypothesis = Hypothesis(effect.name, (effect,), (effect_priors(data, effect),))
     units = dict.fromkeys(data.names, 1.0)
-    forward = _call(Forward, path, where, data, hypothesis, units)
+    forward = _call(Forward, effect, data, hypothesis, units)
     psi = forward.priors.sample(generator(0, "gap", "effect check", effect.name), _TRIALS)
     phi = hypothesis.effect_priors[0].to_natural(psi[:, forward.phi_slices[0]])
     with np.errstate(all="ignore"):
@@ -128,24 +133,23 @@ def _check_testable(effect: Effect, data: Campaigns, path: Path, where: str) -> 
         base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in data.outputs}
         view = replace(data.view, base=base)
         changed = [
-            _changes_conditions(effect, phi, o, view, path, where)
-            | _changes_output(effect, phi, o, plain[o.name], view, path, where)
+            _changes_conditions(effect, phi, o, view)
+            | _changes_output(effect, phi, o, plain[o.name], view)
             for o in data.outputs
         ]
     if not any(changed):
         raise CalibError(
-            "it changes nothing on this case", where=where,
+            "it changes nothing on this case", where=_place(effect),
             allowed=f"on_conditions or on_output that changes {' or '.join(effect.outputs)}",
             mend="correct it, or let not_testable say why the case cannot show it",
         )  # fmt: skip
 
 
-def _changes_conditions(
-    effect: Effect, phi: Array, o: OutputData, view: View, path: Path, where: str
-) -> bool:
+def _changes_conditions(effect: Effect, phi: Array, o: OutputData, view: View) -> bool:
+    where = _place(effect)
     selected = o.problem.bound.model.select(view.conditions)
     given = {role_of(column): values for column, values in selected.items()}
-    found = _call(effect.on_conditions, path, where, phi, o.role, dict(given), view)
+    found = _call(effect.on_conditions, effect, phi, o.role, dict(given), view)
     if not isinstance(found, dict) or set(found) != set(given):
         raise _wrong(f"on_conditions returned {_described(found)} for {o.name}", where,
                      f"a dict with {', '.join(given)}")  # fmt: skip
@@ -155,11 +159,10 @@ def _changes_conditions(
     return any(not np.array_equal(found[name], given[name]) for name in given)
 
 
-def _changes_output(
-    effect: Effect, phi: Array, o: OutputData, plain: Array, view: View, path: Path, where: str
-) -> bool:
+def _changes_output(effect: Effect, phi: Array, o: OutputData, plain: Array, view: View) -> bool:
+    where = _place(effect)
     handed = plain.copy()
-    found = _call(effect.on_output, path, where, phi, o.role, handed, view)
+    found = _call(effect.on_output, effect, phi, o.role, handed, view)
     if not np.array_equal(handed, plain, equal_nan=True):
         raise CalibError(
             "on_output changes the location it is given", where=where, allowed="a new array",
@@ -195,7 +198,7 @@ def _described(found: object) -> str:
     return f"a dict with {', '.join(found)}" if isinstance(found, dict) else type(found).__name__
 
 
-def _call[R](function: Callable[..., R], path: Path, where: str, *args: Any) -> R:
+def _call[R](function: Callable[..., R], effect: Effect, *args: Any) -> R:
     """Call what a user wrote; its exceptions are theirs to mend, at the line they come from."""
     try:
         return function(*args)
@@ -203,11 +206,11 @@ def _call[R](function: Callable[..., R], path: Path, where: str, *args: Any) -> 
         raise
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
+        path = Path(declared_in(type(effect))).resolve()
         line = next(
-            (f.lineno for f in reversed(frames) if Path(f.filename).resolve() == path.resolve()),
-            None,
+            (f.lineno for f in reversed(frames) if Path(f.filename).resolve() == path), None
         )
-        at = where if line is None else f"{where}, line {line}"
+        at = _place(effect) if line is None else f"{_place(effect)}, line {line}"
         raise CalibError(
             f"it does not run: {type(error).__name__}: {error}", where=at,
             mend="correct it; view.of(role) gives what the data record, such as view.of(\"slip\")",
@@ -225,5 +228,5 @@ def _role_of_column(name: str) -> str:
     return f"effects know {name} by its physical role, {roles[0]!r}" if roles else ""
 
 
-def _place(path: Path, effect: Effect) -> str:
-    return f"{path}, effect {effect.name}"
+def _place(effect: Effect) -> str:
+    return f"{declared_in(type(effect))}, effect {effect.name}"

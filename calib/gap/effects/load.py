@@ -34,7 +34,7 @@ def load_effects(path: Path) -> dict[str, Effect]:
     for _, kind in inspect.getmembers(module, inspect.isclass):
         if issubclass(kind, Effect) and kind.__module__ == module.__name__ and kind.name:
             effect = kind()
-            check_declared(effect, path)
+            check_declared(effect)
             beside = path.with_name(f"{effect.name}.toml")
             effect.prior_file = None if effect.priors else beside
             if not effect.priors and not beside.is_file():

@@ -36,6 +36,10 @@ from calib.report.figures.style import (
 from calib.report.gap_rows import output_word, short_name
 from calib.report.labels import MINUS, NO_UNIT, axis_of, joined, percent, short
 
+# Letters of a name in one line, and their mean width.
+_LINE = 27
+_MM_PER_LETTER = 1.45
+
 
 def isolability_plate(found: Diagnosis) -> Plate | None:
     """Draw the likeness of effects, what parameters absorb, and detectable sizes."""
@@ -45,19 +49,23 @@ def isolability_plate(found: Diagnosis) -> Plate | None:
     names = _ordered(design)
     n = len(names)
     side = max(5.0 * n, 30.0)
+    words = [textwrap.fill(short_name(name), _LINE) for name in names]
+    # Names stand to the left of the matrix and, turned, below it.
+    margin = 5.0 + _MM_PER_LETTER * max(len(line) for w in words for line in w.splitlines())
+    bottom = max(margin, 14.0)
     fig, axes = panels(
-        1, 3, height=side, left=40.0, right=4.0, top=6.0, bottom=32.0, gap_x=6.0, sharey=False
+        1, 3, height=side, left=margin, right=4.0, top=6.0, bottom=bottom, gap_x=6.0, sharey=False
     )
     total = fig.get_figwidth() * 25.4
     height = fig.get_figheight() * 25.4
     # The matrix is square; the two strips share its rows.
-    strip = 0.5 * (total - 40.0 - 4.0 - 16.0 - min(side, 86.0))
     width = min(side, 86.0)
-    left = 40.0
+    strip = 0.5 * (total - margin - 4.0 - 16.0 - width)
+    left = margin
     for ax, w in zip(axes[0], (width, strip, strip), strict=True):
-        ax.set_position((left / total, 32.0 / height, w / total, side / height))
+        ax.set_position((left / total, bottom / height, w / total, side / height))
         left += w + 8.0
-    _matrix(axes[0, 0], design, names)
+    _matrix(axes[0, 0], design, names, words)
     y = np.arange(n)
     absorbed = np.array([design.absorbed[name] for name in names])
     axes[0, 1].barh(y, absorbed, color=ORANGE, height=0.6)
@@ -83,7 +91,7 @@ def isolability_plate(found: Diagnosis) -> Plate | None:
     return Plate(fig, "isolability", _design_caption(design), "What this design can tell apart")
 
 
-def _matrix(ax: Axes, design: Isolability, names: list[str]) -> None:
+def _matrix(ax: Axes, design: Isolability, names: list[str], words: list[str]) -> None:
     n = len(names)
     cosine = np.full((n, n), np.nan)
     for i, a in enumerate(names):
@@ -106,9 +114,9 @@ def _matrix(ax: Axes, design: Isolability, names: list[str]) -> None:
                     [i - 0.5, i - 0.5, i + 0.5, i + 0.5, i - 0.5], color=VERMILION, lw=1.1,
                     clip_on=False, zorder=4,
                 )  # fmt: skip
-    words = [short_name(name) for name in names]
-    ax.set_yticks(np.arange(n), words)
-    ax.set_xticks(np.arange(max(n - 1, 1)), words[: max(n - 1, 1)], rotation=90)
+    ax.set_yticks(np.arange(n), words, linespacing=0.95)
+    shown = max(n - 1, 1)
+    ax.set_xticks(np.arange(shown), words[:shown], rotation=90, linespacing=0.95)
     ax.set_xlim(-0.5, max(n - 1.5, 0.5))
     ax.tick_params(length=0.0)
     for spine in ax.spines.values():

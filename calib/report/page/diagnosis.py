@@ -39,11 +39,12 @@ from calib.report.gap_verdict import (
     TIE,
     GapEvidence,
     Tone,
+    advice,
     judge_gap,
     odds_text,
     repeats_needed,
 )
-from calib.report.labels import MINUS, percent, percent_range, short
+from calib.report.labels import MINUS, degrees, percent, percent_range, short
 from calib.report.numbers import format_number, format_value
 from calib.report.page.template import equation, parametrisation, picture, prose, template
 
@@ -166,7 +167,7 @@ def parameter_rows(found: Diagnosis) -> list[list[str]]:
 
 def _unit_of(prior: Prior) -> str:
     """A parameter's unit, to be put after a number."""
-    return "" if prior.unit in ("1", "", "dimensionless") else f" {prior.unit}"
+    return "" if prior.unit in ("1", "", "dimensionless") else f" {degrees(prior.unit)}"
 
 
 def simulators(found: Diagnosis) -> list[dict[str, Any]]:
@@ -224,7 +225,7 @@ def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
         for prior, value, s in zip(o.priors.free, shifts, sds, strict=True):
             if abs(value) < 1.645 * s:
                 continue
-            unit = " %" if prior.log else "" if prior.unit == "1" else f" {prior.unit}"
+            unit = " %" if prior.log else _unit_of(prior)
             if prior.log:  # of a logarithm: the relative change
                 value, s = 100.0 * math.expm1(value), 100.0 * math.exp(value) * s
             sign = "+" if value > 0.0 else ""
@@ -309,6 +310,7 @@ def render_diagnosis(
         unfitted=case.new_conditions is not None,
         next_rows=next_rows(found),
         look=evidence.look,
+        advice=advice(evidence),
         files=[(word, PurePath(t.source).name, len(t), t.sha256) for word, t in files],
         seed=found.seed,
         command=shlex.join(str(part) for part in manifest.get("command", ())),

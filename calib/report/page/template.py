@@ -21,6 +21,7 @@ from calib.report.figures.style import png_size
 from calib.report.labels import (
     MINUS,
     axis_of,
+    degrees,
     joined,
     percent,
     plain,
@@ -107,7 +108,7 @@ def unit_html(unit: str) -> Markup:
     """Return a unit with its powers raised; a dash where there is none."""
     if unit in ("1", ""):
         return Markup("&ndash;")
-    raised = re.sub(r"\^(-?)(\w+)", r"<sup>\1\2</sup>", str(escape(unit)))
+    raised = re.sub(r"\^(-?)(\w+)", r"<sup>\1\2</sup>", str(escape(degrees(unit))))
     return Markup(raised.replace("<sup>-", "<sup>&minus;"))
 
 

@@ -92,7 +92,8 @@ def _greek(letter: str) -> str | None:
 
 def latex_unit(unit: str) -> str:
     """Return a unit with its powers raised; a dash where there is none."""
-    return unit_text(unit).replace("%", r"\%").replace("\N{EN DASH}", "--")
+    text = unit_text(unit).replace("%", r"\%").replace("\N{EN DASH}", "--")
+    return text.replace("\N{DEGREE SIGN}", _SIGNS["\N{DEGREE SIGN}"])
 
 
 OWN = "calib"

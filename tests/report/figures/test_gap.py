@@ -67,8 +67,8 @@ def test_labels_have_units(drawn):
                 assert not label or UNIT.search(label), (name, label)
 
 
-def test_nothing_is_cut_off(drawn):
-    for p in drawn.values():
+def test_nothing_is_cut_off(found, drawn):
+    for p in [*drawn.values(), *gap_plates(with_long_names(found), ["isolability"])]:
         p.figure.draw_without_rendering()
         inside = p.figure.bbox.padded(2.0)
         for ax in p.figure.axes:
@@ -78,6 +78,20 @@ def test_nothing_is_cut_off(drawn):
                 assert box.x1 <= inside.x1, (p.name, box)
                 assert inside.y0 <= box.y0, (p.name, box)
                 assert box.y1 <= inside.y1, (p.name, box)
+
+
+def with_long_names(found):
+    """Return the diagnosis with effects in its design of longer names than those shipped."""
+    design = found.ranking.isolability
+    new = {name: f"depends_on_{name}_and_soil_temperature" for name in sorted(design.absorbed)}
+    new[min(new)] = "depends_on_soil_temperature"
+    design = replace(
+        design,
+        absorbed={new[n]: v for n, v in design.absorbed.items()},
+        detectable={new[n]: v for n, v in design.detectable.items()},
+        likeness={tuple(sorted((new[a], new[b]))): v for (a, b), v in design.likeness.items()},
+    )
+    return replace(found, ranking=replace(found.ranking, isolability=design))
 
 
 def test_every_row_is_shown_once_in_where(found, drawn):

@@ -91,7 +91,20 @@ def test_a_named_effect_says_everything_at_once():
     assert facts["Where"].endswith("0.1 kN above the simulator (97 %)")
     assert "0.11 to 0.04 kN rms (noise 0.03 kN): it shrinks by 63 %" in facts["How far"]
     assert "90 % interval 45 to 80 %" in facts["How far"]
-    assert "Next" not in facts
+    assert facts["Next"].startswith(
+        "Predict with the cause in the model (drift): calib predict DIAGNOSIS --at NEW.csv"
+    )
+
+
+def test_several_causes_are_to_be_predicted_with_together():
+    parts = [CauseFact(n, n, f"what {n} does", 0.95, 0.5, (0.1, 0.9)) for n in ("a", "b")]
+    e = replace(evidence("effect", **{"a+b": 0.95}), causes=parts)
+    assert "the causes in the model (a and b)" in dict(judge_gap(e).facts)["Next"]
+
+
+def test_other_parameter_values_are_to_be_calibrated():
+    text = dict(judge_gap(evidence("effect", parameter_shift=0.95, none=0.05)).facts)["Next"]
+    assert text.startswith("Fit the field's rows too")
 
 
 def test_a_sure_unknown_says_where_to_look():
@@ -265,6 +278,10 @@ def test_the_verdict_comes_first_with_the_whole_story(found, page):
     for words in ("drawbar reading drifts", "probability", "by the end of the campaign", "rms"):
         assert words in opening
     assert reader.ids[0] == "verdict"
+
+
+def test_what_to_do_is_on_the_card_and_under_next(page):
+    assert page[2].text.count("Check the instrument before the model (sensor drift)") == 2
 
 
 def test_every_hypothesis_is_in_the_table(found, page):

@@ -24,7 +24,6 @@ from calib.gap.batch import written
 from calib.gap.case import Case, case_files, read_case
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.effects.check import check_on_case
 from calib.gap.effects.load import load_effects
 from calib.report.page.gap_page import write_page
 
@@ -83,23 +82,20 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
     def work(self, item: DiagnosisItem, seed: int) -> Work:
         """Diagnose it."""
         case, effects, page = item
-        with _effects(effects, case) as own:
+        with _effects(effects) as own:
             found = diagnose(case, seed, effects={**EFFECTS, **own})
             files = written(found, effects) | (_page(found, seed) if page else {})
         return Work(diagnosis_numbers(found), files)
 
 
 @contextmanager
-def _effects(files: Mapping[str, bytes], case: Case) -> Iterator[Mapping[str, Effect]]:
+def _effects(files: Mapping[str, bytes]) -> Iterator[Mapping[str, Effect]]:
     """Yield the user's effects; their prior files are read while they are in use."""
     with TemporaryDirectory() as scratch:
         paths = [Path(scratch) / name for name in files]
         for path in paths:
             path.write_bytes(files[path.name])
-        own = load_effects(paths[0]) if paths else {}
-        if own:
-            check_on_case(own, case, paths[0])
-        yield own
+        yield load_effects(paths[0]) if paths else {}
 
 
 def _page(found: Diagnosis, seed: int) -> dict[str, bytes]:
