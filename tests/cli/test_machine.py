@@ -52,7 +52,7 @@ def test_a_prediction_prints_columns_of_numbers(calib: Calib, run: Path) -> None
     assert (found["exit_code"], found["outside"]) == (ran.code, 1)
     assert found["columns"]["slip_ratio"] == [0.05, 0.1]
     assert all(isinstance(v, float) for v in found["columns"]["rut_depth_mm_median"])
-    assert "1 rows lie outside" in ran.err
+    assert "1 row lies outside" in ran.err
     printed = calib("predict", run, "--at", "at.csv")
     assert printed.out.splitlines()[0].split(",") == list(found["columns"])
 
