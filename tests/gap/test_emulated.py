@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import calib
-from calib.data.registry import Registry
 from calib.gap.case import Campaigns, Case, campaigns
 from calib.gap.fit import fit, log_joint
 from calib.gap.forward import Forward
@@ -17,23 +15,11 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
 from calib.inference.emulation.prepared import prepare
 from calib.inference.uncertain import log_normal
-from calib.models import MODELS
 from calib.models.simulators.emulator.model import emulator_of
-from calib.models.simulators.registered import SIMULATED
+from tests.inference.emulation.test_emulate import as_before as as_before
 from tests.models.simulators.examples import PRIORS, lab, pull
 
 NOISE = 0.03
-
-
-@pytest.fixture(autouse=True)
-def as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    monkeypatch.delenv("CALIB_MODELS", raising=False)
-    registries: tuple[Registry, ...] = (MODELS, SIMULATED)
-    before = [set(r) for r in registries]
-    yield
-    for registry, names in zip(registries, before, strict=True):
-        for name in set(registry) - names:
-            registry.discard(name)
 
 
 def emulated(folder: Path, runs: int) -> Campaigns:

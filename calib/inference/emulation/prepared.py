@@ -20,7 +20,7 @@ from calib.inference.problem import Problem, build_problem
 from calib.models import get_model
 from calib.models.simulators.emulator.files import save_emulator
 from calib.models.simulators.emulator.model import emulator_of
-from calib.models.simulators.registered import SIMULATED, Simulated, simulated_by
+from calib.models.simulators.registered import SIMULATED, Simulated, simulated_by, slow_simulator
 from calib.models.simulators.runs import RunKeeper
 from calib.models.simulators.ways import TableWay
 
@@ -112,8 +112,8 @@ def prepare(
 
     For the calibration on `table`; None for a model that is none of a slow simulator.
     """
-    found = simulated_by(model)
-    if found is None or not found.simulator.emulate:
+    found = slow_simulator(model)
+    if found is None:
         return None
     emulation = emulated(
         build_problem(model, table, priors), seed, elsewhere=elsewhere, workers=workers,

@@ -66,6 +66,12 @@ def simulated_by(model: str) -> Simulated | None:
     return next((s for s in SIMULATED.values() if model in s.models), None)
 
 
+def slow_simulator(model: str) -> Simulated | None:
+    """Return the simulator behind a model if it has to be emulated; None if not."""
+    found = simulated_by(model)
+    return found if found is not None and found.simulator.emulate else None
+
+
 @dataclass(frozen=True)
 class _Direct:
     """Asks a simulator for each parameter vector: only where it is quick enough for that."""

@@ -19,7 +19,7 @@ from calib.inference.emulation.prepared import emulated
 from calib.inference.emulation.settings import EmulationSettings
 from calib.inference.problem import Problem, build_problem
 from calib.models.base import Array, Conditions, not_given
-from calib.models.simulators.registered import Simulated, simulated_by
+from calib.models.simulators.registered import Simulated
 from calib.models.simulators.runs import RunKeeper
 from calib.validation.sbc.designs import Design
 
@@ -27,12 +27,6 @@ from calib.validation.sbc.designs import Design
 MOST_TRUTHS = 50
 # A truth is run at the conditions of the design and at those held out.
 _EACH_TRUTH = 2
-
-
-def slow_simulator(model: str) -> Simulated | None:
-    """Return the simulator behind a model if it has to be emulated; None if not."""
-    found = simulated_by(model)
-    return found if found is not None and found.simulator.emulate else None
 
 
 @dataclass(frozen=True)
@@ -65,7 +59,7 @@ def emulate_campaign(
     return emulated(problem, seed, elsewhere=[elsewhere], workers=workers, scheduler=scheduler)
 
 
-def most_runs(model: str, design: Design, simulations: int) -> str:
+def most_runs(model: str, found: Simulated, design: Design, simulations: int) -> str:
     """Say how many runs of a slow simulator so many campaigns may take.
 
     Raises
@@ -73,9 +67,6 @@ def most_runs(model: str, design: Design, simulations: int) -> str:
     CalibError
         If it cannot be run: a table of runs has none at a new truth.
     """
-    found = slow_simulator(model)
-    if found is None:
-        raise AssertionError
     if not found.simulator.way.runs:
         raise CalibError(
             f"{model} is a table of runs already made: there is none at the truths that are drawn",

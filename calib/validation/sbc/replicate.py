@@ -19,9 +19,10 @@ from calib.inference.problem import build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import Draws, SamplerSettings
 from calib.models.base import Array
+from calib.models.simulators.registered import slow_simulator
 from calib.validation.prediction import predict
 from calib.validation.sbc.designs import Design, design_of
-from calib.validation.sbc.emulated import MOST_TRUTHS, emulate_campaign, run_each, slow_simulator
+from calib.validation.sbc.emulated import MOST_TRUTHS, emulate_campaign, run_each
 from calib.validation.sbc.simulate import Simulated, simulate
 from calib.validation.scores import LEVELS
 

@@ -14,8 +14,9 @@ from calib.errors import CalibError
 from calib.inference.prior_files import DeclaredPriors, prior_file_model
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS, get_model
+from calib.models.simulators.registered import slow_simulator
 from calib.validation.sbc.designs import design_of
-from calib.validation.sbc.emulated import most_runs, slow_simulator
+from calib.validation.sbc.emulated import most_runs
 from calib.validation.sbc.replicate import Item, replicate
 from calib.validation.sbc.score import SbcScore, score
 
@@ -65,12 +66,12 @@ def run_sbc(
     said: dict[str, Any] = (
         {"priors": {model: p.text for model, p in given.items()}} if given else {}
     )
-    slow = [model for model in names if slow_simulator(model) is not None]
-    asked = slow if data is None else names
+    slow = {model: found for model in names if (found := slow_simulator(model)) is not None}
+    asked = [*slow] if data is None else names
     designs = {model: design_of(model, data) for model in asked}
     if data is not None:
         said["data"] = Path(data).read_text("utf-8")
-    told = [most_runs(model, designs[model], simulations) for model in slow]
+    told = [most_runs(m, found, designs[m], simulations) for m, found in slow.items()]
     _claim(out, {"seed": seed, "settings": asdict(settings), **said})
     if announce is not None:
         for line in told:

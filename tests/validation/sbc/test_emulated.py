@@ -4,33 +4,20 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import calib
-from calib.data.registry import Registry
 from calib.errors import CalibError
-from calib.models import MODELS
-from calib.models.simulators.registered import SIMULATED
 from calib.validation.sbc.run import run_sbc
+from tests.inference.emulation.test_emulate import as_before as as_before
 from tests.models.simulators.examples import PRIORS, lab, pull
 
 # The noise is known to a factor of two or so: of one that is nearly zero an emulator would have to
 # be next to exact.
 KNOWN_NOISE = PRIORS.replace('"half_normal"\nsd = 0.2', '"lognormal"\nmedian = 0.05\nsd_log = 0.4')
-
-
-@pytest.fixture(autouse=True)
-def as_before() -> Iterator[None]:
-    registries: tuple[Registry, ...] = (MODELS, SIMULATED)
-    before = [set(r) for r in registries]
-    yield
-    for registry, names in zip(registries, before, strict=True):
-        for name in set(registry) - names:
-            registry.discard(name)
 
 
 def data(folder: Path) -> Path:

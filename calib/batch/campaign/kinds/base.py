@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from calib.batch.campaign.place import Place
 from calib.errors import CalibError
-from calib.models.simulators.registered import simulated_by
+from calib.models.simulators.registered import slow_simulator
 
 
 class Section(BaseModel):
@@ -124,8 +124,8 @@ def refuse_slow_simulators(models: Iterable[str], where: str, verb: str) -> None
         Naming the first such model and the verb that can do it.
     """
     for model in models:
-        found = simulated_by(model)
-        if found is not None and found.simulator.emulate:
+        found = slow_simulator(model)
+        if found is not None:
             raise CalibError(
                 f"the simulator {found.name} behind {model} has to be emulated, which the tasks of "
                 "a campaign cannot do side by side", where=where,
