@@ -8,7 +8,7 @@ OUT ?= out/he2019
 # Small matrices: threads of the linear algebra would only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 
-.PHONY: report reference test test-slow coverage browser docs bench lint format release-check clean
+.PHONY: report reference test test-slow coverage browser docs bench lint format install-check release-check clean
 
 report: $(READY)
 	$(BIN)/calib report --out $(OUT) --overwrite
@@ -86,11 +86,9 @@ $(BENCH_VENV)/.ready: pyproject.toml constraints.txt constraints-bench.txt
 	$(call setup,bench,-c constraints.txt -c constraints-bench.txt)
 
 # What is released, as strangers get it: sdist, and the wheel made from it, each in an environment of its own and used
-# from elsewhere; then with the oldest dependencies that pyproject.toml allows, of which warnings are none of ours.
+# from elsewhere.
 RELEASE := $(CURDIR)/out/release
-OLDEST_TESTS := tests/cli/test_machine.py tests/data tests/models/test_equations.py tests/inference/test_io.py \
-  tests/validation/test_prediction.py tests/gap/test_case.py
-release-check: $(READY)
+install-check: $(READY)
 	rm -rf $(RELEASE) && mkdir -p $(RELEASE)/elsewhere
 	$(BIN)/python -m venv $(RELEASE)/build && $(RELEASE)/build/bin/pip install -q build
 	$(RELEASE)/build/bin/python -m build --outdir $(RELEASE)/dist .
@@ -101,6 +99,11 @@ release-check: $(READY)
 	   calib template bekker --out $$made.csv; calib fit $$made.csv --model bekker --out $$made; \
 	   python -c 'import calib; calib.load_he2019("rut_depth"); print(calib.__file__)'); \
 	done
+
+# The same with the oldest dependencies that pyproject.toml allows, of which warnings are none of ours.
+OLDEST_TESTS := tests/cli/test_machine.py tests/data tests/models/test_equations.py tests/inference/test_io.py \
+  tests/validation/test_prediction.py tests/gap/test_case.py
+release-check: install-check
 	$(BIN)/python -m venv $(RELEASE)/oldest
 	$(RELEASE)/oldest/bin/pip install -q -c constraints-oldest.txt $(RELEASE)/dist/*.whl pytest hypothesis
 	$(RELEASE)/oldest/bin/python -m pytest -q -o filterwarnings= -W ignore $(OLDEST_TESTS)

@@ -13,6 +13,7 @@ import numpy as np
 from calib.check.outcome import Item, Status
 from calib.errors import CalibError
 from calib.inference.diagnostics import hdi
+from calib.inference.netcdf import DRAWN, read_netcdf
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
@@ -36,13 +37,9 @@ class DrawsFile:
 
 def read_draws(path: Path) -> DrawsFile:
     """Read the posterior draws in a file; a CalibError if it cannot be read."""
-    import xarray as xr
-
     try:
-        with xr.open_dataset(path, group="posterior", engine="h5netcdf") as group:
-            draws = {str(k): np.asarray(v.values) for k, v in group.data_vars.items()}
-        with xr.open_dataset(path, group="sample_stats", engine="h5netcdf") as group:
-            log_prob = np.asarray(group["lp"].values)
+        groups = read_netcdf(path, "posterior", "sample_stats").values
+        draws, log_prob = groups["posterior"], groups["sample_stats"]["lp"]
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         raise CalibError(
             f"the file cannot be read ({type(error).__name__})", where=str(path)
@@ -144,18 +141,14 @@ def compare_posterior(name: str, recorded: Path, drawn: Path) -> list[Item]:
 
 def _groups(path: Path) -> dict[str, Array]:
     """Read every variable of a file by its path; of drawn ones, moments by row."""
-    import xarray as xr
-
+    groups = read_netcdf(path)
     found: dict[str, Array] = {}
-    with xr.open_datatree(path, engine="h5netcdf") as tree:
-        for node in tree.subtree:
-            for key, values in node.data_vars.items():
-                where = f"{node.path.strip('/')}/{key}"
-                x = np.asarray(values.values, dtype=np.float64)
-                if {"chain", "draw"} <= set(map(str, values.dims)):
-                    found[where] = _moments(x.reshape(x.shape[0] * x.shape[1], -1))
-                else:
-                    found[where] = x
+    for group, variables in groups.values.items():
+        for name, values in variables.items():
+            x = values.astype(np.float64)
+            if x.ndim >= 2 and groups.dims_of(group, name)[:2] == DRAWN:
+                x = _moments(x.reshape(x.shape[0] * x.shape[1], -1))
+            found[f"{group}/{name}"] = x
     return found
 
 

@@ -7,10 +7,7 @@ emulated, `emulator.npz`.
 
 from __future__ import annotations
 
-import errno
 import json
-import os
-import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -25,6 +22,7 @@ from calib.data import read_for_model, write_table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.estimators import PointEstimate
+from calib.inference.netcdf import Groups, read_netcdf, write_netcdf
 from calib.inference.noise import noise_of
 from calib.inference.prior_files import parse_priors, prior_references, relative_columns
 from calib.inference.priors import Priors
@@ -64,6 +62,20 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     # Of ArviZ the part that lays out and reads: its plots take a second to import.
     from arviz_base import from_dict
 
+    groups = groups_of(calibration)
+    with warnings.catch_warnings():
+        # Walkers are chains, of which there are more than draws in a short run.
+        warnings.filterwarnings("ignore", "Found chain dimension to be longer", UserWarning)
+        tree: xr.DataTree = from_dict(
+            {name: dict(values) for name, values in groups.values.items()},
+            dims={name: list(dims) for name, dims in groups.dims.items()},
+            attrs={"/": dict(groups.attrs)},
+        )
+    return tree
+
+
+def groups_of(calibration: Calibration) -> Groups:
+    """Return what the file of a calibration holds, as `to_datatree` says."""
     problem = calibration.problem
     draws = calibration.draws
     chains, steps = calibration.natural.shape[:2]
@@ -89,30 +101,23 @@ def to_datatree(calibration: Calibration) -> xr.DataTree:
     if kept == 0:
         by_row = {}
     ensembles = np.repeat(np.arange(draws.t.shape[0]), draws.t.shape[1])
-    with warnings.catch_warnings():
-        # Walkers are chains, of which there are more than draws in a short run.
-        warnings.filterwarnings("ignore", "Found chain dimension to be longer", UserWarning)
-        tree: xr.DataTree = from_dict(
-            {
-                "posterior": dict(calibration.parameters),
-                "prior": _prior_group(calibration, prior),
-                **by_row,
-                "log_prior": {"joint": problem.priors.log_prob(draws.flat).reshape(chains, steps)},
-                "sample_stats": {
-                    "lp": draws.log_prob.reshape(chains, steps),
-                    "ensemble": np.repeat(ensembles[:, None], steps, axis=1),
-                },
-                "observed_data": {output: problem.observed},
-                "constant_data": dict(problem.conditions),
+    return Groups(
+        {
+            "posterior": calibration.parameters,
+            "prior": _prior_group(calibration, prior),
+            **by_row,
+            "log_prior": {"joint": problem.priors.log_prob(draws.flat).reshape(chains, steps)},
+            "sample_stats": {
+                "lp": draws.log_prob.reshape(chains, steps),
+                "ensemble": np.repeat(ensembles[:, None], steps, axis=1),
             },
-            dims={
-                output: ["row"],
-                **{name: ["row"] for name in problem.conditions},
-            },
-            # Without durations: equal results give equal files.
-            attrs={"/": {"run": json.dumps(_describe(calibration))}},
-        )
-    return tree
+            "observed_data": {output: problem.observed},
+            "constant_data": problem.conditions,
+        },
+        dims=dict.fromkeys((output, *problem.conditions), ("row",)),
+        # Without durations: equal results give equal files.
+        attrs={"run": json.dumps(_describe(calibration))},
+    )
 
 
 def _prior_group(calibration: Calibration, natural: Array) -> dict[str, Array]:
@@ -169,20 +174,6 @@ def _references(problem: Problem) -> dict[str, float]:
     return {name: known[name] for name in relative_columns(problem.priors.text) if name in known}
 
 
-def write_netcdf(tree: xr.DataTree, path: Path) -> None:
-    """Write a DataTree, compressed, without time stamps, so equal results give equal content."""
-    encoding = {
-        f"/{group}": {str(name): {"zlib": True, "complevel": 1} for name in node.data_vars}
-        for group, node in tree.children.items()
-    }
-    for node in tree.subtree:
-        node.attrs.pop("created_at", None)
-    # HDF5 does not survive a disk that fills up while it writes.
-    if shutil.disk_usage(path.parent).free < tree.nbytes:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
-    tree.to_netcdf(path, engine="h5netcdf", encoding=encoding)
-
-
 def save_calibration(
     calibration: Calibration, folder: Path, *, environment: Environment | None = None
 ) -> None:
@@ -196,7 +187,7 @@ def save_calibration(
         Where it says that it was made: in that of this process by default.
     """
     problem = calibration.problem
-    write_netcdf(to_datatree(calibration), folder / "posterior.nc")
+    write_netcdf(groups_of(calibration), folder / "posterior.nc")
     (folder / "priors.toml").write_text(problem.priors.text, encoding="utf-8")
     write_table(folder / "data.csv", problem.table.columns)
     hashed = [*_HASHED]
@@ -302,21 +293,17 @@ def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
 
 def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Return the internal coordinates, of a shape, and their log densities."""
-    # As HDF5: xarray takes longer to import than the rest of a prediction.
-    from h5netcdf import File
-
-    with File(path, "r") as file:
-        posterior = file["posterior"].variables
-        natural = np.stack(
-            [
-                np.full(shape[:-1], p.loc)
-                if p.fixed
-                else np.asarray(posterior[p.name][...]).reshape(shape[:-1])
-                for p in priors.entries
-            ],
-            axis=-1,
-        )
-        log_prob = np.asarray(file["sample_stats"].variables["lp"][...]).reshape(shape[:-1])
+    groups = read_netcdf(path, "posterior", "sample_stats").values
+    natural = np.stack(
+        [
+            np.full(shape[:-1], p.loc)
+            if p.fixed
+            else groups["posterior"][p.name].reshape(shape[:-1])
+            for p in priors.entries
+        ],
+        axis=-1,
+    )
+    log_prob = groups["sample_stats"]["lp"].reshape(shape[:-1])
     t = priors.to_internal(natural.reshape(-1, natural.shape[-1]), margin=0.0).reshape(shape)
     return t, log_prob
 

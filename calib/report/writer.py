@@ -13,7 +13,8 @@ from calib.batch.folders import fresh_folder
 from calib.batch.pool import HERE, Pool
 from calib.data import write_table
 from calib.inference.estimators import GeneticSettings
-from calib.inference.io import to_datatree, write_netcdf
+from calib.inference.io import groups_of
+from calib.inference.netcdf import write_netcdf
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
@@ -181,7 +182,7 @@ def _write_output(
     key: str, result: OutputResult, folder: Path, pdf: bool
 ) -> tuple[list[Plate], dict[str, bytes]]:
     """Write posterior and figures of an output; return what the page shows of the figures."""
-    write_netcdf(to_datatree(result.calibration), folder / f"{key}.nc")
+    write_netcdf(groups_of(result.calibration), folder / f"{key}.nc")
     drawn, images = [], {}
     for plate in plates(result, reference_of(result.task.table.label)):
         drawn.append(replace(plate, figure=None))

@@ -53,6 +53,8 @@ _RC: dict[Any, Any] = {
     "axes.spines.right": False,
     "axes.linewidth": 0.6,
     "axes.titlepad": 4.0,
+    # Where it is put by default: to look for labels in its way takes longer than to draw it.
+    "axes.titley": 1.0,
     "axes.labelpad": 2.5,
     "xtick.major.width": 0.6,
     "ytick.major.width": 0.6,
