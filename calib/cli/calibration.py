@@ -248,6 +248,7 @@ def predict(
         )
     from calib import load_calibration
     from calib.data import read_for_model
+    from calib.data.units_check import beyond_notes
     from calib.models.simulators.emulator.model import emulator_of
     from calib.validation.prediction import MIN_DEFINED, predict_stacked, prediction_columns
     from calib.validation.prediction import predict as predict_at
@@ -284,6 +285,9 @@ def predict(
     if outside:
         lie = "row lies" if outside == 1 else "rows lie"
         print(f"calib: {outside} {lie} outside the calibrated range", file=sys.stderr)
+        known = {n: v for _, c in parts for n, v in c.problem.conditions.items()}
+        for note in beyond_notes(table, known):
+            print(f"calib: {note}", file=sys.stderr)
     undefined = int((prediction.defined < MIN_DEFINED).sum())
     if undefined:
         emulated = any(emulator_of(c.problem.bound.model) is not None for _, c in parts)

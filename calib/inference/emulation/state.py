@@ -127,8 +127,8 @@ class State:
         at += f"; those with a value are at {_ranges(names, theta[ok])}" if ok.any() else ""
         folder = self.keeper.folder
         kept = "" if folder is None else (
-            f"; the runs, failed ones too, are kept in {folder}: delete it after a mend outside the "
-            "files that the simulator's own names"
+            f"; the runs, failed ones too, are kept in {folder}: delete it after a mend outside "
+            "the files that the simulator's own names"
         )  # fmt: skip
         printed = f"; it printed: {first.printed.strip()}" if first.printed.strip() else ""
         return CalibError(
