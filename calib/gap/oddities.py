@@ -160,12 +160,12 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
 def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str]:
     """Name columns that only effects need, and that may be in another unit than they say.
 
-    Campaigns may well differ in them: in a speed by any factor. Fractions do not by tens, and what
-    was held in the calibration is recognised.
+    Campaigns may differ in them: in speed by any factor. In fractions they do not by tens, and
+    what was held in the calibration is recognised.
     """
     for name in sorted((set(lab) & set(field)) - set(used)):
         quantity = QUANTITIES.get(name)
-        if quantity is None or quantity.role != "condition" or not quantity.units:
+        if quantity is None or quantity.role != "condition" or quantity.kind == "speed":
             continue
         low, high = (float(f(lab[name])) for f in (np.nanmin, np.nanmax))
         ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)

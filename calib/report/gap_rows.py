@@ -17,7 +17,7 @@ from calib.models.base import Array
 from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of
 
 # The words for a region that covers all rows.
-EVERYWHERE = "all conditions"
+EVERYWHERE = "all conditions measured"
 
 _WORDS = {
     "none": "no gap beyond the noise",
