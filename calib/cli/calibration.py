@@ -1,4 +1,4 @@
-"""Verbs of calibration: fit, predict, report, data, template, priors, models."""
+"""Verbs of calibration: fit, predict, report, data, template, priors."""
 
 from __future__ import annotations
 
@@ -424,19 +424,6 @@ def priors(
     from calib.models import get_model
 
     _emit(default_priors(get_model(model).name).read_text(encoding="utf-8"), out)
-
-
-def models(
-    plugins: opt.Models = None, simulator: opt.Simulators = None, json: Json = False
-) -> None:
-    """List the models with their equations and columns."""
-    from calib.models import MODELS
-
-    for model in MODELS.values():
-        print(f"{model.name}: {model.title}\n  {model.equation}")
-        print(f"  needs {', '.join(model.conditions)}; gives {model.output}")
-    facts = ("title", "equation", "conditions", "output", "parameters")
-    finish(0, {"models": {m.name: {f: getattr(m, f) for f in facts} for m in MODELS.values()}})
 
 
 def _emit(text: str, out: Path | None) -> None:
