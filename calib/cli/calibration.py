@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -336,12 +337,21 @@ def _give(columns: Mapping[str, Any], out: Path | None) -> None:
     from calib.data import write_table
 
     if out is not None:
-        write_table(out, columns)
+        write_table(out, {name: [_cell(c, "") for c in column] for name, column in columns.items()})
         print(f"{len(next(iter(columns.values())))} rows written to {out}")
         return
     print(",".join(columns))
     for row in zip(*columns.values(), strict=True):
-        print(",".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in row))
+        print(",".join(map(_cell, row)))
+
+
+def _cell(cell: Any, empty: str = "nan") -> str:
+    """Write a number with as many digits as draws of a posterior bear, and text as it is."""
+    if isinstance(cell, str):
+        return cell
+    return (
+        empty if math.isnan(cell) else f"{cell:.0f}" if float(cell).is_integer() else f"{cell:.6g}"
+    )
 
 
 def _lists(columns: Mapping[str, Any]) -> dict[str, list[float | str]]:

@@ -165,8 +165,19 @@ class Quantity:
         Raises
         ------
         CalibError
-            If its canonical column does not read as itself, or its name is taken.
+            If its canonical column does not read as itself, its name is taken, or its units do not
+            differ from the canonical one by a factor (as degrees Fahrenheit from Celsius).
         """
+        for suffix, unit in (self.suffixes or {}).items():
+            try:
+                convert(1.0, unit, self.unit)
+            except CalibError as error:
+                raise CalibError(
+                    error.message,
+                    where=f"the quantity {self.stem}, suffix {suffix!r}",
+                    allowed="units that differ from the canonical one by a factor",
+                    mend=f"leave {suffix!r} out, and convert such columns before they are read",
+                ) from None
         if self.unit not in (*self.units.values(), self.bare_unit):
             raise CalibError(
                 f"the quantity {self.stem} has no suffix for its own unit {self.unit!r}",
