@@ -1,7 +1,8 @@
-"""Verbs of calibration: fit, predict, report, data, template, priors, models."""
+"""Verbs of calibration: fit, predict, report, data, template, priors."""
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -248,6 +249,7 @@ def predict(
         )
     from calib import load_calibration
     from calib.data import read_for_model
+    from calib.data.units_check import beyond_notes
     from calib.models.simulators.emulator.model import emulator_of
     from calib.validation.prediction import MIN_DEFINED, predict_stacked, prediction_columns
     from calib.validation.prediction import predict as predict_at
@@ -284,6 +286,9 @@ def predict(
     if outside:
         lie = "row lies" if outside == 1 else "rows lie"
         print(f"calib: {outside} {lie} outside the calibrated range", file=sys.stderr)
+        known = {n: v for _, c in parts for n, v in c.problem.conditions.items()}
+        for note in beyond_notes(table, known):
+            print(f"calib: {note}", file=sys.stderr)
     undefined = int((prediction.defined < MIN_DEFINED).sum())
     if undefined:
         emulated = any(emulator_of(c.problem.bound.model) is not None for _, c in parts)
@@ -332,12 +337,21 @@ def _give(columns: Mapping[str, Any], out: Path | None) -> None:
     from calib.data import write_table
 
     if out is not None:
-        write_table(out, columns)
+        write_table(out, {name: [_cell(c, "") for c in column] for name, column in columns.items()})
         print(f"{len(next(iter(columns.values())))} rows written to {out}")
         return
     print(",".join(columns))
     for row in zip(*columns.values(), strict=True):
-        print(",".join(cell if isinstance(cell, str) else f"{cell:.6g}" for cell in row))
+        print(",".join(map(_cell, row)))
+
+
+def _cell(cell: Any, empty: str = "nan") -> str:
+    """Write a number with as many digits as draws of a posterior bear, and text as it is."""
+    if isinstance(cell, str):
+        return cell
+    return (
+        empty if math.isnan(cell) else f"{cell:.0f}" if float(cell).is_integer() else f"{cell:.6g}"
+    )
 
 
 def _lists(columns: Mapping[str, Any]) -> dict[str, list[float | str]]:
@@ -420,19 +434,6 @@ def priors(
     from calib.models import get_model
 
     _emit(default_priors(get_model(model).name).read_text(encoding="utf-8"), out)
-
-
-def models(
-    plugins: opt.Models = None, simulator: opt.Simulators = None, json: Json = False
-) -> None:
-    """List the models with their equations and columns."""
-    from calib.models import MODELS
-
-    for model in MODELS.values():
-        print(f"{model.name}: {model.title}\n  {model.equation}")
-        print(f"  needs {', '.join(model.conditions)}; gives {model.output}")
-    facts = ("title", "equation", "conditions", "output", "parameters")
-    finish(0, {"models": {m.name: {f: getattr(m, f) for f in facts} for m in MODELS.values()}})
 
 
 def _emit(text: str, out: Path | None) -> None:

@@ -87,7 +87,10 @@ def diagnose(
             write_page(found, folder, manifest, pool=side)
     for warning in found.warnings:
         print(f"calib: {warning}", file=sys.stderr)
-    print(f"verdict: {found.verdict} ({gap_verdict(found).headline})")
+    judged = gap_verdict(found)
+    print(f"verdict: {found.verdict} ({judged.headline})")
+    if "Not tested" in dict(judged.facts):
+        print(f"not tested: {dict(judged.facts)['Not tested']}")
     for name in found.ranking.order[:4]:
         p = found.ranking.probability[name]
         text = ">0.999" if p >= 0.9995 else "<0.001" if p < 0.0005 else f"{p:.3f}"

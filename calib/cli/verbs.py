@@ -17,6 +17,7 @@ from calib.cli import (
     challenge,
     check,
     compare,
+    declared,
     doctor,
     gap,
     interruptible,
@@ -59,8 +60,9 @@ app = typer.Typer(
 )
 for verb in (
     calibration.report, calibration.fit, calibration.predict, calibration.data,
-    calibration.template, calibration.priors, calibration.models, compare.compare, gap.diagnose,
-    check.check, audit.audit, campaign.campaign, sbc.sbc, doctor.doctor,
+    calibration.template, calibration.priors, declared.models, declared.effects,
+    declared.quantities, compare.compare, gap.diagnose, check.check, audit.audit,
+    campaign.campaign, sbc.sbc, doctor.doctor,
 ):  # fmt: skip
     app.command()(verb)
 app.add_typer(challenge.verbs, name="challenge")

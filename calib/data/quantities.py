@@ -165,8 +165,19 @@ class Quantity:
         Raises
         ------
         CalibError
-            If its canonical column does not read as itself, or its name is taken.
+            If its canonical column does not read as itself, its name is taken, or its units do not
+            differ from the canonical one by a factor (as degrees Fahrenheit from Celsius).
         """
+        for suffix, unit in (self.suffixes or {}).items():
+            try:
+                convert(1.0, unit, self.unit)
+            except CalibError as error:
+                raise CalibError(
+                    error.message,
+                    where=f"the quantity {self.stem}, suffix {suffix!r}",
+                    allowed="units that differ from the canonical one by a factor",
+                    mend=f"leave {suffix!r} out, and convert such columns before they are read",
+                ) from None
         if self.unit not in (*self.units.values(), self.bare_unit):
             raise CalibError(
                 f"the quantity {self.stem} has no suffix for its own unit {self.unit!r}",
@@ -220,9 +231,10 @@ QUANTITIES: Registry[Quantity] = Registry(
     Quantity("shear_stress", "shear_stress_kpa", "pressure", "kPa", "output",
              "shear force over the sheared area", Range(low=0.0), largest=(1.0, 1e3)),
     Quantity("slip", "slip_ratio", "slip", _ONE, "condition",
-             "wheel slip; 0.2 means 20 %", _SLIP, shown=("%", 100.0)),
+             "wheel slip; 0.2 means 20 %", _SLIP, shown=("%", 100.0), largest=(0.01, 1.0)),
     Quantity("nominal_slip", "nominal_slip_ratio", "slip", _ONE, "bookkeeping",
-             "slip before its zero was redefined", _SLIP, shown=("%", 100.0)),
+             "slip before its zero was redefined", _SLIP, shown=("%", 100.0),
+             largest=(0.01, 1.0)),
     Quantity("inflation_pressure", "inflation_pressure_psi", "pressure", "psi", "condition",
              "tyre inflation (gauge) pressure", _POSITIVE, physical="pressure",
              usual=(6.0, 150.0)),

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import PurePath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.headers import meant
+from calib.data.headers import match_headers, meant
 from calib.data.quantities import QUANTITIES, Quantity, columns_of
 from calib.data.table import Table
+from calib.data.units import convert
 
 type Array = NDArray[np.float64]
 
@@ -19,6 +20,9 @@ _PSI, _NEAR, _FEW_LEVELS = 6.894757, 2e-3, 6
 _MOST_NAMED = 5
 # A column is too large if all but the largest tenth of it is.
 _MOST = 0.9
+# Nearer to the unit of the header than this none is taken for it; units as near to each other as
+# that (bar, atm and kgf/cm2) are told as one.
+_OTHER, _SAME = 2.0, 1.2
 # A column that may be left out is asked after when its name is so like a known one.
 _ALIKE = 0.8
 # The pull of a wheel is a part of its load: small forces that agree on that are of a small wheel.
@@ -31,7 +35,7 @@ def unit_notes(table: Table, quantity: Quantity, values: Array) -> list[str]:
 
 
 def column_notes(table: Table) -> Iterator[str]:
-    """Say which whole columns are a thousand times too large or small, as N that are typed as kN.
+    """Say which whole columns would be of usual size in another unit, as N that are typed as kN.
 
     A small wheel's forces are not taken for such if the table has its load and its pull.
 
@@ -54,18 +58,76 @@ def column_notes(table: Table) -> Iterator[str]:
         low, high = quantity.largest
         if fits and quantity.kind in _OF_SMALL_WHEELS and size < low:
             continue
+        if low <= size <= high:
+            continue
         factor = 1e-3 if size > high else 1e3
-        if low <= size <= high or not low <= factor * size <= high:
-            continue
+        hints = [
+            f"about 1000 times too {'large' if size > high else 'small'}, as where a unit and its "
+            "thousandth (kN and N, MPa and kPa, m and mm) were mixed up"
+        ] * (low <= factor * size <= high)
+        read = usual_in(table, name, np.array([size]), low, high)
+        hints += [f"usual if the readings are in {read}"] * bool(read)
         # One row that is far too large is that row's fault, not the column's.
-        if size > high and float(np.nanquantile(np.abs(table[name]), _MOST)) < high:
-            continue
-        yield (
-            f"{source_of(table)}, {name}: the largest {quantity.word} is {size:g} "
-            f"{quantity.unit.replace('**', '')}, and {low:g} to {high:g} is usual: about 1000 "
-            f"times too {'large' if size > high else 'small'}, as where a unit and its thousandth "
-            "(kN and N, MPa and kPa, m and mm) were mixed up; check the unit in the column name"
-        )
+        alone = size > high and float(np.nanquantile(np.abs(table[name]), _MOST)) < high
+        if hints and not alone:
+            yield (
+                f"{source_of(table)}, {name}: the largest {quantity.word} is {size:g} "
+                f"{_written(quantity.unit)}, and {low:g} to {high:g} is usual: "
+                f"{'; '.join(hints)}; check the unit in the column name"
+            )
+
+
+def usual_in(table: Table, name: str, values: Array, low: float, high: float) -> str:
+    """Name the units in which a column's readings would all lie within a range; "" if in none.
+
+    Parameters
+    ----------
+    table : Table
+        Whose header says in which unit the readings were taken to be.
+    name : str
+        Canonical name of the column.
+    values : ndarray, shape (n,)
+        In the canonical unit, as is the range.
+    low, high : float
+    """
+    quantity = QUANTITIES[name]
+    columns, _ = match_headers(table.header, where=table.source)
+    said = next((c.unit for c in columns if c.quantity is quantity), quantity.unit)
+    own = float(convert(1.0, said, quantity.unit))
+    told: dict[str, float] = {}
+    for unit in quantity.units.values():
+        factor = float(convert(1.0, unit, quantity.unit)) / own
+        known = any(max(factor / f, f / factor) < _SAME for f in told.values())
+        if not known and max(factor, 1.0 / factor) >= _OTHER:
+            read = factor * values
+            if ((low <= read) & (read <= high)).all():
+                told[_written(unit)] = factor
+    return " or ".join(told)
+
+
+def beyond_notes(table: Table, known: Mapping[str, Array]) -> Iterator[str]:
+    """Say which columns lie beyond known values, and would lie among them in another unit.
+
+    Parameters
+    ----------
+    table : Table
+    known : mapping of str to ndarray
+        Values of the same columns in the canonical unit, those that a model was calibrated at.
+    """
+    for name, values in known.items():
+        low, high = float(values.min()), float(values.max())
+        beyond = (table[name] < low) | (table[name] > high)
+        read = usual_in(table, name, table[name], low, high) if beyond.mean() >= _MOST else ""
+        if read:
+            yield (
+                f"{source_of(table)}, {name}: nearly all values lie beyond the calibrated ones, "
+                f"and all would lie among them if the readings are in {read}; check the unit in "
+                "the column name"
+            )
+
+
+def _written(unit: str) -> str:
+    return {"dimensionless": "fractions"}.get(unit, unit.replace("**", ""))
 
 
 def spelling_notes(table: Table) -> Iterator[str]:
@@ -80,9 +142,12 @@ def _unusual(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
     low, high = quantity.usual
     odd = (values < low) | (values > high)
     if odd.any():
+        read = usual_in(table, quantity.canonical, values, low, high)
+        where = f", and all would be inside if the readings are in {read}" if read else ""
         yield (
             f"{source_of(table)}, {lines_of(table, odd)}: {quantity.word} is outside {low:g} to "
-            f"{high:g} {quantity.unit}, where it usually lies; check the unit in the column name"
+            f"{high:g} {quantity.unit}, where it usually lies{where}; check the unit in the column "
+            "name"
         )
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
@@ -36,7 +37,8 @@ from calib.inference.random import generator
 from calib.models.base import Array
 
 __all__ = [
-    "Diagnosis", "diagnose", "diagnose_once", "screened_ranking", "verdict", "with_unseen_rows",
+    "Diagnosis", "diagnose", "diagnose_once", "field_parts", "screened_ranking", "verdict",
+    "with_unseen_rows",
 ]  # fmt: skip
 
 # A single hypothesis is named when it is at least this probable.
@@ -256,11 +258,8 @@ def _left_out(found: Diagnosis, effects: Mapping[str, Effect], pool: Pool) -> di
     was found on. With too few rows to leave some out, the rows' own predictions stand.
     """
     data, truth, seed, design = found.data, found.truth, found.seed, found.ranking.isolability
-    n = len(data.case.field)
-    order = generator(seed, "gap", "folds").permutation(n)
-    folds = [order[fold::_FOLDS] for fold in range(_FOLDS)]
-    left = min(np.setdiff1d(o.rows, rows).size for o in data.outputs for rows in folds)
-    if left < MIN_FIELD_ROWS:
+    folds = field_parts(data, seed)
+    if not folds:
         return truth.means
     lab = calibrate_lab(data, seed)  # whatever is left out of the field
     parts = [without_outputs(data.case, {o.name: rows for o in data.outputs}) for rows in folds]
@@ -270,6 +269,14 @@ def _left_out(found: Diagnosis, effects: Mapping[str, Effect], pool: Pool) -> di
         for name, values in piece.result().items():
             predicted[name][rows] = values[rows]
     return predicted
+
+
+def field_parts(data: Campaigns, seed: int) -> list[NDArray[np.int64]]:
+    """Return the field rows in the parts that are left out in turn; none if too few would stay."""
+    order = generator(seed, "gap", "folds").permutation(len(data.case.field))
+    folds = [order[fold::_FOLDS] for fold in range(_FOLDS)]
+    left = min(np.setdiff1d(o.rows, rows).size for o in data.outputs for rows in folds)
+    return folds if left >= MIN_FIELD_ROWS else []
 
 
 @one_thread()

@@ -34,6 +34,7 @@ __all__ = [
     "inseparable",
     "joined",
     "pair",
+    "read_effect_priors",
     "resized",
     "shifts",
     "singles",
@@ -111,10 +112,15 @@ def split_testable(
 
 def effect_priors(data: Campaigns, effect: Effect) -> Priors:
     """Read an effect's priors, forces relative to the case's load."""
+    references = prior_references(data.case.lab.columns) | {"normal_load_kn": data.view.load_kn}
+    return read_effect_priors(effect, references)
+
+
+def read_effect_priors(effect: Effect, references: Mapping[str, float]) -> Priors:
+    """Read an effect's priors, relative ones to references by column, or to their defaults."""
     file: PriorFile = effect.prior_file or default_priors(f"effects/{effect.name}")
     if effect.priors:
         file = declared_priors("effect", effect.name, effect.priors, type(effect))
-    references = prior_references(data.case.lab.columns) | {"normal_load_kn": data.view.load_kn}
     return read_priors(file, effect.name, effect.parameters, references)
 
 

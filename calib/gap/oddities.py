@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 
 import numpy as np
 
 from calib.data import Table
 from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, role_of
-from calib.data.units_check import column_notes, lines_of, source_of, spelling_notes, unit_notes
+from calib.data.units_check import (
+    column_notes,
+    lines_of,
+    source_of,
+    spelling_notes,
+    unit_notes,
+    usual_in,
+)
 from calib.models import get_model
 from calib.models.base import Array
 
@@ -25,6 +32,8 @@ _UNITS = {
 }  # fmt: skip
 # (sd of a logarithm); conditions are other ones in every campaign, so roughly will do.
 _NEAR, _ROUGHLY = 0.15, 0.4
+# A covariate that was held in the calibration, to this part, is known well enough to be recognised.
+_HELD = 0.05
 
 
 def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, ...]:
@@ -119,10 +128,13 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
                 "unit, the diagnosis means nothing"
             )
         if apart and np.ptp(lab[name]) > 0.0:
+            read = usual_in(field, name, field[name], lab[name].min(), lab[name].max())
+            within = f", and all would if the readings are in {read}" if read else ""
             said.append(
-                f"{name}: no field value lies within the calibration's range, "
+                f"{name}: no field value lies within the calibration's range{within}, "
                 f"{_times(lab[name], field[name])}; the simulator is used where it was not fitted"
             )
+    said += _covariates(lab, field, conditions)
     outputs = [OUTPUTS[output] for output in models]
     for name in outputs:
         if name in lab and name in field:
@@ -143,6 +155,35 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
                     "times the normal load, more than a tyre on soil can pull; check the columns"
                 )
     return said
+
+
+def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str]:
+    """Name columns that only effects need, and that may be in another unit than they say.
+
+    Campaigns may differ in them: in speed by any factor. In fractions they do not by tens, and
+    what was held in the calibration is recognised.
+    """
+    for name in sorted((set(lab) & set(field)) - set(used)):
+        quantity = QUANTITIES.get(name)
+        if quantity is None or quantity.role != "condition" or quantity.kind == "speed":
+            continue
+        low, high = (float(f(lab[name])) for f in (np.nanmin, np.nanmax))
+        ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
+        held = low > 0.0 and high <= (1.0 + _HELD) * low
+        read = (
+            usual_in(field, name, field[name], (1.0 - _HELD) * low, (1.0 + _HELD) * high)
+            if held else ""
+        )  # fmt: skip
+        if read:
+            yield (
+                f"{name}: {_times(lab[name], field[name], 0.0)}, and as in the calibration "
+                f"if the readings are in {read}; check the unit in the column name"
+            )
+        elif quantity.unit == "dimensionless" and not 1.0 / _FAR_RATIO < ratio < _FAR_RATIO:
+            yield (
+                f"{name}: {_times(lab[name], field[name], _ROUGHLY)}; check the unit in the column "
+                "name"
+            )
 
 
 def _typical(values: Array) -> float:

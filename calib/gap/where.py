@@ -107,13 +107,13 @@ def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Re
         draws = (truth.truth[o.name] - truth.simulator[o.name])[:, o.rows]
         noise = truth.noise[o.name][:, o.rows]
         left = np.ones(o.rows.size, dtype=bool)
+        searched = conditions_to_search(data)
+        varied = [n for n in searched if np.ptp(data.view.conditions[n][o.rows]) > 0.0]
         for _ in range(_MOST):
             best: tuple[float, Region, NDArray[np.bool_]] | None = None
-            for name in conditions_to_search(data):
-                column = data.view.conditions[name]
-                if np.ptp(column[o.rows]) == 0.0:
-                    continue
-                values = column[o.rows]
+            # Where none varies one stands for all rows.
+            for name in varied or searched[:1]:
+                values = data.view.conditions[name][o.rows]
                 category = bool(data.case.covariates.get(name))
                 for low, high in _stretches(values, row_gap, left, category):
                     inside = (values >= low) & (values <= high)

@@ -58,7 +58,8 @@ def example_csv(model_name: str) -> str:
         raise CalibError(
             f"the model {model_name!r} has no example of its data",
             allowed=f"columns {', '.join((*model.conditions, model.output))}",
-            mend='declare the model with example="..."',
+            mend="write a CSV with these columns, in any of their units (`calib quantities NAME`); "
+            'a Model of your own may have an example="..."',
         )
     return model.example
 

@@ -10,6 +10,8 @@ import numpy as np
 from calib.data.quantities import role_of
 from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
+from calib.gap.effects import EFFECTS
+from calib.gap.effects.base import LACKING
 from calib.gap.inclusion import UNLISTED, Included
 from calib.gap.next_measurement import NextMeasurement
 from calib.gap.shrink import Shrink
@@ -22,6 +24,7 @@ from calib.report.gap_rows import (
     output_word,
     region_text,
     short_name,
+    shrink_place,
     title_of,
     unit_after,
 )
@@ -63,7 +66,7 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         sizes=[] if found.verdict == "ambiguous" else size_sentences(found, best),
         where=[where_fact(found, r) for r in _leading_regions(found)],
         shrink=shrink_facts(found),
-        unfitted=found.data.case.new_conditions is not None,
+        shrink_place=shrink_place(found),
         next_facts=[
             NextFact(
                 (short_name(m.separates[0]), short_name(m.separates[1])),
@@ -78,9 +81,41 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         causes=[_cause(found, n, c) for n, c in found.inclusion.causes.items()],
         remainder=_cause(found, UNLISTED, found.inclusion.remainder),
         remainder_where=_remainder_where(found),
+        untested=_untested(found),
         put_in="; ".join(case_context.words()),
         without=_without(found),
     )
+
+
+def _untested(found: Diagnosis) -> list[str]:
+    """Name listed effects that a missing column keeps from being tested, in whole or in part.
+
+    Of those on other outputs than what acts nothing is to be feared.
+    """
+    acting = {n for n, c in found.inclusion.causes.items() if c.probability >= 0.5}
+    fits = [fit for group in found.ranking.fits.values() for fit in group]
+    known = {e.name: e for fit in fits for e in fit.forward.hypothesis.effects}
+    touched = {role for n in acting & set(known) for role in known[n].outputs}
+
+    def fits_in(outputs: Sequence[str]) -> bool:
+        return not touched or bool(touched & set(outputs))
+
+    said = [
+        f"{short_name(n)} ({reason})"
+        for n, reason in found.ranking.not_testable.items()
+        if any(words in reason for words in LACKING)
+        and (n not in EFFECTS or fits_in(EFFECTS[n].outputs))
+    ]
+    view = found.data.view
+    for name, effect in known.items():
+        lacking = [c for r in effect.covariates if r != "order" and (c := view.column(r))]
+        lacking = [c for c in lacking if c not in view.lab]
+        if lacking and name not in acting and fits_in(effect.outputs):
+            said.append(
+                f"{short_name(name)} in part (the calibration has no {', '.join(lacking)}, so that "
+                "a constant difference from it cannot be seen)"
+            )
+    return said
 
 
 def _without(found: Diagnosis) -> str:

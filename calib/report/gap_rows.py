@@ -10,14 +10,14 @@ from numpy.typing import NDArray
 
 from calib.data.quantities import OUTPUTS, role_of
 from calib.gap.declared import words_of
-from calib.gap.diagnose import Diagnosis
+from calib.gap.diagnose import Diagnosis, field_parts
 from calib.gap.effects import EFFECTS
 from calib.gap.where import Region
 from calib.models.base import Array
 from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of
 
 # The words for a region that covers all rows.
-EVERYWHERE = "all conditions"
+EVERYWHERE = "all conditions measured"
 
 _WORDS = {
     "none": "no gap beyond the noise",
@@ -69,6 +69,19 @@ def region_text(found: Diagnosis, region: Region) -> str:
     low, high = (_stretch_end(column, axis.scale(np.array(v)).item()) for v in ends)
     span = low if low == high else f"{low} to {high}"
     return f"{axis.name.lower()} {span}{unit_after(axis)}"
+
+
+def shrink_place(found: Diagnosis) -> str:
+    """Say on which rows it was judged how far the gap shrinks."""
+    if found.data.case.new_conditions is not None:
+        return "at new conditions, which were not fitted"
+    parts = len(field_parts(found.data, found.seed))
+    if parts:
+        return (
+            "at the field's own conditions, each row predicted without it (the rows are left out "
+            f"in {parts} parts)"
+        )
+    return "at the field's own rows, which were fitted: they are too few to leave some out"
 
 
 def _stretch_end(column: str, value: float) -> str:

@@ -106,8 +106,8 @@ class GapEvidence:
         What the best hypothesis amounts to.
     where : sequence of WhereFact
         One of each output that has any.
-    unfitted : bool
-        Whether the shrink was judged at conditions other than the fitted ones.
+    shrink_place : str
+        On which rows the shrink was judged.
     alike : sequence of str
         Effects that look like the best one on this design, in words.
     smallest : float
@@ -120,6 +120,8 @@ class GapEvidence:
         Something that is not listed, by itself or beside listed causes.
     remainder_where : str
         Where that lies.
+    untested : sequence of str
+        Listed effects on the outputs of the named causes that a column is missing for, with which.
     put_in, without : str
         What was put into the diagnosis besides the data, and what it finds without that.
     """
@@ -129,7 +131,7 @@ class GapEvidence:
     sizes: Sequence[str]
     where: Sequence[WhereFact]
     shrink: Sequence[ShrinkFact]
-    unfitted: bool
+    shrink_place: str
     next_facts: Sequence[NextFact]
     alike: Sequence[str] = ()
     smallest: float = float("nan")
@@ -137,6 +139,7 @@ class GapEvidence:
     causes: Sequence[CauseFact] = ()
     remainder: CauseFact | None = None
     remainder_where: str = ""
+    untested: Sequence[str] = ()
     put_in: str = ""
     without: str = ""
 
@@ -246,6 +249,11 @@ def _facts(e: GapEvidence) -> list[tuple[str, str]]:
     if e.put_in:
         facts.append(("Put in", f"{e.put_in}. Without that: {e.without}"))
     facts.append(("Which", _which(e)))
+    if e.untested:
+        one = "it acts, its" if len(e.untested) == 1 else "any acts, its"
+        facts.append(
+            ("Not tested", f"{'; '.join(e.untested)}. If {one} trace is put down to what is named")
+        )
     if e.sizes:
         facts.append(("How large", f"{'; '.join(e.sizes)}"))
     facts += [("Where", _where(e)), ("How far", _how_far(e)), *_next(e)]
@@ -307,8 +315,7 @@ def _how_far(e: GapEvidence) -> str:
         if s.interval[0] <= 0.0 < s.fraction:
             part += ", so it may not shrink at all"
         parts.append(part)
-    where = "" if e.unfitted else ", at the field's own conditions"
-    return "; ".join(parts) + where
+    return f"{'; '.join(parts)}, {e.shrink_place}"
 
 
 def advice(e: GapEvidence) -> str:

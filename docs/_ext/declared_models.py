@@ -9,14 +9,14 @@ from declared_text import code, priors_table, quantity_link, table, unit, with_s
 
 from calib.data import read_for_model
 from calib.data.quantities import QUANTITIES
-from calib.inference.prior_files import default_priors, read_priors
 from calib.models import MODELS, Model
+from calib.report.declared import NOISE, model_priors
 from calib.report.page.template import parametrisation
 
 TITLE = "Models"
 LEAD = (
-    "Each page is made from the model's declaration and its prior file. `calib models` lists the "
-    "same in a terminal; [a model of your own](../../extend.md) is one declaration more."
+    "Each page is made from the model's declaration and its prior file. `calib models NAME` "
+    "says the same in a terminal; [a model of your own](../../extend.md) is one declaration more."
 )
 
 
@@ -60,11 +60,6 @@ def _use(model: Model) -> list[str]:
         (quantity_link(c), unit(QUANTITIES[c].unit), words(QUANTITIES[c].range.describe()))
         for c in (model.output, *model.conditions)
     ]
-    noise = (
-        "Noise is normal on the logarithm of the output: `sigma` is a relative scatter."
-        if model.response == "log"
-        else "Noise is normal on the output itself, in its unit."
-    )
     limits = f"{words(model.applies)}\n" if model.applies else ""
     parabolic = ""
     if model.parabolic_in:
@@ -78,17 +73,15 @@ def _use(model: Model) -> list[str]:
         "It works in these units; a file may use [any other](../quantities/index.md) in its "
         "column names. The first one is predicted.\n",
         table(("quantity", "unit", "allowed"), rows),
-        f"{noise}\n",
+        f"{NOISE[model.response]}\n",
     ]  # fmt: skip
 
 
 def _parameters(model: Model) -> list[str]:
-    names = (*model.parameters, "sigma")
-    priors = read_priors(default_priors(model.name), model.name, names, {})
     found = [
         "## Priors of the sampled parameters\n",
         _sampled(model),
-        priors_table(priors.entries),
+        priors_table(model_priors(model)),
         "`normal(mean, sd)`, `lognormal(median, sd of the logarithm)`, `half_normal(sd)`, "
         "`uniform(lower, upper)`, on `[lower, upper]` where truncated. A prior with `x 5 (column)` "
         "is a part of that column's median, 5 where the data lack it. Print the file with "

@@ -5,21 +5,15 @@ from __future__ import annotations
 from declared_text import code, table, unit, words
 
 from calib.data.quantities import QUANTITIES, Quantity
-from calib.gap.effects import EFFECTS
-from calib.models import MODELS
+from calib.report.declared import ROLES, users
 
 TITLE = "Quantities and units"
 LEAD = (
     "Everything that a column may hold. A column name is a quantity and a unit; upper and lower "
     "case, spaces and brackets make no difference (`Rut depth [mm]` is `rut_depth_mm`). Each page "
-    "is made from the quantity's declaration; [one of your own](../../extend.md) is one "
-    "declaration more."
+    "is made from the quantity's declaration, as is what `calib quantities NAME` says; [one of "
+    "your own](../../extend.md) is one declaration more."
 )
-_ROLES = {
-    "output": "An output: models predict it.",
-    "condition": "A condition: models predict from it, effects may need it.",
-    "bookkeeping": "Bookkeeping: no model predicts from it.",
-}
 
 
 def overview() -> list[str]:
@@ -49,7 +43,7 @@ def _page(q: Quantity) -> str:
     return "\n".join(
         [
             f"# {words(q.canonical)}\n",
-            f"{words(q.title)}: {words(q.description)}. {_ROLES[q.role]}\n",
+            f"{words(q.title)}: {words(q.description)}. {ROLES[q.role]}\n",
             table(("what", "is"), facts),
             *scale,
             "## Column names\n",
@@ -71,16 +65,8 @@ def _headers(q: Quantity) -> list[str]:
 
 
 def _users(q: Quantity) -> list[str]:
-    predicted = [n for n, m in MODELS.items() if m.output == q.canonical]
-    used = [n for n, m in MODELS.items() if q.canonical in m.conditions]
-    acting = [n for n, e in EFFECTS.items() if q.role == "output" and q.physical in e.outputs]
-    needing = [n for n, e in EFFECTS.items() if q.role != "output" and q.physical in e.covariates]
     rows = [
-        (what, ", ".join(f"[{code(n)}](../{folder}/{n}.md)" for n in names))
-        for what, folder, names in (
-            ("predicted by models", "models", predicted), ("used by models", "models", used),
-            ("touched by effects", "effects", acting), ("needed by effects", "effects", needing),
-        )
-        if names
-    ]  # fmt: skip
+        (how, ", ".join(f"[{code(n)}](../{how.split()[-1]}/{n}.md)" for n in names))
+        for how, names in users(q).items()
+    ]
     return ["## Who uses it\n", table(("how", "by name"), rows)] if rows else []

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from calib.data.quantities import QUANTITIES, columns_of
 from calib.inference.priors import Prior
+from calib.report.declared import role_columns
 from calib.report.labels import degrees, symbol
 
 _SPECIAL = re.compile(r"([\\*_{}\[\]<>|$~])")
@@ -42,10 +42,7 @@ def quantity_link(column: str) -> str:
 
 def role_links(roles: Iterable[str], *, output: bool) -> str:
     """Link to all quantities that have some physical roles, outputs or not."""
-    columns = [
-        c for role in roles for c in columns_of(role) if (QUANTITIES[c].role == "output") == output
-    ]
-    return ", ".join(map(quantity_link, columns))
+    return ", ".join(map(quantity_link, role_columns(roles, output=output)))
 
 
 def unit(text: str) -> str:

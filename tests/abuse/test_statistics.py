@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from calib.cli.verbs import app
 from calib.data import read_for_model, table_from_arrays
-from calib.data.units_check import column_notes
+from calib.data.units_check import beyond_notes, column_notes
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
@@ -140,6 +140,37 @@ def test_forces_of_which_one_is_in_another_unit(
         assert (f"the largest {'drawbar' if word == 'pull' else 'normal'} {word}" in said) == (
             word in told
         )
+
+
+@pytest.mark.parametrize(("header", "values", "units"), [
+    ("tyre_width_m", [11.2, 13.0], "cm or inch"),
+    ("tyre_diameter_m", [26.0, 31.0], "cm or inch"),
+    ("slip_percent", [0.0, 0.02, 0.6], "fractions"),
+    ("slip_percent", [0.0, 2.0, 60.0], ""),
+    ("slip_percent", [0.0, 0.0], ""),
+    ("normal_load_kn", [900.0, 1100.0], "N or lbf"),
+    ("cone_index_psi", [4000.0, 4600.0], "kPa"),
+    ("cone_index_kpa", [20.0, 460.0], ""),  # in bar they would be usual as well
+])  # fmt: skip
+def test_a_column_in_another_of_its_units(header: str, values: list[float], units: str) -> None:
+    said = " | ".join(column_notes(table_from_arrays({header: values}, source="wheel.csv")))
+    assert bool(said) == bool(units)
+    assert units in said
+
+
+@pytest.mark.parametrize(("header", "values", "units"), [
+    ("inflation_pressure_psi", [124.1, 206.8, 289.6], "kPa"),
+    ("inflation_pressure_kpa", [18.0, 30.0, 42.0], "psi"),
+    ("inflation_pressure_psi", [10.0, 14.0], ""),
+    ("inflation_pressure_psi", [20.0, 206.8], ""),  # the half of them lies among the others
+    ("inflation_pressure_psi", [124.1, 5000.0], ""),
+])  # fmt: skip
+def test_conditions_beyond_the_calibrated_ones_in_another_unit(
+    header: str, values: list[float], units: str
+) -> None:
+    known = {"inflation_pressure_psi": np.array([17.9, 30.0, 42.1])}
+    said = " | ".join(beyond_notes(table_from_arrays({header: values}), known))
+    assert said.partition("readings are in ")[2].partition(";")[0] == units
 
 
 def test_one_row_that_is_far_too_large_is_not_the_columns_unit() -> None:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from calib.data.headers import accepted_headers, match_headers, meant, parse_header
-from calib.data.quantities import QUANTITIES, UNITS, Range
+from calib.data.quantities import QUANTITIES, UNITS, Quantity, Range
 from calib.data.reader import table_from_arrays
 from calib.errors import CalibError
 from calib.models import MODELS
@@ -156,3 +156,22 @@ def test_ranges_are_told_in_the_unit_of_the_file(limits: Range, text: str) -> No
 def test_a_bound_reached_through_another_unit_is_inside() -> None:
     assert Range(-1.0, 1.0).holds(np.array([1.0 + 1e-12, -1.0 - 1e-12])).all()
     assert not Range(low=1.0, integer=True).holds(np.array([0.0, 1.5, np.nan])).any()
+
+
+@pytest.mark.parametrize("unit", ["degF", "kN", "degrees"])
+def test_units_that_are_no_factor_of_its_own_are_refused_where_they_are_declared(unit):
+    def temperature(**suffixes):
+        return Quantity(
+            "soil_warmth", "soil_warmth_c", "temperature", "degC", "condition", "of the soil",
+            suffixes={"c": "degC", **suffixes},
+        )  # fmt: skip
+
+    with pytest.raises(CalibError, match="degC") as caught:
+        temperature(f=unit).register()
+    assert caught.value.where == "the quantity soil_warmth, suffix 'f'"
+    assert "soil_warmth_c" not in QUANTITIES
+    try:
+        temperature().register()
+        assert "soil_warmth_c" in QUANTITIES
+    finally:
+        QUANTITIES.discard("soil_warmth_c")

@@ -349,3 +349,12 @@ def test_a_unit_written_otherwise_is_the_same(run: Calib) -> None:
     text = (HERE / "wheel_torque.py").read_text(encoding="utf-8")
     Path("own.py").write_text(text.replace('unit = "kN*m"', 'unit = "kN m"'), encoding="utf-8")
     assert run("models", "--models", "own.py").code == 0
+
+
+def test_ones_own_are_told_as_well(run: Calib) -> None:
+    own = ["--models", HERE / "wheel_torque.py"]
+    assert "wheel_torque_nm: N*m" in run("quantities", "wheel_torque", *own).out
+    assert "predicts" not in run("models", "janosi_torque", *own).err
+    assert "priors" in run("models", "janosi_torque", *own).out
+    told = run("effects", "load_sensitivity", "--effects", HERE / "load_sensitivity.py")
+    assert told.code == 0, told.err

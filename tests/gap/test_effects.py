@@ -331,6 +331,9 @@ def test_reasons_why_an_effect_cannot_be_tested(view):
     reason = EFFECTS["rate_effect"].not_testable(replace(view, conditions=still), both)
     assert reason is not None
     assert "the same in every row, as in the calibration" in reason
+    unknown = replace(view, conditions=still, lab={})
+    reason = EFFECTS["rate_effect"].not_testable(unknown, both)
+    assert reason == "speed_m_s is the same in every row, and the calibration has no such column"
     # Constant in the field, but not what it was in the laboratory: that can be seen.
     fast = {**view.conditions, "speed_m_s": np.full(20, 2.0)}
     assert EFFECTS["rate_effect"].not_testable(replace(view, conditions=fast), both) is None

@@ -64,6 +64,29 @@ def test_another_unit_is_named_with_its_factor(what):
     assert units in found
 
 
+@pytest.mark.parametrize(("header", "factor", "units"), [
+    ("normal_load_lbf", 1e3, "are in N;"),
+    ("normal_load_n", 224.809, "are in lbf;"),
+    ("normal_load_kn", 2.5, ""),
+    ("gravimetric_water_content_percent", 1.0, "are in fractions;"),
+    ("volumetric_water_content_percent", 1.0, "a fraction and percent"),
+    ("speed_m_s", 40.0, ""),  # campaigns may differ in their speed by any factor
+])  # fmt: skip
+def test_a_covariate_that_no_model_uses_in_another_unit(header, factor, units):
+    case = make_case(None)
+    (column,) = table_from_arrays({header: np.ones(1)})
+    level = {"normal_load_kn": 5.0, "speed_m_s": 0.06}.get(column, 0.1)
+    # All but one were held in the calibration.
+    spread = 0.5 if column == "volumetric_water_content" else 0.0
+    at = level * (1.0 + spread * np.linspace(-1.0, 1.0, len(case.lab)))
+    lab = {**case.lab.columns, column: at}
+    field = {k: v for k, v in case.field.columns.items() if k != column}
+    field[header] = np.full(len(case.field), factor * level)
+    found = said(replace(case, lab=table_from_arrays(lab), field=table_from_arrays(field)))
+    assert (column in found) == bool(units)
+    assert units in found
+
+
 def test_rows_of_one_place_in_the_run_order_are_named_by_line():
     case = make_case(None)
     order = np.arange(1.0, len(case.field) + 1.0)

@@ -147,3 +147,13 @@ def test_no_region_is_along_a_condition_that_is_the_same_in_all_rows(data):
     found = regions(data, truth, row_gaps(data, truth))
     assert found
     assert not any("normal_load_kn" in region.conditions for region in found)
+
+
+def test_a_gap_of_a_field_at_one_condition_is_at_all_its_rows(data):
+    first = {name: np.full_like(v, v[0]) for name, v in data.view.conditions.items()}
+    one = replace(data, view=replace(data.view, conditions=first))
+    truth = truth_with(np.full(27, -0.2))
+    (region,) = regions(one, truth, row_gaps(one, truth))
+    assert region.gap == pytest.approx(-0.2)
+    ((low, high),) = region.conditions.values()
+    assert low == high

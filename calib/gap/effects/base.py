@@ -18,7 +18,10 @@ import numpy as np
 from calib.data.quantities import QUANTITIES, columns_of
 from calib.models.base import Array
 
-__all__ = ["Effect", "View", "saturating"]
+__all__ = ["LACKING", "Effect", "View", "saturating"]
+
+# How the reason begins or ends where an effect is not testable for want of a column.
+LACKING = ("the data lack", "the calibration has no such column")
 
 
 @dataclass(frozen=True)
@@ -212,15 +215,14 @@ class Effect:
             return f"no {' and '.join(map(_named, unseen))} output"
         missing = [c for c in self.covariates if view.column(c) is None]
         if missing:
-            return f"the data lack {', '.join((*columns_of(c), c)[0] for c in missing)}"
+            return f"{LACKING[0]} {', '.join((*columns_of(c), c)[0] for c in missing)}"
         if self.varies and self.covariates:
             values = view.of(self.covariates[0])
             reference = view.lab_of(self.covariates[0], float(values[0]))
             if np.allclose(values, reference, rtol=1e-6, atol=1e-12):
-                return (
-                    f"{view.column(self.covariates[0])} is the same in every row, as in the "
-                    "calibration"
-                )
+                column = view.column(self.covariates[0])
+                as_lab = "as in the calibration" if column in view.lab else f"and {LACKING[1]}"
+                return f"{column} is the same in every row, {as_lab}"
         return None
 
     def register(self) -> None:

@@ -107,6 +107,11 @@ class State:
         self.region = _region(z, self.free)
         return z
 
+    def one_failure(self) -> bool:
+        """Whether all runs so far have failed, and in the same way."""
+        kinds = {None if run.failure is None else run.failure.kind for run in self.runs}
+        return len(kinds) == 1 and None not in kinds
+
     def without_value(self, why: str) -> CalibError:
         """Return what to say where runs that failed are in the way."""
         failures = [run.failure for run in self.runs if run.failure is not None]
@@ -120,6 +125,11 @@ class State:
         theta = np.stack([run.theta for run in self.runs])
         at = f", at {_ranges(names, theta[~ok])}"
         at += f"; those with a value are at {_ranges(names, theta[ok])}" if ok.any() else ""
+        folder = self.keeper.folder
+        kept = "" if folder is None else (
+            f"; the runs, failed ones too, are kept in {folder}: delete it after a mend outside "
+            "the files that the simulator's own names"
+        )  # fmt: skip
         printed = f"; it printed: {first.printed.strip()}" if first.printed.strip() else ""
         return CalibError(
             f"{why}: only {ok.sum()} of the {ok.size} runs have a value "
@@ -127,7 +137,7 @@ class State:
             where=self._where,
             allowed="a simulator with values in at least half of its prior, and where the data are",
             mend="correct the simulator or its limit of time where it fails, or give priors that "
-            "do not reach there",
+            f"do not reach there{kept}",
         )  # fmt: skip
 
     @property

@@ -36,6 +36,7 @@ from calib.report.gap_rows import (
     output_word,
     panel_groups,
     region_text,
+    shrink_place,
 )
 from calib.report.labels import MINUS, NO_UNIT, Axis, axis_of, percent, percent_range, short
 
@@ -351,12 +352,8 @@ def _shrink_caption(found: Diagnosis, outputs: list[OutputRows]) -> str:
             f"{o.axis.unit} rms, noise {short(s.noise_floor)} {o.axis.unit}, a shrink of "
             f"{percent(s.fraction)} (90 % interval {percent_range(s.interval)})"
         )
-    place = (
-        "at new conditions, which were not fitted"
-        if found.data.case.new_conditions is not None
-        else "at the field's own conditions, since no others were asked for"
-    )
     return (
-        f"Expected error of the noise-free prediction {place}: {'; '.join(parts)}. Left and "
+        f"Expected error of the noise-free prediction {shrink_place(found)}: "
+        f"{'; '.join(parts)}. Left and "
         "middle, the rows that were fitted; grey is 1.64 noise sd (90 %)."
     )

@@ -307,7 +307,7 @@ def render_diagnosis(
         ],
         regions=[_region_row(found, r) for r in found.regions],
         shrink=_shrink_rows(found),
-        unfitted=case.new_conditions is not None,
+        shrink_place=evidence.shrink_place,
         next_rows=next_rows(found),
         look=evidence.look,
         advice=advice(evidence),

@@ -166,11 +166,37 @@ def test_where_runs_fail_and_what_to_do_is_told_if_nothing_is_left(
         assert words in text
 
 
-def test_a_simulator_that_never_runs_is_refused() -> None:
-    declared(lambda t, x: 1 / 0, "broken", emulate=True)
-    with pytest.raises(CalibError, match="only 0 of the 20 runs") as caught:
-        calib.emulated(calib.build_problem("broken", table()), seed=1)
-    assert "ZeroDivisionError" in str(caught.value)
+def test_a_simulator_that_never_runs_is_refused_after_its_first_runs(tmp_path: Path) -> None:
+    calls = []
+
+    def broken(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        calls.append(theta)
+        raise OSError("no soil.dat")
+
+    # The middle of the prior and five, each tried twice; what has failed is not made again.
+    declared(broken, "broken", emulate=True, folder=tmp_path / "broken.runs")
+    for _ in range(2):
+        with pytest.raises(CalibError, match="fails from the start") as caught:
+            calib.emulated(calib.build_problem("broken", table()), seed=1)
+        assert len(calls) == 12
+    text = str(caught.value)
+    for words in ("only 0 of the 5 runs", "OSError: no soil.dat", ", at mu 0.", "broken.runs"):
+        assert words in text
+
+
+def test_first_runs_that_fail_in_several_ways_are_no_reason_to_stop() -> None:
+    made = []
+
+    def fickle(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        made.append(theta[0, 0])
+        count = len(set(made))  # the first is the middle of the prior
+        if count == 4:
+            raise RuntimeError("no licence")
+        return np.nan * pull(theta, x) if count < 7 else pull(theta, x)
+
+    declared(fickle, "fickle", emulate=True, runs=40)
+    emulation = calib.emulated(calib.build_problem("fickle", table()), seed=1)
+    assert len(emulation.failed) == 5
 
 
 def test_far_from_all_runs_there_is_no_value() -> None:

@@ -14,6 +14,7 @@ from calib.gap.inclusion import Included, Inclusion, inclusion_probability
 from calib.gap.next_measurement import NextMeasurement
 from calib.inference.priors import Prior
 from calib.report.gap_evidence import gap_evidence
+from calib.report.gap_rows import shrink_place
 from calib.report.gap_sizes import size_sentences
 from calib.report.gap_verdict import (
     Candidate,
@@ -54,7 +55,7 @@ def evidence(verdict: str, **probabilities: float) -> GapEvidence:
         ["pull reads 0.13 ± 0.04 kN high"],
         [WhereFact("drawbar pull at slip 30 to 60 %", "0.1 kN above the simulator", 0.97)],
         [ShrinkFact("drawbar pull", "0.11", "0.04 kN", "0.03 kN", 0.63, (0.45, 0.8))],
-        True,
+        "at new conditions, which were not fitted",
         [NextFact(("lug thrust", "drift"), "slip 65 %", 1.2)],
         smallest=0.7,
     )
@@ -163,11 +164,11 @@ def test_two_effects_are_said_to_be_two():
 
 def test_a_shrink_that_may_be_nothing_says_so():
     e = evidence("effect", drift=0.95)
-    shaky = replace(e, shrink=[replace(e.shrink[0], interval=(-0.3, 0.7))], unfitted=False)
+    shaky = replace(e, shrink=[replace(e.shrink[0], interval=(-0.3, 0.7))])
     text = dict(judge_gap(shaky).facts)["How far"]
     assert "\N{MINUS SIGN}30 to 70 %" in text
     assert "may not shrink at all" in text
-    assert "field's own conditions" in text
+    assert text.endswith(", at new conditions, which were not fitted")
 
 
 def test_nothing_to_show_is_said():
@@ -423,8 +424,41 @@ def test_evidence_is_gathered_from_the_records(found):
         found.ranking.probability.values(), reverse=True
     )
     assert len(e.where) <= len(found.data.outputs)
-    assert e.unfitted
+    assert e.shrink_place.startswith("at new conditions")
     assert [s.fraction for s in e.shrink] == [s.fraction for s in found.shrink.values()]
+
+
+def test_it_is_told_on_which_rows_the_shrink_was_judged(found):
+    case = replace(found.data.case, new_conditions=None)
+    own = replace(found, data=replace(found.data, case=case))
+    assert "each row predicted without it (the rows are left out in 5 parts)" in shrink_place(own)
+    # Of six rows none are left out: four would not be enough.
+    few = replace(case, field=case.field.take(range(6)))
+    outputs = tuple(replace(o, rows=o.rows[:6]) for o in own.data.outputs)
+    assert "which were fitted: they are too few" in shrink_place(
+        replace(own, data=replace(own.data, case=few, outputs=outputs))
+    )
+
+
+def test_effects_that_a_missing_column_hides_are_named_beside_the_cause(found):
+    assert not gap_evidence(found).untested
+    ranking = replace(
+        found.ranking,
+        not_testable={
+            "moisture_softening": "the data lack gravimetric_water_content",
+            "cone_index_bias": "no bulk_density output",
+        },
+    )
+    lab = {n: v for n, v in found.data.view.lab.items() if n != "speed_m_s"}
+    data = replace(found.data, view=replace(found.data.view, lab=lab))
+    e = gap_evidence(replace(found, ranking=ranking, data=data))
+    whole, *parts = e.untested
+    assert whole == "moisture softening (the data lack gravimetric_water_content)"
+    words = "rate effect in part (the calibration has no speed_m_s, so that a constant"
+    assert any(part.startswith(words) for part in parts)
+    told = dict(judge_gap(e).facts)["Not tested"]
+    assert told.startswith("Moisture softening (the data lack")
+    assert told.endswith("If any acts, its trace is put down to what is named")
 
 
 def test_conditions_that_neither_hypothesis_depends_on_are_not_asked_for(found):

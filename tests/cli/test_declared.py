@@ -1,0 +1,49 @@
+"""What is registered is told from its declaration, shipped or of one's own."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from calib.data.quantities import QUANTITIES
+from calib.gap.effects import EFFECTS
+from calib.models import MODELS
+from tests.cli.test_cli import Calib
+
+
+@pytest.mark.parametrize(
+    ("what", "known"), [("models", MODELS), ("effects", EFFECTS), ("quantities", QUANTITIES)]
+)
+def test_all_are_listed_and_each_is_told(run: Calib, what: str, known: dict) -> None:
+    listed = run(what)
+    assert listed.code == 0
+    assert all(f"{name}: " in listed.out for name in known)
+    assert list(json.loads(run(what, "--json").out)[what]) == list(known)
+    for name in known:
+        told = run(what, name, "--json")
+        assert told.code == 0
+        assert json.loads(told.out)[what][name]["title"]
+
+
+def test_an_effect_is_told_with_equation_needs_and_priors(run: Calib) -> None:
+    told = run("effects", "moisture_softening").out
+    for words in ("equation: ", "The field records gravimetric_water_content.", "No formula is"):
+        assert words in told
+    facts = json.loads(run("effects", "moisture_softening", "--json").out)
+    priors = facts["effects"]["moisture_softening"]["priors"]
+    assert list(priors) == list(EFFECTS["moisture_softening"].parameters)
+    assert all(p["source"] and p["why"] for p in priors.values())
+
+
+def test_a_quantity_is_found_by_whatever_a_column_may_be_called(run: Calib) -> None:
+    for name in ("normal_load_kn", "load", "wheel_load_lbf"):
+        assert run("quantities", name).out.startswith("normal_load_kn: Normal load")
+
+
+@pytest.mark.parametrize("what", ["models", "effects", "quantities"])
+def test_what_there_is_not_is_refused_with_what_there_is(run: Calib, what: str) -> None:
+    refused = run(what, "nothing")
+    assert refused.code == 2
+    assert "there is no" in refused.err
+    assert "allowed: " in refused.err
