@@ -134,8 +134,8 @@ class Campaigns:
     def simulated(self) -> dict[str, Simulated]:
         """Every output's simulator at the rows of both campaigns."""
         tables = (self.case.lab, self.case.field)
-        parts = [_recorded(t, "pressure", np.empty(0)) for t in tables]
-        recorded = np.concatenate(parts) if any(p.size for p in parts) else np.zeros(1)
+        # Where there is none no simulator asks for their range.
+        recorded = np.concatenate([_recorded(t, "pressure", np.zeros(1)) for t in tables])
         pressures = float(recorded.min()), float(recorded.max())
         return {o.name: Simulated(o, self.view, pressures) for o in self.outputs}
 
