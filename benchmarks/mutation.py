@@ -56,6 +56,7 @@ ALSO = {
     "gap/test_load_effects.py gap/test_declared.py gap/test_which.py",
     "gap/ascent": "gap/test_fit.py",
     "gap/corrected": "gap/test_case.py",
+    "gap/discrepancy": "gap/test_forward.py",
     "gap/diagnose": "gap/test_case.py gap/test_hypotheses.py gap/test_files.py",
     "gap/fit": "gap/test_evidence.py gap/test_which.py gap/test_shifts.py",
     "gap/forward": "gap/test_fit.py gap/test_shifts.py",

@@ -199,7 +199,7 @@ def read_case(folder: Path) -> Case:
         raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
     unknown = [key for key in content if key not in _KEYS]
     if unknown:
-        near = difflib.get_close_matches(unknown[0], _KEYS, n=1, cutoff=0.5)
+        near = difflib.get_close_matches(unknown[0], _KEYS, cutoff=0.5)
         raise CalibError(
             f"unknown key {unknown[0]}", where=str(path), allowed=", ".join(_KEYS),
             mend=f"was {near[0]} meant?" if near else "correct its name, or leave it out",

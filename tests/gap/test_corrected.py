@@ -241,6 +241,31 @@ def test_it_must_predict_as_when_it_was_saved(kept, output, moved, refused):
         load_corrected(kept)
 
 
+@pytest.mark.parametrize("factor", [1.0, 1.1])
+def test_what_the_coordinates_of_a_shift_mean_is_the_files(kept, factor):
+    """Not what the priors shipped say now: another meaning predicts otherwise."""
+
+    def change(content):
+        found = content["fits"][1]["shift_map"]
+        found["radius_error"] = [factor * x for x in found["radius_error"]]
+
+    damaged(kept, change)
+    told = pytest.raises(CalibError, match="no longer predicts")
+    with told if factor > 1.0 else nullcontext():
+        load_corrected(kept)
+
+
+def test_where_it_had_no_value_it_may_have_none_again(made, tmp_path):
+    """As of a simulator that is asked far outside what it is made for."""
+    fit = fit_of(made.data, Hypothesis("none"), made.lab_mode)
+    psi = fit.psi.copy()
+    psi[fit.forward.theta_slices["rut_depth"]] = np.nan
+    nowhere = Mixture(made.data, (replace(fit, psi=psi),), (1.0,), 1)
+    save_corrected(Corrected(nowhere, made.lab_mode), tmp_path)
+    (again,) = load_corrected(tmp_path).mixture.fits
+    np.testing.assert_array_equal(again.psi, psi)
+
+
 def test_numbers_are_short(kept):
     fit = json.loads((kept / "corrected.json").read_text())["fits"][0]
     for value in [*fit["sample"][0], *fit["field"]["drawbar_pull"]]:
