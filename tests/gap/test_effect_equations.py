@@ -378,14 +378,14 @@ def priors_of(effect: Effect) -> Priors:
 
 DEPENDENCES = {
     "load": (("load", "normal_load"), {"pull_slope": (1.0, 0.3), "sinkage_slope": (0.7, 0.5),
-                                       "density_slope": (0.0, 0.5)}),
+                                       "driving_torque_slope": (0.0, 0.5)}),
     "speed": (("speed", "speed"), {"pull_slope": (0.0, 0.5), "sinkage_slope": (0.0, 0.5),
-                                   "density_slope": (0.0, 0.5)}),
+                                   "driving_torque_slope": (0.0, 0.5)}),
     "temperature": (("tyre_temperature_c", "tyre_temperature_c"),
                     {"pull_slope": (0.0, 0.3), "sinkage_slope": (0.0, 0.3),
-                     "density_slope": (0.0, 0.3)}),
+                     "driving_torque_slope": (0.0, 0.3)}),
 }  # fmt: skip
-LOGS = {"sinkage": True, "pull": False, "density": False}
+LOGS = {"sinkage": True, "pull": False, "driving_torque": False}
 
 
 @pytest.mark.parametrize("which", DEPENDENCES)
@@ -396,8 +396,8 @@ def test_a_dependences_priors_are_those_of_dimensional_analysis_or_wide(which):
     bends = dict.fromkeys((f"{output}_bend" for output in LOGS), (0.0, 0.15))
     wanted = slopes | bends | {"pull_offset": (0.0, 0.02)}
     assert effect.parameters == (
-        "sinkage_slope", "sinkage_bend", "pull_slope", "pull_bend", "density_slope",
-        "density_bend", "pull_offset",
+        "sinkage_slope", "sinkage_bend", "pull_slope", "pull_bend", "driving_torque_slope",
+        "driving_torque_bend", "pull_offset",
     )  # fmt: skip
     assert effect.outputs == tuple(LOGS)
     assert effect.covariates == (role,)
@@ -423,8 +423,8 @@ def test_a_dependence_has_each_output_by_its_own_parameters():
     expected = {
         "sinkage": location + change["sinkage"],
         "pull": location * np.exp(change["pull"]) + p["pull_offset"] * u * W,
-        "density": location * np.exp(change["density"]),
-        "torque": location,
+        "driving_torque": location * np.exp(change["driving_torque"]),
+        "density": location,
     }
     for output, wanted in expected.items():
         np.testing.assert_allclose(effect.on_output(phi, output, location, view), wanted)
@@ -474,7 +474,7 @@ def test_values_of_a_category_have_each_its_factor(usual):
     others = [j for j in range(3) if j != usual]
     phi = 6.0 * drawn(effect)
     location = np.random.default_rng(7).uniform(0.5, 4.0, (K, N))
-    found = {o: effect.on_output(phi, o, location, view) for o in (*LOGS, "torque")}
+    found = {o: effect.on_output(phi, o, location, view) for o in (*LOGS, "density")}
     for k in range(K):
         p = dict(zip(effect.parameters, phi[k], strict=True))
         for i in range(N):
@@ -483,8 +483,8 @@ def test_values_of_a_category_have_each_its_factor(usual):
             expected = {
                 "sinkage": y + factor["sinkage"],
                 "pull": y * math.exp(factor["pull"]) + p.get(f"pull_offset_{word}", 0.0) * W,
-                "density": y * math.exp(factor["density"]),
-                "torque": y,
+                "driving_torque": y * math.exp(factor["driving_torque"]),
+                "density": y,
             }
             for output, wanted in expected.items():
                 assert found[output][k, i] == pytest.approx(wanted, rel=1e-12)
