@@ -16,7 +16,7 @@ from calib.gap.hypotheses import effect_priors, pair, shifts, singles, unknowns,
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.shifts import shift_map
 from calib.inference.priors import Prior, Priors
-from tests.gap.cases import NOISE, campaigns_of
+from tests.gap.cases import NOISE, campaigns_of, make_case
 from tests.gap.test_hypotheses import density_campaigns
 
 SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}
@@ -408,6 +408,19 @@ def test_a_shift_moves_the_parameters_and_the_zero_of_slip(data, shift_as):
         truly = conditions | {"slip_ratio": 1.0 - (1.0 - slip) * (1.0 - error)}
         expected = o.problem.bound.location(o.priors.to_natural(t), truly)
         np.testing.assert_allclose(found[o.name], expected, rtol=1e-12)
+
+
+def test_what_knows_no_slip_does_not_mind_where_its_zero_is():
+    """A rut by plain Bekker, beside a pull that shows another zero of slip."""
+    case = make_case(models={"drawbar_pull": "magic_formula", "rut_depth": "bekker"})
+    both = campaigns(case)
+    forward = Forward(both, Hypothesis("parameter_shift", shift=0.25), SIGMA)
+    psi = centre(forward)
+    zero = forward.shift_slice.start + int(np.argmax(forward.shift.radius_error))
+    psi[:, zero] = 1.0
+    found, plain = forward.field(psi, both.view), forward.simulator(psi, both.view)
+    np.testing.assert_array_equal(found["rut_depth"], plain["rut_depth"])
+    assert not np.allclose(found["drawbar_pull"], plain["drawbar_pull"], rtol=1e-3)
 
 
 def test_form_errors_scale_what_each_effect_adds_to_those_before_it(data):
