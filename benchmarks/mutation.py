@@ -55,8 +55,10 @@ ALSO = {
     "gap/effects/": "gap/test_effect_equations.py gap/test_effects.py gap/test_forward.py "
     "gap/test_load_effects.py gap/test_declared.py gap/test_which.py",
     "gap/ascent": "gap/test_fit.py",
+    "gap/case": "gap/test_declared.py",
     "gap/corrected": "gap/test_case.py",
     "gap/diagnose": "gap/test_case.py gap/test_hypotheses.py gap/test_files.py",
+    "gap/discrepancy": "gap/test_forward.py",
     "gap/fit": "gap/test_evidence.py gap/test_which.py gap/test_shifts.py",
     "gap/forward": "gap/test_fit.py gap/test_shifts.py",
     "gap/guesses": "gap/test_sets.py gap/test_ascent.py gap/test_fit.py",

@@ -134,8 +134,8 @@ class Campaigns:
     def simulated(self) -> dict[str, Simulated]:
         """Every output's simulator at the rows of both campaigns."""
         tables = (self.case.lab, self.case.field)
-        parts = [_recorded(t, "pressure", np.empty(0)) for t in tables]
-        recorded = np.concatenate(parts) if any(p.size for p in parts) else np.zeros(1)
+        # Where there is none no simulator asks for their range.
+        recorded = np.concatenate([_recorded(t, "pressure", np.zeros(1)) for t in tables])
         pressures = float(recorded.min()), float(recorded.max())
         return {o.name: Simulated(o, self.view, pressures) for o in self.outputs}
 
@@ -199,7 +199,7 @@ def read_case(folder: Path) -> Case:
         raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
     unknown = [key for key in content if key not in _KEYS]
     if unknown:
-        near = difflib.get_close_matches(unknown[0], _KEYS, n=1, cutoff=0.5)
+        near = difflib.get_close_matches(unknown[0], _KEYS, cutoff=0.5)
         raise CalibError(
             f"unknown key {unknown[0]}", where=str(path), allowed=", ".join(_KEYS),
             mend=f"was {near[0]} meant?" if near else "correct its name, or leave it out",

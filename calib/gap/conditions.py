@@ -25,6 +25,8 @@ _FAR = 1.5
 _LEAST_FACTOR = 8.0
 # Part of both campaigns that may lie off before it is the campaigns' own way.
 _MOST = 0.05
+# Of fewer rows nobody knows which is the odd one.
+_FEWEST = 4
 
 
 def check_units(case: Case) -> None:
@@ -86,7 +88,7 @@ def _far(values: Array) -> NDArray[np.bool_]:
     u = np.log(values) if positive else values
     order = np.sort(u)
     k = max(1, int(_MOST * u.size))
-    if u.size < 4 * k:
+    if u.size < _FEWEST:
         return np.zeros(u.size, dtype=bool)
     low, high = float(order[k]), float(order[-k - 1])
     least = float(np.log(_LEAST_FACTOR)) if positive else max(0.5 * max(abs(low), abs(high)), 0.1)

@@ -33,7 +33,7 @@ class Size(BaseModel):
 
 
 class _Written(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
     suspected: dict[str, Annotated[float, Field(gt=0.0, lt=1.0)]] = {}
     excluded: list[str] = []
     sizes: dict[str, dict[str, Size]] = {}

@@ -10,6 +10,7 @@ from scipy.special import expit
 from calib.gap.case import Campaigns, OutputData
 from calib.gap.covariates import other_conditions
 from calib.gap.effects import View
+from calib.gap.effects.base import each
 from calib.gap.hypothesis import Hypothesis, Setting
 from calib.models.base import Array
 
@@ -69,7 +70,8 @@ class Discrepancy:
         if self.hypothesis.onset_over is None:
             return np.asarray(amplitudes @ self._smooth(view, output).T)
         step, bend = self.onset(view, output, threshold)
-        return amplitudes[:, :1] * step + amplitudes[:, 1:2] * bend
+        of_step, of_bend = each(amplitudes)
+        return np.asarray(of_step * step + of_bend * bend)
 
     def _smooth(self, view: View, output: str) -> Array:
         same = view.conditions is self.data.view.conditions
@@ -106,7 +108,7 @@ class Discrepancy:
         over = self.hypothesis.smooth_over
         if self.hypothesis.onset_over is not None:
             # Its shape depends on the threshold; here are its two amplitudes.
-            return np.empty((0, 2)), np.array([1.0, 2.0])
+            return np.array([]), np.array([1.0, 2.0])
         if over == "before":
             change = self._from_the_run_before(view, output)
             return change[:, None], np.ones(1)

@@ -220,7 +220,7 @@ class Forward:
         shift = psi[:, self.shift_slice]
         for name, s in self._simulated.items():
             t = psi[:, self.theta_slices[name]] + shift @ self.shift.parameters[name].T
-            conditions = self._shifted(shift, s.conditions(view))
+            conditions = _shifted(shift @ self.shift.radius_error, s.conditions(view))
             plain[name] = s.predict(t, psi[:, self.misfit_slices[name]], conditions)
         return self.departed(psi, view, plain, idle)
 
@@ -265,15 +265,6 @@ class Forward:
         if self.shift is not None:
             return self.field(psi, view), plain
         return self.departed(psi, view, plain), plain
-
-    def _shifted(self, shift: Array, conditions: dict[str, Array]) -> dict[str, Array]:
-        """Conditions as they truly are: with a shift the zero of slip is another."""
-        radius_error = np.zeros(0) if self.shift is None else self.shift.radius_error
-        column = next((c for c in columns_of("slip") if c in conditions), None)
-        if not radius_error.any() or column is None:
-            return conditions
-        error = shift @ radius_error
-        return {**conditions, column: 1.0 - (1.0 - conditions[column]) * (1.0 - error[:, None])}
 
     def _with_effects(
         self, psi: Array, view: View, plain: dict[str, Array], idle: Collection[int]
@@ -329,9 +320,18 @@ class Forward:
         return location
 
     @staticmethod
-    def _factor(psi: Array, part: slice, basis: Array) -> Array | float:
+    def _factor(psi: Array, part: slice, basis: Array) -> Array:
         """By how much what an effect does departs from its formula, shape (k, n)."""
-        return 1.0 + psi[:, part] @ basis.T if part.stop > part.start else 1.0
+        return np.asarray(1.0 + psi[:, part] @ basis.T)
+
+
+def _shifted(radius_error: Array, conditions: dict[str, Array]) -> dict[str, Array]:
+    """Conditions as they truly are: with a shift the zero of slip is another, errors (k,)."""
+    column = next((c for c in columns_of("slip") if c in conditions), None)
+    if not radius_error.any() or column is None:
+        return conditions
+    slip = 1.0 - (1.0 - conditions[column]) * (1.0 - radius_error[:, None])
+    return {**conditions, column: slip}
 
 
 def _append(entries: list[Prior], new: Sequence[Prior]) -> slice:

@@ -6,12 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.context import Context, Size, read_context
 from calib.gap.diagnose import diagnose_once
+from calib.gap.hypothesis import Hypothesis
 from calib.gap.odds import Odds
+from calib.inference.priors import Prior, Priors
 from calib.report.gap_evidence import gap_evidence
 from calib.report.gap_verdict import judge_gap
 from tests.gap.cases import PULL_ONLY, make_case, write_case
@@ -96,4 +99,91 @@ def test_a_context_is_read_from_the_case(tmp_path):
     context = read_case(folder).context
     assert context == Context({"lug_thrust": 0.5}, ("sensor_drift",))
     assert context.words() == ["lug thrust suspected (0.5)", "sensor drift excluded"]
-    assert not read_context(None, "")
+    assert read_context(None, "") == Context()
+
+
+KNOWN = {"lug_thrust": {"thrust": Size(mean=-0.2, sd=0.05)}}
+
+
+@pytest.mark.parametrize(
+    "context",
+    [Context({"lug_thrust": 0.5}), Context(excluded=("lug_thrust",)), Context(sizes=KNOWN)],
+)
+def test_any_of_its_parts_makes_a_context(context):
+    assert context
+    assert context.names == ("lug_thrust",)
+    assert not Context()
+
+
+def digging(*, known) -> Hypothesis:
+    """Lugs of a size that may have either sign, a scale that is positive, a digging held fixed."""
+    entries = (
+        Prior("thrust", "1", "why", "who", "", False, 0.1, 0.3, lower=-1.0),
+        Prior("slip_scale", "1", "why", "who", "", True, -1.5, 0.4),
+        Prior("digging", "1", "why", "who", "", False, 0.2, 0.0),
+    )
+    single = Hypothesis("lug_thrust", effect_priors=(Priors(entries, "text", "source"),))
+    return Context(sizes={"lug_thrust": known}).sized(single)
+
+
+def test_what_is_known_of_a_size_replaces_that_and_nothing_else():
+    """A positive one by its logarithm, of which the sd is sd over mean, to first order."""
+    (before,) = digging(known={}).effect_priors
+    for name, mean, sd, loc, scale in (
+        ("thrust", -0.2, 0.05, -0.2, 0.05), ("thrust", 0.0, 2.0, 0.0, 2.0),
+        ("slip_scale", 0.5, 0.2, np.log(0.5), 0.4), ("slip_scale", 1e-3, 1e-4, np.log(1e-3), 0.1),
+    ):  # fmt: skip
+        (after,) = digging(known={name: Size(mean=mean, sd=sd)}).effect_priors
+        assert (after.text, after.source) == (before.text, before.source)
+        for was, now in zip(before.entries, after.entries, strict=True):
+            if was.name != name:
+                assert now == was
+                continue
+            assert (now.loc, now.scale) == pytest.approx((loc, scale), rel=1e-12)
+            assert replace(now, loc=was.loc, scale=was.scale) == was
+
+
+def test_of_other_effects_nothing_is_known():
+    single = Hypothesis("rate_effect", effect_priors=(Priors(()),))
+    assert Context(sizes=KNOWN).sized(single) is single
+
+
+@pytest.mark.parametrize("mean", [0.0, -0.5])
+def test_what_is_positive_is_not_said_to_be_zero_or_less(mean):
+    with pytest.raises(CalibError, match="slip_scale is positive"):
+        digging(known={"slip_scale": Size(mean=mean, sd=0.1)})
+
+
+def test_what_is_fixed_has_no_size_to_be_known():
+    with pytest.raises(CalibError, match="no parameter 'digging'") as refused:
+        digging(known={"digging": Size(mean=0.1, sd=0.1)})
+    assert refused.value.allowed == "thrust, slip_scale"
+
+
+@pytest.mark.parametrize(
+    ("part", "last", "beyond"),
+    [
+        ("mean", 1e15, 1e15 + 0.25), ("mean", -1e15, -1e15 - 0.25),
+        ("sd", 1e15, 1e15 + 0.25), ("sd", 1.1e-15, 1e-15),
+    ],
+)  # fmt: skip
+def test_a_size_is_a_number_that_can_be_squared(part, last, beyond):
+    def written(value):
+        size = {"mean": 1.0, "sd": 1.0, part: value}
+        return {"sizes": {"force_offset": {"offset": size}}}
+
+    context = read_context(written(last), "case.toml")
+    assert getattr(context.sizes["force_offset"]["offset"], part) == last
+    with pytest.raises(CalibError, match=f"offset.{part}"):
+        read_context(written(beyond), "case.toml")
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0])
+def test_what_is_suspected_is_not_certain(probability):
+    with pytest.raises(CalibError, match=r"context\.suspected\.lug_thrust"):
+        read_context({"suspected": {"lug_thrust": probability}}, "case.toml")
+
+
+def test_a_size_that_was_given_stays_what_it_is():
+    with pytest.raises(ValidationError, match="frozen"):
+        KNOWN["lug_thrust"]["thrust"].mean = 3.0

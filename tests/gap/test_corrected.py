@@ -1,6 +1,7 @@
 """The corrected model, saved and loaded, predicts what the diagnosis predicted."""
 
 import json
+from contextlib import nullcontext
 from dataclasses import replace
 
 import numpy as np
@@ -8,11 +9,12 @@ import pytest
 from typer.testing import CliRunner
 
 from calib.cli.verbs import app
-from calib.data import table_from_arrays, write_table
+from calib.data import Table, table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.gap.case import read_case
+from calib.gap.case import campaigns, read_case
 from calib.gap.corrected import (
+    Corrected,
     conditions_outside,
     load_corrected,
     predict_columns,
@@ -21,6 +23,13 @@ from calib.gap.corrected import (
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
 from calib.gap.effects.load import load_effects
+from calib.gap.fit import Fit
+from calib.gap.forward import Forward
+from calib.gap.hypotheses import pair, singles
+from calib.gap.hypothesis import Hypothesis
+from calib.gap.mixture import Mixture
+from calib.gap.noise import Noise
+from calib.inference.prior_files import DeclaredPriors, default_priors
 from tests.gap.cases import LARGE, PULL_ONLY, make_case
 from tests.gap.test_load_effects import write
 
@@ -66,6 +75,269 @@ def test_a_model_that_has_changed_since_is_refused(saved, tmp_path):
     _, folder = saved
     with pytest.raises(CalibError, match="no longer predicts the drawbar_pull"):
         load_corrected(folder, {**FEW, "force_offset": Other()})
+
+
+OPERATORS = ("Berg", "Lind", "Dahl")
+SIGMA = {"drawbar_pull": 0.03, "rut_depth": 0.05}
+
+
+def widened(table: Table) -> Table:
+    """Return a table with two columns that a case declares."""
+    n = len(table)
+    more = {
+        "operator": np.resize([0.0, 1.0, 2.0, 1.0], n), "tyre_temperature_c": np.linspace(8, 31, n),
+    }  # fmt: skip
+    return replace(table, columns={**table.columns, **more})
+
+
+def fit_of(data, h: Hypothesis, lab_mode, *, draws: int = 0) -> Fit:
+    forward = Forward(data, h, SIGMA, lab_mode)
+    rng = np.random.default_rng(forward.n_dim)
+    psi = np.array([p.loc for p in forward.priors.free])
+    psi += 0.01 * rng.standard_normal(psi.size)
+    root = 1e-3 * rng.standard_normal((psi.size, psi.size))
+    noise = {o: Noise(s, 1.0, -0.8) for o, s in SIGMA.items()}
+    sample = psi + 1e-3 * rng.standard_normal((draws, psi.size)) if draws else None
+    return Fit(forward, psi, root @ root.T, noise, 0.0, 0.0, {}, sample)
+
+
+@pytest.fixture(scope="module")
+def made() -> Corrected:
+    """Every kind of hypothesis, of a case with priors, declared columns and fresh conditions."""
+    case = make_case("force_offset", n_fresh=4)
+    text = default_priors("modified_bekker").read_text(encoding="utf-8").replace("0.35", "0.36")
+    case = replace(
+        case, lab=widened(case.lab), field=widened(case.field),
+        new_conditions=widened(case.new_conditions),
+        covariates={"operator": OPERATORS, "tyre_temperature_c": ()},
+        priors={"rut_depth": DeclaredPriors("mine.toml", text)},
+    )  # fmt: skip
+    data = campaigns(case)
+    lab_mode = {o.name: np.array([p.loc for p in o.priors.free]) + 0.01 for o in data.outputs}
+    pull = ("drawbar_pull",)
+    few = singles(data, {n: EFFECTS[n] for n in ("sensor_drift", "rate_effect")})
+    hypotheses = [
+        pair(*few),
+        Hypothesis("parameter_shift", shift=0.25, shift_as="soil"),
+        Hypothesis("unknown", smooth=2.0, smooth_outputs=pull, smooth_over="slip",
+                   smooth_decay=3.0),
+        Hypothesis("unknown", smooth=4.0, smooth_outputs=pull, onset_over="low_pressure"),
+    ]  # fmt: skip
+    fits = [fit_of(data, h, lab_mode, draws=5 * (i == 0)) for i, h in enumerate(hypotheses)]
+    return Corrected(Mixture(data, tuple(fits), (0.4, 0.3, 0.2, 0.1), 7), lab_mode)
+
+
+@pytest.fixture
+def kept(made, tmp_path):
+    save_corrected(made, tmp_path)
+    return tmp_path
+
+
+def test_everything_is_kept(made, kept):
+    """To twelve digits of each number; the case as it was, whatever is declared in it."""
+    again = load_corrected(kept)
+    assert again.mixture.probability == made.mixture.probability
+    assert again.mixture.seed == 7
+    for name, mode in made.lab_mode.items():
+        np.testing.assert_allclose(again.lab_mode[name], mode, rtol=1e-12)
+    for was, now in zip(made.mixture.fits, again.mixture.fits, strict=True):
+        h, found = was.forward.hypothesis, now.forward.hypothesis
+        for part in ("name", "shift", "shift_as", "smooth", "smooth_outputs", "smooth_over",
+                     "smooth_decay", "onset_over"):  # fmt: skip
+            assert getattr(found, part) == getattr(h, part)
+        assert [e.name for e in found.effects] == [e.name for e in h.effects]
+        assert now.forward.priors.entries == was.forward.priors.entries
+        assert now.noise == was.noise
+        np.testing.assert_allclose(now.psi, was.psi, rtol=1e-12)
+        np.testing.assert_allclose(now.covariance, was.covariance, rtol=1e-12)
+        assert (now.sample is None) == (was.sample is None)
+        if was.sample is not None:
+            np.testing.assert_allclose(now.sample, was.sample, rtol=1e-11)
+        assert (now.forward.shift is None) == (was.forward.shift is None)
+        if was.forward.shift is not None:
+            np.testing.assert_allclose(now.forward.shift.radius_error,
+                                       was.forward.shift.radius_error)  # fmt: skip
+    case, found = made.data.case, again.data.case
+    assert dict(found.models) == dict(case.models)
+    assert found.covariates == case.covariates
+    assert {o: p.text for o, p in found.priors.items()} == {
+        o: p.text for o, p in case.priors.items()
+    }
+    for was, now in ((case.lab, found.lab), (case.field, found.field),
+                     (case.new_conditions, found.new_conditions)):  # fmt: skip
+        assert set(now) == set(was)
+        for column in was:
+            np.testing.assert_allclose(now[column], was[column], rtol=1e-9)
+
+
+def test_without_declared_columns_and_priors_none_are_read(made, tmp_path):
+    case = make_case("force_offset")
+    data = campaigns(case)
+    fit = fit_of(data, Hypothesis("none"), made.lab_mode)
+    save_corrected(Corrected(Mixture(data, (fit,), (1.0,), 1), made.lab_mode), tmp_path)
+    assert sorted(p.name for p in (tmp_path / "case").iterdir()) == [
+        "case.toml", "field.csv", "lab.csv",
+    ]  # fmt: skip
+    found = load_corrected(tmp_path)
+    assert found.data.case.new_conditions is None
+    assert (dict(found.data.case.priors), dict(found.data.case.covariates)) == ({}, {})
+    assert found.causes == ()
+
+
+def test_causes_are_those_of_any_hypothesis(made):
+    assert made.causes == ("rate_effect", "sensor_drift", "parameter_shift", "unknown")
+
+
+@pytest.mark.parametrize(
+    ("probability", "faults"),
+    [
+        ((0.5, 0.5), ["sensor_drift"]), ((0.25, 0.75), []), ((0.49, 0.51), []),
+        ((0.125, 0.375, 0.375, 0.125), ["sensor_drift"]), ((0.3, 0.3, 0.19, 0.21), []),
+    ],
+)  # fmt: skip
+def test_a_fault_is_as_probable_as_not_over_all_hypotheses(made, probability, faults):
+    """Of what acts in the first and the third; an effect of the soil is no fault."""
+    first, other, *_ = made.mixture.fits
+    fits = (first, other, first, other)[: len(probability)]
+    assert Corrected(Mixture(made.data, fits, probability, 1), made.lab_mode).faults == faults
+
+
+def damaged(folder, change):
+    path = folder / "corrected.json"
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c["fits"][0].update(covariance=c["fits"][0]["covariance"][:-1]),
+        lambda c: c["fits"][1].update(covariance=[r[:-1] for r in c["fits"][1]["covariance"]]),
+        lambda c: c["fits"][0].update(sample=[r[:-1] for r in c["fits"][0]["sample"]]),
+        lambda c: c["fits"][1].update(psi=c["fits"][1]["psi"][:-1]),
+        lambda c: c.update(schema="calib/corrected/4"),
+        lambda c: c["fits"][2].pop("smooth_over"),
+        lambda c: c["fits"][2].update(probability=None),
+    ],
+)
+def test_whatever_is_damaged_is_noticed(kept, change):
+    damaged(kept, change)
+    with pytest.raises(CalibError, match="no readable corrected model"):
+        load_corrected(kept)
+
+
+@pytest.mark.parametrize(("moved", "refused"), [(0.9e-4, False), (1.2e-4, True), (-1.2e-4, True)])
+@pytest.mark.parametrize("output", SIGMA)
+def test_it_must_predict_as_when_it_was_saved(kept, output, moved, refused):
+    """To a ten-thousandth of the noise, everywhere."""
+
+    def change(content):
+        content["fits"][3]["field"][output][5] += moved * SIGMA[output]
+
+    damaged(kept, change)
+    told = pytest.raises(CalibError, match=f"no longer predicts the {output}")
+    with told if refused else nullcontext():
+        load_corrected(kept)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.1])
+def test_what_the_coordinates_of_a_shift_mean_is_the_files(kept, factor):
+    """Not what the priors shipped say now: another meaning predicts otherwise."""
+
+    def change(content):
+        found = content["fits"][1]["shift_map"]
+        found["radius_error"] = [factor * x for x in found["radius_error"]]
+
+    damaged(kept, change)
+    told = pytest.raises(CalibError, match="no longer predicts")
+    with told if factor > 1.0 else nullcontext():
+        load_corrected(kept)
+
+
+def test_where_it_had_no_value_it_may_have_none_again(made, tmp_path):
+    """As of a simulator that is asked far outside what it is made for."""
+    fit = fit_of(made.data, Hypothesis("none"), made.lab_mode)
+    psi = fit.psi.copy()
+    psi[fit.forward.theta_slices["rut_depth"]] = np.nan
+    nowhere = Mixture(made.data, (replace(fit, psi=psi),), (1.0,), 1)
+    save_corrected(Corrected(nowhere, made.lab_mode), tmp_path)
+    (again,) = load_corrected(tmp_path).mixture.fits
+    np.testing.assert_array_equal(again.psi, psi)
+
+
+def test_numbers_are_short(kept):
+    fit = json.loads((kept / "corrected.json").read_text())["fits"][0]
+    for value in [*fit["sample"][0], *fit["field"]["drawbar_pull"]]:
+        assert value == float(f"{value:.12g}")
+
+
+def test_a_drift_is_predicted_as_at_the_end_of_the_campaign(made):
+    field = made.data.case.field
+    without = table_from_arrays({k: v for k, v in field.columns.items() if k in CONDITIONS})
+    without = replace(widened(without), ignored=("operator", "tyre_temperature_c"))
+    bare = replace(made.data.case, covariates={})
+    corrected = Corrected(replace(made.mixture, data=campaigns(bare)), made.lab_mode)
+    at = {
+        order: predict_columns(corrected, replace(without, columns={
+            **without.columns, **({} if order is None else {"run_order": np.full(27, order)}),
+        }))
+        for order in (None, 26.0, 3.0)
+    }  # fmt: skip
+    pull = {order: columns["drawbar_pull_kn_after"] for order, columns in at.items()}
+    np.testing.assert_allclose(pull[None], pull[26.0], rtol=1e-12)
+    assert not np.allclose(pull[None], pull[3.0])
+    assert "run_order" not in at[None]
+
+
+CONDITIONS = ("slip_ratio", "inflation_pressure_psi", "average_ground_pressure_kpa",
+              "normal_load_kn", "speed_m_s", "pass_number")  # fmt: skip
+
+
+def test_a_prediction_is_laid_out_by_output(made):
+    """Conditions as they are given, categories by name, then each output's four columns."""
+    case = made.data.case
+    field = case.field
+    words = tuple((OPERATORS[int(c)], f"{t!r}") for c, t in zip(
+        field["operator"], field["tyre_temperature_c"].tolist(), strict=True))  # fmt: skip
+    typed = replace(field, header=("operator", "tyre_temperature_c"), text=words)
+    found = predict_columns(made, typed)
+    of_outputs = [
+        f"{column}_{part}"
+        for column in ("drawbar_pull_kn", "rut_depth_mm")
+        for part in ("before", "after", "after_lower", "after_upper")
+    ]
+    names = [n for n in field if n not in OUTPUTS.values()]
+    assert list(found) == [*names, *of_outputs]
+    assert found["operator"] == [w for w, _ in words]
+    truth = made.mixture.at(made.data.at_conditions(field.columns))
+    for o in made.data.outputs:
+        column, bound = OUTPUTS[o.name], o.problem.bound
+        theta = o.priors.to_natural(made.lab_mode[o.name][None])
+        before = bound.predict(theta, bound.model.select(field.columns))[0]
+        np.testing.assert_allclose(found[f"{column}_before"], before, rtol=1e-12)
+        np.testing.assert_allclose(
+            found[f"{column}_after"], truth.mean(truth.truth[o.name]), rtol=1e-12
+        )
+        for end, q in (("lower", 0.05), ("upper", 0.95)):
+            np.testing.assert_allclose(
+                found[f"{column}_after_{end}"], truth.quantile(truth.measured[o.name], q)
+            )
+
+
+def test_conditions_outside_are_of_numbers_that_are_given(made):
+    """Neither outputs nor categories; of what the table has."""
+    field = made.data.case.field
+    n = len(field)
+    text = tuple(("Berg", f"{t!r}") for t in np.r_[99.0, -5.0, np.full(n - 2, 20.0)].tolist())
+    columns = {
+        "slip_ratio": np.r_[0.9, np.full(n - 1, 0.3)], "drawbar_pull_kn": np.full(n, 80.0),
+        "speed_m_s": np.r_[0.3, 50.0, 0.001, np.full(n - 3, 0.3)],
+    }  # fmt: skip
+    table = replace(field, columns=columns, header=("operator", "tyre_temperature_c"), text=text)
+    assert conditions_outside(made, table) == {
+        "slip_ratio": 1, "speed_m_s": 2, "tyre_temperature_c": 2,
+    }  # fmt: skip
 
 
 def test_missing_covariates_are_named(saved):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.gap.case import campaigns
-from calib.gap.covariates import Covariates
+from calib.gap.covariates import Covariates, columns_over, other_conditions
 from tests.gap.cases import PULL_ONLY, make_case, table_without
 
 
@@ -31,8 +31,10 @@ def test_speeds_are_even_in_ratios():
 
 def test_far_beyond_both_campaigns_it_ends():
     data = campaigns(make_case(models=PULL_ONLY))
-    view = replace(data.view, conditions={**data.view.conditions, "slip_ratio": np.full(27, 9.0)})
-    np.testing.assert_array_equal(Covariates(data).scaled(view, "slip_ratio"), 1.5)
+    for slip, end in ((9.0, 1.5), (-9.0, -1.5)):
+        beyond = {**data.view.conditions, "slip_ratio": np.full(27, slip)}
+        view = replace(data.view, conditions=beyond)
+        np.testing.assert_array_equal(Covariates(data).scaled(view, "slip_ratio"), end)
 
 
 @pytest.mark.parametrize("name", ["speed_m_s", "no_such_column"])
@@ -70,3 +72,54 @@ def test_each_view_has_its_own_values_on_the_scale():
         both = np.concatenate([data.case.lab["slip_ratio"], slip])
         np.testing.assert_allclose(found - field, 2.0 * shift / np.ptp(both), rtol=1e-9)
         np.testing.assert_array_equal(covariates.scaled(data.view, "slip_ratio"), field)
+
+
+@pytest.mark.parametrize(
+    ("values", "varies"),
+    [
+        # By a part in 10^9 of its size, ...
+        ([1e6, 1e6 + 0.9e-3], False),
+        ([1e6, 1e6 + 1.1e-3], True),
+        ([-1e6, -1e6 - 0.9e-3], False),
+        ([-1e6, -1e6 - 1.1e-3], True),
+        # ... or by 10^-9 where it is less than one.
+        ([0.0, 0.9e-9], False),
+        ([0.0, 1e-9], True),
+        ([0.5, 0.5 + 1.5e-9], True),
+    ],
+)
+def test_what_differs_by_rounding_alone_is_constant(values, varies):
+    data = campaigns(make_case(models=PULL_ONLY))
+    columns = {**data.view.conditions, "tyre_temperature_c": np.resize(values, 27)}
+    scaled = Covariates(replace(data, view=replace(data.view, conditions=columns)))
+    found = scaled.over(scaled.data.view, "tyre_temperature_c")
+    if not varies:
+        assert found is None
+    else:
+        up = np.sign(values[1] - values[0])
+        # The values differ by so little that their own rounding shows.
+        np.testing.assert_allclose(found, np.resize([-up, up], 27), rtol=1e-6)
+
+
+def test_what_other_conditions_are_recorded():
+    """Neither an output, nor how runs are counted, nor what a discrepancy knows by itself."""
+    data = campaigns(make_case())
+    assert other_conditions(data.view) == ()
+    more = ("tyre_width_m", "contact_length_mm", "tyre_temperature_c", "cone_index_kpa",
+            "volumetric_water_content", "repeat")  # fmt: skip
+    view = replace(data.view, conditions=dict.fromkeys(more, np.ones(27)) | data.view.conditions)
+    assert other_conditions(view) == ("tyre_width", "contact_length")
+
+
+@pytest.mark.parametrize(
+    ("what", "columns"),
+    [
+        ("water", ("gravimetric_water_content", "volumetric_water_content")),
+        ("pressure", ("inflation_pressure_psi", "average_ground_pressure_kpa")),
+        ("low_pressure", ("inflation_pressure_psi",)),
+        ("slip", ("slip_ratio",)),
+        ("tyre_temperature_c", ("tyre_temperature_c",)),
+    ],
+)
+def test_what_something_may_vary_with_has_its_columns(what, columns):
+    assert columns_over(what) == columns

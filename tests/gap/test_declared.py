@@ -9,11 +9,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.data import read_table
+from calib.data import Table, read_table
 from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.corrected import load_corrected, predict_columns, save_corrected
-from calib.gap.declared import new_values, words_of
+from calib.gap.declared import cells, declared_covariates, new_values, with_declared, words_of
 from calib.gap.diagnose import diagnose_once
 from calib.gap.effects import EFFECTS
 from calib.gap.files import document
@@ -143,6 +143,21 @@ def test_values_of_the_field_alone_are_named(tmp_path):
     assert said.startswith("operator: Dahl in the field only")
 
 
+def test_a_value_of_the_conditions_to_predict_is_a_value(tmp_path):
+    folder = case_with(tmp_path / "case", "operator", operators, operators, '"category"')
+    fresh = "slip_ratio,operator\n0.1,Lind\n0.2,Ahl\n"
+    (folder / "fresh.csv").write_text(fresh)
+    toml = (folder / "case.toml").read_text()
+    (folder / "case.toml").write_text('predict = "fresh.csv"\n' + toml)
+    case = read_case(folder)
+    assert case.covariates == {"operator": ("Ahl", "Berg", "Dahl", "Lind")}
+    assert case.new_conditions["operator"].tolist() == [3.0, 0.0]
+    (folder / "fresh.csv").write_text(fresh.replace("operator", "driver"))
+    with pytest.raises(CalibError, match="there is no column 'operator'") as refused:
+        read_case(folder)
+    assert "fresh.csv" in refused.value.where
+
+
 @pytest.mark.parametrize(
     ("name", "kind", "said"),
     [
@@ -158,6 +173,80 @@ def test_what_is_declared_wrongly_is_refused(tmp_path, name, kind, said):
     (folder / "case.toml").write_text(text.replace('operator = "category"', f"{name} = {kind}"))
     with pytest.raises(CalibError, match=said):
         read_case(folder)
+
+
+def typed(**columns) -> Table:
+    """Return a table of cells as they were typed, which the reader did not know."""
+    header, text = tuple(columns), tuple(zip(*columns.values(), strict=True))
+    return Table({}, "made.csv", np.arange(len(text)) + 2, header, text, "", ignored=header)
+
+
+@pytest.mark.parametrize(("n", "refused"), [(1, True), (2, False), (12, False), (13, True)])
+def test_a_category_has_from_two_to_twelve_values(n, refused):
+    words = [f"w{i:02d}" for i in range(n)]
+    tables = (typed(operator=words), typed(operator=[" w00 "]))
+    if refused:
+        with pytest.raises(CalibError, match=f"operator has {n} different values"):
+            declared_covariates({"operator": "category"}, tables)
+        with pytest.raises(CalibError, match=f"operator has {n} different values"):
+            declared_covariates({"operator": words}, tables)
+    else:
+        assert declared_covariates({"operator": "category"}, tables) == {"operator": tuple(words)}
+        given = words[::-1]
+        assert declared_covariates({"operator": given}, tables) == {"operator": tuple(given)}
+
+
+@pytest.mark.parametrize("name", ["speed_m_s", "speed_km_h", "speed_furlongs"])
+def test_a_known_quantity_is_declared_by_its_name_alone(name):
+    """In whatever unit, even one that nobody knows."""
+    with pytest.raises(CalibError, match=f"{name} is a quantity that is known"):
+        declared_covariates({name: "number"}, (typed(**{name: ["1"]}),))
+
+
+DECLARED = {"operator": ("Lind", "Berg", "Dahl"), "tyre_temperature_c": ()}
+
+
+def test_declared_columns_are_added_to_the_table():
+    """Categories as their places in the list, numbers as they are; others stay ignored."""
+    table = typed(
+        tyre_temperature_c=[" 21.5", "-3", "1e1"], weather=["dry"] * 3,
+        operator=["Berg", "Lind ", "Dahl"],
+    )  # fmt: skip
+    found = with_declared(table, DECLARED)
+    assert found["operator"].tolist() == [1.0, 0.0, 2.0]
+    assert found["tyre_temperature_c"].tolist() == [21.5, -3.0, 10.0]
+    assert found.ignored == ("weather",)
+    assert with_declared(table, {}) is table
+    assert cells(found.columns, DECLARED)["operator"] == ["Berg", "Lind", "Dahl"]
+    np.testing.assert_array_equal(
+        cells(found.columns, DECLARED)["tyre_temperature_c"], [21.5, -3.0, 10.0]
+    )
+
+
+@pytest.mark.parametrize("cell", ["", "warm", "nan", "inf", "-inf", "1,5"])
+def test_a_number_is_a_finite_one(cell):
+    table = typed(tyre_temperature_c=["20", cell, "21"])
+    with pytest.raises(CalibError, match=r"made\.csv, line 3"):
+        with_declared(table, {"tyre_temperature_c": ()})
+
+
+def test_a_table_too_long_to_keep_its_cells_has_no_categories():
+    table = replace(typed(operator=["Lind", "Berg"]), text=())
+    with pytest.raises(CalibError, match=r"made\.csv has 2 rows"):
+        with_declared(table, {"operator": ("Berg", "Lind")})
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "words"),
+    [
+        (0.0, 0.0, "Lind"), (1.0, 1.0, "Berg"), (2.0, 2.0, "Dahl"), (0.0, 1.0, "Lind, Berg"),
+        (0.6, 2.4, "Berg, Dahl"), (0.0, 2.0, "Lind, Berg, Dahl"),
+    ],
+)  # fmt: skip
+def test_values_between_two_places_are_said_in_words(low, high, words):
+    assert words_of(DECLARED, "operator", low, high) == words
+    assert words_of(DECLARED, "tyre_temperature_c", low, high) == ""
+    assert words_of(DECLARED, "speed_m_s", low, high) == ""
 
 
 def test_a_column_that_is_not_there_is_refused(tmp_path):

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.gap.case import Campaigns
+from calib.gap.case import Campaigns, campaigns
 from calib.gap.discrepancy import Discrepancy
 from calib.gap.hypothesis import Hypothesis
-from tests.gap.cases import campaigns_of
+from tests.gap.cases import campaigns_of, make_case
 
 PULL = ("drawbar_pull",)
 
@@ -184,6 +184,51 @@ def written_level(found: Discrepancy, view) -> np.ndarray:
         o.problem.bound.location(theta, select(v.conditions))[0] for v in (view, found.data.view)
     )
     return np.clip(2.0 * (at - reference.min()) / np.ptp(reference) - 1.0, -1.5, 1.5)
+
+
+def test_a_run_keeps_one_part_of_the_run_before(data):
+    np.testing.assert_array_equal(of(data, smooth_over="before").sds("drawbar_pull"), [1.0])
+
+
+@pytest.mark.parametrize("over", ["slip", "pressure", "all"])
+def test_of_many_pressures_a_few_waves_are_told_apart(over):
+    """By themselves six at most, beside slip one, beside every condition two."""
+    case = make_case()
+    psi = np.resize(np.linspace(18.0, 42.0, 9), 27)
+    field = replace(case.field, columns={**case.field.columns, "inflation_pressure_psi": psi})
+    found = of(campaigns(replace(case, field=field)), smooth_over=over, smooth_decay=DECAY)
+    view = found.data.view
+    terms = written_again(found, view, over)
+    sds = found.sds("drawbar_pull")
+    np.testing.assert_allclose(sds, [w for _, w in terms])
+    basis = found.at(np.eye(sds.size), np.empty(0), view, "drawbar_pull")
+    np.testing.assert_allclose(basis, [b for b, _ in terms], atol=1e-12)
+
+
+@pytest.mark.parametrize(("factor", "level"), [(1e-3, -1.5), (1e3, 1.5)])
+def test_far_beyond_the_fields_range_the_level_ends(data, factor, level):
+    found = of(data, smooth_over="sinkage")
+    ground = factor * data.view.conditions["average_ground_pressure_kpa"]
+    view = replace(
+        data.view, conditions={**data.view.conditions, "average_ground_pressure_kpa": ground}
+    )
+    np.testing.assert_array_equal(found._level(view, "rut_depth"), level)
+
+
+@pytest.mark.parametrize(("over", "output"), [("level", "drawbar_pull"), ("sinkage", "rut_depth")])
+def test_it_may_set_in_over_what_is_predicted(data, over, output):
+    """Over the output itself, or over the rut that goes with it: on the scale of the field's."""
+    found = of(data, onset_over=over)
+    u = found.onset_covariate(data.view, "drawbar_pull")
+    np.testing.assert_allclose([u.min(), u.max()], [-1.0, 1.0])
+    predicted = found._predicted(data.view, output)
+    np.testing.assert_allclose(u, 2.0 * (predicted - predicted.min()) / np.ptp(predicted) - 1.0)
+
+
+def test_a_sudden_one_needs_something_to_set_in_over(data):
+    found = of(data, onset_over="cone")
+    with pytest.raises(ValueError, match="cone"):
+        found.onset_covariate(data.view, "drawbar_pull")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.data.quantities import role_of
-from calib.gap.effects import EFFECTS, View
+from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.effects.base import saturating
 from calib.gap.effects.dependence import DependsOn
 from calib.inference.prior_files import default_priors, read_priors
@@ -340,6 +340,55 @@ def test_reasons_why_an_effect_cannot_be_tested(view):
     assert EFFECTS["load_transfer"].not_testable(view, ("sinkage",)) == "no drawbar_pull output"
     for effect in EFFECTS.values():
         assert effect.not_testable(view, OUTPUTS) is None
+
+
+def test_in_a_campaign_as_the_laboratorys_some_effects_can_be_seen(view):
+    """A covariate that nobody varied shows nothing, but a gauge may be wrong at any reading."""
+    alike = {column: np.full(20, values[0]) for column, values in view.conditions.items()}
+    same = replace(view, conditions=alike, lab={c: float(v[0]) for c, v in alike.items()})
+    hidden = {
+        name: reason
+        for name, effect in EFFECTS.items()
+        if (reason := effect.not_testable(same, OUTPUTS)) is not None
+    }
+    assert set(hidden) == {
+        "sensor_drift", "sensor_step", "multipass_compaction", "rate_effect",
+        "moisture_softening", "lug_thrust", "slip_sinkage", "rut_rebound", "post_peak_softening",
+    }  # fmt: skip
+    for name, reason in hidden.items():
+        column = view.column(EFFECTS[name].covariates[0])
+        assert reason == f"{column} is the same in every row, as in the calibration"
+    # To a millionth of it, or where the laboratory did not record it.
+    near = {c: v * np.resize([1.0, 1.0 + 9e-7], 20) for c, v in alike.items()}
+    unknown = replace(same, conditions=near, lab={})
+    assert all(EFFECTS[name].not_testable(unknown, OUTPUTS) for name in hidden)
+    apart = {c: v * np.resize([1.0, 1.0 + 2e-6], 20) + 1e-11 for c, v in alike.items()}
+    for name in hidden:
+        told = EFFECTS[name].not_testable(replace(same, conditions=apart), OUTPUTS)
+        assert told is None
+
+
+def test_instruments_are_told_from_wheel_and_soil():
+    """Of an instrument's fault what is predicted is the reading, and it can be mended."""
+    assert {name for name, effect in EFFECTS.items() if effect.instrument} == {
+        "slip_zero_shift", "force_offset", "sensor_drift", "sensor_step", "pressure_gauge_bias",
+        "cone_index_bias", "water_content_bias",
+    }  # fmt: skip
+
+
+def test_an_effect_of_which_nothing_is_said_does_nothing(view):
+    class Idle(Effect):
+        name = "idle"
+        outputs = ("pull",)
+
+    effect, phi, location = Idle(), np.ones((K, 2)), np.ones((K, 20))
+    given = by_role(view)
+    assert effect.on_conditions(phi, "pull", given, view) is given
+    assert effect.on_output(phi, "pull", location, view) is location
+    assert effect.begun(phi, {"pull": np.ones(20)}, view) is phi
+    assert effect.shape(view) is None
+    assert effect.not_testable(view, ("pull",)) is None
+    assert not effect.instrument
 
 
 def test_signs_hold_with_the_simulators_own_curves():

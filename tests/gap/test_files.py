@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,14 @@ import pytest
 from calib.data import read_table
 from calib.gap.case import read_case
 from calib.gap.diagnose import diagnose
-from calib.gap.files import document, write_diagnosis
+from calib.gap.effects import EFFECTS
+from calib.gap.files import _parameters, document, write_diagnosis
+from calib.gap.fit import Fit
+from calib.gap.forward import Forward
+from calib.gap.hypothesis import Hypothesis
+from calib.gap.next_measurement import NextMeasurement
+from calib.gap.where import Region
+from calib.inference.priors import Prior, Priors
 from tests.gap.cases import CHOICE, diagnosis_of, make_case, pull_diagnosis, write_case
 
 
@@ -122,8 +130,6 @@ def test_conditions_are_copied_as_they_were_written(tmp_path):
     (folder / "fresh.csv").write_text("run_order,slip_percent\n0,10.50\n1,20\n")
     toml = (folder / "case.toml").read_text()
     (folder / "case.toml").write_text('predict = "fresh.csv"\n' + toml)
-    from calib.gap.effects import EFFECTS
-
     found = diagnose(read_case(folder), effects={"force_offset": EFFECTS["force_offset"]})
     out = tmp_path / "out"
     out.mkdir()
@@ -139,6 +145,92 @@ def test_without_conditions_to_predict_there_is_no_prediction(tmp_path):
     write_diagnosis(pull_diagnosis(None), tmp_path)
     assert (tmp_path / "diagnosis.json").exists()
     assert not (tmp_path / "fresh_prediction.csv").exists()
+
+
+def test_every_number_is_the_one_that_was_found():
+    found = diagnosis_of("sensor_drift")
+    d, ranking = document(found), found.ranking
+    assert [e["name"] for e in d["effects"]] == ranking.order
+    assert {e["name"]: e["probability"] for e in d["effects"]} == dict(ranking.probability)
+    assert d["where"] == [
+        {
+            "output": g.output, "row": int(g.rows[i]), "gap": g.gap[i], "gap_sd": g.sd[i],
+            "probability": g.probability[i],
+        }
+        for g in found.gaps for i in range(g.rows.size)
+    ]  # fmt: skip
+    for name, s in found.shrink.items():
+        assert d["shrink"][name] == {
+            "rmse_before": s.rmse_before, "rmse_after": s.rmse_after, "fraction": s.fraction,
+            "interval": list(s.interval), "noise_floor": s.noise_floor,
+        }  # fmt: skip
+    assert d["shrink"]
+    for name, cause in [*found.inclusion.causes.items(), ("", found.inclusion.remainder)]:
+        part = d["inclusion"].get(name, d["remainder"])
+        told = (part["probability"], part["share"], tuple(part["share_interval"]))
+        assert told == (cause.probability, cause.share, cause.share_interval)
+    assert [(n["name"], n["reason"]) for n in d["not_testable"]] == [*ranking.not_testable.items()]
+
+
+def test_conditions_are_told_by_ends_or_by_the_name_of_a_category():
+    """Of regions, of what is left, and of what to measure next; a zero is a number, too."""
+    found = diagnosis_of("sensor_drift")
+    case = replace(found.data.case, covariates={"operator": ("Berg", "Lind"), "warmth": ()})
+    regions = tuple(
+        Region("rut_depth", {name: ends}, 1.5, (1.0, 2.0), 0.9)
+        for name, ends in (
+            ("operator", (1.0, 1.0)), ("warmth", (0.0, 8.0)), ("slip_ratio", (0.2, 0.4)),
+        )
+    )  # fmt: skip
+    told = document(replace(
+        found, data=replace(found.data, case=case), regions=regions,
+        inclusion=replace(found.inclusion, where=regions[::-1]),
+        next_measurements=(NextMeasurement(
+            ("none", "unknown"), {"operator": 0.0, "warmth": 0.0, "slip_ratio": 0.3}, 1.25
+        ),),
+    ))  # fmt: skip
+    conditions = [{"operator": ["Lind"]}, {"warmth": [0.0, 8.0]}, {"slip_ratio": [0.2, 0.4]}]
+    assert told["regions"] == [
+        {"output": "rut_depth", "conditions": c, "gap": 1.5, "probability": 0.9} for c in conditions
+    ]
+    assert told["remainder"]["where"] == [
+        {"output": "rut_depth", "conditions": c} for c in conditions[::-1]
+    ]
+    assert told["next_measurement"] == [{
+        "separates": ["none", "unknown"], "gain_nats": 1.25,
+        "conditions": {"operator": "Berg", "warmth": 0.0, "slip_ratio": 0.3},
+    }]  # fmt: skip
+
+
+def test_parameters_are_told_in_their_own_units():
+    """A positive one's sd is that of its logarithm times its value; a fixed one has none."""
+    data = diagnosis_of("sensor_drift").data
+    entries = (
+        Prior("offset", "kN", "", "", "", False, 0.1, 0.2),
+        Prior("held", "1", "", "", "", False, 0.7, 0.0),
+        Prior("scale", "1", "", "", "", True, np.log(0.3), 0.4),
+    )
+    one = Hypothesis("force_offset", (EFFECTS["force_offset"],), (Priors(entries),))
+    two = replace(
+        one, effects=(*one.effects, EFFECTS["rate_effect"]),
+        effect_priors=(*one.effect_priors, Priors(entries[:1])),
+    )  # fmt: skip
+    for h in (one, two):
+        forward = Forward(data, h, dict.fromkeys(data.names, 0.1))
+        psi = np.array([p.loc for p in forward.priors.free])
+        variance = np.arange(1.0, psi.size + 1.0) ** 2
+        fit = Fit(forward, psi, np.diag(variance), {}, 0.0, 0.0, {})
+        sds = [np.sqrt(variance[part]) for part in forward.phi_slices]
+        wanted = {
+            "offset": (0.1, sds[0][0]), "held": (0.7, 0.0), "scale": (0.3, 0.3 * sds[0][1]),
+        }  # fmt: skip
+        if h is two:
+            wanted = {f"force_offset.{name}": value for name, value in wanted.items()}
+            wanted["rate_effect.offset"] = (0.1, sds[1][0])
+        told = _parameters(fit)
+        assert list(told) == list(wanted)
+        for name, (mean, sd) in wanted.items():
+            assert told[name] == pytest.approx({"mean": mean, "sd": sd}, rel=1e-12)
 
 
 def test_a_null_says_none():

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from calib.data.quantities import role_of
+from calib.gap.case import campaigns
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors, pair, shifts, singles, unknowns, with_remainder
 from calib.gap.hypothesis import Hypothesis
+from calib.gap.shifts import shift_map
 from calib.inference.priors import Prior, Priors
-from tests.gap.cases import NOISE, campaigns_of
+from tests.gap.cases import NOISE, campaigns_of, make_case
+from tests.gap.test_hypotheses import density_campaigns
 
 SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}
 
@@ -281,5 +286,242 @@ def test_without_a_cause_the_others_stay(data):
             np.testing.assert_allclose(neither[o], plain[o], rtol=1e-12)
 
 
+def test_a_vector_stacks_the_parts_of_a_hypothesis_in_their_order(data):
+    """Simulators, effects, form errors by output, shifts, a free discrepancy, its threshold."""
+    lugs = single(data, "lug_thrust")
+    h = replace(
+        lugs, shift=0.25, smooth=3.0, smooth_outputs=("drawbar_pull",), smooth_over="passes"
+    )
+    lab_mode = {o.name: centre_of(o) for o in data.outputs}
+    forward = Forward(data, h, SIGMA, lab_mode)
+    _, sds = shift_map(data.outputs, "alone")
+    wanted = [(f"{o.name}.{p.name}", p.loc, p.scale) for o in data.outputs for p in o.priors.free]
+    assert forward.n_shared == len(wanted) == 13
+    wanted += [(f"lug_thrust.{p.name}", p.loc, p.scale) for p in lugs.effect_priors[0].free]
+    forms = (0.15, 0.1, 0.13)
+    wanted += [(f"{o}.lug_thrust.form", 0.0, sd) for o in data.names for sd in forms]
+    wanted += [("field.shift", 0.0, 0.25 * sd) for sd in sds]
+    # A constant, three cosines that tell four passes apart, and as many for a part of the pull.
+    waves = [0.8 / (1.0 + (j / 4.0) ** 2) for j in (1, 2, 3)]
+    sizes = [1.0, *waves, 0.5, *(0.6 * w for w in waves)]
+    wanted += [("drawbar_pull.smooth", 0.0, 3.0 * 0.03 * w) for w in sizes]
+    found = [(p.name, p.loc, p.scale) for p in forward.priors.entries]
+    assert [name for name, *_ in found] == [name for name, *_ in wanted]
+    for one, other in zip(found, wanted, strict=True):
+        assert one[1:] == pytest.approx(other[1:], rel=1e-12)
+    assert not any(p.log for p in forward.priors.entries if p.name.endswith(("form", "smooth")))
+    assert forward.n_dim == len(wanted)
+    parts = [
+        *forward.theta_slices.values(), *forward.phi_slices,
+        *(part for parts in forward.form_slices.values() for part in parts),
+        forward.shift_slice, *forward.smooth_slices.values(),
+    ]  # fmt: skip
+    assert np.concatenate([np.arange(forward.n_dim)[part] for part in parts]).tolist() == list(
+        range(forward.n_dim)
+    )
+
+
+def test_a_threshold_lies_within_the_campaign(data):
+    """On a scale of -1..1, with some rows on both of its sides."""
+    h = Hypothesis("unknown", smooth=4.0, smooth_outputs=("drawbar_pull",), onset_over="slip")
+    forward = Forward(data, h, SIGMA)
+    step, bend, threshold = forward.priors.entries[-3:]
+    assert (step.scale, bend.scale) == pytest.approx((4.0 * 0.03, 4.0 * 0.03 * 2.0))
+    assert (threshold.lower, threshold.upper) == (-0.85, 0.9)
+    assert threshold.loc == pytest.approx(0.025)
+    assert not np.isfinite(threshold.scale)
+    assert not threshold.log
+    assert forward.threshold == forward.n_dim - 1
+    psi = centre(forward, 3)
+    psi[:, -3:] = [[0.1, -0.2, -0.4], [0.0, 0.3, 0.0], [0.2, 0.1, 0.6]]
+    gap = (forward.field(psi, data.view)["drawbar_pull"]
+           - forward.simulator(psi, data.view)["drawbar_pull"])  # fmt: skip
+    u = (forward.covariates.over(data.view, "slip") - psi[:, -1:]) / 0.06
+    step, bend = 1.0 / (1.0 + np.exp(-u)), 0.06 * np.logaddexp(0.0, u)
+    np.testing.assert_allclose(gap, psi[:, -3:-2] * step + psi[:, -2:-1] * bend, atol=1e-12)
+
+
+def test_of_density_a_simulator_is_inadequate_and_gauges_errors_have_forms():
+    """Bends by the noise at the ends of the lab's range; sizes, cone index and water."""
+    density = campaigns(density_campaigns())
+    h = pair(single(density, "cone_index_bias"), single(density, "water_content_bias"))
+    forward = Forward(density, h, {"bulk_density": 0.02})
+    entries = {p.name: [] for p in forward.priors.entries}
+    for p in forward.priors.entries:
+        entries[p.name].append((p.loc, p.scale))
+    assert entries["bulk_density.misfit"] == [(0.0, 0.02)] * 3
+    assert forward.n_shared == len(density.outputs[0].priors.free) + 3
+    for name in ("cone_index_bias", "water_content_bias"):
+        forms = entries[f"bulk_density.{name}.form"]
+        assert forms == [(0.0, 0.2), (0.0, 0.15), (0.0, 0.1)]
+    # What the form errors multiply: one, cone index and water content on a scale of -1..1.
+    over = [forward.covariates.over(density.view, what) for what in ("cone", "water")]
+    for basis in forward._form(density.view):
+        np.testing.assert_array_equal(basis, np.stack([np.ones(36), *over], axis=1))
+
+
+def test_an_emulators_error_is_standard_normal(data):
+    """Beside the inadequacy, of every simulator that has one."""
+    simulated = {name: copy(s) for name, s in data.simulated.items()}
+    simulated["rut_depth"].n_errors = 2
+    emulated = replace(data)
+    emulated.__dict__["simulated"] = simulated
+    forward = Forward(emulated, Hypothesis("none"), SIGMA)
+    found = [(p.name, p.loc, p.scale) for p in forward.priors.entries[forward.n_shared - 2 :]]
+    assert found == [("rut_depth.emulator", 0.0, 1.0)] * 2
+
+
+def test_lab_field_and_simulator_are_the_same_in_one_call_or_two(data):
+    lab_mode = {o.name: centre_of(o) for o in data.outputs}
+    for h in (
+        Hypothesis("none"), single(data, "slip_zero_shift"), shifts(data)[0], unknowns(data)[0],
+    ):  # fmt: skip
+        forward = Forward(data, h, SIGMA, lab_mode)
+        psi = centre(forward)
+        psi += 0.05 * np.random.default_rng(4).standard_normal(psi.shape)
+        lab, field = forward.lab(psi), forward.field(psi, data.view)
+        plain = forward.simulator(psi, data.view)
+        found = (*forward.campaigns(psi), *forward.field_and_plain(psi, data.view))
+        for one, other in zip((*found, *forward.plain(psi)), (lab, field, field, plain, lab, plain),
+                              strict=True):  # fmt: skip
+            assert set(one) == set(data.names)
+            for o in data.names:
+                np.testing.assert_allclose(one[o], other[o], rtol=1e-12)
+        if h.name != "none":
+            assert not np.allclose(field["drawbar_pull"], plain["drawbar_pull"], rtol=1e-4)
+
+
+@pytest.mark.parametrize("shift_as", ["alone", "soil"])
+def test_a_shift_moves_the_parameters_and_the_zero_of_slip(data, shift_as):
+    h = Hypothesis("parameter_shift", shift=0.25, shift_as=shift_as)
+    forward = Forward(data, h, SIGMA)
+    psi = centre(forward, 3)
+    shift = 0.4 * np.random.default_rng(6).standard_normal((3, len(psi.T) - forward.n_shared))
+    psi[:, forward.shift_slice] = shift
+    found = forward.field(psi, data.view)
+    error = (shift @ forward.shift.radius_error)[:, None]
+    assert np.abs(error).max() > 1e-3
+    for o in data.outputs:
+        t = psi[:, forward.theta_slices[o.name]] + shift @ forward.shift.parameters[o.name].T
+        conditions = o.problem.bound.model.select(data.view.conditions)
+        slip = conditions["slip_ratio"]
+        truly = conditions | {"slip_ratio": 1.0 - (1.0 - slip) * (1.0 - error)}
+        expected = o.problem.bound.location(o.priors.to_natural(t), truly)
+        np.testing.assert_allclose(found[o.name], expected, rtol=1e-12)
+
+
+def test_what_knows_no_slip_does_not_mind_where_its_zero_is():
+    """A rut by plain Bekker, beside a pull that shows another zero of slip."""
+    case = make_case(models={"drawbar_pull": "magic_formula", "rut_depth": "bekker"})
+    both = campaigns(case)
+    forward = Forward(both, Hypothesis("parameter_shift", shift=0.25), SIGMA)
+    psi = centre(forward)
+    zero = forward.shift_slice.start + int(np.argmax(forward.shift.radius_error))
+    psi[:, zero] = 1.0
+    found, plain = forward.field(psi, both.view), forward.simulator(psi, both.view)
+    np.testing.assert_array_equal(found["rut_depth"], plain["rut_depth"])
+    assert not np.allclose(found["drawbar_pull"], plain["drawbar_pull"], rtol=1e-3)
+
+
+def test_form_errors_scale_what_each_effect_adds_to_those_before_it(data):
+    """Of conditions first, of the output then: each by its own factor over rows."""
+    names = ("slip_zero_shift", "rate_effect")
+    h = pair(*(single(data, name) for name in names))
+    assert [e.name for e in h.effects] == sorted(names)
+    rate, zero = h.effects
+    forward = Forward(data, h, SIGMA)
+    psi = centre(forward, 3)
+    rng = np.random.default_rng(8)
+    psi[:, forward.n_shared :] += 0.3 * rng.standard_normal((3, forward.n_dim - forward.n_shared))
+    plain, found = forward.simulator(psi, data.view), forward.field(psi, data.view)
+    phi = [
+        p.to_natural(psi[:, part])
+        for p, part in zip(h.effect_priors, forward.phi_slices, strict=True)
+    ]
+    basis = forward._form(data.view)
+    for o in data.outputs:
+        bound, role = o.problem.bound, o.role
+        factor = [
+            1.0 + psi[:, part] @ b.T
+            for part, b in zip(forward.form_slices[o.name], basis, strict=True)
+        ]
+        assert np.abs(factor[0] - 1.0).max() > 0.1
+        assert np.abs(factor[1] - 1.0).max() > 0.1
+        columns = {role_of(c): c for c in bound.model.conditions}
+        given = {known: data.view.conditions[c] for known, c in columns.items()}
+        theta = o.priors.to_natural(psi[:, forward.theta_slices[o.name]])
+
+        def predicted(conditions, bound=bound, theta=theta, columns=columns):
+            return bound.location(theta, {columns[k]: v for k, v in conditions.items()})
+
+        first = rate.on_conditions(phi[0], role, given, data.view)
+        second = zero.on_conditions(phi[1], role, first, data.view)
+        location = plain[o.name] + (predicted(first) - plain[o.name]) * factor[0]
+        location = location + (predicted(second) - predicted(first)) * factor[1]
+        added = rate.on_output(phi[0], role, location, data.view) - location
+        np.testing.assert_allclose(found[o.name], location + added * factor[0], rtol=1e-10)
+
+
+class Along(Effect):
+    """An effect whose form is least certain along what it is given."""
+
+    name = "along"
+    form = ("shape",)
+    outputs = ("pull",)
+
+    def __init__(self, values) -> None:
+        self.values = np.array(values, float)
+
+    def shape(self, view):
+        return np.resize(self.values, view.slip().size)
+
+
+@pytest.mark.parametrize(
+    ("values", "basis"),
+    [
+        ([2.0, 6.0, 5.0], [-1.0, 1.0, 0.5]),
+        ([-6.0, -2.0, -3.0], [-1.0, 1.0, 0.5]),
+        ([0.0, 2e-9], [-1.0, 1.0]),
+        # What is constant to rounding is no covariate.
+        ([0.0, 1e-9], None),
+        ([3.0], None),
+    ],
+)
+def test_along_its_own_covariate_it_is_on_the_fields_scale(data, values, basis):
+    h = Hypothesis("along", (Along(values),), (Priors(()),))
+    forward = Forward(data, h, SIGMA)
+    (found,) = forward._form(data.view)
+    part = forward.form_slices["drawbar_pull"][0]
+    if basis is None:
+        assert found.shape == (27, 0)
+        assert part.stop == part.start
+    else:
+        np.testing.assert_allclose(found[:, 0], np.resize(basis, 27))
+        assert [p.scale for p in forward.priors.entries[part]] == [0.18]
+
+
+def test_beyond_the_field_the_form_of_an_effect_ends(data):
+    class OverSlip(Along):
+        def shape(self, view):
+            return view.slip()
+
+    h = Hypothesis("along", (OverSlip(()),), (Priors(()),))
+    slip = data.view.slip()
+    middle, half = 0.5 * (slip.max() + slip.min()), 0.5 * np.ptp(slip)
+    u = np.array([-9.0, -1.6, -1.4, -1.0, 0.5, 1.4, 1.6, 9.0])
+    elsewhere = data.at_conditions({"slip_ratio": middle + half * u})
+    (found,) = Forward(data, h, SIGMA)._form(elsewhere)
+    np.testing.assert_allclose(found[:, 0], [-1.5, -1.5, -1.4, -1.0, 0.5, 1.4, 1.5, 1.5])
+
+
 def centre_of(output) -> np.ndarray:
     return np.array([p.loc for p in output.priors.free])
+
+
+def test_a_hypothesis_of_which_nothing_is_said_is_the_simulator():
+    """Of a free discrepancy waves fall off from the fourth; it varies with every condition."""
+    said = Hypothesis(
+        "none", effects=(), effect_priors=(), shift=0.0, shift_as="alone", smooth=0.0,
+        smooth_outputs=(), smooth_over="all", smooth_decay=4.0, onset_over=None, share=1.0,
+    )  # fmt: skip
+    assert Hypothesis("none") == said

@@ -63,6 +63,20 @@ def test_a_changed_file_another_seed_or_version_are_refused(diagnosed):
     assert caught.value.mend is not None
 
 
+@pytest.mark.parametrize(("n", "listed"), [
+    (1, "1 of the diagnoses that are there do not say which cases they are of: case-0"),
+    (5, "case-0, case-1, case-2, case-3, case-4"),
+    (6, "case-0, case-1, case-2, case-3, case-4, ..."),
+])  # fmt: skip
+def test_a_few_of_many_are_named(tmp_path, n, listed):
+    cases = [tmp_path / "cases" / f"case-{i}" for i in range(n)]
+    for case in cases:
+        (tmp_path / "out" / case.name).mkdir(parents=True)
+    with pytest.raises(CalibError) as caught:
+        check_resumable(cases, tmp_path / "out", 1)
+    assert str(caught.value).splitlines()[0].endswith(listed)
+
+
 @pytest.mark.parametrize("text", [None, "{", "[]"])
 def test_results_that_do_not_say_what_they_are_of_are_not_resumed(diagnosed, text):
     case, out = diagnosed

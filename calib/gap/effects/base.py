@@ -18,7 +18,7 @@ import numpy as np
 from calib.data.quantities import QUANTITIES, columns_of
 from calib.models.base import Array
 
-__all__ = ["LACKING", "Effect", "View", "saturating"]
+__all__ = ["LACKING", "Effect", "View", "each", "saturating"]
 
 # How the reason begins or ends where an effect is not testable for want of a column.
 LACKING = ("the data lack", "the calibration has no such column")
@@ -78,6 +78,11 @@ class View:
         return (1.0 + np.maximum(self.slip(), 0.0))[None, :]
 
 
+def each(phi: Array) -> Array:
+    """Parameters of draws (k, n_parameters), to be unpacked: columns (k, 1) beside the rows."""
+    return phi.T[:, :, None]
+
+
 def saturating(u: Array, exponent: Array, half_way: Array) -> Array:
     """Growth from 0 at 0 to 1 at 1: a power at first, levelling off beyond `half_way`.
 
@@ -118,7 +123,8 @@ class Effect:
     covariates : tuple of str
         Physical roles of what it needs recorded.
     varies : bool
-        Whether the (first) covariate must vary in the field, or differ from the laboratory's.
+        Whether the (first) covariate, if any, must vary in the field, or differ from the
+        laboratory's.
     form : tuple of {"size", "slip", "pressure", "cone", "water", "shape", "extrapolation"}
         Along what its size may depart from its formula, by the form error of the diagnosis
         (extrapolation: along inflation pressure, to values the simulator was not fitted at);

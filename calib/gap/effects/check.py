@@ -218,7 +218,7 @@ def _call[R](function: Callable[..., R], effect: Effect, *args: Any) -> R:
 
 
 def _meant(name: str, known: Collection[str]) -> str:
-    near = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    near = difflib.get_close_matches(name, known, cutoff=0.5)
     return f"was {near[0]} meant?" if near else "correct the name"
 
 

@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from calib.data.quantities import QUANTITIES, columns_of
-from calib.gap.effects.base import Effect, View
+from calib.gap.effects.base import Effect, View, each
 from calib.models.base import Array
 
 __all__ = ["PREFIX", "DependsOn", "DiffersBy"]
@@ -95,14 +95,13 @@ class DependsOn(Effect):
         if output not in self.logs:
             return location
         u = self.covariate(view)
-        i = 2 * list(self.logs).index(output)
-        change = np.clip(phi[:, i : i + 1] * u + phi[:, i + 1 : i + 2] * u**2, -4.0, 4.0)
+        p = dict(zip(self.parameters, each(phi), strict=True))
+        change = np.clip(p[f"{output}_slope"] * u + p[f"{output}_bend"] * u**2, -4.0, 4.0)
         if self.logs[output]:
             return np.asarray(location + change)
         changed = location * np.exp(change)
         if output in self._additive:
-            j = 2 * len(self.logs) + self._additive.index(output)
-            changed = changed + phi[:, j : j + 1] * u * view.load_kn
+            changed = changed + p[f"{output}_offset"] * u * view.load_kn
         return np.asarray(changed)
 
     def shape(self, view: View) -> Array | None:
@@ -159,13 +158,13 @@ class DiffersBy(Effect):
             return location
         code = np.rint(view.of(self.column)).astype(int)
         hot = np.array([code == j for j in self._levels], dtype=float)
-        size = len(self._levels)
-        start = size * list(self.logs).index(output)
-        change = np.clip(phi[:, start : start + size] @ hot, -4.0, 4.0)
+        # Factors of each output, then offsets of those that have them, of as many values each.
+        kinds = [*(f"{o}_factor" for o in self.logs), *(f"{o}_offset" for o in self._additive)]
+        p = dict(zip(kinds, np.split(phi, len(kinds), axis=1), strict=True))
+        change = np.clip(p[f"{output}_factor"] @ hot, -4.0, 4.0)
         if self.logs[output]:
             return np.asarray(location + change)
         changed = location * np.exp(change)
         if output in self._additive:
-            start = size * (len(self.logs) + self._additive.index(output))
-            changed = changed + phi[:, start : start + size] @ hot * view.load_kn
+            changed = changed + p[f"{output}_offset"] @ hot * view.load_kn
         return np.asarray(changed)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from calib.gap.effects.base import Effect, View, saturating
+from calib.gap.effects.base import Effect, View, each, saturating
 from calib.models.base import Array
 
 __all__ = [
@@ -40,8 +40,7 @@ class SlipZeroShift(_Fault):
         """Shift the slip."""
         if "slip" not in conditions:
             return conditions
-        slip = conditions["slip"]
-        return {**conditions, "slip": 1.0 - (1.0 - slip) * (1.0 - phi[:, :1])}
+        return {**conditions, "slip": 1.0 - (1.0 - conditions["slip"]) * (1.0 - phi)}
 
 
 class ForceOffset(_Fault):
@@ -52,11 +51,10 @@ class ForceOffset(_Fault):
     latex = (r"$P_\mathrm{f} = P + \text{offset}$ for the pull $P$",)
     parameters = ("offset",)
     outputs = ("pull",)
-    varies = False
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Add the offset (kN)."""
-        return location + phi[:, :1] if output == "pull" else location
+        return location + phi if output == "pull" else location
 
 
 def _progress(view: View) -> Array:
@@ -86,7 +84,7 @@ class SensorDrift(_Fault):
         """Add the drift (kN from the first run to the last)."""
         if output != "pull":
             return location
-        drift, curvature, half_way, zero_at = (phi[:, i : i + 1] for i in range(4))
+        drift, curvature, half_way, zero_at = each(phi)
         u = np.maximum(_progress(view), 1e-3)
         return np.asarray(location + drift * (saturating(u, curvature, half_way) - zero_at))
 
@@ -119,14 +117,15 @@ class SensorStep(_Fault):
     def _beyond(self, phi: Array, view: View) -> Array:
         """How far each run is beyond the change point, 0 to 1, shape (k, n)."""
         first, last = view.order_range
-        lasts = phi[:, 3:4] + 1.0 / max(last - first, 1.0)
-        return np.asarray(np.clip((_progress(view) - phi[:, 2:3]) / lasts + 0.5, 0.0, 1.0))
+        _, _, change_point, duration = each(phi)
+        lasts = duration + 1.0 / max(last - first, 1.0)
+        return np.asarray(np.clip((_progress(view) - change_point) / lasts + 0.5, 0.0, 1.0))
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Add the errors before and after the change point (kN)."""
         if output != "pull":
             return location
-        before, after = phi[:, :1], phi[:, 1:2]
+        before, after, *_ = each(phi)
         return np.asarray(location + before + (after - before) * self._beyond(phi, view))
 
     def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
@@ -173,16 +172,17 @@ class PressureGaugeBias(_Fault):
         self, phi: Array, output: str, conditions: dict[str, Array], view: View
     ) -> dict[str, Array]:
         """Correct the inflation pressure, and the ground pressure and slip that go with it."""
+        gain, offset, ground_response, rolling_radius = each(phi)
         recorded = view.of("pressure")
-        true = np.maximum(recorded * np.exp(phi[:, :1]) + phi[:, 1:2], 0.2 * recorded)
+        true = np.maximum(recorded * np.exp(gain) + offset, 0.2 * recorded)
         changed = dict(conditions)
         if "pressure" in conditions:
             changed["pressure"] = true
         if "ground_pressure" in conditions:
-            ratio = (true / recorded) ** (view.ground_exponent * phi[:, 2:3])
+            ratio = (true / recorded) ** (view.ground_exponent * ground_response)
             changed["ground_pressure"] = conditions["ground_pressure"] * ratio
         if "slip" in conditions:
-            larger = phi[:, 3:4] * np.log(true / recorded)
+            larger = rolling_radius * np.log(true / recorded)
             changed["slip"] = 1.0 - (1.0 - conditions["slip"]) * (1.0 - larger)
         return changed
 
@@ -211,9 +211,10 @@ class ConeIndexBias(_Fault):
         """Correct the cone index."""
         if "cone" not in conditions:
             return conditions
+        gain, offset = each(phi)
         recorded = conditions["cone"]
         typical = view.lab_of("cone", float(np.median(view.of("cone"))))
-        true = recorded * np.exp(phi[:, :1]) + phi[:, 1:2] * typical
+        true = recorded * np.exp(gain) + offset * typical
         return {**conditions, "cone": np.maximum(true, 0.02 * recorded)}
 
 
@@ -231,15 +232,15 @@ class WaterContentBias(_Fault):
     parameters = ("gain", "offset")
     form = ("size", "cone", "water")
     outputs = ("density",)
-    varies = False
 
     def on_conditions(
         self, phi: Array, output: str, conditions: dict[str, Array], view: View
     ) -> dict[str, Array]:
         """Correct the water content."""
+        gain, offset = each(phi)
         changed = dict(conditions)
         for name in ("water", "water_by_volume"):
             if name in conditions:
-                true = conditions[name] * np.exp(phi[:, :1]) + phi[:, 1:2]
+                true = conditions[name] * np.exp(gain) + offset
                 changed[name] = np.maximum(true, 0.0)
         return changed

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import Effect, View
+from calib.gap.effects.base import Effect, View, each
 from calib.models.base import Array
 
 __all__ = ["MoistureSoftening", "MultipassCompaction", "RateEffect"]
@@ -44,18 +44,20 @@ class _SoilStrength(Effect):
         """Stretch the slip axis of the traction curve."""
         if output != "pull" or "slip" not in conditions:
             return conditions
-        stretch = np.exp(np.clip(phi[:, 1:2] * self.covariate(view), -2.0, 2.0))
+        _, slope, *_ = each(phi)
+        stretch = np.exp(np.clip(slope * self.covariate(view), -2.0, 2.0))
         return {**conditions, "slip": conditions["slip"] * stretch}
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Scale the pull and shift the resistance; shift the logarithm of the rut."""
         h = self.covariate(view)
+        pull, _, resistance, rut, rut_slip = each(phi)
         if output == "pull":
-            factor = np.exp(np.clip(phi[:, :1] * h, -2.0, 2.0))
-            return np.asarray(location * factor + phi[:, 2:3] * h * view.load_kn)
+            factor = np.exp(np.clip(pull * h, -2.0, 2.0))
+            return np.asarray(location * factor + resistance * h * view.load_kn)
         if output == "sinkage":
             slip = np.maximum(view.slip(), 0.0)
-            return np.asarray(location + (phi[:, 3:4] + phi[:, 4:5] * slip) * h)
+            return np.asarray(location + (rut + rut_slip * slip) * h)
         return location
 
     def shape(self, view: View) -> Array | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import Effect, View, saturating
+from calib.gap.effects.base import Effect, View, each, saturating
 from calib.models.base import Array
 
 __all__ = [
@@ -31,13 +31,12 @@ class BulldozingResistance(Effect):
     parameters = ("resistance", "sinkage_exponent", "slip_growth")
     form = ("slip", "pressure")
     outputs = ("pull",)
-    varies = False
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Subtract the resistance from the pull."""
         if output != "pull":
             return location
-        resistance, exponent, growth = phi[:, :1], phi[:, 1:2], phi[:, 2:3]
+        resistance, exponent, growth = each(phi)
         slip = np.maximum(view.slip(), 0.0)
         sunk = np.minimum(view.sinkage(), 20.0) ** exponent
         return np.asarray(location - view.load_kn * resistance * sunk * (1.0 + growth * slip))
@@ -66,12 +65,13 @@ class LugThrust(Effect):
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Add the thrust to the pull, the digging to the logarithm of the rut."""
+        thrust, slip_scale, digging = each(phi)
         slip = np.maximum(view.slip(), 0.0)
         if output == "pull":
-            grown = 1.0 - np.exp(-slip / phi[:, 1:2])
-            return np.asarray(location + view.load_kn * phi[:, :1] * grown)
+            grown = 1.0 - np.exp(-slip / slip_scale)
+            return np.asarray(location + view.load_kn * thrust * grown)
         if output == "sinkage":
-            return np.asarray(location + phi[:, 2:3] * slip)
+            return np.asarray(location + digging * slip)
         return location
 
 
@@ -96,18 +96,15 @@ class SlipSinkage(Effect):
     needs = ("sinkage",)  # a pull alone does not tell the sinkage that costs it
     covariates = ("slip",)
 
-    def _deepening(self, phi: Array, view: View) -> Array:
-        slip = np.maximum(view.slip(), 1e-4)
-        return np.asarray(phi[:, :1] * slip ** phi[:, 1:2])
-
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Deepen the rut; take the extra compaction resistance from the pull."""
-        deeper = self._deepening(phi, view)
+        growth, exponent, pull_loss = each(phi)
+        deeper = growth * np.maximum(view.slip(), 1e-4) ** exponent
         if output == "sinkage":
-            return location + deeper
+            return np.asarray(location + deeper)
         if output == "pull":
             extra = view.sinkage() * np.expm1(np.minimum(deeper, 3.0))
-            return np.asarray(location - view.load_kn * phi[:, 2:3] * extra)
+            return np.asarray(location - view.load_kn * pull_loss * extra)
         return location
 
 
@@ -135,9 +132,9 @@ class RutRebound(Effect):
         """Make the rut shallower."""
         if output != "sinkage":
             return location
-        slip = np.maximum(view.slip(), 1e-4)
-        grown = saturating(slip, phi[:, 2:3], phi[:, 3:4])
-        return np.asarray(location - phi[:, :1] - phi[:, 1:2] * grown)
+        towed, growth, exponent, half_way = each(phi)
+        grown = saturating(np.maximum(view.slip(), 1e-4), exponent, half_way)
+        return np.asarray(location - towed - growth * grown)
 
 
 class PostPeakSoftening(Effect):
@@ -161,8 +158,9 @@ class PostPeakSoftening(Effect):
         """Lower the pull past the peak."""
         if output != "pull":
             return location
-        beyond = np.maximum(view.slip() - phi[:, 1:2], 0.0) / phi[:, 2:3]
-        return np.asarray(location * (1.0 - phi[:, :1] * -np.expm1(-beyond)))
+        loss, peak_slip, slip_scale = each(phi)
+        beyond = np.maximum(view.slip() - peak_slip, 0.0) / slip_scale
+        return np.asarray(location * (1.0 - loss * -np.expm1(-beyond)))
 
 
 class LoadTransfer(Effect):
@@ -182,10 +180,9 @@ class LoadTransfer(Effect):
     form = ("slip",)
     outputs = ("pull", "sinkage")
     needs = ("pull",)
-    varies = False
 
-    def _ln_load(self, phi: Array, view: View) -> Array:
-        ratio = 1.0 + phi[:, :1] * view.base["pull"] / view.load_kn
+    def _ln_load(self, transfer: Array, view: View) -> Array:
+        ratio = 1.0 + transfer * view.base["pull"] / view.load_kn
         return np.log(np.clip(ratio, 0.2, 5.0))
 
     def on_conditions(
@@ -194,7 +191,8 @@ class LoadTransfer(Effect):
         """Raise the ground pressure with the load."""
         if output != "sinkage" or "ground_pressure" not in conditions:
             return conditions
-        factor = np.exp(phi[:, 2:3] * self._ln_load(phi, view))
+        transfer, _, exponent = each(phi)
+        factor = np.exp(exponent * self._ln_load(transfer, view))
         pressure = conditions["ground_pressure"] * factor
         return {**conditions, "ground_pressure": pressure}
 
@@ -202,4 +200,5 @@ class LoadTransfer(Effect):
         """Scale the pull with the load."""
         if output != "pull":
             return location
-        return np.asarray(location * np.exp(phi[:, 1:2] * self._ln_load(phi, view)))
+        transfer, exponent, _ = each(phi)
+        return np.asarray(location * np.exp(exponent * self._ln_load(transfer, view)))
