@@ -70,6 +70,29 @@ def test_children_end_with_it(tmp_path: Path, ending: str) -> None:
     assert _ends(pid)
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="where processes are listed in /proc")
+@pytest.mark.parametrize("ending", ["time.sleep(60)", "pass"])
+def test_so_do_those_that_left_its_group(tmp_path: Path, ending: str) -> None:
+    code = (
+        "import os, time\n"
+        "if os.fork() == 0:\n"
+        "    os.setsid()\n"
+        "    open('pid.part', 'w').write(str(os.getpid()))\n"
+        "    os.rename('pid.part', 'pid')\n"
+        "    time.sleep(60)\n"
+        "while not os.path.exists('pid'): time.sleep(0.01)\n" + ending
+    )
+    run_program(python(code), tmp_path, 2.0)
+    assert _ends(int((tmp_path / "pid").read_text()))
+
+
+def test_the_end_alone_is_read_if_asked_for(tmp_path: Path) -> None:
+    found = run_program(python("print('x' * 9_000_000, 'done')"), tmp_path, 20.0, whole=False)
+    assert isinstance(found, str)
+    assert found.endswith("x done\n")
+    assert len(found) < 5000
+
+
 def _ends(pid: int) -> bool:
     """Whether a process is gone, or dead and not yet collected, within some seconds."""
     for _ in range(100):
