@@ -51,6 +51,13 @@ def test_the_tail_of_what_it_printed_is_kept(tmp_path: Path) -> None:
     assert len(found.printed) < 700
 
 
+def test_what_would_steer_a_terminal_is_left_out(tmp_path: Path) -> None:
+    code = "import sys; sys.stdout.buffer.write(b'\\x1b[31mred\\x00\\xff\\n'); sys.exit(1)"
+    found = run_program(python(code), tmp_path, 20.0)
+    assert isinstance(found, Failure)
+    assert found.printed == "\ufffd[31mred\ufffd\ufffd\n"
+
+
 def test_a_program_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(CalibError, match="no-such-wheel cannot be started"):
         run_program(["no-such-wheel"], tmp_path, 1.0)
