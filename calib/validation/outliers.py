@@ -128,7 +128,12 @@ def linear(problem: Problem, t: Array, used: NDArray[np.bool_]) -> tuple[Array, 
     relative = problem.noise.scale(natural[:1], problem.conditions) / natural[0, -1]
     residuals = problem.residuals(natural) / relative
     d = t.size
-    jacobian = ((residuals[1 + d :] - residuals[1 : 1 + d]) / (2.0 * steps)[:, None]).T
+    # One-sided beside ground where the model has no value, as at the edge of an emulator.
+    ends = residuals[1:].reshape(2, d, -1)
+    there = np.isfinite(ends).all(axis=2)
+    ends = np.where(there[:, :, None], ends, residuals[0])
+    apart = np.maximum(there.sum(axis=0), 1) * steps
+    jacobian = ((ends[1] - ends[0]) / apart[:, None]).T
     _, sizes, directions = np.linalg.svd(jacobian[used], full_matrices=False)
     rank = int(np.sum(sizes > 1e-7 * max(float(sizes[0]), 1e-300)))
     return residuals[0], jacobian @ directions[:rank].T / sizes[:rank], rank

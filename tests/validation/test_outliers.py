@@ -12,7 +12,7 @@ from calib.data.quantities import OUTPUTS
 from calib.he2019.designs import he2019_tasks
 from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.mode import find_mode
-from calib.validation.outliers import LEVEL, outlying_notes, outlying_rows
+from calib.validation.outliers import LEVEL, linear, outlying_notes, outlying_rows
 from tests.custom_problems import normal, problem_of
 
 TASKS = {task.output: task for task in he2019_tasks()}
@@ -50,6 +50,26 @@ def test_distances_are_those_from_a_line_through_the_other_rows() -> None:
     assert found.value == pull[9]
     # The line through the others is found by climbing, to its tolerance.
     assert found.sds == pytest.approx(abs(left_out(slip, pull, 9)), rel=1e-5)
+
+
+def test_beside_ground_without_a_value_the_slope_is_that_of_one_side() -> None:
+    """A mode at the edge of where a simulator runs at all."""
+    rng = np.random.default_rng(1)
+    slip = rng.random(15)
+    pull = 1.0 + 2.0 * slip + 0.1 * rng.standard_normal(15)
+    pull[9] -= 2.0
+    t = fitted_line(slip, pull)
+    priors = [normal("a", 0.0, 1e6), normal("b", 0.0, 1e6), normal("sigma", 0.0, 0.1, log=True)]
+    for side in (1.0, -1.0):
+        ends = problem_of(
+            lambda a, b, s, side=side: np.where(side * (b - t[1]) > 0.0, np.nan, a + b * s),
+            priors, slip, pull,
+        )  # fmt: skip
+        used = np.ones(15, dtype=bool)
+        for found, whole in zip(
+            linear(ends, t, used), linear(line_problem(slip, pull), t, used), strict=True
+        ):
+            np.testing.assert_allclose(found, whole, atol=1e-6)
 
 
 @pytest.mark.parametrize("second", [3.0, -3.0, 30.0])

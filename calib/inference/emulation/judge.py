@@ -51,7 +51,7 @@ def judged(
     left_out = over.left_out(np.concatenate([state.emulator.mean[None], state.emulator.curves]))
     # At the ends of the box a node that is left out has none beyond it.
     left_out = left_out[:, ((over.nodes > 0.0) & (over.nodes < 1.0)).all(axis=1)]
-    theta = state.axes.natural(z[:64])
+    theta = state.axes.natural(z[state.holds(z)][:64])
     c = np.concatenate([np.ones((len(theta), 1)), state.emulator.coefficients(theta)], axis=1)
     squares = np.square(c @ left_out)
     between = float(np.sqrt(np.nanmean(squares))) / state.sigma if squares.size else 0.0

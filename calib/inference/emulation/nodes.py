@@ -61,6 +61,17 @@ def choose_nodes(
     return {c: found[:, i].copy() for i, c in enumerate(columns)}
 
 
+def across_zero(
+    nodes: Mapping[str, Array], recorded: Sequence[Mapping[str, Array]] = ()
+) -> NDArray[np.bool_]:
+    """Whether each node has a condition below zero that no recorded row has below zero, (m,)."""
+    found = np.zeros(next(iter(nodes.values())).size, dtype=bool)
+    for column, values in nodes.items():
+        if all((r[column] >= 0.0).all() for r in recorded):
+            found |= values < 0.0
+    return found
+
+
 def _box(
     columns: Sequence[str],
     rows: Array,

@@ -17,11 +17,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.stats import qmc
 
 from calib.batch.threads import one_thread
 from calib.inference.emulation.judge import WORTH, held_out, judged
-from calib.inference.emulation.nodes import choose_nodes
+from calib.inference.emulation.nodes import across_zero, choose_nodes
 from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut
 from calib.inference.emulation.state import State
 from calib.inference.problem import Problem
@@ -65,7 +66,8 @@ def emulate(
     """
     chosen = settings or EmulationSettings()
     recorded = [problem.conditions, *(problem.bound.model.select(e) for e in elsewhere)]
-    state = State(problem, keeper, _nodes(problem, keeper, recorded, chosen.nodes), seed)
+    nodes, across = _nodes(problem, keeper, recorded, chosen.nodes)
+    state = State(problem, keeper, nodes, seed, chosen.runs, across=across)
     own_noise = _first_design(state, chosen)
     state.rebuild()
     return _improved(state, chosen, chosen.runs, own_noise)
@@ -86,7 +88,7 @@ def extend(
     It has the same model and priors. Where the emulator, which serves the calibration, is good it
     stays so. The emulation's runs are the new ones, `more` at the most.
     """
-    state = State.beyond(emulator, problem, keeper, seed)
+    state = State.beyond(emulator, problem, keeper, seed, more)
     return _improved(state, settings or EmulationSettings(), more, 0.0)
 
 
@@ -117,15 +119,20 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
 
 def _nodes(
     problem: Problem, keeper: RunKeeper, recorded: Sequence[Mapping[str, Array]], count: int | None
-) -> dict[str, Array]:
-    """Choose nodes, across zero if the simulator has values there in the middle of the prior."""
+) -> tuple[dict[str, Array], NDArray[np.bool_] | None]:
+    """Choose nodes, across zero if the simulator has values there in the middle of the prior.
+
+    Return with them which of them lie across zero.
+    """
     middle = problem.theta(problem.priors.ppf(np.full((1, len(problem.priors.free)), 0.5)))[:, :-1]
     ranges = keeper.simulator.ranges
     inside = choose_nodes(recorded, ranges, count)
     wide = choose_nodes(recorded, ranges, count, across_zero=True)
     if all(np.array_equal(inside[name], wide[name]) for name in inside):
-        return inside
-    return wide if keeper.runs(middle, wide)[0].ok else inside
+        return inside, None
+    if not keeper.runs(middle, wide)[0].ok:
+        return inside, None
+    return wide, across_zero({n: v for n, v in wide.items() if n not in ranges}, recorded)
 
 
 def _settled(history: Sequence[tuple[int, float]], tolerance: float) -> bool:
@@ -151,9 +158,9 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
     repeats = np.flatnonzero(ok)[: 1 if state.keeper.simulator.deterministic else 5]
     times = [1] if state.keeper.simulator.deterministic else [1, 2]
     again = [state.carry_out(theta[repeats], r) for r in times]
-    apart = np.stack([values[repeats], *again])
+    apart = state.tamed(np.stack([values[repeats], *again]))
     own = float(np.sqrt(np.nanmean(apart.var(axis=0, ddof=1))))
-    if own > 1e-6 * float(np.nanstd(values)):
+    if own > 1e-6 * float(np.nanstd(state.tamed(values))):
         state.training = replace(state.training, noisy=True)
         for found in again:
             state.learn(theta[repeats], found)
@@ -207,6 +214,6 @@ def _check(state: State, z: Array, count: int, step: int) -> HeldOut | None:
     rng = generator(state.seed, state.label, "check", step)
     theta = state.axes.natural(z[rng.choice(len(z), count, replace=False)])
     values = state.carry_out(theta)
-    found = held_out(state, theta, values)
+    found = held_out(state, theta, state.tamed(values))
     state.learn(theta, values)
     return found

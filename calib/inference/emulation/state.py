@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
+from calib.inference.emulation.nodes import across_zero
 from calib.inference.problem import Problem
 from calib.inference.random import stream
 from calib.inference.sampling.mode import prior_widths
@@ -26,21 +27,32 @@ _DRAWS = 512
 _FIRST_NOISE = 0.1
 # Errors below this part of the noise sd (per value) need not be looked into.
 _NEGLIGIBLE = 0.003
+# Across zero a formula may grow beyond bounds: values so many times as far from the others as these
+# reach are wild. So many runs near the posterior tell whether there are such.
+_WILD, _FEW = 10.0, 8
+# The replicate of a run that is made again to tell chance from its conditions.
+_AGAIN = 99
 
 
 class State:
-    """What is known so far for a problem's posterior; `nodes` (m,) are conditions of each run."""
+    """What is known so far for a problem's posterior; `nodes` (m,) are conditions of each run.
+
+    `most` runs are made at the most when a run that failed is made again. Nodes `across` zero (m,)
+    serve a diagnosis only, which asks what another rolling radius does to small slips: they are
+    given up where runs near the posterior are wild there, or have a value but for them.
+    """
 
     def __init__(
         self, problem: Problem, keeper: RunKeeper, nodes: Mapping[str, Array], seed: int,
-        label: str = "emulate",
+        most: int = 0, label: str = "emulate", across: NDArray[np.bool_] | None = None,
     ) -> None:  # fmt: skip
         self.problem, self.keeper, self.nodes = problem, keeper, nodes
-        self.seed, self.label = seed, label
+        self.seed, self.most, self.label = seed, most, label
         entries = problem.priors.entries[:-1]
         self.axes = _axes(problem)
         self.free = np.array([not p.fixed for p in entries])
         n = next(iter(nodes.values())).size
+        self.across = np.zeros(n, dtype=bool) if across is None else across
         self.training = Training(np.zeros((0, len(entries))), np.zeros((0, n)), nodes)
         self.runs: list[Run] = []
         self.sigma = _FIRST_NOISE * float(problem.response.std())
@@ -51,9 +63,12 @@ class State:
         self.earlier: tuple[Region, ...] = ()
 
     @classmethod
-    def beyond(cls, emulator: Emulator, problem: Problem, keeper: RunKeeper, seed: int) -> State:
+    def beyond(
+        cls, emulator: Emulator, problem: Problem, keeper: RunKeeper, seed: int, most: int
+    ) -> State:
         """Return the state in which an emulator begins to serve another problem as well."""
-        state = cls(problem, keeper, emulator.training.nodes, seed, "extend")
+        nodes = emulator.training.nodes
+        state = cls(problem, keeper, nodes, seed, most, "extend", across_zero(nodes))
         state.training, state.emulator = emulator.training, emulator
         state.earlier = emulator.regions
         state._emulate(emulator)
@@ -65,9 +80,41 @@ class State:
 
     def carry_out(self, theta: Array, replicate: Sequence[int] | int = 0) -> Array:
         """Make runs; return their values on the scale of the response, shape (k, m)."""
-        found = self.keeper.runs(theta, self.nodes, replicate)
+        values = self._made(theta, self.nodes, replicate)
+        lost = np.flatnonzero(~np.isfinite(values).all(axis=1))
+        if lost.size and self._fails_across(theta[lost[:1]]):
+            values = values[:, ~self.across]
+            self._give_up_across()
+            if self.emulator is not None:
+                self.rebuild()
+            lost = lost[: max(self.most - len(self.runs), 0)]
+            values[lost] = self._made(theta[lost], self.nodes, replicate)
+        return values
+
+    def _fails_across(self, theta: Array) -> bool:
+        """Whether a run that failed has a value but for nodes across zero, and not by chance."""
+        if self.earlier or not self.across.any() or self.most - len(self.runs) < 2:
+            return False
+        plain = {name: v[~self.across] for name, v in self.nodes.items()}
+        if not np.isfinite(self._made(theta, plain)).all():
+            return False
+        return not np.isfinite(self._made(theta, self.nodes, _AGAIN)).all()
+
+    def _give_up_across(self) -> None:
+        """Go on without the nodes across zero; of the runs so far the other values are kept."""
+        kept = ~self.across
+        self.nodes = {name: v[kept] for name, v in self.nodes.items()}
+        self.across = self.across[kept]
+        self.training = replace(
+            self.training, values=self.training.values[:, kept], nodes=self.nodes
+        )
+
+    def _made(
+        self, theta: Array, nodes: Mapping[str, Array], replicate: Sequence[int] | int = 0
+    ) -> Array:
+        found = self.keeper.runs(theta, nodes, replicate)
         self.runs += found
-        values = np.full((len(theta), self.training.values.shape[1]), np.nan)
+        values = np.full((len(theta), next(iter(nodes.values())).size), np.nan)
         output = self.problem.bound.model.output
         with np.errstate(all="ignore"):
             for i, run in enumerate(found):
@@ -81,14 +128,49 @@ class State:
 
     def rebuild(self) -> None:
         """Fit the emulator again to all runs."""
-        regions = self.earlier if self.region is None else (*self.earlier, self.region)
+        if self._wild_near():
+            self._give_up_across()
         known = self.emulator
+        again = self.region is None or known is None or known.mean.size != self.across.size
         self.emulator = build_emulator(
-            self.training, self.axes, _NEGLIGIBLE * self.sigma, regions,
+            replace(self.training, values=self.tamed(self.training.values)), self.axes,
+            _NEGLIGIBLE * self.sigma, self._regions,
             scales=None if known is None else [f.scales for f in known.functions],
-            over=None if known is None or self.region is None else known.over,
+            over=None if again or known is None else known.over,
         )  # fmt: skip
         self._emulate(self.emulator)
+
+    @property
+    def _regions(self) -> tuple[Region, ...]:
+        return self.earlier if self.region is None else (*self.earlier, self.region)
+
+    def tamed(self, values: Array) -> Array:
+        """Return values (..., m), those across zero no wilder than a process can bear."""
+        low, high = self._bounds()
+        return np.where(self.across, np.clip(values, low, high), values)
+
+    def _wild_near(self) -> bool:
+        """Whether there are wild values near the posterior, as far as that is known."""
+        values, known = self._near()
+        return known and not self.earlier and bool((self.tamed(values) != values).any())
+
+    def _bounds(self) -> tuple[float, float]:
+        """Beyond which values across zero are wild: by what the others are near the posterior."""
+        values = self._near()[0][:, ~self.across]
+        if not values.size:
+            return -np.inf, np.inf
+        low, high = float(values.min()), float(values.max())
+        return low - _WILD * (high - low), high + _WILD * (high - low)
+
+    def _near(self) -> tuple[Array, bool]:
+        """Return the values of runs near the posterior; of all, and false, while few are there."""
+        ok = self.training.ok
+        z, values = self.axes.of(self.training.theta[ok]), self.training.values[ok]
+        inside = np.zeros(len(z), dtype=bool)
+        for region in self._regions:
+            inside |= region.inside(z)
+        known = bool(inside.sum() >= _FEW)
+        return (values[inside] if known else values), known
 
     def sample(self, step: int) -> Array:
         """Draw from the posterior under the emulator; return z of the draws, shape (k, d)."""

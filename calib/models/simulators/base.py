@@ -217,5 +217,6 @@ def checked(found: Values, column: str, n: int) -> Array | Failure:
 
 
 def tail(printed: str) -> str:
-    """Return the end of what a run printed."""
-    return printed if len(printed) <= _TAIL else "..." + printed[-_TAIL:]
+    """Return the end of what a run printed, without what would steer a terminal."""
+    end = printed if len(printed) <= _TAIL else "..." + printed[-_TAIL:]
+    return "".join(c if c.isprintable() or c in "\n\t" else "\ufffd" for c in end)

@@ -12,20 +12,28 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
 from calib.batch.plugins import USER_MODULE
 from calib.errors import CalibError
 from calib.models.simulators.base import Failure, tail
 
 _PRINTED = ".printed"
+# Of what is printed, so many bytes have more characters than are kept.
+_END = 4096
+# What a program and all that it starts have in their environment.
+_MARK = "CALIB_RUN"
 
 
-def run_program(arguments: Sequence[str], folder: Path, limit: float) -> Failure | str:
+def run_program(
+    arguments: Sequence[str], folder: Path, limit: float, *, whole: bool = True
+) -> Failure | str:
     """Run a program in a folder and wait for it, so many seconds at the most.
 
-    Return what it printed, or why it failed. It leads a process group (a session of its own), which
-    is killed when it has come to its end, when the limit has passed, and when this process is
-    interrupted: what it started ends with it.
+    Return what it printed (of which, if not the `whole`, the end), or why it failed. It leads a
+    process group (a session of its own), which is killed when it has come to its end, when the
+    limit has passed, and when this process is interrupted: what it started ends with it. On Linux
+    so does what has left the group, which is known by a variable of its environment.
 
     Raises
     ------
@@ -33,11 +41,13 @@ def run_program(arguments: Sequence[str], folder: Path, limit: float) -> Failure
         If it cannot be started.
     """
     path = folder / _PRINTED
+    mark = f"{_MARK}={uuid4().hex}"
     with path.open("wb") as printed:
         try:
             child = subprocess.Popen(
                 list(arguments), cwd=folder, stdin=subprocess.DEVNULL, stdout=printed,
                 stderr=subprocess.STDOUT, start_new_session=True,
+                env=os.environ | dict([mark.split("=")]),
             )  # fmt: skip
         except OSError as error:
             # No fault of the parameters: nothing is learned from it.
@@ -50,13 +60,20 @@ def run_program(arguments: Sequence[str], folder: Path, limit: float) -> Failure
         except subprocess.TimeoutExpired:
             code = None
         finally:
-            _end(child)
-    text = path.read_text(encoding="utf-8", errors="replace")
+            _end(child, mark)
     if code is None:
-        return Failure("time", f"it took longer than {limit:g} s", tail(text))
+        return Failure("time", f"it took longer than {limit:g} s", tail(_text(path, whole=False)))
     if code:
-        return Failure("exit", _ended(code), tail(text))
-    return text
+        return Failure("exit", _ended(code), tail(_text(path, whole=False)))
+    return _text(path, whole=whole)
+
+
+def _text(path: Path, *, whole: bool) -> str:
+    """Return what a program printed, or the end of it: that may be more than memory holds."""
+    with path.open("rb") as printed:
+        if not whole:
+            printed.seek(max(path.stat().st_size - _END, 0))
+        return printed.read().decode(errors="replace")
 
 
 def call_function(function: Callable[..., Any], arguments: Sequence[Any], limit: float) -> Any:
@@ -79,7 +96,7 @@ def call_function(function: Callable[..., Any], arguments: Sequence[Any], limit:
         )
         child = Path(__file__).with_name("child.py")
         started = [sys.executable, "-P", str(child), str(given), str(taken)]
-        printed = run_program(started, scratch, limit)
+        printed = run_program(started, scratch, limit, whole=False)
         if isinstance(printed, Failure):
             return printed
         found, raised = pickle.loads(taken.read_bytes())
@@ -115,11 +132,27 @@ def _ended(code: int) -> str:
     return f"it was killed by the signal {-code}"
 
 
-def _end(child: subprocess.Popen[bytes]) -> None:
-    """Kill what is left of the child's group, and collect the child."""
+def _end(child: subprocess.Popen[bytes], mark: str) -> None:
+    """Kill what is left of the child's group and what left it, and collect the child."""
     with suppress(ProcessLookupError, PermissionError):
         if sys.platform == "win32":
             child.kill()
         else:
             os.killpg(child.pid, signal.SIGKILL)
     child.wait()
+    # One that is killed may have started another meanwhile.
+    while left := _marked(mark):
+        for pid in left:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+
+
+def _marked(mark: str) -> list[int]:
+    """Return the processes that have a mark in their environment, on Linux."""
+    found = []
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        # Those of others cannot be read, those that have ended are gone or have none.
+        with suppress(OSError):
+            if mark.encode() in path.read_bytes().split(b"\0"):
+                found.append(int(path.parent.name))
+    return found

@@ -161,14 +161,15 @@ class CommandWay:
             given, taken = scratch / f"input.{self._ending}", scratch / f"output.{self.gives}"
             given.write_text(self._input(parameters, conditions), encoding="utf-8")
             paths = {"{input}": str(given), "{output}": str(taken)}
-            printed = run_program(self._arguments(paths), scratch, self.limit)
+            whole = not self._leaves_file
+            printed = run_program(self._arguments(paths), scratch, self.limit, whole=whole)
             if isinstance(printed, Failure):
                 return printed
             return self._read(taken, printed)
 
     def _read(self, taken: Path, printed: str) -> Result:
         text = printed
-        if any("{output}" in a for a in self.arguments):
+        if self._leaves_file:
             try:
                 text = taken.read_text(encoding="utf-8")
             except (OSError, UnicodeDecodeError):
@@ -177,6 +178,10 @@ class CommandWay:
         if isinstance(found, Failure):
             return Failure(found.kind, found.reason, tail(printed))
         return found
+
+    @property
+    def _leaves_file(self) -> bool:
+        return any("{output}" in a for a in self.arguments)
 
     @property
     def _ending(self) -> str:

@@ -34,9 +34,10 @@ def as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 def declared(f: Callable, name: str, **changes: object) -> Simulated:
+    given = {"parameters": PRIORS} | changes
     found = calib.from_callable(
-        f, parameters=PRIORS, conditions=CONDITIONS, output="drawbar_pull_kn", name=name,
-        **changes,  # type: ignore[arg-type]
+        f, conditions=CONDITIONS, output="drawbar_pull_kn", name=name,
+        **given,  # type: ignore[arg-type]
     )  # fmt: skip
     calib.register(found)
     return found
@@ -46,8 +47,8 @@ def table(seed: int = 1, noise: float = 0.03) -> calib.Table:
     return calib.table_from_arrays(lab(np.random.default_rng(seed), noise))
 
 
-def exact(data: calib.Table) -> Calibration:
-    declared(pull, "direct")
+def exact(data: calib.Table, **changes: object) -> Calibration:
+    declared(pull, "direct", **changes)
     return calib.calibrate(calib.build_problem("direct", data), seed=1)
 
 
@@ -159,7 +160,7 @@ def test_where_runs_fail_and_what_to_do_is_told_if_nothing_is_left(
         calib.emulated(calib.build_problem("crashing", table()), seed=1)
     text = str(caught.value)
     for words in (
-        "no parameters are left for the data", "of the 21 runs have a value",
+        "no parameters are left for the data", "of the 22 runs have a value",
         "RuntimeError: the mesh folds", ", at mu 0.7", "those with a value are at mu 0.",
         "simulator crashing", "priors that do not reach there",
     ):  # fmt: skip
@@ -197,6 +198,63 @@ def test_first_runs_that_fail_in_several_ways_are_no_reason_to_stop() -> None:
     declared(fickle, "fickle", emulate=True, runs=40)
     emulation = calib.emulated(calib.build_problem("fickle", table()), seed=1)
     assert len(emulation.failed) == 5
+
+
+def below_zero(emulation: calib.Emulation) -> bool:
+    return bool(emulation.emulator.training.nodes["slip_ratio"].min() < 0.0)
+
+
+def test_what_grows_beyond_bounds_across_zero_does_not_matter_to_a_fit() -> None:
+    """At slips below zero exp(-slip/s0) is 1e200 for some s0 of this prior, and its posterior."""
+    vague = PRIORS.replace("sd_log = 0.8", "sd_log = 2.5")
+    # Full thrust at the least slip: s0 may be a tenth of it or a thousandth.
+    columns = lab(np.random.default_rng(1))
+    y = pull(np.array([[0.6, 0.002]]), columns)[0]
+    y += 0.03 * np.random.default_rng(2).standard_normal(y.size)
+    data = calib.table_from_arrays(columns | {"drawbar_pull_kn": y})
+    largest = 0.0
+
+    def grows(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        nonlocal largest
+        with np.errstate(over="ignore"):
+            found = pull(theta, x)
+        largest = max(largest, float(np.abs(found).max()))
+        return found
+
+    declared(grows, "slow", emulate=True, parameters=vague)
+    emulation = calib.emulated(calib.build_problem("slow", data), seed=1)
+    assert largest > 1e155
+    assert not below_zero(emulation)
+    assert emulation.passed, emulation.reasons
+    assert not any(run.failure for run in emulation.runs[-20:])
+    agree(calib.calibrate(emulation.problem, seed=1), exact(data, parameters=vague))
+
+
+def test_runs_that_fail_across_zero_alone_are_made_without() -> None:
+    def stops(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        if x["slip_ratio"].min() < 0.0 and theta[0, 1] < 0.08:
+            raise RuntimeError("the wheel is braked")
+        return pull(theta, x)
+
+    declared(stops, "stops", emulate=True, runs=40, checks=4)
+    emulation = calib.emulated(calib.build_problem("stops", table()), seed=1)
+    assert not below_zero(emulation)
+    assert len(emulation.runs) <= 40
+    theta = emulation.emulator.training.theta
+    assert (theta[:, 1] < 0.08).sum() > 5
+    assert emulation.emulator.training.ok.all()
+    # What fails by chance, or anywhere, is no reason to do without.
+    rng = np.random.default_rng(1)
+
+    def now_and_then(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        if theta[0, 0] > 0.75 or rng.random() < 0.3:
+            raise RuntimeError("the licence is lost")
+        return pull(theta, x)
+
+    declared(now_and_then, "chance", emulate=True, runs=40, checks=4)
+    emulation = calib.emulated(calib.build_problem("chance", table()), seed=1)
+    assert emulation.failed
+    assert below_zero(emulation)
 
 
 def test_far_from_all_runs_there_is_no_value() -> None:

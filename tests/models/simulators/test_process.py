@@ -51,6 +51,13 @@ def test_the_tail_of_what_it_printed_is_kept(tmp_path: Path) -> None:
     assert len(found.printed) < 700
 
 
+def test_what_would_steer_a_terminal_is_left_out(tmp_path: Path) -> None:
+    code = "import sys; sys.stdout.buffer.write(b'\\x1b[31mred\\x00\\xff\\n'); sys.exit(1)"
+    found = run_program(python(code), tmp_path, 20.0)
+    assert isinstance(found, Failure)
+    assert found.printed == "\ufffd[31mred\ufffd\ufffd\n"
+
+
 def test_a_program_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(CalibError, match="no-such-wheel cannot be started"):
         run_program(["no-such-wheel"], tmp_path, 1.0)
@@ -68,6 +75,29 @@ def test_children_end_with_it(tmp_path: Path, ending: str) -> None:
     assert isinstance(found, Failure) is (ending != "pass")
     pid = int((tmp_path / "pid").read_text())
     assert _ends(pid)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="where processes are listed in /proc")
+@pytest.mark.parametrize("ending", ["time.sleep(60)", "pass"])
+def test_so_do_those_that_left_its_group(tmp_path: Path, ending: str) -> None:
+    code = (
+        "import os, time\n"
+        "if os.fork() == 0:\n"
+        "    os.setsid()\n"
+        "    open('pid.part', 'w').write(str(os.getpid()))\n"
+        "    os.rename('pid.part', 'pid')\n"
+        "    time.sleep(60)\n"
+        "while not os.path.exists('pid'): time.sleep(0.01)\n" + ending
+    )
+    run_program(python(code), tmp_path, 2.0)
+    assert _ends(int((tmp_path / "pid").read_text()))
+
+
+def test_the_end_alone_is_read_if_asked_for(tmp_path: Path) -> None:
+    found = run_program(python("print('x' * 9_000_000, 'done')"), tmp_path, 20.0, whole=False)
+    assert isinstance(found, str)
+    assert found.endswith("x done\n")
+    assert len(found) < 5000
 
 
 def _ends(pid: int) -> bool:
