@@ -21,6 +21,7 @@ from calib.gap.hypotheses import (
     effect_priors,
     inseparable,
     joined,
+    pair,
     resized,
     shifts,
     singles,
@@ -355,7 +356,7 @@ def test_a_set_has_the_product_of_its_causes_shares(data):
     both = joined(replace(a, share=0.02), replace(b, share=0.1))
     assert both.share == pytest.approx(0.002)
     assert both.effect_priors == a.effect_priors + b.effect_priors
-    assert joined(b, a) == joined(a, b)
+    assert pair(b, a) == joined(b, a) == joined(a, b)
 
 
 def test_forces_of_an_effect_go_with_the_load(data):
@@ -439,7 +440,11 @@ def test_declared_columns_may_change_every_output():
     # No dependence is any effect's business but its own.
     constant = replace(data, view=replace(data.view, conditions={
         **data.view.conditions, "speed_m_s": np.full(27, 1.0)}))  # fmt: skip
-    assert not inseparable(constant, EFFECTS["rate_effect"])
+    assert inseparable(constant, EFFECTS["rate_effect"]) is False
+    narrow = np.linspace(20.0, 20.5, 27)
+    little = replace(data, view=replace(data.view, conditions={
+        **data.view.conditions, "temperature": narrow}))  # fmt: skip
+    assert not inseparable(little, found["temperature"])
 
 
 def test_shifts_are_a_part_of_what_all_soils_span(data):

@@ -64,8 +64,8 @@ def test_a_suspicion_multiplies_the_odds_wherever_the_cause_is_a_part(name, usua
         assert suspecting.ln_prior(other) == plain.ln_prior(other)
 
 
-def test_two_suspicions_are_two_factors_and_none_is_even_at_most():
-    """Where one effect alone is tested its usual probability is 0.36, not more than one half."""
+def test_two_suspicions_are_two_factors():
+    """Where one effect alone is tested its usual probability is 0.36."""
     both = Odds.of(1, Context(suspected={"a": 0.5, "b": 0.8}))
     assert both.suspicion["a"] == pytest.approx(-np.log(0.36 / 0.64))
     assert both.suspicion["b"] == pytest.approx(np.log(4.0) - np.log(0.36 / 0.64))
