@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from calib.data import table_from_arrays
 from calib.gap.case import campaigns
 from calib.gap.noise import (
     KAPPA,
@@ -117,10 +118,8 @@ def test_softness_is_of_pressures_of_any_size_where_both_campaigns_have_one():
     # The laboratory's rows are beside the same reference.
     view.lab = {"inflation_pressure_psi": 4.0}
 
-    class Lab(dict):
-        columns = {"inflation_pressure_psi": pressure, "slip_ratio": 0.1 * pressure}
-
-    rows = noise_conditions_of_lab(Lab(a=0, b=0, c=0), view)
+    lab = table_from_arrays({"inflation_pressure_psi": pressure, "slip_ratio": 0.1 * pressure})
+    rows = noise_conditions_of_lab(lab, view)
     np.testing.assert_allclose(rows.softness, np.log(4.0 / pressure))
     np.testing.assert_allclose(rows.slip, 0.1 * pressure)
 
