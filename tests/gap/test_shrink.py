@@ -203,6 +203,7 @@ def test_a_gap_of_half_the_noise_is_one(gap, there):
     assert (shrunk([0.5, 0.5], [gap, gap], before=0.0, after=0.0) is not None) is there
     # Of the truth's own simulator, wherever the calibrated one is.
     assert (shrunk([1.0], [1.0 + gap], 0.0, 0.0, simulator=1.0) is not None) is there
+    assert shrunk([1.0], [0.25], before=0.0, after=0.0, noise=0.5) is None
 
 
 @pytest.mark.parametrize(("weight", "there"), [(0.5, True), (0.499, False)])
@@ -223,3 +224,14 @@ def test_one_that_had_no_error_did_not_shrink_to_anything_infinite():
     assert found.rmse_before == found.rmse_after == 0.0
     assert found.fraction == 1.0
     assert found.interval == pytest.approx((1.0, 1.0))
+
+
+def test_the_noise_floor_is_the_median_of_the_draws_own():
+    name, sd = "drawbar_pull", np.array([[0.3, 0.3], [0.1, 0.1], [0.2, 0.2]])
+    true = np.ones((3, 2))
+    draws = Truth({name: 0.0 * true}, {name: true}, {name: sd}, {name: true}, np.full(3, 1 / 3))
+    data = SimpleNamespace(outputs=(SimpleNamespace(name=name),))
+    found = shrink(data, draws, {name: np.zeros(2)}, {name: np.ones(2)})[name]
+    assert found.noise_floor == pytest.approx(0.2)
+    predicted = predict_new(draws, {name: np.zeros(2)})[name]
+    np.testing.assert_allclose(predicted.after, 1.0)

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from calib.gap.mixture import Truth, mixture
-from calib.gap.where import RowGap, _stretches, conditions_to_search, regions, row_gaps
+from calib.gap.where import RowGap, _region, _stretches, conditions_to_search, regions, row_gaps
 from tests.gap.cases import campaigns_of, diagnosis_of, ranking_of
 
 NOISE = 0.05
@@ -296,3 +296,29 @@ def test_conditions_are_searched_in_the_order_in_which_a_reader_looks(data):
                          "speed_m_s"]  # fmt: skip
     assert found[-1] == "run_order"
     assert "drawbar_pull_kn" not in found
+
+
+@pytest.mark.parametrize(("rows", "fewest"), [(23, 2), (35, 2), (36, 3), (47, 3), (48, 4)])
+def test_a_stretch_has_a_twelfth_of_the_rows_and_two_at_least(rows, fewest):
+    slip = np.concatenate([np.linspace(0.1, 0.4, rows - fewest), np.full(fewest, 0.5)])
+    kind = (slip == 0.5).astype(float)
+    gap = RowGap("drawbar_pull", np.arange(rows), kind, kind, kind)
+    left = np.ones(rows, dtype=bool)
+    assert _stretches(kind, gap, left, True) == [(1.0, 1.0)]
+    left[-1] = False
+    assert _stretches(kind, gap, left, True) == []
+
+
+def test_no_probability_is_above_one_and_a_gap_of_the_noise_itself_is_not_beyond_it():
+    """Weights sum to one but for rounding."""
+    name, one = "drawbar_pull", np.full((1, 4), 0.25)
+    weight = np.array([1.0 + 4e-16])
+    truth = Truth({name: 0.0 * one}, {name: 2.0 * one}, {name: one}, {name: one}, weight)
+    data = of_slips([0.1, 0.2, 0.3, 0.4])
+    gaps = row_gaps(data, truth)
+    assert gaps[0].probability.max() == 1.0
+    (found,) = regions(data, truth, gaps)
+    assert found.probability == 1.0
+    inside = np.ones(4, dtype=bool)
+    assert _region(truth, name, {}, one, one, inside).probability == 0.0
+    assert _region(truth, name, {}, -2.0 * one, one, inside).probability == 1.0
