@@ -189,7 +189,7 @@ def test_of_a_pair_each_is_large_enough_to_count():
 
 def test_a_size_that_no_draw_has_is_refused(monkeypatch):
     monkeypatch.setattr(module, "_TRIES", 2)
-    with pytest.raises(CalibError, match="no force_offset of 1000000.0 noise sds in 8000 draws"):
+    with pytest.raises(CalibError, match=r"no force_offset of 1000000\.0 noise sds in 8000 draws"):
         draw("force_offset", 1e6)
 
 

@@ -271,7 +271,8 @@ def test_a_context_speaks_of_what_is_known_and_suspects_shifts_only():
     _check_names(Context(suspected={"a": 0.5, "parameter_shift": 0.2}, excluded=("b",)), known)
     for context, name in (
         (Context(suspected={"c": 0.5}), "c"), (Context(excluded=("c",)), "c"),
-        (Context(sizes={"c": {}}), "c"), (Context(excluded=("parameter_shift",)), "parameter_shift"),
+        (Context(sizes={"c": {}}), "c"),
+        (Context(excluded=("parameter_shift",)), "parameter_shift"),
         (Context(sizes={"parameter_shift": {}}), "parameter_shift"),
     ):  # fmt: skip
         with pytest.raises(CalibError, match=f"speaks of {name}"):
