@@ -82,6 +82,9 @@ def test_the_best_guesses_lie_apart_by_more_than_seven_tenths_of_a_width(bounded
     assert bounded.best(costs, np.array(at), 10) == [0, 2, 3, 5, 4]
     assert bounded.best(costs, np.array(at), 2) == [0, 2]
     assert bounded.best(costs[::-1], np.array(at)[::-1], 1) == [5]
+    # Wherever they are.
+    there = 64.0 + np.array([[0.0, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, 2.0, 0.0]])
+    assert bounded.best(np.arange(3.0), there, 10) == [0, 2]
 
 
 def test_derivatives_are_of_steps_that_stay_inside(bounded):

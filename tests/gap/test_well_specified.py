@@ -181,7 +181,7 @@ def test_without_a_gap_one_vector_is_drawn():
 
 def test_of_a_pair_each_is_large_enough_to_count():
     for seed in range(2):
-        data, found = draw("force_offset+rut_rebound", 3.0, seed)
+        data, found = draw("force_offset+rut_rebound", 1.3, seed)
         for cause in ("force_offset", "rut_rebound"):
             each = gaps(data, found.forward, found.psi, cause)
             assert max(np.sqrt(np.square(z).mean()) for z in each.values()) >= 1.0
