@@ -127,7 +127,7 @@ def _shares(mixed: Mixture, names: list[str]) -> tuple[Array, Array]:
         shares.append(part)
         weights.append(np.full(rms.shape[0], probability / max(rms.shape[0], 1)))
     weight = np.concatenate(weights)
-    return np.concatenate(shares), weight / max(weight.sum(), 1e-300)
+    return np.concatenate(shares), weight / weight.sum()
 
 
 def _sizes(data: Campaigns, fit: Fit, psi: Array) -> Array:
@@ -150,10 +150,7 @@ def _mean_and_interval(share: Array, weight: Array) -> tuple[float, tuple[float,
         return 0.0, (0.0, 0.0)
     order = np.argsort(share)
     cumulative = np.cumsum(weight[order])
-    low, high = (
-        float(share[order][min(int(np.searchsorted(cumulative, q)), share.size - 1)])
-        for q in (0.05, 0.95)
-    )
+    low, high = (float(share[order][np.searchsorted(cumulative, q)]) for q in (0.05, 0.95))
     mean = float(weight @ share)
     return mean, (min(low, mean), max(high, mean))
 

@@ -131,7 +131,7 @@ def most_probable(squared: Array, at: NoiseConditions) -> list[Noise]:
         variance = np.maximum(squared @ (growth**-2).reshape(-1, n).T / n, 1e-18)
         prior = LN_RHO_PRIOR[:, None] + LN_KAPPA_PRIOR[:kappas]
         value = -0.5 * n * np.log(variance) + (prior - ln_growth).ravel()
-    best = np.where(np.isfinite(value), value, -np.inf).argmax(axis=1).tolist()
+    best = value.argmax(axis=1).tolist()
     # A model without a value somewhere says nothing about the noise.
     known = np.isfinite(value).all(axis=1).tolist()
     return [

@@ -47,7 +47,7 @@ class Odds:
         }
         return cls(
             n_single,
-            {n: _logit(p) - _logit(min(usual[n], 0.5)) for n, p in context.suspected.items()},
+            {n: _logit(p) - _logit(usual[n]) for n, p in context.suspected.items()},
         )
 
     def ln_prior(self, name: str) -> float:

@@ -148,13 +148,13 @@ def hdi_error(batches: Array, prob: float) -> Array:
     doi:10.1214/aos/1176347498), slower than the quantiles at which they lie: so do the ends of the
     parts, whose scatter is scaled by that root.
     """
-    ends = np.asarray(_stats().hdi(batches, prob, axis=-1))
+    ends = np.asarray(_stats().hdi(batches, prob, axis=1))
     return np.asarray(ends.std(axis=0, ddof=1) / np.cbrt(batches.shape[0]))
 
 
 def median_error(batches: Array) -> float:
     """Monte Carlo standard error of the median of draws in nearly independent parts, (g, m)."""
-    return float(np.median(batches, axis=-1).std(ddof=1) / np.sqrt(batches.shape[0]))
+    return float(np.median(batches, axis=1).std(ddof=1) / np.sqrt(batches.shape[0]))
 
 
 N_BINS = 20

@@ -7,7 +7,8 @@ from copy import copy
 import numpy as np
 import pytest
 
-from calib.gap.ascent import together
+import calib.gap.ascent as module
+from calib.gap.ascent import Ascent, _change, _directions, _step, climb, slopes, together
 from calib.gap.case import Campaigns, campaigns
 from calib.gap.fit import Fit, finish, log_joint, truncated_fit
 from calib.gap.forward import Forward
@@ -134,3 +135,141 @@ def test_derivatives_are_taken_within_a_small_part_of_a_prior(problems):
         np.testing.assert_allclose(sizes, 1e-4, rtol=1e-3)
         top = np.where(np.isfinite(problem.upper), problem.upper, psi[:1])
         assert (problem.around(top) <= problem.upper).all()
+
+
+NOISES = {o: Noise(s, 1.0, 0.0) for o, s in SIGMA.items()}
+
+
+def ascents_of(problem: Residuals, size: int) -> list[Ascent]:
+    psi = drawn(problem, size)
+    return [Ascent(p, r, NOISES) for p, r in zip(psi, problem.raw(psi), strict=True)]
+
+
+def test_slopes_are_those_of_the_cost(problems):
+    """The gradient by differences of the cost; the Hessian of the residuals' derivatives."""
+    for problem in problems:
+        ascents = ascents_of(problem, 2)
+        (slope,) = together([slopes(problem, ascents)])
+        sds = problem.sds(NOISES)
+        np.testing.assert_array_equal(slope.sds, [sds, sds])
+        for i, ascent in enumerate(ascents):
+            d = ascent.psi.size
+            step = 1e-5 * problem.width * np.eye(d)
+            there = np.stack([ascent.psi + step, ascent.psi - step])
+            up, down = (problem.costs(p, problem.raw(p), sds) for p in there)
+            gradient = (up - down) / (2e-5 * problem.width)
+            scale = np.abs(gradient * problem.width).max()
+            np.testing.assert_allclose(
+                slope.gradient[i] * problem.width, gradient * problem.width, atol=0.02 * scale
+            )
+            scaled = problem.jacobian(
+                ascent.psi[None], ascent.raw[None], problem.raw(problem.around(ascent.psi[None]))
+            )[0] / sds  # fmt: skip
+            hessian = scaled @ scaled.T + np.diag(problem.precision**2)
+            np.testing.assert_allclose(slope.scaled[i], scaled, rtol=1e-9, atol=1e-9)
+            np.testing.assert_allclose(slope.hessian[i], hessian, rtol=1e-9, atol=1e-9)
+
+
+def test_damped_steps_solve_marquardts_equations_and_leave_a_blocked_coordinate(problems):
+    problem = problems[0]
+    (ascent,) = ascents_of(problem, 1)
+    bounded = int(np.flatnonzero(np.isfinite(problem.lower))[0])
+    dampings = np.array([[1e-3, 0.1, 10.0]])
+    (slope,) = together([slopes(problem, [ascent])])
+    for sign in (1.0, -1.0):
+        slope.gradient[0, bounded] = sign * abs(slope.gradient[0, bounded])
+        psi = ascent.psi.copy()
+        psi[bounded] = problem.lower[bounded]
+        found = _directions(problem, psi[None], slope, dampings)[0]
+        free = np.ones(psi.size, dtype=bool)
+        free[bounded] = sign < 0.0  # downhill is then away from the bound
+        hessian, gradient = slope.hessian[0][np.ix_(free, free)], slope.gradient[0, free]
+        diagonal = (np.diag(slope.hessian[0]) + 1e-2 / problem.width**2)[free]
+        for step, damping in zip(found, dampings[0], strict=True):
+            expected = -np.linalg.solve(hessian + damping * np.diag(diagonal), gradient)
+            np.testing.assert_allclose(step[free], expected, rtol=1e-6, atol=1e-12)
+            np.testing.assert_array_equal(step[~free], 0.0)
+
+
+def test_of_several_dampings_the_step_that_gains_most_is_taken(problems):
+    """From a tenth to ten thousand times the last good one; worked out again one by one."""
+    problem = problems[0]
+    ascents = ascents_of(problem, 3)
+    before = [(a.psi, a.raw) for a in ascents]
+    for ascent, damping in zip(ascents, (1e-3, 1.0, 1e-9), strict=True):
+        ascent.damping = damping
+    dampings = np.array([[a.damping] for a in ascents]) * [[0.1, 1.0, 10.0, 100.0, 1e3, 1e4]]
+    (slope,) = together([slopes(problem, ascents)])
+    (gains,) = together([_step(problem, ascents, slope)])
+    sds = problem.sds(NOISES)
+    for i, (psi, raw) in enumerate(before):
+        steps = _directions(problem, *(psi[None],), _only(slope, i), dampings[i : i + 1])[0]
+        tried = problem.clip(psi + steps)
+        costs = problem.costs(tried, problem.raw(tried), sds)
+        best = int(np.nanargmin(costs))
+        assert gains[i] == pytest.approx(problem.costs(psi, raw, sds) - costs[best], rel=1e-6)
+        assert gains[i] > 0.0
+        np.testing.assert_allclose(ascents[i].psi, tried[best])
+        np.testing.assert_allclose(ascents[i].raw, problem.raw(tried[best : best + 1])[0])
+        assert ascents[i].damping == pytest.approx(max(dampings[i, best], 1e-9), rel=1e-6)
+
+
+def _only(slope, i: int):
+    return type(slope)(*(getattr(slope, n)[i : i + 1] for n in vars(slope)))
+
+
+def test_where_no_step_gains_the_next_are_shorter(problems):
+    """At a mode, uphill: the ascent stays, and begins with ten times the largest damping."""
+    problem = problems[0]
+    (ascent,) = ascents_of(problem, 1)
+    (slope,) = together([slopes(problem, [ascent])])
+    slope.gradient[:] *= -1.0
+    was = ascent.psi.copy()
+    for expected in (1e-3 * 1e5, 1e6, 1e6):
+        (gains,) = together([_step(problem, [ascent], slope)])
+        assert gains == [0.0]
+        np.testing.assert_array_equal(ascent.psi, was)
+        assert ascent.damping == pytest.approx(expected)
+
+
+def test_a_noise_has_changed_by_its_logarithm_and_by_how_it_grows():
+    old = {"a": Noise(0.1, 1.0, 0.8), "b": Noise(0.2, 0.0, 0.0)}
+    new = {"a": Noise(0.05, 2.5, -0.8), "b": Noise(0.2, 0.0, 0.0)}
+    assert _change(old, new) == pytest.approx(np.log(2.0) + 1.5 + 1.6)
+    assert _change(new, old) == pytest.approx(np.log(2.0) + 1.5 + 1.6)
+    assert _change(old, {**old, "b": Noise(0.3, 0.0, 0.8)}) == pytest.approx(np.log(1.5) + 0.8)
+    assert _change(old, old) == 0.0
+
+
+def test_a_climb_ends_after_two_quiet_steps_one_after_the_other(problems, monkeypatch):
+    """Quiet is to gain less than a thousandth of a nat while the noise moves less than 1 %."""
+    problem = problems[0]
+    start = ascents_of(problem, 1)[0]
+    calm, moved = dict(NOISES), {o: Noise(1.02 * s, 1.0, 0.0) for o, s in SIGMA.items()}
+
+    def steps_of(gains, noises) -> int:
+        taken = []
+
+        def step(problem, ascents, slope):
+            taken.append(len(ascents))
+            return [gains[len(taken) - 1]]
+            yield
+
+        def noise(raw, scaled, hessian):
+            return [noises[len(taken) - 1]]
+
+        monkeypatch.setattr(module, "_step", step)
+        again = copy(problem)
+        again.update_noises = noise
+        ascent = copy(start)
+        together([climb(again, [ascent], 5)])
+        assert ascent.noise == noises[len(taken) - 1]
+        return len(taken)
+
+    quiet, loud = 0.9e-3, 1.1e-3
+    assert steps_of([quiet] * 5, [calm] * 5) == 2
+    assert steps_of([loud, quiet, quiet, 0, 0], [calm] * 5) == 3
+    assert steps_of([quiet, loud, quiet, loud, quiet], [calm] * 5) == 5
+    assert steps_of([quiet, loud, quiet, quiet, 0], [calm] * 5) == 4
+    assert steps_of([1e-3] * 5, [calm] * 5) == 5
+    assert steps_of([quiet] * 5, [moved, calm, moved, moved, moved]) == 5

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -13,13 +14,18 @@ from calib.gap.diagnose import diagnose, diagnose_once
 from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
+    COVERED,
     SHIFTS,
+    covered,
     dependences,
+    effect_priors,
     inseparable,
     joined,
+    pair,
     resized,
     shifts,
     singles,
+    split_testable,
     unknowns,
     wider,
     with_remainder,
@@ -274,3 +280,175 @@ def test_a_condition_that_a_simulator_knows_is_no_dependence(data):
     assert "depends_on_inflation_pressure" not in {
         name for name, e in dependences(data).items() if "pull" in e.outputs
     }
+
+
+PULL, RUT = ("drawbar_pull",), ("rut_depth",)
+BOTH = PULL + RUT
+
+
+def weighed(hypotheses: list[Hypothesis]) -> dict[tuple, float]:
+    """What each may vary with or set in over, of which outputs and size, and its share."""
+    found = Counter()
+    for h in hypotheses:
+        assert h.name == "unknown"
+        found[h.onset_over or h.smooth_over, h.onset_over is not None, h.smooth_outputs,
+              h.smooth] += h.share  # fmt: skip
+    assert len(found) == len(hypotheses)
+    return dict(found)
+
+
+def test_what_may_be_unlisted_is_all_that_a_wheel_shows_and_its_shares_are_as_stated(data):
+    """Half of it smooth in either size, the rest setting in, 0.06 of all below a pressure."""
+    each, all_three = (PULL, RUT), (PULL, RUT, BOTH)
+    smooth = [("level", t) for t in each]
+    smooth += [("sinkage", t) for t in (PULL, BOTH)]  # of ruts alone it would be their level
+    for over in ("slip", "order", "ripple", "before", "all", "pressure", "speed", "passes"):
+        smooth += [(over, t) for t in all_three]
+    onsets = [("level", PULL), ("level", RUT), ("sinkage", PULL), ("sinkage", BOTH)]
+    onsets += [("slip", BOTH), ("order", RUT), ("order", BOTH)]
+    expected = {
+        **{(over, False, t, size): 0.25 / len(smooth) for over, t in smooth for size in (1.5, 5.0)},
+        **{(over, True, t, 4.0): 0.44 / len(onsets) for over, t in onsets},
+        **{("low_pressure", True, t, 4.0): 0.06 / 3 for t in all_three},
+    }
+    assert weighed(unknowns(data)) == pytest.approx(expected)
+
+
+def test_of_a_density_its_probes_are_what_it_may_change_with():
+    t = ("bulk_density",)
+    expected = {
+        **{(over, False, t, size): 0.125 for over in ("level", "all") for size in (1.5, 5.0)},
+        **{(over, True, t, 4.0): 0.5 / 3 for over in ("level", "water", "cone")},
+    }
+    assert weighed(unknowns(campaigns(density_campaigns()))) == pytest.approx(expected)
+
+
+def test_beside_a_cause_there_is_little_of_every_shape(data):
+    (offset,) = singles(data, {"force_offset": EFFECTS["force_offset"]})
+    beside = with_remainder(data, replace(offset, share=0.5))
+    shapes = [(h.smooth_over, h.smooth, h.smooth_outputs, h.share) for h in beside]
+    assert sorted(shapes) == [
+        ("all", 1.5, BOTH, 0.1), ("all", 5.0, BOTH, 0.1), ("level", 1.5, BOTH, 0.1),
+        ("slip", 1.5, BOTH, 0.1), ("slip", 5.0, BOTH, 0.1),
+    ]  # fmt: skip
+    assert {h.effects for h in beside} == {offset.effects}
+    probed = with_remainder(campaigns(density_campaigns()), replace(offset, share=0.3))
+    assert [(h.smooth_over, h.smooth) for h in probed] == [
+        ("level", 1.5), ("all", 1.5), ("all", 5.0),
+    ]  # fmt: skip
+    assert [h.share for h in probed] == pytest.approx([0.1] * 3)
+
+
+def test_a_wide_prior_is_four_times_as_wide_or_by_twice_the_logarithm(data):
+    few = singles(data, {n: EFFECTS[n] for n in ("force_offset", "lug_thrust")})
+    logs = set()
+    for single in few:
+        wide = wider(single)
+        assert wide.name == single.name
+        for a, b in zip(single.effect_priors[0].free, wide.effect_priors[0].free, strict=True):
+            assert b.scale == pytest.approx((2.0 if a.log else 4.0) * a.scale)
+            logs.add(a.log)
+    assert logs == {True, False}
+
+
+def test_a_set_has_the_product_of_its_causes_shares(data):
+    a, b = singles(data, {n: EFFECTS[n] for n in ("force_offset", "lug_thrust")})
+    both = joined(replace(a, share=0.02), replace(b, share=0.1))
+    assert both.share == pytest.approx(0.002)
+    assert both.effect_priors == a.effect_priors + b.effect_priors
+    assert pair(b, a) == joined(b, a) == joined(a, b)
+
+
+def test_forces_of_an_effect_go_with_the_load(data):
+    heavy = replace(data, view=replace(data.view, load_kn=3.0 * data.view.load_kn))
+    offset = EFFECTS["force_offset"]
+    (usual,), (heavier,) = (effect_priors(d, offset).free for d in (data, heavy))
+    assert heavier.scale == pytest.approx(3.0 * usual.scale)
+
+
+def test_effects_are_split_by_whether_the_design_shows_them():
+    case = make_case(None, models=PULL_ONLY)
+    able, unable = split_testable(campaigns(case))
+    assert set(able) | set(unable) == set(EFFECTS)
+    assert not set(able) & set(unable)
+    assert "force_offset" in able
+    assert "rut_rebound" in unable
+    assert all(isinstance(reason, str) and reason for reason in unable.values())
+
+
+def test_a_dependence_is_about_half_the_range_of_both_campaigns_and_what_ignores_it():
+    case = make_case(None)
+    ramp = {"lab": (4.0, 5.0), "field": (5.0, 8.0)}
+    tables = {
+        name: table_from_arrays(
+            {**getattr(case, name).columns,
+             "normal_load_kn": np.linspace(*ends, len(getattr(case, name)))}
+        )
+        for name, ends in ramp.items()
+    }  # fmt: skip
+    found = dependences(campaigns(replace(case, **tables)))
+    load = found["depends_on_normal_load"]
+    assert load.half_range == pytest.approx(2.0)
+    assert load.logs == {"pull": False, "sinkage": True}
+    # The simulators know slip and pressures; the pull's knows no passes, ruts' neither.
+    assert "depends_on_slip" not in found
+    assert not any("pressure" in name and "pull" in e.outputs for name, e in found.items())
+    # What is unknown somewhere in the field, or in the laboratory all along, is none.
+    holed = np.array(tables["field"]["normal_load_kn"])
+    holed[3] = np.nan
+    lacking = replace(tables["field"], columns={**tables["field"].columns, "normal_load_kn": holed})
+    data = campaigns(replace(case, **tables))
+    without = replace(data, view=replace(data.view, conditions=dict(lacking.columns)))
+    assert "depends_on_normal_load" not in dependences(without)
+    bare = replace(case, lab=table_without(case.lab, "normal_load_kn"), field=tables["field"])
+    assert "depends_on_normal_load" not in dependences(campaigns(bare))
+
+
+def test_what_a_listed_effect_is_about_is_depended_on_in_another_way_seldom(data):
+    found = dependences(data)
+    passes = found["depends_on_pass_number"]
+    assert covered(passes, {"multipass_compaction", "force_offset"})
+    assert not covered(passes, {"rate_effect", "force_offset"})
+    assert not covered(EFFECTS["multipass_compaction"], {"multipass_compaction"})
+    assert pytest.approx(0.02) == COVERED
+
+
+def test_declared_columns_may_change_every_output():
+    """A number by half its range; a category against its most frequent value in the laboratory."""
+    case = make_case(None)
+    rng = np.random.default_rng(2)
+    tables = {}
+    for name in ("lab", "field"):
+        table, last = getattr(case, name), 5.0 if name == "lab" else 9.0
+        n = len(table)
+        columns = {
+            **table.columns, "temperature": np.linspace(1.0, last, n),
+            "crew": rng.permutation(np.resize([0.0, 2.0, 2.0, 1.0], n)), "flat": np.full(n, 3.0),
+        }  # fmt: skip
+        tables[name] = replace(table, columns=columns)
+    declared = {"temperature": (), "crew": ("a", "b", "c"), "flat": ()}
+    data = campaigns(replace(case, **tables, covariates=declared))
+    found = {e.covariates[0]: e for e in dependences(data).values()}
+    logs = {"pull": False, "sinkage": True}
+    assert found["temperature"].half_range == pytest.approx(4.0)
+    assert found["temperature"].logs == found["crew"].logs == logs
+    assert found["crew"].usual == 2
+    assert 0.0 < found["flat"].half_range < 1e-9
+    assert inseparable(data, found["flat"])
+    assert not inseparable(data, found["temperature"])
+    assert not inseparable(data, found["crew"])
+    # No dependence is any effect's business but its own.
+    constant = replace(data, view=replace(data.view, conditions={
+        **data.view.conditions, "speed_m_s": np.full(27, 1.0)}))  # fmt: skip
+    assert inseparable(constant, EFFECTS["rate_effect"]) is False
+    narrow = np.linspace(20.0, 20.5, 27)
+    little = replace(data, view=replace(data.view, conditions={
+        **data.view.conditions, "temperature": narrow}))  # fmt: skip
+    assert not inseparable(little, found["temperature"])
+
+
+def test_shifts_are_a_part_of_what_all_soils_span(data):
+    sizes = sorted({h.shift for h in shifts(data)})
+    assert sizes == [0.1, 0.25, 0.6]
+    assert [h.share for h in shifts(data) if h.shift_as == "soil"] == pytest.approx([2 / 9] * 3)
+    assert {h.name for h in shifts(data)} == {"parameter_shift"}

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 
-from calib.gap.next_measurement import _candidates, _gain, next_measurements
-from tests.gap.cases import campaigns_of, ranking_of
+from calib.gap.hypotheses import singles
+from calib.gap.next_measurement import _candidates, _gain, _moments, next_measurements
+from tests.gap.cases import CHOICE, campaigns_of, ranking_of
+from tests.gap.fits import SIGMA, fit_at
 
 
 def tied(case: str | None, *names: str):
@@ -106,3 +109,46 @@ def test_at_most_three_in_play_are_told_apart_and_none_that_is_improbable():
     p |= {"force_offset": 0.03, "none": 0.029, "lug_thrust": 0.0}
     (one,) = next_measurements(data, replace(ranking, probability=p), 1)
     assert one.separates == ("sensor_drift", "force_offset")
+
+
+def offset_of(data, offset: float, sd: float = 0.0):
+    (single,) = singles(data, {"force_offset": CHOICE["force_offset"]})
+    found = fit_at(data, single)
+    part = found.forward.phi_slices[0]
+    psi, covariance = found.psi.copy(), np.zeros_like(found.covariance)
+    psi[part] = offset
+    covariance[part, part] = sd**2
+    return replace(found, psi=psi, covariance=covariance)
+
+
+def test_moments_are_of_the_posterior_and_the_noise():
+    data = campaigns_of(None)
+    found = offset_of(data, 0.3, 0.05)
+    moments = _moments(data, found, data.view, 1)
+    middle = found.forward.field(found.psi[None], data.view)
+    mean, variance = moments["drawbar_pull"]
+    # Of 200 draws: means within 4/sqrt 200 sds, variances within 4 sqrt(2/200) of them.
+    np.testing.assert_allclose(mean, middle["drawbar_pull"][0], atol=4.0 * 0.05 / np.sqrt(200.0))
+    np.testing.assert_allclose(
+        variance - SIGMA["drawbar_pull"] ** 2, 0.05**2, rtol=4.0 * np.sqrt(2.0 / 200.0)
+    )
+    np.testing.assert_allclose(moments["rut_depth"][1], SIGMA["rut_depth"] ** 2)
+
+
+def test_two_in_play_are_told_apart_where_their_gain_is_largest():
+    """Offsets of known sizes: the same gain everywhere, that of two normals."""
+    data = campaigns_of(None)
+    fits = {"one": offset_of(data, 0.0), "other": offset_of(data, 0.3), "third": None}
+    p = {"one": 0.5, "other": 0.03, "third": 0.0299}
+    ranking = SimpleNamespace(order=list(p), probability=p, best=fits.__getitem__)
+    (found,) = next_measurements(data, ranking, 1)
+    assert found.separates == ("one", "other")
+    assert np.isclose(found.gain_nats, 0.5 * (0.3 / SIGMA["drawbar_pull"]) ** 2)
+    p["other"] = 0.0299
+    assert next_measurements(data, ranking, 1) == ()
+    # At most three are told apart.
+    four = {n: offset_of(data, x) for n, x in (("a", 0.0), ("b", 0.1), ("c", 0.2), ("d", 0.3))}
+    p = dict.fromkeys(four, 0.25)
+    ranking = SimpleNamespace(order=list(p), probability=p, best=four.__getitem__)
+    pairs = [m.separates for m in next_measurements(data, ranking, 1)]
+    assert pairs == [("a", "b"), ("a", "c"), ("b", "c")]

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from calib.data import table_from_arrays
 from calib.gap.case import campaigns
 from calib.gap.noise import (
     KAPPA,
@@ -14,6 +17,7 @@ from calib.gap.noise import (
     ln_prior,
     most_probable,
     noise_conditions,
+    noise_conditions_of_lab,
 )
 from tests.gap.cases import PULL_ONLY, make_case
 
@@ -81,3 +85,50 @@ def test_how_a_noise_grows_has_a_probability_beforehand_and_all_have_one():
     # No growth at all is believed before any other.
     assert ln_prior(Noise(0.1)) == max(map(ln_prior, grown))
     assert np.exp(ln_prior(Noise(0.1))) == pytest.approx(0.35)
+
+
+@pytest.mark.parametrize(("rho", "beforehand"), [(0.0, 0.5), (1.0, 0.2), (2.5, 0.15), (5.0, 0.15)])
+@pytest.mark.parametrize(("kappa", "too"), [(0.0, 0.7), (0.8, 0.2), (-0.8, 0.1)])
+def test_the_probability_of_a_growth_is_that_with_slip_times_that_with_softness(
+    rho, beforehand, kappa, too
+):
+    assert ln_prior(Noise(0.1, rho, kappa)) == pytest.approx(np.log(beforehand * too))
+
+
+def test_rows_may_be_picked_and_put_one_after_the_other():
+    one, other = at(5), at(3, pressures=False)
+    some = one.rows(np.array([3, 0]))
+    assert some.slip.tolist() == one.slip[[3, 0]].tolist()
+    assert some.softness.tolist() == one.softness[[3, 0]].tolist()
+    both = one + other
+    assert both.slip.tolist() == [*one.slip, *other.slip]
+    assert both.softness.tolist() == [*one.softness, *other.softness]
+
+
+def test_softness_is_of_pressures_of_any_size_where_both_campaigns_have_one():
+    pressure = np.array([0.5, 0.8, 2.0])
+    view = SimpleNamespace(
+        conditions={"inflation_pressure_psi": pressure}, lab={"inflation_pressure_psi": 0.8},
+        slip=lambda: np.zeros(3),
+    )  # fmt: skip
+    np.testing.assert_allclose(noise_conditions(view).softness, np.log(0.8 / pressure))
+    view.lab = {}
+    assert not noise_conditions(view).softness.any()
+    assert not noise_conditions(view).slip.any()
+    # The laboratory's rows are beside the same reference.
+    view.lab = {"inflation_pressure_psi": 4.0}
+
+    lab = table_from_arrays({"inflation_pressure_psi": pressure, "slip_ratio": 0.1 * pressure})
+    rows = noise_conditions_of_lab(lab, view)
+    np.testing.assert_allclose(rows.softness, np.log(4.0 / pressure))
+    np.testing.assert_allclose(rows.slip, 0.1 * pressure)
+
+
+def test_a_guess_without_a_value_somewhere_says_nothing_of_the_noise():
+    rows = at(30)
+    squared = np.random.default_rng(3).standard_normal((3, 30)) ** 2
+    alone = most_probable(squared[[0, 2]], rows)
+    squared[1, 4] = np.nan
+    assert most_probable(squared, rows) == [alone[0], Noise(1.0), alone[1]]
+    squared[1, 4] = np.inf
+    assert most_probable(squared, rows)[1] == Noise(1.0)

@@ -14,7 +14,7 @@ from calib.gap.case import campaigns
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
 from calib.gap.noise import noise_conditions
-from calib.gap.oddities import _times, oddities
+from calib.gap.oddities import _ROUGHLY, _times, identical_rows, oddities
 from tests.gap.cases import MODELS, PULL_ONLY, make_case, table_without
 
 PULL, RUT = OUTPUTS["drawbar_pull"], OUTPUTS["rut_depth"]
@@ -228,3 +228,114 @@ def test_a_factor_near_that_of_two_units_is_called_so(units):
     for off, like in ((1.0, True), (1.12, True), (0.88, True), (1.2, False), (0.8, False)):
         for field in (lab * factor * off, lab / (factor * off)):
             assert (units in _times(lab, field)) == like
+
+
+@pytest.mark.parametrize(
+    ("units", "factor"), [("a fraction and percent", 100.0), ("thousandths and wholes", 1000.0)]
+)
+def test_a_ratio_is_near_a_factor_within_an_sd_of_its_logarithm(units, factor):
+    """0.15 usually, 0.4 where conditions are other ones in every campaign."""
+    lab = np.full(9, 3.0)
+    for near, options in ((0.15, ()), (0.4, (_ROUGHLY,))):
+        for off, like in ((near - 5e-4, True), (near + 5e-4, False)):
+            for sign in (1.0, -1.0):
+                field = lab * factor * np.exp(sign * off)
+                assert (units in _times(lab, field, *options)) == like
+    assert "1 times less" in _times(lab, lab)
+
+
+PSI = "inflation_pressure_psi"
+
+
+def test_a_condition_that_the_calibration_held_constant_is_named():
+    """Of those that the simulators have, and where the field varied it."""
+    case = make_case(None)
+    told = f"{PSI}: held constant in the calibration and varied in the field"
+    flat = {PSI: np.full(len(case.lab), 30.0)}
+    assert told in said(with_columns(case, lab=flat))
+    both = with_columns(case, lab=flat, field={PSI: np.full(len(case.field), 30.0)})
+    assert "held constant" not in said(both)
+    # Speed is constant in the calibration of every such case; no simulator has it.
+    assert "held constant" not in said(case)
+    for which in ("lab", "field"):
+        tables = {"lab": case.lab, "field": case.field}
+        tables[which] = table_without(tables[which], PSI)
+        assert "held constant" not in "\n".join(oddities(**tables, models=case.models))
+
+
+def test_a_state_that_one_table_lacks_was_not_swapped():
+    case = make_case(None)
+    speeds = np.linspace(0.5, 1.5, len(case.lab))
+    varied = with_columns(case, lab={"speed_m_s": speeds})
+    without = replace(varied, field=table_without(case.field, "speed_m_s"))
+    assert "swapped" not in said(without)
+    bare = replace(case, lab=table_without(case.lab, "speed_m_s"))
+    assert "swapped" not in said(bare)
+    assert "the calibration has no speed_m_s: its effects are taken about" in said(bare)
+    assert "the calibration has no" not in said(without)
+
+
+def test_an_output_that_the_calibration_lacks_is_no_condition():
+    case = make_case(None)
+    lab = table_without(case.lab, RUT)
+    told = "\n".join(oddities(lab, case.field, {"drawbar_pull": MODELS["drawbar_pull"]}))
+    assert "the calibration has no" not in told
+
+
+def test_rows_that_are_the_calibrations_are_counted_in_the_columns_of_both():
+    case = make_case(None, models=PULL_ONLY)
+    assert identical_rows(case.lab, case.field) == 0
+    columns = {n: np.array(v) for n, v in case.field.columns.items()}
+    for name in columns:
+        columns[name][[2, 7, 8]] = case.lab[name][[4, 0, 0]]
+    field = table_from_arrays({**columns, "tyre_width_m": np.linspace(0.2, 0.3, 27)})
+    assert identical_rows(case.lab, field) == 3
+    told = said(replace(case, field=field))
+    assert "3 of 27 field rows are rows of the calibration" in told
+    # The third differs from the second by its width.
+    assert "copies of another" not in told
+    same = said(replace(case, field=table_from_arrays(columns)))
+    assert "1 of 27 field rows are copies of another" in same
+
+
+def test_of_two_rows_with_one_place_both_are_named_and_one_is_enough():
+    case = make_case(None)
+    order = np.arange(1.0, len(case.field) + 1.0)
+    order[9] = order[3]
+    twice = changed(case, run_order=order)
+    lines = ", ".join(str(twice.field.lines[i]) for i in (3, 9))
+    assert f"lines {lines}: the same run_order" in said(twice)
+
+
+def test_conditions_beyond_the_calibrations_are_said_to_be_so_if_those_varied():
+    case = make_case(None)
+    beyond = f"{PSI}: no field value lies within the calibration's range"
+    for factor in (3.0, 0.2):
+        told = said(with_columns(case, field={PSI: factor * case.field[PSI]}))
+        assert beyond in told
+    # They touch: at one end both have been.
+    touching = case.field[PSI] + np.ptp(case.lab[PSI])
+    assert beyond not in said(with_columns(case, field={PSI: touching}))
+    assert beyond not in said(with_columns(case, field={PSI: case.field[PSI] * (18.0 / 42.0)}))
+    flat = {PSI: np.full(len(case.lab), 30.0)}
+    told = said(with_columns(case, lab=flat, field={PSI: case.field[PSI] + 31.0}))
+    assert "no field value lies within" not in told
+
+
+def test_just_at_a_limit_a_ratio_is_odd():
+    """Four times for outputs, ten for conditions; a pull of just the load is not."""
+    case = make_case(None, models=PULL_ONLY)
+    n_lab, n_field = len(case.lab), len(case.field)
+    for factor in (4.0, 0.25):
+        outputs = with_columns(
+            case, lab={PULL: np.full(n_lab, 1.0)}, field={PULL: np.full(n_field, factor)}
+        )
+        assert f"{PULL}: typically" in said(outputs)
+    lab, field = np.full(n_lab, 1.0), np.full(n_field, 1.0)
+    for one, other in ((lab, field), (field, lab)):
+        one[:], other[:] = 1.0, 10.0
+        one[0], other[0] = 10.0, 1.0
+        slips = with_columns(case, lab={"slip_ratio": lab}, field={"slip_ratio": field})
+        assert "slip_ratio: typically" in said(slips)
+    load = with_columns(case, field={PULL: np.array(case.field["normal_load_kn"])})
+    assert "times the normal load" not in said(load)

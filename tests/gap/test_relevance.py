@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
+import calib.gap.relevance as module
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import unknowns
+from calib.gap.hypotheses import joined, singles, unknowns
 from calib.gap.noise import Noise, noise_conditions
-from calib.gap.relevance import relevance, sizes
-from tests.gap.cases import campaigns_of, ranking_of
+from calib.gap.relevance import _log_share, relevance, sizes
+from tests.gap.cases import CHOICE, campaigns_of, ranking_of
+from tests.gap.fits import SIGMA, fit_at
 
 
 def fit_of(case: str | None, name: str):
@@ -98,3 +103,62 @@ def test_it_is_the_posterior_share_of_relevant_sizes_over_the_prior_share(case):
     # Sds of a logarithm of a share: of the posterior, where it is small, some draws.
     sd = np.sqrt((1.0 - shares[0]) / (n * shares[0]) + (1.0 - shares[1]) / (n * shares[1]))
     assert found == pytest.approx(np.log(shares[0] / shares[1]), abs=5.0 * sd + 0.02)
+
+
+def test_alone_a_cause_counts_from_one_and_a_half_noise_sds_on_and_of_several_from_one():
+    """As shares of the draws that say something, by a fifth of a draw off none and all."""
+    alone = np.array([[1.5], [1.49], [2.0], [np.nan], [0.0]])
+    assert _log_share(alone) == pytest.approx(np.log((2 + 0.2) / (4 + 0.4)))
+    several = np.array([[1.0, 1.0], [1.0, 0.99], [0.0, 5.0], [np.inf, 5.0], [1.5, 1.6]])
+    assert _log_share(several) == pytest.approx(np.log((2 + 0.2) / (4 + 0.4)))
+    assert _log_share(np.zeros((3, 2))) == pytest.approx(np.log(0.2 / 3.4))
+
+
+def test_no_gap_is_as_relevant_as_it_ever_was():
+    forward = SimpleNamespace(hypothesis=SimpleNamespace(name="none"))
+    assert relevance(SimpleNamespace(forward=forward), 1, 10) == 0.0
+
+
+def test_prior_and_posterior_draws_are_told_by_their_effect_alone(monkeypatch):
+    """The simulator stays as it was fitted; one is the share of what draws of the fit have."""
+    data = campaigns_of(None)
+    (single,) = singles(data, {"force_offset": CHOICE["force_offset"]})
+    found = fit_at(data, single)
+    part = found.forward.phi_slices[0]
+    psi = found.psi.copy()
+    psi[part] = 0.1  # over three noise sds
+    large = replace(found, psi=psi)
+    asked = []
+
+    def noted(forward, noise, psi):
+        asked.append(psi)
+        return sizes(forward, noise, psi)
+
+    monkeypatch.setattr(module, "sizes", noted)
+    gained = relevance(large, 3, 500)
+    posterior, prior = asked
+    np.testing.assert_allclose(posterior, np.tile(psi, (500, 1)), atol=1e-6)
+    np.testing.assert_array_equal(prior[:, : part.start], np.tile(psi[: part.start], (500, 1)))
+    assert np.unique(prior[:, part]).size == 500
+    (offset,) = single.effect_priors[0].free
+    share = 2.0 * norm.sf(1.5 * SIGMA["drawbar_pull"] / offset.scale)
+    assert gained == pytest.approx(-np.log(share), abs=5.0 * np.sqrt((1 - share) / share / 500))
+
+
+def test_of_several_causes_each_is_as_large_as_what_goes_with_it():
+    data = campaigns_of(None)
+    few = singles(data, {n: CHOICE[n] for n in ("force_offset", "rut_rebound")})
+    both = fit_at(data, joined(*few))
+    psi = both.psi.copy()
+    psi[both.forward.phi_slices[0]] = 0.06
+    found = sizes(both.forward, both.noise, psi[None])
+    without = both.forward.without(psi[None], data.view, "rut_rebound")["rut_depth"]
+    full = both.forward.field(psi[None], data.view)["rut_depth"]
+    gone = np.sqrt(np.square((full - without) / SIGMA["rut_depth"]).mean())
+    np.testing.assert_allclose(found, [[2.0, gone]])
+    # One output that a shift leaves alone makes it no smaller, nor one that both outputs have.
+    unknown = next(h for h in unknowns(data) if h.smooth_over == "level" and h.smooth == 1.5)
+    alone = fit_at(data, unknown)
+    psi = alone.psi.copy()
+    psi[alone.forward.smooth_slices["drawbar_pull"].start] = 0.3
+    assert sizes(alone.forward, alone.noise, psi[None])[0, 0] > 1.0

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
+import calib.gap.sets as module
 from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS, physical_role
 from calib.gap.case import Case, campaigns
@@ -16,9 +19,23 @@ from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
 from calib.gap.guesses import Guesses, _led, _places
 from calib.gap.hypotheses import joined, resized, shifts, singles, with_remainder
+from calib.gap.hypothesis import Hypothesis
 from calib.gap.inclusion import inclusion_probability
 from calib.gap.odds import Odds, with_prior
-from calib.gap.sets import _apart, _as_sized, _enlarged, _exchanged, far_out
+from calib.gap.sets import (
+    _apart,
+    _as_sized,
+    _begun_again,
+    _best_of_each,
+    _enlarged,
+    _exchanged,
+    _finished,
+    _fitted,
+    _leading,
+    _pairs,
+    _stepwise,
+    far_out,
+)
 from calib.gap.which import calibrate_lab, rank
 from calib.inference.priors import Priors
 from tests.gap.cases import CHOICE, LARGE, make_case, parameters
@@ -167,3 +184,168 @@ def test_an_effect_that_holds_another_is_not_set_beside_it(guesses):
     assert not _apart(joined(step, lugs), offset)
     assert _apart(step, lugs)
     assert _apart(offset, lugs)
+
+
+EVEN = Odds(1, {})
+
+
+def fit_of(hypothesis, score: float):
+    """A fit of which evidence times prior has this logarithm."""
+    prior = EVEN.ln_prior(hypothesis.name) + np.log(hypothesis.share)
+    return SimpleNamespace(
+        forward=SimpleNamespace(hypothesis=hypothesis), log_evidence=score - float(prior)
+    )
+
+
+def named(name: str, **options) -> Hypothesis:
+    effects = tuple(SimpleNamespace(name=n, holds=()) for n in name.split("+"))
+    return Hypothesis(name, effects, **options)
+
+
+@pytest.mark.parametrize(("off", "far"), [(1.99, False), (2.01, True)])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_an_effect_is_far_out_from_two_sds_of_its_prior_on(off, far, sign):
+    entries = [SimpleNamespace(loc=-3.0, scale=0.5), SimpleNamespace(loc=1.0, scale=0.2)]
+    forward = SimpleNamespace(phi_slices=[slice(0, 1), slice(1, 3)])
+    psi = np.array([99.0, -3.0, 1.0 + sign * off * 0.2])
+    found = SimpleNamespace(psi=psi, forward=forward)
+    assert far_out(found, 1, SimpleNamespace(free=entries)) is far
+
+
+def test_the_best_fit_of_each_hypothesis_counts():
+    a, b = Hypothesis("a"), Hypothesis("b")
+    fits = [fit_of(a, 1.0), fit_of(b, 2.0), fit_of(a, 3.0), fit_of(replace(a, share=0.5), -9.0)]
+    assert _best_of_each(fits) == [fits[2], fits[1], fits[3]]
+
+
+def test_pairs_hold_one_of_the_six_best_and_no_effect_twice():
+    names = [f"e{i}" for i in range(9)]
+    best = {n: fit_of(named(n), 10.0 - i) for i, n in enumerate(names)}
+    holder = SimpleNamespace(name="e0", holds=("e3",))
+    held = replace(named("e0"), effects=(holder,), effect_priors=(None,))
+    for n in names:
+        best[n].forward.hypothesis = replace(named(n), effect_priors=(None,))
+    best["e0"].forward.hypothesis = held
+    mixed = [names[i] for i in (4, 8, 0, 6, 2, 7, 1, 3, 5)]
+    found = _pairs(mixed, best)
+    expected = {
+        "+".join(p)
+        for p in combinations(names, 2)
+        if (set(p) & set(names[:6])) and p != ("e0", "e3")
+    }
+    assert sorted(h.name for h, _ in found) == sorted(expected)
+    for h, members in found:
+        assert {f.forward.hypothesis.name for f in members} == set(h.name.split("+"))
+
+
+def test_sets_are_made_from_the_three_best_of_each_name_that_are_in_play():
+    fits = [fit_of(named(n), s) for n, s in (("a", 1.0), ("b", 5.0), ("a", 4.0), ("c", 2.0),
+            ("d", 3.0), ("e", 0.0))]  # fmt: skip
+    assert _leading(fits, -9.0, EVEN) == [fits[1], fits[2], fits[4]]
+    assert _leading(fits, 3.5, EVEN) == [fits[1], fits[2]]
+    assert _leading(fits, 5.5, EVEN) == []
+
+
+class Stub:
+    """Guesses that note what they are asked to begin."""
+
+    def __init__(self, odds=EVEN) -> None:
+        self.odds, self.asked = odds, []
+
+    def truncated_joint(self, hypothesis, members, count, skip=0):
+        self.asked.append((hypothesis.name, members, count, skip))
+        return [fit_of(hypothesis, 0.5)]
+
+    def truncated_promise(self, promise):
+        self.asked.append(promise.hypothesis.name)
+        return [fit_of(promise.hypothesis, promise.log_joint)]
+
+
+@pytest.fixture
+def at_once(monkeypatch):
+    """Walks that are their results; finishing gains a tenth."""
+    monkeypatch.setattr(module, "together", list)
+
+    def finish(begun):
+        best = max(begun, key=lambda f: f.log_evidence)
+        return SimpleNamespace(forward=best.forward, log_evidence=best.log_evidence + 0.1)
+
+    monkeypatch.setattr(module, "finish", finish)
+
+
+def test_what_is_hopeless_is_not_fitted_further(at_once):
+    a, b = named("a"), named("b")
+    begun = [[fit_of(a, 1.0), fit_of(a, 2.0)], [fit_of(b, 0.5), fit_of(b, 0.4)]]
+    found = _finished(begun, 0.6, EVEN)
+    assert [with_prior(f, EVEN) for f in found] == pytest.approx([2.1, 0.5])
+    assert found[1] is begun[1][0]
+
+
+def test_pairs_in_play_are_begun_again_from_the_guesses_after_the_first(at_once):
+    """Those within eight nats of the best."""
+    stub = Stub()
+    pairs = [(named(n), [n]) for n in ("a+b", "a+c", "b+c")]
+    begun = [[fit_of(h, s)] for (h, _), s in zip(pairs, (2.1, 1.9, 9.0), strict=True)]
+    found = _begun_again(stub, pairs, begun, 10.0)
+    assert stub.asked == [("a+b", ["a+b"], 5, 1), ("b+c", ["b+c"], 5, 1)]
+    assert [len(f) for f in found] == [2, 1, 2]
+    assert [len(f) for f in begun] == [1, 1, 1]
+    assert [f[0] for f in found] == [f[0] for f in begun]
+
+
+def test_the_six_sets_that_promise_most_are_fitted_once_each(at_once):
+    stub, searched = Stub(), {"s0+t"}
+    promises = [
+        SimpleNamespace(hypothesis=named(f"s{i}+t"), log_joint=j)
+        for i, j in ((0, 99.0), (1, 5.0), (2, 6.0), (1, 7.0), (3, 4.0), (4, 3.0), (5, 2.0),
+                     (6, 1.0), (7, 0.0))
+    ]  # fmt: skip
+    found = _fitted(stub, promises, searched, 12.5)
+    assert stub.asked == ["s1+t", "s2+t", "s3+t", "s4+t", "s5+t", "s6+t"]
+    assert searched == {"s0+t", *stub.asked}
+    # Within eight nats of the best that is listed they are fitted fully.
+    assert [with_prior(f, EVEN) for f in found] == pytest.approx([7.1, 6.1, 4.0, 3.0, 2.0, 1.0])
+    assert _fitted(stub, promises, searched, 12.5) != []
+    assert searched == {f"s{i}+t" for i in range(8)}
+
+
+def test_an_effect_takes_anothers_place_or_is_added_if_neither_holds_the_other():
+    class Noted(Stub):
+        def beside(self, kept, found, added):
+            return [(kept.name, found, h.name) for h in added]
+
+    alone = [replace(named(n), effect_priors=(None,)) for n in ("a", "b", "c", "d")]
+    alone[3] = replace(alone[3], effects=(SimpleNamespace(name="d", holds=("a",)),))
+    found = fit_of(joined(*alone[:2]), 0.0)
+    assert _exchanged(Noted(), [found], alone) == [
+        ("b", found, "c"), ("b", found, "d"), ("a", found, "c"),
+    ]  # fmt: skip
+    assert _enlarged(Noted(), [found], alone) == [("a+b", found, "c")]
+
+
+def test_sets_grow_step_by_step_up_to_four_causes_as_long_as_they_are_in_play(monkeypatch):
+    """Each effect more gains a nat; nothing is gained by exchange."""
+    tried = []
+
+    def enlarged(guesses, grown, alone):
+        names = [f.forward.hypothesis.name for f in grown]
+        tried.append(names)
+        return [f"{n}+{chr(ord(n[-1]) + 1)}" for n in names]
+
+    monkeypatch.setattr(module, "_exchanged", lambda *a: [])
+    monkeypatch.setattr(module, "_enlarged", enlarged)
+    monkeypatch.setattr(
+        module, "_fitted",
+        lambda guesses, promises, searched, listed: [
+            fit_of(named(n), float(n.count("+"))) for n in promises
+        ],
+    )  # fmt: skip
+    monkeypatch.setattr(module, "_as_sized", lambda guesses, usual, fits, leading: list(fits))
+    pairs = [fit_of(named("a+b"), 1.0), fit_of(named("k+l"), -3.5)]
+    made = _stepwise(Stub(), [fit_of(named("a"), 0.0)], {}, pairs, 1.0)
+    assert [f.forward.hypothesis.name for f in made] == ["a+b+c", "a+b+c+d"]
+    assert tried == [["a+b"], ["a+b+c"]]
+    # Four nats behind the best listed no pair is in play.
+    tried.clear()
+    assert _stepwise(Stub(), [], {}, pairs, 5.5) == []
+    assert tried == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -160,3 +161,77 @@ def test_a_folder_will_do_and_the_answer_is_short(tmp_path):
     few = {"force_offset": EFFECTS["force_offset"]}
     found = diagnose(folder, 1, effects=few)
     assert re.fullmatch(r"Diagnosis\(offset: effect; force_offset [\d.]+, .+\)", repr(found))
+
+
+def shrunk(weight, gap, before, after, noise=0.1, simulator=0.0):
+    """Of draws that are each one gap at both of two rows, shape (draws,)."""
+    name = "drawbar_pull"
+    true = np.repeat(np.array(gap, dtype=float)[:, None], 2, axis=1)
+    plain, sd = np.full_like(true, simulator), np.full_like(true, noise)
+    draws = Truth({name: plain}, {name: true}, {name: sd}, {name: true}, np.array(weight))
+    data = SimpleNamespace(outputs=(SimpleNamespace(name=name),))
+    return shrink(data, draws, {name: np.full(2, before)}, {name: np.full(2, after)}).get(name)
+
+
+def test_errors_and_fraction_are_those_of_weighted_draws():
+    """Nine tenths of the weight on three draws; the others are the ends of the 90 %."""
+    gap = np.array([0.5, 0.6, 1.0, 1.1, 1.5])
+    found = shrunk([0.06, 0.27, 0.34, 0.27, 0.06], gap, before=0.2, after=1.05)
+    before, after = np.abs(gap - 0.2), np.abs(gap - 1.05)
+    assert found.rmse_before == pytest.approx(0.8)
+    assert found.rmse_after == pytest.approx(0.05)
+    fractions = sorted(1.0 - after / before)
+    assert found.fraction == pytest.approx(1.0 - found.rmse_after / found.rmse_before)
+    low, high = fractions[0], fractions[-1]
+    assert found.interval[1] == pytest.approx(high)
+    assert found.interval[0] < low
+    assert found.noise_floor == pytest.approx(0.1)
+
+
+def test_the_lower_end_is_set_farther_off_by_a_quarter_of_its_logarithm():
+    gap = np.array([1.3, 1.2, 1.1])
+    found = shrunk([0.06, 0.47, 0.47], gap, before=0.0, after=1.0)
+    left = (gap - 1.0) / gap  # 0.231, 0.167 (the median: lower fractions come first) and 0.091
+    assert found.interval[0] == pytest.approx(1.0 - left[1] * (left[0] / left[1]) ** 1.25)
+    assert found.interval[1] == pytest.approx(1.0 - left[2])
+    # Errors' medians are of the errors: 1.2 and 0.2.
+    assert found.fraction == pytest.approx(1.0 - 0.2 / 1.2)
+
+
+@pytest.mark.parametrize(("gap", "there"), [(0.049, False), (0.051, True)])
+def test_a_gap_of_half_the_noise_is_one(gap, there):
+    assert (shrunk([0.5, 0.5], [gap, gap], before=0.0, after=0.0) is not None) is there
+    # Of the truth's own simulator, wherever the calibrated one is.
+    assert (shrunk([1.0], [1.0 + gap], 0.0, 0.0, simulator=1.0) is not None) is there
+    assert shrunk([1.0], [0.25], before=0.0, after=0.0, noise=0.5) is None
+
+
+@pytest.mark.parametrize(("weight", "there"), [(0.5, True), (0.499, False)])
+def test_a_gap_is_told_where_it_is_at_least_as_probable_as_not(weight, there):
+    found = shrunk([weight, 1.0 - weight], [0.3, 0.0], before=0.0, after=0.3)
+    assert (found is not None) is there
+
+
+def test_what_makes_it_worse_has_a_negative_fraction_within_its_interval():
+    found = shrunk([0.5, 0.5], [0.3, 0.32], before=0.0, after=1.0)
+    assert found.fraction == pytest.approx(1.0 - 0.7 / 0.3) or found.fraction < -1.0
+    assert found.interval[0] <= found.fraction <= found.interval[1]
+
+
+def test_one_that_had_no_error_did_not_shrink_to_anything_infinite():
+    """A gap of the simulator as it is in the field, none of the calibrated one, which had none."""
+    found = shrunk([1.0], [1.0], before=1.0, after=1.0, simulator=0.0)
+    assert found.rmse_before == found.rmse_after == 0.0
+    assert found.fraction == 1.0
+    assert found.interval == pytest.approx((1.0, 1.0))
+
+
+def test_the_noise_floor_is_the_median_of_the_draws_own():
+    name, sd = "drawbar_pull", np.array([[0.3, 0.3], [0.1, 0.1], [0.2, 0.2]])
+    true = np.ones((3, 2))
+    draws = Truth({name: 0.0 * true}, {name: true}, {name: sd}, {name: true}, np.full(3, 1 / 3))
+    data = SimpleNamespace(outputs=(SimpleNamespace(name=name),))
+    found = shrink(data, draws, {name: np.zeros(2)}, {name: np.ones(2)})[name]
+    assert found.noise_floor == pytest.approx(0.2)
+    predicted = predict_new(draws, {name: np.zeros(2)})[name]
+    np.testing.assert_allclose(predicted.after, 1.0)

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import groupby
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from calib.gap.mixture import Truth, mixture
-from calib.gap.where import regions, row_gaps
+from calib.gap.where import RowGap, _region, _stretches, conditions_to_search, regions, row_gaps
 from tests.gap.cases import campaigns_of, diagnosis_of, ranking_of
 
 NOISE = 0.05
@@ -132,8 +136,8 @@ def test_what_is_left_out_of_a_mixture_leaves_the_rest_their_odds():
     probability = {first: 0.6, second: 0.2} | dict.fromkeys(rest, 0.2 / len(rest) ** 2)
     scores = {name: (0.0, *[-50.0] * (len(fits) - 1)) for name, fits in ranking.fits.items()}
     few = {first: 0.6, second: 0.2} | dict.fromkeys(rest, 1e-3)
-    for given in (probability, few):
-        ranked = replace(ranking, probability=given, scores=scores)
+    for each in (probability, few):
+        ranked = replace(ranking, probability=each, scores=scores)
         found = mixture(campaigns_of("force_offset"), ranked, 1)
         assert sum(found.probability) == pytest.approx(1.0)
         assert found.probability[0] == pytest.approx(3.0 * found.probability[1])
@@ -157,3 +161,174 @@ def test_a_gap_of_a_field_at_one_condition_is_at_all_its_rows(data):
     assert region.gap == pytest.approx(-0.2)
     ((low, high),) = region.conditions.values()
     assert low == high
+
+
+def stretches_of(values, gap, probability, left, category):
+    """Written out: up to eight groups of distinct values, runs of one probable sign, not too few.
+
+    Of numbers neighbours of one sign are one stretch; of a category each value is its own.
+    """
+    distinct = sorted(set(values))
+    n_groups = len(distinct) if category else min(8, len(distinct))
+    size, longer = divmod(len(distinct), n_groups)
+    groups, at = [], 0
+    for i in range(n_groups):
+        groups.append(distinct[at : at + size + (i < longer)])
+        at += len(groups[-1])
+    told = []
+    for place, group in enumerate(groups):
+        rows = [i for i, v in enumerate(values) if v in group and left[i]]
+        sign = np.sign(sum(gap[i] for i in rows)) if rows else 0.0
+        same = [probability[i] if np.sign(gap[i]) == sign else 0.0 for i in rows]
+        probable = bool(rows) and sum(same) > 0.5 * len(rows)
+        told.append((group, len(rows), sign if probable else 0.0, place if category else 0))
+    found = []
+    for (sign, _), run in groupby(told, key=lambda t: t[2:]):
+        run = list(run)
+        if sign and sum(t[1] for t in run) >= max(2, len(values) // 12):
+            found.append((run[0][0][0], run[-1][0][-1]))
+    return found
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.integers(0, 20), st.sampled_from([-2.0, -1.0, 1.0, 2.0, 4.0]),
+            st.sampled_from([0.25, 0.5, 0.75, 1.0]), st.booleans(),
+        ),
+        min_size=1, max_size=50,
+    ),
+    st.booleans(),
+)  # fmt: skip
+def test_stretches_are_runs_of_groups_that_probably_have_a_gap_of_one_sign(rows, category):
+    values, gap, probability, left = (np.array(column) for column in zip(*rows, strict=True))
+    row_gap = RowGap("drawbar_pull", np.arange(len(rows)), gap, np.ones(len(rows)), probability)
+    found = _stretches(values.astype(float), row_gap, left, category)
+    assert found == stretches_of(*(c.tolist() for c in (values, gap, probability, left)), category)
+
+
+def of_slips(values, **covariates):
+    """One output over slips, and whatever is declared."""
+    conditions = {"slip_ratio": np.asarray(values, dtype=float)} | {
+        name: column for name, (column, _) in covariates.items()
+    }
+    rows = np.arange(len(values))
+    return SimpleNamespace(
+        outputs=(SimpleNamespace(name="drawbar_pull", rows=rows),),
+        view=SimpleNamespace(conditions=conditions),
+        case=SimpleNamespace(covariates={name: levels for name, (_, levels) in covariates.items()}),
+    )
+
+
+def certain(gap, noise=0.1):
+    """Draws that are all the same."""
+    true = np.tile(np.asarray(gap, dtype=float), (4, 1))
+    plain, sd = np.zeros_like(true), np.full_like(true, noise)
+    name = "drawbar_pull"
+    return Truth({name: plain}, {name: true}, {name: sd}, {name: true}, np.full(4, 0.25))
+
+
+def test_gap_sd_and_probability_are_those_of_weighted_draws():
+    """Of three draws the third counts half; where it does not go beyond the noise it is none."""
+    true = np.array([[0.3, 0.1], [-0.3, 0.0], [0.2, 0.2]])
+    sd = np.array([[0.2, 0.1], [0.2, 0.1], [0.2, 0.1]])
+    weight = np.array([0.2, 0.3, 0.5])
+    name = "drawbar_pull"
+    truth = Truth({name: np.zeros((3, 2))}, {name: true}, {name: sd}, {name: true}, weight)
+    (found,) = row_gaps(of_slips([0.1, 0.2]), truth)
+    mean = weight @ true
+    np.testing.assert_allclose(found.gap, mean)
+    np.testing.assert_allclose(found.sd, np.sqrt(weight @ np.square(true - mean)))
+    np.testing.assert_allclose(found.probability, [0.5, 0.5])
+
+
+def test_of_a_region_draws_count_by_their_weight_and_beyond_the_noise():
+    true = np.array([[0.3] * 4, [0.1] * 4, [0.25] * 4])
+    weight = np.array([0.3, 0.3, 0.4])
+    name, sd = "drawbar_pull", np.full((3, 4), 0.2)
+    truth = Truth({name: np.zeros((3, 4))}, {name: true}, {name: sd}, {name: true}, weight)
+    data = of_slips([0.1, 0.2, 0.3, 0.4])
+    (found,) = regions(data, truth, row_gaps(data, truth))
+    assert found.output == name
+    assert found.conditions == {"slip_ratio": (0.1, 0.4)}
+    assert found.gap == pytest.approx(0.3 * 0.3 + 0.3 * 0.1 + 0.4 * 0.25)
+    assert found.interval == pytest.approx((0.1, 0.3))
+    assert found.probability == pytest.approx(0.7)
+    # At the noise itself a gap is not beyond it.
+    none = Truth({name: np.zeros((3, 4))}, {name: sd}, {name: sd}, {name: sd}, weight)
+    assert regions(data, none, row_gaps(data, none)) == ()
+    even = replace(truth, weight=np.array([0.25, 0.5, 0.25]))
+    # A gap that is no more probable than not is no region, though rows be sure of theirs.
+    assert regions(data, even, (replace(row_gaps(data, truth)[0]),)) == ()
+
+
+def test_regions_come_by_their_gap_times_the_root_of_their_rows_at_most_three():
+    """Two rows a slip: 0.5 root 2, 0.3 root 4, 0.4 root 2; that of 0.2 root 6 is a fourth."""
+    slip = np.repeat(np.arange(1, 9) / 8, 2)
+    gap = np.repeat([0.3, 0.3, -0.5, 0.2, 0.2, 0.2, -0.4, 0.0], 2)
+    data, truth = of_slips(slip), certain(gap)
+    found = regions(data, truth, row_gaps(data, truth))
+    ends = [r.conditions["slip_ratio"] for r in found]
+    assert ends == [(0.375, 0.375), (0.125, 0.25), (0.875, 0.875)]
+    assert [r.gap for r in found] == pytest.approx([-0.5, 0.3, -0.4])
+
+
+def test_of_two_conditions_that_show_the_same_gap_that_of_more_rows_is_told_and_only_it():
+    """A surface that is another in four rows, three of them at the three largest slips."""
+    slip = np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8])
+    wet = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+    truth = certain(-0.3 * wet)
+    for levels in (("dry", "wet"), ()):
+        data = of_slips(slip, surface=(wet, levels))
+        assert conditions_to_search(data) == ["slip_ratio", "surface"]
+        (found,) = regions(data, truth, row_gaps(data, truth))
+        assert found.conditions == {"surface": (1.0, 1.0)}
+    # Without the surface, what is left of the slips has fewer than two such rows.
+    bare = of_slips(slip)
+    (found,) = regions(bare, truth, row_gaps(bare, truth))
+    assert found.conditions == {"slip_ratio": (0.6, 0.8)}
+
+
+def test_values_of_a_category_are_no_stretch():
+    kind = np.repeat([0.0, 1.0, 2.0], 3)
+    truth = certain(np.full(9, 0.4))
+    data = of_slips(np.full(9, 0.1), kind=(kind, ("a", "b", "c")))
+    ends = [r.conditions["kind"] for r in regions(data, truth, row_gaps(data, truth))]
+    assert sorted(ends) == [(0.0, 0.0), (1.0, 1.0), (2.0, 2.0)]
+    data = of_slips(np.full(9, 0.1), kind=(kind, ()))
+    (found,) = regions(data, truth, row_gaps(data, truth))
+    assert found.conditions == {"kind": (0.0, 2.0)}
+
+
+def test_conditions_are_searched_in_the_order_in_which_a_reader_looks(data):
+    found = conditions_to_search(data)
+    assert found[:4] == ["slip_ratio", "inflation_pressure_psi", "average_ground_pressure_kpa",
+                         "speed_m_s"]  # fmt: skip
+    assert found[-1] == "run_order"
+    assert "drawbar_pull_kn" not in found
+
+
+@pytest.mark.parametrize(("rows", "fewest"), [(23, 2), (35, 2), (36, 3), (47, 3), (48, 4)])
+def test_a_stretch_has_a_twelfth_of_the_rows_and_two_at_least(rows, fewest):
+    slip = np.concatenate([np.linspace(0.1, 0.4, rows - fewest), np.full(fewest, 0.5)])
+    kind = (slip == 0.5).astype(float)
+    gap = RowGap("drawbar_pull", np.arange(rows), kind, kind, kind)
+    left = np.ones(rows, dtype=bool)
+    assert _stretches(kind, gap, left, True) == [(1.0, 1.0)]
+    left[-1] = False
+    assert _stretches(kind, gap, left, True) == []
+
+
+def test_no_probability_is_above_one_and_a_gap_of_the_noise_itself_is_not_beyond_it():
+    """Weights sum to one but for rounding."""
+    name, one = "drawbar_pull", np.full((1, 4), 0.25)
+    weight = np.array([1.0 + 4e-16])
+    truth = Truth({name: 0.0 * one}, {name: 2.0 * one}, {name: one}, {name: one}, weight)
+    data = of_slips([0.1, 0.2, 0.3, 0.4])
+    gaps = row_gaps(data, truth)
+    assert gaps[0].probability.max() == 1.0
+    (found,) = regions(data, truth, gaps)
+    assert found.probability == 1.0
+    inside = np.ones(4, dtype=bool)
+    assert _region(truth, name, {}, one, one, inside).probability == 0.0
+    assert _region(truth, name, {}, -2.0 * one, one, inside).probability == 1.0

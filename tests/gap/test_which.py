@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import Case, campaigns
+from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import dependences
 from calib.gap.inclusion import inclusion_probability
 from calib.gap.odds import Odds, probabilities
-from calib.gap.which import _score, calibrate_lab, rank
+from calib.gap.which import Ranking, _check_names, _score, _scored, calibrate_lab, rank
 from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
 
@@ -240,3 +242,78 @@ def test_a_score_is_evidence_times_relevance_times_share(monkeypatch):
     monkeypatch.setattr("calib.gap.which.relevance", lambda *_: -2.0)
     assert _score(shared, 1, 100) == pytest.approx(fit.log_evidence - 2.0 + np.log(0.3))
     assert _score(shared, 1, 0) == pytest.approx(fit.log_evidence + np.log(0.3))
+
+
+def variant(name: str, evidence: float, share: float = 1.0):
+    forward = SimpleNamespace(hypothesis=SimpleNamespace(name=name, share=share))
+    return SimpleNamespace(forward=forward, log_evidence=evidence)
+
+
+def test_a_ranking_is_by_probability_and_its_best_variant_by_score():
+    odds = Odds(1, {})
+    fits = {
+        "a": (variant("a", 0.0, 0.6), variant("a", 0.0, 0.6)), "none": (variant("none", 0.0),),
+        "b": (variant("b", 0.0, 0.1),),
+    }  # fmt: skip
+    scores = {"a": (1.0, 2.0), "none": (0.0,), "b": (0.0,)}
+    p = {"none": 0.2, "a": 0.7, "b": 0.1}
+    ranking = Ranking(fits, scores, {}, p, {}, {}, None, odds)
+    assert ranking.order == ["a", "none", "b"]
+    assert ranking.best("a") is fits["a"][1]
+    # Before the data each name has the shares of its variants, all of it at most.
+    weights = {"a": 0.36 * 0.85, "none": 0.4, "b": 0.1 * 0.36 * 0.85}
+    total = sum(weights.values())
+    assert ranking.prior == pytest.approx({n: w / total for n, w in weights.items()})
+
+
+def test_a_context_speaks_of_what_is_known_and_suspects_shifts_only():
+    known = {"a", "b"}
+    _check_names(Context(suspected={"a": 0.5, "parameter_shift": 0.2}, excluded=("b",)), known)
+    for context, name in (
+        (Context(suspected={"c": 0.5}), "c"), (Context(excluded=("c",)), "c"),
+        (Context(sizes={"c": {}}), "c"),
+        (Context(excluded=("parameter_shift",)), "parameter_shift"),
+        (Context(sizes={"parameter_shift": {}}), "parameter_shift"),
+    ):  # fmt: skip
+        with pytest.raises(CalibError, match=f"speaks of {name}"):
+            _check_names(context, known)
+
+
+def test_variants_in_play_are_refined_and_those_far_behind_not_even_drawn(monkeypatch):
+    """Within 10 nats of the best relevance is drawn; within 4, and 2.5 of its name's best, more."""
+    asked = []
+
+    def relevance(found, seed, draws):
+        asked.append((found.log_evidence, draws))
+        return 0.0
+
+    def refine(found, seed, plenty):
+        assert (seed, plenty) == (5, 1000)
+        return variant(found.forward.hypothesis.name, found.log_evidence + 0.25)
+
+    monkeypatch.setattr("calib.gap.which.relevance", relevance)
+    monkeypatch.setattr("calib.gap.which.refine", refine)
+    odds = Odds(1, {})
+    base = {n: -odds.ln_prior(n) for n in ("none", "a", "b")}
+    fits = {
+        "none": (variant("none", base["none"]),),
+        "a": tuple(variant("a", base["a"] + s) for s in (-3.9, -1.0, -3.4, -9.9, -10.1)),
+        "b": (variant("b", base["b"] - 4.1),),
+    }
+    refined, scores = _scored(fits, odds, 5, 1000)
+    was = np.array([-3.9, -1.0, -3.4, -9.9, -10.1])
+    gained = np.array([0.0, 0.25, 0.25, 0.0, 0.0])  # the first is 2.9 behind its name's best
+    assert np.array(scores["a"]) - base["a"] == pytest.approx(was + gained)
+    assert scores["none"] == pytest.approx((base["none"] + 0.25,))
+    assert scores["b"] == pytest.approx((base["b"] - 4.1,))
+    assert [a is b for a, b in zip(refined["a"], fits["a"], strict=True)] == [
+        True, False, False, True, True,
+    ]  # fmt: skip
+    drawn = {round(e - base["a"], 2) for e, n in asked if n == 160}
+    assert {-3.9, -1.0, -3.4, -9.9} <= drawn
+    assert -10.1 not in drawn
+    assert sum(n == 1000 for _, n in asked) == 3
+    asked.clear()
+    monkeypatch.setattr("calib.gap.which.refine", lambda found, seed, plenty: found)
+    _scored(fits, odds, 5, 4000)
+    assert sum(n == 3000 for _, n in asked) == 3

@@ -16,7 +16,10 @@ from calib.inference.diagnostics import (
     hdi_error,
     mcse,
     median_error,
+    power_scaled_weights,
+    power_sensitivity,
     rank_histograms,
+    rank_scatter,
     tail_shape,
 )
 
@@ -130,3 +133,58 @@ def test_distances_of_a_wide_positive_parameter_are_logarithmic() -> None:
     assert log
     assert distance[0] == pytest.approx(1.0, abs=0.05)
     assert np.isnan(distance[1])
+
+
+def test_a_rank_histogram_counts_twentieths_of_all_draws() -> None:
+    """One ensemble below the other: twice its even share in the lower ten, nothing above."""
+    found = rank_histograms(np.arange(80.0).reshape(2, 40))
+    expected = np.repeat([[2.0, 0.0], [0.0, 2.0]], 10, axis=1)
+    np.testing.assert_array_equal(found, expected)
+    # In turns, each has one of the two in every twentieth of forty.
+    turns = np.arange(40.0).reshape(20, 2).T
+    np.testing.assert_array_equal(rank_histograms(turns), np.ones((2, 20)))
+
+
+@pytest.mark.parametrize("effective", [0.3, 1.0, 400.0])
+def test_the_scatter_of_a_rank_histogram_is_binomial(effective: float) -> None:
+    """A twentieth of n draws, over n / 20: never of less than one draw."""
+    n = max(effective, 1.0)
+    sd = np.sqrt(n * 0.05 * 0.95) / (n * 0.05)
+    assert rank_scatter(effective) == pytest.approx(1.96 * sd)
+
+
+@pytest.mark.parametrize(
+    ("interval", "log"),
+    [((1.0, 4.0), False), ((1.0, 4.01), True), ((0.0, 9.0), False), ((-1.0, 9.0), False)],
+)
+def test_logarithms_are_taken_of_positive_intervals_beyond_a_factor_of_four(interval, log) -> None:
+    """Of the draws those that have one; others are seldom so far outside the interval."""
+    draws = np.array([-3.0, 0.0, 1.0, 2.0, 5.0])
+    distance, ends, taken = distances(draws, np.array([3.0]), interval)
+    to, used = (np.log, draws[2:]) if log else (np.asarray, draws)
+    middle, sd = to(used).mean(), to(used).std()
+    assert taken is log
+    np.testing.assert_allclose(distance, (to(np.array([3.0])) - middle) / sd)
+    np.testing.assert_allclose(ends, (to(np.array(interval)) - middle) / sd)
+
+
+def test_raised_to_a_power_a_normal_has_another_variance() -> None:
+    """Draws of variance one, whose density is raised by a quarter: variance 1/1.25."""
+    draws = np.random.default_rng(9).standard_normal((4, 5000))
+    weight = power_scaled_weights(-0.5 * draws**2, 1.25)
+    assert weight.shape == draws.shape
+    assert weight.sum() == pytest.approx(1.0)
+    # The sd of a variance of 20,000 draws is 1 %.
+    assert (weight * draws**2).sum() == pytest.approx(0.8, abs=0.04)
+
+
+def test_sensitivity_is_a_distance_per_doubling_of_the_power() -> None:
+    draws = np.random.default_rng(10).standard_normal((2, 500))
+    lower, upper = (power_scaled_weights(-0.5 * draws**2, a) for a in (0.8, 1.25))
+    near = power_sensitivity(draws, (lower, upper), (0.8, 1.25))
+    # The same marginals, had they needed powers that are three times as far apart.
+    far = power_sensitivity(draws, (lower, upper), (0.8**3, 1.25**3))
+    assert near == pytest.approx(3.0 * far)
+    assert near > 0.0
+    even = np.full_like(lower, 1.0 / lower.size)
+    assert power_sensitivity(draws, (even, even), (0.8, 1.25)) == pytest.approx(0.0, abs=1e-6)

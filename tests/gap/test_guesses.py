@@ -1,0 +1,212 @@
+"""Where fits begin: worked out again, step by step, in plain linear algebra."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calib.gap.case import campaigns
+from calib.gap.context import Context
+from calib.gap.effects import EFFECTS
+from calib.gap.forward import Forward
+from calib.gap.guesses import Guesses, _led
+from calib.gap.hypotheses import joined, singles, unknowns
+from calib.gap.hypothesis import Hypothesis
+from calib.gap.noise import Noise
+from calib.gap.odds import Odds
+from calib.gap.residuals import Residuals
+from tests.gap.cases import CHOICE, campaigns_of, make_case
+from tests.gap.fits import SIGMA, fit_at
+
+
+def guesses_for(data) -> Guesses:
+    """Guesses about parameters that are somewhat off the middle of the priors."""
+    rng = np.random.default_rng(5)
+    mode = {
+        o.name: np.array([p.loc + 0.1 * p.scale * rng.standard_normal() for p in o.priors.free])
+        for o in data.outputs
+    }
+    noise = {o: Noise(1.1 * s, 1.0) for o, s in SIGMA.items()}
+    return Guesses(data, mode, noise, 1, Odds.of(len(CHOICE), Context()))
+
+
+@pytest.fixture(scope="module")
+def guesses() -> Guesses:
+    return guesses_for(campaigns_of("force_offset"))
+
+
+@pytest.fixture(scope="module")
+def alone(guesses) -> dict[str, Hypothesis]:
+    return {h.name: h for h in singles(guesses.data, CHOICE)}
+
+
+def candidates_of(walk) -> tuple[Forward, np.ndarray]:
+    problem, candidates = next(walk)
+    return problem.forward, candidates
+
+
+def lab(guesses: Guesses, forward: Forward, psi: np.ndarray) -> None:
+    """Assert that guesses have the simulators where the laboratory calibrated them."""
+    for name, part in forward.theta_slices.items():
+        expected = np.tile(guesses.lab_mode[name], (len(psi), 1))
+        np.testing.assert_allclose(psi[:, part], expected, atol=1e-5)
+
+
+def test_a_hypothesis_begins_at_the_laboratorys_calibration(guesses, alone):
+    forward, found = candidates_of(guesses.truncated(Hypothesis("none")))
+    assert len(found) == 1
+    lab(guesses, forward, found)
+    for name in ("force_offset", "lug_thrust"):
+        forward, found = candidates_of(guesses.truncated(alone[name]))
+        lab(guesses, forward, found)
+        # The middle of the prior, and draws of it.
+        part = forward.phi_slices[0]
+        middle = np.array([p.loc for p in forward.priors.free])[part]
+        np.testing.assert_allclose(found[0, part], middle, atol=1e-5)
+        assert len(np.unique(found[:, part], axis=0)) == len(found) > 50
+
+
+def test_a_set_begins_where_its_parts_have_led_with_what_they_lack_drawn(guesses, alone):
+    both = joined(alone["force_offset"], alone["lug_thrust"])
+    psi, members = {}, []
+    for name, off in (("force_offset", 0.07), ("lug_thrust", 0.3)):
+        found = fit_at(guesses.data, alone[name])
+        at = found.psi.copy()
+        at[: found.forward.n_shared] += 0.05 * off
+        at[found.forward.phi_slices[0]] += off
+        members.append(replace(found, psi=at))
+        psi[name] = at
+    forward, found = candidates_of(guesses.truncated_joint(both, members, 2))
+    problem = Residuals(guesses.data, forward)
+    first, second = np.split(found[1:], 2)
+    places = dict(zip(("force_offset", "lug_thrust"), forward.phi_slices, strict=True))
+    lab(guesses, forward, found[:1])
+    for part, name, lacking in (
+        (first, "force_offset", "lug_thrust"), (second, "lug_thrust", "force_offset"),
+    ):  # fmt: skip
+        led = psi[name][members[0 if name == "force_offset" else 1].forward.phi_slices[0]]
+        np.testing.assert_allclose(part[:, places[name]], np.tile(led, (len(part), 1)), atol=1e-5)
+        shared = problem.clip(np.tile(found[0], (len(part), 1)))
+        shared[:, : forward.n_shared] = psi[name][: forward.n_shared]
+        np.testing.assert_allclose(
+            part[:, : forward.n_shared], problem.clip(shared)[:, : forward.n_shared], atol=1e-5
+        )
+        assert len(np.unique(part[:, places[lacking]], axis=0)) == len(part) > 20
+    # What lacks nothing has one guess; without parts it begins as any hypothesis.
+    whole = fit_at(guesses.data, both)
+    _, found = candidates_of(guesses.truncated_joint(both, [whole, whole], 2))
+    assert len(found) == 3
+    _, found = candidates_of(guesses.truncated_joint(both, [], 2))
+    _, as_any = candidates_of(guesses.truncated(both))
+    np.testing.assert_array_equal(found, as_any)
+
+
+def test_a_promise_is_the_joint_density_after_one_step_of_all_other_parameters(guesses, alone):
+    """Which take up what they can: Gauss and Newton's step, at the noise of the fit."""
+    data, kept, added = guesses.data, alone["lug_thrust"], alone["force_offset"]
+    found = fit_at(data, kept)
+    psi = found.psi.copy()
+    psi[found.forward.phi_slices[0]] += 0.2
+    found = replace(found, psi=psi)
+    (promise,) = guesses.beside(kept, found, [added])
+    forward = Forward(data, kept, {o: n.sigma for o, n in guesses.noise.items()}, guesses.lab_mode)
+    problem = Residuals(data, forward)
+    led = psi.copy()
+    sds = problem.sds(found.noise)
+    h = 1e-5 * problem.width
+    slope = np.stack([
+        (problem.raw((led + e)[None]) - problem.raw((led - e)[None]))[0] / (2.0 * e.sum()) / sds
+        for e in np.diag(h)
+    ])  # fmt: skip
+    hessian = slope @ slope.T + np.diag(problem.precision**2)
+    larger, start = guesses._forward(joined(kept, added))
+    there = Residuals(data, larger)
+    place = [e.name for e in larger.hypothesis.effects].index("force_offset")
+    begun = there.clip(guesses._spread(larger, _led(larger, start, found), 64, [place]))
+    raw = there.raw(begun)
+    gradient = raw / sds @ slope.T + (led - problem.loc) * problem.precision**2
+    step = -np.linalg.solve(hessian, gradient.T).T
+    costs = there.costs(begun, raw, sds) - 0.5 * np.einsum("kd,de,ke->k", step, hessian, step)
+    best = np.argsort(costs)
+    assert promise.hypothesis == joined(kept, added)
+    assert promise.noise == found.noise
+    assert promise.log_joint == pytest.approx(-costs[best[0]], rel=1e-3)
+    # The starts have the step taken: in the simulators', the size's own drawn.
+    same = larger.n_shared
+    for begin, i in zip(promise.starts, best, strict=False):
+        np.testing.assert_allclose(
+            (begin - begun[i])[:same] / problem.width[:same],
+            step[i, :same] / problem.width[:same], rtol=0.02, atol=2e-3,
+        )  # fmt: skip
+        part = larger.phi_slices[place]
+        np.testing.assert_array_equal(begin[part], begun[i][part])
+    # A fit from it begins with all of them, the best first.
+    _, candidates = candidates_of(guesses.truncated_promise(promise))
+    np.testing.assert_allclose(candidates, there.clip(promise.starts))
+
+
+def test_what_sets_in_begins_where_the_laboratorys_residuals_show_it_best(guesses):
+    """Of thresholds along the prior that of the least penalised squares, by least squares."""
+    data = guesses.data
+    for hypothesis in [h for h in unknowns(data) if h.onset_over in ("level", "slip", "order")]:
+        forward, start = guesses._forward(hypothesis)
+        found = guesses._onset_start(forward, start)
+        free = forward.priors.free
+        plain = forward.simulator(start[None], data.view)
+
+        def solved(threshold, forward=forward, plain=plain, free=free):
+            total, amplitudes = 0.0, {}
+            for o in data.outputs:
+                if o.name not in forward.smooth_slices:
+                    continue
+                part, sigma = forward.smooth_slices[o.name], guesses.noise[o.name].sigma
+                shapes = forward.discrepancy.onset(data.view, o.name, np.array([threshold]))
+                basis = np.stack([s[0] for s in shapes], axis=1)[o.rows] / sigma
+                ridge = np.diag([1.0 / p.scale for p in free[part]])
+                residual = (o.field - plain[o.name][0, o.rows]) / sigma
+                stacked, target = np.vstack([basis, ridge]), np.append(residual, [0.0, 0.0])
+                best = np.linalg.lstsq(stacked, target)[0]
+                total += np.square(target - stacked @ best).sum()
+                amplitudes[o.name] = best
+            return total, amplitudes
+
+        prior = free[forward.threshold]
+        grid = np.linspace(prior.lower, prior.upper, 24)
+        best = grid[int(np.argmin([solved(t)[0] for t in grid]))]
+        assert found[forward.threshold] == pytest.approx(best)
+        for name, amplitude in solved(best)[1].items():
+            np.testing.assert_allclose(
+                found[forward.smooth_slices[name]], amplitude, rtol=1e-6, atol=1e-9
+            )
+        lab(guesses, forward, found[None])
+        _, candidates = candidates_of(guesses.truncated(hypothesis))
+        np.testing.assert_allclose(candidates[0], Residuals(data, forward).clip(found))
+        assert len(candidates) == 1
+
+
+def test_an_effect_may_begin_at_what_is_left_of_the_readings():
+    """A step begins with the mean residuals on both sides; rows without a reading say nothing."""
+    case = make_case("force_offset")
+    pull = np.array(case.field["drawbar_pull_kn"])
+    pull[[1, 6]] = np.nan
+    field = replace(case.field, columns={**case.field.columns, "drawbar_pull_kn": pull})
+    guesses = guesses_for(campaigns(replace(case, field=field)))
+    (step,) = singles(guesses.data, {"sensor_step": EFFECTS["sensor_step"]})
+    forward, start = guesses._forward(step)
+    left = guesses._left(forward, start)
+    predicted = forward.field(start[None], guesses.data.view)
+    expected = pull - predicted["drawbar_pull"][0]
+    np.testing.assert_allclose(left["pull"], expected)
+    rut = np.log(case.field["rut_depth_mm"]) - predicted["rut_depth"][0]
+    np.testing.assert_allclose(left["sinkage"], rut)
+    found = guesses._spread(forward, start, 40, [0])
+    (priors,) = step.effect_priors
+    part = forward.phi_slices[0]
+    natural = priors.to_natural(found[:, part])
+    begun = EFFECTS["sensor_step"].begun(natural, left, guesses.data.view)
+    np.testing.assert_allclose(priors.to_internal(begun), found[:, part], rtol=1e-9, atol=1e-12)
+    rest = np.ones(start.size, dtype=bool)
+    rest[part] = False
+    np.testing.assert_array_equal(found[:, rest], np.tile(start[rest], (40, 1)))
