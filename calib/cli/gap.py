@@ -89,8 +89,6 @@ def diagnose(
         print(f"calib: {warning}", file=sys.stderr)
     judged = gap_verdict(found)
     print(f"verdict: {found.verdict} ({judged.headline})")
-    if "Not tested" in dict(judged.facts):
-        print(f"not tested: {dict(judged.facts)['Not tested']}")
     for name in found.ranking.order[:4]:
         p = found.ranking.probability[name]
         text = ">0.999" if p >= 0.9995 else "<0.001" if p < 0.0005 else f"{p:.3f}"
@@ -103,6 +101,8 @@ def diagnose(
             f"{unit} rms, shrink {100 * s.fraction:.0f} % (90 % interval {100 * low:.0f} to "
             f"{100 * high:.0f} %), noise sd {format_number(s.noise_floor)} {unit}"
         )
+    if "Not tested" in dict(judged.facts):
+        print(f"not tested: {dict(judged.facts)['Not tested']}")
     print(out / "index.html")
     finish(
         0 if all(told) else 3, out / "diagnosis.json", folder=str(out),
