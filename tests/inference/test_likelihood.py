@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -120,3 +122,14 @@ def test_a_vector_without_a_value_does_not_touch_the_others() -> None:
     after = squares(theta)
     assert np.isnan(after[2])
     np.testing.assert_array_equal(np.delete(after, 2), np.delete(before, 2))
+
+
+def test_in_another_process_it_is_the_same_without_its_workspace() -> None:
+    bound, theta, conditions, response = data("magic_formula", 3, 3000)
+    squares = Squares.of(bound, conditions, response)
+    before = pickle.dumps(squares)
+    expected = squares(theta)
+    after = pickle.dumps(squares)
+    # The workspace is some megabytes.
+    assert len(after) == len(before)
+    np.testing.assert_allclose(pickle.loads(after)(theta), expected, rtol=1e-12)

@@ -160,7 +160,7 @@ def test_where_runs_fail_and_what_to_do_is_told_if_nothing_is_left(
         calib.emulated(calib.build_problem("crashing", table()), seed=1)
     text = str(caught.value)
     for words in (
-        "no parameters are left for the data", "of the 22 runs have a value",
+        "no parameters are left for the data", "of the 23 runs have a value",
         "RuntimeError: the mesh folds", ", at mu 0.7", "those with a value are at mu 0.",
         "simulator crashing", "priors that do not reach there",
     ):  # fmt: skip
