@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 from calib.errors import CalibError
@@ -45,7 +46,8 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     Raises
     ------
     CalibError
-        If `out` exists and may not be replaced, or cannot be written.
+        If `out` exists and may not be replaced, or cannot be written; or if another process wrote
+        it while the block ran: then its name ends in a number.
     """
     out = Path(out)
     check_folder(out, overwrite=overwrite)
@@ -57,13 +59,13 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     try:
         yield scratch
         scratch.chmod(0o777 & ~_umask())
-        if out.exists():
+        if overwrite and out.exists():
             old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
             out.replace(old / "old")
             scratch.replace(out)
             shutil.rmtree(old)
         else:
-            scratch.replace(out)
+            _put(scratch, out)
     except OSError as error:
         if error.errno not in _NO_ROOM:
             raise
@@ -72,6 +74,24 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         shutil.rmtree(scratch, ignore_errors=True)
         if held is not None:
             os.close(held)
+
+
+def _put(scratch: Path, out: Path) -> None:
+    """Give a folder its name; where another process has taken it meanwhile, one beside it."""
+    with contextlib.suppress(OSError):
+        out.rmdir()  # an empty one
+    try:
+        scratch.replace(out)
+    except OSError as error:
+        if not out.exists():
+            raise
+        beside = next(p for i in count(2) if not (p := out.with_name(f"{out.name}-{i}")).exists())
+        scratch.replace(beside)
+        raise CalibError(
+            "another process has written the output folder meanwhile",
+            where=str(out),
+            mend=f"look for the result of this one in {beside}",
+        ) from error
 
 
 def lock(folder: Path) -> int | None:

@@ -50,7 +50,8 @@ def run_file(path: Path, what: str) -> ModuleType:
     except CalibError as error:
         sys.modules.pop(name)
         raise error.within(str(path)) from None
-    except Exception as error:
+    except (Exception, SystemExit) as error:
+        # A file that ends the program would end this one, and with success.
         sys.modules.pop(name)
         frames = traceback.extract_tb(error.__traceback__)
         lines = [f.lineno for f in frames if Path(f.filename).resolve() == path]
@@ -122,7 +123,7 @@ def load_installed(group: str) -> None:
     for point in entry_points(group=group):
         try:
             found = point.load()
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             package = point.dist.name if point.dist else "an installed package"
             raise CalibError(
                 f"{point.name} of {package} cannot be loaded: {type(error).__name__}: {error}",

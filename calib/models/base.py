@@ -94,7 +94,7 @@ class _Plain:
             found = np.asarray(self.model.predict(theta, rows), dtype=np.float64)
         except CalibError:
             raise
-        except Exception as error:  # of the user's own code
+        except (Exception, SystemExit) as error:  # of the user's own code
             frame = traceback.extract_tb(error.__traceback__)[-1]
             raise CalibError(
                 f"predict of the model {self.model.name} fails: {type(error).__name__}: {error}",

@@ -61,6 +61,28 @@ def test_a_block_that_fails_leaves_things_as_they_were(tmp_path: Path, existing:
     assert contents(tmp_path) == before
 
 
+def test_of_two_that_write_at_a_time_neither_is_lost(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+
+    def slower(what: str) -> None:
+        with fresh_folder(out) as folder:
+            (folder / "run.json").write_text(what)
+            if not out.exists():
+                with fresh_folder(out) as other:
+                    (other / "run.json").write_text("quicker")
+
+    with pytest.raises(CalibError, match=r"look for the result of this one in .*run-2"):
+        slower("slower")
+    shutil.move(out, tmp_path / "away")
+    with pytest.raises(CalibError, match=r"result of this one in .*run-3"):
+        slower("slowest")
+    assert contents(tmp_path) == {
+        f"{name}{file}" for name in ("run", "run-2", "run-3", "away") for file in ("", "/run.json")
+    }
+    texts = {p.name: (p / "run.json").read_text() for p in tmp_path.iterdir()}
+    assert texts == {"away": "quicker", "run": "quicker", "run-2": "slower", "run-3": "slowest"}
+
+
 def test_an_empty_folder_is_used(tmp_path: Path) -> None:
     (tmp_path / "run").mkdir()
     with fresh_folder(tmp_path / "run") as folder:

@@ -63,6 +63,7 @@ def test_an_effect_and_its_priors_are_loaded(tmp_path):
         (CODE, None, "has no priors"),
         ("x = 1\n", PRIOR, "defines no effect"),
         ("import nothing_of_this_name\n", PRIOR, "does not run"),
+        ("import sys\nsys.exit(0)\n", PRIOR, "does not run: SystemExit: 0"),
     ],
 )
 def test_what_cannot_be_loaded_is_refused(tmp_path, code, prior, word):
@@ -241,6 +242,7 @@ REGISTERED = "import calib\n" + CODE.replace(
     ("old", "new", "words"),
     [
         ("phi[:, :1]", "phii[:, :1]", "it does not run: NameError"),
+        ("phi[:, :1]", "exit(0)", "it does not run: SystemExit: 0"),
         ("phi[:, :1]", 'view.of("temperature")', "it does not run: KeyError: 'temperature'"),
         ("location + phi[:, :1]", "phi[:, 0]", "an array of float64 of shape (8,)"),
         ("def on_output", "def on_ouput", "was on_output meant?"),

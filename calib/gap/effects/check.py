@@ -204,7 +204,7 @@ def _call[R](function: Callable[..., R], effect: Effect, *args: Any) -> R:
         return function(*args)
     except CalibError:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         frames = traceback.extract_tb(error.__traceback__)
         path = Path(declared_in(type(effect))).resolve()
         line = next(

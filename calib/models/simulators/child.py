@@ -21,7 +21,7 @@ def main(given: str, taken: str) -> None:
     try:
         function, arguments = pickle.loads(call)
         found = function(*arguments)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         traceback.print_exc()
         raised = f"{type(error).__name__}: {error}"
     Path(taken).write_bytes(pickle.dumps((found, raised)))

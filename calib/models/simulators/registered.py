@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -237,5 +238,12 @@ def split_tables(priors: str, name: str) -> dict[str, str]:
 
 def written(name: str, table: Mapping[str, Any]) -> str:
     """Write a table ``[parameters.NAME]``."""
-    lines = [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in table.items()]
+    lines = [f"{key} = {_toml(value)}" for key, value in table.items()]
     return "\n".join([f"[parameters.{name}]", *lines]) + "\n"
+
+
+def _toml(value: Any) -> str:
+    # TOML's nan and inf are Python's, not those of JSON.
+    if isinstance(value, float) and not math.isfinite(value):
+        return repr(value)
+    return json.dumps(value, ensure_ascii=False)

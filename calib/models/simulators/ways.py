@@ -73,7 +73,7 @@ class CallableWay:
             return {name: values.ravel() for name, values in self._named(found).items()}
         except CalibError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             return Failure("error", f"{type(error).__name__}: {error}")
 
     def call(self, theta: Array, conditions: Mapping[str, Array]) -> dict[str, Array]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from calib.errors import CalibError
+from calib.inference.prior_files import parse_priors
 from calib.models import MODELS
 from calib.models.simulators.files import read_simulator, register_file
 from calib.models.simulators.registered import SIMULATED, from_callable, models_of, simulated_by
@@ -137,3 +138,11 @@ def test_a_slow_one_is_not_run_for_each_draw_and_a_quick_one_is(tmp_path: Path) 
     # Where it fails there is no value.
     np.testing.assert_allclose(found[:2], pull(theta[:2], conditions))
     assert np.isnan(found[2]).all()
+
+
+def test_a_prior_that_is_no_number_is_named(tmp_path: Path) -> None:
+    file = write_program(tmp_path)
+    file.write_text(file.read_text().replace("median = 0.5", "median = nan", 1))
+    (model,) = models_of(read_simulator(file).simulator)
+    with pytest.raises(CalibError, match=r"parameters\.mu.*median: Input should be a finite"):
+        parse_priors(model.priors, "wheel", "wheel", (*model.parameters, "sigma"), {})
