@@ -25,6 +25,8 @@ __all__ = ["identical_rows", "oddities"]
 _ODD_RATIO = 4.0
 # Typical conditions of two campaigns, their ranges overlapping, differ by less than this.
 _FAR_RATIO = 10.0
+# So far apart are fractions of two campaigns of which one may be in percent: 100, give or take 2.
+_PERCENT = 50.0
 # Factors between units that are taken for one another, and how near a ratio has to come.
 _UNITS = {
     6.895: "psi and kPa", 10.0: "mm and cm", 25.4: "inches and mm", 4.448: "lbf and N",
@@ -160,8 +162,8 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
 def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str]:
     """Name columns that only effects need, and that may be in another unit than they say.
 
-    Campaigns may differ in them: in speed by any factor. In fractions they do not by tens, and
-    what was held in the calibration is recognised.
+    Campaigns may differ in them: in speed by any factor. In fractions they do not by hundreds, as
+    fractions and percent do, and what was held in the calibration is recognised.
     """
     for name in sorted((set(lab) & set(field)) - set(used)):
         quantity = QUANTITIES.get(name)
@@ -179,7 +181,7 @@ def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str
                 f"{name}: {_times(lab[name], field[name], 0.0)}, and as in the calibration "
                 f"if the readings are in {read}; check the unit in the column name"
             )
-        elif quantity.unit == "dimensionless" and not 1.0 / _FAR_RATIO < ratio < _FAR_RATIO:
+        elif quantity.unit == "dimensionless" and not 1.0 / _PERCENT < ratio < _PERCENT:
             yield (
                 f"{name}: {_times(lab[name], field[name], _ROUGHLY)}; check the unit in the column "
                 "name"
