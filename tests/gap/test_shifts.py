@@ -56,6 +56,7 @@ def drawn_shifts(data, shift_as) -> dict[str, np.ndarray]:
 
 def test_end_pressures_share_a_shift_and_differ_by_another():
     assert quantities(("K_lo", "K_hi", "K_bend", "C")) == ["K", "K_difference", "K_bend", "C"]
+    assert quantities(("K_lo", "K_hi")) == ["K", "K_difference"]
     assert quantities(("K", "Sh")) == ["K", "Sh"]
     assert quantities(("z_ref", "n")) == ["z_ref", "n0"]
 
