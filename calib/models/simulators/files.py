@@ -113,7 +113,9 @@ def read_simulator(path: Path) -> Simulated:
 
 
 def _explain(error: ValidationError, path: Path) -> CalibError:
-    first = error.errors()[0]
+    errors = error.errors()
+    # A key that is missing is most often there by a wrong name.
+    first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
     key = ".".join(str(part) for part in first["loc"])
     known = list((_Budget if key.startswith("emulator.") else SimulatorFile).model_fields)
     mend = "correct it"

@@ -40,6 +40,7 @@ def test_several_outputs_are_several_models() -> None:
     ("old", "new", "words"),
     [
         ("name =", "nmae = 1\nname =", ["unknown key nmae", "did you mean name?"]),
+        ("[conditions]", "[condition]", ["unknown key condition", "did you mean conditions?"]),
         ('name = "wheel"\n', "", ["name is missing"]),
         ("name =", "limit = -1\nname =", ["limit"]),
         ("[conditions]", "[emulator]\nrun = 3\n[conditions]", ["emulator.run", "mean runs?"]),
