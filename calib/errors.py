@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 
 class CalibError(Exception):
     """Raised for every problem the user can mend.
@@ -48,6 +51,25 @@ class CalibError(Exception):
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword-only arguments do not survive the default pickling between worker processes.
         return (_rebuild, (self.message, self.where, self.allowed, self.mend))
+
+
+def meant(name: str, known: Iterable[str], otherwise: str = "correct the name") -> str:
+    """Ask whether known names that hold a name, or else the one most like it, were meant.
+
+    Parameters
+    ----------
+    name : str
+        What was given.
+    known : iterable of str
+        What there is.
+    otherwise : str
+        What is said if none is like it.
+    """
+    known = list(known)
+    # Of a few letters it would be chance that another name holds them.
+    near = [one for one in known if len(name) > 3 and name in one][:3]
+    near = near or difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    return f"did you mean {' or '.join(near)}?" if near else otherwise
 
 
 def _rebuild(message: str, where: str | None, allowed: str | None, mend: str | None) -> CalibError:

@@ -21,6 +21,8 @@ type Lines = Sequence[int] | NDArray[np.int64]
 
 MAX_SHOWN = 5
 _MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
+# Squares and cubes of larger numbers leave the range of double precision.
+_LARGEST = 1e100
 _MINUS = "\N{MINUS SIGN}"
 
 
@@ -202,7 +204,7 @@ def check_values(
     """
     with np.errstate(over="ignore"):
         canonical = column.to_canonical(values)
-    fine = np.isfinite(canonical)
+    fine = np.abs(canonical) <= _LARGEST
     if used or not column.quantity.log_scale:
         fine &= column.quantity.range.holds(canonical)
     if missing_ok:
@@ -223,6 +225,8 @@ def _complaint(column: Column, value: float, cell: str) -> tuple[str, str]:
         what = f"{cell.strip()!r} is not a finite number" if cell.strip() else "an empty cell"
         return what, "fill in the measured value, or delete the row"
     quantity = column.quantity
+    if abs(value) > _LARGEST:
+        return f"{cell.strip()!r} is too large for a reading", quantity.mend
     what = f"{cell.strip()!r} is outside the range of {quantity.stem}"
     in_percent = "percent" in quantity.units and column.unit == "dimensionless"
     if in_percent and 1.0 < abs(value) <= 100.0:

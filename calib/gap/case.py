@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from calib.data import Table, read_table
 from calib.data.headers import renamed
 from calib.data.quantities import OUTPUTS, columns_of, output_of, physical_role
-from calib.errors import CalibError
+from calib.errors import CalibError, meant
 from calib.gap.context import Context, read_context
 from calib.gap.covariates import Covariates
 from calib.gap.declared import declared_covariates, with_declared
@@ -199,10 +198,9 @@ def read_case(folder: Path) -> Case:
         raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
     unknown = [key for key in content if key not in _KEYS]
     if unknown:
-        near = difflib.get_close_matches(unknown[0], _KEYS, cutoff=0.5)
         raise CalibError(
             f"unknown key {unknown[0]}", where=str(path), allowed=", ".join(_KEYS),
-            mend=f"was {near[0]} meant?" if near else "correct its name, or leave it out",
+            mend=meant(unknown[0], _KEYS, "correct its name, or leave it out"),
         )  # fmt: skip
     models = content.get("models")
     files = {key: content.get(key) for key in ("calibration", "field")}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calib.data.registry import Registry
-from calib.errors import CalibError
+from calib.errors import CalibError, meant
 from calib.models.ayers_perumpral import AYERS_PERUMPRAL, AYERS_PERUMPRAL_VOLUMETRIC
 from calib.models.base import Array, BoundModel, Conditions, Model, References
 from calib.models.bekker import BEKKER, MODIFIED_BEKKER
@@ -83,7 +83,7 @@ def get_model(name: str) -> Model:
         raise CalibError(
             f"there is no model {name!r}",
             allowed=", ".join(MODELS),
-            mend="use one of these names, or name the file of your models (--models FILE) or of "
-            "your simulator (--simulator FILE)",
+            mend=f"{meant(name, MODELS, 'use one of these names,')} or name the file of your "
+            "models (--models FILE) or of your simulator (--simulator FILE)",
         )
     return MODELS[name]

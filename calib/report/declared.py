@@ -8,7 +8,7 @@ from typing import Any
 
 from calib.data.headers import accepted_headers, parse_header
 from calib.data.quantities import QUANTITIES, Quantity, columns_of
-from calib.errors import CalibError
+from calib.errors import CalibError, meant
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import FORM_ERROR
 from calib.gap.hypotheses import read_effect_priors
@@ -149,7 +149,8 @@ def declared[T](what: str, known: Mapping[str, T], name: str) -> T:
     if name not in known:
         raise CalibError(
             f"there is no {what} {name!r}", allowed=", ".join(known),
-            mend=f"correct the name, or name the file that declares the {what}",
+            mend=f"{meant(name, known, 'correct the name,')} or name the file that declares "
+            f"the {what}",
         )  # fmt: skip
     return known[name]
 

@@ -15,6 +15,7 @@ from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.inference.prior_files import prior_file_model
 from calib.models import MODELS, get_model
+from calib.report.labels import degrees
 
 # A report's figures and leave-one-out hold a number for every draw and row.
 MAX_ROWS = 5000
@@ -29,6 +30,16 @@ class HoldOut:
 
     def __str__(self) -> str:
         return f"{self.column} = {self.value:g}"
+
+    @property
+    def words(self) -> str:
+        """What is held out, as a heading says it: the quantity, its value and unit."""
+        column = parse_header(self.column)
+        if column is None:
+            return str(self)
+        unit = degrees(column.unit.replace("**", "^").replace("*", " "))
+        value = f"{column.quantity.word} {self.value:g}"
+        return value if unit == "dimensionless" else f"{value} {unit}"
 
     @classmethod
     def parse(cls, text: str) -> HoldOut:

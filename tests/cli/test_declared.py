@@ -26,6 +26,23 @@ def test_all_are_listed_and_each_is_told(run: Calib, what: str, known: dict) -> 
         assert json.loads(told.out)[what][name]["title"]
 
 
+@pytest.mark.parametrize(
+    ("what", "given", "near"),
+    [
+        ("models", "bekkr", "bekker"),
+        ("effects", "slipzero", "slip_zero_shift"),
+        ("quantities", "pressure", "inflation_pressure_psi or average_ground_pressure_kpa"),
+        ("quantities", "rut_dept", "rut_depth_mm"),
+    ],
+)
+def test_a_name_that_is_not_there_is_answered_by_one_like_it(
+    run: Calib, what: str, given: str, near: str
+) -> None:
+    refused = run(what, given)
+    assert refused.code == 2
+    assert f"did you mean {near}? or name the file" in refused.err
+
+
 def test_an_effect_is_told_with_equation_needs_and_priors(run: Calib) -> None:
     told = run("effects", "moisture_softening").out
     for words in ("equation: ", "The field records gravimetric_water_content.", "No formula is"):

@@ -202,6 +202,8 @@ def test_wrong_columns(my_csv: Write, header: str, words: list[str]) -> None:
         ("slip_ratio", "NaN", ["'NaN' is not a finite number"]),
         ("drawbar_pull_kn", "inf", ["'inf' is not a finite number", "a number in kN"]),
         ("drawbar_pull_kn", "1e999", ["'1e999' is not a finite number"]),
+        ("drawbar_pull_kn", "-1e300", ["'-1e300' is too large for a reading", "correct the value"]),
+        ("normal_load_kn", "1e300", ["'1e300' is too large for a reading", "correct the value"]),
         ("drawbar_pull_kn", "about 2", ["'about 2' is not a number", "one plain number"]),
         ("drawbar_pull_kn", "2 kN", ["'2 kN' is not a number", "unit belongs in the column"]),
         ("drawbar_pull_kn", "1_000", ["'1_000' is not a number"]),

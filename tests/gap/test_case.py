@@ -58,7 +58,7 @@ def test_units_in_column_names_are_converted(tmp_path):
             'rut_depth = "bekker"\n',
             "unknown key prdict\n  allowed: calibration, field, predict, models, priors, "
             "covariates, context\n"
-            "  to mend: was predict meant?",
+            "  to mend: did you mean predict?",
         ),
         (
             'calibration = "lab.csv"\nfield = "field.csv"\n[models]\nsinkage = "bekker"\n',

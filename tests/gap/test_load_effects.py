@@ -83,7 +83,7 @@ RETURN = "        return location + phi[:, :1]\n"
     ("old", "new", "words"),
     [
         ('name = "cross_wind"', 'name = "rate_effect"', "an effect of calib's own"),
-        ('outputs = ("pull",)', 'outputs = ("pul",)', "was pull meant?"),
+        ('outputs = ("pull",)', 'outputs = ("pul",)', "did you mean pull?"),
         ('outputs = ("pull",)', 'outputs = ("drawbar_pull",)', "by its physical role, 'pull'"),
         ('outputs = ("pull",)', 'outputs = "pull"', "with the comma"),
         (
@@ -91,10 +91,10 @@ RETURN = "        return location + phi[:, :1]\n"
             'outputs = ("pull",); needs = ("drawbar",)',
             "in needs",
         ),
-        ('    outputs', '    covariates = ("sped",)\n    outputs', "was speed meant?"),
-        ('    outputs', '    covariate = ("speed",)\n    outputs', "was covariates meant?"),
+        ('    outputs', '    covariates = ("sped",)\n    outputs', "did you mean speed?"),
+        ('    outputs', '    covariate = ("speed",)\n    outputs', "did you mean covariates?"),
         ('    outputs', '    form = ("slope",)\n    outputs', "unknown name 'slope' in form"),
-        ("def on_output", "def on_outputs", "was on_output meant?"),
+        ("def on_output", "def on_outputs", "did you mean on_output?"),
     ],
 )  # fmt: skip
 def test_what_an_effect_declares_wrongly_is_named(tmp_path, old, new, words):
@@ -245,7 +245,7 @@ REGISTERED = "import calib\n" + CODE.replace(
         ("phi[:, :1]", "exit(0)", "it does not run: SystemExit: 0"),
         ("phi[:, :1]", 'view.of("temperature")', "it does not run: KeyError: 'temperature'"),
         ("location + phi[:, :1]", "phi[:, 0]", "an array of float64 of shape (8,)"),
-        ("def on_output", "def on_ouput", "was on_output meant?"),
+        ("def on_output", "def on_ouput", "did you mean on_output?"),
         ('outputs = ("pull",)', 'outputs = ("drawbar_pull",)', "by its physical role, 'pull'"),
         (
             "    outputs",

@@ -161,6 +161,20 @@ def test_a_report_has_a_longest_table() -> None:
 def test_a_hold_out_is_written_as_it_is_read() -> None:
     assert HoldOut.parse("inflation_pressure_psi=30") == HELD
     assert str(HELD) == "inflation_pressure_psi = 30"
+    assert HELD.words == "inflation pressure 30 psi"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("inflation_pressure_kpa=160", "inflation pressure 160 kPa"),
+        ("wheel_load_kn=5.5", "normal load 5.5 kN"),
+        ("bulk_density_g_cm3=1.5", "bulk density 1.5 g/cm^3"),
+        ("pass_number=2", "pass number 2"),
+    ],
+)
+def test_a_heading_names_the_unit_as_it_is_written(text: str, words: str) -> None:
+    assert HoldOut.parse(text).words == words
 
 
 def test_among_models_that_use_the_same_the_one_of_fewest_parameters_is_chosen() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import traceback
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ import numpy as np
 
 from calib.batch.plugins import declared_in
 from calib.data.quantities import QUANTITIES, role_of
-from calib.errors import CalibError
+from calib.errors import CalibError, meant
 from calib.gap.case import Campaigns, Case, OutputData, campaigns
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.forward import Forward
@@ -99,7 +99,7 @@ def check_declared(effect: Effect) -> None:
             if name not in known:
                 raise CalibError(
                     f"unknown name {name!r} in {attribute}", where=where,
-                    allowed=", ".join(known), mend=_role_of_column(name) or _meant(name, known),
+                    allowed=", ".join(known), mend=_role_of_column(name) or meant(name, known),
                 )  # fmt: skip
     for kind in type(effect).__mro__[:-2]:
         for name, value in vars(kind).items():
@@ -113,12 +113,12 @@ def _check_attribute(name: str, value: object, where: str) -> None:
         raise CalibError(
             f"the method {name} is none of an effect's, so nothing would call it", where=where,
             allowed=", ".join(_METHODS),
-            mend=f"{_meant(name, _METHODS)} (a helper's name starts with an underscore)",
+            mend=f"{meant(name, _METHODS)} (a helper's name starts with an underscore)",
         )  # fmt: skip
     if difflib.get_close_matches(name, _BASE, cutoff=_MISSPELT):
         raise CalibError(
             f"the attribute {name} is none of an effect's", where=where, allowed=", ".join(_BASE),
-            mend=f"{_meant(name, _BASE)} (a constant's name starts with an underscore)",
+            mend=f"{meant(name, _BASE)} (a constant's name starts with an underscore)",
         )  # fmt: skip
 
 
@@ -215,11 +215,6 @@ def _call[R](function: Callable[..., R], effect: Effect, *args: Any) -> R:
             f"it does not run: {type(error).__name__}: {error}", where=at,
             mend="correct it; view.of(role) gives what the data record, such as view.of(\"slip\")",
         ) from error  # fmt: skip
-
-
-def _meant(name: str, known: Collection[str]) -> str:
-    near = difflib.get_close_matches(name, known, cutoff=0.5)
-    return f"was {near[0]} meant?" if near else "correct the name"
 
 
 def _role_of_column(name: str) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -202,11 +202,15 @@ def _parsed(header: str, name: str) -> tuple[str, str]:
     return found.quantity.canonical, found.unit
 
 
+def no_output(column: str, found: Iterable[str]) -> str:
+    """Say that an output was not given, and which were."""
+    return f"there is no output {column!r}; it gave {', '.join(map(str, found)) or 'nothing'}"
+
+
 def checked(found: Values, column: str, n: int) -> Array | Failure:
     """Return one output as n numbers, or why it is not that."""
     if column not in found:
-        there = ", ".join(found) or "nothing"
-        return Failure("unreadable", f"there is no output {column!r}; it gave {there}")
+        return Failure("unreadable", no_output(column, found))
     values = np.asarray(found[column], dtype=np.float64).ravel()
     if values.size != n:
         return Failure("short", f"{column} has {values.size} values for {n} rows of conditions")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import shlex
 import tomllib
@@ -13,7 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.batch.plugins import run_file
-from calib.errors import CalibError
+from calib.errors import CalibError, meant
 from calib.models.simulators.base import Way
 from calib.models.simulators.exchange import check_template
 from calib.models.simulators.registered import SIMULATED, Simulated, declare, written
@@ -114,13 +113,14 @@ def read_simulator(path: Path) -> Simulated:
 
 
 def _explain(error: ValidationError, path: Path) -> CalibError:
-    first = error.errors()[0]
+    errors = error.errors()
+    # A key that is missing is most often there by a wrong name.
+    first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
     key = ".".join(str(part) for part in first["loc"])
     known = list((_Budget if key.startswith("emulator.") else SimulatorFile).model_fields)
     mend = "correct it"
     if first["type"] == "extra_forbidden":
-        near = difflib.get_close_matches(str(first["loc"][-1]), known, n=1)
-        mend = f"was {near[0]} meant?" if near else "correct its name, or leave it out"
+        mend = meant(str(first["loc"][-1]), known, "correct its name, or leave it out")
         return CalibError(
             f"unknown key {key}", where=str(path), allowed=", ".join(known), mend=mend
         )

@@ -17,9 +17,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from calib.batch.plugins import declared_in
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.models.simulators.base import Failure, Result, tail
+from calib.models.simulators.base import Failure, Result, no_output, tail
 from calib.models.simulators.exchange import filled, input_csv, input_json, output_of_text
 from calib.models.simulators.process import call_function, run_program
 
@@ -80,9 +81,24 @@ class CallableWay:
         """Call it here and now, and name what it returns."""
         return self._named(self.function(theta, conditions))
 
+    @property
+    def _place(self) -> str:
+        """The function and its file, for messages."""
+        called = getattr(self.function, "__qualname__", repr(self.function))
+        return ", ".join(filter(None, (declared_in(self.function), f"function {called}")))
+
     def _named(self, found: Any) -> dict[str, Array]:
         if not isinstance(found, Mapping):
             found = dict.fromkeys(self.columns[:1], found)
+        missing = [column for column in self.columns if column not in found]
+        if missing:
+            # No fault of the parameters: the next run would not give it either.
+            raise CalibError(
+                no_output(missing[0], found),
+                where=self._place,
+                allowed=", ".join(self.columns),
+                mend="return a mapping with these names, or rename the outputs declared",
+            )
         return {name: np.asarray(v, dtype=np.float64) for name, v in found.items()}
 
 

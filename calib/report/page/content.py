@@ -214,8 +214,7 @@ def _validation_title(result: OutputResult) -> str:
     held = result.task.held_out
     if held_table(result) is None or held is None:
         return "Validation: each row predicted without itself (leave-one-out)"
-    name, _, unit = held.column.rpartition("_")
-    return f"Validation on held-out rows: {name.replace('_', ' ')} {held.value:g} {unit}"
+    return f"Validation on held-out rows: {held.words}"
 
 
 def _card_facts(result: OutputResult, evidence: Evidence) -> list[list[str]]:

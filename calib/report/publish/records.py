@@ -12,6 +12,7 @@ from calib.inference.calibration import ParameterSummary
 from calib.models import get_model
 from calib.report.publish.markup import to_latex
 from calib.report.reference import Reference, reference_of
+from calib.report.study_tasks import HoldOut
 
 type Row = Mapping[str, str]
 """Cells by the head of their column."""
@@ -68,8 +69,7 @@ class Output:
         held = self.task["held_out"]
         if held is None or self.found["validation"]["method"] != "held_out":
             return ""
-        name, _, unit = held["column"].rpartition("_")
-        return f"{name.replace('_', ' ')} {held['value']:g} {unit}"
+        return HoldOut(**held).words
 
     @property
     def estimates_use_all_rows(self) -> bool:

@@ -40,10 +40,11 @@ def test_several_outputs_are_several_models() -> None:
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("name =", "nmae = 1\nname =", ["unknown key nmae", "was name meant?"]),
+        ("name =", "nmae = 1\nname =", ["unknown key nmae", "did you mean name?"]),
+        ("[conditions]", "[condition]", ["unknown key condition", "did you mean conditions?"]),
         ('name = "wheel"\n', "", ["name is missing"]),
         ("name =", "limit = -1\nname =", ["limit"]),
-        ("[conditions]", "[emulator]\nrun = 3\n[conditions]", ["emulator.run", "was runs meant?"]),
+        ("[conditions]", "[emulator]\nrun = 3\n[conditions]", ["emulator.run", "mean runs?"]),
         ("[parameters.sigma]", "[parameters.simga]", ["no prior of the noise", "sigma"]),
         ('"drawbar_pull_n"', '"drawbar_push"', ["drawbar_push", "no known quantity"]),
         ("name =", 'url = "http://x"\nname =', ["run, url", "exactly one of"]),

@@ -16,6 +16,7 @@ import pytest
 from calib.errors import CalibError
 from calib.models.simulators.base import Failure, Output, Simulator, Way
 from calib.models.simulators.files import read_simulator
+from calib.models.simulators.registered import models_of
 from calib.models.simulators.ways import CallableWay, CommandWay, UmbridgeWay
 from tests.models.simulators.examples import pull, write_program
 
@@ -65,13 +66,26 @@ def test_a_callable_of_one_vector() -> None:
         (lambda t, x: sys.exit(0), "error", "SystemExit: 0"),
         (lambda t, x: np.array([1.0, np.nan]), "nan", "1 of 2 rows, first 1"),
         (lambda t, x: np.array([1.0]), "short", "1 values for 2 rows"),
-        (lambda t, x: {"force": np.ones(2)}, "unreadable", "it gave force"),
     ],
 )
 def test_a_run_without_value_says_why(gives: object, kind: str, word: str) -> None:
     found = failure(simulator(CallableWay(gives, ("pull",))).run(THETA, X))  # type: ignore[arg-type]
     assert found.kind == kind
     assert word in found.reason
+
+
+@pytest.mark.parametrize("batched", [True, False])
+def test_a_function_without_a_declared_output_is_named_at_once(batched: bool) -> None:
+    def f(theta: np.ndarray, x: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {"pul": np.ones((len(theta), 2) if batched else 2)}
+
+    one = simulator(CallableWay(f, ("pull",), batched=batched), emulate=False)
+    (model,) = models_of(one)
+    assert model.predict is not None
+    for asked in (lambda: model.predict(THETA[None], X), lambda: one.run(THETA, X)):
+        with pytest.raises(CalibError, match=r"no output 'pull'; it gave pul\n") as refused:
+            asked()
+        assert "test_ways.py, function" in str(refused.value.where)
 
 
 def test_a_callable_with_a_limit_gives_the_same_from_a_process_of_its_own() -> None:
@@ -180,6 +194,16 @@ def test_a_command_that_fails(tmp_path: Path, extra: str, kind: str, word: str) 
     found = failure(read_simulator(file).simulator.run(THETA, X))
     assert found.kind == kind
     assert word in found.printed
+
+
+def test_a_command_without_a_declared_output_says_what_it_gave(tmp_path: Path) -> None:
+    found = failure(
+        simulator(
+            read_simulator(write_program(tmp_path)).simulator.way,
+            outputs=(Output("drawbar_pull_n", "Pull", ""),),
+        ).run(THETA, X)
+    )
+    assert found == Failure("unreadable", "there is no output 'Pull'; it gave pull")
 
 
 def test_a_template_a_pattern_and_a_row_at_a_time(tmp_path: Path) -> None:
