@@ -85,14 +85,15 @@ $(VENV)/.docs: pyproject.toml constraints.txt
 $(BENCH_VENV)/.ready: pyproject.toml constraints.txt constraints-bench.txt
 	$(call setup,bench,-c constraints.txt -c constraints-bench.txt)
 
-# What is released, as strangers get it: sdist, and the wheel made from it, each in an environment of its own and used
-# from elsewhere.
+# What is released, as strangers get it: the sdist, and the wheel made from it, installed into an empty environment and
+# used from elsewhere.
 RELEASE := $(CURDIR)/out/release
+INSTALLED := whl
 install-check: $(READY)
 	rm -rf $(RELEASE) && mkdir -p $(RELEASE)/elsewhere
 	$(BIN)/python -m venv $(RELEASE)/build && $(RELEASE)/build/bin/pip install -q build
 	$(RELEASE)/build/bin/python -m build --outdir $(RELEASE)/dist .
-	set -e; for made in whl tar.gz; do \
+	set -e; for made in $(INSTALLED); do \
 	  $(BIN)/python -m venv $(RELEASE)/$$made; \
 	  $(RELEASE)/$$made/bin/pip install -q -c constraints.txt $(RELEASE)/dist/*.$$made; \
 	  (cd $(RELEASE)/elsewhere; PATH=$(RELEASE)/$$made/bin:$$PATH; calib --version; calib doctor --quick >/dev/null; \
@@ -100,9 +101,11 @@ install-check: $(READY)
 	   python -c 'import calib; calib.load_he2019("rut_depth"); print(calib.__file__)'); \
 	done
 
-# The same with the oldest dependencies that pyproject.toml allows, of which warnings are none of ours.
+# The same of the sdist itself, and with the oldest dependencies that pyproject.toml allows, of which warnings are none of
+# ours.
 OLDEST_TESTS := tests/cli/test_machine.py tests/data tests/models/test_equations.py tests/inference/test_io.py \
   tests/validation/test_prediction.py tests/gap/test_case.py
+release-check: INSTALLED := whl tar.gz
 release-check: install-check
 	$(BIN)/python -m venv $(RELEASE)/oldest
 	$(RELEASE)/oldest/bin/pip install -q -c constraints-oldest.txt $(RELEASE)/dist/*.whl pytest hypothesis
