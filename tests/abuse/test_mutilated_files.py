@@ -1,6 +1,7 @@
 """Whatever a file holds, it is read or refused with a `CalibError`: thousands of mutilated files.
 
-`make test` tries some hundred of each kind, `make test-slow` 20,000 together, and says how many.
+`make test` tries some hundred of each kind, `make test-slow` 30,000 together, and says how many.
+Command lines as well: each ends in an exit code and words, never in a traceback.
 """
 
 from __future__ import annotations
@@ -8,21 +9,27 @@ from __future__ import annotations
 import tempfile
 import warnings
 from collections.abc import Callable, Sequence
+from contextlib import chdir
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from typer.testing import CliRunner
 
 from calib.batch.campaign import read_plan
+from calib.cli.verbs import app
 from calib.data import read_table
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.gap.case import campaigns, read_case
-from calib.inference.prior_files import default_priors, read_priors
+from calib.inference.prior_files import default_priors, parse_priors, read_priors
 from calib.inference.problem import build_problem
 from calib.models import MODELS, example_csv
+from calib.models.simulators.files import read_simulator
+from calib.models.simulators.registered import models_of
+from tests.models.simulators.examples import PROGRAM, write_program
 
 FEW, MANY = 120, 5_000
 
@@ -184,11 +191,62 @@ def try_case(toml: str, lab: str, field: str) -> str:
         return read_or_refused(lambda: campaigns(read_case(folder)))
 
 
+with scratch() as _folder:
+    SIMULATOR = write_program(Path(_folder)).read_text(encoding="utf-8")
+SIMULATOR += """
+[emulator]
+runs = 30
+[ranges]
+s = [0.0, 90.0]
+"""
+
+
+def try_simulator(text: str) -> str:
+    with scratch() as folder:
+        path = Path(folder) / "wheel.toml"
+        path.write_bytes(text.encode("utf-8", "surrogatepass"))
+        (Path(folder) / "wheel.py").write_text(PROGRAM.format(extra=""), encoding="utf-8")
+
+        def work() -> None:
+            for model in models_of(read_simulator(path).simulator):
+                parse_priors(model.priors, "wheel", "wheel", (*model.parameters, "sigma"), {})
+
+        return read_or_refused(work)
+
+
+# On files that are not there, so that nothing is worked out. Not `report` and `sbc`: without files
+# they have data of their own.
+WORDS = (
+    "fit none.csv --model bekker --out out --seed 3 --max-steps 400 --workers 1",
+    "predict none --at new.csv --out bands.csv --level 0.9",
+    "diagnose none --out out --effects mine.py --seed 1 --json",
+    "diagnose --run none --field field.csv --simulator wheel.toml --out out",
+    "check none --quick --workers 2",
+    "compare bekker reece none.csv --out out",
+    "campaign none.toml --out out --workers 2",
+    "template none --out t.csv", "models bekker", "effects slip_zero_shift --json",
+    "quantities slip", "priors none",
+)  # fmt: skip
+
+
+def try_words(text: str) -> str:
+    words = [word.replace("\x00", "") for word in text.split(" ")]
+    with scratch() as folder, chdir(folder):
+        done = CliRunner().invoke(app, words)
+        assert isinstance(done.exception, SystemExit | None), (words, done.exception)
+        assert done.exit_code in (0, 1, 2, 3), (words, done.output)
+        assert "Traceback" not in done.output
+        assert done.exit_code == 0 or done.output.strip(), words
+    return "refused" if done.exit_code else "read"
+
+
 KINDS: dict[str, tuple[Callable[..., str], tuple[Sequence[str], ...]]] = {
     "csv": (try_csv, (CSVS,)),
     "priors": (try_priors, ((*PRIORS.values(), *WITH_NOISE),)),
     "plan": (try_plan, ((PLAN,),)),
     "case": (try_case, ((CASE,), (PULL,), (FIELD,))),
+    "simulator": (try_simulator, ((SIMULATOR,),)),
+    "words": (try_words, (WORDS,)),
 }
 
 
@@ -216,7 +274,7 @@ def test_a_mutilated_file_is_read_or_refused(kind: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
-def test_twenty_thousand_mutilated_files_are_read_or_refused(kind: str) -> None:
+def test_thousands_of_mutilated_files_are_read_or_refused(kind: str) -> None:
     seen = run(kind, MANY)
     print(f"{kind}: {seen}")
     assert sum(seen.values()) >= MANY
