@@ -31,7 +31,7 @@ _USUAL: Mapping[str, Mapping[str, float]] = {
     "pressure": {
         "Pa": 1.0, "kPa": 1e3, "MPa": 1e6, "bar": 1e5, "psi": _POUND * _GRAVITY / _INCH**2,
     },
-    "force": {"N": 1.0, "kN": 1e3, "lbf": _POUND * _GRAVITY},
+    "force": {"N": 1.0, "kN": 1e3, "lbf": _POUND * _GRAVITY, "kgf": _GRAVITY},
     "length": {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "inch": _INCH},
     "ratio": {"dimensionless": 1.0, "percent": 1e-2},
     "density": {"g/cm**3": 1e3, "kg/m**3": 1.0},

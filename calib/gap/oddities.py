@@ -171,11 +171,10 @@ def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str
             continue
         low, high = (float(f(lab[name])) for f in (np.nanmin, np.nanmax))
         ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
-        held = low > 0.0 and high <= (1.0 + _HELD) * low
-        read = (
-            usual_in(field, name, field[name], (1.0 - _HELD) * low, (1.0 + _HELD) * high)
-            if held else ""
-        )  # fmt: skip
+        bottom, top = (1.0 - _HELD) * low, (1.0 + _HELD) * high
+        as_before = bool(((bottom <= field[name]) & (field[name] <= top)).all())
+        held = low > 0.0 and high <= (1.0 + _HELD) * low and not as_before
+        read = usual_in(field, name, field[name], bottom, top) if held else ""
         if read:
             yield (
                 f"{name}: {_times(lab[name], field[name], 0.0)}, and as in the calibration "
