@@ -11,7 +11,6 @@ from calib.data.quantities import role_of
 from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import EFFECTS
-from calib.gap.effects.base import LACKING
 from calib.gap.inclusion import UNLISTED, Included
 from calib.gap.next_measurement import NextMeasurement
 from calib.gap.shrink import Shrink
@@ -100,13 +99,15 @@ def _untested(found: Diagnosis) -> list[str]:
     def fits_in(outputs: Sequence[str]) -> bool:
         return not touched or bool(touched & set(outputs))
 
-    said = [
-        f"{short_name(n)} ({reason})"
-        for n, reason in found.ranking.not_testable.items()
-        if any(words in reason for words in LACKING)
-        and (n not in EFFECTS or fits_in(EFFECTS[n].outputs))
-    ]
     view = found.data.view
+    unable = {n: EFFECTS[n] for n in found.ranking.not_testable if n in EFFECTS}
+    said = [
+        f"{short_name(n)} ({found.ranking.not_testable[n]})"
+        for n, effect in unable.items()
+        if n not in found.data.case.context.excluded
+        and fits_in(effect.outputs)
+        and effect.lacking(view, found.data.roles)
+    ]
     for name, effect in known.items():
         lacking = [c for r in effect.covariates if r != "order" and (c := view.column(r))]
         lacking = [c for c in lacking if c not in view.lab]

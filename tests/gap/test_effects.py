@@ -361,7 +361,12 @@ def test_in_a_campaign_as_the_laboratorys_some_effects_can_be_seen(view):
     # To a millionth of it, or where the laboratory did not record it.
     near = {c: v * np.resize([1.0, 1.0 + 9e-7], 20) for c, v in alike.items()}
     unknown = replace(same, conditions=near, lab={})
-    assert all(EFFECTS[name].not_testable(unknown, OUTPUTS) for name in hidden)
+    for name in hidden:
+        effect = EFFECTS[name]
+        assert "no such column" in effect.not_testable(unknown, OUTPUTS)
+        assert not effect.lacking(same, OUTPUTS)
+        assert effect.lacking(unknown, OUTPUTS) == [view.column(effect.covariates[0])]
+        assert not effect.lacking(unknown, ()), "its output is lacking as well"
     apart = {c: v * np.resize([1.0, 1.0 + 2e-6], 20) + 1e-11 for c, v in alike.items()}
     for name in hidden:
         told = EFFECTS[name].not_testable(replace(same, conditions=apart), OUTPUTS)

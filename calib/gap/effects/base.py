@@ -18,10 +18,7 @@ import numpy as np
 from calib.data.quantities import QUANTITIES, columns_of
 from calib.models.base import Array
 
-__all__ = ["LACKING", "Effect", "View", "each", "saturating"]
-
-# How the reason begins or ends where an effect is not testable for want of a column.
-LACKING = ("the data lack", "the calibration has no such column")
+__all__ = ["Effect", "View", "each", "saturating"]
 
 
 @dataclass(frozen=True)
@@ -214,22 +211,44 @@ class Effect:
         outputs : tuple of str
             Physical roles of the outputs that the case models.
         """
-        if not set(self.outputs) & set(outputs):
-            return f"no {' or '.join(map(_named, self.outputs))} output"
-        unseen = [o for o in self.needs if o not in outputs]
-        if unseen:
-            return f"no {' and '.join(map(_named, unseen))} output"
-        missing = [c for c in self.covariates if view.column(c) is None]
-        if missing:
-            return f"{LACKING[0]} {', '.join((*columns_of(c), c)[0] for c in missing)}"
-        if self.varies and self.covariates:
-            values = view.of(self.covariates[0])
-            reference = view.lab_of(self.covariates[0], float(values[0]))
-            if np.allclose(values, reference, rtol=1e-6, atol=1e-12):
-                column = view.column(self.covariates[0])
-                as_lab = "as in the calibration" if column in view.lab else f"and {LACKING[1]}"
-                return f"{column} is the same in every row, {as_lab}"
+        if unseen := self._unseen(outputs):
+            return f"no {unseen} output"
+        if missing := self._unrecorded(view):
+            return f"the data lack {', '.join(missing)}"
+        if column := self._still(view):
+            absent = "and the calibration has no such column"
+            compared = "as in the calibration" if column in view.lab else absent
+            return f"{column} is the same in every row, {compared}"
         return None
+
+    def lacking(self, view: View, outputs: tuple[str, ...]) -> list[str]:
+        """Name the columns for want of which alone the data cannot show this effect.
+
+        Those that are not recorded, or else one that does not vary in the field and is not recorded
+        in the calibration, from which it may differ. Parameters are those of `not_testable`.
+        """
+        if self._unseen(outputs):
+            return []
+        still = self._still(view)
+        return self._unrecorded(view) or ([still] if still and still not in view.lab else [])
+
+    def _unseen(self, outputs: tuple[str, ...]) -> str:
+        """Name the outputs that it would have to be seen in and that are not there."""
+        if not set(self.outputs) & set(outputs):
+            return " or ".join(map(_named, self.outputs))
+        return " and ".join(_named(o) for o in self.needs if o not in outputs)
+
+    def _unrecorded(self, view: View) -> list[str]:
+        return [(*columns_of(c), c)[0] for c in self.covariates if view.column(c) is None]
+
+    def _still(self, view: View) -> str | None:
+        """Return the column that would have to vary and has the calibration's median throughout."""
+        column = view.column(self.covariates[0]) if self.varies and self.covariates else None
+        if column is None:
+            return None
+        values = view.conditions[column]
+        reference = view.lab.get(column, float(values[0]))
+        return column if np.allclose(values, reference, rtol=1e-6, atol=1e-12) else None
 
     def register(self) -> None:
         """Make the effect known to every diagnosis.
