@@ -2,115 +2,32 @@
 
 from __future__ import annotations
 
-import difflib
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
-from scipy.special import digamma, polygamma
+from pydantic import ValidationError
 
 from calib.batch.plugins import declared_in
-from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
-from calib.inference.noise import DEFAULT_PRIORS, USUAL, Along, Family, NoiseChoice
+from calib.inference.noise import USUAL, NoiseChoice
+from calib.inference.prior_entries import (
+    NOISE_ENTRIES,
+    LikelihoodTable,
+    PriorFileContent,
+    explain,
+    likeliest,
+    meant_by,
+    no_such_key,
+    prior_of,
+)
 from calib.inference.priors import Prior, Priors
 from calib.models import MODELS
-
-# Beyond these, squares and products of numbers leave the range of double precision; no quantity of
-# the field comes near them. An sd of 20 on the logarithm is a factor of 5e8 to either side.
-_Number = Annotated[float, Field(strict=True, ge=-1e15, le=1e15)]
-_Positive = Annotated[float, Field(strict=True, gt=1e-15, le=1e15)]
-_LogSd = Annotated[float, Field(strict=True, gt=1e-6, le=20.0)]
-
-
-class _Entry(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-    unit: str
-    reason: str = Field(min_length=1)
-    source: str = Field(min_length=1)
-    relative_to: str | None = None
-    default_reference: _Positive = 1.0
-
-
-class _Bounded(_Entry):
-    lower: _Number | None = None
-    upper: _Number | None = None
-
-
-class _OnLogarithm(_Entry):
-    lower: _Positive | None = None
-    upper: _Positive | None = None
-
-
-class _Normal(_Bounded):
-    dist: Literal["normal"]
-    mean: _Number
-    sd: _Positive
-
-
-class _LogNormal(_OnLogarithm):
-    dist: Literal["lognormal"]
-    median: _Positive
-    sd_log: _LogSd
-
-
-class _HalfNormal(_Entry):
-    dist: Literal["half_normal"]
-    sd: _Positive
-
-
-class _Uniform(_Entry):
-    dist: Literal["uniform"]
-    lower: _Number
-    upper: _Number
-
-
-class _Gamma(_OnLogarithm):
-    dist: Literal["gamma"]
-    shape: _Positive
-    rate: _Positive
-
-
-class _Fixed(_Entry):
-    dist: Literal["fixed"]
-    value: _Number
-
-
-_DISTS: Mapping[str, type[_Entry]] = {
-    "normal": _Normal, "lognormal": _LogNormal, "half_normal": _HalfNormal, "uniform": _Uniform,
-    "gamma": _Gamma, "fixed": _Fixed,
-}  # fmt: skip
-type _AnyEntry = Annotated[
-    _Normal | _LogNormal | _HalfNormal | _Uniform | _Gamma | _Fixed, Field(discriminator="dist")
-]
-
-
-class _Likelihood(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    family: Family = "normal"
-    noise_depends_on: str = ""
-    correlated_along: Along = ""
-
-
-class _File(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    model: str
-    likelihood: _Likelihood = _Likelihood()
-    parameters: dict[str, _AnyEntry]
-
-
-_NOISE = TypeAdapter(dict[str, _AnyEntry]).validate_python(tomllib.loads(DEFAULT_PRIORS))
-
-
-def json_schema() -> dict[str, Any]:
-    """Return the JSON schema of a prior file."""
-    return _File.model_json_schema()
 
 
 @dataclass(frozen=True)
@@ -257,18 +174,18 @@ def parse_priors(
     """Check the text of a prior file; see `read_priors`."""
     content = _content(text, source)
     # A misspelt name is reported before its content: it is the likelier mistake.
-    if unknown := [key for key in content if key not in _File.model_fields]:
-        raise _no_such_key(unknown[0], _File.model_fields, source)
+    if unknown := [key for key in content if key not in PriorFileContent.model_fields]:
+        raise no_such_key(unknown[0], PriorFileContent.model_fields, source)
     noise = _noise_choice(content, source, parameters)
     _check_names(content, source, model_name, parameters, noise.parameters)
     try:
-        file = _File.model_validate(content)
+        file = PriorFileContent.model_validate(content)
     except ValidationError as error:
-        raise _explain(error, source) from None
+        raise explain(error, source) from None
     _check_units(file, source, model_name)
-    given = _NOISE | file.parameters
+    given = NOISE_ENTRIES | file.parameters
     names = (*parameters[:-1], *noise.parameters, *parameters[-1:])
-    entries = tuple(_prior(name, given[name], source, references) for name in names)
+    entries = tuple(prior_of(name, given[name], source, references) for name in names)
     for prior in entries[len(parameters) - 1 : -1]:
         _check_noise(prior, source)
     return Priors(entries, text, source, noise)
@@ -304,11 +221,11 @@ def _noise_choice(
             "an effect has no likelihood of its own", where=where, mend="take the table out"
         )
     try:
-        chosen = _Likelihood.model_validate(content["likelihood"])
+        chosen = LikelihoodTable.model_validate(content["likelihood"])
     except ValidationError as error:
-        first = _likeliest(error)
+        first = likeliest(error)
         if first["type"] == "extra_forbidden":
-            raise _no_such_key(first["loc"][-1], _Likelihood.model_fields, where) from None
+            raise no_such_key(first["loc"][-1], LikelihoodTable.model_fields, where) from None
         raise CalibError(
             f"{'.'.join(map(str, first['loc']))}: {first['msg']}", where=where,
             allowed='family = "normal" or "student_t", noise_depends_on = "slip" or another '
@@ -355,7 +272,7 @@ def _check_names(
             found,
             where=f"{source}, [parameters]",
             allowed=", ".join(parameters),
-            mend=f"{_meant(unknown, missing)}give exactly these parameters{_example(model_name)}",
+            mend=f"{meant_by(unknown, missing)}give exactly these parameters{_example(model_name)}",
         )
 
 
@@ -365,7 +282,7 @@ def _example(model_name: str) -> str:
     return "; copy the shipped file and edit it" if there else ""
 
 
-def _check_units(file: _File, source: str, model_name: str) -> None:
+def _check_units(file: PriorFileContent, source: str, model_name: str) -> None:
     """A prior in another unit would silently be taken for one in the model's."""
     shipped = default_priors(model_name)
     if not shipped.is_file():
@@ -373,7 +290,7 @@ def _check_units(file: _File, source: str, model_name: str) -> None:
     units = {
         name: entry.get("unit")
         for name, entry in tomllib.loads(shipped.read_text(encoding="utf-8"))["parameters"].items()
-    } | {name: entry.unit for name, entry in _NOISE.items()}
+    } | {name: entry.unit for name, entry in NOISE_ENTRIES.items()}
     for name, entry in file.parameters.items():
         if name in units and entry.unit != units[name]:
             raise CalibError(
@@ -382,131 +299,3 @@ def _check_units(file: _File, source: str, model_name: str) -> None:
                 allowed=f"unit = {units[name]!r}",
                 mend="convert the numbers to this unit",
             )
-
-
-def _likeliest(error: ValidationError) -> Any:
-    """Return the error to tell: of a misspelt key, by which another is missing, its name."""
-    errors = error.errors()
-    return next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
-
-
-def _no_such_key(key: object, known: Iterable[str], where: str) -> CalibError:
-    return CalibError(
-        f"there is no key {str(key)!r}", where=where, allowed=", ".join(known),
-        mend=f"{_meant([str(key)], known)}correct it, or take it out",
-    )  # fmt: skip
-
-
-def _meant(found: Iterable[str], known: Iterable[str]) -> str:
-    """Say which names may have been meant."""
-    known = list(known)
-    pairs = ((name, difflib.get_close_matches(name, known, n=2, cutoff=0.5)) for name in found)
-    said = ", ".join(f"{' or '.join(near)} by {name}" for name, near in pairs if near)
-    return f"did you mean {said}? " if said else ""
-
-
-def _explain(error: ValidationError, source: str) -> CalibError:
-    first = _likeliest(error)
-    place = [str(part) for part in first["loc"]]
-    if first["type"] == "extra_forbidden" and place[0] == "parameters":
-        _, name, dist, key = place
-        return _no_such_key(key, _DISTS[dist].model_fields, f"{source}, parameters.{name}")
-    if first["type"].startswith("union_tag"):
-        return _no_such_dist(first["input"], f"{source}, {'.'.join(place)}")
-    if first["type"] == "float_type":
-        return CalibError(
-            f"{place[-1]} = {first['input']!r} is not a number",
-            where=f"{source}, parameters.{place[1]}", allowed=f"a number, as in {place[-1]} = 0.75",
-            mend="write a number without quotes",
-        )  # fmt: skip
-    return CalibError(
-        f"{first['msg']} (found {first.get('input')!r})",
-        where=f"{source}, {'.'.join(place)}",
-        allowed="dist = normal (mean, sd > 0), lognormal (median > 0, sd_log > 0), half_normal "
-        "(sd > 0), uniform (lower < upper) or fixed (value); of nu also gamma (shape > 0, "
-        "rate > 0); each with unit, reason, source",
-        mend="correct this entry",
-    )
-
-
-def _no_such_dist(entry: Mapping[str, Any], where: str) -> CalibError:
-    dist = entry.get("dist")
-    found = "there is no dist" if dist is None else f"there is no distribution {dist!r}"
-    return CalibError(
-        found, where=where, allowed=", ".join(_DISTS),
-        mend=f"{_meant([str(dist)], _DISTS)}choose one of these",
-    )  # fmt: skip
-
-
-def _prior(name: str, entry: _AnyEntry, source: str, references: Mapping[str, float]) -> Prior:
-    reference, text = 1.0, _words(entry)
-    if entry.relative_to is not None:
-        _check_relative(name, entry.relative_to, source)
-        reference = references.get(entry.relative_to, entry.default_reference)
-        text += f" x {reference:g} ({entry.relative_to})"
-    loc, scale, lower, upper = _internal(entry, reference)
-    gamma = (entry.shape, entry.rate) if isinstance(entry, _Gamma) else None
-    if gamma is not None and name != "nu":
-        raise CalibError(
-            'dist = "gamma" is for the degrees of freedom nu of a Student-t likelihood',
-            where=f"{source}, parameters.{name}", allowed="normal, lognormal, half_normal, uniform "
-            "or fixed", mend="choose one of these",
-        )  # fmt: skip
-    if not lower < upper:
-        raise CalibError(
-            f"lower bound {lower:g} is not below upper bound {upper:g}",
-            where=f"{source}, parameters.{name}",
-            mend="give lower < upper",
-        )
-    return Prior(
-        name, entry.unit, entry.reason, entry.source, text, isinstance(entry, _OnLogarithm), loc,
-        scale, lower, upper, gamma,
-    )  # fmt: skip
-
-
-def _check_relative(name: str, column: str, source: str) -> None:
-    if all(q.canonical != column for q in QUANTITIES.values()):
-        raise CalibError(
-            f"relative_to names no known column: {column!r}",
-            where=f"{source}, parameters.{name}",
-            allowed=", ".join(q.canonical for q in QUANTITIES.values()),
-            mend="name one of these, as the table has it in its own unit",
-        )
-
-
-def _internal(entry: _AnyEntry, reference: float) -> tuple[float, float, float, float]:
-    """Return (loc, scale, lower, upper) of an entry in internal coordinates."""
-    low, high = getattr(entry, "lower", None), getattr(entry, "upper", None)
-    if isinstance(entry, _OnLogarithm):
-        reference = 1.0 if isinstance(entry, _Gamma) else reference
-        low, high = (x and float(np.log(x * reference)) for x in (low, high))
-    else:
-        low, high = (x if x is None else x * reference for x in (low, high))
-    low, high = -np.inf if low is None else low, np.inf if high is None else high
-    match entry:
-        case _Normal(mean=mean, sd=sd):
-            return mean * reference, sd * reference, low, high
-        case _LogNormal(median=median, sd_log=sd_log):
-            return float(np.log(median * reference)), sd_log, low, high
-        case _HalfNormal(sd=sd):
-            return 0.0, sd * reference, 0.0, high
-        case _Uniform():
-            return 0.5 * (low + high), np.inf, low, high
-        case _Gamma(shape=shape, rate=rate):
-            mean, variance = float(digamma(shape) - np.log(rate)), float(polygamma(1, shape))
-            return mean, float(np.sqrt(variance)), low, high
-        case _Fixed(value=value):
-            return value * reference, 0.0, low, high
-
-
-def _words(entry: _AnyEntry) -> str:
-    """Write an entry as its distribution with its numbers, and its bounds if there are any."""
-    own = {name: value for name, value in entry if name not in _Entry.model_fields}
-    dist = own.pop("dist")
-    low, high = None, None
-    if dist != "uniform":
-        low, high = own.pop("lower", None), own.pop("upper", None)
-    text = f"{dist}({', '.join(f'{value:g}' for value in own.values())})"
-    if low is None and high is None:
-        return text
-    return f"{text} on [{-np.inf if low is None else low:g}, {np.inf if high is None else high:g}]"

@@ -6,7 +6,7 @@ from typing import Any
 
 from calib.batch.campaign.kinds import KINDS
 from calib.check.schema import Manifest, RunRecord
-from calib.inference.prior_files import json_schema
+from calib.inference.prior_entries import json_schema
 
 
 def schemas() -> dict[str, dict[str, Any]]:
