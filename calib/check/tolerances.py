@@ -167,8 +167,10 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     # seeds moved probabilities by 0.025 at the most, rounding by 0.002.
     ("summary.json/paper_gaps/*/variants/*/probability/*", _chance(0.1)),
     ("summary.json/paper_gaps/*/variants/*", _JUMPS),
-    ("{summary.json/paper_gaps,gaps}/*{,/diagnosis.json}/shrink/*/{fraction,interval/*}",
-     _chance(0.1)),
+    # The ends are quantiles over all hypotheses. Where a few per cent of probability belong to
+    # those that explain much less, 0.01 more of it moves the lower end by 0.05: eight seeds by 0.11.
+    ("{summary.json/paper_gaps,gaps}/*{,/diagnosis.json}/shrink/*/interval/*", _chance(0.25)),
+    ("{summary.json/paper_gaps,gaps}/*{,/diagnosis.json}/shrink/*/fraction", _chance(0.1)),
     ("{summary.json/paper_gaps,gaps}/*{,/diagnosis.json}/shrink/*/*", Tolerance("diagnosis", 0.1)),
     ("summary.json/paper_gaps/*/checks/*/probability*", _chance(0.1)),
     ("summary.json/paper_gaps/*/checks/*/in_90_band", _chance(1.0)),

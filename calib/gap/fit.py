@@ -65,7 +65,8 @@ class Fit:
     def draws(self, rng: np.random.Generator, size: int) -> Array:
         """Draw psi within its bounds, shape (size, d)."""
         if self.sample is not None:
-            return np.asarray(self.sample[rng.integers(self.sample.shape[0], size=size)])
+            # Each draw as often as any other: chance adds nothing to what the sample has already.
+            return np.asarray(self.sample[np.resize(rng.permutation(len(self.sample)), size)])
         values, vectors = np.linalg.eigh(self.covariance)
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         drawn = self.psi + rng.standard_normal((size, self.psi.size)) @ root.T

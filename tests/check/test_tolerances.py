@@ -73,6 +73,7 @@ N1 = ("models", "rut_depth", "prior_sensitivity", "parameters", "n1")
         (SUMMARY, (*BEKKER, "probability", "slip_sinkage"), -0.03, -0.06),
         (SUMMARY, (*BEKKER, "parameters", "growth", "mean"), 0.05, 0.2),
         (SUMMARY, (*BEKKER, "shrink", "rut_depth", "fraction"), 0.05, -0.15),
+        (SUMMARY, (*BEKKER, "shrink", "rut_depth", "interval", "0"), -0.15, -0.3),
         (SUMMARY, (*BEKKER, "open_sd_rms"), 1e-2, 0.1),
         (SUMMARY, (*BEKKER, "rows", "field"), None, 1),
         (SUMMARY, (*BEKKER, "verdict"), None, "none"),
