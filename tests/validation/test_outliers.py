@@ -39,11 +39,17 @@ def left_out(slip: np.ndarray, pull: np.ndarray, i: int) -> float:
     return float((pull[i] - at @ coefficients) / np.sqrt(spread))
 
 
-def test_distances_are_those_from_a_line_through_the_other_rows() -> None:
+def one_row_off() -> tuple[np.ndarray, np.ndarray]:
+    """Slip and pull of 15 rows on a line, but for the tenth."""
     rng = np.random.default_rng(1)
     slip = rng.random(15)
     pull = 1.0 + 2.0 * slip + 0.1 * rng.standard_normal(15)
     pull[9] -= 2.0
+    return slip, pull
+
+
+def test_distances_are_those_from_a_line_through_the_other_rows() -> None:
+    slip, pull = one_row_off()
     problem = line_problem(slip, pull)
     (found,) = outlying_rows(problem, fitted_line(slip, pull))
     assert found.line == problem.table.lines[9]
@@ -54,10 +60,7 @@ def test_distances_are_those_from_a_line_through_the_other_rows() -> None:
 
 def test_beside_ground_without_a_value_the_slope_is_that_of_one_side() -> None:
     """A mode at the edge of where a simulator runs at all."""
-    rng = np.random.default_rng(1)
-    slip = rng.random(15)
-    pull = 1.0 + 2.0 * slip + 0.1 * rng.standard_normal(15)
-    pull[9] -= 2.0
+    slip, pull = one_row_off()
     t = fitted_line(slip, pull)
     priors = [normal("a", 0.0, 1e6), normal("b", 0.0, 1e6), normal("sigma", 0.0, 0.1, log=True)]
     for side in (1.0, -1.0):
