@@ -60,9 +60,10 @@ format: $(READY)
 	$(BIN)/ruff check --fix calib challenge tests benchmarks docs
 	$(BIN)/ruff format calib challenge tests benchmarks docs
 
-# $(call setup,extra,constraints): make the target's virtual environment with an optional extra.
+# $(call setup,extra,constraints): make the target's virtual environment with an optional extra. With another Python:
+# make test VENV=.venv-3.13 PYTHON=python3.13
 define setup
-	@python=$$(for p in python3.12 python3.13 python3.14 python3 python; do \
+	@python=$$(for p in $(PYTHON) python3.12 python3.13 python3.14 python3 python; do \
 	  $$p -c 'import sys; raise SystemExit(sys.version_info < (3, 12))' >/dev/null 2>&1 \
 	    && echo $$p && break; done); \
 	if [ -z "$$python" ]; then \
