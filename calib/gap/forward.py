@@ -13,9 +13,10 @@ The vector psi of a hypothesis stacks, all with (truncated) normal or uniform pr
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.data.quantities import columns_of, role_of
 from calib.gap.case import Campaigns
@@ -26,7 +27,7 @@ from calib.gap.shifts import ShiftMap, shift_map
 from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
 
-__all__ = ["FORM_ERROR", "Forward"]
+__all__ = ["FORM_ERROR", "Forward", "departed_of_all"]
 
 # Relative size by which a formula may misrepresent its effect along one direction: the effect's
 # size, its tilt and bend over slip, its tilt over other conditions. Estimated from the true
@@ -243,20 +244,11 @@ class Forward:
         effects = enumerate(self.hypothesis.effects)
         return self.field(rest, view, [i for i, e in effects if e.name in left_out])
 
-    @_SILENT
     def departed(
         self, psi: Array, view: View, plain: dict[str, Array], idle: Collection[int] = ()
     ) -> dict[str, Array]:
         """Add effects, but for those idle, and discrepancies to what simulators predict."""
-        changed = dict(plain)
-        if self.hypothesis.effects:
-            changed = self._with_effects(psi, view, changed, idle)
-        if self.smooth_slices:
-            threshold = psi[:, self.threshold :].ravel()  # of one that sets in, else empty
-            for name, part in self.smooth_slices.items():
-                added = self.discrepancy.at(psi[:, part], threshold, view, name)
-                changed[name] = changed[name] + added
-        return changed
+        return departed_of_all([(self, psi)], view, plain, idle)
 
     @_SILENT
     def field_and_plain(self, psi: Array, view: View) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -266,63 +258,145 @@ class Forward:
             return self.field(psi, view), plain
         return self.departed(psi, view, plain), plain
 
-    def _with_effects(
-        self, psi: Array, view: View, plain: dict[str, Array], idle: Collection[int]
-    ) -> dict[str, Array]:
-        base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in self.data.outputs}
+
+@_SILENT
+def departed_of_all(
+    asked: Sequence[tuple[Forward, Array]], view: View, plain: dict[str, Array],
+    idle: Collection[int] = (),
+) -> dict[str, Array]:  # fmt: skip
+    """Add to what simulators predict what hypotheses on the same campaigns say.
+
+    An effect is asked once for all hypotheses that have it: of few rows at a time asking takes
+    longer than the arithmetic.
+
+    Parameters
+    ----------
+    asked : sequence of (Forward, ndarray)
+        With psi of each, shape (k, d); one below the other they are the rows of `plain`.
+    view : View
+    plain : dict of str to ndarray, shape (sum of k, n)
+    idle : collection of int
+        Effects to leave out, by their place.
+    """
+    changed = dict(plain)
+    ends = np.cumsum([len(psi) for _, psi in asked]).tolist()
+    parts = [
+        (forward, psi, slice(end - len(psi), end))
+        for (forward, psi), end in zip(asked, ends, strict=True)
+    ]
+    acting = _acting(parts, view, idle)
+    if acting:
+        forward = asked[0][0]
+        shared = np.concatenate([psi[:, : forward.n_shared] for _, psi in asked])
+        outputs = forward.data.outputs
+        base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in outputs}
         view = replace(view, base=base)
-        acting = [
-            (i, effect, p.to_natural(psi[:, self.phi_slices[i]]))
-            for i, (effect, p) in enumerate(
-                zip(self.hypothesis.effects, self.hypothesis.effect_priors, strict=True)
-            )
-            if i not in idle
-        ]
-        form = self._form(view)
-        return {name: self._changed(psi, name, view, acting, plain[name], form) for name in plain}
+        changed = {o: _changed(forward, shared, o, view, acting, plain[o]) for o in plain}
+    for forward, psi, rows in parts:
+        threshold = psi[:, forward.threshold :].ravel()  # of one that sets in, else empty
+        for name, part in forward.smooth_slices.items():
+            if changed[name] is plain[name]:
+                changed[name] = plain[name].copy()
+            changed[name][rows] += forward.discrepancy.at(psi[:, part], threshold, view, name)
+    return changed
 
-    def _changed(
-        self, psi: Array, name: str, view: View, effects: Sequence[tuple[int, Effect, Array]],
-        plain: Array, form: Sequence[Array],
-    ) -> Array:  # fmt: skip
-        """One output with the effects in it; effects with their natural parameters.
 
-        What an effect adds to the output, given those before it, departs from its formula by a
-        factor of its own.
-        """
-        role = self._roles[name]
-        acting = [
-            (effect, phi, self._factor(psi, self.form_slices[name][i], form[i]))
-            for i, effect, phi in effects
+type _Part = tuple[Forward, Array, slice]
+
+
+@dataclass(frozen=True)
+class _Acting:
+    """An effect in some rows, with its natural parameters and how it departs from its formula.
+
+    Factors by output.
+    """
+
+    effect: Effect
+    rows: NDArray[np.int64]
+    phi: Array
+    factors: Mapping[str, Array]
+
+
+def _acting(parts: Sequence[_Part], view: View, idle: Collection[int]) -> list[_Acting]:
+    """Effects in alphabetical order, which is that of each hypothesis."""
+    places: dict[str, list[tuple[_Part, int]]] = {}
+    for part in parts:
+        for i, effect in enumerate(part[0].hypothesis.effects):
+            if i not in idle:
+                places.setdefault(effect.name, []).append((part, i))
+    found = []
+    for _, having in sorted(places.items()):
+        (forward, _, _), i = having[0]
+        effect, basis = forward.hypothesis.effects[i], forward._form(view)[i]
+        phi = np.concatenate([psi[:, f.phi_slices[j]] for (f, psi, _), j in having])
+        # One plus what its form errors say: by how much it departs from its formula.
+        factors = {
+            name: 1.0
+            + np.concatenate([psi[:, f.form_slices[name][j]] for (f, psi, _), j in having])
+            @ basis.T
+            for name, role in forward._roles.items()
             if role in effect.outputs
-        ]
-        if not acting:
-            return plain
-        simulated = self._simulated[name]
-        recorded = simulated.conditions(view)
-        columns = self._columns[name]
-        conditions = {known: recorded[column] for known, column in columns.items()}
-        location = ahead = plain
-        for effect, phi, factor in acting:
-            truly = effect.on_conditions(phi, role, conditions, view)
-            if truly is conditions:
-                continue
-            conditions = truly
-            t, misfit = psi[:, self.theta_slices[name]], psi[:, self.misfit_slices[name]]
-            there = simulated.predict_beyond(
-                t, misfit, {columns[known]: values for known, values in truly.items()}
-            )
-            location, ahead = location + (there - ahead) * factor, there
-        for effect, phi, factor in acting:
-            changed = effect.on_output(phi, role, location, view)
-            if changed is not location:
-                location = location + (changed - location) * factor
-        return location
+        }
+        rows = np.concatenate([np.arange(p.start, p.stop) for (_, _, p), _ in having])
+        natural = forward.hypothesis.effect_priors[i].to_natural(phi)
+        found.append(_Acting(effect, rows, natural, factors))
+    return found
 
-    @staticmethod
-    def _factor(psi: Array, part: slice, basis: Array) -> Array:
-        """By how much what an effect does departs from its formula, shape (k, n)."""
-        return np.asarray(1.0 + psi[:, part] @ basis.T)
+
+def _changed(
+    forward: Forward, shared: Array, name: str, view: View, effects: Sequence[_Acting],
+    plain: Array,
+) -> Array:  # fmt: skip
+    """One output with the effects in it.
+
+    What an effect adds to the output, given those before it, departs from its formula by a factor
+    of its own.
+    """
+    acting = [a for a in effects if name in a.factors]
+    if not acting:
+        return plain
+    role, simulated = forward._roles[name], forward._simulated[name]
+    columns = forward._columns[name]
+    t, misfit = shared[:, forward.theta_slices[name]], shared[:, forward.misfit_slices[name]]
+    recorded = simulated.conditions(view)
+    conditions = {known: recorded[column] for known, column in columns.items()}
+    bits = {known: 1 << i for i, known in enumerate(conditions)}
+    truly: dict[str, Array] = {}
+    # Which conditions are no longer the recorded ones; with those a simulator has less to do.
+    moved = np.zeros(len(plain), dtype=np.int64)
+    location, ahead = plain.copy(), plain.copy()
+    for a in acting:
+        before = moved[a.rows]
+        for mask in np.unique(before).tolist():
+            some = before == mask
+            rows = a.rows[some]
+            given = {
+                known: truly[known][rows] if mask & bits[known] else values
+                for known, values in conditions.items()
+            }
+            found = a.effect.on_conditions(a.phi[some], role, given, _of(view, rows))
+            if found is given:
+                continue
+            there = simulated.predict_beyond(
+                t[rows], misfit[rows], {columns[known]: v for known, v in found.items()}
+            )
+            location[rows] += (there - ahead[rows]) * a.factors[name][some]
+            ahead[rows] = there
+            for known in (known for known, values in found.items() if values is not given[known]):
+                if known not in truly:
+                    truly[known] = np.empty(plain.shape)
+                truly[known][rows] = found[known]
+                moved[rows] |= bits[known]
+    for a in acting:
+        here = location[a.rows]
+        changed = a.effect.on_output(a.phi, role, here, _of(view, a.rows))
+        if changed is not here:
+            location[a.rows] += (changed - here) * a.factors[name]
+    return location
+
+
+def _of(view: View, rows: NDArray[np.int64]) -> View:
+    return replace(view, base={role: values[rows] for role, values in view.base.items()})
 
 
 def _shifted(radius_error: Array, conditions: dict[str, Array]) -> dict[str, Array]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.gap.case import Campaigns
-from calib.gap.forward import Forward
+from calib.gap.forward import Forward, departed_of_all
 from calib.gap.noise import Noise, most_probable
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
@@ -179,12 +179,9 @@ def _batched(asked: Sequence[tuple[Residuals, Array]], batch: list[int]) -> dict
     # Guesses and differences mostly leave the simulators' parameters as in the row before.
     new = np.append(True, (shared[1:] != shared[:-1]).any(axis=1))
     index = np.cumsum(new) - 1
-    lab, plain = forward.plain(shared[new])
-    found, end = {}, 0
-    for i in batch:
-        problem, psi = asked[i]
-        start, end = end, end + len(psi)
-        own_lab, own = ({o: v[index[start:end]] for o, v in p.items()} for p in (lab, plain))
-        field = problem.forward.departed(psi, problem.data.view, own)
-        found[i] = problem.beside(own_lab, field)
-    return found
+    lab, plain = ({o: v[index] for o, v in p.items()} for p in forward.plain(shared[new]))
+    view = forward.data.view
+    field = departed_of_all([(asked[i][0].forward, asked[i][1]) for i in batch], view, plain)
+    raw = asked[batch[0]][0].beside(lab, field)
+    ends = np.cumsum([len(asked[i][1]) for i in batch])[:-1]
+    return dict(zip(batch, np.split(raw, ends), strict=True))
