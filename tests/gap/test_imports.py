@@ -19,7 +19,8 @@ def _imported(statement: str) -> list[str]:
 
 
 def test_a_diagnosis_needs_no_sampler_no_figures_and_no_data_frames():
-    found = _imported("import calib.gap.case, calib.gap.diagnose")
+    # Whether a simulator has to be emulated is looked at first.
+    found = _imported("import calib.inference.emulation.prepared, calib.gap.diagnose")
     assert "calib.gap.which" in found
     assert [name for name in _HEAVY if name in found] == []
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from calib.data.quantities import QUANTITIES
 from calib.models.base import Array
@@ -99,6 +98,8 @@ def _between(inside: Array, varying: NDArray[np.bool_], more: int) -> tuple[Arra
     Far is measured half by the conditions and half by their ranks: where readings were taken
     close together the output changes fast.
     """
+    from scipy.stats import qmc  # late: half a second, and few commands emulate
+
     d = int(varying.sum())
     corners = np.zeros((2**d if d <= _CORNERS else 0, inside.shape[1]))
     if len(corners):

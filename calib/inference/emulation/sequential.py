@@ -18,7 +18,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from calib.batch.threads import one_thread
 from calib.inference.emulation.judge import WORTH, held_out, judged
@@ -173,6 +172,8 @@ def prior_design(problem: Problem, count: int, seed: int, *, latin: bool = False
 
     By Sobol's sequence, of which every beginning is even, or a Latin hypercube.
     """
+    from scipy.stats import qmc  # late: half a second, and few commands emulate
+
     d = len(problem.priors.free)
     bits = int(np.ceil(np.log2(max(count, 2))))
     rng = generator(seed, "emulate", "design")
