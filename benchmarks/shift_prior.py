@@ -66,7 +66,7 @@ def see(seed: np.random.SeedSequence, tier: Tier) -> Seen | None:
             start = np.array([p.loc for p in forward.priors.free])
             for o in data.outputs:
                 start[forward.theta_slices[o.name]] = lab_mode[o.name]
-            fits.append(fit(data, forward, start, noise))
+            fits.append(fit(forward, start, noise))
     best = max(fits, key=lambda f: f.log_evidence)
     return seen(best, data.outputs)
 

@@ -1,48 +1,57 @@
-"""Climb to modes of a hypothesis's posterior: Gauss-Newton from several guesses in step.
+"""Climb to modes of hypotheses' posteriors: Gauss-Newton from several guesses in step.
 
-The simulator costs as much for one vector of parameters as for a hundred, so that all guesses take
-their steps together, and so do hypotheses: a climb is a generator that asks for residuals.
+The simulator costs as much for one vector of parameters as for a hundred, and of matrices as small
+as these the overhead of an operation is most of its cost. All guesses at all hypotheses take their
+steps together: a climb is a generator that asks for residuals.
 """
 
 from __future__ import annotations
 
 from collections.abc import Generator, Sequence
+from copy import copy
 from dataclasses import dataclass
+from itertools import batched, groupby
+from math import log
 
 import numpy as np
 
 from calib.gap.noise import Noise
-from calib.gap.residuals import Residuals, residuals_of_all
+from calib.gap.residuals import Coordinates, Residuals, diagonal, residuals_of_all
 from calib.models.base import Array
 
-__all__ = ["Ascent", "Slope", "Walk", "climb", "slopes", "together"]
+__all__ = ["Ascent", "Slope", "Stack", "Walk", "climb", "in_step", "slopes", "together"]
 
-# Asks for a problem's residuals at some psi (k, d), is sent them (k, N), until it has a result.
-type Walk[T] = Generator[tuple[Residuals, Array], Array, T]
+# Asks for problems' residuals at some psi (k, d), is sent them (k, N), until it has a result.
+type Walk[T] = Generator[list[tuple[Residuals, Array]], list[Array], T]
 
 # Dampings that are tried at each step, relative to the last that was good.
 _DAMPINGS = 10.0 ** np.arange(-1.0, 5.0)
 # A step that gains less, in nats, and changes the noise less, is quiet; two of them are the end.
 _QUIET_GAIN, _QUIET_NOISE = 1e-3, 1e-2
+# Ascents whose derivatives stay in the processor's cache.
+_AT_ONCE = 16
+# What is taken of coordinates that one hypothesis lacks and others have: nothing depends on them.
+_LACKING = {"loc": 0.0, "precision": 1.0, "width": 1.0, "lower": -np.inf, "upper": np.inf}
 
 
 def together[T](walks: Sequence[Walk[T]]) -> list[T]:
     """Run walks on the same campaigns in step and return their results."""
     results: dict[int, T] = {}
-    asked: dict[int, tuple[Residuals, Array]] = {}
+    asked: dict[int, list[tuple[Residuals, Array]]] = {}
     for i, walk in enumerate(walks):
         _go_on(i, walk, None, asked, results)
     while asked:
-        answers = residuals_of_all(list(asked.values()))
-        asked, before = {}, list(asked)
-        for i, raw in zip(before, answers, strict=True):
+        found = iter(residuals_of_all([each for some in asked.values() for each in some]))
+        answers = {i: [next(found) for _ in some] for i, some in asked.items()}
+        asked = {}
+        for i, raw in answers.items():
             _go_on(i, walks[i], raw, asked, results)
     return [results[i] for i in range(len(walks))]
 
 
 def _go_on[T](
-    i: int, walk: Walk[T], raw: Array | None, asked: dict[int, tuple[Residuals, Array]],
-    results: dict[int, T],
+    i: int, walk: Walk[T], raw: list[Array] | None,
+    asked: dict[int, list[tuple[Residuals, Array]]], results: dict[int, T],
 ) -> None:  # fmt: skip
     """Send one walk what it asked for; keep its next question or its result."""
     try:
@@ -51,28 +60,97 @@ def _go_on[T](
         results[i] = end.value
 
 
-@dataclass
+@dataclass(eq=False)
 class Ascent:
     """One guess on its way to the mode beside it.
 
     Parameters
     ----------
+    problem : Residuals
     psi : ndarray, shape (d,)
     raw : ndarray, shape (N,)
         Residuals at psi.
     noise : dict of str to Noise
+    steps : int
+        That it may still take.
     """
 
+    problem: Residuals
     psi: Array
     raw: Array
     noise: dict[str, Noise]
+    steps: int
     damping: float = 1e-3
     quiet: int = 0
 
 
+def in_step(ascents: Sequence[Ascent]) -> list[list[Ascent]]:
+    """Group ascents of about as many coordinates."""
+    alike = sorted(ascents, key=lambda a: a.psi.size)
+    return [list(some) for some in batched(alike, _AT_ONCE)]
+
+
+class Stack(Coordinates):
+    """Where ascents stand, in arrays as wide as that of the most coordinates, D.
+
+    Attributes
+    ----------
+    psi : ndarray, shape (m, D)
+    raw : ndarray, shape (m, N)
+    dampings : ndarray, shape (m, 1)
+    """
+
+    def __init__(self, ascents: Sequence[Ascent]) -> None:
+        super().__init__(ascents[0].problem.data)
+        self.ascents = ascents
+        for name, value in _LACKING.items():
+            setattr(self, name, _wide([getattr(a.problem, name) for a in ascents], value))
+        self.psi = _wide([a.psi for a in ascents], 0.0)
+        self.raw = np.stack([a.raw for a in ascents])
+        self.dampings = np.array([[a.damping] for a in ascents])
+        self._parts: list[tuple[Residuals, slice]] = []
+        start = 0
+        for problem, some in groupby(a.problem for a in ascents):
+            end = start + len(list(some))
+            self._parts.append((problem, slice(start, end)))
+            start = end
+
+    @property
+    def each(self) -> Coordinates:
+        """The same for several points of each, whose arrays are (m, t, D)."""
+        other = copy(self)
+        for name in _LACKING:
+            setattr(other, name, getattr(self, name)[:, None])
+        return other
+
+    def residuals(self, points: Array, *, own: bool = False) -> Walk[Array]:
+        """Evaluate at several points of each, shapes (m, t, D) to (m, t, N).
+
+        Of points one for each coordinate, `own` leaves out those for coordinates that are lacking;
+        residuals there are those where the ascent stands.
+        """
+        t = points.shape[1]
+        asked = [
+            (p, points[rows, : p.loc.size if own else t, : p.loc.size]) for p, rows in self._parts
+        ]
+        answers = yield [(p, some.reshape(-1, p.loc.size)) for p, some in asked]
+        found = np.repeat(self.raw[:, None], t, axis=1)
+        for (_, rows), (_, some), answer in zip(self._parts, asked, answers, strict=True):
+            found[rows, : some.shape[1]] = answer.reshape(*some.shape[:2], -1)
+        return found
+
+
+def _wide(rows: Sequence[Array], value: float) -> Array:
+    """Rows one below the other, the shorter ones filled up, shape (m, D)."""
+    found = np.full((len(rows), max(row.size for row in rows)), value)
+    for wide, row in zip(found, rows, strict=True):
+        wide[: row.size] = row
+    return found
+
+
 @dataclass(frozen=True)
 class Slope:
-    """Derivatives of several ascents where they stand.
+    """Derivatives of ascents where they stand.
 
     Parameters
     ----------
@@ -92,63 +170,52 @@ class Slope:
     hessian: Array
 
 
-def climb(problem: Residuals, ascents: list[Ascent], steps: int) -> Walk[None]:
-    """Climb from each guess to the mode beside it.
-
-    Parameters
-    ----------
-    problem : Residuals
-    ascents : list of Ascent
-        Moved in place.
-    steps : int
-        At most.
-    """
+def climb(ascents: Sequence[Ascent]) -> Walk[None]:
+    """Climb from guesses to the modes beside them; the ascents are moved in place."""
     going = ascents
-    for _ in range(steps):
-        slope = yield from slopes(problem, going)
-        gains = yield from _step(problem, going, slope)
+    while going := [a for a in going if a.quiet < 2 and a.steps]:
+        stack = Stack(going)
+        slope = yield from slopes(stack)
+        gains = yield from _step(stack, slope)
         raw = np.stack([a.raw for a in going])
-        noises = problem.update_noises(raw, slope.scaled, slope.hessian)
+        noises = stack.update_noises(raw, slope.scaled, slope.hessian)
         for ascent, gained, noise in zip(going, gains, noises, strict=True):
             quiet = gained < _QUIET_GAIN and _change(ascent.noise, noise) < _QUIET_NOISE
             ascent.noise, ascent.quiet = noise, ascent.quiet + 1 if quiet else 0
-        going = [a for a in going if a.quiet < 2]
-        if not going:
-            break
+            ascent.steps -= 1
 
 
-def slopes(problem: Residuals, ascents: list[Ascent]) -> Walk[Slope]:
+def slopes(stack: Stack) -> Walk[Slope]:
     """Work out the derivatives of ascents where they stand."""
-    psi, raw = np.stack([a.psi for a in ascents]), np.stack([a.raw for a in ascents])
-    sds = np.stack([problem.sds(a.noise) for a in ascents])
-    moved = yield problem, problem.around(psi)
-    scaled = problem.jacobian(psi, raw, moved) / sds[:, None]
+    psi, raw = stack.psi, stack.raw
+    sds = np.stack([a.problem.sds(a.noise) for a in stack.ascents])
+    moved = yield from stack.residuals(stack.around(psi).reshape(*psi.shape, -1), own=True)
+    scaled = stack.jacobian(psi, raw, moved) / sds[:, None]
     with np.errstate(invalid="ignore", over="ignore"):
         gradient = (scaled @ (raw / sds)[:, :, None])[..., 0]
-        gradient += (psi - problem.loc) * problem.precision**2
+        gradient += (psi - stack.loc) * stack.precision**2
         hessian = scaled @ scaled.swapaxes(1, 2)
-    hessian += np.diag(problem.precision**2)
+    hessian += diagonal(stack.precision**2)
     return Slope(sds, scaled, gradient, hessian)
 
 
-def _step(problem: Residuals, ascents: list[Ascent], slope: Slope) -> Walk[list[float]]:
+def _step(stack: Stack, slope: Slope) -> Walk[list[float]]:
     """One Levenberg-Marquardt step of each: several dampings tried in one batched call.
 
     Returns what each gained; without a step the next dampings are larger.
     """
-    psi, raw = np.stack([a.psi for a in ascents]), np.stack([a.raw for a in ascents])
-    dampings = np.array([a.damping for a in ascents])[:, None] * _DAMPINGS
-    tried = problem.clip(psi[:, None] + _directions(problem, psi, slope, dampings))
-    m, t, d = tried.shape
-    there = (yield problem, tried.reshape(m * t, d)).reshape(m, t, -1)
-    cost = problem.costs(psi, raw, slope.sds)
-    costs = problem.costs(tried, there, slope.sds[:, None])
+    psi, each = stack.psi, stack.each
+    dampings = stack.dampings * _DAMPINGS
+    tried = each.clip(psi[:, None] + _directions(stack, psi, slope, dampings))
+    there = yield from stack.residuals(tried)
+    cost = stack.costs(psi, stack.raw, slope.sds)
+    costs = each.costs(tried, there, slope.sds[:, None])
     costs = np.where(np.isfinite(costs), costs, np.inf)
     gains = []
     for i, best in enumerate(costs.argmin(axis=1).tolist()):
-        ascent, better = ascents[i], bool(costs[i, best] < cost[i])
+        ascent, better = stack.ascents[i], bool(costs[i, best] < cost[i])
         if better:
-            ascent.psi, ascent.raw = tried[i, best], there[i, best]
+            ascent.psi, ascent.raw = tried[i, best, : ascent.psi.size], there[i, best]
             ascent.damping = max(float(dampings[i, best]), 1e-9)
         else:
             ascent.damping = min(float(dampings[i, -1]) * 10.0, 1e6)
@@ -156,24 +223,23 @@ def _step(problem: Residuals, ascents: list[Ascent], slope: Slope) -> Walk[list[
     return gains
 
 
-def _directions(problem: Residuals, psi: Array, slope: Slope, dampings: Array) -> Array:
-    """Damped steps, shape (m, dampings, d)."""
+def _directions(stack: Coordinates, psi: Array, slope: Slope, dampings: Array) -> Array:
+    """Damped steps, shape (m, dampings, D)."""
     # A coordinate that nothing depends on at this point still needs a finite step.
-    diagonal = np.diagonal(slope.hessian, axis1=1, axis2=2) + 1e-2 / problem.width**2
+    size = np.diagonal(slope.hessian, axis1=1, axis2=2) + 1e-2 / stack.width**2
     # At a bound, a coordinate that would leave is held there.
-    free = ~problem.blocked(psi, -slope.gradient)
+    free = ~stack.blocked(psi, -slope.gradient)
     hessian = slope.hessian * (free[:, :, None] & free[:, None])
-    added = np.where(free[:, None], dampings[..., None] * diagonal[:, None], 1.0)
-    stack = np.repeat(hessian[:, None], dampings.shape[1], axis=1)
-    np.einsum("mtii->mti", stack)[...] += added
+    added = np.where(free[:, None], dampings[..., None] * size[:, None], 1.0)
     gradient = np.where(free, slope.gradient, 0.0)
-    return np.asarray(-np.linalg.solve(stack, gradient[:, None, :, None])[..., 0])
+    damped = hessian[:, None] + diagonal(added)
+    return np.asarray(-np.linalg.solve(damped, gradient[:, None, :, None])[..., 0])
 
 
 def _change(old: dict[str, Noise], new: dict[str, Noise]) -> float:
     """The most that an output's noise has changed."""
     return max(
-        float(abs(np.log(new[o].sigma / old[o].sigma)))
+        abs(log(new[o].sigma / old[o].sigma))
         + abs(new[o].rho - old[o].rho)
         + abs(new[o].kappa - old[o].kappa)
         for o in old

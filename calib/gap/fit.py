@@ -15,14 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
-from calib.gap.ascent import Ascent, Walk, climb, slopes, together
-from calib.gap.case import Campaigns
+from calib.gap.ascent import Ascent, Slope, Stack, climb, in_step, slopes, together
 from calib.gap.forward import Forward
 from calib.gap.noise import Noise, ln_prior
-from calib.gap.residuals import Residuals
+from calib.gap.residuals import Residuals, diagonal, residuals_of_all
 from calib.models.base import Array
 
-__all__ = ["Fit", "finish", "fit", "full_fit", "log_joint", "truncated_fit"]
+__all__ = ["Fit", "Start", "finished", "fit", "full_fits", "log_joint", "truncated_fits"]
 
 _MAX_STEPS = 40
 # Steps of a truncated fit; of one at a discrepancy alone, which predictions are linear in.
@@ -74,67 +73,64 @@ class Fit:
         return np.clip(drawn, lower, upper)
 
 
-def truncated_fit(
-    data: Campaigns,
-    forward: Forward,
-    start: Array,
-    noise: Mapping[str, Noise],
-    *,
-    starts: Array | None = None,
-    count: int = 1,
-    skip: int = 0,
-) -> Walk[list[Fit]]:
-    """Take the first Gauss-Newton steps of a fit, from one guess or several.
+@dataclass(frozen=True)
+class Start:
+    """Where a fit of a hypothesis begins.
 
     Parameters
     ----------
-    data : Campaigns
     forward : Forward
-    start : ndarray, shape (d,)
-        First guess, the simulator's part of it fitted to the lab.
+    guesses : ndarray, shape (k, d)
     noise : mapping of str to Noise
         First guess.
-    starts : ndarray, shape (k, d), optional
-        More guesses, screened in one call.
     count : int
         How many of the best guesses, apart from each other, to begin from.
     skip : int
         How many of those to leave out, as begun from before.
     """
-    problem = Residuals(data, forward)
-    candidates = problem.clip(start)[None]
-    if starts is not None:
-        candidates = np.concatenate([candidates, problem.clip(starts)])
-    raw = yield problem, candidates
-    costs = problem.costs(candidates, raw, problem.sds(noise))
-    begun = problem.best(costs, candidates, count)[skip:]
-    linear = bool(forward.smooth_slices) and not forward.hypothesis.effects
-    steps = _LINEAR_STEPS if linear and forward.shift is None else _FIRST_STEPS
-    ascents = [Ascent(candidates[i], raw[i], dict(noise)) for i in begun]
-    return (yield from _climbed(problem, ascents, steps))
+
+    forward: Forward
+    guesses: Array
+    noise: Mapping[str, Noise]
+    count: int = 1
+    skip: int = 0
 
 
-def fit(
-    data: Campaigns, forward: Forward, start: Array, noise: Mapping[str, Noise],
-    *, starts: Array | None = None, count: int = 1,
-) -> Fit:  # fmt: skip
-    """Fit a hypothesis, the parameters as for `truncated_fit`."""
-    (truncated,) = together(
-        [truncated_fit(data, forward, start, noise, starts=starts, count=count)]
-    )
-    return together([finish(truncated)])[0]
+def truncated_fits(starts: Sequence[Start]) -> list[list[Fit]]:
+    """Take the first Gauss-Newton steps of fits on the same campaigns."""
+    problems = [Residuals(start.forward.data, start.forward) for start in starts]
+    asked = [(p, p.clip(start.guesses)) for p, start in zip(problems, starts, strict=True)]
+    ascents = []
+    for start, (problem, psi), raw in zip(starts, asked, residuals_of_all(asked), strict=True):
+        costs = problem.costs(psi, raw, problem.sds(start.noise))
+        begun = problem.best(costs, psi, start.count)[start.skip :]
+        forward, noise = start.forward, dict(start.noise)
+        linear = forward.smooth_slices and not forward.hypothesis.effects and forward.shift is None
+        steps = _LINEAR_STEPS if linear else _FIRST_STEPS
+        ascents.append([Ascent(problem, psi[i], raw[i], noise, steps) for i in begun])
+    return _climbed(ascents)
 
 
-def finish(begun: Sequence[Fit]) -> Walk[Fit]:
-    """Fit fully from the truncated fits that are worth it, and keep the most probable mode."""
+def fit(forward: Forward, start: Array, noise: Mapping[str, Noise]) -> Fit:
+    """Fit one hypothesis from one guess, shape (d,)."""
+    return finished(truncated_fits([Start(forward, start[None], noise)]))[0]
+
+
+def finished(begun: Sequence[Sequence[Fit]]) -> list[Fit]:
+    """Fit fully from the truncated fits of each hypothesis that are worth it; keep the best."""
+    climbed = full_fits([_worth(group) for group in begun])
+    return [max(group, key=lambda f: f.log_evidence) for group in climbed]
+
+
+def _worth(begun: Sequence[Fit]) -> list[Fit]:
+    """Truncated fits of a hypothesis that may end at its best mode, one for each mode."""
     ranked = sorted(begun, key=lambda f: -f.log_evidence)
     kept: list[Fit] = []
     for found in ranked:
         worth = found.log_evidence >= ranked[0].log_evidence - _WORTH
         if worth and not any(_near(found, other) for other in kept):
             kept.append(found)
-    climbed = yield from full_fit(kept or ranked[:1])
-    return max(climbed, key=lambda f: f.log_evidence)
+    return kept or ranked[:1]
 
 
 def _near(found: Fit, other: Fit) -> bool:
@@ -143,54 +139,60 @@ def _near(found: Fit, other: Fit) -> bool:
     return bool((np.abs(found.psi - other.psi) < _NEAR * sd).all())
 
 
-def full_fit(begun: Sequence[Fit]) -> Walk[list[Fit]]:
-    """Climb from where fits of one hypothesis have stopped to the modes beside them."""
-    forward = begun[0].forward
-    problem = Residuals(forward.data, forward)
-    raw = yield problem, np.stack([f.psi for f in begun])
-    ascents = [Ascent(f.psi, r, dict(f.noise)) for f, r in zip(begun, raw, strict=True)]
-    return (yield from _climbed(problem, ascents, _MAX_STEPS))
-
-
-def _climbed(problem: Residuals, ascents: list[Ascent], steps: int) -> Walk[list[Fit]]:
-    """Climb from guesses to the modes beside them."""
-    if not ascents:
-        return []
-    yield from climb(problem, ascents, steps)
-    slope = yield from slopes(problem, ascents)
-    return [
-        _laplace(problem, ascent, sds, gradient, hessian)
-        for ascent, sds, gradient, hessian in zip(
-            ascents, slope.sds, slope.gradient, slope.hessian, strict=True
-        )
+def full_fits(begun: Sequence[Sequence[Fit]]) -> list[list[Fit]]:
+    """Climb from where fits of each hypothesis have stopped to the modes beside them."""
+    problems = [Residuals(group[0].forward.data, group[0].forward) for group in begun]
+    asked = [
+        (p, np.stack([f.psi for f in group])) for p, group in zip(problems, begun, strict=True)
     ]
+    return _climbed([
+        [Ascent(p, f.psi, r, dict(f.noise), _MAX_STEPS) for f, r in zip(group, raw, strict=True)]
+        for p, group, raw in zip(problems, begun, residuals_of_all(asked), strict=True)
+    ])  # fmt: skip
 
 
-def _laplace(
-    problem: Residuals, ascent: Ascent, sds: Array, gradient: Array, hessian: Array
-) -> Fit:
-    """The normal about a mode, and the evidence that it gives."""
-    psi, d, n = ascent.psi, ascent.psi.size, sds.size
-    residual = ascent.raw / sds
-    log_likelihood = (
-        -0.5 * float(residual @ residual) - float(np.log(sds).sum()) - 0.5 * n * np.log(2 * np.pi)
-    )
-    log_prior = float(problem.forward.priors.log_prob(psi[None])[0])
+def _climbed(ascents: Sequence[Sequence[Ascent]]) -> list[list[Fit]]:
+    """Climb from guesses at several hypotheses to the modes beside them."""
+    groups = in_step([a for group in ascents for a in group])
+    together([climb(group) for group in groups])
+    stacks = [Stack(group) for group in groups]
+    found: dict[Ascent, Fit] = {}
+    for stack, slope in zip(stacks, together([slopes(s) for s in stacks]), strict=True):
+        found |= zip(stack.ascents, _laplace(stack, slope), strict=True)
+    return [[found[a] for a in group] for group in ascents]
+
+
+def _laplace(stack: Stack, slope: Slope) -> list[Fit]:
+    """The normals about modes, and the evidence that they give."""
     # A flat direction is as wide as its prior.
-    flat = np.where(problem.precision > 0, 0.0, 1.0 / problem.width**2) * 1e-6
-    hessian = hessian + np.diag(flat)
+    flat = np.where(stack.precision > 0, 0.0, 1.0 / stack.width**2) * 1e-6
+    hessian = slope.hessian + diagonal(flat)
     sign, log_det = np.linalg.slogdet(hessian)
-    covariance = np.linalg.inv(hessian)
-    evidence = log_likelihood + log_prior + 0.5 * d * np.log(2 * np.pi) - 0.5 * log_det
-    evidence += _bounds_correction(problem, psi, gradient, covariance)
-    evidence += sum(ln_prior(n) for n in ascent.noise.values())
-    covariance = _within(problem, covariance)
-    n_lab = {o.name: o.problem.response.size for o in problem.data.outputs}
-    return Fit(
-        problem.forward, psi, covariance, ascent.noise,
-        float(evidence) if np.isfinite(evidence) and sign > 0 else -np.inf, log_likelihood,
-        {o: residual[part][n_lab[o]:] for o, part in problem.parts.items()},
-    )  # fmt: skip
+    inverse = np.linalg.inv(hessian)
+    residual = stack.raw / slope.sds
+    log_likelihood = -0.5 * (
+        np.square(residual).sum(axis=1)
+        + 2.0 * np.log(slope.sds).sum(axis=1)
+        + residual.shape[1] * np.log(2.0 * np.pi)
+    )
+    n_lab = {o.name: o.problem.response.size for o in stack.data.outputs}
+    fits = []
+    for i, ascent in enumerate(stack.ascents):
+        problem, psi, d = ascent.problem, ascent.psi, ascent.psi.size
+        covariance = inverse[i, :d, :d]
+        evidence = float(log_likelihood[i] + problem.forward.priors.log_prob(psi[None])[0])
+        evidence += 0.5 * d * np.log(2.0 * np.pi) - 0.5 * float(log_det[i])
+        evidence += _bounds_correction(problem, psi, slope.gradient[i, :d], covariance)
+        evidence += sum(ln_prior(n) for n in ascent.noise.values())
+        field = {o: residual[i, part][n_lab[o] :] for o, part in stack.parts.items()}
+        fits.append(
+            Fit(
+                problem.forward, psi, _within(problem, covariance), ascent.noise,
+                evidence if np.isfinite(evidence) and sign[i] > 0 else -np.inf,
+                float(log_likelihood[i]), field,
+            )
+        )  # fmt: skip
+    return fits
 
 
 def _within(problem: Residuals, covariance: Array) -> Array:

@@ -7,11 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.gap.ascent import Walk, together
 from calib.gap.case import Campaigns
 from calib.gap.discrepancy import Bases
 from calib.gap.effects import Effect
-from calib.gap.fit import Fit, finish, truncated_fit
+from calib.gap.fit import Fit, Start, finished, truncated_fits
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import joined
 from calib.gap.hypothesis import Hypothesis
@@ -74,41 +73,38 @@ class Guesses:
 
     def fit(self, hypotheses: Sequence[Hypothesis]) -> dict[str, tuple[Fit, ...]]:
         """Fit from the lab's calibration, by name."""
-        truncated = together([self.truncated(h) for h in hypotheses])
+        truncated = truncated_fits([self.begun(h) for h in hypotheses])
         fits: dict[str, tuple[Fit, ...]] = {}
-        for found in together([finish(group) for group in truncated]):
+        for found in finished(truncated):
             name = found.forward.hypothesis.name
             fits[name] = (*fits.get(name, ()), found)
         return fits
 
-    def truncated(self, hypothesis: Hypothesis) -> Walk[list[Fit]]:
+    def begun(self, hypothesis: Hypothesis) -> Start:
         """Begin at the lab's calibration, effects at several guesses of their prior."""
         forward, start = self._forward(hypothesis)
         if hypothesis.onset_over is not None:
-            return truncated_fit(self.data, forward, self._onset_start(forward, start), self.noise)
+            start = self._onset_start(forward, start)
         if not hypothesis.effects:
-            return truncated_fit(self.data, forward, start, self.noise)
+            return Start(forward, start[None], self.noise)
         starts = self._spread(forward, start, _N_SCREEN, range(len(hypothesis.effects)))
-        return truncated_fit(self.data, forward, start, self.noise, starts=starts, count=_N_BEGUN)
+        return Start(forward, np.concatenate([start[None], starts]), self.noise, _N_BEGUN)
 
-    def truncated_joint(
+    def begun_jointly(
         self, hypothesis: Hypothesis, members: Sequence[Fit], count: int, skip: int = 0
-    ) -> Walk[list[Fit]]:
+    ) -> Start:
         """Begin where parts of a hypothesis have led, the effects they lack by their prior."""
         if not members:
-            return self.truncated(hypothesis)
+            return self.begun(hypothesis)
         forward, start = self._forward(hypothesis)
-        parts = []
+        parts = [start[None]]
         for member in members:
             led = _led(forward, start, member)
             known = {e.name for e in member.forward.hypothesis.effects}
             lacking = [i for i, e in enumerate(hypothesis.effects) if e.name not in known]
             size = _N_SCREEN // len(members) if lacking else 1
             parts.append(self._spread(forward, led, size, lacking))
-        starts = np.concatenate(parts)
-        return truncated_fit(
-            self.data, forward, start, self.noise, starts=starts, count=count, skip=skip
-        )
+        return Start(forward, np.concatenate(parts), self.noise, count, skip)
 
     def beside(self, kept: Hypothesis, found: Fit, added: Sequence[Hypothesis]) -> list[Promise]:
         """Guess at sets of what is kept of one that was fitted and one effect more.
@@ -156,13 +152,10 @@ class Guesses:
             )
         return promises
 
-    def truncated_promise(self, promise: Promise) -> Walk[list[Fit]]:
+    def begun_as_promised(self, promise: Promise) -> Start:
         """Begin where a promise says."""
         forward, _ = self._forward(promise.hypothesis)
-        first, count = promise.starts[0], len(promise.starts)
-        return truncated_fit(
-            self.data, forward, first, promise.noise, starts=promise.starts[1:], count=count
-        )
+        return Start(forward, promise.starts, promise.noise, len(promise.starts))
 
     def _forward(self, hypothesis: Hypothesis) -> tuple[Forward, Array]:
         scale = {o: n.sigma for o, n in self.noise.items()}

@@ -13,7 +13,7 @@ from calib.gap.noise import Noise, most_probable
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 
-__all__ = ["Residuals", "residuals_of_all"]
+__all__ = ["Coordinates", "Residuals", "diagonal", "residuals_of_all"]
 
 # Guesses closer than this (in prior sds) climb to the same mode.
 _APART = 0.7
@@ -23,20 +23,24 @@ _DIFFERENCE = 1e-4
 _AT_ONCE = 1024
 
 
-class Residuals:
-    """Observed minus predicted of lab then field rows, one output after the other.
+class Coordinates:
+    """The parameters of a hypothesis, or of several: what their priors say, shape (d,) or (m, d).
 
-    Parameters
+    Attributes
     ----------
-    data : Campaigns
-    forward : Forward
+    loc, precision : ndarray
+        Means and inverse sds of normal priors; zeros of uniform ones.
+    width, lower, upper : ndarray
     """
 
-    def __init__(self, data: Campaigns, forward: Forward) -> None:
-        self.data, self.forward = data, forward
-        loc, _, self.lower, self.upper, self.precision = forward.priors._arrays
-        self.loc = np.where(self.precision > 0, loc, 0.0)
-        self.width = prior_widths(forward.priors)
+    loc: Array
+    precision: Array
+    width: Array
+    lower: Array
+    upper: Array
+
+    def __init__(self, data: Campaigns) -> None:
+        self.data = data
         sizes = [at.slip.size for at in data.at_rows.values()]
         ends = np.cumsum(sizes).tolist()
         self.parts = {
@@ -56,23 +60,6 @@ class Residuals:
             (psi >= self.upper - tiny) & (direction > 0)
         )
 
-    def raw(self, psi: Array) -> Array:
-        """Evaluate, shape (k, d) to (k, N)."""
-        return self.beside(*self.forward.campaigns(psi))
-
-    def beside(self, lab: Mapping[str, Array], field: Mapping[str, Array]) -> Array:
-        """Observed minus what is predicted for both campaigns."""
-        predicted: list[Array] = []
-        for o in self.data.outputs:
-            there = field[o.name]
-            predicted += lab[o.name], there if o.rows.size == there.shape[1] else there[:, o.rows]
-        raw: Array = np.concatenate(predicted, axis=1)
-        return np.subtract(self.data.observed, raw, out=raw)
-
-    def sds(self, noise: Mapping[str, Noise]) -> Array:
-        """Noise sd of every row, shape (N,)."""
-        return np.concatenate([noise[o].sd(at) for o, at in self.data.at_rows.items()])
-
     def costs(self, psi: Array, raw: Array, sds: Array) -> Array:
         """Minus log posterior but for constants.
 
@@ -89,17 +76,6 @@ class Residuals:
             squares = np.square(raw / sds).sum(axis=-1)
             squares += np.square((psi - self.loc) * self.precision).sum(axis=-1)
             return np.asarray(0.5 * squares + np.log(sds).sum(axis=-1))
-
-    def best(self, costs: Array, candidates: Array, count: int) -> list[int]:
-        """Return which candidates are best and lie apart from each other, at most `count`."""
-        picked: list[int] = []
-        for i in np.argsort(np.where(np.isfinite(costs), costs, np.inf), kind="stable").tolist():
-            apart = np.abs((candidates[picked] - candidates[i]) / self.width).max(axis=1) > _APART
-            if apart.all():
-                picked.append(i)
-            if len(picked) == count:
-                break
-        return picked
 
     def around(self, psi: Array) -> Array:
         """Points beside psi that tell the derivatives there, shape (m, d) to (m d, d)."""
@@ -141,13 +117,63 @@ class Residuals:
             Derivatives of the residuals over their sds.
         hessian : ndarray, shape (m, d, d)
         """
-        inverse = np.linalg.inv(hessian + np.diag(1e-6 / self.width**2))
+        inverse = np.linalg.inv(hessian + diagonal(1e-6 / self.width**2))
         leverage = (scaled * (inverse @ scaled)).sum(axis=1)
         # Each residual lost the part of its variance that the parameters took up.
         corrected = np.square(raw) / np.minimum(np.maximum(1.0 - leverage, 0.1), 1.0)
         at = self.data.at_rows
         found = [most_probable(corrected[:, part], at[o]) for o, part in self.parts.items()]
         return [dict(zip(self.parts, each, strict=True)) for each in zip(*found, strict=True)]
+
+
+def diagonal(values: Array) -> Array:
+    """Return diagonal matrices, shape (..., d) to (..., d, d)."""
+    return values[..., None] * np.eye(values.shape[-1])
+
+
+class Residuals(Coordinates):
+    """Observed minus predicted of lab then field rows, one output after the other.
+
+    Parameters
+    ----------
+    data : Campaigns
+    forward : Forward
+    """
+
+    def __init__(self, data: Campaigns, forward: Forward) -> None:
+        super().__init__(data)
+        self.forward = forward
+        loc, _, self.lower, self.upper, self.precision = forward.priors._arrays
+        self.loc = np.where(self.precision > 0, loc, 0.0)
+        self.width = prior_widths(forward.priors)
+
+    def raw(self, psi: Array) -> Array:
+        """Evaluate, shape (k, d) to (k, N)."""
+        return self.beside(*self.forward.campaigns(psi))
+
+    def beside(self, lab: Mapping[str, Array], field: Mapping[str, Array]) -> Array:
+        """Observed minus what is predicted for both campaigns."""
+        predicted: list[Array] = []
+        for o in self.data.outputs:
+            there = field[o.name]
+            predicted += lab[o.name], there if o.rows.size == there.shape[1] else there[:, o.rows]
+        raw: Array = np.concatenate(predicted, axis=1)
+        return np.subtract(self.data.observed, raw, out=raw)
+
+    def sds(self, noise: Mapping[str, Noise]) -> Array:
+        """Noise sd of every row, shape (N,)."""
+        return np.concatenate([noise[o].sd(at) for o, at in self.data.at_rows.items()])
+
+    def best(self, costs: Array, candidates: Array, count: int) -> list[int]:
+        """Return which candidates are best and lie apart from each other, at most `count`."""
+        picked: list[int] = []
+        for i in np.argsort(np.where(np.isfinite(costs), costs, np.inf), kind="stable").tolist():
+            apart = np.abs((candidates[picked] - candidates[i]) / self.width).max(axis=1) > _APART
+            if apart.all():
+                picked.append(i)
+            if len(picked) == count:
+                break
+        return picked
 
 
 def residuals_of_all(asked: Sequence[tuple[Residuals, Array]]) -> list[Array]:

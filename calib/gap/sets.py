@@ -14,8 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 
-from calib.gap.ascent import together
-from calib.gap.fit import Fit, finish
+from calib.gap.fit import Fit, finished, truncated_fits
 from calib.gap.guesses import Guesses, Promise
 from calib.gap.hypotheses import joined, resized, unknowns, with_remainder
 from calib.gap.hypothesis import Hypothesis
@@ -68,15 +67,13 @@ def sets_and_unlisted(
     others: list[_Started] = [(h, []) for h in unknowns(guesses.data)]
     others += _with_remainders(guesses, alone[:_N_LEADING])
     pairs = _pairs(single, best)
-    truncated_fits = together(
-        [guesses.truncated_joint(h, members, 1) for h, members in others + pairs]
+    truncated = truncated_fits(
+        [guesses.begun_jointly(h, members, 1) for h, members in others + pairs]
     )
-    leading = max(
-        _promise(truncated, n) for truncated in (*((f,) for f in best.values()), *truncated_fits)
-    )
+    leading = max(_promise(group, n) for group in (*((f,) for f in best.values()), *truncated))
     n_others = len(others)
-    truncated_fits[n_others:] = _begun_again(guesses, pairs, truncated_fits[n_others:], leading)
-    ended = _finished(truncated_fits, leading - _HOPELESS, n)
+    truncated[n_others:] = _begun_again(guesses, pairs, truncated[n_others:], leading)
+    ended = _finished(truncated, leading - _HOPELESS, n)
     unlisted, sets = (sized(part, leading) for part in (ended[:n_others], ended[n_others:]))
     # What is unlisted takes up what any listed causes leave: these are compared without it.
     listed = max(with_prior(f, n) for f in (*best.values(), *sets))
@@ -85,8 +82,8 @@ def sets_and_unlisted(
     leading = max(leading, *(with_prior(f, n) for f in (*unlisted, *sets)))
     top = _leading(sets, leading - _SEARCHED, n)[:_N_LEADING_SETS]
     beside = _with_remainders(guesses, top)
-    truncated_fits = together([guesses.truncated_joint(h, of, 1) for h, of in beside])
-    ended = sized(_finished(truncated_fits, leading - _HOPELESS, n), leading)
+    truncated = truncated_fits([guesses.begun_jointly(h, of, 1) for h, of in beside])
+    ended = sized(_finished(truncated, leading - _HOPELESS, n), leading)
     everything = _best_of_each([*unlisted, *sets, *ended])
     by_name: dict[str, tuple[Fit, ...]] = {}
     for found in everything:
@@ -117,8 +114,8 @@ def _as_sized(
             if other not in there:
                 there.add(other)
                 asked.append((other, [found]))
-    truncated_fits = together([guesses.truncated_joint(h, of, 1) for h, of in asked])
-    return [*fits, *_finished(truncated_fits, leading - _SEARCHED, guesses.odds)]
+    truncated = truncated_fits([guesses.begun_jointly(h, of, 1) for h, of in asked])
+    return [*fits, *_finished(truncated, leading - _SEARCHED, guesses.odds)]
 
 
 def _best_of_each(fits: Sequence[Fit]) -> list[Fit]:
@@ -148,19 +145,17 @@ def _pairs(single: Sequence[str], best: Mapping[str, Fit]) -> list[_Started]:
 def _begun_again(
     guesses: Guesses,
     pairs: Sequence[_Started],
-    truncated_fits: Sequence[list[Fit]],
+    truncated: Sequence[list[Fit]],
     leading: float,
 ) -> list[list[Fit]]:
     """Begin the pairs that are in play from more guesses."""
     in_play = [
-        i
-        for i in range(len(pairs))
-        if _promise(truncated_fits[i], guesses.odds) > leading - _SEARCHED
+        i for i in range(len(pairs)) if _promise(truncated[i], guesses.odds) > leading - _SEARCHED
     ]
-    more = together([guesses.truncated_joint(*pairs[i], _N_BEGUN, skip=1) for i in in_play])
-    searched = [list(truncated) for truncated in truncated_fits]
-    for i, truncated in zip(in_play, more, strict=True):
-        searched[i] += truncated
+    more = truncated_fits([guesses.begun_jointly(*pairs[i], _N_BEGUN, skip=1) for i in in_play])
+    searched = [list(group) for group in truncated]
+    for i, group in zip(in_play, more, strict=True):
+        searched[i] += group
     return searched
 
 
@@ -235,8 +230,8 @@ def _fitted(
             best.setdefault(p.hypothesis.name, p)
     chosen = list(best.values())[:_N_FITTED]
     searched |= {p.hypothesis.name for p in chosen}
-    truncated_fits = together([guesses.truncated_promise(p) for p in chosen])
-    return _finished(truncated_fits, listed - _SEARCHED, guesses.odds)
+    truncated = truncated_fits([guesses.begun_as_promised(p) for p in chosen])
+    return _finished(truncated, listed - _SEARCHED, guesses.odds)
 
 
 def _apart(a: Hypothesis, b: Hypothesis) -> bool:
@@ -246,13 +241,11 @@ def _apart(a: Hypothesis, b: Hypothesis) -> bool:
     )
 
 
-def _finished(truncated_fits: Sequence[Sequence[Fit]], hopeless: float, odds: Odds) -> list[Fit]:
+def _finished(truncated: Sequence[Sequence[Fit]], hopeless: float, odds: Odds) -> list[Fit]:
     """Fit hypotheses fully from their truncated fits, but for those that are hopeless."""
-    worth = [
-        i for i, truncated in enumerate(truncated_fits) if _promise(truncated, odds) > hopeless
-    ]
-    ended = [max(truncated, key=lambda f: f.log_evidence) for truncated in truncated_fits]
-    for i, found in zip(worth, together([finish(truncated_fits[i]) for i in worth]), strict=True):
+    worth = [i for i, group in enumerate(truncated) if _promise(group, odds) > hopeless]
+    ended = [max(group, key=lambda f: f.log_evidence) for group in truncated]
+    for i, found in zip(worth, finished([truncated[i] for i in worth]), strict=True):
         ended[i] = found
     return ended
 

@@ -8,9 +8,19 @@ import numpy as np
 import pytest
 
 import calib.gap.ascent as module
-from calib.gap.ascent import Ascent, _change, _directions, _step, climb, slopes, together
+from calib.gap.ascent import (
+    Ascent,
+    Stack,
+    _change,
+    _directions,
+    _step,
+    climb,
+    in_step,
+    slopes,
+    together,
+)
 from calib.gap.case import Campaigns, campaigns
-from calib.gap.fit import Fit, finish, log_joint, truncated_fit
+from calib.gap.fit import Fit, Start, finished, log_joint, truncated_fits
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import pair, shifts, singles, split_testable, unknowns
 from calib.gap.hypothesis import Hypothesis
@@ -58,6 +68,18 @@ def test_all_at_once_have_the_residuals_of_each_alone(problems):
         np.testing.assert_allclose(raw, alone, rtol=1e-9, atol=1e-12)
 
 
+def test_each_effect_is_asked_once_for_all_hypotheses_that_have_it(data):
+    """Whatever conditions those before it have changed in some of them and in others not."""
+    one = singles(data, split_testable(data)[0])
+    both = [pair(a, b) for i, a in enumerate(one) for b in one[i + 1 :]]
+    asked = []
+    for h in (*one, *both):
+        problem = Residuals(data, Forward(data, h, SIGMA))
+        asked.append((problem, drawn(problem, 2)))
+    for (problem, psi), raw in zip(asked, residuals_of_all(asked), strict=True):
+        np.testing.assert_allclose(raw, problem.raw(psi), rtol=1e-9, atol=1e-12)
+
+
 def test_derivatives_are_those_of_central_differences(problems):
     for problem in problems:
         psi = drawn(problem, 3)
@@ -74,18 +96,13 @@ def test_derivatives_are_those_of_central_differences(problems):
             np.testing.assert_allclose(found[:, i], exact, atol=5e-3 * scale)
 
 
-def test_hypotheses_in_step_end_where_each_alone_does(data, problems):
+def test_hypotheses_in_step_end_where_each_alone_does(problems):
     noise = {o: Noise(s) for o, s in SIGMA.items()}
 
     def fitted(chosen: list[Residuals]) -> list[Fit]:
         starts = [drawn(p, 8) for p in chosen]
-        truncated = together(
-            [
-                truncated_fit(data, p.forward, s[0], noise, starts=s[1:], count=3)
-                for p, s in zip(chosen, starts, strict=True)
-            ]
-        )
-        return together([finish(group) for group in truncated])
+        begun = [Start(p.forward, s, noise, 3) for p, s in zip(chosen, starts, strict=True)]
+        return finished(truncated_fits(begun))
 
     for problem, found in zip(problems, fitted(problems), strict=True):
         (alone,) = fitted([problem])
@@ -94,10 +111,10 @@ def test_hypotheses_in_step_end_where_each_alone_does(data, problems):
         assert found.log_evidence == pytest.approx(alone.log_evidence, abs=0.01)
 
 
-def test_the_log_density_is_the_same_in_parts(data, problems):
+def test_the_log_density_is_the_same_in_parts(problems):
     noise = {o: Noise(s) for o, s in SIGMA.items()}
     problem = problems[0]
-    (truncated,) = together([truncated_fit(data, problem.forward, drawn(problem, 1)[0], noise)])
+    (truncated,) = truncated_fits([Start(problem.forward, drawn(problem, 1), noise)])
     psi = drawn(problem, 2500)
     whole = log_joint(truncated[0], psi)
     some = np.array([0, 1023, 1024, 2047, 2048, 2499])
@@ -142,14 +159,14 @@ NOISES = {o: Noise(s, 1.0, 0.0) for o, s in SIGMA.items()}
 
 def ascents_of(problem: Residuals, size: int) -> list[Ascent]:
     psi = drawn(problem, size)
-    return [Ascent(p, r, NOISES) for p, r in zip(psi, problem.raw(psi), strict=True)]
+    return [Ascent(problem, p, r, NOISES, 5) for p, r in zip(psi, problem.raw(psi), strict=True)]
 
 
 def test_slopes_are_those_of_the_cost(problems):
     """The gradient by differences of the cost; the Hessian of the residuals' derivatives."""
     for problem in problems:
         ascents = ascents_of(problem, 2)
-        (slope,) = together([slopes(problem, ascents)])
+        (slope,) = together([slopes(Stack(ascents))])
         sds = problem.sds(NOISES)
         np.testing.assert_array_equal(slope.sds, [sds, sds])
         for i, ascent in enumerate(ascents):
@@ -175,7 +192,7 @@ def test_damped_steps_solve_marquardts_equations_and_leave_a_blocked_coordinate(
     (ascent,) = ascents_of(problem, 1)
     bounded = int(np.flatnonzero(np.isfinite(problem.lower))[0])
     dampings = np.array([[1e-3, 0.1, 10.0]])
-    (slope,) = together([slopes(problem, [ascent])])
+    (slope,) = together([slopes(Stack([ascent]))])
     for sign in (1.0, -1.0):
         slope.gradient[0, bounded] = sign * abs(slope.gradient[0, bounded])
         psi = ascent.psi.copy()
@@ -199,8 +216,8 @@ def test_of_several_dampings_the_step_that_gains_most_is_taken(problems):
     for ascent, damping in zip(ascents, (1e-3, 1.0, 1e-9), strict=True):
         ascent.damping = damping
     dampings = np.array([[a.damping] for a in ascents]) * [[0.1, 1.0, 10.0, 100.0, 1e3, 1e4]]
-    (slope,) = together([slopes(problem, ascents)])
-    (gains,) = together([_step(problem, ascents, slope)])
+    (slope,) = together([slopes(Stack(ascents))])
+    (gains,) = together([_step(Stack(ascents), slope)])
     sds = problem.sds(NOISES)
     for i, (psi, raw) in enumerate(before):
         steps = _directions(problem, *(psi[None],), _only(slope, i), dampings[i : i + 1])[0]
@@ -214,6 +231,30 @@ def test_of_several_dampings_the_step_that_gains_most_is_taken(problems):
         assert ascents[i].damping == pytest.approx(max(dampings[i, best], 1e-9), rel=1e-6)
 
 
+def test_ascents_of_other_hypotheses_change_no_slope_and_no_step(problems):
+    """In arrays as wide as that of the most coordinates; those of one hypothesis side by side."""
+    ascents = [a for problem in problems for a in ascents_of(problem, 2)]
+    mixed = [*ascents[::2], *ascents[1::2]]
+    (group,) = in_step(mixed)
+    sizes = [a.psi.size for a in group]
+    assert sizes == sorted(sizes)
+    assert set(group) == set(ascents)
+    stack = Stack(group)
+    (slope,) = together([slopes(stack)])
+    before = [copy(a) for a in group]
+    (gains,) = together([_step(stack, slope)])
+    for i, ascent in enumerate(before):
+        d = ascent.psi.size
+        alone = Stack([ascent])
+        (own,) = together([slopes(alone)])
+        np.testing.assert_allclose(slope.gradient[i, :d], own.gradient[0], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(slope.hessian[i, :d, :d], own.hessian[0], rtol=1e-9, atol=1e-9)
+        np.testing.assert_array_equal(slope.gradient[i, d:], 0.0)
+        (gain,) = together([_step(alone, own)])
+        assert gains[i] == pytest.approx(gain[0], rel=1e-6)
+        np.testing.assert_allclose(group[i].psi, ascent.psi, rtol=1e-6, atol=1e-9)
+
+
 def _only(slope, i: int):
     return type(slope)(*(getattr(slope, n)[i : i + 1] for n in vars(slope)))
 
@@ -222,11 +263,11 @@ def test_where_no_step_gains_the_next_are_shorter(problems):
     """At a mode, uphill: the ascent stays, and begins with ten times the largest damping."""
     problem = problems[0]
     (ascent,) = ascents_of(problem, 1)
-    (slope,) = together([slopes(problem, [ascent])])
+    (slope,) = together([slopes(Stack([ascent]))])
     slope.gradient[:] *= -1.0
     was = ascent.psi.copy()
     for expected in (1e-3 * 1e5, 1e6, 1e6):
-        (gains,) = together([_step(problem, [ascent], slope)])
+        (gains,) = together([_step(Stack([ascent]), slope)])
         assert gains == [0.0]
         np.testing.assert_array_equal(ascent.psi, was)
         assert ascent.damping == pytest.approx(expected)
@@ -250,19 +291,18 @@ def test_a_climb_ends_after_two_quiet_steps_one_after_the_other(problems, monkey
     def steps_of(gains, noises) -> int:
         taken = []
 
-        def step(problem, ascents, slope):
-            taken.append(len(ascents))
+        def step(stack, slope):
+            taken.append(len(stack.ascents))
             return [gains[len(taken) - 1]]
             yield
 
-        def noise(raw, scaled, hessian):
+        def noise(self, raw, scaled, hessian):
             return [noises[len(taken) - 1]]
 
         monkeypatch.setattr(module, "_step", step)
-        again = copy(problem)
-        again.update_noises = noise
+        monkeypatch.setattr(Stack, "update_noises", noise)
         ascent = copy(start)
-        together([climb(again, [ascent], 5)])
+        together([climb([ascent])])
         assert ascent.noise == noises[len(taken) - 1]
         return len(taken)
 

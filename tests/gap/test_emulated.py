@@ -84,6 +84,6 @@ def test_a_good_emulator_adds_next_to_nothing(tmp_path: Path) -> None:
     forward = Forward(data, Hypothesis("none"), {"drawbar_pull": NOISE})
     start = np.array([p.loc for p in forward.priors.free])
     start[forward.misfit_slices["drawbar_pull"]] = 0.0
-    found = fit(data, forward, start, {"drawbar_pull": Noise(NOISE)})
+    found = fit(forward, start, {"drawbar_pull": Noise(NOISE)})
     assert np.isfinite(found.log_evidence)
     assert np.isfinite(log_joint(found, found.psi[None])).all()

@@ -11,9 +11,8 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
 import calib.gap.fit as module
-from calib.gap.ascent import together
 from calib.gap.case import Campaigns, OutputData, campaigns
-from calib.gap.fit import Fit, _bounds_correction, _near, _within, finish, fit, log_joint
+from calib.gap.fit import Fit, _bounds_correction, _near, _within, finished, fit, log_joint
 from calib.gap.forward import Forward
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, ln_prior, noise_conditions_of_lab
@@ -47,7 +46,7 @@ def straight_line(seed: int, *idle: Prior, lower: float = -np.inf) -> Campaigns:
 def test_at_its_noise_the_evidence_is_that_of_the_closed_form(seed: int):
     data = straight_line(seed)
     forward = Forward(data, Hypothesis("none"), {"drawbar_pull": 0.04})
-    found = fit(data, forward, np.array([0.0, 0.5]), {"drawbar_pull": Noise(0.04)})
+    found = fit(forward, np.array([0.0, 0.5]), {"drawbar_pull": Noise(0.04)})
     noise, at = found.noise["drawbar_pull"], data.at_rows["drawbar_pull"]
     design = np.stack([np.ones(17), at.slip], axis=1)
     # Both parameters integrated out, the readings are normal.
@@ -63,7 +62,7 @@ def test_at_its_noise_the_evidence_is_that_of_the_closed_form(seed: int):
 def test_what_nothing_depends_on_changes_no_evidence(start: float):
     def evidence(data: Campaigns, begun: list[float]) -> tuple[float, float]:
         forward = Forward(data, Hypothesis("none"), {"drawbar_pull": 0.04})
-        found = fit(data, forward, np.array(begun), {"drawbar_pull": Noise(0.04)})
+        found = fit(forward, np.array(begun), {"drawbar_pull": Noise(0.04)})
         refined = refine(found, 1)
         assert refined.sample is not None
         return found.log_evidence, refined.log_evidence
@@ -81,9 +80,7 @@ def test_of_a_bounded_parameter_the_evidence_is_the_mass_inside(lower: float):
     """The mode is inside the bound, beside it, or held at it by readings that ask for less."""
     data = straight_line(1, lower=lower)
     forward = Forward(data, Hypothesis("none"), {"drawbar_pull": 0.04})
-    found = fit(
-        data, forward, np.array([max(0.0, lower + 0.1), 0.5]), {"drawbar_pull": Noise(0.04)}
-    )
+    found = fit(forward, np.array([max(0.0, lower + 0.1), 0.5]), {"drawbar_pull": Noise(0.04)})
     noise, at = found.noise["drawbar_pull"], data.at_rows["drawbar_pull"]
     design = np.stack([np.ones(17), at.slip], axis=1)
     prior, sd = np.diag([1.0, 4.0]), noise.sd(at)
@@ -111,14 +108,13 @@ def test_of_two_modes_the_more_probable_is_kept():
     begun = [at(0.0, -3.0), at(9.0, -1.0), at(9.5, -2.0), at(20.0, -30.0)]
     climbed: list[list[float]] = []
 
-    def climb(fits):
-        climbed.append([float(f.psi[0]) for f in fits])
-        return [replace(f, log_evidence=-float(f.psi[0])) for f in fits]
-        yield
+    def climb(begun):
+        climbed.extend([float(f.psi[0]) for f in fits] for fits in begun)
+        return [[replace(f, log_evidence=-float(f.psi[0])) for f in fits] for fits in begun]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "full_fit", climb)
-        (found,) = together([finish(begun)])
+        patch.setattr(module, "full_fits", climb)
+        (found,) = finished([begun])
     # Of two on the way to one mode the better is climbed; one far less probable is not.
     assert climbed == [[9.0, 0.0]]
     assert found.psi[0] == 0.0
@@ -141,22 +137,21 @@ def test_two_fits_are_near_within_one_and_a_half_sds_of_the_better_in_every_coor
 def test_fits_are_climbed_from_within_six_nats_of_the_best(monkeypatch):
     climbed: list[float] = []
 
-    def climb(fits):
-        climbed.extend(f.log_evidence for f in fits)
-        return fits
-        yield
+    def climb(begun):
+        climbed.extend(f.log_evidence for fits in begun for f in fits)
+        return begun
 
-    monkeypatch.setattr(module, "full_fit", climb)
+    monkeypatch.setattr(module, "full_fits", climb)
     begun = [at(9.0 * i, e) for i, e in enumerate((-8.0, -2.0, -8.01, -3.0))]
-    (found,) = together([finish(begun)])
+    (found,) = finished([begun])
     assert climbed == [-2.0, -3.0, -8.0]
     assert found.log_evidence == -2.0
     # Where none has an evidence one is climbed all the same.
     climbed.clear()
-    together([finish([at(0.0, -np.inf), at(9.0, -np.inf)])])
+    finished([[at(0.0, -np.inf), at(9.0, -np.inf)]])
     assert len(climbed) >= 1
     climbed.clear()
-    together([finish([at(0.0, np.nan), at(9.0, np.nan)])])
+    finished([[at(0.0, np.nan), at(9.0, np.nan)]])
     assert len(climbed) == 1
 
 
@@ -194,7 +189,7 @@ def test_draws_of_all_rounds_weigh_as_from_the_mixture_of_their_proposals():
     """Worked out again by the densities; no weight is above root k times their mean."""
     data = straight_line(1)
     forward = Forward(data, Hypothesis("none"), {"drawbar_pull": 0.04})
-    found = fit(data, forward, np.array([0.0, 0.5]), {"drawbar_pull": Noise(0.04)})
+    found = fit(forward, np.array([0.0, 0.5]), {"drawbar_pull": Noise(0.04)})
     root = np.linalg.cholesky(found.covariance)
     proposals = [
         StudentT(found.psi + root[:, 0], 0.5 * root, 6.0), StudentT(found.psi, 2.0 * root, 6.0)
@@ -223,7 +218,7 @@ def test_draws_that_are_kept_are_as_many_of_each_part_as_it_weighs():
     """Of a straight line: at equal weights, quantiles of its normal posterior."""
     data = straight_line(1)
     forward = Forward(data, Hypothesis("none"), {"drawbar_pull": 0.04})
-    found = fit(data, forward, np.array([0.0, 0.5]), {"drawbar_pull": Noise(0.04)})
+    found = fit(forward, np.array([0.0, 0.5]), {"drawbar_pull": Noise(0.04)})
     refined = refine(found, 1)
     assert refined.sample is not None
     assert refined.sample.shape == (500, 2)

@@ -39,7 +39,7 @@ def fitted(data) -> Fit:
     h = Hypothesis("force_offset", (effect,), (effect_priors(data, effect),))
     forward = Forward(data, h, {"drawbar_pull": 0.03})
     start = np.array([p.loc for p in forward.priors.free])
-    return fit(data, forward, start, {"drawbar_pull": Noise(0.03, 0.0)})
+    return fit(forward, start, {"drawbar_pull": Noise(0.03, 0.0)})
 
 
 def log_joint(data: Campaigns, found: Fit, psi: np.ndarray) -> np.ndarray:
@@ -86,7 +86,7 @@ def test_evidence_is_that_of_importance_sampling():
     h = Hypothesis("slip_zero_shift", (effect,), (effect_priors(data, effect),))
     forward = Forward(data, h, {"rut_depth": 0.05})
     start = np.array([p.loc for p in forward.priors.free])
-    found = fit(data, forward, start, {"rut_depth": Noise(0.05, 0.0)})
+    found = fit(forward, start, {"rut_depth": Noise(0.05, 0.0)})
     rng = np.random.default_rng(4)
     proposal = multivariate_t(found.psi, 1.3 * found.covariance, df=5, seed=rng)
     psi = proposal.rvs(20_000)
@@ -146,7 +146,7 @@ def noisy_again(case: Case, sds: Sequence[np.ndarray], seed: int) -> Campaigns:
 def fitted_noise(data: Campaigns) -> Noise:
     forward = Forward(data, Hypothesis("none"), {"drawbar_pull": 0.03})
     start = np.array([p.loc for p in forward.priors.free])
-    return fit(data, forward, start, {"drawbar_pull": Noise(0.03)}).noise["drawbar_pull"]
+    return fit(forward, start, {"drawbar_pull": Noise(0.03)}).noise["drawbar_pull"]
 
 
 def test_noise_that_grows_with_slip_is_seen():

@@ -10,6 +10,7 @@ import pytest
 from calib.gap.case import campaigns
 from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
+from calib.gap.fit import Start
 from calib.gap.forward import Forward
 from calib.gap.guesses import Guesses, _led
 from calib.gap.hypotheses import joined, singles, unknowns
@@ -42,9 +43,8 @@ def alone(guesses) -> dict[str, Hypothesis]:
     return {h.name: h for h in singles(guesses.data, CHOICE)}
 
 
-def candidates_of(walk) -> tuple[Forward, np.ndarray]:
-    problem, candidates = next(walk)
-    return problem.forward, candidates
+def candidates_of(start: Start) -> tuple[Forward, np.ndarray]:
+    return start.forward, start.guesses
 
 
 def lab(guesses: Guesses, forward: Forward, psi: np.ndarray) -> None:
@@ -55,11 +55,11 @@ def lab(guesses: Guesses, forward: Forward, psi: np.ndarray) -> None:
 
 
 def test_a_hypothesis_begins_at_the_laboratorys_calibration(guesses, alone):
-    forward, found = candidates_of(guesses.truncated(Hypothesis("none")))
+    forward, found = candidates_of(guesses.begun(Hypothesis("none")))
     assert len(found) == 1
     lab(guesses, forward, found)
     for name in ("force_offset", "lug_thrust"):
-        forward, found = candidates_of(guesses.truncated(alone[name]))
+        forward, found = candidates_of(guesses.begun(alone[name]))
         lab(guesses, forward, found)
         # The middle of the prior, and draws of it.
         part = forward.phi_slices[0]
@@ -78,7 +78,7 @@ def test_a_set_begins_where_its_parts_have_led_with_what_they_lack_drawn(guesses
         at[found.forward.phi_slices[0]] += off
         members.append(replace(found, psi=at))
         psi[name] = at
-    forward, found = candidates_of(guesses.truncated_joint(both, members, 2))
+    forward, found = candidates_of(guesses.begun_jointly(both, members, 2))
     problem = Residuals(guesses.data, forward)
     first, second = np.split(found[1:], 2)
     places = dict(zip(("force_offset", "lug_thrust"), forward.phi_slices, strict=True))
@@ -96,10 +96,10 @@ def test_a_set_begins_where_its_parts_have_led_with_what_they_lack_drawn(guesses
         assert len(np.unique(part[:, places[lacking]], axis=0)) == len(part) > 20
     # What lacks nothing has one guess; without parts it begins as any hypothesis.
     whole = fit_at(guesses.data, both)
-    _, found = candidates_of(guesses.truncated_joint(both, [whole, whole], 2))
+    _, found = candidates_of(guesses.begun_jointly(both, [whole, whole], 2))
     assert len(found) == 3
-    _, found = candidates_of(guesses.truncated_joint(both, [], 2))
-    _, as_any = candidates_of(guesses.truncated(both))
+    _, found = candidates_of(guesses.begun_jointly(both, [], 2))
+    _, as_any = candidates_of(guesses.begun(both))
     np.testing.assert_array_equal(found, as_any)
 
 
@@ -143,8 +143,8 @@ def test_a_promise_is_the_joint_density_after_one_step_of_all_other_parameters(g
         part = larger.phi_slices[place]
         np.testing.assert_array_equal(begin[part], begun[i][part])
     # A fit from it begins with all of them, the best first.
-    _, candidates = candidates_of(guesses.truncated_promise(promise))
-    np.testing.assert_allclose(candidates, there.clip(promise.starts))
+    _, candidates = candidates_of(guesses.begun_as_promised(promise))
+    np.testing.assert_array_equal(candidates, promise.starts)
 
 
 def test_what_sets_in_begins_where_the_laboratorys_residuals_show_it_best(guesses):
@@ -181,8 +181,8 @@ def test_what_sets_in_begins_where_the_laboratorys_residuals_show_it_best(guesse
                 found[forward.smooth_slices[name]], amplitude, rtol=1e-6, atol=1e-9
             )
         lab(guesses, forward, found[None])
-        _, candidates = candidates_of(guesses.truncated(hypothesis))
-        np.testing.assert_allclose(candidates[0], Residuals(data, forward).clip(found))
+        _, candidates = candidates_of(guesses.begun(hypothesis))
+        np.testing.assert_array_equal(candidates[0], found)
         assert len(candidates) == 1
 
 

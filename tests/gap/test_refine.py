@@ -28,7 +28,7 @@ def fitted(name: str, models: dict[str, str], **case):
     noise = dict.fromkeys(models, 0.05)
     forward = Forward(data, h, noise)
     start = np.array([p.loc for p in forward.priors.free])
-    return fit(data, forward, start, {o: Noise(s, 0.0) for o, s in noise.items()})
+    return fit(forward, start, {o: Noise(s, 0.0) for o, s in noise.items()})
 
 
 def long_chain(found, seed: int) -> np.ndarray:

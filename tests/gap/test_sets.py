@@ -85,8 +85,8 @@ def test_what_two_sets_share_begins_where_it_was_led(guesses, alone):
     pair = fitted(guesses, alone["rate_effect"], alone["sensor_drift"])
     (promise,) = guesses.beside(pair.forward.hypothesis, pair, [alone["force_offset"]])
     assert promise.hypothesis.name == "force_offset+rate_effect+sensor_drift"
-    problem, candidates = next(guesses.truncated_promise(promise))
-    forward = problem.forward
+    start = guesses.begun_as_promised(promise)
+    forward, candidates = start.forward, start.guesses
     # With the new effect at rest and the others where they were, it predicts what the pair did.
     led = _led(forward, candidates[0], pair)
     led[forward.phi_slices[0]] = 0.0
@@ -252,25 +252,25 @@ class Stub:
     def __init__(self, odds=EVEN) -> None:
         self.odds, self.asked = odds, []
 
-    def truncated_joint(self, hypothesis, members, count, skip=0):
+    def begun_jointly(self, hypothesis, members, count, skip=0):
         self.asked.append((hypothesis.name, members, count, skip))
         return [fit_of(hypothesis, 0.5)]
 
-    def truncated_promise(self, promise):
+    def begun_as_promised(self, promise):
         self.asked.append(promise.hypothesis.name)
         return [fit_of(promise.hypothesis, promise.log_joint)]
 
 
 @pytest.fixture
 def at_once(monkeypatch):
-    """Walks that are their results; finishing gains a tenth."""
-    monkeypatch.setattr(module, "together", list)
+    """Starts that are their truncated fits; finishing gains a tenth."""
+    monkeypatch.setattr(module, "truncated_fits", list)
 
-    def finish(begun):
-        best = max(begun, key=lambda f: f.log_evidence)
-        return SimpleNamespace(forward=best.forward, log_evidence=best.log_evidence + 0.1)
+    def finished(begun):
+        best = [max(group, key=lambda f: f.log_evidence) for group in begun]
+        return [SimpleNamespace(forward=f.forward, log_evidence=f.log_evidence + 0.1) for f in best]
 
-    monkeypatch.setattr(module, "finish", finish)
+    monkeypatch.setattr(module, "finished", finished)
 
 
 def test_what_is_hopeless_is_not_fitted_further(at_once):
