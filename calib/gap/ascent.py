@@ -232,7 +232,8 @@ def _directions(stack: Coordinates, psi: Array, slope: Slope, dampings: Array) -
     hessian = slope.hessian * (free[:, :, None] & free[:, None])
     added = np.where(free[:, None], dampings[..., None] * size[:, None], 1.0)
     gradient = np.where(free, slope.gradient, 0.0)
-    damped = hessian[:, None] + diagonal(added)
+    damped = np.repeat(hessian[:, None], dampings.shape[1], axis=1)
+    np.einsum("mtii->mti", damped)[...] += added
     return np.asarray(-np.linalg.solve(damped, gradient[:, None, :, None])[..., 0])
 
 

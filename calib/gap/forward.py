@@ -12,8 +12,9 @@ The vector psi of a hypothesis stacks, all with (truncated) normal or uniform pr
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,10 +186,13 @@ class Forward:
     @_SILENT
     def simulator(self, psi: Array, view: View) -> dict[str, Array]:
         """Predict with the calibrated simulator alone, on the scale of the response."""
-        return {
-            name: self._predict(psi, name, s.conditions(view))
+        # Draws of what is not the simulators' have these in common.
+        once = psi[:1] if (psi[:, : self.n_shared] == psi[:1, : self.n_shared]).all() else psi
+        found = {
+            name: self._predict(once, name, s.conditions(view))
             for name, s in self._simulated.items()
         }
+        return {o: np.broadcast_to(v, (len(psi), v.shape[1])) for o, v in found.items()}
 
     @_SILENT
     def campaigns(self, psi: Array) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -233,16 +237,20 @@ class Forward:
         return (*names, *(["unknown"] if self.smooth_slices else []))
 
     @_SILENT
-    def without(self, psi: Array, view: View, *left_out: str) -> dict[str, Array]:
-        """Predict field rows with all of `causes` in force but some."""
+    def without(
+        self, psi: Array, view: View, *left_out: str, plain: dict[str, Array] | None = None
+    ) -> dict[str, Array]:
+        """Predict field rows with all of `causes` in force but some; plain as from `simulator`."""
         rest = psi.copy()
         if "parameter_shift" in left_out:
             rest[:, self.shift_slice] = 0.0
         if "unknown" in left_out:
             for part in self.smooth_slices.values():
                 rest[:, part] = 0.0
-        effects = enumerate(self.hypothesis.effects)
-        return self.field(rest, view, [i for i, e in effects if e.name in left_out])
+        idle = [i for i, e in enumerate(self.hypothesis.effects) if e.name in left_out]
+        if plain is None or self.shift is not None:
+            return self.field(rest, view, idle)
+        return self.departed(rest, view, plain, idle)
 
     def departed(
         self, psi: Array, view: View, plain: dict[str, Array], idle: Collection[int] = ()
@@ -284,13 +292,10 @@ def departed_of_all(
         (forward, psi, slice(end - len(psi), end))
         for (forward, psi), end in zip(asked, ends, strict=True)
     ]
-    acting = _acting(parts, view, idle)
+    acting = _acting(parts, view, plain, idle)
     if acting:
         forward = asked[0][0]
         shared = np.concatenate([psi[:, : forward.n_shared] for _, psi in asked])
-        outputs = forward.data.outputs
-        base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in outputs}
-        view = replace(view, base=base)
         changed = {o: _changed(forward, shared, o, view, acting, plain[o]) for o in plain}
     for forward, psi, rows in parts:
         threshold = psi[:, forward.threshold :].ravel()  # of one that sets in, else empty
@@ -306,25 +311,45 @@ type _Part = tuple[Forward, Array, slice]
 
 @dataclass(frozen=True)
 class _Acting:
-    """An effect in some rows, with its natural parameters and how it departs from its formula.
+    """An effect in some rows: its natural parameters there, and what it sees.
 
-    Factors by output.
+    Factors by which it departs from its formula, by output.
     """
 
     effect: Effect
-    rows: NDArray[np.int64]
+    rows: slice | NDArray[np.int64]
     phi: Array
     factors: Mapping[str, Array]
+    view: View
+
+    def apart(self, moved: NDArray[np.int64]) -> Iterator[tuple[int, _Acting]]:
+        """Part the rows by what was moved there before."""
+        before = moved[self.rows]
+        masks = np.unique(before).tolist()
+        if len(masks) == 1:
+            yield masks[0], self
+            return
+        places = np.arange(moved.size)[self.rows]
+        for some, mask in [(before == mask, mask) for mask in masks]:
+            factors = {name: factor[some] for name, factor in self.factors.items()}
+            view = _seen(self.view, self.view.base, some)
+            yield mask, _Acting(self.effect, places[some], self.phi[some], factors, view)
 
 
-def _acting(parts: Sequence[_Part], view: View, idle: Collection[int]) -> list[_Acting]:
+def _acting(
+    parts: Sequence[_Part], view: View, plain: Mapping[str, Array], idle: Collection[int]
+) -> list[_Acting]:
     """Effects in alphabetical order, which is that of each hypothesis."""
     places: dict[str, list[tuple[_Part, int]]] = {}
     for part in parts:
         for i, effect in enumerate(part[0].hypothesis.effects):
             if i not in idle:
                 places.setdefault(effect.name, []).append((part, i))
-    found = []
+    found: list[_Acting] = []
+    if not places:
+        return found
+    outputs = parts[0][0].data.outputs
+    base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in outputs}
     for _, having in sorted(places.items()):
         (forward, _, _), i = having[0]
         effect, basis = forward.hypothesis.effects[i], forward._form(view)[i]
@@ -337,9 +362,11 @@ def _acting(parts: Sequence[_Part], view: View, idle: Collection[int]) -> list[_
             for name, role in forward._roles.items()
             if role in effect.outputs
         }
-        rows = np.concatenate([np.arange(p.start, p.stop) for (_, _, p), _ in having])
+        rows: slice | NDArray[np.int64] = having[0][0][2]
+        if len(having) > 1:
+            rows = np.concatenate([np.arange(p.start, p.stop) for (_, _, p), _ in having])
         natural = forward.hypothesis.effect_priors[i].to_natural(phi)
-        found.append(_Acting(effect, rows, natural, factors))
+        found.append(_Acting(effect, rows, natural, factors, _seen(view, base, rows)))
     return found
 
 
@@ -366,21 +393,19 @@ def _changed(
     moved = np.zeros(len(plain), dtype=np.int64)
     location, ahead = plain.copy(), plain.copy()
     for a in acting:
-        before = moved[a.rows]
-        for mask in np.unique(before).tolist():
-            some = before == mask
-            rows = a.rows[some]
+        for mask, some in a.apart(moved):
+            rows = some.rows
             given = {
                 known: truly[known][rows] if mask & bits[known] else values
                 for known, values in conditions.items()
             }
-            found = a.effect.on_conditions(a.phi[some], role, given, _of(view, rows))
+            found = some.effect.on_conditions(some.phi, role, given, some.view)
             if found is given:
                 continue
             there = simulated.predict_beyond(
                 t[rows], misfit[rows], {columns[known]: v for known, v in found.items()}
             )
-            location[rows] += (there - ahead[rows]) * a.factors[name][some]
+            location[rows] += (there - ahead[rows]) * some.factors[name]
             ahead[rows] = there
             for known in (known for known, values in found.items() if values is not given[known]):
                 if known not in truly:
@@ -389,14 +414,15 @@ def _changed(
                 moved[rows] |= bits[known]
     for a in acting:
         here = location[a.rows]
-        changed = a.effect.on_output(a.phi, role, here, _of(view, a.rows))
+        changed = a.effect.on_output(a.phi, role, here, a.view)
         if changed is not here:
             location[a.rows] += (changed - here) * a.factors[name]
     return location
 
 
-def _of(view: View, rows: NDArray[np.int64]) -> View:
-    return replace(view, base={role: values[rows] for role, values in view.base.items()})
+def _seen(view: View, base: Mapping[str, Array], rows: slice | NDArray[Any]) -> View:
+    """What an effect can see of some rows of what simulators predict."""
+    return replace(view, base={role: values[rows] for role, values in base.items()})
 
 
 def _shifted(radius_error: Array, conditions: dict[str, Array]) -> dict[str, Array]:

@@ -163,10 +163,7 @@ def _signatures(
     psi = forward.priors.sample(generator(seed, "gap", "isolability", h.name), _N_SIZES)
     for o in data.outputs:
         psi[:, forward.theta_slices[o.name]] = lab_mode[o.name]
-    # All draws have the simulators in common but for their inadequacy, of which few have any.
-    alike = not any(s.n_bends + s.n_errors for s in data.simulated.values())
-    once = forward.simulator(psi[:1] if alike else psi, data.view)
-    plain = {o: np.broadcast_to(values, (_N_SIZES, values.shape[1])) for o, values in once.items()}
+    plain = forward.simulator(psi, data.view)
     full = forward.departed(psi, data.view, plain)
     parts = [
         (full[o.name] - plain[o.name])[:, o.rows]

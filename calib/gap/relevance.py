@@ -75,7 +75,9 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
     alone = len(causes) == 1
     with np.errstate(all="ignore"):
         full, plain = forward.field_and_plain(psi, data.view)
-        without = [plain if alone else forward.without(psi, data.view, c) for c in causes]
+        without = [
+            plain if alone else forward.without(psi, data.view, c, plain=plain) for c in causes
+        ]
     at = noise_conditions(data.view)
     columns = []
     for other in without:

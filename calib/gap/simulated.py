@@ -110,11 +110,11 @@ class Simulated:
         beyond = (pressure - inside) / (high - low)
         if not beyond.any():
             return self.predict(t, misfit, conditions)
-        # Inside and at either end in one call.
-        ends = [np.full_like(inside, end) for end in (low, high)]
-        thrice = {name: np.concatenate([v, v, v], axis=-1) for name, v in conditions.items()}
-        thrice[column] = np.concatenate([inside, *ends], axis=-1)
-        location, at_low, at_high = np.split(self.predict(t, misfit, thrice), 3, axis=1)
+        location = self.predict(t, misfit, {**conditions, column: inside})
+        # Both ends in one call, each a pressure of all vectors.
+        twice = {name: np.concatenate([v, v], axis=-1) for name, v in conditions.items()}
+        twice[column] = np.repeat([low, high], pressure.shape[-1])
+        at_low, at_high = np.split(self.predict(t, misfit, twice), 2, axis=1)
         return np.asarray(location + (at_high - at_low) * beyond)
 
     def _error_of(self, conditions: Mapping[str, Array]) -> Array:

@@ -155,7 +155,7 @@ class Priors:
             full = np.tile(fixed, (t.shape[0], 1))
             full[:, free] = t
         if logs is not None:
-            np.exp(np.minimum(full, 700.0), out=full, where=logs)
+            full[:, logs] = np.exp(np.minimum(full[:, logs], 700.0))
         return full
 
     @cached_property

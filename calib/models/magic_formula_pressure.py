@@ -41,7 +41,11 @@ def _at(columns: Columns, u: Array) -> tuple[Array, Array, Array, Array]:
     mean, half = 0.5 * (low + high), 0.5 * (high - low)
     curvature = bend * mean
     allowed = _positive(mean, half, curvature).all(axis=0)
-    K, D, G = mean + half * u + curvature * (u * u - 1.0)
+    # In place: fresh memory would cost more than the arithmetic.
+    values = half * u
+    values += mean
+    values += curvature * (u * u - 1.0)
+    K, D, G = values
     return K, columns[9], np.where(allowed, D, np.nan), G
 
 
