@@ -41,33 +41,15 @@ def made_under() -> Setting | None:
     return FEW[0] if FEW else None
 
 
-def original_of(kind: str, factory: pytest.TempPathFactory) -> Path:
-    setting, out = made_under(), factory.mktemp("original") / kind
-    return getattr(made, kind)(out) if setting is None else made.elsewhere(kind, out, setting)
-
-
 @pytest.fixture(scope="package")
-def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report of rut depth, posterior included."""
-    return original_of("report", tmp_path_factory)
-
-
-@pytest.fixture(scope="package")
-def original_whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report with one of the source's gaps, the audit and figures for print."""
-    return original_of("whole", tmp_path_factory)
-
-
-@pytest.fixture(scope="package")
-def original_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run as `calib fit` makes it."""
-    return original_of("run", tmp_path_factory)
-
-
-@pytest.fixture(scope="package")
-def original_comparison(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A comparison as `calib compare` makes it."""
-    return original_of("comparison", tmp_path_factory)
+def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of all of them (`made.KINDS`); importing takes as long as making one."""
+    setting, out = made_under(), tmp_path_factory.mktemp("original")
+    if setting is not None:
+        return made.elsewhere(out, setting, *made.KINDS)
+    for kind, make in made.KINDS.items():
+        make(out / kind)
+    return out
 
 
 @pytest.fixture(autouse=True)
@@ -77,8 +59,8 @@ def _few_figures() -> Any:
 
 
 @pytest.fixture
-def report(original: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(original, tmp_path / "report"))
+def report(originals: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(originals / "report", tmp_path / "report"))
 
 
 @pytest.fixture(scope="package")
@@ -93,18 +75,19 @@ def report_here(original_here: Path, tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def whole(original_whole: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(original_whole, tmp_path / "whole"))
+def whole(originals: Path, tmp_path: Path) -> Path:
+    """A report with one of the source's gaps, the audit and figures for print."""
+    return Path(shutil.copytree(originals / "whole", tmp_path / "whole"))
 
 
 @pytest.fixture
-def run(original_run: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(original_run, tmp_path / "run"))
+def run(originals: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(originals / "run", tmp_path / "run"))
 
 
 @pytest.fixture
-def compared(original_comparison: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(original_comparison, tmp_path / "compared"))
+def compared(originals: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(originals / "comparison", tmp_path / "compared"))
 
 
 @pytest.fixture(scope="package")

@@ -2,7 +2,7 @@
 
 In a process of its own.
 
-As a program: python -m tests.check.made KIND FOLDER.
+As a program: python -m tests.check.made FOLDER KIND ...; each gets its name in the folder.
 """
 
 from __future__ import annotations
@@ -109,16 +109,19 @@ def fitted_run(problem: Problem, seed: int) -> Calibration:
     return calibrate(problem, seed, estimates=(point,), settings=SETTINGS)
 
 
-def elsewhere(kind: str, out: Path, setting: Setting) -> Path:
-    """Make one of them as another processor would."""
+KINDS = {"report": report, "whole": whole, "run": run, "comparison": comparison}
+
+
+def elsewhere(folder: Path, setting: Setting, *kinds: str) -> Path:
+    """Make some of them as another processor would, in one process."""
     skip_what_crashes(setting)
     subprocess.run(
-        [sys.executable, "-m", "tests.check.made", kind, str(out)],
+        [sys.executable, "-m", "tests.check.made", str(folder), *kinds],
         env=setting.environment(), cwd=ROOT, check=True, capture_output=True,
     )  # fmt: skip
-    return out
+    return folder
 
 
 if __name__ == "__main__":
-    kinds = {"report": report, "whole": whole, "run": run, "comparison": comparison}
-    kinds[sys.argv[1]](Path(sys.argv[2]))
+    for kind in sys.argv[2:]:
+        KINDS[kind](Path(sys.argv[1]) / kind)

@@ -81,7 +81,7 @@ def test_chains_that_part_ways_are_judged_by_their_monte_carlo_error(
 def test_whatever_another_processor_makes_is_the_same(
     tmp_path: Path, setting: Setting, kind: str
 ) -> None:
-    outcome = check(made.elsewhere(kind, tmp_path / kind, setting))
+    outcome = check(made.elsewhere(tmp_path, setting, kind) / kind)
     assert different(outcome) == {}
 
 
