@@ -127,9 +127,10 @@ def test_nothing_is_its_own_rival(blind_test: BlindTest) -> None:
             assert (case["rival"] == "") == (case["rival_nats"] is None)
 
 
-def test_same_seed_same_bytes(blind_test: BlindTest, tmp_path: Path) -> None:
+@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_same_seed_same_bytes(blind_test: BlindTest, tmp_path: Path, workers: int) -> None:
     """Two processes write what one wrote, byte for byte; another seed does not."""
-    again = make(tmp_path / "c", tmp_path / "key.json", seed=5, n_cases=6, workers=2)
+    again = make(tmp_path / "c", tmp_path / "key.json", seed=5, n_cases=6, workers=workers)
     assert again == blind_test.digest
     assert (tmp_path / "key.json").read_bytes() == blind_test.key.read_bytes()
     for path in blind_test.cases.rglob("*"):

@@ -38,6 +38,7 @@ def test_cases_are_made_diagnosed_and_scored(calib: Calib) -> None:  # noqa: F81
 def test_cases_are_drawn_again_as_the_diagnosis_believes(
     calib: Calib,  # noqa: F811
     blind_test: BlindTest,
+    believed_test: BlindTest,
 ) -> None:
     given = ("challenge", "well-specified", blind_test.cases, "--key", blind_test.key)
     drawn = calib(*given, "--out", "cases", "--out-key", "key.json", "--workers", 1)
@@ -46,3 +47,8 @@ def test_cases_are_drawn_again_as_the_diagnosis_believes(
     names = {p.name for p in blind_test.cases.iterdir() if p.is_dir()}
     assert {p.name for p in Path("cases").iterdir() if p.is_dir()} == names
     assert set(json.loads(Path("key.json").read_text())["cases"]) == names
+    # The same seed, the same cases.
+    assert Path("key.json").read_bytes() == believed_test.key.read_bytes()
+    for path in Path("cases").rglob("*.csv"):
+        other = believed_test.cases / path.relative_to("cases")
+        assert path.read_bytes() == other.read_bytes()

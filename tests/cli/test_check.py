@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
@@ -11,16 +12,23 @@ from calib.he2019.datasets import embedded
 from tests.cli.test_cli import Calib, calib  # noqa: F401
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the run is kept, once it is made."""
+    return tmp_path_factory.mktemp("kept") / "run"
+
+
 @pytest.fixture
-def run(calib: Calib) -> Path:  # noqa: F811
+def run(calib: Calib, kept: Path) -> Path:  # noqa: F811
     """A run folder, in the current folder."""
     embedded.write(Path("data"))
-    made = calib(
-        "fit", "data/rut_depth.csv", "--model", "bekker", "--out", "run",
-        "--hold-out", "inflation_pressure_psi=30", "--seed", 4,
-    )  # fmt: skip
-    assert made.code == 0, made.err
-    return Path("run")
+    if not kept.exists():
+        made = calib(
+            "fit", "data/rut_depth.csv", "--model", "bekker", "--out", kept,
+            "--hold-out", "inflation_pressure_psi=30", "--seed", 4,
+        )  # fmt: skip
+        assert made.code == 0, made.err
+    return Path(shutil.copytree(kept, "run"))
 
 
 def test_the_first_line_is_the_verdict(calib: Calib, run: Path) -> None:  # noqa: F811

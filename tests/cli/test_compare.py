@@ -10,6 +10,7 @@ import pytest
 
 from calib.batch.folders import check_folder
 from calib.models import example_csv
+from calib.report.figures.collect import plates
 from tests.browser import Browser, faults
 from tests.cli.test_cli import Calib
 from tests.cli.test_cli import calib as calib
@@ -42,7 +43,8 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
     assert "run `calib compare` again" in broken.err
 
 
-def test_a_report_has_it_as_a_section(calib: Calib) -> None:
+def test_a_report_has_it_as_a_section(calib: Calib, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("calib.report.writer.plates", lambda *args: plates(*args)[:1])
     Path("plates.csv").write_text(example_csv("reece"))
     made = calib("report", "plates.csv", "--compare", "reece", "--compare", "bekker_plate",
                  "--hold-out", "plate_width_mm=80", "--out", "r", *FEW)  # fmt: skip

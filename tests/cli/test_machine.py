@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import signal
 import subprocess
 import sys
@@ -23,12 +24,19 @@ from tests.cli.test_cli import calib as calib
 FEW = ("--max-steps", 800)
 
 
+@pytest.fixture(scope="module")
+def kept(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where the run is kept, once it is made."""
+    return tmp_path_factory.mktemp("kept") / "run"
+
+
 @pytest.fixture
-def run(calib: Calib) -> Path:
-    Path("my.csv").write_text(example_csv("modified_bekker"))
-    made = calib("fit", "my.csv", "--model", "modified_bekker", "--out", "run", *FEW)
-    assert made.code in (0, 3), made.err
-    return Path("run")
+def run(calib: Calib, kept: Path) -> Path:
+    if not kept.exists():
+        Path("my.csv").write_text(example_csv("modified_bekker"))
+        made = calib("fit", "my.csv", "--model", "modified_bekker", "--out", kept, *FEW)
+        assert made.code in (0, 3), made.err
+    return Path(shutil.copytree(kept, "run"))
 
 
 def test_a_fit_prints_its_run_and_what_was_held_out(calib: Calib) -> None:

@@ -14,7 +14,7 @@ from calib.data.quantities import OUTPUTS, physical_role, role_of
 from calib.gap.case import Campaigns, Case, campaigns
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.which import Ranking, rank
+from calib.gap.which import Ranking
 from calib.inference.prior_files import default_priors, read_priors
 from calib.inference.problem import build_problem
 
@@ -180,10 +180,9 @@ def campaigns_of(effect: str | None, outputs: str = "both") -> Campaigns:
     return campaigns(make_case(effect, models=models))
 
 
-@cache
 def ranking_of(effect: str | None) -> Ranking:
     """Rank the hypotheses of a case with both outputs, among a few effects."""
-    return rank(campaigns_of(effect), 1, effects=CHOICE)
+    return diagnosis_of(effect).ranking
 
 
 @cache

@@ -17,7 +17,7 @@ from calib.gap.odds import Odds
 from calib.inference.priors import Prior, Priors
 from calib.report.gap_evidence import gap_evidence
 from calib.report.gap_verdict import judge_gap
-from tests.gap.cases import PULL_ONLY, make_case, write_case
+from tests.gap.cases import CHOICE, PULL_ONLY, make_case, write_case
 
 
 def test_suspicion_multiplies_the_odds_of_every_explanation_with_the_cause():
@@ -32,20 +32,22 @@ def test_suspicion_multiplies_the_odds_of_every_explanation_with_the_cause():
 
 def test_an_excluded_cause_is_not_tested_and_both_verdicts_are_told():
     case = make_case("sensor_drift", models=PULL_ONLY)
-    found = diagnose_once(replace(case, context=Context(excluded=("sensor_drift",))), 1)
+    found = diagnose_once(
+        replace(case, context=Context(excluded=("sensor_drift",))), 1, effects=CHOICE
+    )
     assert "sensor_drift" not in found.inclusion.causes
     assert "excluded" in found.ranking.not_testable["sensor_drift"]
     assert found.without_context is not None
     assert found.without_context["sensor_drift"] > 0.5
     facts = dict(judge_gap(gap_evidence(found)).facts)
     assert facts["Put in"].startswith("Sensor drift excluded. Without that: sensor drift (")
-    assert diagnose_once(case, 1).without_context is None
+    assert diagnose_once(case, 1, effects=CHOICE).without_context is None
 
 
 def test_a_known_size_takes_the_place_of_the_prior():
     case = make_case("force_offset", models=PULL_ONLY)
     context = Context(sizes={"force_offset": {"offset": Size(mean=0.02, sd=0.001)}})
-    found = diagnose_once(replace(case, context=context), 1)
+    found = diagnose_once(replace(case, context=context), 1, effects=CHOICE)
     priors = found.ranking.fits["force_offset"][0].forward.hypothesis.effect_priors[0]
     (offset,) = priors.free
     assert (offset.loc, offset.scale) == (0.02, 0.001)

@@ -32,10 +32,8 @@ def blind(blind_test) -> tuple[Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def believed(blind, tmp_path_factory) -> tuple[Path, Path]:
-    root = tmp_path_factory.mktemp("believed")
-    assert drawn(blind, root) == {}
-    return root / "cases", root / "key.json"
+def believed(believed_test) -> tuple[Path, Path]:
+    return believed_test.cases, believed_test.key
 
 
 def drawn(blind: tuple[Path, Path], root: Path, **options: int) -> dict[str, str]:
@@ -95,6 +93,7 @@ def test_readings_are_the_truth_with_noise(believed):
     assert abs(z.var() - 1.0) < 4.0 * np.sqrt(2.0 / z.size)
 
 
+@pytest.mark.slow  # with one, the command line's are compared in every run
 def test_the_same_seed_gives_the_same_cases_on_any_number_of_workers(blind, believed, tmp_path):
     drawn(blind, tmp_path, workers=2)
     assert (tmp_path / "key.json").read_bytes() == believed[1].read_bytes()

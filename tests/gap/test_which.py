@@ -119,7 +119,7 @@ OVER_ORDER = {
 
 
 @pytest.mark.parametrize("name", OVER_ORDER)
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, *(pytest.param(s, marks=pytest.mark.slow) for s in (2, 3))])
 def test_a_step_and_a_drift_are_told_apart(name, seed):
     case = make_case(name, size=OVER_ORDER[name], models=PULL_ONLY, seed=seed)
     few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "sensor_step", "lug_thrust")}
