@@ -66,9 +66,14 @@ class Environment:
 
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that numbers depend on."""
+    return {"python": sys.version.split()[0], **{name: _version(name) for name in _PACKAGES}}
+
+
+@cache
+def _version(package: str) -> str:
     from importlib.metadata import version
 
-    return {"python": sys.version.split()[0], **{name: version(name) for name in _PACKAGES}}
+    return version(package)
 
 
 def _machine() -> dict[str, str]:
