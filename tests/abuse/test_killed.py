@@ -1,4 +1,7 @@
-"""Killed at random moments, a command leaves its result whole or none, and ends when repeated."""
+"""Killed at random moments, a command leaves its result whole or none, and ends when repeated.
+
+In `make test` it is the writing of a folder that is killed (`batch/test_folders.py`).
+"""
 
 from __future__ import annotations
 
@@ -90,10 +93,6 @@ def kill_and_go_again(verb: str, times: int, rng: np.random.Generator) -> int:
         assert start(words).wait(timeout=300) in (0, 3)
         assert numbers(Path("out"), files) == whole
     return cut_short
-
-
-def test_a_killed_command_leaves_nothing_half_written(folder: Path) -> None:
-    kill_and_go_again("fit", 1, np.random.default_rng())
 
 
 @pytest.mark.slow
