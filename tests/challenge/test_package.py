@@ -16,18 +16,17 @@ from calib.batch.bench import from_the_bench
 from calib.batch.campaign.kinds.challenge import ChallengeSection
 from calib.batch.environment import source_sha256
 from challenge.make import NULL_FRACTION
+from tests.cli.test_cli import Calib
 
 ROOT = Path(challenge.__path__[0]).parent
 PLAN = '[[challenge]]\nname = "blind"\ncases = 1\ndraw_seed = 5\n'
 
 
-def without_bench(*words: str) -> subprocess.CompletedProcess[str]:
-    """Run the program where only calib can be imported."""
-    code = "import sys; sys.modules['challenge'] = None; from calib.cli import main; main()"
-    return subprocess.run(
-        [sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=120,
-        env={**os.environ, "PYTHONPATH": str(Path(calib.__path__[0]).parent)},
-    )  # fmt: skip
+@pytest.fixture
+def no_bench(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let only calib be imported."""
+    for name in ["challenge", *(m for m in sys.modules if m.startswith("challenge."))]:
+        monkeypatch.setitem(sys.modules, name, None)
 
 
 @pytest.mark.parametrize(
@@ -39,18 +38,18 @@ def without_bench(*words: str) -> subprocess.CompletedProcess[str]:
         ("campaign", "plan.toml"),
     ],
 )
+@pytest.mark.usefixtures("no_bench")
 def test_without_the_bench_it_is_named_and_nothing_is_written(
-    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    words: tuple[str, ...], tmp_path: Path, run: Calib
 ) -> None:
     """Exit code 2, what it is, where it is, and how to get it."""
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "plan.toml").write_text(PLAN, encoding="utf-8")
-    ran = without_bench(*words)
-    assert ran.returncode == 2
-    assert "a test bench of the repository, not of the wheel" in ran.stderr
-    assert "to mend: run from a checkout" in ran.stderr
+    ran = run(*words)
+    assert ran.code == 2
+    assert "a test bench of the repository, not of the wheel" in ran.err
+    assert "to mend: run from a checkout" in ran.err
     assert ("[[challenge]]" if words[0] == "campaign" else f"calib {words[0]} {words[1]}") in (
-        ran.stderr
+        ran.err
     )
     assert [p.name for p in tmp_path.iterdir()] == ["plan.toml"]
 
@@ -59,7 +58,12 @@ def test_campaigns_of_other_kinds_need_no_bench(tmp_path: Path) -> None:
     """Neither does a list of a plan's tasks."""
     plan = tmp_path / "plan.toml"
     plan.write_text('[[sbc]]\nname = "ranks"\nsimulations = 1\ndraw_seed = 3\n')
-    ran = without_bench("campaign", str(plan), "--list")
+    code = "import sys; sys.modules['challenge'] = None; from calib.cli import main; main()"
+    ran = subprocess.run(
+        [sys.executable, "-c", code, "campaign", str(plan), "--list"], capture_output=True,
+        text=True, timeout=120,
+        env={**os.environ, "PYTHONPATH": str(Path(calib.__path__[0]).parent)},
+    )  # fmt: skip
     assert ran.returncode == 0
     assert ran.stdout.startswith("ranks.")
 
