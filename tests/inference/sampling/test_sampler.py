@@ -68,6 +68,7 @@ def test_an_unknown_noise_scale() -> None:
     assert abs(draws.log_evidence - model.log_evidence_unknown()) < 5.0 * evidence_error(draws)
 
 
+@pytest.mark.slow  # `test_an_attempt_that_fails_teaches_the_next` ends on a harder one
 def test_a_banana() -> None:
     def log_prob(t):
         bent = t[:, 1] - t[:, 0] ** 2
