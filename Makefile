@@ -17,7 +17,9 @@ report: $(READY)
 reference: $(READY)
 	$(BIN)/calib report --out reports/he2019 --overwrite --no-posteriors
 
-# Tests that share what they sample stay in one process (tests/together.py).
+# Tests that share what they sample stay in one process (tests/together.py). Compiled once: to write
+# their assertions out takes each process six seconds.
+test: export PYTHONDONTWRITEBYTECODE :=
 test: $(READY)
 	$(BIN)/python -m pytest -n auto --dist loadfile
 

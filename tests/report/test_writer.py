@@ -106,10 +106,9 @@ def test_pdfs_come_on_request_only(plate, tmp_path, monkeypatch):
 
 
 def test_made_again_it_is_the_same_to_the_last_byte(rut, report, tmp_path):
-    again = write(rut, tmp_path / "rep", pdf=True)
-    first, second = file_hashes(report), file_hashes(again)
-    assert set(first) == set(second)
-    assert first == second
+    """PDFs are made again in `figures/test_print.py`."""
+    again = file_hashes(write(rut, tmp_path / "rep"))
+    assert again == {n: v for n, v in file_hashes(report).items() if not n.endswith(".pdf")}
 
 
 def test_it_may_be_replaced(rut, tmp_path, monkeypatch):
