@@ -168,7 +168,8 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     ("summary.json/paper_gaps/*/variants/*/probability/*", _chance(0.1)),
     ("summary.json/paper_gaps/*/variants/*", _JUMPS),
     # The ends are quantiles over all hypotheses. Where a few per cent of probability belong to
-    # those that explain much less, 0.01 more of it moves the lower end by 0.05: eight seeds by 0.11.
+    # those that explain much less, 0.01 more of it moves the lower end by 0.05 (eight seeds: by
+    # 0.11 at the most).
     ("{summary.json/paper_gaps,gaps}/*{,/diagnosis.json}/shrink/*/interval/*", _chance(0.25)),
     ("{summary.json/paper_gaps,gaps}/*{,/diagnosis.json}/shrink/*/fraction", _chance(0.1)),
     ("{summary.json/paper_gaps,gaps}/*{,/diagnosis.json}/shrink/*/*", Tolerance("diagnosis", 0.1)),

@@ -157,7 +157,7 @@ def fit(
     from calib import validate_held_out as validate
     from calib.batch.folders import check_folder, fresh_folder
     from calib.cli.display import posterior_table, progress_bars, verdict_line
-    from calib.cli.simulators import say
+    from calib.cli.simulators import say, say_failed
     from calib.inference.emulation.prepared import prepare
     from calib.inference.random import generator
     from calib.models import get_model
@@ -191,6 +191,7 @@ def fit(
     posterior_table(calibration)
     print(verdict_line(calibration))
     good = say(model, emulation)
+    say_failed(model)
     if preference is not None:
         print(preference.sentence)
     told = warnings_of(problem, calibration.draws.mode)

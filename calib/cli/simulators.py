@@ -22,7 +22,8 @@ def say(model: str, emulation: Emulation | None) -> bool:
         f"; on {h.runs} runs not seen it is off by {h.rmse:.3f} noise sds (rms), "
         f"{100 * h.covered:.0f} % inside its 90 % intervals"
     )  # fmt: skip
-    print(f"{model}: emulated from {len(emulation.emulator.training.theta)} runs{seen}")
+    n = len(emulation.runs)
+    print(f"{model}: emulated {f'with {n} more' if emulation.extended else f'from {n}'} runs{seen}")
     if emulation.own_noise:
         print(f"{model}: the simulator has a noise of its own, sd {emulation.own_noise:.3g}")
     if emulation.failed:
@@ -30,12 +31,35 @@ def say(model: str, emulation: Emulation | None) -> bool:
         why = "" if first is None else f", the first as {first.reason}"
         print(
             f"calib: {len(emulation.failed)} of {len(emulation.runs)} runs failed{why}; they are "
-            "listed beside the runs, and the posterior keeps out of where they lie",
+            "listed beside the runs, and the posterior keeps out of where there is no value",
             file=sys.stderr,
         )
     for reason in emulation.reasons:
         print(f"EMULATOR NOT GOOD ENOUGH: {reason}")
     return emulation.passed
+
+
+def say_failed(model: str) -> None:
+    """Say which runs failed of a simulator that the sampler asked itself, and list them."""
+    from calib.inference.emulation.prepared import write_failed
+    from calib.models import get_model
+    from calib.models.simulators.registered import Direct, simulated_by
+
+    direct, found = get_model(model).predict, simulated_by(model)
+    if not isinstance(direct, Direct) or found is None or not direct.tally.failed:
+        return
+    tally, listed = direct.tally, ""
+    if found.folder is not None:
+        path = found.folder / f"{model}-failed.csv"
+        write_failed(tally.failed, direct.simulator.parameters, path)
+        listed = f"; the first {len(tally.failed)} are listed in {path}"
+    first = tally.failed[0].failure
+    print(
+        f"calib: {tally.lost} of {tally.made} runs failed, the first as "
+        f"{'' if first is None else first.reason}{listed}; the posterior keeps out of where there "
+        "is no value",
+        file=sys.stderr,
+    )
 
 
 def keep_emulators(models: Iterable[str], folder: Path) -> None:
@@ -70,14 +94,18 @@ def prepare_case(
         def measured(table: Table, column: str = column) -> Table:
             return table.take(np.isfinite(table[column]))
 
+        priors = case.priors.get(output)
         kept = None if run is None else run / "emulator.npz"
         if kept is not None and kept.exists():
             load_files([kept])
         if not reaches(model, [case.lab, *others]):
             found = prepare(
-                model, measured(case.lab), seed, elsewhere=others, workers=workers, progress=tell
-            )
+                model, measured(case.lab), seed, priors=priors, elsewhere=others, workers=workers,
+                progress=tell,
+            )  # fmt: skip
             said.append((model, found))
-        found = prepare_field(model, measured(case.field), seed, workers=workers, progress=tell)
+        found = prepare_field(
+            model, measured(case.field), seed, priors=priors, workers=workers, progress=tell
+        )
         said.append((f"{model}, field", found))
     return said

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from calib.cli.simulators import say
+from calib.cli.simulators import say, say_failed
 from calib.inference.emulation import Emulation
 from calib.inference.emulation.settings import HeldOut
+from calib.models import MODELS
 from calib.models.simulators.base import Failure
+from calib.models.simulators.files import read_simulator
+from calib.models.simulators.registered import SIMULATED
 from calib.models.simulators.runs import Run
+from tests.models.simulators.examples import write_program
 
 
 def emulation(**other: Any) -> Emulation:
-    training = SimpleNamespace(theta=np.zeros((58, 2)))
     ok, crashed = Run(np.zeros(2), {}), Run(np.zeros(2), {}, Failure("exit", "exit code 3", ""))
     given: dict[str, Any] = {
-        "problem": None, "emulator": SimpleNamespace(training=training), "expected": 0.0,
+        "problem": None, "emulator": None, "expected": 0.0,
         "between": 0.0, "own_noise": 0.0, "passed": True, "reasons": (), "history": (),
         "runs": (ok, ok, crashed), "held_out": HeldOut(20, 0.0456, np.zeros(1), np.zeros(1), 0.95),
     }  # fmt: skip
@@ -32,7 +35,7 @@ def test_a_good_one_is_said_to_be_so_and_its_failed_runs_are_told(
     assert say("sim", emulation())
     told = capsys.readouterr()
     assert told.out == (
-        "sim: emulated from 58 runs; on 20 runs not seen it is off by 0.046 noise sds (rms), "
+        "sim: emulated from 3 runs; on 20 runs not seen it is off by 0.046 noise sds (rms), "
         "95 % inside its 90 % intervals\n"
     )
     assert "1 of 3 runs failed, the first as exit code 3;" in told.err
@@ -45,12 +48,43 @@ def test_one_that_is_not_good_enough_stops_and_says_why(
     assert not say("sim", few)
     said = capsys.readouterr().out.splitlines()
     assert said == [
-        "sim: emulated from 58 runs",
+        "sim: emulated from 3 runs",
         "sim: the simulator has a noise of its own, sd 0.25",
         "EMULATOR NOT GOOD ENOUGH: too few runs",
     ]
 
 
+def test_runs_of_a_field_campaign_are_told_as_such(capsys: pytest.CaptureFixture[str]) -> None:
+    assert say("sim, field", emulation(extended=True, held_out=None))
+    assert capsys.readouterr().out == "sim, field: emulated with 3 more runs\n"
+
+
 def test_of_a_model_that_needs_none_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert say("bekker", None)
     assert capsys.readouterr().out == ""
+
+
+def test_runs_that_fail_under_the_sampler_are_listed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    extra = "print('meshing'); assert p['mu'] < 1, 'the mesh folds'"
+    found = read_simulator(write_program(tmp_path, extra=extra, emulate="false", retries="0"))
+    found.register()
+    try:
+        predict = MODELS["wheel"].predict
+        assert predict is not None
+        x = {"slip_ratio": np.array([0.1]), "normal_load_kn": np.array([4.0])}
+        say_failed("wheel")
+        assert capsys.readouterr().err == ""
+        predict(np.array([[0.5, 0.1], [1.5, 0.1], [2.5, 0.1]]), x)
+        say_failed("wheel")
+        told = capsys.readouterr().err
+    finally:
+        MODELS.discard("wheel")
+        SIMULATED.discard("wheel")
+    assert "2 of 3 runs failed, the first as it ended with exit code 1; the first 2 are" in told
+    assert "wheel-failed.csv" in told
+    listed = (tmp_path / "wheel.runs" / "wheel-failed.csv").read_text()
+    assert listed.startswith("mu,s0,kind,reason,printed\n1.5,0.1,exit,")
+    assert "meshing" in listed
+    assert "the mesh folds" in listed

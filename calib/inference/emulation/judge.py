@@ -72,5 +72,5 @@ def judged(
         )
     return Emulation(
         state.emulated, state.emulator, tuple(state.runs), measured, expected, between, own_noise,
-        not reasons, tuple(reasons), tuple(history),
+        not reasons, tuple(reasons), tuple(history), bool(state.earlier),
     )  # fmt: skip

@@ -16,12 +16,14 @@ from calib.errors import CalibError
 from calib.inference.emulation.sequential import emulate, extend
 from calib.inference.emulation.settings import Emulation, EmulationSettings
 from calib.inference.emulation.tabulated import emulate_table
+from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
 from calib.models import get_model
+from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.emulator.files import save_emulator
 from calib.models.simulators.emulator.model import emulator_of
 from calib.models.simulators.registered import SIMULATED, Simulated, simulated_by, slow_simulator
-from calib.models.simulators.runs import RunKeeper
+from calib.models.simulators.runs import Run, RunKeeper
 from calib.models.simulators.ways import TableWay
 
 _MORE = 100
@@ -103,7 +105,7 @@ def prepare(
     table: Table,
     seed: int,
     *,
-    priors: Path | None = None,
+    priors: PriorFile | None = None,
     elsewhere: Sequence[Table] = (),
     workers: int = 1,
     progress: Progress | None = None,
@@ -124,7 +126,13 @@ def prepare(
 
 
 def prepare_field(
-    model: str, field: Table, seed: int, *, workers: int = 1, progress: Progress | None = None
+    model: str,
+    field: Table,
+    seed: int,
+    *,
+    priors: PriorFile | None = None,
+    workers: int = 1,
+    progress: Progress | None = None,
 ) -> Emulation | None:
     """Have an emulator in use serve a field campaign as well, with 100 more runs at the most.
 
@@ -133,12 +141,40 @@ def prepare_field(
     found, emulator = simulated_by(model), emulator_of(get_model(model))
     if found is None or emulator is None or not found.simulator.way.runs:
         return None
-    problem = build_problem(model, field)
-    settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
-    keeper = _keeper(found, workers, None, progress, _MORE)
-    emulation = extend(emulator, problem, keeper, seed, settings=settings, more=_MORE)
+    problem = build_problem(model, field, priors)
+    emulation = _extended(found, emulator, problem, seed, workers, progress)
     load_files([_kept(found, model, emulation)])
     return emulation
+
+
+def emulated_for_both(
+    model: str,
+    lab: Table,
+    field: Table,
+    seed: int,
+    *,
+    priors: PriorFile | None = None,
+    elsewhere: Sequence[Table] = (),
+) -> list[Emulation]:
+    """Emulate a model's simulator for a diagnosis, as `prepare` and `prepare_field` do.
+
+    The model is not made the emulator here: that of the last emulation's problem is it.
+    """
+    found = _simulated(model)
+    first = emulated(build_problem(model, lab, priors), seed, elsewhere=[field, *elsewhere])
+    if not found.simulator.way.runs:
+        return [first]
+    problem = build_problem(model, field, priors)
+    return [first, _extended(found, first.emulator, problem, seed, 1, None)]
+
+
+def _extended(
+    found: Simulated, emulator: Emulator, problem: Problem, seed: int, workers: int,
+    progress: Progress | None,
+) -> Emulation:  # fmt: skip
+    settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
+    keeper = _keeper(found, workers, None, progress, _MORE)
+    return extend(emulator, problem, keeper, seed, settings=settings, more=_MORE)
 
 
 def reaches(model: str, tables: Sequence[Table]) -> bool:
@@ -159,21 +195,22 @@ def _kept(found: Simulated, model: str, emulation: Emulation) -> Path:
     digest = hashlib.sha256(theta.tobytes() + found.simulator.digest.encode()).hexdigest()[:16]
     path = folder / f"{model}-{digest}.npz"
     save_emulator(emulation.emulator, model, path)
-    write_failed(emulation, found.simulator.parameters, folder / f"{model}-failed.csv")
+    write_failed(emulation.failed, found.simulator.parameters, folder / f"{model}-failed.csv")
     report = json.dumps(emulation.document(), indent=1)
     (folder / f"{model}-{digest}.json").write_text(report + "\n", encoding="utf-8")
     return path
 
 
-def write_failed(emulation: Emulation, parameters: Sequence[str], path: Path) -> None:
-    """List the runs that failed with their parameters and the tail of what they printed."""
-    if not emulation.failed:
+def write_failed(failed: Sequence[Run], parameters: Sequence[str], path: Path) -> None:
+    """List runs that failed with their parameters and the tail of what they printed."""
+    if not failed:
         path.unlink(missing_ok=True)
         return
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([*parameters, "kind", "reason", "printed"])
-        for run in emulation.failed:
+        for run in failed:
             if run.failure is not None:
                 what = run.failure.kind, run.failure.reason, run.failure.printed.strip()
                 writer.writerow([*map(repr, run.theta.tolist()), *what])

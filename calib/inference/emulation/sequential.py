@@ -20,28 +20,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.batch.threads import one_thread
+from calib.inference.design import prior_design, prior_middle
 from calib.inference.emulation.judge import WORTH, held_out, judged
 from calib.inference.emulation.nodes import across_zero, choose_nodes
 from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut
-from calib.inference.emulation.state import State
+from calib.inference.emulation.state import State, across_too
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
 from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.emulator.kriging import correlation
-from calib.models.simulators.runs import RunKeeper
+from calib.models.simulators.refused import FIRST, FROM_THE_START, fail_alike
+from calib.models.simulators.runs import Run, RunKeeper
 
 _CANDIDATES = 400
 # Some of the candidates are so many times as far from the posterior's middle as its draws.
 _WIDER = 1.6
 # How far in posterior sds a run is taken to tell of others when a batch is picked.
 _APART = 2.0
-_TRIMMED = 0.002
 _LEAST_OK = 0.5
-# Of a simulator with values in half of its prior, the least that is taken, so many runs fail all of
-# them once in 32 times at most, and less often as they are spread evenly. A mistake in its file or
-# program fails in every run, and need not be paid for sixty times.
-_FIRST = 5
 
 
 @one_thread()
@@ -60,13 +57,13 @@ def emulate(
     Raises
     ------
     CalibError
-        If the first five runs fail in one way, fewer than half of those over the prior have a
+        If the first five runs over the prior fail in one way, fewer than half of its runs have a
         value, or none where the data are: with where the others failed and what they printed.
     """
     chosen = settings or EmulationSettings()
     recorded = [problem.conditions, *(problem.bound.model.select(e) for e in elsewhere)]
-    nodes, across = _nodes(problem, keeper, recorded, chosen.nodes)
-    state = State(problem, keeper, nodes, seed, chosen.runs, across=across)
+    nodes, across, tried = _nodes(problem, keeper, recorded, chosen.nodes)
+    state = State(problem, keeper, nodes, seed, chosen.runs, across=across, tried=tried)
     own_noise = _first_design(state, chosen)
     state.rebuild()
     return _improved(state, chosen, chosen.runs, own_noise)
@@ -95,20 +92,22 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
     """Make runs where the posterior needs them, then some to check the emulator on."""
     history: list[tuple[int, float]] = []
     batch = max(2 * int(state.free.sum()), 4)
-    checks = min(chosen.checks, most // 5) if chosen.sequential else 0
+    checks = chosen.checks_of(most)
     state.sample(0)
     all_ran = True
     while True:
         state.rebuild()
         z = state.sample(len(history) + 1)
         history.append((len(state.runs), state.error(z)))
-        room = most - checks - len(state.runs)
+        room = state.left - checks
         if room < 1 or (all_ran and _settled(history, chosen.tolerance)):
             break
         theta = state.axes.natural(_next(state, z, min(batch, room), len(history)))
         values = state.carry_out(theta)
         all_ran = bool(np.isfinite(values).all())
         state.learn(theta, values)
+    # Runs that failed across zero and were made again may have taken some of them.
+    checks = min(checks, state.left)
     measured = _check(state, z, checks, len(history)) if checks else None
     state.rebuild()
     if not state.holds(z).any():
@@ -118,20 +117,21 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
 
 def _nodes(
     problem: Problem, keeper: RunKeeper, recorded: Sequence[Mapping[str, Array]], count: int | None
-) -> tuple[dict[str, Array], NDArray[np.bool_] | None]:
+) -> tuple[dict[str, Array], NDArray[np.bool_] | None, tuple[Run, ...]]:
     """Choose nodes, across zero if the simulator has values there in the middle of the prior.
 
-    Return with them which of them lie across zero.
+    Return with them which of them lie across zero, and the run that told, if one was made.
     """
-    middle = problem.theta(problem.priors.ppf(np.full((1, len(problem.priors.free)), 0.5)))[:, :-1]
     ranges = keeper.simulator.ranges
     inside = choose_nodes(recorded, ranges, count)
     wide = choose_nodes(recorded, ranges, count, across_zero=True)
     if all(np.array_equal(inside[name], wide[name]) for name in inside):
-        return inside, None
-    if not keeper.runs(middle, wide)[0].ok:
-        return inside, None
-    return wide, across_zero({n: v for n, v in wide.items() if n not in ranges}, recorded)
+        return inside, None, ()
+    tried = tuple(keeper.runs(prior_middle(problem), wide))
+    if not tried[0].ok:
+        return inside, None, tuple(map(across_too, tried))
+    across = across_zero({n: v for n, v in wide.items() if n not in ranges}, recorded)
+    return wide, across, tried
 
 
 def _settled(history: Sequence[tuple[int, float]], tolerance: float) -> bool:
@@ -141,22 +141,27 @@ def _settled(history: Sequence[tuple[int, float]], tolerance: float) -> bool:
 
 def _first_design(state: State, chosen: EmulationSettings) -> float:
     """Spread runs over the prior, some of them twice; return the sd of the simulator's noise."""
-    d = int(state.free.sum())
-    count = chosen.runs if not chosen.sequential else chosen.first or 10 * d
+    d, deterministic = int(state.free.sum()), state.keeper.simulator.deterministic
+    before = len(state.runs)
     theta = prior_design(
-        state.problem, min(count, chosen.runs), state.seed, latin=not chosen.sequential
-    )
-    values = state.carry_out(theta[:_FIRST])
-    if state.one_failure():
-        raise state.without_value("it fails from the start, and no more runs were made")
-    values = np.concatenate([values, state.carry_out(theta[_FIRST:])])
+        state.problem, chosen.spread(d, deterministic, before), state.seed,
+        latin=not chosen.sequential,
+    )  # fmt: skip
+    values = state.carry_out(theta[:FIRST])
+    if fail_alike(state.runs[before:]) and fail_alike(state.runs):
+        raise state.without_value(FROM_THE_START)
+    # Runs that failed across zero and were made again may have taken some of them.
+    theta = theta[: FIRST + state.left]
+    values = np.concatenate([values, state.carry_out(theta[FIRST:])])
     ok = np.isfinite(values).all(axis=1)
     if ok.mean() < _LEAST_OK:
         raise state.without_value("the simulator fails in most of its prior")
     state.learn(theta, values)
-    repeats = np.flatnonzero(ok)[: 1 if state.keeper.simulator.deterministic else 5]
-    times = [1] if state.keeper.simulator.deterministic else [1, 2]
-    again = [state.carry_out(theta[repeats], r) for r in times]
+    count, times = chosen.repeats(deterministic)
+    repeats = np.flatnonzero(ok)[: min(count, state.left // times)]
+    if not repeats.size:
+        return 0.0
+    again = [state.repeat(theta[repeats], r) for r in range(1, times + 1)]
     apart = state.tamed(np.stack([values[repeats], *again]))
     own = float(np.sqrt(np.nanmean(apart.var(axis=0, ddof=1))))
     if own > 1e-6 * float(np.nanstd(state.tamed(values))):
@@ -165,24 +170,6 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
             state.learn(theta[repeats], found)
         return own
     return 0.0
-
-
-def prior_design(problem: Problem, count: int, seed: int, *, latin: bool = False) -> Array:
-    """Return natural parameters spread over the prior, shape (count, d).
-
-    By Sobol's sequence, of which every beginning is even, or a Latin hypercube.
-    """
-    from scipy.stats import qmc  # late: half a second, and few commands emulate
-
-    d = len(problem.priors.free)
-    bits = int(np.ceil(np.log2(max(count, 2))))
-    rng = generator(seed, "emulate", "design")
-    if latin:
-        u = qmc.LatinHypercube(d, rng=rng).random(count)
-    else:
-        u = qmc.Sobol(d, scramble=True, rng=rng).random_base2(bits)[:count]
-    t = problem.priors.ppf(_TRIMMED + (1.0 - 2.0 * _TRIMMED) * u)
-    return problem.theta(t)[:, :-1]
 
 
 def _next(state: State, z: Array, count: int, step: int) -> Array:

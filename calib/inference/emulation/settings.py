@@ -19,7 +19,8 @@ class EmulationSettings:
     Parameters
     ----------
     runs : int
-        At most, those of an earlier call with the same cache among them.
+        At most, whatever they are made for, those of an earlier call with the same cache among
+        them. A run that is tried again after it failed counts once.
     first : int, optional
         Of the space-filling design over the prior; ten for each parameter by default.
     checks : int
@@ -41,6 +42,20 @@ class EmulationSettings:
     tolerance: float = 0.1
     nodes: int | None = None
     sequential: bool = True
+
+    def checks_of(self, most: int) -> int:
+        """How many of so many runs are kept for the check."""
+        return min(self.checks, most // 5) if self.sequential else 0
+
+    def repeats(self, deterministic: bool) -> tuple[int, int]:
+        """How many of the first runs are made again, to see whether they differ, and how often."""
+        return (1, 1) if deterministic else (min(5, max(self.runs // 10, 1)), 2)
+
+    def spread(self, free: int, deterministic: bool, made: int = 1) -> int:
+        """How many runs are spread over the prior of so many parameters, where some are made."""
+        runs, times = self.repeats(deterministic)
+        most = max(self.runs - made - runs * times - self.checks_of(self.runs), 1)
+        return min(self.first or 10 * free, most) if self.sequential else most
 
 
 @dataclass(frozen=True)
@@ -69,7 +84,7 @@ class Emulation:
         To be calibrated: its model is the emulator.
     emulator : Emulator
     runs : tuple of Run
-        All that were asked for, those that failed among them.
+        All that were asked for: probes, repeats and those that failed among them.
     held_out : HeldOut, optional
         None where no run was left for it.
     expected : float
@@ -84,6 +99,8 @@ class Emulation:
         Why not.
     history : tuple of (int, float)
         Runs, and the expected error then.
+    extended : bool
+        Whether an emulator that was there serves another campaign, to which the runs were added.
     """
 
     problem: Problem
@@ -96,6 +113,7 @@ class Emulation:
     passed: bool
     reasons: tuple[str, ...]
     history: tuple[tuple[int, float], ...]
+    extended: bool = False
 
     @property
     def failed(self) -> tuple[Run, ...]:

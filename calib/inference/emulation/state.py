@@ -18,6 +18,7 @@ from calib.models.base import Array
 from calib.models.simulators.emulator import Axes, Emulator, Training, build_emulator
 from calib.models.simulators.emulator.model import emulated_model
 from calib.models.simulators.emulator.region import Region
+from calib.models.simulators.refused import without_value
 from calib.models.simulators.runs import Run, RunKeeper
 
 # Draws on the way to the next runs: for a picture, not for a result.
@@ -37,14 +38,15 @@ _AGAIN = 99
 class State:
     """What is known so far for a problem's posterior; `nodes` (m,) are conditions of each run.
 
-    `most` runs are made at the most when a run that failed is made again. Nodes `across` zero (m,)
-    serve a diagnosis only, which asks what another rolling radius does to small slips: they are
-    given up where runs near the posterior are wild there, or have a value but for them.
+    `most` runs are made at the most, those that were `tried` before among them. Nodes `across` zero
+    (m,) serve a diagnosis only, which asks what another rolling radius does to small slips: they
+    are given up where runs near the posterior are wild there, or have a value but for them.
     """
 
     def __init__(
         self, problem: Problem, keeper: RunKeeper, nodes: Mapping[str, Array], seed: int,
         most: int = 0, label: str = "emulate", across: NDArray[np.bool_] | None = None,
+        tried: Sequence[Run] = (),
     ) -> None:  # fmt: skip
         self.problem, self.keeper, self.nodes = problem, keeper, nodes
         self.seed, self.most, self.label = seed, most, label
@@ -54,13 +56,16 @@ class State:
         n = next(iter(nodes.values())).size
         self.across = np.zeros(n, dtype=bool) if across is None else across
         self.training = Training(np.zeros((0, len(entries))), np.zeros((0, n)), nodes)
-        self.runs: list[Run] = []
+        self.runs: list[Run] = list(tried)
         self.sigma = _FIRST_NOISE * float(problem.response.std())
         self.emulator: Emulator | None = None
         self.emulated = problem
         self.mode: Array | None = None
         self.region: Region | None = None
         self.earlier: tuple[Region, ...] = ()
+        for run in tried:
+            if run.ok:
+                self.learn(run.theta[None], self._response(run, n)[None])
 
     @classmethod
     def beyond(
@@ -74,31 +79,49 @@ class State:
         state._emulate(emulator)
         return state
 
+    @property
+    def left(self) -> int:
+        """How many runs may still be made."""
+        return max(self.most - len(self.runs), 0)
+
     def _emulate(self, emulator: Emulator) -> None:
         model = emulated_model(self.problem.bound.model, emulator)
         self.emulated = replace(self.problem, bound=replace(self.problem.bound, model=model))
 
-    def carry_out(self, theta: Array, replicate: Sequence[int] | int = 0) -> Array:
+    def carry_out(self, theta: Array) -> Array:
         """Make runs; return their values on the scale of the response, shape (k, m)."""
-        values = self._made(theta, self.nodes, replicate)
+        values = self._made(theta, self.nodes)
         lost = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        if lost.size and self._fails_across(theta[lost[:1]]):
+        before = len(self.runs)
+        plain = self._without_across(theta[lost[0]]) if lost.size else None
+        if plain is not None:
+            self.runs = [*map(across_too, self.runs[:before]), *self.runs[before:]]
             values = values[:, ~self.across]
             self._give_up_across()
             if self.emulator is not None:
                 self.rebuild()
-            lost = lost[: max(self.most - len(self.runs), 0)]
-            values[lost] = self._made(theta[lost], self.nodes, replicate)
+            values[lost[0]] = plain
+            lost = lost[1 : 1 + self.left]
+            values[lost] = self._made(theta[lost], self.nodes)
         return values
 
-    def _fails_across(self, theta: Array) -> bool:
-        """Whether a run that failed has a value but for nodes across zero, and not by chance."""
-        if self.earlier or not self.across.any() or self.most - len(self.runs) < 2:
-            return False
+    def repeat(self, theta: Array, replicate: int) -> Array:
+        """Make runs that had a value again; return values as `carry_out` does."""
+        return self._made(theta, self.nodes, replicate)
+
+    def _without_across(self, theta: Array) -> Array | None:
+        """Return the values of a run (d,) that failed, made again but for nodes across zero.
+
+        None if it fails there too, or failed by chance.
+        """
+        if self.earlier or not self.across.any() or self.left < 2:
+            return None
         plain = {name: v[~self.across] for name, v in self.nodes.items()}
-        if not np.isfinite(self._made(theta, plain)).all():
-            return False
-        return not np.isfinite(self._made(theta, self.nodes, _AGAIN)).all()
+        (found,) = self._made(theta[None], plain)
+        if not np.isfinite(found).all():
+            return None
+        again = self._made(theta[None], self.nodes, _AGAIN)
+        return None if np.isfinite(again).all() else np.asarray(found)
 
     def _give_up_across(self) -> None:
         """Go on without the nodes across zero; of the runs so far the other values are kept."""
@@ -109,18 +132,18 @@ class State:
             self.training, values=self.training.values[:, kept], nodes=self.nodes
         )
 
-    def _made(
-        self, theta: Array, nodes: Mapping[str, Array], replicate: Sequence[int] | int = 0
-    ) -> Array:
+    def _made(self, theta: Array, nodes: Mapping[str, Array], replicate: int = 0) -> Array:
         found = self.keeper.runs(theta, nodes, replicate)
         self.runs += found
-        values = np.full((len(theta), next(iter(nodes.values())).size), np.nan)
-        output = self.problem.bound.model.output
+        n = next(iter(nodes.values())).size
+        return np.array([self._response(run, n) for run in found]).reshape(-1, n)
+
+    def _response(self, run: Run, n: int) -> Array:
+        """Return a run's values on the scale of the response, NaN if it has none, shape (n,)."""
+        if not run.ok:
+            return np.full(n, np.nan)
         with np.errstate(all="ignore"):
-            for i, run in enumerate(found):
-                if run.ok:
-                    values[i] = self.problem.bound.to_response(run.outputs[output])
-        return values
+            return self.problem.bound.to_response(run.outputs[self.problem.bound.model.output])
 
     def learn(self, theta: Array, values: Array) -> None:
         """Take runs into the training."""
@@ -189,42 +212,9 @@ class State:
         self.region = _region(z, self.free)
         return z
 
-    def one_failure(self) -> bool:
-        """Whether all runs so far have failed, and in the same way."""
-        kinds = {None if run.failure is None else run.failure.kind for run in self.runs}
-        return len(kinds) == 1 and None not in kinds
-
     def without_value(self, why: str) -> CalibError:
         """Return what to say where runs that failed are in the way."""
-        failures = [run.failure for run in self.runs if run.failure is not None]
-        if not failures:
-            return CalibError(
-                f"{why}, although every run has a value", where=self._where,
-                mend="check that the data's units and the priors' scales fit each other",
-            )  # fmt: skip
-        first, names = failures[0], self.keeper.simulator.parameters
-        ok = np.array([run.ok for run in self.runs])
-        theta = np.stack([run.theta for run in self.runs])
-        at = f", at {_ranges(names, theta[~ok])}"
-        at += f"; those with a value are at {_ranges(names, theta[ok])}" if ok.any() else ""
-        folder = self.keeper.folder
-        kept = "" if folder is None else (
-            f"; the runs, failed ones too, are kept in {folder}: delete it after a mend outside "
-            "the files that the simulator's own names"
-        )  # fmt: skip
-        printed = f"; it printed: {first.printed.strip()}" if first.printed.strip() else ""
-        return CalibError(
-            f"{why}: only {ok.sum()} of the {ok.size} runs have a value "
-            f"({first.kind}: {first.reason}{printed}){at}",
-            where=self._where,
-            allowed="a simulator with values in at least half of its prior, and where the data are",
-            mend="correct the simulator or its limit of time where it fails, or give priors that "
-            f"do not reach there{kept}",
-        )  # fmt: skip
-
-    @property
-    def _where(self) -> str:
-        return f"simulator {self.keeper.simulator.name}"
+        return without_value(why, self.keeper.simulator, self.runs, self.keeper.folder)
 
     def error(self, z: Array) -> float:
         """The emulator's expected error at draws, rms over the rows, in sds of the noise."""
@@ -246,11 +236,12 @@ class State:
         return np.asarray(variances @ (curves**2).sum(axis=0))
 
 
-def _ranges(names: Sequence[str], theta: Array) -> str:
-    low, high = theta.min(axis=0), theta.max(axis=0)
-    return ", ".join(
-        f"{n} {a:.4g} to {b:.4g}" for n, a, b in zip(names, low, high, strict=True)
-    )  # fmt: skip
+def across_too(run: Run) -> Run:
+    """Say of a run that failed that it was asked across zero, which is given up."""
+    if run.failure is None:
+        return run
+    reason = f"{run.failure.reason} (with conditions below zero, which are not asked for any more)"
+    return replace(run, failure=replace(run.failure, reason=reason))
 
 
 def _axes(problem: Problem) -> Axes:

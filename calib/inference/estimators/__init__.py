@@ -16,6 +16,7 @@ from calib.inference.estimators.differential_evolution import estimate_different
 from calib.inference.estimators.genetic import GeneticSettings, estimate_genetic, minimise_genetic
 from calib.inference.estimators.least_squares import estimate_least_squares
 from calib.inference.problem import Problem
+from calib.inference.trial import try_simulator
 from calib.models import get_model
 
 __all__ = [
@@ -116,6 +117,7 @@ def estimate(
             allowed=", ".join(methods_for(model)),
             mend="use one of these methods",
         )
+    try_simulator(problem)
     return METHODS[method].estimate(problem, rng, **settings)
 
 

@@ -16,6 +16,7 @@ from calib.inference.sampling.adapt import Guess, adapt, refit
 from calib.inference.sampling.gate import Gate, GateReport, judge
 from calib.inference.sampling.mode import Mode, find_modes
 from calib.inference.sampling.proposal import Proposal
+from calib.inference.trial import try_simulator
 from calib.models.base import Array
 
 type Progress = Callable[[int, int], None]
@@ -110,6 +111,7 @@ def sample_posterior(
     CalibError
         If no parameters of positive probability can be found.
     """
+    try_simulator(problem)
     chosen = _fitting(settings or SamplerSettings(), problem)
     root = np.random.SeedSequence(seed) if isinstance(seed, int) else seed
     seeds = root.spawn(1 + chosen.ensembles)

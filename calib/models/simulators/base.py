@@ -25,6 +25,9 @@ type Values = Mapping[str, Array]
 
 # Of what a failed run printed, so many characters are kept.
 _TAIL = 600
+# The key of a simulator file that a failed run has to do with, if not the one that says how it is
+# run.
+_KEYS: Mapping[str, str] = {"time": "limit", "short": "outputs", "unreadable": "outputs"}
 
 
 @dataclass(frozen=True)
@@ -50,12 +53,24 @@ class Failure:
 type Result = Values | Failure
 
 
+class Printed(dict[str, Array]):
+    """Outputs of a run that printed something besides, for the message if they will not do."""
+
+    def __init__(self, outputs: Values, printed: str) -> None:
+        super().__init__(outputs)
+        self.printed = printed
+
+
 class Way(Protocol):
     """How a simulator is carried out."""
 
     @property
     def identity(self) -> str:
         """What results depend on besides parameters and conditions, as text."""
+
+    @property
+    def key(self) -> str:
+        """The key of a simulator file that says how it is run."""
 
     @property
     def runs(self) -> bool:
@@ -111,6 +126,8 @@ class Simulator:
         Bounds within which it may be asked, by canonical condition.
     made_of : tuple of str
         SHA-256 of what its results depend on beside what it is run by: libraries, tables of soils.
+    file : str
+        That it was read from, if any.
     """
 
     name: str
@@ -127,6 +144,7 @@ class Simulator:
     emulate: bool = True
     ranges: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     made_of: tuple[str, ...] = ()
+    file: str = ""
 
     @property
     def digest(self) -> str:
@@ -139,6 +157,12 @@ class Simulator:
     def canonical(self, header: str) -> str:
         """Return the canonical column of one of its headers, which must name a known quantity."""
         return _parsed(header, self.name)[0]
+
+    def place(self, kind: Kind = "error") -> str:
+        """Return where to look if runs fail in some way: the file and the key, for messages."""
+        if not self.file:
+            return f"simulator {self.name}"
+        return f"{self.file}, {_KEYS.get(kind, self.way.key)}"
 
     @property
     def takes(self) -> tuple[str, ...]:
@@ -155,10 +179,13 @@ class Simulator:
         asked = self.asked(conditions)
         n = next(iter(asked.values())).size
         found: Result = Failure("error", "it was not run")
-        for _ in range(1 + self.retries):
-            found = self._once(parameters, asked, n)
-            if not isinstance(found, Failure):
-                return found
+        try:
+            for _ in range(1 + self.retries):
+                found = self._once(parameters, asked, n)
+                if not isinstance(found, Failure):
+                    return found
+        except CalibError as error:
+            raise error.within(self.place()) from None
         return found
 
     def asked(self, conditions: Mapping[str, Array]) -> dict[str, Array]:
@@ -209,14 +236,17 @@ def no_output(column: str, found: Iterable[str]) -> str:
 
 def checked(found: Values, column: str, n: int) -> Array | Failure:
     """Return one output as n numbers, or why it is not that."""
+    printed = found.printed if isinstance(found, Printed) else ""
     if column not in found:
-        return Failure("unreadable", no_output(column, found))
+        return Failure("unreadable", no_output(column, found), printed)
     values = np.asarray(found[column], dtype=np.float64).ravel()
     if values.size != n:
-        return Failure("short", f"{column} has {values.size} values for {n} rows of conditions")
+        what = f"{column} has {values.size} values for {n} rows of conditions"
+        return Failure("short", what, printed)
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
-        return Failure("nan", f"{column} is not finite in {bad.size} of {n} rows, first {bad[0]}")
+        what = f"{column} is not finite in {bad.size} of {n} rows, first {bad[0]}"
+        return Failure("nan", what, printed)
     return values
 
 

@@ -103,6 +103,7 @@ def read_simulator(path: Path) -> Simulated:
             budget=file.emulator.model_dump(), title=file.title, source=file.source,
             limit=file.limit, retries=file.retries, deterministic=file.deterministic,
             emulate=file.emulate, ranges=_ranges(file, path), made_of=_made_of(file, path),
+            file=str(path),
         )  # fmt: skip
     except CalibError as error:
         where = str(path) if error.where is None else f"{path}, {error.where}"
@@ -242,6 +243,11 @@ def _umbridge(file: SimulatorFile, path: Path) -> UmbridgeWay:
 
 def _of_table(file: SimulatorFile, path: Path) -> TableWay:
     where = path.parent / file.table
+    if not file.emulate:
+        raise CalibError(
+            "a table of runs has none where a sampler asks", where=f"{path}, emulate",
+            allowed="emulate = true, which is so by itself", mend="leave emulate out",
+        )  # fmt: skip
     try:
         content = where.read_bytes()
     except OSError as error:

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -23,6 +24,10 @@ _PRINTED = ".printed"
 _END = 4096
 # What a program and all that it starts have in their environment.
 _MARK = "CALIB_RUN"
+# How long what was killed is waited for: what hangs in the kernel, on a disk that is gone, may not
+# come to its end.
+_GIVE_UP = 5.0
+_PAUSE = 0.01
 
 
 def run_program(
@@ -33,7 +38,8 @@ def run_program(
     Return what it printed (of which, if not the `whole`, the end), or why it failed. It leads a
     process group (a session of its own), which is killed when it has come to its end, when the
     limit has passed, and when this process is interrupted: what it started ends with it. On Linux
-    so does what has left the group, which is known by a variable of its environment.
+    so does what has left the group, which is known by a variable of its environment. What the
+    kernel cannot end is left after some seconds.
 
     Raises
     ------
@@ -139,12 +145,15 @@ def _end(child: subprocess.Popen[bytes], mark: str) -> None:
             child.kill()
         else:
             os.killpg(child.pid, signal.SIGKILL)
-    child.wait()
+    with suppress(subprocess.TimeoutExpired):
+        child.wait(_GIVE_UP)
     # One that is killed may have started another meanwhile.
-    while left := _marked(mark):
+    until = time.monotonic() + _GIVE_UP
+    while (left := _marked(mark)) and time.monotonic() < until:
         for pid in left:
             with suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
+        time.sleep(_PAUSE)
 
 
 def _marked(mark: str) -> list[int]:

@@ -6,7 +6,7 @@ import json
 import math
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,12 @@ from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.models.base import Array, Conditions, Model
 from calib.models.simulators.base import Failure, Output, Simulator
+from calib.models.simulators.refused import FROM_THE_START, fail_alike, without_value
+from calib.models.simulators.runs import Run
 from calib.models.simulators.ways import CallableWay
+
+# So many of the runs that failed are listed, where a sampler asks for thousands.
+_LISTED = 200
 
 
 @dataclass(frozen=True)
@@ -73,14 +78,50 @@ def slow_simulator(model: str) -> Simulated | None:
     return found if found is not None and found.simulator.emulate else None
 
 
+@dataclass
+class Tally:
+    """What this process has asked of a simulator: runs, those that failed, the first of these."""
+
+    tried: bool = False
+    made: int = 0
+    lost: int = 0
+    failed: list[Run] = field(default_factory=list)
+
+    def add(self, run: Run) -> None:
+        """Count a run."""
+        self.made += 1
+        if run.failure is not None:
+            self.lost += 1
+            self.failed += [run] * (len(self.failed) < _LISTED)
+
+
 @dataclass(frozen=True)
-class _Direct:
+class Direct:
     """Asks a simulator for each parameter vector: only where it is quick enough for that."""
 
     simulator: Simulator
     output: str
+    tally: Tally = field(default_factory=Tally, repr=False, compare=False)
+
+    def try_first(self, thetas: Array, conditions: Conditions) -> None:
+        """Refuse a simulator that fails at each of some parameters (k, d), and in the same way.
+
+        Once for each process. One that is emulated or takes all parameter vectors at once is not
+        tried: what that raises is told at once, and its NaN stand for no value.
+        """
+        if self.tally.tried or self.simulator.emulate or self._at_once:
+            return
+        runs: list[Run] = []
+        for theta in thetas:
+            runs.append(self._run(theta, conditions))
+            if runs[-1].ok:
+                break
+        if fail_alike(runs):
+            raise without_value(FROM_THE_START, self.simulator, runs, None)
+        self.tally.tried = True
 
     def __call__(self, theta: Array, conditions: Conditions) -> Array:
+        """Return the output of parameters (k, d) at conditions (n,), (k, n); NaN if a run fails."""
         if self.simulator.emulate:
             raise CalibError(
                 f"the simulator {self.simulator.name} is not run for each parameter vector that a "
@@ -89,12 +130,26 @@ class _Direct:
                 mend="emulate it first, or declare it with emulate = false",
             )
         way = self.simulator.way
-        if isinstance(way, CallableWay) and way.batched:
+        if isinstance(way, CallableWay) and self._at_once:
             asked = self.simulator.asked(conditions)
-            return self.simulator.converted(way.call(theta, asked), self.output)
-        found = [self.simulator.run(t, conditions) for t in theta]
+            try:
+                return self.simulator.converted(way.call(theta, asked), self.output)
+            except CalibError as error:
+                raise error.within(self.simulator.place()) from None
         empty = np.full(next(iter(conditions.values())).shape[-1], np.nan)
-        return np.stack([empty if isinstance(f, Failure) else f[self.output] for f in found])
+        runs = [self._run(t, conditions) for t in theta]
+        return np.stack([run.outputs.get(self.output, empty) for run in runs])
+
+    @property
+    def _at_once(self) -> bool:
+        """Whether the simulator takes all parameter vectors in one call."""
+        return isinstance(self.simulator.way, CallableWay) and self.simulator.way.batched
+
+    def _run(self, theta: Array, conditions: Conditions) -> Run:
+        found = self.simulator.run(theta, conditions)
+        run = Run(theta, {}, found) if isinstance(found, Failure) else Run(theta, found)
+        self.tally.add(run)
+        return run
 
 
 def models_of(simulator: Simulator) -> tuple[Model, ...]:
@@ -114,7 +169,7 @@ def _model(simulator: Simulator, output: Output) -> Model:
         output=column,
         conditions=simulator.takes,
         parameters=simulator.parameters,
-        predict=_Direct(simulator, column),
+        predict=Direct(simulator, column),
         response="log" if log else "identity",
         source=simulator.source,
         parametrisation="The parameters of the simulator are sampled.",
@@ -214,8 +269,15 @@ def declare(
     parameters = tuple(t for t in tables if t not in sigmas.values())
     text = "\n".join(tables[t] for t in parameters)
     simulator = Simulator(name, way, parameters, text, conditions, declared, **details)
-    for header in (*conditions.values(), *outputs.values()):
-        simulator.canonical(header)
+    for key, table in (("conditions", conditions), ("outputs", outputs)):
+        for own, header in table.items():
+            try:
+                simulator.canonical(header)
+            except CalibError as error:
+                raise CalibError(
+                    error.message, where=f"simulator {name}, {key}.{own}", allowed=error.allowed,
+                    mend=error.mend,
+                ) from None  # fmt: skip
     return Simulated(simulator, folder, budget)
 
 

@@ -130,10 +130,10 @@ class RunKeeper:
         self.kept += len(outcome.resumed)
         self.made += len(items) - len(outcome.resumed)
         if outcome.failed:
-            first = next(iter(outcome.failed.values()))
+            first, place = next(iter(outcome.failed.values())), self.simulator.place()
             raise CalibError(
                 f"{len(outcome.failed)} of {len(items)} runs could not be made: {first}",
-                where=f"simulator {self.simulator.name}",
+                where=None if place in first else place,
             )
         return {name: _read(folder / f"{name}.json") for name in outcome.done}
 

@@ -12,15 +12,17 @@ import urllib.error
 import urllib.request
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from http.client import HTTPException
 from pathlib import Path
 from typing import Any, Literal
+from urllib.parse import urlsplit
 
 import numpy as np
 
 from calib.batch.plugins import declared_in
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.models.simulators.base import Failure, Result, no_output, tail
+from calib.models.simulators.base import Failure, Printed, Result, no_output, tail
 from calib.models.simulators.exchange import filled, input_csv, input_json, output_of_text
 from calib.models.simulators.process import call_function, run_program
 
@@ -54,6 +56,11 @@ class CallableWay:
         except (OSError, TypeError):
             source = repr(self.function)
         return f"callable {getattr(self.function, '__qualname__', '')} {self.batched}\n{source}"
+
+    @property
+    def key(self) -> str:
+        """The key of a simulator file."""
+        return "python"
 
     @property
     def runs(self) -> bool:
@@ -141,6 +148,11 @@ class CommandWay:
         return json.dumps(["command", *what, dict(self.patterns), self.each_row])
 
     @property
+    def key(self) -> str:
+        """The key of a simulator file."""
+        return "run"
+
+    @property
     def runs(self) -> bool:
         """Always."""
         return True
@@ -162,16 +174,19 @@ class CommandWay:
         """Run it once, or once for each row."""
         if not self.each_row:
             return self._one(parameters, conditions)
-        found: list[Mapping[str, Array]] = []
+        found: list[Printed] = []
         for i in range(next(iter(conditions.values())).size):
             one = self._one(parameters, {name: v[i : i + 1] for name, v in conditions.items()})
             if isinstance(one, Failure):
                 return Failure(one.kind, f"row {i} of the conditions: {one.reason}", one.printed)
             found.append(one)
         common = set(found[0]).intersection(*found)
-        return {name: np.concatenate([one[name] for one in found]) for name in common}
+        outputs = {name: np.concatenate([one[name] for one in found]) for name in common}
+        return Printed(outputs, found[-1].printed)
 
-    def _one(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+    def _one(
+        self, parameters: Mapping[str, float], conditions: Mapping[str, Array]
+    ) -> Printed | Failure:
         with tempfile.TemporaryDirectory(prefix="calib-run-", ignore_cleanup_errors=True) as name:
             scratch = Path(name)
             given, taken = scratch / f"input.{self._ending}", scratch / f"output.{self.gives}"
@@ -183,7 +198,7 @@ class CommandWay:
                 return printed
             return self._read(taken, printed)
 
-    def _read(self, taken: Path, printed: str) -> Result:
+    def _read(self, taken: Path, printed: str) -> Printed | Failure:
         text = printed
         if self._leaves_file:
             try:
@@ -193,7 +208,7 @@ class CommandWay:
         found = output_of_text(text, self.gives, self.patterns)
         if isinstance(found, Failure):
             return Failure(found.kind, found.reason, tail(printed))
-        return found
+        return Printed(found, tail(printed))
 
     @property
     def _leaves_file(self) -> bool:
@@ -249,6 +264,11 @@ class UmbridgeWay:
         return json.dumps(["umbridge", self.url, self.model, self.columns, self.rows])
 
     @property
+    def key(self) -> str:
+        """The key of a simulator file."""
+        return "url"
+
+    @property
     def runs(self) -> bool:
         """Always."""
         return True
@@ -271,9 +291,15 @@ class UmbridgeWay:
                 return reply
             vectors = reply.get("output")
             if not isinstance(vectors, list) or len(vectors) != len(self.columns):
-                return Failure("unreadable", f"the reply has no {len(self.columns)} output vectors")
-            for name, values in zip(self.columns, vectors, strict=True):
-                outputs[name] += [np.nan if v is None else float(v) for v in values]
+                given = len(vectors) if isinstance(vectors, list) else 0
+                what = f"the reply has {given} output vectors for {', '.join(self.columns)}"
+                return Failure("unreadable", what, tail(str(reply)))
+            try:
+                for name, values in zip(self.columns, vectors, strict=True):
+                    outputs[name] += [np.nan if v is None else float(v) for v in values]
+            except (TypeError, ValueError) as error:
+                what = f"the reply is not of output vectors of numbers: {error}"
+                return Failure("unreadable", what, tail(str(reply)))
         return {name: np.array(values) for name, values in outputs.items()}
 
     def ask(self, what: str, content: Mapping[str, Any]) -> dict[str, Any] | Failure:
@@ -290,20 +316,30 @@ class UmbridgeWay:
             return Failure("error", f"the server answered {error.code}", tail(_body(error)))
         except TimeoutError:
             return Failure("time", f"the server took longer than {self.limit:g} s")
-        except (OSError, ValueError) as error:
+        except (OSError, HTTPException, ValueError) as error:
             reason = getattr(error, "reason", error)
-            if isinstance(reason, (ConnectionRefusedError, socket.gaierror)):
+            if isinstance(reason, TimeoutError):
+                return Failure("time", f"the server took longer than {self.limit:g} s")
+            if isinstance(reason, socket.gaierror) or not self._listens():
                 # No fault of the parameters: nothing is learned from it.
                 raise CalibError(
                     f"the server at {self.url} is not there ({reason})", allowed="a running server",
                     mend="start it and call the same command: the runs that were made are kept",
                 ) from None  # fmt: skip
-            if isinstance(reason, TimeoutError):
-                return Failure("time", f"the server took longer than {self.limit:g} s")
             return Failure("error", f"the server at {self.url} did not answer: {reason}")
         if not isinstance(found, dict) or "error" in found:
             return Failure("error", "the server reports an error", tail(str(found)))
         return found
+
+    def _listens(self) -> bool:
+        """Whether something is there to answer: a server that died has no faulty parameters."""
+        try:
+            place = urlsplit(self.url)
+            port = place.port or (443 if place.scheme == "https" else 80)
+            socket.create_connection((place.hostname or "", port), self.limit).close()
+        except (OSError, ValueError):
+            return False
+        return True
 
 
 def _body(error: urllib.error.HTTPError) -> str:
@@ -330,6 +366,11 @@ class TableWay:
     def identity(self) -> str:
         """The content of the table."""
         return f"table {self.sha256}"
+
+    @property
+    def key(self) -> str:
+        """The key of a simulator file."""
+        return "table"
 
     @property
     def runs(self) -> bool:

@@ -77,7 +77,7 @@ def most_runs(model: str, found: Simulated, design: Design, simulations: int) ->
     free = len(build_problem(model, design.table).priors.free) - 1
     # Without a folder nothing is kept from one campaign to the next.
     shared = found.folder is not None and settings.sequential
-    first = min(settings.first or 10 * free, settings.runs) if shared else 0
+    first = settings.spread(free, found.simulator.deterministic) if shared else 0
     each = settings.runs - first + _EACH_TRUTH
     return (
         f"{model}: {first} runs that all campaigns share and at most {each} for each of "

@@ -3,27 +3,39 @@
 from __future__ import annotations
 
 import json
+import pickle
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from calib.batch.campaign import read_plan, run_campaign
+from calib.batch.campaign.kinds import KINDS
 from calib.check.check import check
+from calib.cli.simulators import prepare_case
 from calib.data import hold_out, read_table
 from calib.errors import CalibError
 from calib.gap.batch import diagnose_cases
+from calib.gap.case import read_case
+from calib.gap.diagnose import diagnose
 from calib.he2019.datasets import embedded
 from calib.inference.calibration import calibrate
+from calib.inference.emulation.prepared import emulated
 from calib.inference.estimators import estimate
 from calib.inference.io import load_calibration
 from calib.inference.problem import build_problem
 from calib.inference.random import generator
-from calib.models import example_csv
+from calib.models import MODELS, example_csv, get_model
+from calib.models.simulators.emulator.files import load_emulator
+from calib.models.simulators.emulator.model import emulator_of
+from calib.models.simulators.files import register_file
+from calib.models.simulators.registered import SIMULATED
 from calib.validation.sbc.run import run_sbc
 from calib.validation.validate import validate_held_out
 from challenge.make import make
 from tests.batch.campaign.sites import EFFECT, NAMES, WIND, content, refuse_all
+from tests.models.simulators.examples import lab, pull, write_program
 
 
 def test_a_diagnosis_is_that_of_the_verb(site, serial, tmp_path):
@@ -88,6 +100,83 @@ def test_a_fit_is_that_of_the_verb(site, serial):
     assert numbers["posterior"]["n"]["mean"] == expected.summary["n"].mean
     assert numbers["posterior"]["n"]["unit"] == "1"
     assert numbers["converged"] is True
+
+
+def write_columns(path: Path, columns: dict[str, np.ndarray]) -> None:
+    rows = zip(*(v.tolist() for v in columns.values()), strict=True)
+    text = "\n".join([",".join(columns), *(",".join(map(str, row)) for row in rows)])
+    path.write_text(text + "\n")
+
+
+@pytest.fixture
+def wheel(tmp_path) -> Iterator[Path]:
+    """The file of a simulator that has to be emulated, with its data beside it."""
+    write_columns(tmp_path / "lab.csv", lab(np.random.default_rng(1)))
+    (tmp_path / "own.py").write_text(
+        "import numpy as np\ndef f(theta, x):\n    return 1000 * theta[:, :1] * x['w'] * "
+        "(1 - np.exp(-x['s'] / 100 / theta[:, 1:2]))\n"
+    )
+    path = write_program(tmp_path, name='"campaign_wheel"', run="", python='"own.py:f"')
+    yield path
+    for registry in (MODELS, SIMULATED):
+        registry.discard("campaign_wheel")
+
+
+def test_a_slow_simulator_is_emulated_where_the_campaign_is_started(wheel, tmp_path):
+    found = register_file(wheel)
+    text = '[[fit]]\nname = "a"\ndata = ["lab.csv"]\nmodels = ["campaign_wheel"]\n'
+    numbers = run(tmp_path, text)
+    ((name, told),) = numbers.items()
+    task = read_plan(tmp_path / "plan.toml").tasks[name]
+    assert task.settings["simulators"] == {"campaign_wheel": found.simulator.digest}
+    problem = build_problem("campaign_wheel", read_table(tmp_path / "lab.csv"))
+    emulation = emulated(problem, task.seed)
+    assert told["emulator"]["runs"] == len(emulation.runs)
+    assert told["emulator"]["passed"] is told["converged"] is True
+    # What is sent to a worker has the emulator with it, and asks nothing of the simulator.
+    item = pickle.loads(pickle.dumps(KINDS["fit"].load(task)))
+    SIMULATED.discard("campaign_wheel")
+    assert KINDS["fit"].work(item, task.seed).numbers == told
+    kept = tmp_path / "out" / "results" / name
+    assert json.loads((kept / "emulation.json").read_text())["campaign_wheel"][0]["passed"]
+    assert (kept / "run" / "emulator.npz").exists()
+
+
+@pytest.mark.slow
+def test_cases_of_a_slow_simulator_are_diagnosed_side_by_side(wheel, tmp_path):
+    """Each with an emulator of its own, which does not stay behind."""
+    register_file(wheel)
+    for i, off in enumerate((0.97, 1.0)):
+        case = tmp_path / "cases" / f"case-{i}"
+        case.mkdir(parents=True)
+        (case / "lab.csv").write_bytes((tmp_path / "lab.csv").read_bytes())
+        columns = lab(np.random.default_rng(2))
+        true = columns | {"slip_ratio": 1.0 - (1.0 - columns["slip_ratio"]) / off}
+        y = pull(np.array([[0.6, 0.08]]), true)[0]
+        y += 0.03 * np.random.default_rng(3).standard_normal(y.size)
+        write_columns(case / "field.csv", columns | {"drawbar_pull_kn": y})
+        (case / "case.toml").write_text(
+            'calibration = "lab.csv"\nfield = "field.csv"\n'
+            '[models]\ndrawbar_pull = "campaign_wheel"\n'
+        )
+    numbers = run(tmp_path, '[[diagnose]]\nname = "a"\ncases = ["cases/*"]\n')
+    shifted, same = numbers["a.cases-case-0"], numbers["a.cases-case-1"]
+    assert shifted["first"] == "slip_zero_shift"
+    assert same["first"] == "none"
+    for told in (shifted, same):
+        assert told["emulator"]["campaign_wheel"]["passed"]
+    assert emulator_of(get_model("campaign_wheel")) is None
+    kept = tmp_path / "out" / "results" / "a.cases-case-0"
+    model, _ = load_emulator(kept / "emulators" / "campaign_wheel.npz")
+    assert model == "campaign_wheel"
+    # With the runs that are kept the verb gives the same.
+    case = read_case(tmp_path / "cases" / "case-0")
+    seed = read_plan(tmp_path / "plan.toml").tasks["a.cases-case-0"].seed
+    prepare_case(case, None, seed, 1, lambda what, done, planned: None)
+    found = diagnose(case, seed)
+    assert found.ranking.probability["slip_zero_shift"] == pytest.approx(
+        shifted["probability"], abs=0.02
+    )
 
 
 @pytest.fixture

@@ -162,20 +162,27 @@ def emulated() -> Iterator[str]:
     SIMULATED.discard(declared.name)
 
 
-def test_a_simulator_that_has_to_be_emulated_is_sent_to_its_verb(folder, emulated):
-    with pytest.raises(CalibError, match=r"\[\[fit\]\], models(.|\n)*use calib fit"):
-        planned(folder, FIT.replace("bekker", emulated))
+def test_replicates_of_a_slow_simulator_are_sent_to_their_verb(folder, emulated):
     sbc = f'[[sbc]]\nname = "a"\nsimulations = 2\ndraw_seed = 1\nmodels = ["{emulated}"]\n'
-    with pytest.raises(CalibError, match=r"\[\[sbc\]\], models(.|\n)*use calib sbc"):
+    with pytest.raises(
+        CalibError, match=r"\[\[sbc\]\], models(.|\n)*use calib sbc --model"
+    ) as told:
         planned(folder, sbc)
+    assert "slow_wheel is emulated for every replicate" in str(told.value)
+
+
+def test_tasks_depend_on_the_simulator(folder, emulated):
+    planned(folder, FIT.replace("bekker", emulated).replace("data/*.csv", "data/rut.csv"))
+    (fit,) = read_plan(folder / "plan.toml").tasks.values()
     case = folder / "cases" / "slow"
     shutil.copytree(next((folder / "cases").iterdir()), case)
     text = (case / "case.toml").read_text()
     (case / "case.toml").write_text(re.sub('(drawbar_pull = )"[^"]*"', f'\\1"{emulated}"', text))
     planned(folder, '[[diagnose]]\nname = "a"\ncases = ["cases/slow"]')
-    (task,) = read_plan(folder / "plan.toml").tasks.values()
-    with pytest.raises(CalibError, match=r"case.toml, \[models\](.|\n)*use calib diagnose"):
-        KINDS["diagnose"].load(task)
+    (diagnosis,) = read_plan(folder / "plan.toml").tasks.values()
+    digest = SIMULATED[emulated].simulator.digest
+    for task in (fit, diagnosis):
+        assert task.settings["simulators"] == {emulated: digest}
 
 
 def test_two_tasks_of_one_name_are_refused(folder):

@@ -106,7 +106,7 @@ def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> N
     nearest = min(run.theta[0] for run in emulation.failed)
     assert found.parameters["mu"].max() < nearest < whole.max()
     assert abs(found.summary["mu"].mean - kept.mean()) < kept.std()
-    write_failed(emulation, simulated.simulator.parameters, tmp_path / "failed.csv")
+    write_failed(emulation.failed, simulated.simulator.parameters, tmp_path / "failed.csv")
     lines = (tmp_path / "failed.csv").read_text().splitlines()
     assert lines[0] == "mu,s0,kind,reason,printed"
     assert len(lines) == 1 + len(emulation.failed)
@@ -167,7 +167,7 @@ def test_where_runs_fail_and_what_to_do_is_told_if_nothing_is_left(
         calib.emulated(calib.build_problem("crashing", table()), seed=1)
     text = str(caught.value)
     for words in (
-        "no parameters are left for the data", "of the 23 runs have a value",
+        "no parameters are left for the data", "of the 24 runs have a value",
         "RuntimeError: the mesh folds", ", at mu 0.7", "those with a value are at mu 0.",
         "simulator crashing", "priors that do not reach there",
     ):  # fmt: skip
@@ -188,7 +188,7 @@ def test_a_simulator_that_never_runs_is_refused_after_its_first_runs(tmp_path: P
             calib.emulated(calib.build_problem("broken", table()), seed=1)
         assert len(calls) == 12
     text = str(caught.value)
-    for words in ("only 0 of the 5 runs", "OSError: no soil.dat", ", at mu 0.", "broken.runs"):
+    for words in ("only 0 of the 6 runs", "OSError: no soil.dat", ", at mu 0.", "broken.runs"):
         assert words in text
 
 
@@ -204,7 +204,23 @@ def test_first_runs_that_fail_in_several_ways_are_no_reason_to_stop() -> None:
 
     declared(fickle, "fickle", emulate=True, runs=40)
     emulation = calib.emulated(calib.build_problem("fickle", table()), seed=1)
-    assert len(emulation.failed) == 5
+    assert len(emulation.failed) == 6
+
+
+@pytest.mark.parametrize("deterministic", [True, False])
+@pytest.mark.parametrize("runs", [10, 25])
+def test_the_budget_is_of_all_runs_that_are_made(runs: int, deterministic: bool) -> None:
+    """Probes, repeats and checks among them; what cannot be reached with so few is told."""
+    made = []
+
+    def counted(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        made.append(theta)
+        return pull(theta, x) * np.cos(25.0 * theta[:, :1])
+
+    declared(counted, "counted", emulate=True, runs=runs, deterministic=deterministic)
+    emulation = calib.emulated(calib.build_problem("counted", table()), seed=1)
+    assert len(made) == len(emulation.runs) == runs
+    assert emulation.document()["runs"] == runs
 
 
 def below_zero(emulation: calib.Emulation) -> bool:
@@ -238,7 +254,10 @@ def test_what_grows_beyond_bounds_across_zero_does_not_matter_to_a_fit() -> None
 
 
 def test_runs_that_fail_across_zero_alone_are_made_without() -> None:
+    made = []
+
     def stops(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        made.append(theta)
         if x["slip_ratio"].min() < 0.0 and theta[0, 1] < 0.08:
             raise RuntimeError("the wheel is braked")
         return pull(theta, x)
@@ -246,7 +265,9 @@ def test_runs_that_fail_across_zero_alone_are_made_without() -> None:
     declared(stops, "stops", emulate=True, runs=40, checks=4)
     emulation = calib.emulated(calib.build_problem("stops", table()), seed=1)
     assert not below_zero(emulation)
-    assert len(emulation.runs) <= 40
+    # Each that failed was tried twice.
+    assert len(emulation.runs) == len(made) - len(emulation.failed) <= 40
+    assert any("below zero" in r.failure.reason for r in emulation.failed if r.failure)
     theta = emulation.emulator.training.theta
     assert (theta[:, 1] < 0.08).sum() > 5
     assert emulation.emulator.training.ok.all()

@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -64,3 +70,40 @@ def write_program(folder: Path, *, extra: str = "", **keys: str) -> Path:
     text += '[outputs]\npull = "drawbar_pull_n"\n' + PRIORS
     (folder / "wheel.toml").write_text(text)
     return folder / "wheel.toml"
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """An UM-Bridge server in a few lines, with a mood that the model's name sets."""
+
+    def do_POST(self) -> None:
+        given = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+        mood = given["name"]
+        if mood == "slow":
+            time.sleep(3.0)
+        replies: dict[str, object] = {
+            "nan": {"output": [[float("nan")]]},
+            "error": {"error": {"message": "no soil"}},
+            "more": {"output": [[1.0], [1.0]]},
+            "number": {"output": [1.0]},
+        }
+        body = json.dumps(replies.get(mood, {"output": [[1.0]]})).encode()
+        self.send_response(500 if mood == "broken" else 200)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, *args: object) -> None:
+        """Print nothing."""
+
+
+@contextmanager
+def serving() -> Iterator[str]:
+    """Serve on this machine; yield the address."""
+    server = HTTPServer(("127.0.0.1", 0), _Handler)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()

@@ -46,7 +46,9 @@ def test_several_outputs_are_several_models() -> None:
         ("name =", "limit = -1\nname =", ["limit"]),
         ("[conditions]", "[emulator]\nrun = 3\n[conditions]", ["emulator.run", "mean runs?"]),
         ("[parameters.sigma]", "[parameters.simga]", ["no prior of the noise", "sigma"]),
-        ('"drawbar_pull_n"', '"drawbar_push"', ["drawbar_push", "no known quantity"]),
+        ('"drawbar_pull_n"', '"drawbar_push"', ["outputs.pull: ", "no known quantity"]),
+        ('"drawbar_pull_n"', '"drawbar_pull_kpa"', ["outputs.pull: 'kpa' is a unit of pressure"]),
+        ('"normal_load_kn"', '"normal_laod_kn"', ["conditions.w: ", "no known quantity"]),
         ("name =", 'url = "http://x"\nname =', ["run, url", "exactly one of"]),
         ("name =", 'template = "none.inp"\nname =', ["the template cannot be read"]),
         ("[conditions]", "[ranges]\nz = [0.0, 1.0]\n[conditions]", ["ranges.z", "s, w"]),
@@ -98,6 +100,13 @@ def test_a_table_of_runs_is_known_by_its_content(tmp_path: Path) -> None:
         assert not found.simulator.way.runs
         digests.append(found.simulator.digest)
     assert digests[0] != digests[1]
+
+
+def test_a_table_cannot_be_asked_by_a_sampler(tmp_path: Path) -> None:
+    (tmp_path / "runs.csv").write_text("mu,s0,s,w,pull\n0.5,0.1,10,4,1.0\n")
+    with pytest.raises(CalibError, match="none where a sampler asks") as caught:
+        read_simulator(by(tmp_path, 'table = "runs.csv"\nemulate = false'))
+    assert "wheel.toml, emulate" in str(caught.value)
 
 
 def test_a_server_needs_the_name_of_its_model(tmp_path: Path) -> None:

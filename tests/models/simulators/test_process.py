@@ -93,6 +93,22 @@ def test_so_do_those_that_left_its_group(tmp_path: Path, ending: str) -> None:
     assert _ends(int((tmp_path / "pid").read_text()))
 
 
+def test_what_the_kernel_cannot_end_is_not_waited_for_for_ever(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such a process stays listed, whatever it is sent; here one that is gone is said to be."""
+    asked = []
+
+    def there(mark: str) -> list[int]:
+        asked.append(mark)
+        return [2**22 + 1]  # beyond the largest id of a process
+
+    monkeypatch.setattr("calib.models.simulators.process._marked", there)
+    monkeypatch.setattr("calib.models.simulators.process._GIVE_UP", 0.2)
+    assert run_program(python("print('done')"), tmp_path, 20.0) == "done\n"
+    assert len(asked) > 1
+
+
 def test_the_end_alone_is_read_if_asked_for(tmp_path: Path) -> None:
     found = run_program(python("print('x' * 9_000_000, 'done')"), tmp_path, 20.0, whole=False)
     assert isinstance(found, str)

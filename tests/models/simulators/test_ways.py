@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import socket
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +16,7 @@ from calib.models.simulators.base import Failure, Output, Simulator, Way
 from calib.models.simulators.files import read_simulator
 from calib.models.simulators.registered import models_of
 from calib.models.simulators.ways import CallableWay, CommandWay, UmbridgeWay
-from tests.models.simulators.examples import pull, write_program
+from tests.models.simulators.examples import pull, serving, write_program
 
 X = {"slip_ratio": np.array([0.1, 0.3]), "normal_load_kn": np.array([4.0, 5.0])}
 THETA = np.array([0.6, 0.08])
@@ -199,11 +197,11 @@ def test_a_command_that_fails(tmp_path: Path, extra: str, kind: str, word: str) 
 def test_a_command_without_a_declared_output_says_what_it_gave(tmp_path: Path) -> None:
     found = failure(
         simulator(
-            read_simulator(write_program(tmp_path)).simulator.way,
+            read_simulator(write_program(tmp_path, extra="print('meshed')")).simulator.way,
             outputs=(Output("drawbar_pull_n", "Pull", ""),),
         ).run(THETA, X)
     )
-    assert found == Failure("unreadable", "there is no output 'Pull'; it gave pull")
+    assert found == Failure("unreadable", "there is no output 'Pull'; it gave pull", "meshed\n")
 
 
 def test_a_template_a_pattern_and_a_row_at_a_time(tmp_path: Path) -> None:
@@ -247,34 +245,10 @@ def test_files_that_a_program_calls_are_of_its_identity_if_they_are_named(tmp_pa
     assert read_simulator(file).simulator.digest != before
 
 
-class _Handler(BaseHTTPRequestHandler):
-    """An UM-Bridge server in a few lines, with a mood that the model's name sets."""
-
-    def do_POST(self) -> None:
-        given = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
-        mood = given["name"]
-        if mood == "slow":
-            time.sleep(3.0)
-        value = float("nan") if mood == "nan" else 1.0
-        reply = {"error": {"message": "no soil"}} if mood == "error" else {"output": [[value]]}
-        body = json.dumps(reply).encode()
-        self.send_response(500 if mood == "broken" else 200)
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, *args: object) -> None:
-        """Print nothing."""
-
-
 @pytest.fixture
 def url() -> Iterator[str]:
-    server = HTTPServer(("127.0.0.1", 0), _Handler)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
-    thread.start()
-    yield f"http://127.0.0.1:{server.server_port}"
-    server.shutdown()
-    server.server_close()
-    thread.join()
+    with serving() as found:
+        yield found
 
 
 @pytest.mark.parametrize(
@@ -292,6 +266,41 @@ def test_a_server_that_is_not_there(url: str) -> None:
     well = simulator(UmbridgeWay(url, "forward", ("pull",))).run(THETA, X)
     assert not isinstance(well, Failure)
     np.testing.assert_allclose(well["drawbar_pull_kn"], [0.001, 0.001])
+
+
+@pytest.mark.parametrize("reply", [b"", b"HTTP/1.0 200 OK\r\nContent-Length: 99\r\n\r\n{"])
+def test_a_server_that_dies_on_the_way_has_no_run_that_failed(reply: bytes) -> None:
+    """With no retry that would find it gone: a failed run would be kept, and not made again."""
+    server = socket.create_server(("127.0.0.1", 0))
+    port = server.getsockname()[1]
+
+    def once() -> None:
+        connection, _ = server.accept()
+        server.close()
+        connection.recv(65536)
+        connection.sendall(reply)
+        connection.close()
+
+    thread = threading.Thread(target=once, daemon=True)
+    thread.start()
+    way = UmbridgeWay(f"http://127.0.0.1:{port}", "forward", ("pull",), limit=5.0)
+    with pytest.raises(CalibError, match=f"127.0.0.1:{port} is not there"):
+        simulator(way).run(THETA, X)
+    thread.join()
+
+
+@pytest.mark.parametrize(
+    ("mood", "words"),
+    [
+        ("more", ("2 output vectors for pull", "'output': [[1.0], [1.0]]")),
+        ("number", ("not of output vectors of numbers", "'output': [1.0]")),
+    ],
+)
+def test_a_reply_that_will_not_do_is_shown(url: str, mood: str, words: tuple[str, str]) -> None:
+    found = failure(simulator(UmbridgeWay(url, mood, ("pull",))).run(THETA, X))
+    assert found.kind == "unreadable"
+    assert words[0] in found.reason
+    assert words[1] in found.printed
 
 
 def test_a_program_beside_the_file_is_found(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -11,8 +12,10 @@ from typing import Any, ClassVar
 from pydantic import BaseModel, ConfigDict, Field
 
 from calib.batch.campaign.place import Place
-from calib.errors import CalibError
-from calib.models.simulators.registered import slow_simulator
+from calib.inference.emulation import Emulation
+from calib.models import Model
+from calib.models.simulators.registered import simulated_by
+from calib.report.numbers import finite
 
 
 class Section(BaseModel):
@@ -112,23 +115,49 @@ class Kind[S: Section, I](ABC):
         """
 
 
-def refuse_slow_simulators(models: Iterable[str], where: str, verb: str) -> None:
-    """Refuse simulators that have to be emulated.
+EMULATION = "emulation.json"
 
-    Tasks are done side by side, each from its inputs alone, while the runs of a simulator are made
-    and kept in one folder, for one process at a time.
 
-    Raises
-    ------
-    CalibError
-        Naming the first such model and the verb that can do it.
+@dataclass(frozen=True)
+class Emulated:
+    """What became of the simulator of a task's model: the emulator in its place, and how well.
+
+    It is emulated where the campaign was started, as the runs of all tasks are kept in the
+    simulator's one folder, for one process at a time; the model is sent to where the work is done.
     """
-    for model in models:
-        found = slow_simulator(model)
-        if found is not None:
-            raise CalibError(
-                f"the simulator {found.name} behind {model} has to be emulated, which the tasks of "
-                "a campaign cannot do side by side", where=where,
-                allowed="closed forms, and simulators with emulate = false",
-                mend=f"use {verb}, which spreads the runs themselves over --workers",
-            )  # fmt: skip
+
+    model: Model
+    documents: tuple[Mapping[str, Any], ...]
+
+    @classmethod
+    def of(cls, *emulations: Emulation) -> Emulated:
+        """Put together what one task needs; the last emulation has the emulator."""
+        model = emulations[-1].problem.bound.model
+        return cls(model, tuple(e.document() for e in emulations))
+
+    @property
+    def passed(self) -> bool:
+        """Whether the emulator is good enough."""
+        return all(d["passed"] for d in self.documents)
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """Key numbers for the summary."""
+        return {
+            "runs": sum(d["runs"] for d in self.documents),
+            "failed_runs": sum(len(d["failed"]) for d in self.documents),
+            "passed": self.passed,
+            "reasons": " | ".join(reason for d in self.documents for reason in d["reasons"]),
+        }
+
+
+def emulation_file(found: Iterable[Emulated]) -> str:
+    """Return `EMULATION`: what is known of the emulations of a task, by model."""
+    documents = {e.model.name: list(e.documents) for e in found}
+    return json.dumps(finite(documents), indent=1) + "\n"
+
+
+def simulators_of(models: Iterable[str]) -> dict[str, Any]:
+    """Return what the results of a task depend on of simulators of the user's own."""
+    found = {m: s.simulator.digest for m in models if (s := simulated_by(m)) is not None}
+    return {"simulators": found} if found else {}

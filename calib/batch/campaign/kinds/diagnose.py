@@ -2,29 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import numpy as np
 from pydantic import Field
 
 from calib.batch.campaign.kinds.base import (
+    EMULATION,
+    Emulated,
     Kind,
     Planned,
     Section,
     Task,
     Work,
-    refuse_slow_simulators,
-)  # fmt: skip
+    emulation_file,
+    simulators_of,
+)
 from calib.batch.campaign.place import Place
 from calib.batch.folders import read_folder
+from calib.data.quantities import OUTPUTS
 from calib.gap.batch import written
 from calib.gap.case import Case, case_files, read_case
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.load import load_effects
+from calib.inference.emulation.prepared import emulated_for_both
+from calib.models import MODELS
+from calib.models.simulators.emulator.files import save_emulator
+from calib.models.simulators.emulator.model import emulator_of
+from calib.models.simulators.registered import slow_simulator
 from calib.report.page.gap_page import write_page
 
 
@@ -42,8 +52,9 @@ class DiagnoseSection(Section):
     )
 
 
-# A case; the user's file of effects, first, and the prior files beside it; whether to write a page.
-type DiagnosisItem = tuple[Case, Mapping[str, bytes], bool]
+# A case; the user's file of effects, first, and the prior files beside it; whether to write a page;
+# what became of simulators that had to be emulated.
+type DiagnosisItem = tuple[Case, Mapping[str, bytes], bool, tuple[Emulated, ...]]
 
 
 class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
@@ -62,13 +73,16 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
                 if effect.prior_file is not None:
                     extra[f"effects, {name}.toml"] = effect.prior_file
         for case in place.find("cases", section.cases, holding="case.toml"):
+            content, files = case_files(case)
+            models = content.get("models")
             settings = {
-                "case": place.name(case), "effects": section.effects, "pages": section.pages
+                "case": place.name(case), "effects": section.effects, "pages": section.pages,
+                **simulators_of(models.values() if isinstance(models, dict) else ()),
             }  # fmt: skip
-            yield Planned(place.word(case), settings, case_files(case)[1] | extra)
+            yield Planned(place.word(case), settings, files | extra)
 
     def load(self, task: Task) -> DiagnosisItem:
-        """Read the case."""
+        """Read the case; emulate simulators that have to be."""
         effects = {
             path.name: path.read_bytes()
             for label, path in task.inputs.items()
@@ -76,16 +90,62 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
         }
         path = task.inputs["case.toml"]
         case = read_case(path.parent)
-        refuse_slow_simulators(case.models.values(), f"{path}, [models]", "calib diagnose")
-        return case, effects, task.settings["pages"]
+        return case, effects, task.settings["pages"], _emulated(case, task.seed)
 
     def work(self, item: DiagnosisItem, seed: int) -> Work:
         """Diagnose it."""
-        case, effects, page = item
-        with _effects(effects) as own:
+        case, effects, page, emulated = item
+        with _effects(effects) as own, _in_place(emulated):
             found = diagnose(case, seed, effects={**EFFECTS, **own})
-            files = written(found, effects) | (_page(found, seed) if page else {})
-        return Work(diagnosis_numbers(found), files)
+            files: dict[str, str | bytes] = {**written(found, effects)}
+            files |= _page(found, seed) if page else {}
+        numbers = diagnosis_numbers(found)
+        if emulated:
+            # A verdict under an emulator that is too far off is not to be used.
+            numbers |= {} if all(e.passed for e in emulated) else {"converged": False}
+            numbers["emulator"] = {e.model.name: e.numbers for e in emulated}
+            files |= {EMULATION: emulation_file(emulated), **_emulators(emulated)}
+        return Work(numbers, files)
+
+
+def _emulated(case: Case, seed: int) -> tuple[Emulated, ...]:
+    others = [] if case.new_conditions is None else [case.new_conditions]
+    found = []
+    for output, model in case.models.items():
+        column = OUTPUTS[output]
+        if slow_simulator(model) is None or column not in case.lab or column not in case.field:
+            continue
+        lab, field = (t.take(np.isfinite(t[column])) for t in (case.lab, case.field))
+        made = emulated_for_both(
+            model, lab, field, seed, priors=case.priors.get(output), elsewhere=others
+        )
+        found.append(Emulated.of(*made))
+    return tuple(found)
+
+
+@contextmanager
+def _in_place(emulated: Sequence[Emulated]) -> Iterator[None]:
+    """Let models be their emulators, in this process and for this task."""
+    before = [MODELS[e.model.name] for e in emulated if e.model.name in MODELS]
+    try:
+        for e in emulated:
+            MODELS.discard(e.model.name)
+            MODELS.add(e.model)
+        yield
+    finally:
+        for e in emulated:
+            MODELS.discard(e.model.name)
+        for model in before:
+            MODELS.add(model)
+
+
+def _emulators(emulated: Sequence[Emulated]) -> dict[str, bytes]:
+    """Return the emulators as files, to predict from the diagnosis."""
+    with TemporaryDirectory() as scratch:
+        for e in emulated:
+            if (emulator := emulator_of(e.model)) is not None:
+                save_emulator(emulator, e.model.name, Path(scratch) / f"{e.model.name}.npz")
+        return {f"emulators/{name}": data for name, data in read_folder(Path(scratch)).items()}
 
 
 @contextmanager

@@ -13,18 +13,22 @@ from typing import Any
 from pydantic import Field
 
 from calib.batch.campaign.kinds.base import (
+    EMULATION,
+    Emulated,
     Kind,
     Planned,
     Section,
     Task,
     Work,
-    refuse_slow_simulators,
-)  # fmt: skip
+    emulation_file,
+    simulators_of,
+)
 from calib.batch.campaign.place import Place, word
 from calib.batch.folders import read_folder
 from calib.data import Table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
+from calib.inference.emulation.prepared import emulated
 from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
 from calib.inference.prior_files import default_priors, prior_file_model
@@ -32,6 +36,7 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
+from calib.models.simulators.registered import slow_simulator
 from calib.report.study_tasks import HoldOut, read_and_split
 from calib.validation.assumptions import warnings_of
 from calib.validation.validate import validate_held_out
@@ -60,8 +65,9 @@ class FitSection(Section):
     )
 
 
-# A problem on the rows that are not held out, these, how to sample, and whether to keep it.
-type FitItem = tuple[Problem, Table | None, SamplerSettings, bool]
+# A problem on the rows that are not held out, these, how to sample, whether to keep it, and what
+# became of the emulation of its simulator, if it needed one.
+type FitItem = tuple[Problem, Table | None, SamplerSettings, bool, Emulated | None]
 
 
 class Fit(Kind[FitSection, FitItem]):
@@ -73,7 +79,6 @@ class Fit(Kind[FitSection, FitItem]):
     def plan(self, section: FitSection, place: Place) -> Iterator[Planned]:
         """Yield a task for each file, model, prior file and hold-out."""
         priors = _priors(section, place)
-        refuse_slow_simulators(priors, f"{place.where}, models", "calib fit")
         with place.telling("hold_out"):
             for text in section.hold_out:
                 _held(text)
@@ -84,27 +89,37 @@ class Fit(Kind[FitSection, FitItem]):
                     {
                         "data": place.name(path), "model": model, "priors": prior,
                         "hold_out": out, "max_steps": section.max_steps,
-                        "posteriors": section.posteriors,
+                        "posteriors": section.posteriors, **simulators_of([model]),
                     },
                     {"data": path} | ({"priors": prior_path} if prior_path else {}),
                 )  # fmt: skip
 
     def load(self, task: Task) -> FitItem:
-        """Read the file and bind the model to it."""
+        """Read the file and bind the model to it; emulate its simulator if that has to be."""
         model = get_model(task.settings["model"])
         kept = _held(task.settings["hold_out"])
         fitted, held = read_and_split(task.inputs["data"], (*model.conditions, model.output), kept)
         problem = build_problem(model.name, fitted, task.inputs.get("priors"))
         settings = SamplerSettings(max_steps=task.settings["max_steps"])
-        return problem, held, settings, task.settings["posteriors"]
+        made: Emulated | None = None
+        if slow_simulator(model.name) is not None:
+            emulation = emulated(problem, task.seed, elsewhere=[] if held is None else [held])
+            problem, made = emulation.problem, Emulated.of(emulation)
+        return problem, held, settings, task.settings["posteriors"], made
 
     def work(self, item: FitItem, seed: int) -> Work:
         """Sample the posterior, and score it on the rows that were held out."""
-        problem, held, settings, posterior = item
+        problem, held, settings, posterior, emulation = item
         model = problem.bound.model.name
         point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
         calibration = calibrate(problem, seed, estimates=(point,), settings=settings)
         numbers = _numbers(calibration)
+        files = dict(_run_folder(calibration)) if posterior else {}
+        if emulation is not None:
+            # A posterior under an emulator that is too far off is not to be used either.
+            numbers["converged"] = numbers["converged"] and emulation.passed
+            numbers["emulator"] = emulation.numbers
+            files[EMULATION] = emulation_file([emulation])
         if warnings := warnings_of(problem, calibration.draws.mode):
             numbers["warnings"] = " | ".join(warnings)
         if held is not None:
@@ -114,7 +129,7 @@ class Fit(Kind[FitSection, FitItem]):
                 "crps": scores.crps if isfinite(scores.crps) else None,
                 "in_90_percent_band": scores.coverage[0.9].hits,
             }  # fmt: skip
-        return Work(numbers, _run_folder(calibration) if posterior else {})
+        return Work(numbers, files)
 
 
 def _priors(section: FitSection, place: Place) -> dict[str, list[tuple[str, Path | None]]]:
@@ -171,7 +186,7 @@ def _numbers(calibration: Calibration) -> dict[str, Any]:
 _SHOWN = ("unit", "mean", "sd", "median", "hdi_lower", "hdi_upper", "sd_ratio")
 
 
-def _run_folder(calibration: Calibration) -> Mapping[str, bytes]:
+def _run_folder(calibration: Calibration) -> Mapping[str, str | bytes]:
     # How long it took stands elsewhere: without it, equal posteriors are equal files.
     calibration = replace(calibration, draws=replace(calibration.draws, seconds=0.0))
     with TemporaryDirectory() as scratch:

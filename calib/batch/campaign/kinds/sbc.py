@@ -8,16 +8,11 @@ from dataclasses import asdict
 
 from pydantic import Field
 
-from calib.batch.campaign.kinds.base import (
-    Kind,
-    Planned,
-    Section,
-    Task,
-    Work,
-    refuse_slow_simulators,
-)  # fmt: skip
+from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
 from calib.batch.campaign.place import Place
+from calib.errors import CalibError
 from calib.models import get_model
+from calib.models.simulators.registered import slow_simulator
 from calib.validation.sbc.replicate import Item, replicate
 from calib.validation.sbc.run import SETTINGS, chosen_models
 
@@ -45,8 +40,16 @@ class Sbc(Kind[SbcSection, Item]):
         """Yield a task for each replicate."""
         with place.telling("models"):
             names = [get_model(name).name for name in section.models]
-        refuse_slow_simulators(names, f"{place.where}, models", "calib sbc")
         for model in names:
+            if slow_simulator(model) is not None:
+                # Its truths are runs, and so it is emulated on the way: for one process at a time.
+                raise CalibError(
+                    f"the simulator behind {model} is emulated for every replicate, which a "
+                    "campaign cannot do side by side", where=f"{place.where}, models",
+                    allowed="closed forms, and simulators with emulate = false",
+                    mend=f"use calib sbc --model {model} --data CSV, which spreads the runs "
+                    "themselves over --workers",
+                )  # fmt: skip
             for i in range(section.simulations):
                 yield Planned(
                     f"{model}-{i:04d}",

@@ -1,0 +1,143 @@
+"""A simulator that fails from the start is not asked a thousand times by a sampler."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calib
+from calib.data.registry import Registry
+from calib.errors import CalibError
+from calib.inference.random import generator
+from calib.inference.trial import try_simulator
+from calib.models import MODELS
+from calib.models.simulators.registered import SIMULATED
+from tests.models.simulators.examples import PRIORS, lab, pull, serving, write_program
+
+# At the middle of the prior and at five points spread over it, each tried again once.
+MADE = 6 * 2
+QUICK = {"emulate": "false"}
+
+
+@pytest.fixture(autouse=True)
+def as_before() -> Iterator[None]:
+    registries: tuple[Registry, ...] = (MODELS, SIMULATED)
+    before = [set(r) for r in registries]
+    yield
+    for registry, names in zip(registries, before, strict=True):
+        for name in set(registry) - names:
+            registry.discard(name)
+
+
+def problem_of(file: Path) -> calib.Problem:
+    calib.register(calib.read_simulator(file))
+    return calib.build_problem("wheel", calib.table_from_arrays(lab(np.random.default_rng(1))))
+
+
+def refused(problem: calib.Problem, *words: str) -> None:
+    """Whoever asks first: the estimator or the sampler."""
+    for ask in (
+        lambda: calib.estimate(problem, "least_squares", generator(1)),
+        lambda: calib.calibrate(problem, seed=1),
+    ):
+        with pytest.raises(CalibError, match="fails from the start") as caught:
+            ask()
+        for word in ("only 0 of the 6 runs", "to mend: ", *words):
+            assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("extra", "key", "words"),
+    [
+        ("print('meshed'); json.dump({'Pull': [1.0]}, open(sys.argv[2], 'w')); sys.exit(0)",
+         "outputs", ["there is no output 'pull'; it gave Pull", "it printed: meshed"]),
+        ("print('no licence'); sys.exit(3)", "run", ["exit code 3", "it printed: no licence"]),
+        ("print('meshed'); sys.exit(0)", "outputs", ["no readable output file", "meshed"]),
+        ("print('meshed'); x['s'].pop()", "outputs", ["17 values for 18 rows", "meshed"]),
+        ("print('meshed'); p['mu'] = float('nan')", "run", ["not finite", "meshed"]),
+    ],
+)  # fmt: skip
+def test_a_command_says_file_and_key_and_what_it_printed(
+    tmp_path: Path, extra: str, key: str, words: list[str]
+) -> None:
+    counted = f"open({str(tmp_path / 'made')!r}, 'a').write('x'); {extra}"
+    problem = problem_of(write_program(tmp_path, extra=counted, **QUICK))
+    refused(problem, f"wheel.toml, {key}: ", *words)
+    assert len((tmp_path / "made").read_text()) == 2 * MADE
+
+
+@pytest.mark.parametrize(
+    ("mood", "key", "words"),
+    [
+        ("error", "url", ["the server reports an error", "no soil"]),
+        ("broken", "url", ["the server answered 500"]),
+        ("more", "outputs", ["2 output vectors for pull"]),
+    ],
+)
+def test_a_server_says_file_and_key(tmp_path: Path, mood: str, key: str, words: list[str]) -> None:
+    with serving() as url:
+        file = write_program(
+            tmp_path, run="", url=f'"{url}"', model=f'"{mood}"', rows='"each"', limit="20", **QUICK
+        )
+        problem = problem_of(file)
+        refused(problem, f"wheel.toml, {key}: ", *words)
+    with pytest.raises(CalibError, match=r"wheel.toml, url: the server at .* is not there"):
+        calib.calibrate(problem, seed=1)
+
+
+def of_function(f: Callable, **changes: object) -> calib.Problem:
+    calib.register(
+        calib.from_callable(
+            f, parameters=PRIORS, conditions=["slip_ratio", "normal_load_kn"],
+            output="drawbar_pull_kn", name="own", batched=False, **changes,  # type: ignore[arg-type]
+        )
+    )  # fmt: skip
+    return calib.build_problem("own", calib.table_from_arrays(lab(np.random.default_rng(1))))
+
+
+def test_a_function_that_always_raises_is_called_a_few_times() -> None:
+    calls = []
+
+    def broken(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        calls.append(theta)
+        raise OSError("no soil.dat")
+
+    problem = of_function(broken)
+    refused(problem, "simulator own: ", "OSError: no soil.dat", ", at mu 0.")
+    assert len(calls) == 2 * MADE
+
+
+def test_a_function_of_a_file_names_the_file(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text("def f(theta, x):\n    return open('no soil.dat')\n")
+    file = write_program(tmp_path, run="", python='"own.py:f"', batched="false", **QUICK)
+    refused(problem_of(file), "wheel.toml, python: ", "no soil.dat")
+
+
+def test_one_that_fails_now_and_then_or_in_several_ways_is_not_refused() -> None:
+    """Where it fails a sampler finds no value, and goes on elsewhere."""
+    calls = []
+
+    def half(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        calls.append(theta)
+        if theta[0] > 0.5 * 0.999:  # the middle, too
+            raise RuntimeError("the mesh folds")
+        return pull(theta[None], x)[0]
+
+    problem = of_function(half)
+    try_simulator(problem)
+    made = len(calls)
+    assert made > 2
+    try_simulator(problem)
+    assert len(calls) == made
+
+    def several(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        if theta[0] > 0.5 * 0.999:
+            raise RuntimeError("the mesh folds")
+        return np.nan * pull(theta[None], x)[0]
+
+    MODELS.discard("own")
+    SIMULATED.discard("own")
+    try_simulator(of_function(several))
