@@ -104,8 +104,11 @@ def _load(path: Path) -> None:
 def declared_in(declared: object) -> str:
     """Return the file of a user's function or class, or its module where that has no file.
 
-    Nothing for calib's own, and for what is neither function nor class.
+    Nothing for calib's own, and for what is neither function nor class, unless it says so itself.
     """
+    own = getattr(declared, "declared_in", "")
+    if isinstance(own, str) and own:
+        return own
     module = str(getattr(declared, "__module__", ""))
     if module.startswith("calib.") or not hasattr(declared, "__qualname__"):
         return ""

@@ -91,8 +91,8 @@ def test_a_server_says_file_and_key(tmp_path: Path, mood: str, key: str, words: 
 def of_function(f: Callable, **changes: object) -> calib.Problem:
     calib.register(
         calib.from_callable(
-            f, parameters=PRIORS, conditions=["slip_ratio", "normal_load_kn"],
-            output="drawbar_pull_kn", name="own", batched=False, **changes,  # type: ignore[arg-type]
+            f, conditions=["slip_ratio", "normal_load_kn"], output="drawbar_pull_kn", name="own",
+            batched=False, **({"parameters": PRIORS} | changes),  # type: ignore[arg-type]
         )
     )  # fmt: skip
     return calib.build_problem("own", calib.table_from_arrays(lab(np.random.default_rng(1))))
@@ -141,3 +141,30 @@ def test_one_that_fails_now_and_then_or_in_several_ways_is_not_refused() -> None
     MODELS.discard("own")
     SIMULATED.discard("own")
     try_simulator(of_function(several))
+
+
+def too_small(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+    return 0.001 * pull(theta[None], x)[0]
+
+
+@pytest.mark.parametrize("emulate", [True, False])
+def test_an_output_in_another_unit_is_named(emulate: bool) -> None:
+    """By the factor of kN and N, wherever in the prior."""
+    problem = of_function(too_small, emulate=emulate)
+    with pytest.raises(CalibError, match="times the largest that was measured") as caught:
+        (calib.emulated if emulate else calib.calibrate)(problem, seed=1)
+    for word in ("simulator own: ", "in the unit of drawbar_pull_kn", "to mend: name the column"):
+        assert word in str(caught.value)
+
+
+def test_a_prior_that_reaches_the_data_somewhere_is_no_other_unit() -> None:
+    wide = PRIORS.replace("median = 0.5\nsd_log = 0.4", "median = 0.001\nsd_log = 5.0")
+    assert wide != PRIORS
+    try_simulator(of_function(lambda t, x: pull(t[None], x)[0], parameters=wide))
+
+
+def test_a_prior_that_lacks_something_names_the_simulators_file(tmp_path: Path) -> None:
+    file = write_program(tmp_path)
+    file.write_text(file.read_text().replace("median = 0.5\n", "", 1))
+    with pytest.raises(CalibError, match=r"wheel.toml, priors of the model wheel, parameters\.mu"):
+        problem_of(file)

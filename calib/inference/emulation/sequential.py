@@ -27,6 +27,7 @@ from calib.inference.emulation.settings import Emulation, EmulationSettings, Hel
 from calib.inference.emulation.state import State, across_too
 from calib.inference.problem import Problem
 from calib.inference.random import generator
+from calib.inference.trial import check_scale
 from calib.models.base import Array
 from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.emulator.kriging import correlation
@@ -129,7 +130,7 @@ def _nodes(
         return inside, None, ()
     tried = tuple(keeper.runs(prior_middle(problem), wide))
     if not tried[0].ok:
-        return inside, None, tuple(map(across_too, tried))
+        return inside, None, tried
     across = across_zero({n: v for n, v in wide.items() if n not in ranges}, recorded)
     return wide, across, tried
 
@@ -150,12 +151,14 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
     values = state.carry_out(theta[:FIRST])
     if fail_alike(state.runs[before:]) and fail_alike(state.runs):
         raise state.without_value(FROM_THE_START)
+    state.runs = [*map(across_too, state.runs[:before]), *state.runs[before:]]
     # Runs that failed across zero and were made again may have taken some of them.
     theta = theta[: FIRST + state.left]
     values = np.concatenate([values, state.carry_out(theta[FIRST:])])
     ok = np.isfinite(values).all(axis=1)
     if ok.mean() < _LEAST_OK:
         raise state.without_value("the simulator fails in most of its prior")
+    check_scale(state.problem, state.outputs(values), state.keeper.simulator)
     state.learn(theta, values)
     count, times = chosen.repeats(deterministic)
     repeats = np.flatnonzero(ok)[: min(count, state.left // times)]

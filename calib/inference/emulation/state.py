@@ -63,9 +63,6 @@ class State:
         self.mode: Array | None = None
         self.region: Region | None = None
         self.earlier: tuple[Region, ...] = ()
-        for run in tried:
-            if run.ok:
-                self.learn(run.theta[None], self._response(run, n)[None])
 
     @classmethod
     def beyond(
@@ -144,6 +141,10 @@ class State:
             return np.full(n, np.nan)
         with np.errstate(all="ignore"):
             return self.problem.bound.to_response(run.outputs[self.problem.bound.model.output])
+
+    def outputs(self, values: Array) -> Array:
+        """Return values (k, m) as outputs, without those across zero."""
+        return self.problem.bound.from_response(values[:, ~self.across])
 
     def learn(self, theta: Array, values: Array) -> None:
         """Take runs into the training."""

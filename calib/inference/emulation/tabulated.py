@@ -15,6 +15,7 @@ from calib.inference.emulation.settings import Emulation, EmulationSettings
 from calib.inference.emulation.state import State
 from calib.inference.problem import Problem
 from calib.inference.random import generator
+from calib.inference.trial import check_scale
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Simulator
 from calib.models.simulators.emulator import Training
@@ -38,6 +39,7 @@ def emulate_table(
         else Run(t, {}, Failure("nan", "the table has no value for it"))
         for t, v in zip(training.theta, training.values, strict=True)
     ]
+    check_scale(problem, state.outputs(training.values), simulator)
     order = generator(seed, "emulate", "table").permutation(len(training.theta))
     checks, kept = order[::_EVERY], np.delete(order, np.s_[::_EVERY])
     state.learn(training.theta[kept], training.values[kept])

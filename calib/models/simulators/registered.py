@@ -103,13 +103,18 @@ class Direct:
     output: str
     tally: Tally = field(default_factory=Tally, repr=False, compare=False)
 
+    @property
+    def declared_in(self) -> str:
+        """The simulator file, if any, for messages."""
+        return self.simulator.file
+
     def try_first(self, thetas: Array, conditions: Conditions) -> None:
         """Refuse a simulator that fails at each of some parameters (k, d), and in the same way.
 
-        Once for each process. One that is emulated or takes all parameter vectors at once is not
-        tried: what that raises is told at once, and its NaN stand for no value.
+        One that takes all parameter vectors at once is not tried: what that raises is told at once,
+        and its NaN stand for no value.
         """
-        if self.tally.tried or self.simulator.emulate or self._at_once:
+        if self._at_once:
             return
         runs: list[Run] = []
         for theta in thetas:
@@ -118,7 +123,6 @@ class Direct:
                 break
         if fail_alike(runs):
             raise without_value(FROM_THE_START, self.simulator, runs, None)
-        self.tally.tried = True
 
     def __call__(self, theta: Array, conditions: Conditions) -> Array:
         """Return the output of parameters (k, d) at conditions (n,), (k, n); NaN if a run fails."""
