@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.headers import Column
+from calib.data.headers import CHECKED, Column
 from calib.errors import CalibError
 
 type Array = NDArray[np.float64]
@@ -24,6 +24,11 @@ _MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 # Squares and cubes of larger numbers leave the range of double precision.
 _LARGEST = 1e100
 _MINUS = "\N{MINUS SIGN}"
+# What instruments and databases write where there is no value; of the positive ones from 9999 on.
+_NINES = [10.0**d - 1.0 + more for d in range(2, 7) for more in (0.0, 0.9, 0.99)]
+_CODES = np.array([
+    *(-x for x in _NINES), *(x for x in _NINES if x >= 9999.0), -999.25, -32768.0,
+])  # fmt: skip
 
 
 @dataclass(frozen=True, order=True)
@@ -219,12 +224,53 @@ def check_values(
     return canonical
 
 
+def check_codes(
+    column: Column, canonical: Array, lines: Lines, problems: Problems, *, missing_ok: bool
+) -> None:
+    """Note codes for missing values, -999 and the like, among values (n,) that can be readings.
+
+    A code is taken for a reading if it is no farther from the other values than these are from one
+    another, or if the header says that its values were checked.
+    """
+    written = column.written(canonical)
+    there = np.isfinite(written)
+    coded = there & _is_code(written)
+    if column.checked or column.quantity.role == "bookkeeping" or not coded.any():
+        return
+    others = written[there & ~coded]
+    low, high = (float(f(others)) for f in (np.min, np.max)) if others.size else (np.inf, -np.inf)
+    apart = np.maximum(low - written, written - high) > max(high - low, 0.0)
+    among = f", where the others are {low:g} to {high:g}" if others.size else ""
+    # Those that cannot be readings have been noted.
+    possible = column.quantity.range.holds(canonical)
+    for i in np.flatnonzero(coded & apart & possible).tolist():
+        problems.add(
+            int(lines[i]), column.header,
+            f"{written[i]:g} looks like a code for a missing value{among}",
+            "an empty cell" if missing_ok else "a measured value", _mend_code(column, missing_ok),
+        )  # fmt: skip
+
+
+def _is_code(written: Array) -> NDArray[np.bool_]:
+    # Rounded, for a conversion of units there and back may cost the last bit.
+    return np.isin(np.round(written, 6), _CODES)
+
+
+def _mend_code(column: Column, missing_ok: bool) -> str:
+    """Say what to do about a code for a missing value."""
+    cell = "leave the cell empty" if missing_ok else "delete the row"
+    return f"{cell}; if it is a reading, say so in the column name: '{column.header} {CHECKED}'"
+
+
 def _complaint(column: Column, value: float, cell: str) -> tuple[str, str]:
     """Say what is wrong with a value and how to mend it."""
     if not math.isfinite(value):
         what = f"{cell.strip()!r} is not a finite number" if cell.strip() else "an empty cell"
         return what, "fill in the measured value, or delete the row"
     quantity = column.quantity
+    if _is_code(np.array(value)):
+        what = f"{cell.strip()!r} is outside the range of {quantity.stem}"
+        return what, "if it stands for a missing value, delete the row or leave the cell empty"
     if abs(value) > _LARGEST:
         return f"{cell.strip()!r} is too large for a reading", quantity.mend
     what = f"{cell.strip()!r} is outside the range of {quantity.stem}"

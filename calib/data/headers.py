@@ -1,7 +1,8 @@
 """How a column name says which quantity it holds, and in which unit.
 
 A column name is a quantity followed by a unit (``rut_depth_mm``). Upper and lower case, spaces
-and brackets make no difference (``Rut depth [mm]``).
+and brackets make no difference (``Rut depth [mm]``). Behind it may stand ``(checked)``: its values
+are right, however unusual.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ _QUALIFIERS = frozenset({
     "level", "class", "method", "sensor", "channel", "time", "date",
 })  # fmt: skip
 
+# What a user puts behind a header whose values are to be believed as they are.
+CHECKED = "(checked)"
+
 
 def _stems() -> list[tuple[str, Quantity]]:
     """Every stem and the quantity it names, the longest first."""
@@ -42,9 +46,23 @@ class Column:
     unit: str
     position: int = 0
 
+    @property
+    def checked(self) -> bool:
+        """Whether the user says that its values are right, however unusual."""
+        return self.header.rstrip().lower().endswith(CHECKED)
+
     def to_canonical(self, values: ArrayLike) -> NDArray[np.float64]:
         """Convert values in this column's unit to the canonical unit, any shape."""
         return convert(values, self.unit, self.quantity.unit)
+
+    def written(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Convert canonical values to this column's unit, any shape."""
+        return convert(values, self.quantity.unit, self.unit)
+
+    @property
+    def unit_word(self) -> str:
+        """The unit as messages say it; empty for a plain number."""
+        return "" if self.unit == "dimensionless" else self.unit.replace("**", "")
 
     @property
     def allowed(self) -> str:
@@ -88,7 +106,7 @@ def parse_header(header: str, *, where: str = "", position: int = 0) -> Column |
     CalibError
         If a quantity is named without its unit, or with an unknown or an unfitting one.
     """
-    name = _normal(header)
+    name = _normal(re.sub(rf"{re.escape(CHECKED)}\s*$", "", header, flags=re.IGNORECASE))
     for stem, quantity in _stems():
         if name == stem:
             if quantity.bare_unit is None:

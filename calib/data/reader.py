@@ -12,7 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.data.cells import CellReader, Decimals, Problems, check_values, label_codes
+from calib.data.cells import (
+    CellReader,
+    Decimals,
+    Problems,
+    check_codes,
+    check_values,
+    label_codes,
+)
 from calib.data.csvfile import CsvFile, open_csv
 from calib.data.headers import Column, match_headers
 from calib.data.quantities import QUANTITIES
@@ -84,13 +91,14 @@ class _Parts:
 
     def __init__(
         self, columns: Sequence[Column], file: CsvFile, problems: Problems,
-        used: Collection[str], allow_missing: Collection[str],
+        used: frozenset[str], allow_missing: Collection[str],
     ) -> None:  # fmt: skip
         self._width = len(file.header)
         self._problems = problems
         self._delimiter = file.delimiter
         self._decimals = None if file.delimiter == "," else Decimals()
         self._missing = allow_missing
+        self._used = used
         self._readers = {
             c.quantity.canonical: CellReader(
                 c, problems, c.quantity.canonical in allow_missing,
@@ -136,6 +144,12 @@ class _Parts:
         if self._decimals:
             self._decimals.complain(self._problems)
         done = {n: np.concatenate(p) if p else np.empty(0) for n, p in self._numbers.items()}
+        for name, values in done.items():
+            if name in self._used:
+                check_codes(
+                    self._columns[name], values, self.lines, self._problems,
+                    missing_ok=name in self._missing,
+                )  # fmt: skip
         for name, labels in self._labels.items():
             done[name] = label_codes(
                 self._columns[name], labels, self.lines, self._problems,
@@ -198,6 +212,8 @@ def table_from_arrays(
             column, _as_floats(array, column, source), rows, problems,
             missing_ok=missing_ok, used=name in used,
         )  # fmt: skip
+        if name in used:
+            check_codes(column, done[name], rows, problems, missing_ok=missing_ok)
     problems.raise_any()
     text = _texts(arrays, n) if n <= MAX_TEXT_ROWS else ()
     return Table(done, source, rows, tuple(arrays), text, _sha256(done), label, ignored)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.headers import missing_column, parse_header, renamed
+from calib.data.headers import CHECKED, Column, missing_column, parse_header, renamed
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 
@@ -81,6 +82,34 @@ class Table:
                 allowed=", ".join(self.columns), mend="add the column to the data",
             )  # fmt: skip
         return self.columns[name]
+
+    @cached_property
+    def _headers(self) -> Mapping[str, Column]:
+        columns = [parse_header(header) for header in self.header]
+        return {c.quantity.canonical: c for c in columns if c is not None}
+
+    def column(self, name: str) -> Column:
+        """Return a quantity's column as the file has it: what messages about its values name.
+
+        Parameters
+        ----------
+        name : str
+            Its canonical name, which stands for the header where the file has none.
+        """
+        quantity = QUANTITIES[name]
+        return self._headers.get(name) or Column(name, quantity, quantity.unit)
+
+    def header_of(self, name: str) -> str:
+        """Return the header of a canonical column as it stands in the file."""
+        return self.column(name).header if name in QUANTITIES else name
+
+    def to_write[T](self, columns: Mapping[str, T]) -> dict[str, T]:
+        """Return columns of this table, by canonical name, under the headers to write them with.
+
+        What was said to be checked is so for whoever reads the file.
+        """
+        sure = {name for name, column in self._headers.items() if column.checked}
+        return {f"{n} {CHECKED}" if n in sure else n: v for n, v in columns.items()}
 
     def must_have(self, *names: str) -> None:
         """Raise a CalibError unless there are columns of these canonical names."""
@@ -176,14 +205,37 @@ def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -
     )
 
 
+def check_settings(table: Table, conditions: Sequence[str]) -> None:
+    """Raise a CalibError if no condition varies: the rows then repeat a single measurement.
+
+    They tell one number, and leave every parameter but one to its prior. Where only some of the
+    conditions are constant, what depends on these is the prior's, which a warning says.
+    """
+    values = {name: table[name] for name in conditions}
+    if any(np.ptp(v) > 1e-12 * np.abs(v).max() for v in values.values()):
+        return
+    at = ", ".join(
+        f"{table.header_of(name)} = {float(table.column(name).written(v[0])):g}"
+        for name, v in values.items()
+    )
+    raise CalibError(
+        f"all rows are at one setting of the conditions, {at}", where=table.source,
+        allowed="at least two settings: what the model says of any other would be the prior's",
+        mend="add measurements at other values, or check that the right column was written",
+    )  # fmt: skip
+
+
 def check_varies(table: Table, column: str) -> None:
     """Raise a CalibError if the values of a column are all equal, up to rounding."""
     values = table[column][~np.isnan(table[column])]
     if values.size and np.ptp(values) > 1e-12 * np.abs(values).max():
         return
-    found = f"all {values.size} values are {values[0]:g}" if values.size else "there is no value"
+    found = "there is no value"
+    if values.size:
+        value = table.column(column).written(values[0]) if column in QUANTITIES else values[0]
+        found = f"all {values.size} values are {value:g}"
     raise CalibError(
-        found, where=f"{table.source}, column {column!r}",
+        found, where=f"{table.source}, column {table.header_of(column)!r}",
         allowed="at least two different values: a constant column tells a model nothing",
         mend="check that the right column was written, or add measurements",
     )  # fmt: skip

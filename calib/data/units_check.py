@@ -1,17 +1,23 @@
-"""Values that are unusual or as in another unit than their column says; columns misspelt."""
+"""Values that are unusual or as in another unit than their column says; columns misspelt.
+
+A whole column that is as in another unit is refused where a model is to be fitted to it, and only
+warned of elsewhere; the user can say that it is right (`calib.data.headers.CHECKED`).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import PurePath
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.headers import match_headers, meant
+from calib.data.headers import CHECKED, accepted_headers, meant
 from calib.data.quantities import QUANTITIES, Quantity, columns_of
 from calib.data.table import Table
 from calib.data.units import convert
+from calib.errors import CalibError
 
 type Array = NDArray[np.float64]
 
@@ -20,6 +26,10 @@ _PSI, _NEAR, _FEW_LEVELS = 6.894757, 2e-3, 6
 _MOST_NAMED = 5
 # A column is too large if all but the largest tenth of it is.
 _MOST = 0.9
+# Refused are values that are, all of them, so many times beyond the usual, or the calibrated ones:
+# tyres of 3 psi are rare, tyres of 2 psi that would be usual in bar are in bar; and a model is used
+# beyond its range on purpose, by a factor.
+_FAR_FROM_USUAL, _FAR_FROM_KNOWN = 2.0, 10.0
 # Nearer to the unit of the header than this none is taken for it; units as near to each other as
 # that (bar, atm and kgf/cm2) are told as one.
 _OTHER, _SAME = 2.0, 1.2
@@ -34,15 +44,108 @@ def unit_notes(table: Table, quantity: Quantity, values: Array) -> list[str]:
     return [*_unusual(table, quantity, values), *_mixed_units(table, quantity, values)]
 
 
+@dataclass(frozen=True)
+class _Odd:
+    """A column that would be of usual size in another unit.
+
+    What was found in it, in its own unit; in which unit it would be usual, or what else may be the
+    matter; and whether no value of it is usual as it is.
+    """
+
+    name: str
+    found: str
+    hints: str
+    whole: bool
+
+
 def column_notes(table: Table) -> Iterator[str]:
     """Say which whole columns would be of usual size in another unit, as N that are typed as kN.
 
-    A small wheel's forces are not taken for such if the table has its load and its pull.
+    A small wheel's forces are not taken for such if the table has its load and its pull, and no
+    column whose header says that it was checked.
 
     Parameters
     ----------
     table : Table
     """
+    for odd in _odd_columns(table):
+        yield (
+            f"{source_of(table)}, {table.header_of(odd.name)}: {odd.found}: {odd.hints}; check the "
+            "unit in the column name"
+        )
+
+
+def check_units(table: Table, names: Iterable[str]) -> None:
+    """Raise a CalibError if a column that will be used is, as a whole, as in another unit.
+
+    Parameters
+    ----------
+    table : Table
+    names : iterable of str
+        Canonical names of the columns that will be used.
+    """
+    used = set(names)
+    for odd in _odd_columns(table):
+        if odd.whole and odd.name in used:
+            raise _another_unit(table, odd.name, f"{odd.found}: {odd.hints}")
+    for name in used & set(table) & set(QUANTITIES):
+        usual = QUANTITIES[name].usual
+        values = table[name][np.isfinite(table[name])]
+        if usual is None or not values.size or table.column(name).checked:
+            continue
+        low, high = usual[0] / _FAR_FROM_USUAL, usual[1] * _FAR_FROM_USUAL
+        read = usual_in(table, name, values, *usual)
+        if read and ((values < low).all() or (values > high).all()):
+            raise _another_unit(
+                table, name, f"all values are far from {_between(table, name, *usual)}, where they "
+                f"usually lie, and all would lie there if the readings are in {read}",
+            )  # fmt: skip
+
+
+def check_conditions(table: Table, known: Mapping[str, Array]) -> None:
+    """Raise a CalibError for conditions far from all calibrated ones, but not in another unit.
+
+    Parameters
+    ----------
+    table : Table
+        Conditions at which to predict.
+    known : mapping of str to ndarray
+        Those of the calibration, in the canonical unit.
+    """
+    for name, values in known.items():
+        low, high = float(values.min()), float(values.max())
+        far = bool((np.abs(table[name]) > _FAR_FROM_KNOWN * max(abs(low), abs(high))).all())
+        # What may be zero may be as near to it as one likes.
+        if QUANTITIES[name].range.low_open:
+            far |= bool((table[name] < low / _FAR_FROM_KNOWN).all())
+        read = usual_in(table, name, table[name], low, high) if far else ""
+        if read and not table.column(name).checked:
+            raise _another_unit(
+                table, name, "all values are more than ten times beyond the calibrated ones, "
+                f"{_between(table, name, low, high)}, and all would lie among them if the readings "
+                f"are in {read}",
+            )  # fmt: skip
+
+
+def _another_unit(table: Table, name: str, found: str) -> CalibError:
+    header = table.header_of(name)
+    return CalibError(
+        found, where=f"{table.source}, column {header!r}",
+        allowed=f"the unit of the readings in the column name: "
+        f"{', '.join(QUANTITIES[name].units)}",
+        mend="correct the unit in the column name; if the values are right as they are, say so "
+        f"there: '{header} {CHECKED}'",
+    )  # fmt: skip
+
+
+def _between(table: Table, name: str, low: float, high: float) -> str:
+    """Say a range in the unit of the file."""
+    column = table.column(name)
+    ends = column.written(np.array([low, high]))
+    return f"{ends[0]:.4g} to {ends[1]:.4g} {column.unit_word}".rstrip()
+
+
+def _odd_columns(table: Table) -> Iterator[_Odd]:
     known = [n for n in table if n in QUANTITIES and np.isfinite(table[n]).any()]
     sizes = {name: float(np.nanmax(np.abs(table[name]))) for name in known}
     pull, load = (
@@ -58,7 +161,7 @@ def column_notes(table: Table) -> Iterator[str]:
         low, high = quantity.largest
         if fits and quantity.kind in _OF_SMALL_WHEELS and size < low:
             continue
-        if low <= size <= high:
+        if low <= size <= high or table.column(name).checked:
             continue
         factor = 1e-3 if size > high else 1e3
         hints = [
@@ -67,14 +170,18 @@ def column_notes(table: Table) -> Iterator[str]:
         ] * (low <= factor * size <= high)
         read = usual_in(table, name, np.array([size]), low, high)
         hints += [f"usual if the readings are in {read}"] * bool(read)
+        sizes_of = np.abs(table[name][np.isfinite(table[name])])
         # One row that is far too large is that row's fault, not the column's.
-        alone = size > high and float(np.nanquantile(np.abs(table[name]), _MOST)) < high
+        alone = size > high and float(np.quantile(sizes_of, _MOST)) < high
         if hints and not alone:
-            yield (
-                f"{source_of(table)}, {name}: the largest {quantity.word} is {size:g} "
-                f"{_written(quantity.unit)}, and {low:g} to {high:g} is usual: "
-                f"{'; '.join(hints)}; check the unit in the column name"
-            )
+            column = table.column(name)
+            written = f"{float(column.written(size)):.4g} {column.unit_word}".rstrip()
+            yield _Odd(
+                name, f"the largest {quantity.word} is {written}, and "
+                f"{_between(table, name, low, high)} is usual", "; ".join(hints),
+                # Of what is too large, small values (at little slip) are usual in any unit.
+                size < low or float(np.median(sizes_of)) > high,
+            )  # fmt: skip
 
 
 def usual_in(table: Table, name: str, values: Array, low: float, high: float) -> str:
@@ -91,9 +198,7 @@ def usual_in(table: Table, name: str, values: Array, low: float, high: float) ->
     low, high : float
     """
     quantity = QUANTITIES[name]
-    columns, _ = match_headers(table.header, where=table.source)
-    said = next((c.unit for c in columns if c.quantity is quantity), quantity.unit)
-    own = float(convert(1.0, said, quantity.unit))
+    own = float(convert(1.0, table.column(name).unit, quantity.unit))
     told: dict[str, float] = {}
     for unit in quantity.units.values():
         factor = float(convert(1.0, unit, quantity.unit)) / own
@@ -120,7 +225,8 @@ def beyond_notes(table: Table, known: Mapping[str, Array]) -> Iterator[str]:
         read = usual_in(table, name, table[name], low, high) if beyond.mean() >= _MOST else ""
         if read:
             yield (
-                f"{source_of(table)}, {name}: nearly all values lie beyond the calibrated ones, "
+                f"{source_of(table)}, {table.header_of(name)}: nearly all values lie beyond the "
+                "calibrated ones, "
                 f"and all would lie among them if the readings are in {read}; check the unit in "
                 "the column name"
             )
@@ -137,7 +243,7 @@ def spelling_notes(table: Table) -> Iterator[str]:
 
 
 def _unusual(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
-    if quantity.usual is None:
+    if quantity.usual is None or table.column(quantity.canonical).checked:
         return
     low, high = quantity.usual
     odd = (values < low) | (values > high)
@@ -145,9 +251,9 @@ def _unusual(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
         read = usual_in(table, quantity.canonical, values, low, high)
         where = f", and all would be inside if the readings are in {read}" if read else ""
         yield (
-            f"{source_of(table)}, {lines_of(table, odd)}: {quantity.word} is outside {low:g} to "
-            f"{high:g} {quantity.unit}, where it usually lies{where}; check the unit in the column "
-            "name"
+            f"{source_of(table)}, {lines_of(table, odd)}: {word_of(table, quantity)} is outside "
+            f"{_between(table, quantity.canonical, low, high)}, where it usually lies{where}; "
+            "check the unit in the column name"
         )
 
 
@@ -171,9 +277,16 @@ def _mixed_units(table: Table, quantity: Quantity, values: Array) -> Iterable[st
     if not odd.any():
         return
     yield (
-        f"{source_of(table)}, {lines_of(table, odd)}: {quantity.word} is 6.895 times {way} than in "
-        "other rows, as where psi and kPa were mixed up; check the unit"
+        f"{source_of(table)}, {lines_of(table, odd)}: {word_of(table, quantity)} is 6.895 times "
+        f"{way} than in other rows, as where psi and kPa were mixed up; check the unit"
     )
+
+
+def word_of(table: Table, quantity: Quantity) -> str:
+    """Name a quantity in a sentence, and its column where this has another name than usual."""
+    header = table.header_of(quantity.canonical)
+    usual = header in accepted_headers(quantity)
+    return quantity.word if usual else f"{quantity.word} ({header!r})"
 
 
 def source_of(table: Table) -> str:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from calib.data import Table, read_table
 from calib.data.headers import renamed
-from calib.data.quantities import OUTPUTS, columns_of, output_of, physical_role
+from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, output_of, physical_role
 from calib.errors import CalibError, meant
 from calib.gap.context import Context, read_context
 from calib.gap.covariates import Covariates
@@ -369,7 +369,7 @@ def _output(case: Case, name: str, model: str) -> OutputData:
     for table in (case.lab, case.field):
         if column not in table or not np.isfinite(table[column]).any():
             raise CalibError(
-                f"the case models {name}, but there are no values of {column}",
+                f"the case models {name}, but there are no values of {table.header_of(column)}",
                 where=table.source,
                 mend=f"{renamed(table.ignored, [column])}add the column, or take the model out of "
                 "case.toml",
@@ -389,16 +389,18 @@ def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) ->
     """Refuse a field campaign that cannot be told from a mistake."""
     if rows.size < MIN_FIELD_ROWS:
         raise CalibError(
-            f"{rows.size} field rows with {column} cannot show a gap",
+            f"{rows.size} field rows with {case.field.header_of(column)} cannot show a gap",
             where=case.field.source,
             allowed=f"at least {MIN_FIELD_ROWS}",
             mend=f"measure more, or take {name} out of the case",
         )
     lab, field = (float(np.nanmedian(np.abs(t[column]))) for t in (case.lab, case.field))
+    unit = QUANTITIES[column].unit
     if not 1.0 / MAX_RATIO < field / max(lab, 1e-300) < MAX_RATIO:
         raise CalibError(
-            f"{column} is typically {field:.3g} in the field and {lab:.3g} in the calibration",
-            where=case.field.source,
+            f"{QUANTITIES[column].word} is typically {field:.3g} {unit} in the field and "
+            f"{lab:.3g} {unit} in the calibration",
+            where=f"{case.field.source}, column {case.field.header_of(column)!r}",
             allowed=f"campaigns whose outputs differ by less than a factor of {MAX_RATIO:g}",
             mend="check the units in the column names",
         )

@@ -43,9 +43,11 @@ def check_units(case: Case) -> None:
         lab, field = (float(np.median(table[name])) for table in (case.lab, case.field))
         if min(lab, field) <= 0.0 or 1.0 / MAX_RATIO < field / lab < MAX_RATIO:
             continue
+        unit = QUANTITIES[name].unit
         raise CalibError(
-            f"{name} is typically {field:.3g} in the field and {lab:.3g} in the calibration",
-            where=case.field.source,
+            f"{QUANTITIES[name].word} is typically {field:.3g} {unit} in the field and {lab:.3g} "
+            f"{unit} in the calibration",
+            where=f"{case.field.source}, column {case.field.header_of(name)!r}",
             allowed=f"campaigns whose conditions differ by less than a factor of {MAX_RATIO:g}",
             mend="check the units in the column names",
         )
@@ -115,7 +117,9 @@ def _blanked(table: Table, name: str, rows: NDArray[np.int64]) -> Table:
 
 
 def _said(table: Table, name: str, rows: NDArray[np.int64]) -> str:
-    at = ", ".join(f"line {table.lines[row]} ({name} = {table[name][row]:.4g})" for row in rows)
+    header = table.header_of(name)
+    values = table.column(name).written(table[name]) if name in QUANTITIES else table[name]
+    at = ", ".join(f"line {table.lines[row]} ({header} = {values[row]:.4g})" for row in rows)
     return (
         f"{table.source}, {at}: far from all other rows of both campaigns, or as in another unit; "
         "left out as a mistake (if it is none, add rows between)"

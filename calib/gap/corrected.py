@@ -93,14 +93,13 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
     case = corrected.data.case
     inner = folder / "case"
     inner.mkdir()
-    write_table(inner / "lab.csv", cells(case.lab.columns, case.covariates))
-    write_table(inner / "field.csv", cells(case.field.columns, case.covariates))
-    files = ["calibration", "field"]
-    if case.new_conditions is not None:
-        write_table(inner / "fresh.csv", cells(case.new_conditions.columns, case.covariates))
-        files.append("predict")
-    names = {"calibration": "lab.csv", "field": "field.csv", "predict": "fresh.csv"}
-    lines = [f'{name} = "{names[name]}"' for name in files]
+    tables = {"lab": case.lab, "field": case.field, "fresh": case.new_conditions}
+    lines = []
+    for key, (name, table) in zip(("calibration", "field", "predict"), tables.items(), strict=True):
+        if table is not None:
+            written = table.to_write(cells(table.columns, case.covariates))
+            write_table(inner / f"{name}.csv", written)
+            lines.append(f'{key} = "{name}.csv"')
     lines += ["", "[models]", *(f'{output} = "{model}"' for output, model in case.models.items())]
     lines += ["", "[priors]"] if case.priors else []
     for output, priors in case.priors.items():

@@ -111,9 +111,9 @@ def _same_place(field: Table) -> Iterator[str]:
         shared[first] = count[place] > 1
         if shared.any():
             yield (
-                f"{source_of(field)}, {lines_of(field, shared)}: the same {name} as another row; a "
-                "drift or a step of a sensor is sought in this order: number the rows as they were "
-                "measured, or leave the column out"
+                f"{source_of(field)}, {lines_of(field, shared)}: the same {field.header_of(name)} "
+                "as another row; a drift or a step of a sensor is sought in this order: number the "
+                "rows as they were measured, or leave the column out"
             )
 
 
@@ -126,15 +126,16 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
         ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
         if not apart and not 1.0 / _FAR_RATIO < ratio < _FAR_RATIO:
             said.append(
-                f"{name}: {_times(lab[name], field[name], _ROUGHLY)}; if the field's is in another "
-                "unit, the diagnosis means nothing"
+                f"{_compared(lab, field, name, _ROUGHLY)}; if the field's is in another unit, the "
+                "diagnosis means nothing"
             )
         if apart and np.ptp(lab[name]) > 0.0:
             read = usual_in(field, name, field[name], lab[name].min(), lab[name].max())
             within = f", and all would if the readings are in {read}" if read else ""
             said.append(
-                f"{name}: no field value lies within the calibration's range{within}, "
-                f"{_times(lab[name], field[name])}; the simulator is used where it was not fitted"
+                f"{field.header_of(name)}: no field value lies within the calibration's range"
+                f"{within}, {_typically(lab, field, name)}; the simulator is used where it was not "
+                "fitted"
             )
     said += _covariates(lab, field, conditions)
     outputs = [OUTPUTS[output] for output in models]
@@ -143,8 +144,8 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
             ratio = _typical(field[name]) / max(_typical(lab[name]), 1e-300)
             if not 1.0 / _ODD_RATIO < ratio < _ODD_RATIO:
                 said.append(
-                    f"{name}: {_times(lab[name], field[name])}; if the field's is in another unit, "
-                    "or is another column's, the diagnosis means nothing"
+                    f"{_compared(lab, field, name)}; if the field's is in another unit, or is "
+                    "another column's, the diagnosis means nothing"
                 )
     pull = next((name for name in outputs if role_of(name) == "pull"), None)
     for table in (lab, field):
@@ -177,18 +178,26 @@ def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str
         read = usual_in(field, name, field[name], bottom, top) if held else ""
         if read:
             yield (
-                f"{name}: {_times(lab[name], field[name], 0.0)}, and as in the calibration "
-                f"if the readings are in {read}; check the unit in the column name"
+                f"{_compared(lab, field, name, 0.0)}, and as in the calibration if "
+                f"the readings are in {read}; check the unit in the column name"
             )
         elif quantity.unit == "dimensionless" and not 1.0 / _PERCENT < ratio < _PERCENT:
-            yield (
-                f"{name}: {_times(lab[name], field[name], _ROUGHLY)}; check the unit in the column "
-                "name"
-            )
+            yield f"{_compared(lab, field, name, _ROUGHLY)}; check the unit in the column name"
 
 
 def _typical(values: Array) -> float:
     return float(np.nanmedian(np.abs(values)))
+
+
+def _compared(lab: Table, field: Table, name: str, near: float = _NEAR) -> str:
+    """Name a column of the field, and say how the campaigns compare in it."""
+    return f"{field.header_of(name)}: {_typically(lab, field, name, near)}"
+
+
+def _typically(lab: Table, field: Table, name: str, near: float = _NEAR) -> str:
+    """Say in the field's unit how typical values of a column compare, and which units do so."""
+    column = field.column(name)
+    return _times(column.written(lab[name]), column.written(field[name]), near)
 
 
 def _times(lab: Array, field: Array, near: float = _NEAR) -> str:

@@ -202,7 +202,8 @@ def noise_of(choice: NoiseChoice, conditions: Conditions, source: str) -> Noise:
     spread = float(values.std())
     if not spread > 1e-9 * float(np.abs(values).max()):
         raise CalibError(
-            f"the noise is to depend on {column}, which is the same in all rows that are fitted",
+            f"the noise is to depend on {QUANTITIES[column].word}, which is the same in all rows "
+            "that are fitted",
             where=where, allowed="a condition that varies", mend="leave noise_depends_on out",
         )  # fmt: skip
     return Noise(choice, column, float(values.mean()), spread)

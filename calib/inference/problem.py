@@ -20,7 +20,8 @@ from functools import cached_property
 
 import numpy as np
 
-from calib.data import Table, check_enough, check_varies
+from calib.data import Table, check_enough, check_settings, check_varies
+from calib.data.units_check import check_units
 from calib.errors import CalibError
 from calib.inference.likelihood import Squares
 from calib.inference.noise import NORMAL, Noise, noise_of
@@ -277,13 +278,14 @@ def build_problem(
     Raises
     ------
     CalibError
-        If a column is missing, too few rows are there, the output is constant, or the priors do
-        not fit the model.
+        If a column is missing, or as in another unit; if too few rows are there, all of them at one
+        setting of the conditions or with one output; or the priors do not fit the model.
     """
     model = get_model(model_name)
     table.must_have(*model.conditions, model.output)
     check_enough(table, len(model.parameters), model=model.name)
     check_varies(table, model.output)
+    check_settings(table, model.conditions)
     references = prior_references(table.columns)
     priors = read_priors(
         prior_path or default_priors(model.name),
@@ -291,6 +293,8 @@ def build_problem(
         (*model.parameters, "sigma"),
         references,
     )
+    relative = relative_columns(priors.text)
+    check_units(table, (*model.conditions, model.output, *relative))
     try:
         bound = model.bind(table.columns)
     except CalibError as error:
@@ -298,7 +302,7 @@ def build_problem(
     notes = tuple(
         f"the data have no column {name}, so priors that are relative to it assume {value:g}; give "
         "it if yours differs"
-        for name, value in relative_columns(priors.text).items()
+        for name, value in relative.items()
         if name not in references
     )
     noise = noise_of(priors.noise, model.select(table.columns), priors.source)

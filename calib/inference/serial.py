@@ -118,8 +118,9 @@ def serial_of(along: Along, table: Table) -> Serial | None:
     if wrong.size:
         lines = sorted(table.lines[row] for row in order[np.union1d(wrong, wrong - 1)])
         raise CalibError(
-            f"{along} does not say in which order the rows of a run were measured: see line"
-            f"{'s' if len(lines) > 1 else ''} {', '.join(map(str, lines[:_SHOWN]))}"
+            f"{table.header_of(along)} does not say in which order the rows of a run were "
+            f"measured: see line{'s' if len(lines) > 1 else ''} "
+            f"{', '.join(map(str, lines[:_SHOWN]))}"
             f"{' and others' if len(lines) > _SHOWN else ''}",
             where=table.source,
             allowed="a whole number in every row, another one for each row of a run",

@@ -14,7 +14,14 @@ from scipy import stats
 
 from calib.data import Table
 from calib.data.quantities import QUANTITIES
-from calib.data.units_check import column_notes, lines_of, source_of, spelling_notes, unit_notes
+from calib.data.units_check import (
+    column_notes,
+    lines_of,
+    source_of,
+    spelling_notes,
+    unit_notes,
+    word_of,
+)
 from calib.inference.problem import Problem
 from calib.models.base import Array
 from calib.validation.outliers import linear, outlying_notes
@@ -54,11 +61,25 @@ def file_notes(problem: Problem, scatter: float) -> tuple[str, ...]:
         quantity = QUANTITIES[name]
         if np.unique(values).size == 1:
             found.append(
-                f"{source_of(problem.table)}: {quantity.word} is the same in all rows; what "
-                "depends on it comes from the prior, and predictions elsewhere with it"
+                f"{source_of(problem.table)}: {word_of(problem.table, quantity)} is the same in "
+                "all rows; what depends on it comes from the prior, and predictions elsewhere "
+                "with it"
             )
         found += unit_notes(problem.table, quantity, values)
-    return (*found, *_copies(problem, scatter))
+    return (*found, *_few_settings(problem), *_copies(problem, scatter))
+
+
+def _few_settings(problem: Problem) -> Iterable[str]:
+    """Rows at fewer different conditions than there are parameters, however many rows."""
+    settings = len(np.unique(np.stack([*problem.conditions.values()], axis=1), axis=0))
+    names = set(problem.bound.model.parameters)
+    free = sum(prior.name in names for prior in problem.priors.free)
+    if settings < free:
+        yield (
+            f"{source_of(problem.table)}: the rows are at {settings} different settings of the "
+            f"conditions, which tell no more than so many numbers about {free} parameters; the "
+            "rest comes from the prior"
+        )
 
 
 def _copies(problem: Problem, scatter: float) -> Iterable[str]:
@@ -174,7 +195,7 @@ def _uneven(problem: Problem, residual: Array, judged: np.ndarray) -> Iterable[s
     for name, values in varying.items():
         found = stats.spearmanr(np.abs(residual), values)
         if found.pvalue < LEVEL / len(varying):
-            word, stem = QUANTITIES[name].word, QUANTITIES[name].stem
+            word, stem = word_of(problem.table, QUANTITIES[name]), QUANTITIES[name].stem
             grows = "grows" if found.statistic > 0.0 else "falls"
             yield (
                 f"{source_of(problem.table)}: the scatter {grows} with {word} (rank correlation "

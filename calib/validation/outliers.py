@@ -84,9 +84,11 @@ def outlying_notes(problem: Problem, t: Array) -> Sequence[str]:
     weight = "for one such row moves the posterior and widens it"
     if problem.noise.student:
         weight = "to which Student-t noise gives little weight"
-    output, source = problem.bound.model.output, PurePath(problem.table.source).name
+    source = PurePath(problem.table.source).name
+    column = problem.table.column(problem.bound.model.output)
     said = [
-        f"{source}, line {row.line}: {output} = {row.value:.4g} is {row.sds:.1f} sds from what the "
+        f"{source}, line {row.line}: {column.header} = {float(column.written(row.value)):.4g} is "
+        f"{row.sds:.1f} sds from what the "
         f"other rows say; check the reading, {weight}"
         for row in rows[:_MOST_NAMED]
     ]

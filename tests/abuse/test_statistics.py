@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -115,12 +116,14 @@ def in_metres(rows: Rows) -> Rows:
 
 
 def test_a_whole_column_in_another_unit(clean: Calibration) -> None:
-    problem = build_problem(
-        MODEL, _table(*(getattr(in_metres(Rows.made()), k) for k in ("slip", "pressure", "rut")))
-    )
-    said = " | ".join(file_notes(problem, 0.05))
+    rows = in_metres(Rows.made())
+    table = _table(rows.slip, rows.pressure, rows.rut)
+    said = " | ".join(column_notes(table))
     assert "ruts.csv, rut_depth_mm: the largest rut depth is 0.0" in said
     assert "about 1000 times too small" in said
+    with pytest.raises(CalibError, match="about 1000 times too small") as caught:
+        build_problem(MODEL, table)
+    assert "'rut_depth_mm (checked)'" in str(caught.value)
 
 
 @pytest.mark.parametrize(("load", "factor", "told"), [
@@ -201,6 +204,30 @@ def test_a_condition_that_does_not_vary(clean: Calibration) -> None:
     assert ratio > 0.5 > clean.summary["n0"].sd_ratio
 
 
+@pytest.mark.parametrize(("model", "columns"), [
+    ("magic_formula", {"slip_percent": [20.0], "drawbar_pull_kn": [1.0, 1.1, 0.9]}),
+    ("bekker", {"average_ground_pressure_kpa": [90.0], "rut_depth_mm": [20.0, 21.0, 19.0]}),
+    ("magic_formula_pressure", {"slip_percent": [20.0], "inflation_pressure_kpa": [200.0],
+                                "drawbar_pull_kn": [1.0, 1.1, 0.9]}),
+])  # fmt: skip
+def test_rows_at_one_setting_are_one_measurement_whatever_the_model(
+    model: str, columns: dict[str, list[float]]
+) -> None:
+    repeated = {name: np.resize(values, 30) for name, values in columns.items()}
+    with pytest.raises(CalibError, match="all rows are at one setting of the conditions"):
+        build_problem(model, table_from_arrays(repeated, source="one.csv"))
+
+
+def test_fewer_settings_than_parameters_are_told() -> None:
+    slip = np.tile([0.05, 0.2, 0.5], 10)
+    pull = 1.5 * np.sin(10.0 * slip) + 0.03 * np.random.default_rng(3).standard_normal(30)
+    columns = {"Slip (%)": 100.0 * slip, "drawbar_pull_kn": pull}
+    problem = build_problem("magic_formula", table_from_arrays(columns, source="few.csv"))
+    said = " | ".join(file_notes(problem, 0.03))
+    assert "few.csv: the rows are at 3 different settings of the conditions" in said
+    assert "about 6 parameters" in said
+
+
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_fewer_rows_than_parameters(n: int) -> None:
     rows = Rows.made().take(np.arange(n))
@@ -279,6 +306,34 @@ def test_warnings_are_on_the_terminal_the_page_and_in_the_summary(tmp_path: Path
     for text in (fit.stderr, report.stderr, page, "".join(told["models"]["rut_depth"]["warnings"])):
         assert "line 19: rut_depth_mm" in text
         assert "line 50: this row repeats another one exactly" in text
+
+
+@pytest.mark.slow
+def test_a_report_is_in_the_words_and_units_of_its_file_and_checks(tmp_path: Path) -> None:
+    """The folder keeps canonical columns, and what they were called."""
+    rows = Rows.made()
+    rows.rut[17] *= 100.0
+    cells = zip(100.0 * rows.slip, rows.pressure / 6.894757, rows.rut / 25.4, strict=True)
+    lines = ["Slip (%),Average ground pressure [psi],Sinkage [inch]"]
+    lines += [",".join(f"{v:.5f}" for v in row) for row in cells]
+    file = tmp_path / "ruts.csv"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    out, run = tmp_path / "report", CliRunner()
+    report = run.invoke(app, ["report", str(file), "--model", MODEL, "--out", str(out),
+                              "--workers", "1"])  # fmt: skip
+    assert report.exit_code == 0, report.output
+    assert "line 19: Sinkage [inch] = " in report.stderr
+    page = (out / "index.html").read_text(encoding="utf-8").replace("\N{NO-BREAK SPACE}", " ")
+    assert "Sinkage [inch] = " in page
+    told = json.loads((out / "summary.json").read_text(encoding="utf-8"))["models"]["rut_depth"]
+    rmse = told["validation"]["rmse"]
+    assert f"{rmse / 25.4:.3g} inch" in page
+    assert "13.1 to 21.8 psi" in page
+    for text in (page, (out / "methods.txt").read_text(encoding="utf-8")):
+        assert not re.search(r"\d (mm|kPa)\b", re.sub(r"<t[dr].*?</t[dr]>", "", text))
+    check = run.invoke(app, ["check", str(out), "--workers", "1"])
+    assert check.exit_code == 0, check.output
+    assert check.output.startswith("SAME"), check.output
 
 
 @pytest.mark.slow

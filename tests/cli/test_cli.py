@@ -112,14 +112,17 @@ def test_fit_predict_and_read_the_numbers(calib: Calib, he2019: Path, tmp_path: 
 
 
 def test_fit_names_a_reading_that_is_far_off(calib: Calib, he2019: Path) -> None:
+    """By the name and in the unit that the file has."""
     header, *rows = (he2019 / "rut_depth.csv").read_text().splitlines()
     at = header.split(",").index("rut_depth_mm")
-    cells = rows[10].split(",")
-    cells[at] = str(10.0 * float(cells[at]))
-    rows[10] = ",".join(cells)
-    Path("my.csv").write_text("\n".join([header, *rows]) + "\n")
+    table = [row.split(",") for row in rows]
+    for i, cells in enumerate(table):
+        cells[at] = f"{(10.0 if i == 10 else 1.0) * float(cells[at]) / 10.0:.4f}"
+    lines = [header.replace("rut_depth_mm", "Rut depth [cm]"), *map(",".join, table)]
+    Path("my.csv").write_text("\n".join(lines) + "\n")
     ran = calib("fit", "my.csv", "--model", "modified_bekker", "--out", "run")
-    assert f"my.csv, line 12: rut_depth_mm = {float(cells[at]):.4g} is" in ran.err
+    reading = float(table[10][at])
+    assert f"my.csv, line 12: Rut depth [cm] = {reading:.4g} is" in ran.err
     assert "check the reading" in ran.err
 
 

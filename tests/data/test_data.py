@@ -442,6 +442,62 @@ def test_a_table_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["folder", "out.csv"]
 
 
+# Codes for missing values, and columns in another unit that are right
+
+
+@pytest.mark.parametrize("code", ["-999", "-9999", "9999", "-999.25", "-99.9", "99999", "-32768"])
+@pytest.mark.parametrize("header", ["drawbar_pull_kn", "Drawbar pull [lbf]"])
+def test_a_code_for_a_missing_value_is_no_reading(my_csv: Write, code: str, header: str) -> None:
+    rows = [f"10,{value}" for value in ("0.5", "1.2", code, "1.4", code)]
+    path = my_csv("\n".join([f"slip_percent,{header}", *rows]) + "\n")
+    said = refusal(path)
+    for line in (4, 6):
+        assert f"line {line}, column {header!r}: {code} looks like a code for a missing" in said
+    assert "where the others are 0.5 to 1.4" in said
+    assert "delete the row" in said
+    assert "leave the cell empty" in refusal(path, allow_missing=["drawbar_pull_kn"])
+    # Where the column is not used nobody minds.
+    assert len(read_table(path, required=["slip_ratio"])) == 5
+    # A reading it may be.
+    sure = my_csv(path.read_text().replace(header, f"{header} (Checked)"))
+    assert read_table(sure).header[1] == f"{header} (Checked)"
+
+
+def test_a_column_of_codes_is_no_column_of_readings() -> None:
+    with pytest.raises(CalibError, match="2 problems in the data"):
+        table_from_arrays({"drawbar_pull_kn": np.array([-999.0, -999.0])})
+
+
+@pytest.mark.parametrize(("header", "values"), [
+    ("drawbar_pull_n", [-1500.0, -999.0, 200.0, 1800.0]),  # towed and driven
+    ("cone_index_kpa", [400.0, 999.0, 1300.0]),
+    ("average_ground_pressure_kpa", [99.0, 150.0]),
+    ("run_order", [1.0, 2.0, 9999.0]),
+])  # fmt: skip
+def test_readings_among_others_are_no_codes(header: str, values: list[float]) -> None:
+    assert len(table_from_arrays({header: np.array(values)})) == len(values)
+
+
+def test_a_code_that_cannot_be_a_reading_is_called_one(my_csv: Write) -> None:
+    said = refusal(my_csv("rut_depth_mm\n20\n-999\n"))
+    assert "line 3, column 'rut_depth_mm': '-999' is outside the range of rut_depth" in said
+    assert "if it stands for a missing value, delete the row or leave the cell empty" in said
+    assert said.count("line 3") == 1
+
+
+def test_a_table_knows_its_columns_as_the_file_has_them(my_csv: Write) -> None:
+    table = read_table(my_csv("Slip (%),Rut depth [cm] (checked),note\n10,2.5,x\n20,3.0,y\n"))
+    assert table.header_of("slip_ratio") == "Slip (%)"
+    assert table.header_of("rut_depth_mm") == "Rut depth [cm] (checked)"
+    assert table.header_of("speed_m_s") == "speed_m_s"
+    assert table.column("rut_depth_mm").written(table["rut_depth_mm"]).tolist() == [2.5, 3.0]
+    assert list(table.to_write(table.columns)) == ["slip_ratio", "rut_depth_mm (checked)"]
+    with pytest.raises(
+        CalibError, match=r"column 'Rut depth \[cm\] \(checked\)': all 1 values are 2.5"
+    ):
+        check_varies(table.take([0]), "rut_depth_mm")
+
+
 # Size and real files
 
 

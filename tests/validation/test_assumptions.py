@@ -179,7 +179,8 @@ def test_a_column_that_may_be_left_out_is_asked_after_when_misspelt() -> None:
 
 
 def test_residuals_are_not_judged_while_a_column_looks_to_be_in_another_unit() -> None:
-    slip = np.linspace(0.01, 0.5, 30)
+    # More than half of the pulls could be kN.
+    slip = np.concatenate([np.linspace(1e-4, 5e-3, 18), np.linspace(0.02, 0.5, 12)])
     pull = 1e3 * np.sin(20.0 * slip)
     table = table_from_arrays({"slip_ratio": slip, "drawbar_pull_kn": pull}, source="n.csv")
     problem = build_problem("magic_formula", table)
@@ -213,8 +214,15 @@ def test_coarse_readings_may_agree() -> None:
 
 
 def test_a_condition_that_does_not_vary_is_named() -> None:
-    found = notes_of(rut(average_ground_pressure_kpa=np.full(12, 100.0)))
+    same = {"average_ground_pressure_kpa": np.full(12, 100.0), "Slip [%]": np.arange(12.0)}
+    table = rut()
+    columns = {"rut_depth_mm": table["rut_depth_mm"], **same}
+    found = notes_of(table_from_arrays(columns, source="r.csv"), model="modified_bekker")
     assert "average ground pressure is the same in all rows" in found
+    # Named as the file has it.
+    columns |= {"Slip [%]": np.full(12, 5.0), "average_ground_pressure_kpa": np.arange(60.0, 72.0)}
+    found = notes_of(table_from_arrays(columns, source="r.csv"), model="modified_bekker")
+    assert "slip ('Slip [%]') is the same in all rows" in found
 
 
 def test_psi_among_kpa_is_noticed() -> None:
