@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.batch.folders import writing
 from calib.batch.tasks import completed
 from calib.errors import CalibError
 from challenge.build import try_case, unlisted_order
@@ -16,7 +17,7 @@ from challenge.design import TIERS, Tier
 from challenge.effects import LISTED, wheel_effects
 from challenge.files import CaseFiles, case_files
 from challenge.mechanism import NONE, SHIFT, UNKNOWN
-from challenge.seal import KEY_SCHEMA, check_new, publish, seal
+from challenge.seal import KEY_SCHEMA, check_new, new_folder, publish, seal
 
 type Progress = Callable[[int, int], None]
 type Job = tuple[np.random.SeedSequence, Tier, str]
@@ -193,12 +194,15 @@ def make(
     check_new(out_dir, key_path)
     jobs, planning = case_jobs(seed, n_cases, tiers, null_fraction)
     entries: dict[str, Any] = {}
-    out_dir.mkdir(parents=True, exist_ok=True)
-    with closing(completed(make_job, jobs, workers=workers, scheduler=scheduler)) as coming:
+    with (
+        new_folder(out_dir),
+        closing(completed(make_job, jobs, workers=workers, scheduler=scheduler)) as coming,
+    ):
         for task in coming:
             if task.result is None:
                 raise CalibError(f"{task.name} could not be made: {task.error}")
-            task.result.write(out_dir / task.name)
+            with writing(out_dir):
+                task.result.write(out_dir / task.name)
             entries[task.name] = task.result.key
             if progress is not None:
                 progress(len(entries), n_cases)

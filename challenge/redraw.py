@@ -9,10 +9,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from calib.batch.folders import writing
 from calib.batch.tasks import completed
 from calib.errors import CalibError
 from challenge.files import CaseFiles
-from challenge.seal import KEY_SCHEMA, check_new, open_key, publish, seal
+from challenge.seal import KEY_SCHEMA, check_new, new_folder, open_key, publish, seal
 
 type Draw = Callable[[Path, str, float], tuple[dict[str, str], dict[str, Any]]]
 
@@ -75,14 +76,18 @@ def redraw(
     entries: dict[str, Any] = {}
     without: dict[str, str] = {}
     work = partial(_redrawn, draw)
-    with closing(
-        completed(work, jobs, workers=workers, scheduler=scheduler, announce=announce)
-    ) as coming:
+    with (
+        new_folder(out),
+        closing(
+            completed(work, jobs, workers=workers, scheduler=scheduler, announce=announce)
+        ) as coming,
+    ):
         for task in coming:
             if task.result is None:
                 without[task.name] = str(task.error)
             else:
-                task.result.write(out / task.name)
+                with writing(out):
+                    task.result.write(out / task.name)
                 entries[task.name] = task.result.key
             if progress is not None:
                 progress(len(entries) + len(without), len(jobs))

@@ -8,9 +8,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from calib.batch.folders import check_room, writing
+from calib.batch.tasks import alone
 from calib.errors import CalibError
 
 KEY_SCHEMA = "calib/challenge-key/1"
@@ -49,12 +53,23 @@ def check_new(cases_dir: Path, key_path: Path) -> None:
             where=str(cases_dir),
             mend="choose a new folder, so that cases of two tests cannot mix",
         )
+    for path in (cases_dir, key_path):
+        check_room(path)
     if key_path.exists():
         raise CalibError(
             "a key is there already",
             where=str(key_path),
             mend="choose another path; without its key a test cannot be scored",
         )
+
+
+@contextmanager
+def new_folder(cases_dir: Path) -> Iterator[None]:
+    """Make the folder of cases, and keep other processes from writing theirs there."""
+    with writing(cases_dir):
+        cases_dir.mkdir(parents=True, exist_ok=True)
+    with alone(cases_dir):
+        yield
 
 
 def seal(key: dict[str, Any], key_path: Path) -> str:
@@ -68,9 +83,10 @@ def seal(key: dict[str, Any], key_path: Path) -> str:
         Where to write; readable by its owner only.
     """
     data = (json.dumps(key, indent=1, sort_keys=True, allow_nan=False) + "\n").encode()
-    key_path.parent.mkdir(parents=True, exist_ok=True)
-    key_path.write_bytes(data)
-    key_path.chmod(0o600)
+    with writing(key_path):
+        key_path.parent.mkdir(parents=True, exist_ok=True)
+        key_path.write_bytes(data)
+        key_path.chmod(0o600)
     return sha256(data)
 
 

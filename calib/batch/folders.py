@@ -26,11 +26,13 @@ _WRITTEN = (
     "emulators", "compared", "held_out.csv",
 )  # fmt: skip
 
+# Scratch folders of results to be written by this process: of each its lock.
+_claimed: dict[Path, tuple[Path, int | None]] = {}
 _YOUNG_SECONDS = 60.0
 # A folder with posteriors is of some megabytes; with less than this left it is not begun.
 _ROOM_BYTES = 16_000_000
 # The disk is full, the quota used up, the file system read-only.
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
 
 def _is_ours(name: str) -> bool:
@@ -51,11 +53,8 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """
     out = Path(out)
     check_folder(out, overwrite=overwrite)
-    with writing(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        _remove_abandoned(out)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-        held = lock(scratch)
+    key = out.absolute()
+    scratch, held = _claimed.pop(key) if key in _claimed else _scratch(out)
     try:
         yield scratch
         scratch.chmod(0o777 & ~_umask())
@@ -67,13 +66,78 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         else:
             _put(scratch, out)
     except OSError as error:
-        if error.errno not in _NO_ROOM:
+        # NumPy says of a full disk itself what the system would, without its number.
+        if error.errno not in (*NO_ROOM, None):
             raise
-        raise _unwritable(out, str(error.strerror)) from None
+        raise _unwritable(out, error.strerror or str(error)) from None
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
         if held is not None:
             os.close(held)
+
+
+@contextmanager
+def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
+    """Keep a folder, which will be written at the end of long work, from other processes.
+
+    What can be known before the work is found here: that it may not be written or replaced, that
+    the disk is full, or that another process is about to write it.
+
+    Raises
+    ------
+    CalibError
+        As `fresh_folder` does, or if the folder is claimed already.
+    """
+    out = Path(out)
+    check_folder(out, overwrite=overwrite)
+    with writing(out):
+        living = out.parent.is_dir() and any(_is_alive(path) for path, _ in _scratches(out))
+    if living:
+        raise CalibError(
+            "another process is working on this output folder",
+            where=str(out),
+            mend="wait until it ends, stop it, or choose another --out",
+        )
+    _claimed[out.absolute()] = _scratch(out)
+    try:
+        yield
+    finally:
+        if out.absolute() in _claimed:
+            scratch, held = _claimed.pop(out.absolute())
+            shutil.rmtree(scratch, ignore_errors=True)
+            if held is not None:
+                os.close(held)
+
+
+def _scratch(out: Path) -> tuple[Path, int | None]:
+    """Make the scratch folder of a result, and lock it."""
+    with writing(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        _remove_abandoned(out)
+        scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+        return scratch, lock(scratch)
+
+
+def _scratches(out: Path) -> Iterator[tuple[Path, bool]]:
+    """Yield the scratch folders of a result that are there, and whether each holds an old one."""
+    pattern = re.compile(rf"\.{re.escape(out.name)}-(?P<old>old-)?[a-z0-9_]{{8}}")
+    for path in out.parent.iterdir():
+        match = pattern.fullmatch(path.name)
+        if match is not None and path.is_dir():
+            yield path, match["old"] is not None
+
+
+def _is_alive(scratch: Path) -> bool:
+    """Whether the process that made a scratch folder still runs."""
+    try:
+        held = lock(scratch)
+    except BlockingIOError:
+        return True
+    except OSError:  # gone meanwhile
+        return False
+    if held is not None:
+        os.close(held)
+    return False
 
 
 def _put(scratch: Path, out: Path) -> None:
@@ -124,10 +188,8 @@ def _remove_abandoned(out: Path) -> None:
     may be about to lock them. An earlier result that was being replaced stays if it is the only
     one there is.
     """
-    pattern = re.compile(rf"\.{re.escape(out.name)}-(?P<old>old-)?[a-z0-9_]{{8}}")
-    for path in out.parent.iterdir():
-        match = pattern.fullmatch(path.name)
-        if match is None or not path.is_dir() or (match["old"] and not out.exists()):
+    for path, old in _scratches(out):
+        if old and not out.exists():
             continue
         with contextlib.suppress(OSError):
             if time.time() - path.stat().st_mtime < _YOUNG_SECONDS:
@@ -149,9 +211,14 @@ def read_folder(folder: Path) -> dict[str, bytes]:
 
 def write_whole(path: Path, text: str) -> None:
     """Write a file that is there whole or not at all, or as it was, whenever it is killed."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text, encoding="utf-8")
-    part.replace(path)
+    # Of a name of its own, for another process may write the same.
+    part = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        part.write_text(text, encoding="utf-8")
+        part.replace(path)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -165,14 +232,22 @@ def writing(out: Path) -> Iterator[None]:
 
 def _unwritable(out: Path, why: str) -> CalibError:
     return CalibError(
-        f"the output folder cannot be written ({why})",
+        f"the output cannot be written ({why})",
         where=str(out),
-        mend="choose another folder with --out, change its permissions, or make room",
+        mend="choose another --out, change its permissions, or make room",
     )
 
 
-def _check_parent(out: Path) -> None:
-    parent = next(p for p in out.absolute().parents if p.exists())
+def check_room(out: Path) -> None:
+    """Raise a CalibError, before long work, if a file or into a folder nothing can be written."""
+    _check_place(out, out if out.is_dir() else _above(out))
+
+
+def _above(out: Path) -> Path:
+    return next(p for p in out.absolute().parents if p.exists())
+
+
+def _check_place(out: Path, parent: Path) -> None:
     if not parent.is_dir():
         raise _unwritable(out, f"{parent} is a file")
     if not os.access(parent, os.W_OK | os.X_OK):
@@ -193,7 +268,7 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
     with writing(out):  # a name that is too long, a folder that may not be searched
         exists = out.exists()
     if not exists:
-        _check_parent(out)
+        _check_place(out, _above(out))
         return
     if not out.is_dir():
         raise CalibError(
@@ -205,8 +280,8 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
             where=str(out),
             mend="choose another --out, such as a new folder inside it",
         )
+    _check_place(out, _above(out))
     if not any(out.iterdir()):
-        _check_parent(out)
         return
     if not overwrite:
         raise CalibError(

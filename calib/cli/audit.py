@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 
 def audit(
+    ctx: typer.Context,
     out: Annotated[
         Path | None, typer.Option(help="Folder for audit.json, audit.csv, figures and a page.")
     ] = None,
@@ -25,12 +26,12 @@ def audit(
     overwrite: opt.Overwrite = False,
 ) -> None:
     """Audit the published tables of He, Sandu & Osorio (2019): every figure and its verdict."""
-    from calib.batch.folders import check_folder, fresh_folder
+    from calib.batch.folders import claimed, fresh_folder
     from calib.cli.display import progress_bars
     from calib.he2019.audit import audit_json, run_audit
 
     if out is not None:
-        check_folder(out, overwrite=overwrite)
+        ctx.with_resource(claimed(out, overwrite=overwrite))
     with progress_bars() as tell:
         found = run_audit(seed, progress=tell)
         if out is not None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 
 def report(
+    ctx: typer.Context,
     files: Annotated[
         list[Path] | None, typer.Argument(help="Your CSV files; the embedded data if none.")
     ] = None,
@@ -49,10 +50,10 @@ def report(
     json: Json = False,
 ) -> None:
     """Calibrate, predict, validate and write a report folder with an index.html."""
-    from calib.batch.folders import check_folder
+    from calib.batch.folders import claimed
     from calib.batch.pool import begin_imports, pool
 
-    check_folder(out, overwrite=overwrite)
+    ctx.with_resource(claimed(out, overwrite=overwrite))
     begin_imports(workers)
     from dataclasses import replace
 
@@ -137,6 +138,7 @@ def report(
 
 
 def fit(
+    ctx: typer.Context,
     file: Annotated[Path, typer.Argument(help="CSV whose column names carry units.")],
     model: Annotated[str, typer.Option(help="See `calib models`.")],
     out: Annotated[Path, typer.Option(help="Run folder to write.")] = Path("calib-run"),
@@ -155,7 +157,7 @@ def fit(
 
     from calib import SamplerSettings, build_problem, calibrate, estimate, save_calibration
     from calib import validate_held_out as validate
-    from calib.batch.folders import check_folder, fresh_folder
+    from calib.batch.folders import claimed, fresh_folder
     from calib.cli.display import posterior_table, progress_bars, verdict_line
     from calib.cli.simulators import say, say_failed
     from calib.inference.emulation.prepared import prepare
@@ -167,7 +169,7 @@ def fit(
     from calib.validation.noise_preference import noise_preference
 
     chosen = get_model(model)
-    check_folder(out, overwrite=overwrite)
+    ctx.with_resource(claimed(out, overwrite=overwrite))
     settings = SamplerSettings(max_steps=max_steps)
     kept = None if hold_out is None else HoldOut.parse(hold_out)
     fitted, held = read_and_split(file, (*chosen.conditions, chosen.output), kept)
@@ -249,12 +251,15 @@ def predict(
             mend="choose another --out, or pass --overwrite",
         )
     from calib import load_calibration
+    from calib.batch.folders import check_room
     from calib.data import read_for_model
-    from calib.data.units_check import beyond_notes
+    from calib.data.units_check import beyond_notes, check_conditions
     from calib.models.simulators.emulator.model import emulator_of
     from calib.validation.prediction import MIN_DEFINED, predict_stacked, prediction_columns
     from calib.validation.prediction import predict as predict_at
 
+    if out is not None:
+        check_room(out)
     if (run / "corrected.json").exists():
         _predict_corrected(run, at, out, effects, without or [])
         return
@@ -277,6 +282,8 @@ def predict(
               file=sys.stderr)  # fmt: skip
     used = dict.fromkeys(n for _, c in parts for n in c.problem.bound.model.conditions)
     table = read_for_model(at, tuple(used))
+    known = {n: v for _, c in parts for n, v in c.problem.conditions.items()}
+    check_conditions(table, known)
     prediction = (
         predict_at(parts[0][1], table) if len(parts) == 1 else predict_stacked(parts, table)
     )
@@ -287,7 +294,6 @@ def predict(
     if outside:
         lie = "row lies" if outside == 1 else "rows lie"
         print(f"calib: {outside} {lie} outside the calibrated range", file=sys.stderr)
-        known = {n: v for _, c in parts for n, v in c.problem.conditions.items()}
         for note in beyond_notes(table, known):
             print(f"calib: {note}", file=sys.stderr)
     undefined = int((prediction.defined < MIN_DEFINED).sum())
@@ -441,10 +447,12 @@ def _emit(text: str, out: Path | None) -> None:
     if out is None:
         sys.stdout.write(text)
         return
+    from calib.batch.folders import write_whole
+
     try:
         if out.exists():
             raise CalibError("the file exists already", where=str(out), mend="choose another --out")
-        out.write_text(text, encoding="utf-8")
+        write_whole(out, text)
     except OSError as error:
         raise CalibError(
             f"the file cannot be written ({error.strerror})", where=str(out),

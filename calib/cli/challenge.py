@@ -10,6 +10,7 @@ import typer
 
 from calib.batch.bench import from_the_bench
 from calib.cli import options as opt
+from calib.cli.machine import Json, finish
 
 _Cases = Annotated[Path, typer.Argument(help="Folder with cases.")]
 _Key = Annotated[Path, typer.Option(help="Their sealed answers.")]
@@ -29,6 +30,7 @@ def make(
     ] = "both",
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
+    json: Json = False,
 ) -> None:
     """Write cases of known cause, and their answers into a sealed key."""
     with from_the_bench("calib challenge make"):
@@ -42,6 +44,7 @@ def make(
             progress=lambda done, n: tell("making cases", done, n),
         )  # fmt: skip
     print(f"{cases} cases in {out}; the key's SHA-256 is {digest}")
+    finish(0, {"folder": str(out), "cases": cases, "key_sha256": digest})
 
 
 @verbs.command()
@@ -52,6 +55,7 @@ def run(
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
     plugins: opt.Models = None,
+    json: Json = False,
 ) -> None:
     """Diagnose every case of a folder; run again to resume."""
     from calib.cli.display import progress_bars
@@ -66,8 +70,7 @@ def run(
     for name, error in failed.items():
         print(f"calib: {name} failed: {error}", file=sys.stderr)
     print(f"{len(cases) - len(failed)} of {len(cases)} cases diagnosed in {out}")
-    if failed:
-        raise typer.Exit(1)
+    finish(1 if failed else 0, {"folder": str(out), "cases": len(cases), "failed": failed})
 
 
 @verbs.command("well-specified")
@@ -79,6 +82,7 @@ def well_specified(
     seed: opt.Seed = 1,
     workers: opt.Workers = 2,
     scheduler: opt.Scheduler = None,
+    json: Json = False,
 ) -> None:
     """Write the same designs again, with effects that act exactly as the diagnosis believes."""
     with from_the_bench("calib challenge well-specified"):
@@ -97,10 +101,12 @@ def well_specified(
     for name, why in without.items():
         print(f"calib: {name} has no well-specified case: {why}", file=sys.stderr)
     print(f"well-specified cases in {out}; diagnose and score them as any others")
+    finish(0, {"folder": str(out), "without": without})
 
 
 @verbs.command()
 def score(
+    ctx: typer.Context,
     folder: _Cases,
     results: Annotated[Path, typer.Option(help="Folder with the diagnoses.")],
     key: _Key,
@@ -109,29 +115,32 @@ def score(
     ] = "",
     out: Annotated[Path | None, typer.Option(help="Folder for the table and figures.")] = None,
     overwrite: opt.Overwrite = False,
+    json: Json = False,
 ) -> None:
     """Compare diagnoses with the sealed answers."""
+    from dataclasses import asdict
+
     with from_the_bench("calib challenge score"):
         from challenge.figures import levels_figure, reliability_figure
         from challenge.score import score as score_all
         from challenge.table import text_table
-    from calib.batch.folders import check_folder, fresh_folder
+    from calib.batch.folders import claimed, fresh_folder
 
     if out is not None:
-        check_folder(out, overwrite=overwrite)
+        ctx.with_resource(claimed(out, overwrite=overwrite))
     found = score_all(folder, results, key, [o.strip() for o in outputs.split(",") if o.strip()])
     table = text_table(found)
     for warning in found.warnings:
         print(f"calib: {warning}", file=sys.stderr)
     print(table)
-    if out is None:
-        return
-    with fresh_folder(out, overwrite=overwrite) as scratch:
-        (scratch / "score.txt").write_text(table + "\n", encoding="utf-8")
-        levels_figure(list(found.tiers.values())).savefig(scratch / "levels.png", dpi=150)
-        for tier in found.tiers:
-            bins = found.tiers[tier].reliability
-            reliability_figure(bins, f"{tier} cases").savefig(
-                scratch / f"reliability_{tier}.png", dpi=150
-            )
-    print(out)
+    if out is not None:
+        with fresh_folder(out, overwrite=overwrite) as scratch:
+            (scratch / "score.txt").write_text(table + "\n", encoding="utf-8")
+            levels_figure(list(found.tiers.values())).savefig(scratch / "levels.png", dpi=150)
+            for tier in found.tiers:
+                bins = found.tiers[tier].reliability
+                reliability_figure(bins, f"{tier} cases").savefig(
+                    scratch / f"reliability_{tier}.png", dpi=150
+                )
+        print(out)
+    finish(0, {**asdict(found), "folder": out and str(out)})

@@ -12,6 +12,7 @@ from calib.cli.machine import Json, finish
 
 
 def compare(
+    ctx: typer.Context,
     what: Annotated[list[str], typer.Argument(help="Models, then the CSV: A B my.csv.")],
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-comparison"),
     priors: opt.PriorFiles = None,
@@ -25,7 +26,7 @@ def compare(
     json: Json = False,
 ) -> None:
     """Say which of several models the same data prefer, and what they cannot tell."""
-    from calib.batch.folders import check_folder, fresh_folder
+    from calib.batch.folders import claimed, fresh_folder
     from calib.cli.display import progress_bars
     from calib.cli.simulators import say
     from calib.inference.emulation.prepared import prepare
@@ -38,7 +39,7 @@ def compare(
     from calib.validation.comparison import compare as find
 
     *models, file = what
-    check_folder(out, overwrite=overwrite)
+    ctx.with_resource(claimed(out, overwrite=overwrite))
     check_comparable(models)
     chosen = [get_model(name) for name in models]
     needed = {c for m in chosen for c in (*m.conditions, m.output)}

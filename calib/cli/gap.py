@@ -20,6 +20,7 @@ _PAGE = (
 
 
 def diagnose(
+    ctx: typer.Context,
     case: Annotated[Path | None, typer.Argument(help="Case folder with a case.toml.")] = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-diagnosis"),
     seed: opt.Seed = 1,
@@ -35,10 +36,10 @@ def diagnose(
     json: Json = False,
 ) -> None:
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
-    from calib.batch.folders import check_folder, fresh_folder
+    from calib.batch.folders import claimed, fresh_folder
     from calib.batch.pool import begin_imports, pool
 
-    check_folder(out, overwrite=overwrite)
+    ctx.with_resource(claimed(out, overwrite=overwrite))
     begin_imports(workers, _PAGE)
     from calib.cli.display import progress_bars
     from calib.cli.simulators import keep_emulators, prepare_case, say

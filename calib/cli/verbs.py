@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import sys
 from typing import Annotated, Any
 
@@ -32,6 +33,7 @@ class _Verbs(TyperGroup):
     """All verbs: what the user can mend, or stops, ends with a line and no traceback."""
 
     def invoke(self, ctx: Any) -> Any:
+        from calib.batch.folders import NO_ROOM
         from calib.errors import CalibError
 
         try:
@@ -43,6 +45,16 @@ class _Verbs(TyperGroup):
 
                 traceback.print_exc()
             print(f"calib: {error}", file=sys.stderr)
+            raise typer.Exit(2) from None
+        except OSError as error:
+            # Of a disk that fills up while something is written nothing more can be known before.
+            if error.errno not in (*NO_ROOM, errno.EACCES, errno.EPERM, None):
+                raise
+            print(
+                f"calib: {error.filename or 'a file'} cannot be written "
+                f"({error.strerror or error}): make room, or change its permissions",
+                file=sys.stderr,
+            )  # fmt: skip
             raise typer.Exit(2) from None
         except KeyboardInterrupt as stop:
             print(f"calib: {str(stop) or STOPPED}", file=sys.stderr)

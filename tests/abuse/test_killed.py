@@ -6,6 +6,7 @@ In `make test` it is the writing of a folder that is killed (`batch/test_folders
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -18,6 +19,7 @@ import pytest
 
 from calib.models import example_csv
 from tests.gap.cases import make_case, write_case
+from tests.models.simulators.examples import lab, write_program
 
 COMMAND = [sys.executable, "-c", "from calib.cli import main; main()"]
 # Words of a command, and the files that hold its numbers.
@@ -39,7 +41,14 @@ VERBS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("sbc", "--model", "bekker", "--simulations", "10", "--workers", "1", "--out", "out"),
         ("sbc.json",),
     ),
+    "simulator": (
+        ("fit", "lab.csv", "--model", "wheel", "--simulator", "wheel.toml", "--max-steps", "400",
+         "--workers", "1", "--out", "out"),
+        ("run.json", "data.csv", "priors.toml"),
+    ),
 }  # fmt: skip
+CHECK = ("check", "run", "--workers", "1", "--json")
+RUNS = Path("wheel.runs")
 
 
 @pytest.fixture
@@ -47,14 +56,23 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "ruts.csv").write_text(example_csv("bekker"), encoding="utf-8")
     write_case(make_case("force_offset", n_lab=15, n_field=12), tmp_path / "case")
+    columns = lab(np.random.default_rng(1))
+    np.savetxt("lab.csv", np.stack(list(columns.values()), axis=1), delimiter=",",
+               header=",".join(columns), comments="")  # fmt: skip
+    # Of each run that is begun a line, with its parameters.
+    begun = f"open({str(tmp_path / 'begun')!r}, 'a').write(json.dumps(p, sort_keys=True) + chr(10))"
+    simulator = write_program(tmp_path, extra=f"{begun}; time.sleep(0.05)")
+    budget = "\n[emulator]\nruns = 30\nfirst = 12\nchecks = 4\n"
+    simulator.write_text(simulator.read_text(encoding="utf-8") + budget, encoding="utf-8")
+    (tmp_path / "scratch").mkdir()
     return tmp_path
 
 
-def start(words: tuple[str, ...]) -> subprocess.Popen[bytes]:
+def start(words: tuple[str, ...], out: int = subprocess.DEVNULL) -> subprocess.Popen[bytes]:
+    path = os.pathsep.join(p for p in sys.path if p)
     return subprocess.Popen(
-        [*COMMAND, *words], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
-        start_new_session=True,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+        [*COMMAND, *words], stdout=out, stderr=subprocess.DEVNULL, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": path, "TMPDIR": str(Path("scratch").resolve())},
     )  # fmt: skip
 
 
@@ -68,6 +86,24 @@ def numbers(out: Path, files: tuple[str, ...]) -> dict[str, str]:
     return found
 
 
+def kill(process: subprocess.Popen[bytes], seconds: float) -> None:
+    """Kill a command, and all that it has started in its group, after so many seconds."""
+    time.sleep(seconds)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait(timeout=60)
+
+
+def kept_runs() -> set[str]:
+    """The parameters of the simulator's runs that are kept; half of one could not be read."""
+    kept = [json.loads(path.read_text(encoding="utf-8")) for path in RUNS.glob("*/*-0.json")]
+    return {json.dumps(run["parameters"], sort_keys=True) for run in kept}
+
+
+def begun_runs() -> list[str]:
+    path = Path("begun")
+    return path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+
+
 def kill_and_go_again(verb: str, times: int, rng: np.random.Generator) -> int:
     """Kill a command so often at random moments; return how often it had no result yet."""
     words, files = VERBS[verb]
@@ -77,11 +113,9 @@ def kill_and_go_again(verb: str, times: int, rng: np.random.Generator) -> int:
     whole = numbers(Path("out"), files)
     cut_short = 0
     for _ in range(times):
-        subprocess.run(["rm", "-rf", "out"], check=True)
-        process = start(words)
-        time.sleep(took * rng.uniform(0.05, 1.0))
-        os.killpg(process.pid, signal.SIGKILL)
-        process.wait(timeout=60)
+        subprocess.run(["rm", "-rf", "out", str(RUNS)], check=True)
+        kill(start(words), took * rng.uniform(0.05, 1.0))
+        kept, before = kept_runs(), len(begun_runs())
         if Path("out").exists() and all((Path("out") / name).exists() for name in files):
             assert numbers(Path("out"), files) == whole
             if verb != "sbc":
@@ -92,13 +126,60 @@ def kill_and_go_again(verb: str, times: int, rng: np.random.Generator) -> int:
             cut_short += 1
         assert start(words).wait(timeout=300) in (0, 3)
         assert numbers(Path("out"), files) == whole
+        assert kept.isdisjoint(begun_runs()[before:])
+    return cut_short
+
+
+def everything(folder: Path) -> dict[str, str]:
+    return {
+        path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in folder.rglob("*") if path.is_file()
+    }  # fmt: skip
+
+
+def check() -> tuple[int, dict[str, object]]:
+    """Check a run; return the exit code and all that was said."""
+    process = start(CHECK, subprocess.PIPE)
+    out, _ = process.communicate(timeout=300)
+    return process.returncode, json.loads(out)
+
+
+def kill_checks(times: int, rng: np.random.Generator) -> int:
+    """Kill checks of a run at random moments; return how many had not ended."""
+    words = (*VERBS["fit"][0][:-1], "run")
+    assert start(words).wait(timeout=300) in (0, 3)
+    before, beside = everything(Path("run")), set(Path().iterdir())
+    began = time.monotonic()
+    said = check()
+    took = time.monotonic() - began
+    assert said[1]["verdict"] == "same"
+    cut_short = 0
+    for _ in range(times):
+        process = start(CHECK)
+        kill(process, took * rng.uniform(0.05, 1.0))
+        cut_short += process.returncode == -signal.SIGKILL
+        # Its scratch folder is the system's, for temporary files; here there is nothing new.
+        assert everything(Path("run")) == before
+        assert set(Path().iterdir()) == beside
+        assert check() == said
     return cut_short
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("verb", VERBS)
-def test_fifty_kills_lose_nothing(verb: str, folder: Path) -> None:
+@pytest.mark.parametrize(("verb", "times"), [
+    ("fit", 12), ("report", 12), ("diagnose", 12), ("sbc", 10), ("simulator", 8),
+])  # fmt: skip
+def test_fifty_kills_lose_nothing(verb: str, times: int, folder: Path) -> None:
     # Any seed must do: another one each time.
-    cut_short = kill_and_go_again(verb, 13, np.random.default_rng())
-    print(f"{verb}: killed 13 times, {cut_short} of them before there was a result")
+    cut_short = kill_and_go_again(verb, times, np.random.default_rng())
+    print(f"{verb}: killed {times} times, {cut_short} of them before there was a result")
+    assert cut_short > 0
+    if verb == "simulator":
+        assert len(begun_runs()) > 30
+
+
+@pytest.mark.slow
+def test_a_check_that_is_killed_changes_nothing(folder: Path) -> None:
+    cut_short = kill_checks(8, np.random.default_rng())
+    print(f"check: killed 8 times, {cut_short} of them before there was a verdict")
     assert cut_short > 0

@@ -33,6 +33,13 @@ def test_cases_are_made_diagnosed_and_scored(calib: Calib) -> None:  # noqa: F81
         "score.txt", "levels.png", "reliability_easy.png"
     }  # fmt: skip
     assert (Path("found") / case / "diagnosis.json").exists()
+    given = ("challenge", "score", "cases", "--results", "found", "--key", "sealed/key.json")
+    told = json.loads(calib(*given, "--json").out)
+    assert (told["exit_code"], told["folder"]) == (0, None)
+    assert told["tiers"]["easy"]["n_cases"] == 1
+    assert [answer["case"] for answer in told["answers"]] == [case]
+    again = json.loads(calib("challenge", "run", "cases", "--out", "found", "--json").out)
+    assert (again["exit_code"], again["cases"], set(again["failed"])) == (1, 2, {"damaged"})
 
 
 def test_cases_are_drawn_again_as_the_diagnosis_believes(

@@ -11,7 +11,7 @@ from calib.batch.campaign.kinds import KINDS, Task
 from calib.batch.campaign.plan import Plan
 from calib.batch.campaign.record import RECORD, describe, discard_changed
 from calib.batch.campaign.summary import NUMBERS, Summary, summarise, write_summary
-from calib.batch.folders import check_folder, writing
+from calib.batch.folders import check_folder, check_room, writing
 from calib.batch.tasks import LateItems, check_names, run_folder_tasks
 from calib.report.numbers import finite
 
@@ -58,7 +58,9 @@ def run_campaign(
     """
     out, results = Path(out), Path(out) / "results"
     check_names(plan.tasks)
-    if not (out / PLAN).exists():
+    if (out / PLAN).exists():
+        check_room(out)
+    else:
         check_folder(out)
     records = describe(plan.tasks.values())
     discard_changed(records, results, overwrite=overwrite)

@@ -4,11 +4,11 @@
 missing when they are called again; `completed` hands results over as they come and writes nothing.
 """
 
-from calib.batch.tasks.landing import check_names, failed_tasks, read_seconds
+from calib.batch.tasks.landing import alone, check_names, failed_tasks, read_seconds
 from calib.batch.tasks.run import Outcome, run_folder_tasks, run_tasks
 from calib.batch.tasks.stream import Finished, LateItems, completed
 
 __all__ = [
-    "Finished", "LateItems", "Outcome", "check_names", "completed", "failed_tasks",
-    "read_seconds", "run_folder_tasks", "run_tasks",
+    "Finished", "LateItems", "Outcome", "alone", "check_names", "completed",
+    "failed_tasks", "read_seconds", "run_folder_tasks", "run_tasks",
 ]  # fmt: skip

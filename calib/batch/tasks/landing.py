@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from calib.batch.folders import lock, writing
+from calib.batch.folders import check_room, lock, writing
 from calib.batch.tasks.stream import Finished
 from calib.errors import CalibError
 
@@ -88,9 +88,10 @@ def landing_ground(folder: Path, kept: Kept[Any, Any]) -> Iterator[Callable[[Fin
         If the folder cannot be written, or another process is landing results in it.
     """
     scratch = folder / _SCRATCH
+    check_room(folder)
     with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    with _alone(folder):
+    with alone(folder):
         with writing(folder):
             shutil.rmtree(scratch, ignore_errors=True)
             scratch.mkdir()
@@ -136,8 +137,14 @@ def read_seconds(folder: Path) -> dict[str, float]:
 
 
 @contextmanager
-def _alone(folder: Path) -> Iterator[None]:
-    """Hold the folder's lock, which the system releases however the process ends."""
+def alone(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder that is there; the system releases it however the process ends.
+
+    Raises
+    ------
+    CalibError
+        If another process holds it.
+    """
     try:
         with writing(folder):
             held = lock(folder)

@@ -95,7 +95,6 @@ def run_tasks[I, R](
     resumed = tuple(name for name in items if (folder / f"{name}{kept.suffix}").exists())
     found = set(resumed)
     failed: dict[str, str] = {}
-    tell(len(found), len(items))
     with (
         landing_ground(folder, kept) as land,
         closing(
@@ -106,6 +105,7 @@ def run_tasks[I, R](
             )
         ) as coming,
     ):  # fmt: skip
+        tell(len(found), len(items))
         try:
             for task in coming:
                 if task.error is None:

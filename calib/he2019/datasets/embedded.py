@@ -19,6 +19,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from calib.batch.folders import write_whole
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
 from calib.he2019.datasets import density, drawbar, rut
@@ -109,5 +110,5 @@ def write(out_dir: Path) -> list[Path]:
     texts = {out_dir / f"{name}.csv": _csv(table) for name, table in tables().items()}
     out_dir.mkdir(parents=True, exist_ok=True)
     for path, text in texts.items():
-        path.write_text(text, encoding="ascii", newline="\n")
+        write_whole(path, text)
     return list(texts)

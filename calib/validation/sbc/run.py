@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from calib.batch.folders import write_whole, writing
+from calib.batch.folders import check_room, write_whole, writing
 from calib.batch.tasks import run_tasks
 from calib.errors import CalibError
 from calib.inference.prior_files import DeclaredPriors, prior_file_model
@@ -105,6 +105,7 @@ def read_records(out: Path, names: Sequence[str]) -> list[dict[str, Any]]:
 
 def _claim(out: Path, run: dict[str, Any]) -> None:
     """Write what is run into the folder, or check that it is the same that is there."""
+    check_room(out)
     path = out / _RUN
     text = json.dumps(run, indent=1) + "\n"
     with writing(out):

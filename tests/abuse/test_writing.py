@@ -1,0 +1,291 @@
+"""Whatever writes says at once what it cannot: a read-only place, a full disk, another process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from calib.batch.folders import claimed, fresh_folder
+from calib.cli.verbs import app
+from calib.errors import CalibError
+from calib.models import example_csv
+from tests.gap.cases import make_case, write_case
+
+PLAN = """
+[[fit]]
+name = "ruts"
+data = ["ruts.csv"]
+models = ["bekker"]
+"""
+# Words of each verb that works long before it writes, the output as OUT. The inputs of these are
+# not there: that is not even looked at.
+AT_ONCE = {
+    "fit": "fit none.csv --model bekker --out OUT",
+    "report": "report none.csv --out OUT",
+    "compare": "compare bekker_plate reece none.csv --out OUT",
+    "diagnose": "diagnose none --out OUT",
+    "audit": "audit --out OUT",
+    "predict": "predict none --at none.csv --out OUT",
+    "score": "challenge score none --results none --key none.json --out OUT",
+}
+# These read what they are to do first, and land one result after the other.
+LANDING = {
+    "sbc": "sbc --model bekker --simulations 10 --workers 1 --out OUT",
+    "campaign": "campaign plan.toml --workers 1 --out OUT",
+    "run": "challenge run cases --workers 1 --out OUT",
+    "make": "challenge make --seed 1 --cases 1 --workers 1 --key key.json --out OUT",
+}
+# These write at once.
+SMALL = {
+    "template": "template bekker --out OUT",
+    "priors": "priors bekker --out OUT",
+    "data": "data he2019 --out OUT",
+    "cases": "data he2019-gaps --out OUT",
+}
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("ruts.csv").write_text(example_csv("bekker"), encoding="utf-8")
+    Path("plan.toml").write_text(PLAN, encoding="utf-8")
+    write_case(make_case("force_offset", n_lab=15, n_field=12), Path("cases") / "case-000")
+    return tmp_path
+
+
+@pytest.fixture
+def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have anything that takes long end the test."""
+
+    def begun(*_: object, **__: object) -> None:
+        raise AssertionError("the work has begun")
+
+    for name in (
+        "calib.batch.tasks.run.completed", "challenge.make.completed",
+        "calib.he2019.audit.run_audit", "calib.inference.calibration.calibrate",
+    ):  # fmt: skip
+        monkeypatch.setattr(name, begun)
+
+
+@contextmanager
+def mounted(folder: Path, options: str) -> Iterator[Path]:
+    """Mount a file system of its own in memory."""
+    folder.mkdir(exist_ok=True)
+    mount = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+    if (
+        not sys.platform.startswith("linux")
+        or subprocess.run(mount, capture_output=True).returncode
+    ):
+        pytest.skip("no file system may be mounted here")
+    try:
+        yield folder
+    finally:
+        subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.fixture
+def read_only(tmp_path: Path) -> Iterator[Path]:
+    folder = tmp_path / "archive"
+    folder.mkdir()
+    folder.chmod(0o555)
+    if not os.access(folder, os.W_OK):
+        yield folder
+        folder.chmod(0o755)
+        return
+    # The superuser may write wherever the file system can.
+    with mounted(folder, "ro,size=64k"):
+        yield folder
+
+
+@pytest.fixture
+def full(tmp_path: Path) -> Iterator[Path]:
+    with mounted(tmp_path / "stick", "size=64k") as folder:
+        with (folder / "photos").open("wb", buffering=0) as file:
+            try:
+                while file.write(bytes(4096)):
+                    pass
+            except OSError:
+                pass
+        yield folder
+
+
+def refused(words: str, out: Path) -> str:
+    """Run a command that must be refused; return the one line that says why."""
+    done: Result = CliRunner().invoke(app, words.replace("OUT", str(out)).split())
+    assert done.exit_code == 2, (done.output, done.exception)
+    lines = done.stderr.splitlines()
+    assert lines[0].startswith("calib: "), lines
+    # What is allowed and how to mend it stand below, moved in.
+    assert all(line.startswith("  ") for line in lines[1:]), lines
+    assert done.stdout == ""
+    return done.stderr
+
+
+@pytest.mark.parametrize("verb", [*AT_ONCE, *LANDING, *SMALL])
+def test_a_read_only_place_is_found_before_the_work(
+    verb: str, read_only: Path, no_work: None
+) -> None:
+    said = refused((AT_ONCE | LANDING | SMALL)[verb], read_only / "out")
+    assert str(read_only / "out") in said
+    assert "cannot be written" in said
+    assert list(read_only.iterdir()) == []
+
+
+@pytest.mark.parametrize("verb", [*AT_ONCE, *LANDING])
+def test_a_full_disk_is_found_before_the_work(verb: str, full: Path, no_work: None) -> None:
+    said = refused((AT_ONCE | LANDING)[verb], full / "out")
+    assert str(full / "out") in said
+    assert "only 0.0 MB are left on its disk" in said
+    assert [path.name for path in full.iterdir()] == ["photos"]
+
+
+@pytest.mark.parametrize("verb", SMALL)
+def test_of_what_does_not_fit_nothing_is_left(verb: str, full: Path) -> None:
+    said = refused(SMALL[verb], full / "out")
+    assert "cannot be written (No space left on device)" in said
+    assert not [path for path in full.rglob("*") if path.is_file() and path.name != "photos"]
+
+
+def test_a_key_that_cannot_be_written_is_found_before_cases_are_made(
+    read_only: Path, no_work: None
+) -> None:
+    words = f"challenge make --seed 1 --cases 1 --out OUT --key {read_only / 'key.json'}"
+    assert "key.json: the output cannot be written" in refused(words, Path("new"))
+
+
+def test_results_that_land_in_an_earlier_folder_are_refused_as_early(
+    full: Path, read_only: Path, no_work: None
+) -> None:
+    """A campaign, or simulations, resumed where nothing can be written any more."""
+    for words in (LANDING["sbc"], LANDING["campaign"]):
+        assert "cannot be written" in refused(words, read_only)
+        assert "cannot be written" in refused(words, full / "out")
+
+
+def test_a_disk_that_fills_up_meanwhile_costs_one_line(tmp_path: Path) -> None:
+    with mounted(tmp_path / "stick", "size=17m") as folder:
+        with (
+            pytest.raises(CalibError, match=r"cannot be written \(No space left on device\)"),
+            fresh_folder(folder / "out") as scratch,
+        ):
+            (scratch / "posterior.nc").write_bytes(bytes(32_000_000))
+        with (
+            pytest.raises(CalibError, match=r"cannot be written \(Not enough free space"),
+            fresh_folder(folder / "out") as scratch,
+        ):
+            np.save(scratch / "posterior.npy", np.zeros(4_000_000))
+        assert list(folder.iterdir()) == []
+
+
+# Another process
+
+HOLD = """
+import sys
+from pathlib import Path
+from calib.batch.folders import claimed
+from calib.batch.tasks import alone
+out = Path(sys.argv[2])
+if sys.argv[1] == "alone":
+    out.mkdir(parents=True)
+with {"claimed": claimed, "alone": alone}[sys.argv[1]](out):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+@contextmanager
+def another(way: str, out: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """Hold a folder in another process, as a command does while it works."""
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, way, str(out)], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+    )  # fmt: skip
+    assert holder.stdout is not None
+    assert holder.stdin is not None
+    with closing(holder.stdout), closing(holder.stdin):
+        assert holder.stdout.readline() == b"held\n"
+        try:
+            yield holder
+        finally:
+            holder.kill()
+            holder.wait()
+
+
+def contents(folder: Path) -> set[str]:
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("verb", [v for v in AT_ONCE if v != "predict"])
+def test_a_second_process_on_a_folder_is_refused_before_the_work(
+    verb: str, tmp_path: Path, no_work: None
+) -> None:
+    out = tmp_path / "out"
+    with another("claimed", out):
+        before = contents(tmp_path)
+        said = refused(AT_ONCE[verb], out)
+        assert "another process is working on this output folder" in said
+        assert contents(tmp_path) == before
+    # It was killed, and what it held is free at once.
+    assert "another process" not in refused(AT_ONCE["fit"], out)
+
+
+@pytest.mark.parametrize(("verb", "inside"), [
+    ("sbc", "out/replicates"), ("campaign", "out/results"), ("run", "out"), ("make", "out"),
+])  # fmt: skip
+def test_a_second_process_that_lands_results_is_refused(
+    verb: str, inside: str, no_work: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # That the folder is not empty is another reason, told first.
+    monkeypatch.setattr("calib.validation.sbc.run._claim", lambda *_: None)
+    monkeypatch.setattr("calib.batch.campaign.run.check_folder", lambda *_: None)
+    with another("alone", Path(inside)):
+        said = refused(LANDING[verb], Path("out"))
+    assert "another process is writing results to this folder" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["fit", "sbc"])
+def test_a_second_process_beside_a_real_one_is_refused(verb: str, tmp_path: Path) -> None:
+    words = {
+        "fit": "fit ruts.csv --model bekker --out out",
+        "sbc": LANDING["sbc"].replace("10", "300").replace("OUT", "out"),
+    }[verb]
+    sign = {"fit": ".out-????????", "sbc": "out/replicates/.landing"}[verb]
+    first = subprocess.Popen(
+        [sys.executable, "-c", "from calib.cli import main; main()", *words.split()],
+        stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+    )  # fmt: skip
+    try:
+        for _ in range(600):
+            if list(tmp_path.glob(sign)):
+                break
+            time.sleep(0.05)
+        assert "another process is" in refused(words, Path("out"))
+    finally:
+        os.killpg(first.pid, signal.SIGKILL)
+        first.wait()
+
+
+def test_a_claim_that_came_to_nothing_leaves_nothing(tmp_path: Path) -> None:
+    with claimed(tmp_path / "new" / "out"):
+        assert len(list((tmp_path / "new").iterdir())) == 1
+    assert list((tmp_path / "new").iterdir()) == []
+
+
+def test_what_was_claimed_is_written(tmp_path: Path) -> None:
+    with claimed(tmp_path / "out"), fresh_folder(tmp_path / "out") as folder:
+        (folder / "run.json").write_text("{}", encoding="utf-8")
+        with pytest.raises(CalibError, match="another process"), claimed(tmp_path / "out"):
+            pass
+    assert contents(tmp_path / "out") == {"run.json"}
