@@ -61,6 +61,8 @@ def _task(key: str, entry: TaskRecord, folder: Path, scratch: Path) -> Task:
         source=entry.data.source,
         sha256=entry.data.source_sha256,
         label=entry.label,
+        header=entry.data.header or table.header,
+        text=(),
         ignored=entry.data.ignored,
     )
     scratch.mkdir(parents=True)

@@ -77,6 +77,8 @@ class _Data(_Record):
     sha256: _Hash
     source: str
     source_sha256: _Hash
+    # Where it is not that of the file that is kept: messages and units of the page are by it.
+    header: tuple[str, ...] = ()
     ignored: tuple[str, ...]
 
 

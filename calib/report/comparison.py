@@ -221,7 +221,8 @@ def write_comparison(
     (folder / FIGURE).write_bytes(image)
     (folder / PAGE).write_text(page(found, image), encoding="utf-8")
     if first.held is not None:
-        write_table(folder / HELD_OUT, first.held.table.columns)
+        held = first.held.table
+        write_table(folder / HELD_OUT, held.to_write(held.columns))
     for c in comparison.candidates:
         run = folder / "runs" / c.model
         run.mkdir(parents=True)

@@ -162,14 +162,15 @@ def panel_groups(
     everything = np.ones(rows.size, dtype=np.bool_)
     if pressure is None or np.ptp(pressure) == 0.0:
         return [("", everything)]
-    distinct, unit = np.unique(pressure), axis_of(column).unit
+    distinct, axis = np.unique(pressure), axis_of(column)
     if distinct.size <= _MOST_PANELS:
-        return [(f"{float(p):.3g} {unit}", pressure[rows] == p) for p in distinct]
+        return [(f"{axis.factor * p:.3g} {axis.unit}", pressure[rows] == p) for p in distinct]
     edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
     groups = []
     for low, high in pairwise(edges):
         inside = (pressure[rows] >= low) & (pressure[rows] <= high)
         if low > edges[0]:
             inside &= pressure[rows] > low
-        groups.append((f"{low:.3g} to {high:.3g} {unit}", inside))
+        ends = f"{axis.factor * low:.3g} to {axis.factor * high:.3g}"
+        groups.append((f"{ends} {axis.unit}", inside))
     return groups

@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 
+from calib.data.headers import parse_header
 from calib.data.quantities import QUANTITIES
+from calib.data.units import convert
+from calib.errors import CalibError
 from calib.models.base import Array
 from calib.report.numbers import NOTHING, format_number
 
@@ -21,6 +27,32 @@ _GREEK = {
     "nu": "\N{GREEK SMALL LETTER NU}",
     "theta": "\N{GREEK SMALL LETTER THETA}",
 }
+
+
+# Units by canonical column in which a page shows its values, where they are not the usual ones.
+_UNITS: ContextVar[Mapping[str, str]] = ContextVar("units of a page", default=MappingProxyType({}))
+_FRACTIONS = ("dimensionless", "percent")
+
+
+@contextmanager
+def units_of(headers: Iterable[str]) -> Iterator[None]:
+    """Have `axis_of` show values in the units of a file, which its column names say.
+
+    Of two columns of one quantity the first counts. Fractions are shown in percent all the same.
+    """
+    units: dict[str, str] = {}
+    for header in headers:
+        try:
+            column = parse_header(header)
+        except CalibError:  # not from a file that was read
+            continue
+        if column is not None:
+            units.setdefault(column.quantity.canonical, column.unit)
+    before = _UNITS.set(units)
+    try:
+        yield
+    finally:
+        _UNITS.reset(before)
 
 
 @dataclass(frozen=True)
@@ -57,6 +89,10 @@ def axis_of(column: str) -> Axis:
     quantity = QUANTITIES.get(column)
     if quantity is None:
         return Axis(column.replace("_", " ").capitalize(), NO_UNIT)
+    own = _UNITS.get().get(column, quantity.unit)
+    if own not in (quantity.unit, *_FRACTIONS):
+        factor = float(convert(1.0, quantity.unit, own))
+        return Axis(quantity.title, unit_plain(own.replace("**", "^").replace("*", " ")), factor)
     unit = quantity.unit.replace("**", "^").replace("*", " ").replace("dimensionless", NO_UNIT)
     return Axis(quantity.title, *(quantity.shown or (degrees(unit), 1.0)))
 

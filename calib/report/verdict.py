@@ -235,6 +235,7 @@ def gather(result: OutputResult) -> Evidence:
     parabolic = problem.bound.model.parabolic_in
     changes, neighbours = signs_along(result, standardise(calibration, problem).residual)
     scatter = float(np.mean(np.square(v.observed - problem.observed.mean())))
+    axis = axis_of(problem.bound.model.output)
     return Evidence(
         converged=report.passed,
         reasons=report.reasons,
@@ -248,8 +249,8 @@ def gather(result: OutputResult) -> Evidence:
             else binomial_p(covered.hits, covered.n)
         ),
         effective=effective_rows(v.draws) if complete else float("nan"),
-        rmse=v.scores.rmse,
-        unit=axis_of(problem.bound.model.output).unit,
+        rmse=axis.factor * v.scores.rmse,
+        unit=axis.unit,
         max_relative_error=v.scores.max_relative_error,
         prior_set=[p for p in problem.names if role(calibration, p) in (PRIOR, MOVED)],
         two_pressures=bool(parabolic) and np.unique(problem.table[parabolic]).size == 2,

@@ -11,7 +11,7 @@ from typing import Any
 from calib.batch.environment import Environment, sha256
 from calib.batch.folders import fresh_folder
 from calib.batch.pool import HERE, Pool
-from calib.data import write_table
+from calib.data import Table, write_table
 from calib.inference.estimators import GeneticSettings
 from calib.inference.io import groups_of
 from calib.inference.netcdf import write_netcdf
@@ -23,6 +23,7 @@ from calib.models.simulators.emulator.model import emulator_of
 from calib.report.figures.collect import plates
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import pdf_bytes, png
+from calib.report.labels import units_of
 from calib.report.page.content import render_page
 from calib.report.publish import publication
 from calib.report.reference import reference_of
@@ -184,7 +185,9 @@ def _write_output(
     """Write posterior and figures of an output; return what the page shows of the figures."""
     write_netcdf(groups_of(result.calibration), folder / f"{key}.nc")
     drawn, images = [], {}
-    for plate in plates(result, reference_of(result.task.table.label)):
+    with units_of(result.task.table.header):
+        figures = plates(result, reference_of(result.task.table.label))
+    for plate in figures:
         drawn.append(replace(plate, figure=None))
         if plate.figure is None:
             continue
@@ -197,6 +200,11 @@ def _write_output(
     return drawn, images
 
 
+def _own_names(table: Table) -> dict[str, Any]:
+    """Return the file's own column names, where they are not those of the copy that is kept."""
+    return {} if table.header == tuple(table.columns) else {"header": list(table.header)}
+
+
 def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
     """Copy data and priors into the report, so that it can be computed again from itself."""
     (folder / "data").mkdir()
@@ -205,7 +213,7 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
     for key, result in study.results.items():
         task = result.task
         prior_path = task.prior_path or default_priors(task.model)
-        write_table(folder / "data" / f"{key}.csv", task.table.columns)
+        write_table(folder / "data" / f"{key}.csv", task.table.to_write(task.table.columns))
         data = (folder / "data" / f"{key}.csv").read_bytes()
         priors = prior_path.read_bytes()
         (folder / "priors" / f"{key}.toml").write_bytes(priors)
@@ -218,6 +226,7 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
                 "sha256": sha256(data),
                 "source": task.table.source,
                 "source_sha256": task.table.sha256,
+                **_own_names(task.table),
                 "ignored": list(task.table.ignored),
             },
             "priors": {

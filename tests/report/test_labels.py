@@ -15,6 +15,7 @@ from calib.report.labels import (
     symbol,
     unit_plain,
     unit_text,
+    units_of,
 )
 from calib.report.page.template import unit_html
 from calib.report.publish.markup import latex_unit
@@ -37,6 +38,21 @@ def test_percent_and_joined():
     assert percent(0.0294) == "2.9 %"
     assert joined(["a"]) == "a"
     assert joined(["a", "b", "c"]) == "a, b and c"
+
+
+def test_a_page_has_the_units_of_its_file():
+    usual = axis_of("drawbar_pull_kn")
+    headers = ("Drawbar pull [lbf]", "drawbar_pull_n", "slip_ratio", "note", "bulk_density_kg_m3",
+               "average_ground_pressure_lbf_in2", "rut_depth_furlong")  # fmt: skip
+    with units_of(headers):
+        pull = axis_of("drawbar_pull_kn")
+        assert pull.label == "Drawbar pull (lbf)"
+        assert pull.range_text(np.array([1.0, 2.0])) == "225 to 450 lbf"
+        assert axis_of("slip_ratio").label == "Slip (%)"
+        assert axis_of("bulk_density_g_cm3").label == "Dry bulk density (kg/m³)"
+        assert axis_of("average_ground_pressure_kpa").unit == "lbf/in²"
+        assert axis_of("rut_depth_mm").unit == "mm"
+    assert axis_of("drawbar_pull_kn") == usual
 
 
 def test_symbols():

@@ -28,7 +28,7 @@ from calib.report.figures.style import (
     legend_below,
     panels,
 )
-from calib.report.labels import axis_of, joined, percent, short
+from calib.report.labels import Axis, axis_of, joined, percent, short
 from calib.report.reference import NOTHING, Reference
 from calib.report.rows import (
     Group,
@@ -45,6 +45,13 @@ from calib.validation.prediction import Bands, median_change, smooth_bands
 
 # Lighter outwards, also in greyscale.
 FILLS = {0.95: "#dfebf5", 0.9: "#bcd6ea", 0.5: "#86b5d9"}
+
+
+def scaled(axis: Axis, found: Bands) -> Bands:
+    """Convert bands from the canonical unit to that of an axis."""
+    ends = found.lower, found.upper
+    lower, upper = ({level: axis.scale(v) for level, v in end.items()} for end in ends)
+    return Bands(axis.scale(found.median), lower, upper)
 
 
 def fill_bands(ax: Axes, x: Array, mean: Bands, measured: Bands) -> dict[str, Any]:
@@ -102,21 +109,28 @@ def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -
     problem, held = result.calibration.problem, held_table(result)
     x, y = x_column(result), problem.bound.model.output
     conditions = grid(result, group)
-    scale = axis_of(x).scale
-    handles = fill_bands(ax, scale(conditions[x]), *smooth_bands(result.calibration, conditions))
+    scale, y_axis = axis_of(x).scale, axis_of(y)
+    both = (scaled(y_axis, b) for b in smooth_bands(result.calibration, conditions))
+    handles = fill_bands(ax, scale(conditions[x]), *both)
     curve = reference.curve(problem.bound.model.name, conditions)
     if curve is not None:
         (handles[f"published fit ({curve[1]})"],) = ax.plot(
-            scale(conditions[x]), curve[0], color=ORANGE, lw=1.4, ls=DASHES[3], zorder=3
+            scale(conditions[x]),
+            y_axis.scale(curve[0]),
+            color=ORANGE,
+            lw=1.4,
+            ls=DASHES[3],
+            zorder=3,
         )
     word = data_word(result)
     if group.fitted.any():
         handles[f"{word}, calibrated"] = scatter_points(
-            ax, scale(problem.table[x][group.fitted]), problem.table[y][group.fitted], held=False
-        )
+            ax, scale(problem.table[x][group.fitted]),
+            y_axis.scale(problem.table[y][group.fitted]), held=False,
+        )  # fmt: skip
     if held is not None and group.held_out.any():
         handles[f"{word}, held out"] = scatter_points(
-            ax, scale(held[x][group.held_out]), held[y][group.held_out], held=True
+            ax, scale(held[x][group.held_out]), y_axis.scale(held[y][group.held_out]), held=True
         )
     return handles
 
@@ -140,7 +154,7 @@ def _bands_caption(result: OutputResult, shown: int) -> str:
     text = words[0].upper() + words[1:]
     held = held_table(result)
     if held is not None:
-        miss = validation.scores.median - validation.observed
+        miss = axis.scale(validation.scores.median - validation.observed)
         i = int(np.nanargmax(np.abs(miss)))
         where = axis_of(x_column(result))
         side = "above" if miss[i] > 0 else "below"
@@ -182,7 +196,7 @@ def prior_predictive_plate(result: OutputResult) -> Plate:
         ax.set_xlabel(x_axis.label)
     for ax in axes[:, 0]:
         ax.set_ylabel(y_axis.label)
-    y = problem.observed
+    y = y_axis.scale(problem.observed)
     reach = _ZOOM * max(float(np.ptp(y)), 0.1 * float(np.abs(y).max()))
     low, high = axes[0, 0].get_ylim()
     floor = 0.0 if y.min() >= 0.0 and problem.bound.model.response == "log" else y.min() - reach
@@ -194,8 +208,9 @@ def prior_predictive_plate(result: OutputResult) -> Plate:
 def _prior_panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]:
     problem = result.calibration.problem
     x, scale = x_column(result), axis_of(x_column(result)).scale
+    y_axis = axis_of(problem.bound.model.output)
     conditions = grid(result, group)
-    _, expected = smooth_bands(result.calibration, conditions, prior=True)
+    expected = scaled(y_axis, smooth_bands(result.calibration, conditions, prior=True)[1])
     along = scale(conditions[x])
     handles: dict[str, Any] = {
         f"prior, {100 * level:g} %": ax.fill_between(
@@ -205,8 +220,9 @@ def _prior_panel(ax: Axes, result: OutputResult, group: Group) -> dict[str, Any]
     }
     (handles["prior median"],) = ax.plot(along, expected.median, color=GREY, lw=1.3)
     handles[data_word(result)] = scatter_points(
-        ax, scale(problem.table[x][group.fitted]), problem.observed[group.fitted], held=False
-    )
+        ax, scale(problem.table[x][group.fitted]), y_axis.scale(problem.observed[group.fitted]),
+        held=False,
+    )  # fmt: skip
     return handles
 
 
@@ -263,26 +279,36 @@ def _columns(result: OutputResult) -> tuple[str, str]:
 def _against_cone_index(ax: Axes, fig: Figure, result: OutputResult) -> dict[str, Any]:
     problem, (cone, water) = result.calibration.problem, _columns(result)
     ci, w = problem.table[cone], axis_of(water).scale(problem.table[water])
+    of_cone, of_density = axis_of(cone), axis_of(problem.bound.model.output)
     handles: dict[str, Any] = {}
     points = ax.scatter(
-        ci, problem.observed, c=w, cmap=_COLOURS, s=17, edgecolor=BLACK, linewidth=0.4, zorder=4
-    )
+        of_cone.scale(ci), of_density.scale(problem.observed), c=w, cmap=_COLOURS, s=17,
+        edgecolor=BLACK, linewidth=0.4, zorder=4,
+    )  # fmt: skip
     x = np.linspace(ci.min(), ci.max(), 60)
     for quantile, dashes in zip(_WATER_QUANTILES, DASHES, strict=False):
         at = float(np.quantile(problem.table[water], quantile))
-        mean, measured = smooth_bands(result.calibration, {cone: x, water: np.full_like(x, at)})
-        scaled = axis_of(water).factor * at
-        colour = points.to_rgba(np.array([scaled]))[0]
-        (line,) = ax.plot(x, mean.median, ls=dashes, lw=1.4, color=colour)
-        handles[f"median, water {short(scaled)} {axis_of(water).unit}"] = line
+        mean, measured = (
+            scaled(of_density, b)
+            for b in smooth_bands(result.calibration, {cone: x, water: np.full_like(x, at)})
+        )
+        shown = axis_of(water).factor * at
+        colour = points.to_rgba(np.array([shown]))[0]
+        (line,) = ax.plot(of_cone.scale(x), mean.median, ls=dashes, lw=1.4, color=colour)
+        handles[f"median, water {short(shown)} {axis_of(water).unit}"] = line
         if quantile == 0.5:
-            handles[f"90 % predictive, water {short(scaled)} {axis_of(water).unit}"] = (
+            handles[f"90 % predictive, water {short(shown)} {axis_of(water).unit}"] = (
                 ax.fill_between(
-                    x, measured.lower[0.9], measured.upper[0.9], color="#e4e4e4", lw=0.0, zorder=0
+                    of_cone.scale(x),
+                    measured.lower[0.9],
+                    measured.upper[0.9],
+                    color="#e4e4e4",
+                    lw=0.0,
+                    zorder=0,
                 )
             )
-    ax.set_xlabel(axis_of(cone).label)
-    ax.set_ylabel(axis_of(problem.bound.model.output).label)
+    ax.set_xlabel(of_cone.label)
+    ax.set_ylabel(of_density.label)
     bar = fig.colorbar(points, ax=ax, cax=ax.inset_axes((1.03, 0.0, 0.035, 1.0)))
     bar.set_label(axis_of(water).label)
     bar.outline.set_linewidth(0.4)
@@ -293,9 +319,10 @@ def draw_predicted_observed(ax: Axes, result: OutputResult) -> dict[str, Any]:
     """Draw what was predicted for rows that were not fitted against what was observed there."""
     v = result.validation
     axis = axis_of(result.calibration.problem.bound.model.output)
-    low, high = np.nanquantile(v.draws, [0.05, 0.95], axis=0)
-    median = np.nanmedian(v.draws, axis=0)
-    inside = (v.observed >= low) & (v.observed <= high)
+    observed = axis.scale(v.observed)
+    low, high = axis.scale(np.nanquantile(v.draws, [0.05, 0.95], axis=0))
+    median = axis.scale(np.nanmedian(v.draws, axis=0))
+    inside = (observed >= low) & (observed <= high)
     held = held_table(result) is not None
     word = data_word(result)
     handles: dict[str, Any] = {}
@@ -305,12 +332,12 @@ def draw_predicted_observed(ax: Axes, result: OutputResult) -> dict[str, Any]:
     ):
         if part.any():
             handles[name] = ax.errorbar(
-                v.observed[part], median[part],
+                observed[part], median[part],
                 yerr=[(median - low)[part], (high - median)[part]],
                 fmt=shape, ms=3.6, color=colour, ecolor=colour if shape == "s" else GREY,
                 elinewidth=0.7, mec="white", mew=0.4,
             )  # fmt: skip
-    ends = _ends(v.observed, median)
+    ends = _ends(observed, median)
     (handles["observed = predicted"],) = ax.plot(ends, ends, color=GREY, lw=0.9, ls=DASHES[2])
     ax.xaxis.set_major_locator(MaxNLocator(5))
     ax.set_xlabel(f"Observed {axis.name.lower()} ({axis.unit})")
@@ -326,7 +353,7 @@ def _ends(*values: Array) -> Array:
 def _density_caption(result: OutputResult) -> str:
     cone, water = _columns(result)
     axis = axis_of(result.calibration.problem.bound.model.output)
-    effect = [median_change(result.calibration, name) for name in (cone, water)]
+    effect = [axis.factor * median_change(result.calibration, name) for name in (cone, water)]
     words = observed_words(result)
     return (
         f"{words[0].upper()}{words[1:]}. Between the 10 % and 90 % points of the data, cone index "

@@ -60,8 +60,9 @@ def residuals_plate(result: OutputResult) -> Plate:
     y_axis, x_axis = axis_of(problem.bound.model.output), axis_of(x)
     residuals = (fitted.residual, None if held is None else held.residual)
     handles = _scatter(
-        axes[0, 0], result, residuals, fitted.predicted, None if held is None else held.predicted
-    )
+        axes[0, 0], result, residuals, y_axis.scale(fitted.predicted),
+        None if held is None else y_axis.scale(held.predicted),
+    )  # fmt: skip
     _scatter(
         axes[0, 1], result, residuals, x_axis.scale(problem.table[x]),
         None if other is None else x_axis.scale(other[x]),
@@ -130,8 +131,9 @@ def _quantiles(ax: Axes, residual: Array) -> None:
 
 
 def _replicated(ax: Axes, result: OutputResult) -> dict[str, Any]:
-    observed = np.sort(result.calibration.problem.observed)
-    replicated = np.sort(result.posterior_predictive[:400], axis=1)
+    axis = axis_of(result.calibration.problem.bound.model.output)
+    observed = np.sort(axis.scale(result.calibration.problem.observed))
+    replicated = np.sort(axis.scale(result.posterior_predictive[:400]), axis=1)
     complete = replicated[np.isfinite(replicated).all(axis=1)]
     level = np.arange(1, observed.size + 1) / observed.size
     low, high = np.quantile(complete, [0.025, 0.975], axis=0)
@@ -141,7 +143,6 @@ def _replicated(ax: Axes, result: OutputResult) -> dict[str, Any]:
     (handles[f"{data_word(result)}, calibrated"],) = ax.step(
         observed, level, where="post", color=BLACK, lw=1.2
     )
-    axis = axis_of(result.calibration.problem.bound.model.output)
     ax.set_xlabel(axis.label)
     ax.set_ylabel(f"Part of the data below ({NO_UNIT})")
     ax.set_ylim(0.0, 1.02)
@@ -190,8 +191,9 @@ def _spread_words(result: OutputResult, fitted: Standardised) -> str:
     if not p < _SIGNIFICANT:
         return f" Their spread does not tell the pressures apart (Levene p = {short(p)})."
     model = problem.bound.model
-    unit = "of ln output" if model.response == "log" else axis_of(model.output).unit
-    named = zip(sd.tolist(), (g.title for g in found), strict=True)
+    axis = axis_of(model.output)
+    unit, factor = ("of ln output", 1.0) if model.response == "log" else (axis.unit, axis.factor)
+    named = zip((factor * sd).tolist(), (g.title for g in found), strict=True)
     sds = sorted(((s, title) for s, title in named if s > 0.0), reverse=True)
     listed = joined([f"{short(sd)} {unit} at {title}" for sd, title in sds])
     return (
@@ -316,7 +318,8 @@ def _validation_caption(result: OutputResult) -> str:
     cover = "; ".join(f"{100 * c.level:g} % band {c.hits} of {c.n}" for c in s.coverage.values())
     many = "no row" if s.n_far == 0 else "1 row" if s.n_far == 1 else f"{s.n_far} rows"
     text = (
-        f"Over {who}{label} the median is wrong by {short(s.rmse)} {axis.unit} rms and by "
+        f"Over {who}{label} the median is wrong by {short(axis.factor * s.rmse)} {axis.unit} rms "
+        "and by "
         f"{percent(s.max_relative_error)} at most{left}, {many} by more than 6 %. "
         f"Covered: {cover}. The PIT {'leaves' if outside else 'stays inside'} its 95 % band."
     )

@@ -15,7 +15,7 @@ from markupsafe import Markup
 
 from calib.models import get_model
 from calib.report.figures.plate import Plate
-from calib.report.labels import axis_of, percent, short
+from calib.report.labels import axis_of, percent, short, units_of
 from calib.report.numbers import TIMES, format_number, format_value
 from calib.report.page.tables import (
     estimates_grid,
@@ -43,10 +43,11 @@ from calib.report.verdict import Evidence, Level, gather, judge_evidence
 def validation_facts(result: OutputResult, effective: float, low_p: float) -> list[list[str]]:
     """Label and value of every validation figure."""
     v, s = result.validation, result.validation.scores
-    unit = axis_of(result.calibration.problem.bound.model.output).unit
+    axis = axis_of(result.calibration.problem.bound.model.output)
+    rmse, crps = (format_number(axis.factor * error, 3) for error in (s.rmse, s.crps))
     facts = [
-        ["Root mean square error of the median", f"{format_number(s.rmse, 3)} {unit}"],
-        ["Mean CRPS", f"{format_number(s.crps, 3)} {unit}"],
+        ["Root mean square error of the median", f"{rmse} {axis.unit}"],
+        ["Mean CRPS", f"{crps} {axis.unit}"],
     ]
     repeats = repeats_words(result)
     if repeats:
@@ -225,7 +226,7 @@ def _card_facts(result: OutputResult, evidence: Evidence) -> list[list[str]]:
     held = held_table(result) is not None
     state = "yes" if calibration.converged else "NO"
     how = f"R-hat {max(report.rhat):.3f}, ESS {min(report.ess_bulk):.0f} or more"
-    error = f"{short(s.rmse)} {axis.unit} rms"
+    error = f"{short(axis.factor * s.rmse)} {axis.unit} rms"
     if math.isfinite(evidence.max_relative_error):
         error += f", {percent(evidence.max_relative_error)} at most"
         error += f" (at {worst_row(result, along=True)})"
@@ -291,12 +292,14 @@ def render_page(
     paper : Publication, optional
         Tables and methods beside the page.
     """
-    sections = [
-        section(key, result, plates.get(key, ()), images)
-        if isinstance(result, OutputResult)
-        else failed_section(key, result)
-        for key, result in study.results.items()
-    ]
+    sections = []
+    for key, result in study.results.items():
+        with units_of(result.task.table.header):
+            sections.append(
+                section(key, result, plates.get(key, ()), images)
+                if isinstance(result, OutputResult)
+                else failed_section(key, result)
+            )
     return template("report.html.j2").render(
         title=title,
         sections=sections,

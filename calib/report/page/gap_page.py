@@ -43,9 +43,11 @@ def _drawn(found: Diagnosis, half: bool) -> dict[int, tuple[Plate, bytes]]:
 
     from calib.report.figures.gap import GAP_FIGURES, gap_plates
     from calib.report.figures.style import png
+    from calib.report.labels import units_of
 
     places = {name: i for i, name in enumerate(GAP_FIGURES) if (i in _HALF) is half}
-    plates = gap_plates(found, tuple(places))
+    with units_of(_headers(found)):
+        plates = gap_plates(found, tuple(places))
     return {places[p.name]: (replace(p, figure=None), png(p)) for p in plates}
 
 
@@ -55,6 +57,13 @@ def _rendered(
     images: Mapping[str, bytes],
     manifest: Mapping[str, Any],
 ) -> str:
+    from calib.report.labels import units_of
     from calib.report.page.diagnosis import render_diagnosis
 
-    return render_diagnosis(found, plates, images, manifest=manifest)
+    with units_of(_headers(found)):
+        return render_diagnosis(found, plates, images, manifest=manifest)
+
+
+def _headers(found: Diagnosis) -> tuple[str, ...]:
+    """Return the column names whose units the page has: those of the field first."""
+    return (*found.data.case.field.header, *found.data.case.lab.header)

@@ -12,7 +12,7 @@ from jinja2 import UndefinedError
 from calib.data.labels import KNOWN_DATA
 from calib.inference.estimators import METHODS
 from calib.models import get_model
-from calib.report.labels import axis_of
+from calib.report.labels import Axis
 from calib.report.numbers import format_number, format_value
 from calib.report.page.template import template
 from calib.report.publish.markup import joined_symbols
@@ -34,7 +34,7 @@ def methods(manifest: Mapping[str, Any], outputs: Sequence[Output]) -> list[Para
             seed=manifest["seed"], command=shlex.join(map(str, manifest["command"])),
             labels=[label for label in labels if label in KNOWN_DATA], known=KNOWN_DATA,
             genetic=any("genetic" in o.found["estimates"] for o in outputs), digits=_HASH,
-            outputs=[(o, _words(o)) for o in outputs], axis_of=axis_of, format_value=format_value,
+            outputs=[(o, _words(o)) for o in outputs], format_value=format_value,
         )  # fmt: skip
     except UndefinedError as error:
         raise KeyError(str(error)) from None
@@ -52,14 +52,14 @@ def _blocks(text: str) -> list[str]:
 
 def _words(o: Output) -> dict[str, Any]:
     """What is said of an output beside what stands in its records."""
-    model, v, axis = get_model(o.model), o.found["validation"], axis_of(o.found["output"])
+    model, v, axis = get_model(o.model), o.found["validation"], o.axis(o.found["output"])
     hits = (f"{round(share * v['n'])}" for share in v["coverage"].values())
     return {
         "model": model,
         "noise": {"family": "", "correlated_along": "", "depends_on": None, "against_normal": None}
         | o.found.get("noise", {}),
-        "output_word": _lower(axis_of(model.output).name),
-        "ranges": [_range(name, r) for name, r in o.found["data"]["ranges"].items()],
+        "output_word": _lower(axis.name),
+        "ranges": [_range(o.axis(name), r) for name, r in o.found["data"]["ranges"].items()],
         "sampled": joined_symbols(
             name for name, p in o.found["posterior"].items()
             if p["posterior_to_prior_sd"] is not None
@@ -71,8 +71,7 @@ def _words(o: Output) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _range(name: str, found: Mapping[str, float]) -> str:
-    axis = axis_of(name)
+def _range(axis: Axis, found: Mapping[str, float]) -> str:
     low, high = axis.value_text(found["lower"]), axis.value_text(found["upper"])
     both = {1: low, 2: f"{low} and {high}"}.get(int(found["distinct"]), f"{low} to {high}")
     return f"{_lower(axis.name)} {both} {axis.unit}"

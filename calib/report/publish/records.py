@@ -10,6 +10,7 @@ from typing import Any
 
 from calib.inference.calibration import ParameterSummary
 from calib.models import get_model
+from calib.report.labels import Axis, axis_of, units_of
 from calib.report.publish.markup import to_latex
 from calib.report.reference import Reference, reference_of
 from calib.report.study_tasks import HoldOut
@@ -57,6 +58,11 @@ class Output:
     def data_words(self) -> str:
         """What to call the data."""
         return f"{self.label} data" if self.label else "data"
+
+    def axis(self, column: str) -> Axis:
+        """Return how a column is shown, in the unit of the file."""
+        with units_of(self.task["data"].get("header", ())):
+            return axis_of(column)
 
     @property
     def converged(self) -> bool:

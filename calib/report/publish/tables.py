@@ -8,7 +8,6 @@ from typing import Any
 from calib.inference.calibration import ParameterSummary
 from calib.inference.estimators import METHODS, method_name
 from calib.models import get_model
-from calib.report.labels import axis_of
 from calib.report.numbers import (
     NOTHING,
     ascii_number,
@@ -286,8 +285,8 @@ def _hits(v: Mapping[str, Any], level: str) -> int:
 
 
 def _errors(o: Output) -> list[str]:
-    """Return RMSE and CRPS in the unit of `axis_of`, and the largest relative error in per cent."""
-    v, factor = o.found["validation"], axis_of(o.found["output"]).factor
+    """Return RMSE and CRPS as `Output.axis` says, and the largest relative error in per cent."""
+    v, factor = o.found["validation"], o.axis(o.found["output"]).factor
     wanted = (("rmse", factor, 3), ("crps", factor, 3), ("max_relative_error", 100.0, 2))
     return [NOTHING if v[k] is None else format_number(f * v[k], n) for k, f, n in wanted]
 
@@ -303,7 +302,7 @@ def _validation_row(o: Output) -> Row:
     above = "n_relative_error_above_6_percent"
     cells = {
         "output": o.key, "model": o.model, "method": v["method"], "held_out": o.held_out,
-        "n": str(v["n"]), "unit": axis_of(o.found["output"]).unit, "rmse": rmse, "crps": crps,
+        "n": str(v["n"]), "unit": o.axis(o.found["output"]).unit, "rmse": rmse, "crps": crps,
         "max_relative_error_percent": worst, above: str(v[above]),
     }  # fmt: skip
     for level in _LEVELS:
@@ -326,7 +325,7 @@ def _scores(o: Output) -> Row:
     v = o.found["validation"]
     elpd = v.get("elpd")
     return {
-        "Output": f"{o.name} ({axis_of(o.found['output']).unit})",
+        "Output": f"{o.name} ({o.axis(o.found['output']).unit})",
         "Rows": f"held out: {o.held_out}" if o.held_out else "leave-one-out",
         "n": str(v["n"]),
         **dict(zip(("RMSE", "CRPS", "Error (%)"), _errors(o), strict=True)),

@@ -12,9 +12,10 @@ from matplotlib import rcParams
 from matplotlib.collections import LineCollection
 
 from calib.data import table_from_arrays
+from calib.data.quantities import QUANTITIES
 from calib.he2019.figures.reference import HE2019
 from calib.report.figures import collect
-from calib.report.figures.bands import bands_plate, prior_predictive_plate
+from calib.report.figures.bands import bands_plate, density_plate, prior_predictive_plate
 from calib.report.figures.collect import plates
 from calib.report.figures.corner import corner_plate
 from calib.report.figures.estimates import estimates_plate
@@ -22,6 +23,7 @@ from calib.report.figures.plate import Plate
 from calib.report.figures.posterior import ensembles_plate, learned_plate
 from calib.report.figures.style import style
 from calib.report.figures.validation import residuals_plate, validation_plate
+from calib.report.labels import axis_of, units_of
 from calib.report.reference import NOTHING
 from calib.report.rows import groups, signs_along
 from calib.validation.residuals import standardise
@@ -57,6 +59,38 @@ def test_every_axis_has_a_label_with_a_unit(drawn):
                 label = ax.get_xlabel()
                 assert UNIT.search(label) or (shared_x and not label), (p.name, label)
                 assert UNIT.search(ax.get_ylabel()) or hidden_y, (p.name, ax.get_ylabel())
+
+
+@pytest.mark.parametrize(("key", "headers"), [
+    ("drawbar", ("Pull [lbf]", "Drawbar pull [lbf]", "inflation_pressure_kpa")),
+    ("rut", ("rut_depth_inch", "average_ground_pressure_psi")),
+    ("density", ("bulk_density_kg_m3", "cone_index_mpa")),
+])  # fmt: skip
+def test_in_the_units_of_a_file_the_same_is_drawn(request, key, headers):
+    """Every number beside a unit that is another one is that many times larger."""
+    result = request.getfixturevalue(key)
+    draw = [density_plate if key == "density" else bands_plate, prior_predictive_plate,
+            validation_plate, residuals_plate]  # fmt: skip
+    output = result.calibration.problem.bound.model.output
+    for one in draw:
+        usual = one(result)
+        with units_of(headers):
+            own, factors = one(result), {}
+            for column in (output, *result.calibration.problem.bound.model.conditions):
+                factors[axis_of(column).unit] = axis_of(column).factor
+        before = {axis_of(c).unit: axis_of(c).factor for c in QUANTITIES}
+        changed = 0
+        for old, new in zip(usual.figure.axes, own.figure.axes, strict=True):
+            for way in ("x", "y"):
+                label, was = (getattr(a, f"get_{way}label")() for a in (new, old))
+                ends, before_ends = (getattr(a.dataLim, f"interval{way}") for a in (new, old))
+                units = [(UNIT.search(text) or [""])[0].strip("()") for text in (label, was)]
+                if units[0] == units[1]:
+                    continue
+                changed += 1
+                ratio = factors[units[0]] / before[units[1]]
+                np.testing.assert_allclose(ends, ratio * before_ends, rtol=1e-6, atol=1e-9)
+        assert changed or one is residuals_plate
 
 
 def test_shared_axes_are_labelled_at_the_edge(drawn):

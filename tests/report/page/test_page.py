@@ -16,6 +16,7 @@ from calib.inference.noise import Noise, NoiseChoice
 from calib.models import MODELS, example_csv
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import png_size
+from calib.report.labels import units_of
 from calib.report.page.content import failed_section, render_page, repeats_words, validation_facts
 from calib.report.page.tables import (
     estimates_grid,
@@ -73,6 +74,16 @@ class Reader(HTMLParser):
     def handle_data(self, data):
         if not {"style", "script"} & set(self.open):
             self.text += data.replace("\N{NO-BREAK SPACE}", " ")
+
+
+def test_scores_have_the_unit_of_the_file(drawbar):
+    usual = dict(validation_facts(drawbar, 3.0, 0.5))
+    with units_of(["Drawbar pull [N]"]):
+        own = dict(validation_facts(drawbar, 3.0, 0.5))
+    for name in ("Root mean square error of the median", "Mean CRPS"):
+        (kn, _), (n, unit) = usual[name].split(), own[name].split()
+        assert unit == "N"
+        assert float(n) == pytest.approx(1000.0 * float(kn), rel=0.01)
 
 
 def page(results, **kwargs) -> tuple[str, Reader]:
