@@ -1,26 +1,35 @@
-"""JSON schemas of the files that are read with pydantic."""
+"""JSON schemas of the files, made from the models of pydantic that read or describe them."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from result_schemas import RESULTS
+
 from calib.batch.campaign.kinds import KINDS
-from calib.check.schema import Manifest, RunRecord
+from calib.check.schema import ComparisonRecord, Manifest, RunRecord
 from calib.inference.prior_entries import json_schema
+from calib.models.simulators.files import SimulatorFile
 
 
 def schemas() -> dict[str, dict[str, Any]]:
     """Return the schemas by the names of their files."""
-    run = RunRecord.model_json_schema()
-    # The whole file, kept beside what is read of it: no entry of its own.
-    del run["properties"]["document"]
-    run["required"].remove("document")
     return {
         "priors": json_schema(),
         "plan": _plan(),
+        "simulator": SimulatorFile.model_json_schema(),
         "manifest": Manifest.model_json_schema(),
-        "run": run,
+        "run": _without_document(RunRecord.model_json_schema()),
+        "comparison": _without_document(ComparisonRecord.model_json_schema()),
+        **{name: of.model_json_schema() for name, of in RESULTS.items()},
     }
+
+
+def _without_document(schema: dict[str, Any]) -> dict[str, Any]:
+    """Leave the whole file out, kept beside what is read of it: no entry of its own."""
+    del schema["properties"]["document"]
+    schema["required"].remove("document")
+    return schema
 
 
 def _plan() -> dict[str, Any]:

@@ -118,6 +118,8 @@ def test_every_declaration_has_its_page(built: Path) -> None:
 
 def test_the_schemas_can_be_downloaded(built: Path) -> None:
     found = {path.name: json.loads(path.read_text()) for path in built.rglob("_downloads/*/*.json")}
-    assert set(found) == {"priors.json", "plan.json", "manifest.json", "run.json"}
+    inputs = {"priors", "plan", "simulator", "case"}
+    results = {"manifest", "run", "comparison", "summary", "diagnosis", "sbc", "check", "campaign"}
+    assert set(found) == {f"{name}.json" for name in inputs | results}
     assert {"model", "likelihood", "parameters"} == set(found["priors.json"]["properties"])
     assert {"fit", "diagnose"} < set(found["plan.json"]["properties"])

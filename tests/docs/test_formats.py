@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import json
 import re
+import sys
+import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pydantic import BaseModel, ValidationError
 
 from calib.check.schema import RunRecord
 from calib.data.quantities import QUANTITIES
+from calib.gap import case
 from calib.gap.effects import View
+from calib.models import example_csv
 from calib.models.simulators.files import SimulatorFile
+from tests.cli.test_cli import Calib
 from tests.docs.pages import DOCS, ROOT
 
 REPORTS = ROOT / "reports"
@@ -55,6 +63,57 @@ def test_every_key_is_told(file: str) -> None:
     document = json.loads((REPORTS / file).read_text(encoding="utf-8"))
     told = set(re.findall(r"`(\w+)`", RESULTS))
     assert {key for key in keys(document) if key not in told} == set()
+
+
+def described() -> dict[str, type[BaseModel]]:
+    """Return the models that the schemas of the documentation are made from."""
+    spec = spec_from_file_location("result_schemas", DOCS / "_ext" / "result_schemas.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    sys.modules[spec.name] = module  # pydantic looks for names that come later there
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        del sys.modules[spec.name]
+    return module.RESULTS
+
+
+MODELS_OF = described()
+
+
+@pytest.mark.parametrize(
+    ("name", "pattern"),
+    [
+        ("summary", "he2019/summary.json"), ("diagnosis", "he2019/gaps/*/diagnosis.json"),
+        ("sbc", "sbc/sbc.json"), ("case", "he2019/gaps/*/case/case.toml"),
+    ],
+)  # fmt: skip
+def test_what_is_written_is_as_its_schema_says(name: str, pattern: str) -> None:
+    files = sorted(REPORTS.glob(pattern))
+    assert files
+    for path in files:
+        text = path.read_text(encoding="utf-8")
+        content = tomllib.loads(text) if path.suffix == ".toml" else json.loads(text)
+        MODELS_OF[name].model_validate(content)
+        with pytest.raises(ValidationError):
+            MODELS_OF[name].model_validate({**content, "models": {"a": {}}, "verdict": 3})
+
+
+def test_what_a_check_and_a_campaign_say_is_as_their_schemas_say(run: Calib) -> None:
+    Path("ruts.csv").write_text(example_csv("bekker"), encoding="utf-8")
+    plan = '[[fit]]\nname = "ruts"\ndata = ["*.csv"]\nmodels = ["bekker"]\n'
+    Path("plan.toml").write_text(plan, encoding="utf-8")
+    assert run("campaign", "plan.toml", "--out", "c", "--workers", 1).code == 0
+    written = json.loads(Path("c/summary.json").read_text(encoding="utf-8"))
+    campaign = MODELS_OF["campaign"].model_validate(written)
+    (task,) = campaign.tasks
+    checked = json.loads(run("check", f"c/results/{task}/run", "--quick", "--json").out)
+    assert MODELS_OF["check"].model_validate(checked).verdict == "same"
+
+
+def test_the_cases_schema_has_the_keys_that_are_read() -> None:
+    assert set(MODELS_OF["case"].model_fields) == set(case._KEYS)
 
 
 def test_the_keys_of_a_run_are_told() -> None:
