@@ -15,26 +15,31 @@ FOLDER = Path(__file__).resolve().parents[2] / "reports" / "he2019"
 PROGRAM = "from calib.cli import main; main()"
 
 
-def checked(setting: Setting) -> dict:
-    """Check the report in a process that stands in for another processor."""
+def checked(setting: Setting, *, drawn: bool = True) -> dict:
+    """Check the report in a process that stands in for another processor.
+
+    To draw its figures takes a third of the time; where they are not, these alone may differ.
+    """
     skip_what_crashes(setting)
+    blank = () if drawn else ("--models", str(Path(__file__).with_name("undrawn.py")))
     ran = subprocess.run(
         [sys.executable, "-c", PROGRAM, "check", str(FOLDER), "--json",
-         "--workers", str(setting.threads)],
+         "--workers", str(setting.threads), *blank],
         env=setting.environment(), capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert ran.stdout, ran.stderr
     document = json.loads(ran.stdout)
-    found = [f"{i['name']}: {i['note']}" for i in document["items"] if i["status"] == "different"]
+    different = [i for i in document["items"] if i["status"] == "different"]
+    found = [f"{i['name']}: {i['note']}" for i in different if drawn or i["group"] != "figures"]
     assert found == []
-    assert ran.returncode == document["exit_code"] == 0
-    assert document["headline"].startswith("SAME")
+    assert ran.returncode == document["exit_code"] == (0 if drawn else 1)
+    assert document["headline"].startswith("SAME" if drawn else "DIFFERENT: figures/")
     return document
 
 
 @pytest.mark.parametrize("setting", FEW, ids=str)
 def test_the_reference_report_is_what_is_computed_again(setting: Setting) -> None:
-    document = checked(setting)
+    document = checked(setting, drawn=setting == FEW[0])
     names = {item["name"] for item in document["items"]}
     summary = json.loads((FOLDER / "summary.json").read_text())
     manifest = json.loads((FOLDER / "manifest.json").read_text())
@@ -53,6 +58,6 @@ def test_the_reference_report_is_what_is_computed_again(setting: Setting) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", [s for s in ALL if s not in FEW], ids=str)
+@pytest.mark.parametrize("setting", [s for s in ALL if s not in FEW[:1]], ids=str)
 def test_the_reference_report_is_the_same_on_every_processor(setting: Setting) -> None:
     checked(setting)
