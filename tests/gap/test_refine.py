@@ -49,7 +49,9 @@ def long_chain(found, seed: int) -> np.ndarray:
     return np.asarray(sampler.get_chain(discard=400, thin=20, flat=True))
 
 
-@pytest.mark.parametrize("name", ["slip_zero_shift", "slip_sinkage"])
+@pytest.mark.parametrize(
+    "name", ["slip_zero_shift", pytest.param("slip_sinkage", marks=pytest.mark.slow)]
+)
 def test_draws_are_those_of_the_posterior(name):
     found = fitted(
         name, {"rut_depth": "modified_bekker"}, size={"growth": 0.8, "radius_error": 0.05}
