@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+
 import numpy as np
 import pytest
 from hypothesis import settings
@@ -28,6 +30,18 @@ from tests.report.figures.fixtures import (  # noqa: F401
 from tests.together import pytest_collection_modifyitems, pytest_xdist_make_scheduler  # noqa: F401
 
 SEED = 2019
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection():
+    """Look for no garbage among what is imported: it stays, and looking takes three seconds."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.freeze()
+        gc.enable()
+
 
 # How long an example takes depends on the machine and on what else it does. Each run tries others:
 # fifty find in two runs what a hundred find in one.
