@@ -40,6 +40,9 @@ _WIDER = 1.6
 # How far in posterior sds a run is taken to tell of others when a batch is picked.
 _APART = 2.0
 _LEAST_OK = 0.5
+# A posterior most of whose draws are closer to a run that failed than to any other has no value
+# that is known. At the edge of where there are values some are.
+_AMONG_FAILED = 0.5
 
 
 @one_thread()
@@ -113,6 +116,11 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
     state.rebuild()
     if not state.holds(z).any():
         raise state.without_value("no parameters are left for the data")
+    if state.emulator is not None and state.emulator.support is not None:
+        # Where no run was made among those that failed there may seem to be room.
+        z = state.sample(len(history) + 2)
+        if state.among_failed(z) > _AMONG_FAILED:
+            raise state.without_value("the posterior lies among runs that failed")
     return judged(state, z, chosen, measured, own_noise, history)
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from calib.errors import CalibError
 from calib.inference.emulation.nodes import across_zero
@@ -227,6 +228,14 @@ class State:
         if self.emulator is None:
             return np.zeros(len(z), dtype=bool)
         return self.emulator.holds(z)
+
+    def among_failed(self, z: Array) -> float:
+        """Return the share of draws to which a run that failed is closer than any other."""
+        if self.region is None:
+            return 0.0
+        runs = self.region.coordinates(self.axes.of(self.training.theta))
+        nearest = cdist(self.region.coordinates(z), runs).argmin(axis=1)
+        return float((~self.training.ok[nearest]).mean())
 
     def row_variance(self, z: Array) -> Array:
         """Sum over the data's rows of the emulator's variance, shape (k,)."""
