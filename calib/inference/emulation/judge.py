@@ -32,9 +32,14 @@ def held_out(state: State, theta: Array, values: Array) -> HeldOut | None:
     rest = values[ok] - emulator.mean - true @ emulator.curves
     rows = emulator.curves_at(state.problem.conditions)[:, 1:]
     total = np.square(off @ rows.T).sum(axis=1) + np.square(rest).mean(axis=1) * len(rows)
-    z = off / np.sqrt(np.maximum(variances[ok], 1e-300))
+    # A run of a simulator with noise of its own has that besides, no error of the emulator: in each
+    # of the coefficients, as the curves are orthonormal, and in what these do not hold.
+    own = state.own_noise**2
+    left = 1.0 - len(emulator.curves) / emulator.mean.size
+    squared = max(float(total.mean()) - own * (np.square(rows).sum() + left * len(rows)), 0.0)
+    z = off / np.sqrt(np.maximum(variances[ok] + own, 1e-300))
     return HeldOut(
-        int(ok.sum()), float(np.sqrt(total.mean() / len(rows))) / state.sigma, z, ndtr(z).ravel(),
+        int(ok.sum()), float(np.sqrt(squared / len(rows))) / state.sigma, z, ndtr(z).ravel(),
         float((np.abs(z) < _NINETY).mean()),
     )  # fmt: skip
 

@@ -95,25 +95,18 @@ def extend(
 def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: float) -> Emulation:
     """Make runs where the posterior needs them, then some to check the emulator on."""
     history: list[tuple[int, float]] = []
-    batch = max(2 * int(state.free.sum()), 4)
     checks = chosen.checks_of(most)
     state.sample(0)
-    all_ran = True
     while True:
+        z = _needed(state, chosen, checks, history)
+        # Runs that failed across zero and were made again may have taken some of them.
+        checks = min(checks, state.left)
+        measured = _check(state, z, checks, len(history)) if checks else None
         state.rebuild()
-        z = state.sample(len(history) + 1)
-        history.append((len(state.runs), state.error(z)))
-        room = state.left - checks
-        if room < 1 or (all_ran and _settled(history, chosen.tolerance)):
+        # One that was surer of itself than it had reason to be has learned from its check.
+        good = measured is None or measured.rmse <= chosen.tolerance
+        if good or state.left <= checks:
             break
-        theta = state.axes.natural(_next(state, z, min(batch, room), len(history)))
-        values = state.carry_out(theta)
-        all_ran = bool(np.isfinite(values).all())
-        state.learn(theta, values)
-    # Runs that failed across zero and were made again may have taken some of them.
-    checks = min(checks, state.left)
-    measured = _check(state, z, checks, len(history)) if checks else None
-    state.rebuild()
     if not state.holds(z).any():
         raise state.without_value("no parameters are left for the data")
     if state.emulator is not None and state.emulator.support is not None:
@@ -122,6 +115,28 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
         if state.among_failed(z) > _AMONG_FAILED:
             raise state.without_value("the posterior lies among runs that failed")
     return judged(state, z, chosen, measured, own_noise, history)
+
+
+def _needed(
+    state: State, chosen: EmulationSettings, checks: int, history: list[tuple[int, float]]
+) -> Array:
+    """Make runs until the expected error is small, or as many as the check needs are left.
+
+    Return draws of the posterior.
+    """
+    batch, all_ran = max(2 * int(state.free.sum()), 4), True
+    began = len(history)
+    while True:
+        state.rebuild()
+        z = state.sample(len(history) + 1)
+        history.append((len(state.runs), state.error(z)))
+        room = state.left - checks
+        if room < 1 or (all_ran and _settled(history[began:], chosen.tolerance)):
+            return z
+        theta = state.axes.natural(_next(state, z, min(batch, room), len(history)))
+        values = state.carry_out(theta)
+        all_ran = bool(np.isfinite(values).all())
+        state.learn(theta, values)
 
 
 def _nodes(
@@ -179,6 +194,7 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
         state.training = replace(state.training, noisy=True)
         for found in again:
             state.learn(theta[repeats], found)
+        state.own_noise = own
         return own
     return 0.0
 

@@ -59,6 +59,7 @@ class State:
         self.training = Training(np.zeros((0, len(entries))), np.zeros((0, n)), nodes)
         self.runs: list[Run] = list(tried)
         self.sigma = _FIRST_NOISE * float(problem.response.std())
+        self.own_noise = 0.0
         self.emulator: Emulator | None = None
         self.emulated = problem
         self.mode: Array | None = None
