@@ -40,6 +40,8 @@ _WIDER = 1.6
 # How far in posterior sds a run is taken to tell of others when a batch is picked.
 _APART = 2.0
 _LEAST_OK = 0.5
+# So many of the runs that an emulator is checked on have to have a value.
+_RAN = 0.75
 # A posterior most of whose draws are closer to a run that failed than to any other has no value
 # that is known. At the edge of where there are values some are.
 _AMONG_FAILED = 0.5
@@ -103,8 +105,10 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
         checks = min(checks, state.left)
         measured = _check(state, z, checks, len(history)) if checks else None
         state.rebuild()
-        # One that was surer of itself than it had reason to be has learned from its check.
-        good = measured is None or measured.rmse <= chosen.tolerance
+        # One that was surer of itself, or of where there are values, than it had reason to be has
+        # learned from its check.
+        ran = 0 if measured is None else measured.runs
+        good = ran >= _RAN * checks and (measured is None or measured.rmse <= chosen.tolerance)
         if good or state.left <= checks:
             break
     if not state.holds(z).any():
