@@ -21,7 +21,9 @@ from calib.cli import (
     declared,
     doctor,
     gap,
+    inputs,
     interruptible,
+    predict,
     sbc,
 )
 from calib.cli.examples import add_examples
@@ -71,8 +73,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for verb in (
-    calibration.report, calibration.fit, calibration.predict, calibration.data,
-    calibration.template, calibration.priors, declared.models, declared.effects,
+    calibration.report, calibration.fit, predict.predict, inputs.data, inputs.template,
+    inputs.priors, declared.models, declared.effects,
     declared.quantities, compare.compare, gap.diagnose, check.check, audit.audit,
     campaign.campaign, sbc.sbc, doctor.doctor,
 ):  # fmt: skip
