@@ -48,8 +48,10 @@ def test_compare(problem_of):
 
 
 def test_compare_leaves_out_what_cannot_read_the_data():
-    rut = np.arange(9) + 20.0
-    columns = {"average_ground_pressure_kpa": np.full(9, 120.0), "rut_depth_mm": rut}
+    columns = {
+        "average_ground_pressure_kpa": np.linspace(100.0, 140.0, 9), "slip_ratio": np.full(9, 0.5),
+        "rut_depth_mm": np.arange(9) + 20.0,
+    }  # fmt: skip
     problem = build_problem("bekker", table_from_arrays(columns))
     found = compare(problem, np.random.default_rng(0))
     assert tuple(e.method for e in found) == ANY
