@@ -28,7 +28,7 @@ from typing import Protocol
 from calib.batch.plugins import load_files, loaded_files
 from calib.errors import CalibError
 
-__all__ = ["HERE", "Later", "Pool", "begin_imports", "pool", "without_interruptions"]
+__all__ = ["HERE", "Later", "Pool", "begin_imports", "end_server", "pool", "without_interruptions"]
 
 _LOOK_SECONDS = 2.0
 # What a report needs, and what its figures and files import when they are first made.
@@ -191,12 +191,20 @@ def without_interruptions() -> None:
         signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
 
 
-def _stop(executor: ProcessPoolExecutor) -> None:
-    """End processes at once, and the server that may just be importing what they need."""
+def end_server() -> None:
+    """End the server of all processes, which may just be importing what they need.
+
+    It would end by itself, but only then, and keep a pipe open that the output goes to.
+    """
     server = getattr(forkserver._forkserver, "_forkserver_pid", None)
     if server is not None:
         with suppress(ProcessLookupError):  # one before it was stopped, and is gone
             os.kill(server, signal.SIGTERM)
+
+
+def _stop(executor: ProcessPoolExecutor) -> None:
+    """End processes at once, and what they are forked from."""
+    end_server()
     for process in list((executor._processes or {}).values()):
         process.terminate()
 

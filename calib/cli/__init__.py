@@ -50,6 +50,7 @@ def program() -> None:
         main()
     except SystemExit as ended:
         if ended.code == INTERRUPTED:
+            _end_server()
             # The interpreter would take as long again to give back, one by one, what it holds.
             atexit._run_exitfuncs()
             sys.stdout.flush()
@@ -67,7 +68,15 @@ def interruptible() -> None:
 def _stop(*_: object) -> None:
     """End while the commands are imported, where an exception would come out as any other."""
     os.write(2, f"calib: {STOPPED}\n".encode())
+    _end_server()
     os._exit(INTERRUPTED)
+
+
+def _end_server() -> None:
+    """End what processes are forked from, if it was begun: nothing is imported for that."""
+    end = getattr(sys.modules.get("calib.batch.pool"), "end_server", None)
+    if end is not None:
+        end()
 
 
 def _interrupt_again(usual: Callable[[Any], object], lost: Any) -> None:
