@@ -19,6 +19,7 @@ from calib.batch.folders import claimed, fresh_folder
 from calib.cli.verbs import app
 from calib.errors import CalibError
 from calib.models import example_csv
+from challenge.seal import KEY_SCHEMA, publish, seal
 from tests.gap.cases import make_case, write_case
 
 PLAN = """
@@ -44,6 +45,8 @@ LANDING = {
     "campaign": "campaign plan.toml --workers 1 --out OUT",
     "run": "challenge run cases --workers 1 --out OUT",
     "make": "challenge make --seed 1 --cases 1 --workers 1 --key key.json --out OUT",
+    "well-specified": "challenge well-specified cases --key sealed.json --out-key key.json "
+    "--workers 1 --out OUT",
 }
 # These write at once.
 SMALL = {
@@ -59,7 +62,11 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     Path("ruts.csv").write_text(example_csv("bekker"), encoding="utf-8")
     Path("plan.toml").write_text(PLAN, encoding="utf-8")
-    write_case(make_case("force_offset", n_lab=15, n_field=12), Path("cases") / "case-000")
+    cases = Path("cases")
+    write_case(make_case("force_offset", n_lab=15, n_field=12), cases / "case-000")
+    truth = {"tier": "easy", "truth": "force_offset", "gap_over_noise": 3.0}
+    key = {"schema": KEY_SCHEMA, "seed": 1, "salt": "", "cases": {"case-000": truth}}
+    publish(cases, key, seal(key, Path("sealed.json")), ("easy",))
     return tmp_path
 
 
@@ -72,7 +79,8 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
 
     for name in (
         "calib.batch.tasks.run.completed", "challenge.make.completed",
-        "calib.he2019.audit.run_audit", "calib.inference.calibration.calibrate",
+        "challenge.redraw.completed", "calib.he2019.audit.run_audit",
+        "calib.inference.calibration.calibrate",
     ):  # fmt: skip
         monkeypatch.setattr(name, begun)
 
@@ -241,6 +249,7 @@ def test_a_second_process_on_a_folder_is_refused_before_the_work(
 
 @pytest.mark.parametrize(("verb", "inside"), [
     ("sbc", "out/replicates"), ("campaign", "out/results"), ("run", "out"), ("make", "out"),
+    ("well-specified", "out"),
 ])  # fmt: skip
 def test_a_second_process_that_lands_results_is_refused(
     verb: str, inside: str, no_work: None, monkeypatch: pytest.MonkeyPatch
