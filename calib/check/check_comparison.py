@@ -40,7 +40,7 @@ _GROUP = "comparison"
 # Of what follows from rows by arithmetic; weights by iterations that stop at a billionth.
 _ROUNDING = 1e-6
 # Of the file itself, and what was taken over from it.
-_NOT_COMPARED = ("files", "command", "settings", "versions", "machine", "code")
+_NOT_COMPARED = ("files", "header", "command", "settings", "versions", "machine", "code")
 
 
 def check_comparison(
@@ -63,7 +63,7 @@ def check_comparison(
     with not_computed(items, folder, FILE):
         runs = {name: read_run(folder / "runs" / name) for name in record.models}
         problems = {
-            name: run_problem(run.document, folder / "runs" / name / "data.csv")
+            name: _problem(run, folder / "runs" / name / "data.csv", record.header)
             for name, run in runs.items()
         }
         for name, run in runs.items():
@@ -89,6 +89,17 @@ def check_comparison(
                 old, new = ((f / FIGURE).read_bytes() for f in (folder, made))
                 items.append(compare_figure(FIGURE, old, new, thumbnails(made)))
     return items, allowed
+
+
+def _problem(run: RunRecord, data: Path, header: tuple[str, ...]) -> Problem:
+    """Return a run's problem, its columns named as in the file that was compared on.
+
+    Units are shown by these names, where they are not those of the copy that is kept.
+    """
+    problem = run_problem(run.document, data)
+    if not header:
+        return problem
+    return problem.with_table(replace(problem.table, header=header, text=()))
 
 
 def _of(model: str, items: Iterable[Item]) -> list[Item]:

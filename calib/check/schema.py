@@ -169,6 +169,7 @@ class ComparisonRecord(_Made):
     seed: _Seed
     settings: SamplerSettings
     held_out: str
+    header: tuple[str, ...] = ()
     command: tuple[str, ...]
     models: Annotated[dict[_Model, _Compared], Field(min_length=2)]
     files: dict[_File, _Hash]

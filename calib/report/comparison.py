@@ -23,10 +23,10 @@ from calib.inference.io import load_calibration, save_calibration
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.figures.style import BLACK, BLUE, legend_below, panels, png_bytes, style
-from calib.report.labels import aligned, axis_of
+from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
 from calib.report.page.template import data_uri, template
-from calib.report.writer import file_hashes
+from calib.report.writer import file_hashes, own_names
 from calib.validation.comparison import Candidate, Comparison, difference
 from calib.validation.prediction import N_DRAWS
 from calib.validation.validate import PARETO_K_MAX
@@ -93,29 +93,41 @@ def _spread(x: Array) -> Array:
 
 
 _HEAD = (
-    "Model", "Below the best, elpd", "Standard error", "Stacking weight", "RMSE", "90 % covers",
-    "Rows fitted again", "Log evidence",
+    "Model", "Below the best, elpd", "Standard error", "Stacking weight", "RMSE ({unit})",
+    "90 % covers", "Rows fitted again", "Log evidence",
 )  # fmt: skip
-_HELD_HEAD = ("held-out elpd", "held-out RMSE", "held-out CRPS", "held-out 90 % covers")
+_HELD_HEAD = (
+    "held-out elpd", "held-out RMSE ({unit})", "held-out CRPS ({unit})", "held-out 90 % covers",
+)  # fmt: skip
 
 
 def table(found: Mapping[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Return head and rows of the table, from the content of `comparison.json`."""
+    """Return head and rows of the table, from the content of `comparison.json`.
+
+    Errors are in the unit of the file that was compared on.
+    """
+    models = found["models"]
+    with units_of(found.get("header", ())):
+        axis = axis_of(get_model(next(iter(models))).output)
     head = [*_HEAD, *(_HELD_HEAD if found["held_out"] else ())]
-    return head, [_row(name, m) for name, m in found["models"].items()]
+    return (
+        [cell.format(unit=axis.unit) for cell in head],
+        [_row(name, m, axis.factor) for name, m in models.items()],
+    )
 
 
-def _row(name: str, m: Mapping[str, Any]) -> list[str]:
+def _row(name: str, m: Mapping[str, Any], factor: float) -> list[str]:
     cells = [
         name, f"{m['below_best']:.1f}", f"{m['below_best_se']:.1f}", f"{m['weight']:.2f}",
-        format_number(m["rmse"]), f"{100 * m['coverage_90']:.0f} %", str(m["refitted_rows"]),
+        format_number(factor * m["rmse"]), f"{100 * m['coverage_90']:.0f} %",
+        str(m["refitted_rows"]),
         "none" if m["log_evidence"] is None else f"{m['log_evidence']:.1f}",
     ]  # fmt: skip
     held = m.get("held_out")
     if held:
         density = "none" if held["elpd"] is None else f"{held['elpd']:.1f}"
-        crps = "none" if held["crps"] is None else format_number(held["crps"])
-        cells += [density, format_number(held["rmse"]), crps,
+        crps = "none" if held["crps"] is None else format_number(factor * held["crps"])
+        cells += [density, format_number(factor * held["rmse"]), crps,
                   f"{100 * held['coverage_90']:.0f} %"]  # fmt: skip
     return cells
 
@@ -154,10 +166,12 @@ def document(comparison: Comparison, hold_out: str = "", best: str | None = None
     comparison had it for the best.
     """
     first = next(c for c in comparison.candidates if best in (None, c.model))
+    rows = first.calibration.problem.table
     return {
         "schema": SCHEMA,
         "seed": comparison.seed,
-        "rows": len(comparison.candidates[0].loo.table),
+        "rows": len(rows),
+        **own_names(rows),
         "held_out": hold_out,
         "converged": comparison.sound,
         "verdict": comparison.sentence,
@@ -216,7 +230,8 @@ def write_comparison(
         "settings": json.loads(json.dumps(asdict(first.calibration.settings))),
         **here.document(),
     }
-    image = png_bytes(comparison_figure(comparison))
+    with units_of(first.calibration.problem.table.header):
+        image = png_bytes(comparison_figure(comparison))
     (folder / "figures").mkdir()
     (folder / FIGURE).write_bytes(image)
     (folder / PAGE).write_text(page(found, image), encoding="utf-8")

@@ -200,7 +200,7 @@ def _write_output(
     return drawn, images
 
 
-def _own_names(table: Table) -> dict[str, Any]:
+def own_names(table: Table) -> dict[str, Any]:
     """Return the file's own column names, where they are not those of the copy that is kept."""
     return {} if table.header == tuple(table.columns) else {"header": list(table.header)}
 
@@ -226,7 +226,7 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
                 "sha256": sha256(data),
                 "source": task.table.source,
                 "source_sha256": task.table.sha256,
-                **_own_names(task.table),
+                **own_names(task.table),
                 "ignored": list(task.table.ignored),
             },
             "priors": {

@@ -96,6 +96,11 @@ def comparison(out: Path, seed: int = 2019) -> Path:
     """Two models of plates as `calib compare` compares them, one width held out."""
     path = out.with_suffix(".csv")
     path.write_text(example_csv("reece"))
+    return compared(path, out, seed)
+
+
+def compared(path: Path, out: Path, seed: int = 2019) -> Path:
+    """A comparison on the rows of a file."""
     fitted, held = hold_out(read_table(path), "plate_width_mm", 80.0)
     found = compare(fitted, ["bekker_plate", "bekker"], seed, held_out=held, settings=SETTINGS)
     out.mkdir()

@@ -6,15 +6,19 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import h5py
 import pytest
+from matplotlib.figure import Figure
 
 from calib.batch.environment import sha256
 from calib.check.check import check
 from calib.check.outcome import Status
 from calib.errors import CalibError
-from calib.report.comparison import page
+from calib.models import example_csv
+from calib.report.comparison import page, table
+from calib.report.figures.style import png_bytes
 from tests.check.conftest import different, edit_json, findings, seal_run
 
 from . import made
@@ -55,6 +59,48 @@ def test_a_comparison_of_other_draws_is_the_same_within_their_error(tmp_path: Pa
     outcome = check(folder)
     assert different(outcome) == {}
     assert outcome.verdict.startswith("SAME within Monte Carlo error")
+
+
+def test_a_comparison_is_in_the_units_of_its_file_and_checks(
+    compared: Path, tmp_path: Path
+) -> None:
+    """All but the page and the figure is in canonical units, those of the other comparison."""
+    rows = [line.split(",") for line in example_csv("reece").split()]
+    lines = ["Average ground pressure [psi],Plate width [mm],Sinkage [inch]"]
+    lines += [f"{float(p) / 6.894757293168361!r},{w},{float(z) / 25.4!r}" for p, w, z in rows[1:]]
+    file = tmp_path / "own.csv"
+    file.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    drawn: list[Figure] = []
+    with patch("calib.report.comparison.png_bytes", lambda f: drawn.append(f) or png_bytes(f)):
+        own = made.compared(file, tmp_path / "own")
+    found, usual = (json.loads((folder / FILE).read_text()) for folder in (own, compared))
+    assert found["header"] == lines[0].split(",")
+    assert "header" not in usual
+    for name, numbers in usual["models"].items():
+        assert found["models"][name]["rmse"] == pytest.approx(numbers["rmse"], rel=0.1)
+    head, body = table(found)
+    errors = [i for i, cell in enumerate(head) if "RMSE" in cell or "CRPS" in cell]
+    assert [head[i] for i in errors] == [
+        "RMSE (inch)", "held-out RMSE (inch)", "held-out CRPS (inch)",
+    ]  # fmt: skip
+    assert "RMSE (mm)" in table(usual)[0]
+    for row in body:
+        m = found["models"][row[0]]
+        errors_mm = m["rmse"], m["held_out"]["rmse"], m["held_out"]["crps"]
+        assert [float(row[i]) for i in errors] == pytest.approx(
+            [e / 25.4 for e in errors_mm], rel=5e-3
+        )
+    text = (own / "index.html").read_text(encoding="utf-8")
+    assert all(cell in text for cell in (*head, *body[0]))
+    assert "(mm)" not in text
+    (figure,) = drawn
+    assert "Ground pressure (psi)" in figure.axes[0].get_xlabel()
+    assert "Rut depth (inch)" in figure.axes[0].get_ylabel()
+    # The deepest rut is 38.85 mm.
+    assert figure.axes[0].dataLim.ymax < 4.0
+    outcome = check(own)
+    assert different(outcome) == {}
+    assert {i.status for i in outcome.items} == {Status.IDENTICAL}
 
 
 def of_model(change: Callable[[dict[str, Any]], object]) -> Callable[[Path], None]:
