@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
 
 import pytest
+from matplotlib.text import Text
 
-from calib.gap.diagnose import diagnose_once
+from calib.check.derived import verify_gaps
+from calib.check.outcome import Status
+from calib.gap.case import Case, read_case
+from calib.gap.diagnose import diagnose, diagnose_once
 from calib.gap.effects import EFFECTS
+from calib.gap.files import document, write_diagnosis
 from calib.gap.inclusion import Included, Inclusion, inclusion_probability
 from calib.gap.next_measurement import NextMeasurement
 from calib.inference.priors import Prior
@@ -28,6 +37,7 @@ from calib.report.gap_verdict import (
     odds_text,
     repeats_needed,
 )
+from calib.report.labels import short
 from calib.report.page.diagnosis import (
     conditions_text,
     hypothesis_groups,
@@ -38,7 +48,7 @@ from calib.report.page.diagnosis import (
 )
 from calib.report.page.gap_page import write_page
 from tests.browser import faults
-from tests.gap.cases import PULL_ONLY, diagnosis_of, make_case, pull_diagnosis
+from tests.gap.cases import PULL_ONLY, diagnosis_of, make_case, pull_diagnosis, write_case
 from tests.report.page.test_page import Reader
 
 
@@ -251,6 +261,71 @@ def test_it_is_well_formed_and_makes_no_request(page):
     assert reader.open == []
     assert not re.search(r"https?://|@import|url\(", html)
     assert all(a.startswith(("#", "data:")) for a in reader.addresses)
+
+
+# Columns as a file has them, and how much of the canonical unit one of theirs is.
+OWN = {
+    "drawbar_pull_kn": ("Drawbar pull [N]", 1e-3),
+    "rut_depth_mm": ("Sinkage [inch]", 25.4),
+    "inflation_pressure_psi": ("Inflation pressure [kPa]", 1.0 / 6.894757293168361),
+    "average_ground_pressure_kpa": ("Average ground pressure [psi]", 6.894757293168361),
+    "speed_m_s": ("Speed [ft/s]", 0.3048),
+}
+
+
+def in_own_units(case: Case, folder: Path) -> Case:
+    """Return a case as it is read from files of other words and units."""
+    write_case(case, folder)
+    for file in folder.glob("*.csv"):
+        with file.open() as lines:
+            head, *rows = csv.reader(lines)
+        scale = [OWN.get(column, ("", 1.0))[1] for column in head]
+        lines = [",".join(OWN.get(column, (column,))[0] for column in head)]
+        lines += [",".join(repr(float(c) / f) for c, f in zip(r, scale, strict=True)) for r in rows]
+        file.write_text("\n".join(lines) + "\n")
+    return read_case(folder)
+
+
+def test_it_is_in_the_units_of_the_files_and_checks(tmp_path):
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift")}
+    found = diagnose(in_own_units(make_case("sensor_drift", n_fresh=3), tmp_path / "own"), 1,
+                     effects=few)  # fmt: skip
+    out = tmp_path / "gaps" / "drift"
+    out.mkdir(parents=True)
+    write_diagnosis(found, out)
+    drawn = []
+    with patch("calib.report.figures.style.png", lambda p: drawn.append(p.figure) or b""):
+        write_page(found, out, {})
+    told = json.loads((out / "diagnosis.json").read_text())
+    reader = Reader()
+    reader.feed((out / "index.html").read_text(encoding="utf-8"))
+    shrink = told["shrink"]["drawbar_pull"]
+    before, after, noise = (
+        short(1e3 * shrink[key]) for key in ("rmse_before", "rmse_after", "noise_floor")
+    )
+    assert f"from {before} to {after} N rms" in reader.text
+    assert f"noise sd of a reading {noise} N" in reader.text
+    # Parameters are in their own units, here kN; their definitions name a pressure.
+    assert set(re.findall(r"[\d.]+ (mm|psi|kPa|m/s|kN)\b", reader.text)) == {"kN", "kPa", "psi"}
+    assert re.findall(r".{7}[\d.]+ psi\b", reader.text) == ["18 and 42 psi"]
+    labels = {text.get_text() for f in drawn for text in f.findobj(Text)}
+    assert {"Gap in drawbar pull (N)", "Gap in rut depth (inch)", "Speed\n(ft/s)"} <= labels
+    assert not [t for t in labels if re.search(r"\((kN|mm|psi|m/s)\)", t)]
+
+    # What it keeps is canonical: it is diagnosed as before, and its model predicts what it states.
+    again = document(diagnose(read_case(out / "case"), 1, effects=few))
+    assert again["verdict"] == told["verdict"] == "effect"
+    for new, old in zip(again["effects"], told["effects"], strict=True):
+        assert new["name"] == old["name"]
+        assert new["probability"] == pytest.approx(old["probability"], abs=1e-4)
+    best = told["effects"][0]
+    said = {
+        "verdict": told["verdict"], "best": best["name"], "parameters": best["parameters"],
+        "probability": {e["name"]: e["probability"] for e in told["effects"]},
+        "shrink": told["shrink"],
+    }  # fmt: skip
+    checked = verify_gaps(tmp_path, {"paper_gaps": {"drift": said}}, same_code=True)
+    assert [item.status for item in checked] == [Status.IDENTICAL] * 2
 
 
 def test_it_holds_in_a_browser(page, browser):
