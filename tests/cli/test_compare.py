@@ -10,6 +10,7 @@ import pytest
 
 from calib.batch.folders import check_folder
 from calib.models import example_csv
+from calib.report.comparison import table
 from calib.report.figures.collect import plates
 from tests.browser import Browser, faults
 from tests.cli.test_cli import Calib
@@ -45,7 +46,10 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
 
 def test_a_report_has_it_as_a_section(calib: Calib, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("calib.report.writer.plates", lambda *args: plates(*args)[:1])
-    Path("plates.csv").write_text(example_csv("reece"))
+    rows = [line.rpartition(",") for line in example_csv("reece").split()[1:]]
+    lines = ["average_ground_pressure_kpa,plate_width_mm,Sinkage [inch]"]
+    lines += [f"{conditions},{float(depth) / 25.4!r}" for conditions, _, depth in rows]
+    Path("plates.csv").write_text("\n".join(lines) + "\n")
     made = calib("report", "plates.csv", "--compare", "reece", "--compare", "bekker_plate",
                  "--hold-out", "plate_width_mm=80", "--out", "r", *FEW)  # fmt: skip
     assert made.code in (0, 3), made.err
@@ -55,6 +59,12 @@ def test_a_report_has_it_as_a_section(calib: Calib, monkeypatch: pytest.MonkeyPa
     assert (
         json.loads(Path("r/manifest.json").read_text())["comparison"]["models"] == found["models"]
     )
+    # In the unit of the file, and in millimetres for a machine.
+    for page in ("r/index.html", "r/compared/index.html"):
+        assert "held-out RMSE (inch)" in Path(page).read_text(encoding="utf-8")
+    best, numbers = next(iter(found["models"].items()))
+    (row,) = [cells for cells in table(found)[1] if cells[0] == best]
+    assert float(row[4]) == pytest.approx(numbers["rmse"] / 25.4, rel=5e-3)
     for folder in ("r", "r/compared"):
         check_folder(Path(folder), overwrite=True)
     told = calib("check", "r", "--quick")
