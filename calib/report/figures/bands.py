@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import matplotlib as mpl
@@ -10,8 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy.typing import NDArray
 
 from calib.data.quantities import role_of
+from calib.data.table import Table
 from calib.errors import CalibError
 from calib.models.base import Array, Model
 from calib.report.figures.plate import Plate
@@ -123,6 +126,16 @@ def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -
             zorder=3,
         )
     word = data_word(result)
+    for table, rows, draws in (
+        (problem.table, group.fitted, result.posterior_predictive),
+        (held, group.held_out, result.validation.draws),
+    ):
+        away = np.zeros(0, bool) if table is None else rows & _elsewhere(table, conditions, x)
+        if table is not None and away.any():
+            low, high = y_axis.scale(np.nanquantile(draws[:, away], [0.05, 0.95], axis=0))
+            handles["90 % at the row's own conditions"] = ax.vlines(
+                scale(table[x][away]), low, high, color=GREY, lw=3.0, alpha=0.5, zorder=3.5
+            )
     if group.fitted.any():
         handles[f"{word}, calibrated"] = scatter_points(
             ax, scale(problem.table[x][group.fitted]),
@@ -133,6 +146,15 @@ def _panel(ax: Axes, result: OutputResult, group: Group, reference: Reference) -
             ax, scale(held[x][group.held_out]), y_axis.scale(held[y][group.held_out]), held=True
         )
     return handles
+
+
+def _elsewhere(table: Table, drawn: Mapping[str, Array], x: str) -> NDArray[np.bool_]:
+    """Which rows (n,) are at other conditions, beside x, than a curve is drawn at."""
+    apart = [
+        ~np.isclose(table[name], values[0], rtol=1e-6, atol=1e-12)
+        for name, values in drawn.items() if name != x
+    ]  # fmt: skip
+    return np.any(apart, axis=0) if apart else np.zeros(len(table), dtype=np.bool_)
 
 
 def observed_words(result: OutputResult) -> str:
@@ -168,7 +190,27 @@ def _bands_caption(result: OutputResult, shown: int) -> str:
     if column is not None and 0 < shown < total:
         names = joined([g.title for g in groups(result)])
         text += f". {total} values of {axis_of(column).name.lower()} are shown as {names}"
-    return text + "."
+    return f"{text}.{_drawn_at(result)}"
+
+
+def _drawn_at(result: OutputResult) -> str:
+    """Say at what the curves are drawn, of conditions that vary within a panel; else nothing."""
+    table, said = result.calibration.problem.table, []
+    for name in result.calibration.problem.bound.model.conditions:
+        inside = [table[name][g.fitted] for g in groups(result) if g.fitted.any()]
+        if name == x_column(result) or all(np.ptp(v) <= 1e-6 * np.abs(v).max() for v in inside):
+            continue
+        axis = axis_of(name)
+        middles, rows = [float(np.median(v)) for v in inside], np.concatenate(inside)
+        at, whole = (
+            " to ".join(dict.fromkeys(map(axis.value_text, (min(v), max(v)))))
+            for v in (middles, rows)
+        )
+        said.append(f"{axis.name.lower()} {at} {axis.unit} (rows at {whole} {axis.unit})")
+    return "" if not said else (
+        f" Curves are drawn at each panel's middle, {joined(said)}; grey bars are the 90 % bands "
+        "of rows at other conditions."
+    )  # fmt: skip
 
 
 # A heavy prior tail would flatten the data: the axis ends at this multiple of their range.
