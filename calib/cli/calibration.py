@@ -194,7 +194,7 @@ def fit(
     say_failed(model)
     if preference is not None:
         print(preference.sentence)
-    told = warnings_of(problem, calibration.draws.mode)
+    told = warnings_of(problem, calibration.draws.mode, calibration.draws.flat)
     for note in problem.notes:
         print(f"note: {note}", file=sys.stderr)
     for warning in told:

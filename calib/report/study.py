@@ -203,7 +203,7 @@ def _work_out(
         seconds,
         prior_sensitivity(calibration),
         preference,
-        warnings_of(problem, calibration.draws.mode),
+        warnings_of(problem, calibration.draws.mode, calibration.draws.flat),
     )
 
 

@@ -31,24 +31,52 @@ LEVEL = 1e-3
 # Chance that readings agree to the last digit, from which equal rows are taken for copies.
 _COPIED = 0.01
 _FEWEST, _FEWEST_FOR_TAILS = 8, 20
+# Draws that are looked at for an edge of where the model has a value, and what part beyond it is.
+_PROBES, _MANY = 100, 0.2
 _UNIT_FIRST = (
     "whether neighbouring rows are alike, the scatter even and its tails light is not judged while "
     "a column looks to be in another unit"
 )
 
 
-def warnings_of(problem: Problem, t: Array) -> tuple[str, ...]:
+def warnings_of(problem: Problem, t: Array, draws: Array | None = None) -> tuple[str, ...]:
     """Say what a reader should mend, or know, before believing a calibration's width.
 
-    `t` (d,) are internal coordinates of a fit to all rows, for instance the posterior's mode. Of a
-    column in another unit the priors make a misfit, whose residuals say nothing of the rows.
+    `t` (d,) are internal coordinates of a fit to all rows, for instance the posterior's mode, and
+    `draws` (k, d) those of the posterior. Of a column in another unit the priors make a misfit,
+    whose residuals say nothing of the rows.
     """
     scatter = float(problem.theta(t[None])[0, -1])
     off = any(column_notes(problem.table))
     return (
         *outlying_notes(problem, t), *file_notes(problem, scatter),
         *((_UNIT_FIRST,) if off else residual_notes(problem, t)),
+        *(() if draws is None else _cut_off(problem, draws)),
     )  # fmt: skip
+
+
+def _cut_off(problem: Problem, draws: Array) -> Iterable[str]:
+    """A posterior that ends where the model has no value, and not where the data end it.
+
+    Draws twice as far from their mean as they are lie beyond such an edge: a fifth of them if it is
+    nearer than 1.7 sds.
+    """
+    some = draws[:: max(1, len(draws) // _PROBES)][:_PROBES]
+    mean = draws.mean(axis=0)
+    t = np.concatenate([mean + 2.0 * (some - mean), mean - 2.0 * (some - mean)])
+    t = t[np.isfinite(problem.priors.log_prob(t))]
+    nowhere = np.isneginf(problem.log_likelihood(t))
+    if nowhere.sum() <= _MANY * len(t):
+        return
+    # Of the side where there is none, the coordinate that is farthest off.
+    away = (t[nowhere].mean(axis=0) - mean) / draws.std(axis=0)
+    name = problem.priors.free[int(np.argmax(np.abs(away)))].name
+    yield (
+        f"{problem.bound.model.name}: the posterior ends where the model has no value, at "
+        f"{'large' if away[np.argmax(np.abs(away))] > 0.0 else 'small'} {name} above all: it is cut "
+        "off there, not where the data end it; mend the model there, or exclude such values by the "
+        "bounds of the priors"
+    )
 
 
 def file_notes(problem: Problem, scatter: float) -> tuple[str, ...]:

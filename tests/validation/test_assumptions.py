@@ -17,13 +17,14 @@ from calib.inference.sampling.mode import find_mode
 from calib.models import MODELS, example_csv
 from calib.validation.assumptions import (
     LEVEL,
+    _cut_off,
     durbin_watson_moments,
     file_notes,
     residual_notes,
     warnings_of,
 )  # fmt: skip
 from calib.validation.outliers import linear
-from tests.custom_problems import normal
+from tests.custom_problems import normal, problem_of
 from tests.validation.test_outliers import fitted_line, line_problem
 
 SLIP = np.linspace(0.02, 0.6, 40)
@@ -189,6 +190,22 @@ def test_residuals_are_not_judged_while_a_column_looks_to_be_in_another_unit() -
     unit, withheld = warnings_of(problem, t)
     assert "about 1000 times too large" in unit
     assert "is not judged while a column looks to be in another unit" in withheld
+
+
+@pytest.mark.parametrize(("edge", "told"), [(1.0, True), (4.0, False)])
+def test_a_posterior_that_ends_where_the_model_has_no_value_is_said(
+    edge: float, told: bool
+) -> None:
+    """A slope of 2 +- 0.1 as the data have it, and no value beyond an edge so many sds above."""
+    rng, slip = np.random.default_rng(2), np.linspace(0.0, 1.0, 40)
+    beyond = 2.0 + 0.1 * edge
+    priors = [normal("a", 0.0, 1.0), normal("b", 0.0, 10.0), normal("sigma", 0.0, 0.1, log=True)]
+    problem = problem_of(
+        lambda a, b, s: np.where(b > beyond, np.nan, a + b * s), priors, slip, 1.0 + 2.0 * slip
+    )
+    t = np.array([1.0, 2.0, 0.0]) + 0.1 * rng.standard_normal((4000, 3))
+    found = " | ".join(_cut_off(problem, t[t[:, 1] <= beyond]))
+    assert ("ends where the model has no value, at large b" in found) is told
 
 
 def test_copies_are_named_by_line() -> None:

@@ -120,7 +120,7 @@ class Fit(Kind[FitSection, FitItem]):
             numbers["converged"] = numbers["converged"] and emulation.passed
             numbers["emulator"] = emulation.numbers
             files[EMULATION] = emulation_file([emulation])
-        if warnings := warnings_of(problem, calibration.draws.mode):
+        if warnings := warnings_of(problem, calibration.draws.mode, calibration.draws.flat):
             numbers["warnings"] = " | ".join(warnings)
         if held is not None:
             scores = validate_held_out(calibration, held).scores
