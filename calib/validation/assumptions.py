@@ -70,12 +70,12 @@ def _cut_off(problem: Problem, draws: Array) -> Iterable[str]:
         return
     # Of the side where there is none, the coordinate that is farthest off.
     away = (t[nowhere].mean(axis=0) - mean) / draws.std(axis=0)
-    name = problem.priors.free[int(np.argmax(np.abs(away)))].name
+    i = int(np.argmax(np.abs(away)))
+    at = f"{'large' if away[i] > 0.0 else 'small'} {problem.priors.free[i].name}"
     yield (
-        f"{problem.bound.model.name}: the posterior ends where the model has no value, at "
-        f"{'large' if away[np.argmax(np.abs(away))] > 0.0 else 'small'} {name} above all: it is cut "
-        "off there, not where the data end it; mend the model there, or exclude such values by the "
-        "bounds of the priors"
+        f"{problem.bound.model.name}: the posterior ends where the model has no value, at {at} "
+        "above all: it is cut off there, not where the data end it; mend the model there, or "
+        "exclude such values by the bounds of the priors"
     )
 
 
