@@ -51,12 +51,15 @@ def without_value(
     )  # fmt: skip
     printed = f"; it printed: {first.printed.strip()}" if first.printed.strip() else ""
     mend = _MEND.get(first.kind, "correct the simulator where it fails")
+    mend += "; or give priors that do not reach there" if ok.any() else ""
+    have = (
+        f"only {ok.sum()} of the {ok.size} runs have" if ok.any() else f"none of {ok.size} runs has"
+    )
     return CalibError(
-        f"{why}: only {ok.sum()} of the {ok.size} runs have a value "
-        f"({first.kind}: {first.reason}{printed}){at}",
+        f"{why}: {have} a value ({first.kind}: {first.reason}{printed}){at}",
         where=simulator.place(first.kind),
         allowed="a simulator with values in at least half of its prior, and where the data are",
-        mend=f"{mend}; or give priors that do not reach there{kept}",
+        mend=f"{mend}{kept}",
     )
 
 

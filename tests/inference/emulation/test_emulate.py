@@ -188,7 +188,12 @@ def test_a_simulator_that_never_runs_is_refused_after_its_first_runs(tmp_path: P
             calib.emulated(calib.build_problem("broken", table()), seed=1)
         assert len(calls) == 12
     text = str(caught.value)
-    for words in ("only 0 of the 6 runs", "OSError: no soil.dat", ", at mu 0.", "broken.runs"):
+    for words in (
+        "none of the 6 runs has a value",
+        "OSError: no soil.dat",
+        ", at mu 0.",
+        "broken.runs",
+    ):
         assert words in text
 
 

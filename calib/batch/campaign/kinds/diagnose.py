@@ -37,6 +37,10 @@ from calib.models.simulators.emulator.model import emulator_of
 from calib.models.simulators.registered import slow_simulator
 from calib.report.page.gap_page import write_page
 
+# What is run of a slow simulator does not depend on a task's own stream: it is what
+# `calib diagnose` runs by default, so that neither runs anything twice.
+_EMULATION_SEED = 1
+
 
 class DiagnoseSection(Section):
     """``[[diagnose]]``: every case folder."""
@@ -90,7 +94,7 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
         }
         path = task.inputs["case.toml"]
         case = read_case(path.parent)
-        return case, effects, task.settings["pages"], _emulated(case, task.seed)
+        return case, effects, task.settings["pages"], _emulated(case, _EMULATION_SEED)
 
     def work(self, item: DiagnosisItem, seed: int) -> Work:
         """Diagnose it."""
