@@ -49,7 +49,8 @@ def run_file(path: Path, what: str) -> ModuleType:
         spec.loader.exec_module(module)
     except CalibError as error:
         sys.modules.pop(name)
-        raise error.within(str(path)) from None
+        # An effect names its file itself.
+        raise error.within(None if str(path) in (error.where or "") else str(path)) from None
     except (Exception, SystemExit) as error:
         # A file that ends the program would end this one, and with success.
         sys.modules.pop(name)

@@ -15,14 +15,39 @@ if TYPE_CHECKING:
 _ONE = "dimensionless"
 
 
+def check_tuple(attribute: str, given: object, where: str) -> None:
+    """Check that several texts are declared as such: one would be taken letter by letter.
+
+    Raises
+    ------
+    CalibError
+        If they are plain text, or no texts.
+    """
+    if isinstance(given, str):
+        raise CalibError(
+            f"{attribute} is the text {given!r}", where=where, allowed="a tuple of texts",
+            mend=f"write {attribute} = ({_quoted(given)},), with the comma",
+        )  # fmt: skip
+    if not isinstance(given, list | tuple) or not all(isinstance(part, str) for part in given):
+        raise CalibError(
+            f"{attribute} is {given!r}", where=where, allowed="a tuple of texts",
+            mend='write each between quotation marks, with commas: ("a", "b")',
+        )  # fmt: skip
+
+
+def _quoted(given: str) -> str:
+    """Return a text as it is written in Python, mathematics with its backslashes as they are."""
+    return f'r"{given}"' if "\\" in given else f'"{given}"'
+
+
 def check_model(model: Model) -> None:
     """Check a declaration.
 
     Raises
     ------
     CalibError
-        If a column is no quantity, the output is none, a name is given twice, or the priors are
-        missing, not of the model's parameters, or in another unit than theirs.
+        If plain text stands for a tuple, a column is no quantity, the output is none, a name is
+        given twice, or the priors are missing, not of the model's parameters, or in another unit.
     """
     where = f"model {model.name!r}"
     if not model.name.isidentifier():
@@ -30,6 +55,8 @@ def check_model(model: Model) -> None:
             "the name of a model must be a word", where=where,
             allowed="letters, digits and underscores", mend="give it another name",
         )  # fmt: skip
+    for attribute in ("conditions", "parameters", "latex"):
+        check_tuple(attribute, getattr(model, attribute), where)
     for column in (model.output, *model.conditions):
         if column not in QUANTITIES:
             raise CalibError(

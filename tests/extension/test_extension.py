@@ -219,6 +219,11 @@ def declared(**changes: object) -> calib.Model:
         ({"name": "my model"}, ["must be a word"]),
         ({"name": "bekker"}, ["there is a model 'bekker' already"]),
         ({"conditions": ("slip",)}, ["no quantity 'slip'", "slip_ratio"]),
+        (
+            {"conditions": "slip_ratio"},
+            ["conditions is the text", '("slip_ratio",), with the comma'],
+        ),
+        ({"latex": r"$a \mu$"}, [r'write latex = (r"$a \mu$",), with the comma']),
         ({"output": "slip_ratio"}, ["slip_ratio is no output", "drawbar_pull_kn"]),
         ({"parameters": ("a", "a")}, ["the parameter a is there twice"]),
         ({"priors": ""}, ["has no priors", "calib priors"]),

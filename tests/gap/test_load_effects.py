@@ -4,11 +4,12 @@ from pathlib import Path
 
 import pytest
 
+import calib
 from calib.batch.plugins import run_file
 from calib.errors import CalibError
 from calib.gap.case import campaigns
 from calib.gap.diagnose import diagnose
-from calib.gap.effects import EFFECTS
+from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.check import check_effects
 from calib.gap.effects.load import load_effects
 from calib.gap.hypotheses import effect_priors
@@ -93,6 +94,9 @@ RETURN = "        return location + phi[:, :1]\n"
         ),
         ('    outputs', '    covariates = ("sped",)\n    outputs', "did you mean speed?"),
         ('    outputs', '    covariate = ("speed",)\n    outputs', "did you mean covariates?"),
+        ('    outputs', '    latex = "$P + F$"\n    outputs', 'write latex = ("$P + F$",), with'),
+        ('    outputs', '    covariates = ("speed")\n    outputs', "is the text 'speed'"),
+        ('    outputs', '    latex = (1,)\n    outputs', "latex is (1,)"),
         ('    outputs', '    form = ("slope",)\n    outputs', "unknown name 'slope' in form"),
         ("def on_output", "def on_outputs", "did you mean on_output?"),
     ],
@@ -102,6 +106,22 @@ def test_what_an_effect_declares_wrongly_is_named(tmp_path, old, new, words):
         load_effects(write(tmp_path, CODE.replace(old, new)))
     assert words in str(caught.value)
     assert "mine.py, effect" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("attribute", "given", "words"),
+    [
+        ("form", ("slipp",), "did you mean slip?"), ("covariates", "tread", '("tread",), with'),
+        ("outputs", "pull", '("pull",), with'), ("latex", "$P$", '("$P$",), with'),
+        ("name", "rate_effect", "of calib's own"),
+    ],
+)  # fmt: skip
+def test_what_an_effect_declares_wrongly_is_named_when_it_is_registered(attribute, given, words):
+    kind = type("Mine", (Effect,), {"name": "mine", "outputs": ("pull",), attribute: given})
+    with pytest.raises(CalibError) as caught:
+        calib.register(kind())
+    assert words in str(caught.value)
+    assert "mine" not in EFFECTS
 
 
 @pytest.mark.parametrize(

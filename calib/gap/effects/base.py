@@ -256,10 +256,12 @@ class Effect:
         Raises
         ------
         CalibError
-            If there is another one of its name.
+            If its declaration does not hold together, or there is another one of its name.
         """
         from calib.gap.effects import EFFECTS
+        from calib.gap.effects.check import check_declared
 
+        check_declared(self)
         EFFECTS.add(self)
 
 

@@ -25,6 +25,7 @@ from calib.gap.hypotheses import effect_priors
 from calib.gap.hypothesis import Hypothesis
 from calib.inference.random import generator
 from calib.models.base import Array
+from calib.models.declared import check_tuple
 
 __all__ = ["check_declared", "check_effects"]
 
@@ -34,6 +35,7 @@ _TRIALS = 8
 _MISSPELT = 0.8
 _BASE = tuple(name for name in vars(Effect) if not name.startswith("_"))
 _METHODS = tuple(name for name in _BASE if callable(getattr(Effect, name)))
+_TUPLES = ("latex", "parameters", "outputs", "needs", "covariates", "form", "holds")
 _FORMS = ("size", "slip", "pressure", "cone", "water", "shape", "extrapolation")
 
 
@@ -75,27 +77,25 @@ def check_declared(effect: Effect) -> None:
     Raises
     ------
     CalibError
-        If the name is taken, an output, covariate or form is unknown, or a method is misspelt.
+        If the name is taken, an output, covariate or form is unknown, plain text stands for a
+        tuple, or a method is misspelt.
     """
     where = _place(effect)
     taken = EFFECTS.get(effect.name)
     if taken is not None and type(taken) is not type(effect):
+        whose = "calib's own" if type(taken).__module__.startswith("calib.") else "another file"
         raise CalibError(
-            "the name is that of an effect of calib's own", where=where,
+            f"the name is that of an effect of {whose}", where=where,
             allowed=f"any name but {', '.join(EFFECTS)}", mend="give it another name",
         )  # fmt: skip
+    for attribute in _TUPLES:
+        check_tuple(attribute, getattr(effect, attribute), where)
     outputs = {q.physical: q.stem for q in QUANTITIES.values() if q.role == "output"}
     conditions = {q.physical: c for c, q in QUANTITIES.items() if q.role != "output"}
     for attribute, known in (
         ("outputs", outputs), ("needs", outputs), ("covariates", conditions), ("form", _FORMS),
     ):  # fmt: skip
-        given = getattr(effect, attribute)
-        if isinstance(given, str):
-            raise CalibError(
-                f"{attribute} is the text {given!r}", where=where, allowed="a tuple of names",
-                mend=f'write {attribute} = ("{given}",), with the comma',
-            )  # fmt: skip
-        for name in given:
+        for name in getattr(effect, attribute):
             if name not in known:
                 raise CalibError(
                     f"unknown name {name!r} in {attribute}", where=where,
