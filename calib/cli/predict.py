@@ -16,6 +16,9 @@ from calib.errors import CalibError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+# By which a file is known for a prediction: of a run, of one that did not converge, of a diagnosis.
+_LAST_COLUMNS = ("outside_calibrated_range", "converged", "_after_upper")
+
 
 def predict(
     run: Annotated[
@@ -39,12 +42,8 @@ def predict(
     json: Json = False,
 ) -> None:
     """Predict at new conditions: with 50, 90 and 95 % bands; a diagnosis with 90 % bands."""
-    if out is not None and out.exists() and not overwrite:
-        raise CalibError(
-            "the file exists already",
-            where=str(out),
-            mend="choose another --out, or pass --overwrite",
-        )
+    if out is not None and out.exists():
+        _must_be_ours(out, at, overwrite)
     from calib import load_calibration
     from calib.batch.folders import check_room
     from calib.data import read_for_model
@@ -101,6 +100,29 @@ def predict(
         print(f"calib: no value (nan) at {undefined} of {len(table)} rows{why}", file=sys.stderr)
     _give(columns, out)
     finish(0 if converged else 3, {"columns": _lists(columns)}, outside=outside)
+
+
+def _must_be_ours(out: Path, at: Path, overwrite: bool) -> None:
+    """Refuse to replace a file unless it is a prediction, and that is wanted."""
+    if not overwrite:
+        raise CalibError(
+            "the file exists already", where=str(out),
+            mend="choose another --out, or pass --overwrite",
+        )  # fmt: skip
+    if at.exists() and out.samefile(at):
+        raise CalibError(
+            "it holds the conditions, which --out would replace", where=str(out),
+            mend="choose another --out",
+        )  # fmt: skip
+    if not out.is_file():
+        return
+    with out.open(encoding="utf-8", errors="replace") as file:
+        header = file.readline().strip()
+    if header and not header.endswith(_LAST_COLUMNS):
+        raise CalibError(
+            "the file is no prediction, so it is not replaced", where=str(out),
+            allowed="a CSV that calib predict wrote", mend="choose another --out",
+        )  # fmt: skip
 
 
 def _predict_corrected(

@@ -535,11 +535,22 @@ def test_the_command_is_installed() -> None:
 
 def test_a_prediction_replaces_a_file_on_request_only(calib: Calib) -> None:
     assert fit_rut(calib, RUT.encode()).code == 0
-    Path("p.csv").write_text("mine")
-    command = ("predict", "run", "--at", "my.csv", "--out", "p.csv")
-    refused = calib(*command)
-    assert refused.code == 2
-    assert "p.csv" in refused.err
-    assert Path("p.csv").read_text() == "mine"
-    assert calib(*command, "--overwrite").code == 0
-    assert "rut_depth_mm_median" in Path("p.csv").read_text()
+    command = ("predict", "run", "--at", "my.csv", "--out")
+    assert calib(*command, "p.csv").code == 0
+    whole = Path("p.csv").read_text()
+    assert "rut_depth_mm_median" in whole
+    Path("p.csv").write_text(whole.splitlines()[0])
+    assert_refused(calib(*command, "p.csv"), ["p.csv", "--overwrite"])
+    assert calib(*command, "p.csv", "--overwrite").code == 0
+    assert Path("p.csv").read_text() == whole
+
+
+def test_a_prediction_never_replaces_its_conditions_nor_what_others_wrote(calib: Calib) -> None:
+    assert fit_rut(calib, RUT.encode()).code == 0
+    Path("notes.txt").write_text("Tyre 3 was changed.\n")
+    for out, words in (("my.csv", "conditions"), ("run/../my.csv", "conditions"),
+                       ("notes.txt", "no prediction")):  # fmt: skip
+        before = Path(out).read_bytes()
+        refused = calib("predict", "run", "--at", "my.csv", "--out", out, "--overwrite")
+        assert_refused(refused, [out, words, "another --out"])
+        assert Path(out).read_bytes() == before
