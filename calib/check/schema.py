@@ -46,12 +46,13 @@ def _name(text: str) -> str:
     return text
 
 
+class _UnknownModel(ValueError):
+    """A model that is not known here: most likely its file was not passed."""
+
+
 def _known_model(name: str) -> str:
     if name not in MODELS:
-        raise ValueError(
-            f"{name} is not one of {', '.join(MODELS)}; of your own, pass the file that declares "
-            "it (--models FILE or --simulator FILE)"
-        )
+        raise _UnknownModel(f"{name} is not one of {', '.join(MODELS)}")
     return name
 
 
@@ -200,12 +201,7 @@ def read_folder(folder: Path) -> Record:
     }  # fmt: skip
     found = [name for name in readers if (folder / name).is_file()]
     if not found:
-        raise CalibError(
-            f"this is no folder that can be checked (no {', '.join(readers)} in it)",
-            where=str(folder),
-            allowed="a folder written by `calib report`, `calib fit` or `calib compare`",
-            mend="give the folder that --out named",
-        )
+        raise _unchecked(folder, f"no {', '.join(readers)} in it")
     return readers[found[0]](_content(folder / found[0]), folder / found[0])
 
 
@@ -253,6 +249,9 @@ def _run(content: Any, path: Path) -> RunRecord:
 
 def _check_schema(content: Any, schema: str, path: Path) -> None:
     given = content.get("schema") if isinstance(content, Mapping) else None
+    # A folder of `calib sbc` has a run.json as well, which is no record of a run.
+    if given is None and (path.parent / "sbc.json").is_file():
+        raise _unchecked(path.parent, "it is one of `calib sbc`")
     if given != schema:
         raise CalibError(
             f"the schema is {given!r}",
@@ -268,7 +267,24 @@ def _validated[R: _Made](kind: type[R], content: Any, path: Path, **more: Any) -
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
+        unknown = first.get("ctx", {}).get("error")
+        if isinstance(unknown, _UnknownModel):
+            raise CalibError(
+                f"{place}: {unknown}", where=str(path),
+                allowed="a model that is known here",
+                mend="pass the file of your own that declares it (--models FILE or --simulator "
+                "FILE); if there is none, restore the folder's",
+            ) from None  # fmt: skip
         raise _damaged(path, f"{place}: {first['msg']}") from None
+
+
+def _unchecked(folder: Path, why: str) -> CalibError:
+    return CalibError(
+        f"this is no folder that can be checked ({why})",
+        where=str(folder),
+        allowed="a folder written by `calib report`, `calib fit` or `calib compare`",
+        mend="give the folder that --out of one of these named",
+    )
 
 
 def _damaged(path: Path, found: str) -> CalibError:

@@ -219,7 +219,8 @@ def _load_fit(
         raise CalibError(
             f"the corrected model uses the effect {', '.join(unknown)}, which is not known here",
             allowed=", ".join(effects),
-            mend="pass the Python file that defines it (`calib predict --effects FILE`)",
+            mend="pass the Python file that defines it as the diagnosis was given it: "
+            "--models FILE if it registers the effect, else --effects FILE",
         )
     chosen = tuple(effects[name] for name in document["effects"])
     hypothesis = Hypothesis(

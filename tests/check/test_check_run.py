@@ -188,7 +188,7 @@ def test_a_run_says_nothing_of_the_computer_it_was_made_on(run: Path) -> None:
         (lambda m: m.pop("settings"), "settings"),
         (lambda m: m.pop("code"), "code"),
         (lambda m: m.update(schema="calib/run/0"), "calib/run/0"),
-        (lambda m: m.update(model="pacejka"), "model"),
+        (lambda m: m.update(model="pacejka"), "mend: pass the file of your own that declares it"),
         (lambda m: m.update(references={"p": "high"}), "references"),
     ],
 )

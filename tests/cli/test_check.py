@@ -86,6 +86,12 @@ def test_what_cannot_be_checked_ends_with_2(calib: Calib, run: Path) -> None:  #
         assert "to mend:" in refused.err
         document = json.loads(refused.out)
         assert (document["verdict"], document["exit_code"]) == ("cannot be checked", 2)
+    Path("simulated").mkdir()
+    for name in ("run.json", "sbc.json"):
+        Path("simulated", name).write_text('{"seed": 1}')
+    simulated = calib("check", "simulated")
+    assert simulated.code == 2
+    assert "no folder that can be checked (it is one of `calib sbc`)" in simulated.err
     (run / "run.json").write_text("{")
     damaged = calib("check", run)
     assert damaged.code == 2
