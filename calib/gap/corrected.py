@@ -29,7 +29,7 @@ from calib.gap.noise import Noise
 from calib.gap.shifts import ShiftMap
 from calib.gap.shrink import predict_new
 from calib.models.base import Array
-from calib.validation.prediction import outside
+from calib.validation.prediction import echoed, outside
 
 __all__ = [
     "Corrected", "conditions_outside", "load_corrected", "predict_columns", "save_corrected",
@@ -281,7 +281,7 @@ def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
 def predict_columns(
     corrected: Corrected, table: Table, left_out: Collection[str] = ()
 ) -> dict[str, Array | list[str]]:
-    """Lay out a prediction at new conditions: conditions, before, after, 90 % predictive band.
+    """Lay out a prediction at new conditions: columns as given, before, after, 90 % band.
 
     Parameters
     ----------
@@ -318,8 +318,7 @@ def predict_columns(
         # A drift is predicted as it stood at the end of the campaign.
         conditions[order] = np.full(len(table), corrected.data.view.order_range[1])
     truth = corrected.mixture.at(corrected.data.at_conditions(conditions), left_out=left_out)
-    recorded = {n: v for n, v in table.columns.items() if n not in OUTPUTS.values()}
-    columns = cells(recorded, corrected.data.case.covariates)
+    columns = echoed(table, *OUTPUTS.values())
     for name, p in predict_new(truth, corrected.calibrated(conditions)).items():
         column = OUTPUTS[name]
         columns |= {

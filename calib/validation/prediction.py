@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -240,23 +240,23 @@ def prediction_columns(prediction: Prediction, table: Table) -> dict[str, Array 
     return columns
 
 
-def echoed(table: Table, output: str) -> dict[str, Array | list[str]]:
-    """Return the columns of a table as they were given, but for a measured output.
+def echoed(table: Table, *outputs: str) -> dict[str, Array | list[str]]:
+    """Return the columns of a table as they were given, but for measured outputs.
 
     Long tables, whose text is not kept, come back in canonical columns.
     """
     if table.text:
         given = {h: [row[j] for row in table.text] for j, h in enumerate(table.header)}
-        return {h: v for h, v in given.items() if not _names(h, output)}
-    return {name: v for name, v in table.columns.items() if name != output}
+        return {h: v for h, v in given.items() if not _names(h, outputs)}
+    return {name: v for name, v in table.columns.items() if name not in outputs}
 
 
-def _names(header: str, output: str) -> bool:
+def _names(header: str, outputs: Collection[str]) -> bool:
     try:
         column = parse_header(header)
     except CalibError:
         return False
-    return column is not None and column.quantity.canonical == output
+    return column is not None and column.quantity.canonical in outputs
 
 
 def outside(

@@ -295,21 +295,25 @@ CONDITIONS = ("slip_ratio", "inflation_pressure_psi", "average_ground_pressure_k
 
 
 def test_a_prediction_is_laid_out_by_output(made):
-    """Conditions as they are given, categories by name, then each output's four columns."""
+    """Columns as they are given, but for outputs, then each output's four columns."""
     case = made.data.case
     field = case.field
     words = tuple((OPERATORS[int(c)], f"{t!r}") for c, t in zip(
         field["operator"], field["tyre_temperature_c"].tolist(), strict=True))  # fmt: skip
-    typed = replace(field, header=("operator", "tyre_temperature_c"), text=words)
+    words = tuple((*row, "A", f"{100 * s!r}", "1.0")
+                  for row, s in zip(words, field["slip_ratio"].tolist(), strict=True))  # fmt: skip
+    header = ("operator", "tyre_temperature_c", "Site", "Slip [%]", "Drawbar pull [lbf]")
+    typed = replace(field, header=header, text=words)
     found = predict_columns(made, typed)
     of_outputs = [
         f"{column}_{part}"
         for column in ("drawbar_pull_kn", "rut_depth_mm")
         for part in ("before", "after", "after_lower", "after_upper")
     ]
-    names = [n for n in field if n not in OUTPUTS.values()]
-    assert list(found) == [*names, *of_outputs]
-    assert found["operator"] == [w for w, _ in words]
+    assert list(found) == [*header[:-1], *of_outputs]
+    assert found["operator"] == [row[0] for row in words]
+    assert found["Site"] == ["A"] * len(field)
+    assert found["Slip [%]"] == [row[3] for row in words]
     truth = made.mixture.at(made.data.at_conditions(field.columns))
     for o in made.data.outputs:
         column, bound = OUTPUTS[o.name], o.problem.bound
