@@ -277,8 +277,9 @@ REGISTERED = "import calib\n" + CODE.replace(
 def test_an_effect_that_a_file_registers_is_checked_as_well(tmp_path, old, new, words):
     code = REGISTERED.replace(old, new) + "\n\ncalib.register(CrossWind())\n"
     try:
-        run_file(write(tmp_path, code, None), "models")
         with pytest.raises(CalibError) as caught:
+            # What is declared is checked here already; then it is tried out.
+            run_file(write(tmp_path, code, None), "models")
             diagnose(make_case("force_offset"))
     finally:
         EFFECTS.discard("cross_wind")
