@@ -52,9 +52,8 @@ def without_value(
     printed = f"; it printed: {first.printed.strip()}" if first.printed.strip() else ""
     mend = _MEND.get(first.kind, "correct the simulator where it fails")
     mend += "; or give priors that do not reach there" if ok.any() else ""
-    have = (
-        f"only {ok.sum()} of the {ok.size} runs have" if ok.any() else f"none of {ok.size} runs has"
-    )
+    some = f"only {ok.sum()} of the {ok.size} runs have"
+    have = some if ok.any() else f"none of the {ok.size} runs has"
     return CalibError(
         f"{why}: {have} a value ({first.kind}: {first.reason}{printed}){at}",
         where=simulator.place(first.kind),
