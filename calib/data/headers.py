@@ -179,36 +179,39 @@ def match_headers(
                 allowed="one column per quantity",
                 mend="delete or rename one of the two",
             )
-    for name in required:
-        if name not in found:
-            raise missing_column(name, headers, ignored, where)
+    if missing := [name for name in required if name not in found]:
+        raise missing_columns(missing, headers, ignored, where)
     return tuple(found.values()), tuple(ignored)
 
 
-def missing_column(
-    name: str, headers: Sequence[str], ignored: Sequence[str], where: str
+def missing_columns(
+    names: Sequence[str], headers: Sequence[str], ignored: Sequence[str], where: str
 ) -> CalibError:
-    """Return the error of a quantity, by its canonical name, that no header names.
+    """Return the error of quantities, by their canonical names, that no header names.
 
     The ignored headers are those that name none.
     """
-    quantity = QUANTITIES[name]
+    wanted = [QUANTITIES[name] for name in dict.fromkeys(names)]
+    added = ", ".join(f"{q.canonical} ({q.description})" for q in wanted)
     return CalibError(
-        f"there is no column for {quantity.stem}; found {', '.join(map(repr, headers))}",
-        where=_at(where, quantity.canonical),
-        allowed=", ".join(accepted_headers(quantity)),
-        mend=f"{renamed(ignored, [name])}add the column {quantity.canonical} "
-        f"({quantity.description})",
+        f"there is no column for {', '.join(q.stem for q in wanted)}; "
+        f"found {', '.join(map(repr, headers))}",
+        where=_at(where, names[0]) if len(wanted) == 1 else where,
+        allowed="; ".join(", ".join(accepted_headers(q)) for q in wanted),
+        mend=f"{renamed(ignored, names)}add the {'column' if len(wanted) == 1 else 'columns'} "
+        f"{added}",
     )
 
 
 def renamed(headers: Iterable[str], names: Iterable[str]) -> str:
     """Begin a way to mend with what headers may have been meant to be; empty if nothing."""
-    guesses = "; ".join(meant(headers, names))
+    guesses = "; ".join(meant(headers, names, shortened=True))
     return f"{guesses} Rename it, or " if guesses else ""
 
 
-def meant(headers: Iterable[str], names: Iterable[str], cutoff: float = 0.7) -> list[str]:
+def meant(
+    headers: Iterable[str], names: Iterable[str], cutoff: float = 0.7, *, shortened: bool = False
+) -> list[str]:
     """Ask of headers that name no quantity whether one of some was meant.
 
     Parameters
@@ -218,6 +221,8 @@ def meant(headers: Iterable[str], names: Iterable[str], cutoff: float = 0.7) -> 
         Canonical names of the quantities.
     cutoff : float
         How like one a header must be, up to 1.
+    shortened : bool
+        Whether the last words of a name will do, as of what a file must have.
     """
     known = {
         name: quantity
@@ -225,12 +230,15 @@ def meant(headers: Iterable[str], names: Iterable[str], cutoff: float = 0.7) -> 
         for stem in (quantity.stem, *quantity.synonyms)
         for name in (*accepted_headers(quantity), *(f"{stem}_{unit}" for unit in quantity.units))
     }
-    return [guess for header in headers if (guess := _guess(header, known, cutoff))]
+    return [guess for header in headers if (guess := _guess(header, known, cutoff, shortened))]
 
 
-def _guess(header: str, known: Mapping[str, Quantity], cutoff: float) -> str:
+def _guess(header: str, known: Mapping[str, Quantity], cutoff: float, shortened: bool) -> str:
     name = _normal(header)
     near = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
+    if shortened and not near:
+        # A unit alone ("kn") is the end of a name too, but no word of it.
+        near = [k for k, q in known.items() if k.endswith(f"_{name}") and name not in q.units][:1]
     if not near:
         return ""
     quantity = known[near[0]]

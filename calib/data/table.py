@@ -10,7 +10,7 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.headers import CHECKED, Column, missing_column, parse_header, renamed
+from calib.data.headers import CHECKED, Column, missing_columns, parse_header, renamed
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 
@@ -113,9 +113,8 @@ class Table:
 
     def must_have(self, *names: str) -> None:
         """Raise a CalibError unless there are columns of these canonical names."""
-        for name in names:
-            if name not in self.columns:
-                raise missing_column(name, self.header, self.ignored, self.source)
+        if missing := [name for name in names if name not in self.columns]:
+            raise missing_columns(missing, self.header, self.ignored, self.source)
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.int64] | Sequence[int]) -> Table:
         """Return some of the rows, by a mask (n,) or by indices from 0 in the order wanted."""

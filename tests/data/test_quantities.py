@@ -122,6 +122,26 @@ def test_a_missing_required_column_says_what_to_add() -> None:
     assert "add the column cone_index_kpa (penetration resistance of a cone)" in message
 
 
+def test_all_missing_columns_are_told_at_once_each_with_its_guess() -> None:
+    with pytest.raises(CalibError) as caught:
+        match_headers(
+            ["Slipp [%]", "Pull (lbf)", "kN", "note"], where="my.csv, line 1",
+            required=["slip_ratio", "inflation_pressure_psi", "drawbar_pull_kn"],
+        )  # fmt: skip
+    message = str(caught.value)
+    assert "no column for slip, inflation_pressure, drawbar_pull; found" in message
+    assert "'Slipp [%]': did you mean slip_percent?" in message
+    assert "'Pull (lbf)': did you mean drawbar_pull_lbf?" in message
+    assert "'kN': did" not in message
+    assert "'note': did" not in message
+    assert "add the columns slip_ratio (" in message
+    assert "inflation_pressure_bar" in message
+
+
+def test_the_last_words_of_a_name_are_no_misspelling() -> None:
+    assert meant(["Pull (lbf)"], ["drawbar_pull_kn"], 0.8) == []
+
+
 @pytest.mark.parametrize("second", ["slip_ratio", "Slip_Percent"])
 def test_a_quantity_given_twice_is_refused(second: str) -> None:
     with pytest.raises(CalibError, match=r"columns 1 \('slip_ratio'\) and 2 .* both give slip"):
