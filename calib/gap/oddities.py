@@ -164,7 +164,8 @@ def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str
     """Name columns that only effects need, and that may be in another unit than they say.
 
     Campaigns may differ in them: in speed by any factor. In fractions they do not by hundreds, as
-    fractions and percent do, and what was held in the calibration is recognised.
+    fractions and percent do, and what was held in the calibration is recognised. Where every value
+    is ten times off all others', a unit in which the ranges would meet is named.
     """
     for name in sorted((set(lab) & set(field)) - set(used)):
         quantity = QUANTITIES.get(name)
@@ -183,6 +184,23 @@ def _covariates(lab: Table, field: Table, used: Collection[str]) -> Iterator[str
             )
         elif quantity.unit == "dimensionless" and not 1.0 / _PERCENT < ratio < _PERCENT:
             yield f"{_compared(lab, field, name, _ROUGHLY)}; check the unit in the column name"
+        elif met := _would_meet(field, name, bottom, top):
+            yield (
+                f"{_compared(lab, field, name, 0.0)}: every value is more than {_FAR_RATIO:g} "
+                f"times off the calibration's, and would not be if the readings are in {met}; "
+                "check the unit in the column name"
+            )
+
+
+def _would_meet(field: Table, name: str, low: float, high: float) -> str:
+    """Name the units in which a far column of the field would meet the calibration's range."""
+    least, most = (float(f(field[name])) for f in (np.nanmin, np.nanmax))
+    if low <= 0.0 or least <= 0.0 or (most * _FAR_RATIO > low and least < high * _FAR_RATIO):
+        return ""
+    # A factor brings the ranges together if it brings the field's middle (of logarithms) into the
+    # calibration's, widened by the field's own half width.
+    half = np.sqrt(most / least)
+    return usual_in(field, name, np.array([np.sqrt(least * most)]), low / half, high * half)
 
 
 def _typical(values: Array) -> float:

@@ -248,6 +248,20 @@ def test_a_ratio_is_near_a_factor_within_an_sd_of_its_logarithm(units, factor):
 PSI = "inflation_pressure_psi"
 
 
+def test_a_covariate_that_is_far_off_throughout_is_met_in_another_unit():
+    """Inches that were typed as mm, at other wear in the field than in the calibration."""
+    case, n = make_case(None), 27
+    name = "tyre_deflection_mm"
+    lab = {name: np.full(len(case.lab), 38.0)}
+    told = said(with_columns(case, lab=lab, field={name: np.linspace(0.5, 1.5, n)}))
+    assert f"{name}: typically 1 against 38, 38 times less" in told
+    assert "would not be if the readings are in inch; check the unit" in told
+    # As far off, but met in no unit; less far off; and in the right unit.
+    for low, high in ((3.0, 3.5), (0.5, 4.5), (12.7, 38.1)):
+        fair = with_columns(case, lab=lab, field={name: np.linspace(low, high, n)})
+        assert "readings are in" not in said(fair)
+
+
 def test_a_condition_that_the_calibration_held_constant_is_named():
     """Of those that the simulators have, and where the field varied it."""
     case = make_case(None)
