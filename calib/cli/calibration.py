@@ -163,6 +163,7 @@ def fit(
     from calib.models import get_model
     from calib.report.numbers import format_number
     from calib.report.study_tasks import HoldOut, read_and_split
+    from calib.report.verdict import prior_conflict
     from calib.validation.assumptions import warnings_of
     from calib.validation.noise_preference import noise_preference
 
@@ -194,7 +195,8 @@ def fit(
     say_failed(model)
     if preference is not None:
         print(preference.sentence)
-    told = warnings_of(problem, calibration.draws.mode, calibration.draws.flat)
+    mode, draws = calibration.draws.mode, calibration.draws.flat
+    told = (*warnings_of(problem, mode, draws), *prior_conflict(calibration))
     for note in problem.notes:
         print(f"note: {note}", file=sys.stderr)
     for warning in told:

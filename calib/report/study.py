@@ -198,7 +198,7 @@ def _work_out(
         validation,
         estimates,
         by_pressure,
-        _prior_predictive(problem, generator(seed, task.output, "prior")),
+        prior_predictive(problem, generator(seed, task.output, "prior")),
         replicated,
         seconds,
         prior_sensitivity(calibration),
@@ -219,7 +219,7 @@ def judged(calibration: Calibration, validation: Validation) -> OutputResult:
     _, replicated = predictive_draws(
         calibration, problem.conditions, generator(calibration.seed, output, "replicate")
     )
-    prior = _prior_predictive(problem, generator(calibration.seed, output, "prior"))
+    prior = prior_predictive(problem, generator(calibration.seed, output, "prior"))
     return OutputResult(
         Task(output, model.name, table), calibration, validation, (), {}, prior, replicated
     )
@@ -273,7 +273,8 @@ def _each_alone(task: Task, seed: int) -> dict[float, tuple[PointEstimate, ...]]
     return found
 
 
-def _prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
+def prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
+    """Return measurements that the priors expect at the calibrated rows, shape (draws, n)."""
     natural = problem.theta(problem.priors.sample(rng, N_PRIOR_PREDICTIVE))
     location = problem.draw_location(natural, problem.conditions, rng)
     return problem.bound.from_response(location + problem.draw_noise(natural, rng))

@@ -21,11 +21,14 @@ from enum import StrEnum
 
 import numpy as np
 
-from calib.data.quantities import role_of
+from calib.data.quantities import output_of, role_of
 from calib.inference.calibration import Calibration
+from calib.inference.problem import Problem
+from calib.inference.random import generator
 from calib.report.labels import axis_of, joined, percent, plain, short
 from calib.report.rows import held_table, signs_along, x_column
-from calib.report.study import OutputResult, judged
+from calib.report.study import OutputResult, judged, prior_predictive
+from calib.report.study_tasks import MAX_ROWS
 from calib.validation.joint import binomial_p, coverage_probability, effective_rows, hits
 from calib.validation.residuals import standardise
 from calib.validation.roles import MOVED, PRIOR, role
@@ -263,12 +266,33 @@ def gather(result: OutputResult) -> Evidence:
         at_pressures=_at_pressures(result) if parabolic else "",
         prior_hits=hits(result.prior_predictive, problem.observed, 0.95),
         prior_n=problem.observed.size,
-        suspects=(
-            "the units and the normal load"
-            if role_of(problem.bound.model.output) == "pull"
-            else "the units"
-        ),
+        suspects=_suspects(problem),
         notes=problem.notes,
+    )
+
+
+def _suspects(problem: Problem) -> str:
+    """Name what to check where data and priors disagree."""
+    pull = role_of(problem.bound.model.output) == "pull"
+    return "the units and the normal load" if pull else "the units"
+
+
+def prior_conflict(calibration: Calibration) -> tuple[str, ...]:
+    """Say that data and priors disagree as a whole, by the rule of a report's card; else nothing.
+
+    Tables of more rows than a report takes are not judged.
+    """
+    problem = calibration.problem
+    n = problem.observed.size
+    if n > MAX_ROWS:
+        return ()
+    rng = generator(calibration.seed, output_of(problem.bound.model.output), "prior")
+    inside = hits(prior_predictive(problem, rng), problem.observed, 0.95)
+    if inside >= _EXPECTED * n:
+        return ()
+    return (
+        f"data and priors disagree: {inside} of {n} points lie inside the 95 % band that the "
+        f"priors expect; check {_suspects(problem)}, then the priors",
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import calib
-from calib.report.verdict import Evidence, Level, Where, gather, judge_evidence
+from calib.report.verdict import Evidence, Level, Where, gather, judge_evidence, prior_conflict
 from calib.validation.joint import binomial_p
 
 FINE = Evidence(
@@ -130,6 +130,22 @@ def test_units_off_by_a_thousand_conflict_with_the_priors(drawbar):
     assert (evidence.prior_hits, evidence.prior_n) == (0, 28)
     assert evidence.notes == ("5 kN is assumed",)
     assert "normal load" in judge_evidence(evidence).doubt
+
+
+def test_a_fit_says_of_a_wrong_sign_what_the_card_does(drawbar):
+    """And says nothing where the priors expect the data."""
+    assert prior_conflict(drawbar.calibration) == ()
+    problem = drawbar.calibration.problem
+    columns = dict(problem.table.columns)
+    pull = problem.bound.model.output
+    table = calib.table_from_arrays({**columns, pull: -columns[pull]})
+    turned = calib.build_problem(problem.bound.model.name, table)
+    calibration = replace(drawbar.calibration, problem=turned)
+    (said,) = prior_conflict(calibration)
+    inside = int(said.split("disagree: ")[1].split()[0])
+    assert inside < 14
+    assert f"{inside} of 28 points" in said
+    assert "the normal load" in said
 
 
 def test_parameters_set_by_the_prior_are_named_even_where_all_is_fine():
