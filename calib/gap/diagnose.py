@@ -156,7 +156,10 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
     before = corrected.calibrated(target.conditions)
     far = shrink(data, at_target, before, at_target.means)
     causes = inclusion(mixed, ranking)
-    said += [*_beyond(corrected, before), *_confounded(data, causes)]
+    said += [
+        *_beyond(corrected, before),
+        *_confounded(data, causes, {**effects, **dependences(data)}),
+    ]
     return Diagnosis(
         data,
         ranking,
@@ -227,14 +230,14 @@ def _beyond(corrected: Corrected, before: Mapping[str, Array]) -> list[str]:
     return said
 
 
-def _confounded(data: Campaigns, causes: Inclusion) -> list[str]:
+def _confounded(data: Campaigns, causes: Inclusion, effects: Mapping[str, Effect]) -> list[str]:
     """Warn of causes that go with a condition which differs between the campaigns only."""
     # What a user declared is of interest, however probable it is.
     own = set(data.case.covariates)
     return [
-        f"{name}: this condition is one value in the laboratory and another in the field; what "
+        f"{name}: its condition is one value in the laboratory and another in the field; what "
         "depends on it cannot be separated from anything else that changed between them"
-        for name, effect in dependences(data).items()
+        for name, effect in effects.items()
         if name in causes.causes
         and (causes.causes[name].probability >= _WORTH_SAYING or own & set(effect.covariates))
         and inseparable(data, effect)

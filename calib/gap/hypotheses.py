@@ -173,8 +173,12 @@ def covered(effect: Effect, listed: Collection[str]) -> bool:
 
 
 def inseparable(data: Campaigns, effect: Effect) -> bool:
-    """Whether a dependence is on a condition that differs between the campaigns only."""
-    if not isinstance(effect, DependsOn | DiffersBy):
+    """Whether an effect rests on a condition that differs between the campaigns only.
+
+    Of those that are testable: what must vary in the field, and does not, differs from the
+    laboratory's.
+    """
+    if not effect.varies or not effect.covariates:
         return False
     return bool(np.ptp(data.view.of(effect.covariates[0])) < 1e-9)
 

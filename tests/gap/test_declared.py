@@ -119,7 +119,7 @@ def test_a_category_that_differs_between_the_campaigns_only_cannot_be_separated(
         np.full(36, 0.4),
     )  # fmt: skip
     found = diagnose_once(read_case(folder), 1, effects=FEW)
-    assert any("site: this condition is one value" in w for w in found.warnings) or any(
+    assert any("site: its condition is one value" in w for w in found.warnings) or any(
         "depends_on_site" in w and "cannot be separated" in w for w in found.warnings
     )
 

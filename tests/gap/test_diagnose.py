@@ -148,14 +148,13 @@ def test_what_cannot_be_separated_is_said_of_what_is_probable_or_declared(
     probability, declared, inseparable, said, monkeypatch
 ):
     effect = SimpleNamespace(covariates=("crew",))
-    monkeypatch.setattr(module, "dependences", lambda data: {"depends_on_crew": effect})
     monkeypatch.setattr(module, "inseparable", lambda data, effect: inseparable)
     covariates = {"crew": ("a", "b")} if declared else {"other": ()}
     data = SimpleNamespace(case=SimpleNamespace(covariates=covariates))
     causes = {} if probability is None else {
         "depends_on_crew": Included(probability, 0.1, (0.0, 0.2))
     }  # fmt: skip
-    told = _confounded(data, SimpleNamespace(causes=causes))
+    told = _confounded(data, SimpleNamespace(causes=causes), {"depends_on_crew": effect})
     assert [t.split(":")[0] for t in told] == (["depends_on_crew"] if said else [])
 
 

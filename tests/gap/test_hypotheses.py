@@ -11,7 +11,7 @@ import pytest
 from calib.data import table_from_arrays
 from calib.gap.case import Case, campaigns
 from calib.gap.diagnose import diagnose, diagnose_once
-from calib.gap.effects import EFFECTS
+from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
     COVERED,
@@ -262,6 +262,25 @@ def test_a_condition_that_differs_between_the_campaigns_only_is_said_to_be_insep
     assert any("cannot be separated" in w for w in found.warnings)
 
 
+@pytest.mark.parametrize("field", [[2.0], [1.0, 2.0, 3.0]])
+def test_any_effect_may_rest_on_a_condition_that_differs_between_the_campaigns_only(data, field):
+    """Whoever wrote the effect: what counts is the condition that it must see vary."""
+
+    class Speed(Effect):
+        name, outputs, covariates = "speed", ("pull",), ("speed",)
+
+    class Gauge(Speed):
+        varies = False
+
+    speed = np.resize(field, data.view.slip().size)
+    seen = replace(data, view=replace(data.view, conditions={
+        **data.view.conditions, "speed_m_s": speed}))  # fmt: skip
+    for effect in (Speed(), EFFECTS["rate_effect"], dependences(seen)["depends_on_speed"]):
+        assert inseparable(seen, effect) == (len(field) == 1)
+    assert not inseparable(seen, Gauge())
+    assert not inseparable(seen, EFFECTS["force_offset"])
+
+
 def test_a_condition_of_a_small_range_may_be_depended_on(data):
     """Of a water content the whole range is a tenth; of one that is constant there is none."""
     for spread, there in ((0.1, True), (0.0, False)):
@@ -437,10 +456,6 @@ def test_declared_columns_may_change_every_output():
     assert inseparable(data, found["flat"])
     assert not inseparable(data, found["temperature"])
     assert not inseparable(data, found["crew"])
-    # No dependence is any effect's business but its own.
-    constant = replace(data, view=replace(data.view, conditions={
-        **data.view.conditions, "speed_m_s": np.full(27, 1.0)}))  # fmt: skip
-    assert inseparable(constant, EFFECTS["rate_effect"]) is False
     narrow = np.linspace(20.0, 20.5, 27)
     little = replace(data, view=replace(data.view, conditions={
         **data.view.conditions, "temperature": narrow}))  # fmt: skip

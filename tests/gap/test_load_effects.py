@@ -258,6 +258,12 @@ REGISTERED = "import calib\n" + CODE.replace(
 )
 
 
+def diagnose_with(path: Path) -> None:
+    """What a file declares is checked when it registers it; then it is tried out."""
+    run_file(path, "models")
+    diagnose(make_case("force_offset"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
@@ -278,9 +284,7 @@ def test_an_effect_that_a_file_registers_is_checked_as_well(tmp_path, old, new, 
     code = REGISTERED.replace(old, new) + "\n\ncalib.register(CrossWind())\n"
     try:
         with pytest.raises(CalibError) as caught:
-            # What is declared is checked here already; then it is tried out.
-            run_file(write(tmp_path, code, None), "models")
-            diagnose(make_case("force_offset"))
+            diagnose_with(write(tmp_path, code, None))
     finally:
         EFFECTS.discard("cross_wind")
     assert words in str(caught.value)
