@@ -71,6 +71,10 @@ def _cut_off(problem: Problem, draws: Array) -> Iterable[str]:
     # Of the side where there is none, the coordinate that is farthest off.
     away = (t[nowhere].mean(axis=0) - mean) / draws.std(axis=0)
     i = int(np.argmax(np.abs(away)))
+    low, high = problem.priors.ppf(np.outer([0.16, 0.84], np.ones(t.shape[1])))[:, i]
+    if draws[:, i].std() > 0.25 * (high - low):
+        # Of what the data hardly tell, an edge of the model is as much assumed as the prior is.
+        return
     at = f"{'large' if away[i] > 0.0 else 'small'} {problem.priors.free[i].name}"
     yield (
         f"{problem.bound.model.name}: the posterior ends where the model has no value, at {at} "

@@ -192,14 +192,16 @@ def test_residuals_are_not_judged_while_a_column_looks_to_be_in_another_unit() -
     assert "is not judged while a column looks to be in another unit" in withheld
 
 
-@pytest.mark.parametrize(("edge", "told"), [(1.0, True), (4.0, False)])
-def test_a_posterior_that_ends_where_the_model_has_no_value_is_said(
-    edge: float, told: bool
+@pytest.mark.parametrize(
+    ("edge", "sd", "told"), [(1.0, 10.0, True), (4.0, 10.0, False), (1.0, 0.1, False)]
+)
+def test_a_posterior_that_is_cut_off_by_its_model_is_said(
+    edge: float, sd: float, told: bool
 ) -> None:
-    """A slope of 2 +- 0.1 as the data have it, and no value beyond an edge so many sds above."""
+    """A slope of 2 +- 0.1, by the data or the prior, and no value beyond an edge so far above."""
     rng, slip = np.random.default_rng(2), np.linspace(0.0, 1.0, 40)
     beyond = 2.0 + 0.1 * edge
-    priors = [normal("a", 0.0, 1.0), normal("b", 0.0, 10.0), normal("sigma", 0.0, 0.1, log=True)]
+    priors = [normal("a", 0.0, 1.0), normal("b", 2.0, sd), normal("sigma", 0.0, 0.1, log=True)]
     problem = problem_of(
         lambda a, b, s: np.where(b > beyond, np.nan, a + b * s), priors, slip, 1.0 + 2.0 * slip
     )
