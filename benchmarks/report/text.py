@@ -75,7 +75,7 @@ _HOW = """## How it was measured
   posterior is known; three data sets of 28 readings. Not blind: earlier runs on these data were
   seen while the emulator was made, and the diagnosis of the first led to nodes at slips below zero
   (two other data sets confirmed it). Each way has the same sampler; runs count those that check the
-  emulator, which exceed a budget of 60 by three. The peer is scikit-learn's regressor on principal
+  emulator. The peer is scikit-learn's regressor on principal
   components of a Latin hypercube, its mean taken for the simulator.
 - **A million rows.** All cores. The check evaluates the equation as printed at every row in plain
   NumPy, at draws of a Student-t that are weighted by it.
