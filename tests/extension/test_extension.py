@@ -23,6 +23,7 @@ from calib.models.base import BoundModel
 from calib.report.page.template import equation
 from tests.cli.test_cli import Calib
 from tests.docs.pages import ROOT, blocks
+from tests.registered import forgotten
 
 HERE = Path(__file__).parent
 FEW = ["--max-steps", 400]
@@ -31,12 +32,9 @@ FEW = ["--max-steps", 400]
 @pytest.fixture(autouse=True)
 def as_before() -> Iterator[None]:
     """Forget what a test registers."""
-    before = [(r, set(r)) for r in (QUANTITIES, MODELS, EFFECTS)]
     environment = os.environ.pop("CALIB_MODELS", None)
-    yield
-    for registry, names in before:
-        for name in set(registry) - names:
-            registry.discard(name)
+    with forgotten(QUANTITIES, MODELS, EFFECTS):
+        yield
     for name in [m for m in sys.modules if m.startswith("calib_user_")]:
         del sys.modules[name]
     os.environ.pop("CALIB_MODELS", None)

@@ -18,12 +18,12 @@ import pytest
 
 import calib
 from calib.batch.folders import check_folder
-from calib.data.registry import Registry
 from calib.gap.case import Case
 from calib.models import MODELS
 from calib.models.simulators.registered import SIMULATED
 from tests.cli.test_cli import Calib
 from tests.models.simulators.examples import PRIORS, lab, pull, write_program
+from tests.registered import forgotten
 
 HERE = Path(__file__).parent
 FEW = ["--max-steps", 400]
@@ -32,13 +32,9 @@ FEW = ["--max-steps", 400]
 @pytest.fixture(autouse=True)
 def as_before() -> Iterator[None]:
     """Forget what a test registers."""
-    registries: tuple[Registry, ...] = (MODELS, SIMULATED)
-    before = [set(r) for r in registries]
     os.environ.pop("CALIB_MODELS", None)
-    yield
-    for registry, names in zip(registries, before, strict=True):
-        for name in set(registry) - names:
-            registry.discard(name)
+    with forgotten(MODELS, SIMULATED):
+        yield
     os.environ.pop("CALIB_MODELS", None)
 
 

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import calib
-from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.inference.random import generator
 from calib.inference.trial import try_simulator
 from calib.models import MODELS
 from calib.models.simulators.registered import SIMULATED
 from tests.models.simulators.examples import PRIORS, lab, pull, serving, write_program
+from tests.registered import forgotten
 
 # At the middle of the prior and at five points spread over it, each tried again once.
 MADE = 6 * 2
@@ -24,12 +24,8 @@ QUICK = {"emulate": "false"}
 
 @pytest.fixture(autouse=True)
 def as_before() -> Iterator[None]:
-    registries: tuple[Registry, ...] = (MODELS, SIMULATED)
-    before = [set(r) for r in registries]
-    yield
-    for registry, names in zip(registries, before, strict=True):
-        for name in set(registry) - names:
-            registry.discard(name)
+    with forgotten(MODELS, SIMULATED):
+        yield
 
 
 def problem_of(file: Path) -> calib.Problem:

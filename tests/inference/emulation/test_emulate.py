@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import calib
-from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.emulation.prepared import prepare, write_failed
@@ -19,6 +18,7 @@ from calib.models import MODELS
 from calib.models.simulators.base import Failure
 from calib.models.simulators.registered import SIMULATED, Simulated
 from tests.models.simulators.examples import PRIORS, lab, pull
+from tests.registered import forgotten
 
 CONDITIONS = ("slip_ratio", "normal_load_kn")
 
@@ -26,12 +26,8 @@ CONDITIONS = ("slip_ratio", "normal_load_kn")
 @pytest.fixture(autouse=True)
 def as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     monkeypatch.delenv("CALIB_MODELS", raising=False)
-    registries: tuple[Registry, ...] = (MODELS, SIMULATED)
-    before = [set(r) for r in registries]
-    yield
-    for registry, names in zip(registries, before, strict=True):
-        for name in set(registry) - names:
-            registry.discard(name)
+    with forgotten(MODELS, SIMULATED):
+        yield
 
 
 def declared(f: Callable, name: str, **changes: object) -> Simulated:
