@@ -1,8 +1,8 @@
 """Statistics of chains: R-hat, effective sample sizes, autocorrelation times, intervals, weights.
 
-ArviZ works them out; this is the only place that calls its array functions, imported late because
-that takes half a second. The ranks, most of the work, are found here, once for R-hat and bulk ESS
-alike; emcee's autocorrelation time is worked out for all walkers at once.
+ArviZ works them out; this is the only place that calls its array functions, imported late. The
+ranks, most of the work, are found here, once for R-hat and bulk ESS alike; emcee's autocorrelation
+time is worked out for all walkers at once.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _WINDOW = 5.0
 
 
 def _stats() -> Any:
-    return import_module("arviz_stats.base").array_stats
+    return import_module("calib.inference.array_stats").array_stats
 
 
 @dataclass(frozen=True)

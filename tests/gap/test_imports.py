@@ -25,5 +25,14 @@ def test_a_diagnosis_needs_no_sampler_no_figures_and_no_data_frames():
     assert [name for name in _HEAVY if name in found] == []
 
 
+def test_to_look_at_the_units_of_data_needs_no_package_of_units():
+    found = _imported(
+        "from calib import build_problem, load_he2019\n"
+        "build_problem('magic_formula_pressure', load_he2019('drawbar_pull'))"
+    )
+    assert "calib.data.units_check" in found
+    assert "pint" not in found
+
+
 def test_the_package_by_itself_needs_nothing():
     assert [name for name in ("numpy", "scipy", *_HEAVY) if name in _imported("import calib")] == []

@@ -12,6 +12,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.ticker import MaxNLocator
 
 from calib.inference.calibration import Calibration
+from calib.inference.light import part_of
 from calib.inference.priors import Prior
 from calib.models.base import Array
 from calib.report.figures.plate import Plate
@@ -32,6 +33,8 @@ from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
 
 __all__ = ["corner_plate"]
+
+hist2d = part_of("corner.core", "arviz").hist2d
 
 MAX_PARAMETERS = 11
 _N_DRAWS = 4000
@@ -146,8 +149,6 @@ def _marginal(ax: Axes, cells: _Cells, i: int, draws: Array) -> None:
 
 
 def _pair(ax: Axes, cells: _Cells, i: int, j: int, draws: Array) -> None:
-    from corner import hist2d
-
     y = cells.bottom(i)
     before = len(ax.collections)
     hist2d(
