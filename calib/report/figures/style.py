@@ -190,9 +190,16 @@ def png_bytes(figure: Figure) -> bytes:
     _Canvas(figure)
     pixels = _saved(figure, format="raw", dpi=_DPI)
     width, height = (int(inches * _DPI) for inches in figure.get_size_inches())
-    full_colour = Image.frombytes("RGBA", (width, height), pixels)
+    # A palette for the colours that there are, not for a million pixels; most equal the one before.
+    flat = np.frombuffer(pixels, np.uint32)
+    runs = np.flatnonzero(np.concatenate([[True], flat[1:] != flat[:-1]]))
+    colours, which = np.unique(flat[runs], return_inverse=True)
+    full_colour = Image.frombytes("RGBA", (colours.size, 1), colours.tobytes()).convert("RGB")
+    few = full_colour.quantize(256, Image.Quantize.MAXCOVERAGE)
+    indices = np.repeat(np.asarray(few)[0, which], np.diff(runs, append=flat.size))
+    image = Image.frombytes("P", (width, height), indices.tobytes())
+    image.putpalette(few.getpalette() or [])
     # With its resolution, by which a text processor takes it over at its size in print.
-    image = full_colour.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE)
     small = io.BytesIO()
     image.save(small, format="png", dpi=(_DPI, _DPI))
     return small.getvalue()
