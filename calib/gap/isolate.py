@@ -9,11 +9,11 @@ the smallest size that is told from noise, and the effects that look alike.
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import brentq
 
 from calib.gap.case import Campaigns
 from calib.gap.forward import Forward
@@ -125,16 +125,18 @@ def smallest_shown(prior: Array, sd: float, ln_odds: float) -> float:
     relevant = prior[prior >= RELEVANT]
     if not relevant.size:
         return float("inf")
-    estimates = np.linspace(0.0, relevant.max() + 4.0 * sd, 2000)
 
-    def reached(estimate: float) -> bool:
+    def beyond(estimate: float) -> float:
         exponent = relevant * (estimate - 0.5 * relevant) / sd**2
         top = float(exponent.max())
-        return top + float(np.log(np.exp(exponent - top).mean())) >= ln_odds
+        return top + float(np.log(np.exp(exponent - top).mean())) - ln_odds
 
-    # The evidence grows with the estimate: the first that reaches it is found by halving.
-    first = bisect_left(estimates, True, key=reached)
-    return float(estimates[first]) + _Z_POWER * sd if first < estimates.size else float("inf")
+    largest = float(relevant.max()) + 4.0 * sd
+    if beyond(largest) < 0.0:
+        return float("inf")
+    # The evidence grows with the estimate.
+    first = brentq(beyond, 0.0, largest, xtol=1e-4) if beyond(0.0) < 0.0 else 0.0
+    return float(first) + _Z_POWER * sd
 
 
 def _likeness(left: Mapping[str, Array]) -> dict[tuple[str, str], float]:

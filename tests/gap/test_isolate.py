@@ -109,16 +109,19 @@ def test_more_rows_show_smaller_effects():
 
 
 @pytest.mark.parametrize("sd", [0.05, 0.3, 1.5])
-def test_halving_finds_the_first_estimate_of_a_grid_that_counts(sd: float):
+def test_the_smallest_size_shown_is_the_first_estimate_that_counts(sd: float):
     sizes = np.random.default_rng(2).gamma(2.0, 2.0, 300)
     relevant = sizes[sizes >= RELEVANT]
-    estimates = np.linspace(0.0, relevant.max() + 4.0 * sd, 2000)
-    exponent = (2.0 * estimates[:, None] * relevant - relevant**2) / (2.0 * sd**2)
-    ln_factor = logsumexp(exponent, axis=1) - np.log(relevant.size)
-    for ln_odds in (1.0, 4.0, float(ln_factor[-1]) - 1e-6, float(ln_factor[-1]) + 1e-6):
-        first = np.flatnonzero(ln_factor >= ln_odds)
-        expected = estimates[first[0]] + norm.ppf(0.8) * sd if first.size else np.inf
-        assert smallest_shown(sizes, sd, ln_odds) == pytest.approx(expected, abs=1e-4 * sd)
+    largest = relevant.max() + 4.0 * sd
+
+    def ln_factor(estimate: float) -> float:
+        exponent = (2.0 * estimate * relevant - relevant**2) / (2.0 * sd**2)
+        return float(logsumexp(exponent) - np.log(relevant.size))
+
+    for ln_odds in (1.0, 4.0, ln_factor(largest) - 1e-6):
+        first = smallest_shown(sizes, sd, ln_odds) - norm.ppf(0.8) * sd
+        assert ln_factor(first - 1e-3) < ln_odds < ln_factor(first + 1e-3)
+    assert smallest_shown(sizes, sd, ln_factor(largest) + 1e-6) == np.inf
 
 
 def test_the_smallest_size_shown_is_that_of_the_bayes_factor():
