@@ -21,7 +21,7 @@ from calib.errors import CalibError, meant
 from calib.gap.context import Context, read_context
 from calib.gap.covariates import Covariates
 from calib.gap.declared import declared_covariates, with_declared
-from calib.gap.effects import View
+from calib.gap.effects import Effect, View
 from calib.gap.noise import NoiseConditions, noise_conditions, noise_conditions_of_lab
 from calib.gap.oddities import identical_rows
 from calib.gap.simulated import Simulated
@@ -100,7 +100,7 @@ class OutputData:
     rows: NDArray[np.int64]
     field: Array
 
-    @property
+    @cached_property
     def role(self) -> str:
         """The physical role by which effects know the output."""
         return physical_role(self.name)
@@ -142,6 +142,11 @@ class Campaigns:
     def covariates(self) -> Covariates:
         """Conditions scaled to the range of both campaigns."""
         return Covariates(self)
+
+    @cached_property
+    def forms(self) -> dict[Effect, tuple[Array, list[float]]]:
+        """Bases of effects' form errors at the field's rows, kept as hypotheses need them."""
+        return {}
 
     @cached_property
     def at_rows(self) -> dict[str, NoiseConditions]:

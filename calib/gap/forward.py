@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.quantities import columns_of, role_of
+from calib.data.quantities import columns_of
 from calib.gap.case import Campaigns
 from calib.gap.discrepancy import THRESHOLDS, Bases, Discrepancy
 from calib.gap.effects import Effect, View
@@ -80,9 +81,6 @@ class Forward:
         self.noise = noise
         self._simulated = data.simulated
         self._roles = {o.name: o.role for o in data.outputs}
-        self._columns = {
-            name: {role_of(c): c for c in s.field} for name, s in self._simulated.items()
-        }
         entries: list[Prior] = []
         self.theta_slices = {
             name: _append(entries, s.priors) for name, s in self._simulated.items()
@@ -96,12 +94,12 @@ class Forward:
             for name, s in self._simulated.items()
         }
         self.phi_slices = [
-            _append(entries, [replace(q, name=f"{e.name}.{q.name}") for q in p.free])
+            _append(entries, _named(e.name, p))
             for e, p in zip(hypothesis.effects, hypothesis.effect_priors, strict=True)
         ]
         self.covariates = data.covariates
         self.discrepancy = Discrepancy(data, hypothesis, lab_mode or {}, bases)
-        forms = [self._form_basis(e, data.view) for e in hypothesis.effects]
+        forms = [self._form_of_field(e) for e in hypothesis.effects]
         self._field_form = [basis for basis, _ in forms]
         # Of each effect in each output that it touches; elsewhere it has none.
         self.form_slices: dict[str, list[slice]] = {
@@ -148,6 +146,13 @@ class Forward:
         if view.conditions is self.data.view.conditions:
             return self._field_form
         return [self._form_basis(e, view)[0] for e in self.hypothesis.effects]
+
+    def _form_of_field(self, effect: Effect) -> tuple[Array, list[float]]:
+        """What `_form_basis` gives for the field's rows, worked out once for all hypotheses."""
+        kept = self.data.forms
+        if effect not in kept:
+            kept[effect] = self._form_basis(effect, self.data.view)
+        return kept[effect]
 
     def _form_basis(self, effect: Effect, view: View) -> tuple[Array, list[float]]:
         """Basis of an effect's form error, shape (n, m), and the sds of its coefficients."""
@@ -325,12 +330,11 @@ class _Acting:
     def apart(self, moved: NDArray[np.int64]) -> Iterator[tuple[int, _Acting]]:
         """Part the rows by what was moved there before."""
         before = moved[self.rows]
-        masks = np.unique(before).tolist()
-        if len(masks) == 1:
-            yield masks[0], self
+        if (before == before[0]).all():
+            yield int(before[0]), self
             return
         places = np.arange(moved.size)[self.rows]
-        for some, mask in [(before == mask, mask) for mask in masks]:
+        for some, mask in [(before == mask, mask) for mask in np.unique(before).tolist()]:
             factors = {name: factor[some] for name, factor in self.factors.items()}
             view = _seen(self.view, self.view.base, some)
             yield mask, _Acting(self.effect, places[some], self.phi[some], factors, view)
@@ -383,10 +387,9 @@ def _changed(
     if not acting:
         return plain
     role, simulated = forward._roles[name], forward._simulated[name]
-    columns = forward._columns[name]
     t, misfit = shared[:, forward.theta_slices[name]], shared[:, forward.misfit_slices[name]]
     recorded = simulated.conditions(view)
-    conditions = {known: recorded[column] for known, column in columns.items()}
+    conditions = {known: recorded[column] for known, column in simulated.columns.items()}
     bits = {known: 1 << i for i, known in enumerate(conditions)}
     truly: dict[str, Array] = {}
     # Which conditions are no longer the recorded ones; with those a simulator has less to do.
@@ -403,7 +406,7 @@ def _changed(
             if found is given:
                 continue
             there = simulated.predict_beyond(
-                t[rows], misfit[rows], {columns[known]: v for known, v in found.items()}
+                t[rows], misfit[rows], {simulated.columns[known]: v for known, v in found.items()}
             )
             location[rows] += (there - ahead[rows]) * some.factors[name]
             ahead[rows] = there
@@ -422,7 +425,7 @@ def _changed(
 
 def _seen(view: View, base: Mapping[str, Array], rows: slice | NDArray[Any]) -> View:
     """What an effect can see of some rows of what simulators predict."""
-    return replace(view, base={role: values[rows] for role, values in base.items()})
+    return view.with_base({role: values[rows] for role, values in base.items()})
 
 
 def _shifted(radius_error: Array, conditions: dict[str, Array]) -> dict[str, Array]:
@@ -447,5 +450,12 @@ def _uniform(name: str, lower: float, upper: float) -> Prior:
     )  # fmt: skip
 
 
+@lru_cache(maxsize=256)
+def _named(effect: str, priors: Priors) -> tuple[Prior, ...]:
+    """Priors of an effect's free parameters under names that no other effect's have."""
+    return tuple(replace(p, name=f"{effect}.{p.name}") for p in priors.free)
+
+
+@lru_cache(maxsize=1024)
 def _normal(name: str, sd: float) -> Prior:
     return Prior(name, "1", "", "", f"normal(0, {sd:g})", False, 0.0, sd)

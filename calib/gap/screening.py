@@ -54,12 +54,13 @@ def screen(case: Case, seed: int) -> tuple[Campaigns, Lab, list[str]]:
     CalibError
         If the case cannot be diagnosed.
     """
-    campaigns(case)  # refuses what cannot be diagnosed, before rows are set aside
+    data = campaigns(case)  # refuses what cannot be diagnosed, before rows are set aside
     check_units(case)
     case, far = without_far_conditions(case)
     case, impossible = _without_impossible(case)
-    data, lab, outlying = _without_lab_outliers(case, seed)
-    return data, lab, far + impossible + outlying
+    said = far + impossible
+    data, lab, outlying = _without_lab_outliers(campaigns(case) if said else data, seed)
+    return data, lab, said + outlying
 
 
 def without_field_outliers(data: Campaigns, ranking: Ranking) -> tuple[Campaigns, list[str]]:
@@ -165,9 +166,9 @@ def _most(n: int) -> int:
     return max(1, n // 10)
 
 
-def _without_lab_outliers(case: Case, seed: int) -> tuple[Campaigns, Lab, list[str]]:
+def _without_lab_outliers(data: Campaigns, seed: int) -> tuple[Campaigns, Lab, list[str]]:
     """The campaigns without them, and the simulators calibrated on what is left of the lab."""
-    data = campaigns(case)
+    case = data.case
     lab = calibrate_lab(data, seed)
     said: list[str] = []
     for _ in range(MOST_ROUNDS):

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.data.quantities import QUANTITIES
+from calib.data.quantities import QUANTITIES, role_of
 from calib.gap.effects import View
 from calib.models.base import Array
 from calib.models.simulators.emulator.model import emulator_of
@@ -42,6 +42,8 @@ class Simulated:
     ----------
     lab, field, both : dict of str to ndarray
         The model's conditions at the rows of a campaign; at the lab's, then the field's.
+    columns : dict of str to str
+        Those conditions, by physical role.
     priors : tuple of Prior
         Of the free parameters, named after the output.
     n_bends : int
@@ -61,6 +63,7 @@ class Simulated:
         self.n_bends = len(self._ranges) * (len(self._ranges) + 1) // 2
         self.lab = o.problem.conditions
         self.field = self._bound.model.select(view.conditions)
+        self.columns = {role_of(c): c for c in self.field}
         self.both = {k: np.concatenate([self.lab[k], v]) for k, v in self.field.items()}
         self._emulator = emulator_of(self._bound.model)
         self._mix = self._error_of(self.both)

@@ -16,6 +16,7 @@ keeps the curve single-peaked.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -36,7 +37,7 @@ def _positive(mean: Array, half: Array, curvature: Array) -> NDArray[np.bool_]:
 
 def _at(columns: Columns, u: Array) -> tuple[Array, Array, Array, Array]:
     # K, D and G at once: one small array operation in the place of three.
-    ends = np.stack(columns[:9])
+    ends = np.concatenate(columns[:9]).reshape(9, *columns[0].shape)
     low, high, bend = ends[0::3], ends[1::3], ends[2::3]
     mean, half = 0.5 * (low + high), 0.5 * (high - low)
     curvature = bend * mean
@@ -61,12 +62,18 @@ def _prepare(conditions: Conditions, references: References) -> Rows:
     rows: dict[str, NDArray[Any]] = {"slip_percent": 100.0 * conditions["slip_ratio"]}
     if pressure.ndim == 1:
         # Few pressures, many slips: the quadratics are worked out once per distinct pressure.
-        pressure, level = np.unique(pressure, return_inverse=True)
+        pressure, level = _levels(pressure.tobytes())
         if pressure.size > 1:
             rows["level"] = level
     # Otherwise a pressure for every parameter vector and row, as an uncertain gauge gives.
     rows["u"] = (pressure - references["p_mid_psi"]) / references["p_half_psi"]
     return rows
+
+
+@lru_cache(maxsize=64)
+def _levels(pressure: bytes) -> tuple[Array, NDArray[np.intp]]:
+    """Distinct pressures, and which of them each row has: a fit asks for the same rows again."""
+    return np.unique(np.frombuffer(pressure), return_inverse=True)
 
 
 def _location(columns: Columns, rows: Rows, references: References, work: Array) -> Array:

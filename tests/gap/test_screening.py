@@ -224,7 +224,7 @@ def test_of_the_laboratory_rows_beyond_eight_sds_are_set_aside_three_times_at_mo
 
     monkeypatch.setattr(module, "_lab_residuals", residuals)
     monkeypatch.setattr(module, "calibrate_lab", calibrated)
-    data, lab, told = _without_lab_outliers(case, 1)
+    data, lab, told = _without_lab_outliers(campaigns(case), 1)
     assert calls == [30, 29, 28]
     assert lab[0] == {"drawbar_pull": 27}
     left = np.delete(np.arange(30), [5, 6, 7])

@@ -57,9 +57,22 @@ class View:
         """Return recorded values by their physical role, shape (n,)."""
         return self.conditions[self.column(role) or role]
 
-    def lab_of(self, role: str, otherwise: float) -> float:
-        """Return the median in the calibration data by its physical role."""
-        return self.lab.get(self.column(role) or role, otherwise)
+    def lab_of(self, role: str, otherwise: float | None = None) -> float:
+        """Return the median in the calibration data by its physical role; by default the field's.
+
+        That is for what the calibration did not record.
+        """
+        column = self.column(role) or role
+        if column in self.lab:
+            return self.lab[column]
+        return float(np.median(self.conditions[column])) if otherwise is None else otherwise
+
+    def with_base(self, base: Mapping[str, Array]) -> View:
+        """Return the same campaign with other predictions."""
+        # Fits do this a thousand times: `dataclasses.replace` takes five times as long.
+        return View(
+            self.conditions, self.lab, self.load_kn, self.ground_exponent, self.order_range, base
+        )
 
     def slip(self) -> Array:
         """Recorded slip (fraction), zero where it is not recorded, shape (n,)."""

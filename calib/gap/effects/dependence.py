@@ -84,8 +84,7 @@ class DependsOn(Effect):
 
     def covariate(self, view: View) -> Array:
         """The condition over the laboratory's, u, shape (n,)."""
-        values = view.of(self.role)
-        lab = view.lab_of(self.role, float(np.median(values)))
+        values, lab = view.of(self.role), view.lab_of(self.role)
         if self.of_factors:
             return np.log(np.maximum(values, 1e-6) / max(lab, 1e-6))
         return (values - lab) / self.half_range

@@ -213,7 +213,7 @@ class ConeIndexBias(_Fault):
             return conditions
         gain, offset = each(phi)
         recorded = conditions["cone"]
-        typical = view.lab_of("cone", float(np.median(view.of("cone"))))
+        typical = view.lab_of("cone")
         true = recorded * np.exp(gain) + offset * typical
         return {**conditions, "cone": np.maximum(true, 0.02 * recorded)}
 

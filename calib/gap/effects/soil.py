@@ -95,7 +95,7 @@ class RateEffect(_SoilStrength):
     def covariate(self, view: View) -> Array:
         """Logarithm of the speed over the laboratory's."""
         speed = view.of("speed")
-        lab = max(view.lab_of("speed", float(np.median(speed))), 1e-3)
+        lab = max(view.lab_of("speed"), 1e-3)
         return np.log(np.maximum(speed, 1e-3) / lab)
 
 
@@ -112,6 +112,4 @@ class MoistureSoftening(_SoilStrength):
 
     def covariate(self, view: View) -> Array:
         """Water content above the laboratory's, in steps of 0.02 g/g."""
-        water = view.of("water")
-        lab = view.lab_of("water", float(np.median(water)))
-        return (water - lab) / 0.02
+        return (view.of("water") - view.lab_of("water")) / 0.02
