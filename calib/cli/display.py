@@ -6,9 +6,12 @@ import logging
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
-from calib.inference.calibration import Calibration
 from calib.report.numbers import centre_text, interval_text
+
+if TYPE_CHECKING:
+    from calib.inference.calibration import Calibration
 
 _log = logging.getLogger("calib")
 

@@ -11,16 +11,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from calib.batch.pool import HERE, Pool
 from calib.data.registry import Registry
-from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.numbers import format_number
-from calib.report.study import Progress, Study, begin_study
-from calib.report.study_tasks import Task
+
+# Every command loads what plug-ins declare here, and few work a report out.
+if TYPE_CHECKING:
+    from calib.inference.sampling.sampler import SamplerSettings
+    from calib.report.study import Progress, Study
+    from calib.report.study_tasks import Task
 
 type Document = Mapping[str, Any]
 
@@ -210,6 +213,8 @@ def work_out(
         Where outputs and sections are worked out, in any order. The numbers depend neither on it
         nor on `workers`.
     """
+    from calib.report.study import begin_study
+
     tell = progress or (lambda what, done, planned: None)
     study = begin_study(
         tasks, seed, pool, settings=settings, progress=progress,
