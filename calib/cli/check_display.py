@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from calib.check.outcome import Item, Outcome, Status
+from calib.data.numbers import plain_number
 
 _MOST = 40
 
@@ -51,7 +52,7 @@ def _groups(outcome: Outcome) -> Table:
     for name, items in groups.items():
         counts = [sum(item.status is status for item in items) for status in Status]
         shares = [item.share for item in items if item.share is not None]
-        largest = f"{100.0 * max(shares):.3g} %" if any(shares) else ""
+        largest = f"{plain_number(100.0 * max(shares))} %" if any(shares) else ""
         table.add_row(name, *(str(n) if n else "" for n in counts), largest)
     return table
 

@@ -51,9 +51,11 @@ def progress_bars() -> Iterator[Callable[[str, int, int], None]]:
     )
     from rich.text import Text
 
+    from calib.data.numbers import plain_number
+
     class _Speed(ProgressColumn):
         def render(self, task: Task) -> Text:
-            return Text("" if task.speed is None else f"{task.speed:.2g}/s")
+            return Text("" if task.speed is None else f"{plain_number(task.speed, 2)}/s")
 
     columns = (
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 def say(model: str, emulation: Emulation | None) -> bool:
     """Say what became of an emulation; return whether it is good enough (or was not needed)."""
+    from calib.data.numbers import plain_number
+
     if emulation is None:
         return True
     h = emulation.held_out
@@ -25,7 +27,8 @@ def say(model: str, emulation: Emulation | None) -> bool:
     n = len(emulation.runs)
     print(f"{model}: emulated {f'with {n} more' if emulation.extended else f'from {n}'} runs{seen}")
     if emulation.own_noise:
-        print(f"{model}: the simulator has a noise of its own, sd {emulation.own_noise:.3g}")
+        sd = plain_number(emulation.own_noise)
+        print(f"{model}: the simulator has a noise of its own, sd {sd}")
     if emulation.failed:
         first = emulation.failed[0].failure
         why = "" if first is None else f", the first as {first.reason}"

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data.headers import CHECKED, accepted_headers, meant
+from calib.data.numbers import plain_number
 from calib.data.quantities import QUANTITIES, Quantity, columns_of
 from calib.data.table import Table
 from calib.data.units import convert
@@ -144,7 +145,7 @@ def _between(table: Table, name: str, low: float, high: float) -> str:
     """Say a range in the unit of the file."""
     column = table.column(name)
     ends = column.written(np.array([low, high]))
-    return f"{ends[0]:.4g} to {ends[1]:.4g} {column.unit_word}".rstrip()
+    return f"{plain_number(ends[0], 4)} to {plain_number(ends[1], 4)} {column.unit_word}".rstrip()
 
 
 def _odd_columns(table: Table) -> Iterator[_Odd]:
@@ -177,7 +178,7 @@ def _odd_columns(table: Table) -> Iterator[_Odd]:
         alone = size > high and float(np.quantile(sizes_of, _MOST)) < high
         if hints and not alone:
             column = table.column(name)
-            written = f"{float(column.written(size)):.4g} {column.unit_word}".rstrip()
+            written = f"{plain_number(float(column.written(size)), 4)} {column.unit_word}".rstrip()
             yield _Odd(
                 name, f"the largest {quantity.word} is {written}, and "
                 f"{_between(table, name, low, high)} is usual", "; ".join(hints),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from calib.data import Table, read_table
 from calib.data.headers import renamed
+from calib.data.numbers import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, output_of, physical_role
 from calib.errors import CalibError, meant
 from calib.gap.context import Context, read_context
@@ -403,8 +404,8 @@ def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) ->
     unit = QUANTITIES[column].unit
     if not 1.0 / MAX_RATIO < field / max(lab, 1e-300) < MAX_RATIO:
         raise CalibError(
-            f"{QUANTITIES[column].word} is typically {field:.3g} {unit} in the field and "
-            f"{lab:.3g} {unit} in the calibration",
+            f"{QUANTITIES[column].word} is typically {plain_number(field)} {unit} in the field and "
+            f"{plain_number(lab)} {unit} in the calibration",
             where=f"{case.field.source}, column {case.field.header_of(column)!r}",
             allowed=f"campaigns whose outputs differ by less than a factor of {MAX_RATIO:g}",
             mend="check the units in the column names",

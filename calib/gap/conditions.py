@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
+from calib.data.numbers import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
 from calib.data.units_check import mixed_units
 from calib.errors import CalibError
@@ -45,8 +46,8 @@ def check_units(case: Case) -> None:
             continue
         unit = QUANTITIES[name].unit
         raise CalibError(
-            f"{QUANTITIES[name].word} is typically {field:.3g} {unit} in the field and {lab:.3g} "
-            f"{unit} in the calibration",
+            f"{QUANTITIES[name].word} is typically {plain_number(field)} {unit} in the field and "
+            f"{plain_number(lab)} {unit} in the calibration",
             where=f"{case.field.source}, column {case.field.header_of(name)!r}",
             allowed=f"campaigns whose conditions differ by less than a factor of {MAX_RATIO:g}",
             mend="check the units in the column names",
@@ -119,7 +120,9 @@ def _blanked(table: Table, name: str, rows: NDArray[np.int64]) -> Table:
 def _said(table: Table, name: str, rows: NDArray[np.int64]) -> str:
     header = table.header_of(name)
     values = table.column(name).written(table[name]) if name in QUANTITIES else table[name]
-    at = ", ".join(f"line {table.lines[row]} ({header} = {values[row]:.4g})" for row in rows)
+    at = ", ".join(
+        f"line {table.lines[row]} ({header} = {plain_number(values[row], 4)})" for row in rows
+    )
     return (
         f"{table.source}, {at}: far from all other rows of both campaigns, or as in another unit; "
         "left out as a mistake (if it is none, add rows between)"

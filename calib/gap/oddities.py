@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 import numpy as np
 
 from calib.data import Table
+from calib.data.numbers import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, role_of
 from calib.data.units_check import (
     column_notes,
@@ -153,9 +154,10 @@ def _other_units(lab: Table, field: Table, models: Mapping[str, str]) -> list[st
         if pull is not None and load is not None and pull in table:
             pulls = np.abs(table[pull]) / table[load]
             if np.nanmedian(pulls) > 1.0:
+                times = plain_number(np.nanmedian(pulls), 2)
                 said.append(
-                    f"{table.source}: the drawbar pull is typically {np.nanmedian(pulls):.2g} "
-                    "times the normal load, more than a tyre on soil can pull; check the columns"
+                    f"{table.source}: the drawbar pull is typically {times} times "
+                    "the normal load, more than a tyre on soil can pull; check the columns"
                 )
     return said
 
@@ -225,8 +227,8 @@ def _times(lab: Array, field: Array, near: float = _NEAR) -> str:
     way = "more" if _typical(field) > _typical(lab) else "less"
     like = [units for known, units in _UNITS.items() if abs(np.log(factor / known)) < near]
     between = f", about the factor between {' or '.join(like)}" if like else ""
-    typical = f"typically {_typical(field):.3g} against {_typical(lab):.3g}"
-    return f"{typical}, {factor:.3g} times {way}{between}"
+    typical = f"typically {plain_number(_typical(field))} against {plain_number(_typical(lab))}"
+    return f"{typical}, {plain_number(factor)} times {way}{between}"
 
 
 def identical_rows(lab: Table, field: Table) -> int:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
+from calib.data.numbers import plain_number
 from calib.data.quantities import OUTPUTS
 from calib.gap.case import Campaigns, Case, OutputData, campaigns
 from calib.gap.conditions import check_units, without_far_conditions
@@ -143,8 +144,9 @@ def _said(table: Table, far: Mapping[str, list[int]], why: str) -> list[str]:
     """Say of each value that is set aside where in its file it is, and why."""
     said = []
     for output, rows in far.items():
+        column = OUTPUTS[output]
         at = ", ".join(
-            f"line {table.lines[row]} ({OUTPUTS[output]} = {table[OUTPUTS[output]][row]:.4g})"
+            f"line {table.lines[row]} ({column} = {plain_number(table[column][row], 4)})"
             for row in rows
         )
         said.append(f"{table.source}, {at}: {why}")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from calib.data.numbers import plain_number
 from calib.errors import CalibError
 from calib.inference.design import prior_design, prior_middle
 from calib.inference.problem import Problem
@@ -64,9 +65,10 @@ def check_scale(problem: Problem, outputs: Array, simulator: Simulator) -> None:
         return
     output = problem.bound.model.output
     header = next(o.header for o in simulator.outputs if simulator.canonical(o.header) == output)
+    least, most = (plain_number(t, 2) for t in (times.min(), times.max()))
     raise CalibError(
-        f"in all of {times.size} runs over the prior the largest output is {times.min():.2g} to "
-        f"{times.max():.2g} times the largest that was measured",
+        f"in all of {times.size} runs over the prior the largest output is {least} to {most} times "
+        "the largest that was measured",
         where=simulator.place("unreadable"),
         allowed=f"outputs in the unit of {header}, and priors that reach the data",
         mend="name the column with the unit that it gives, or correct the priors or the data's "

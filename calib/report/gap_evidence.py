@@ -18,6 +18,7 @@ from calib.gap.where import Region
 from calib.models import get_model
 from calib.report.gap_rows import (
     OutputRows,
+    condition_text,
     output_axis,
     output_rows,
     output_word,
@@ -217,10 +218,9 @@ def conditions_text(found: Diagnosis, measurement: NextMeasurement) -> str:
         if np.ptp(both) == 0.0 or follows or role == "order" or role not in matters:
             continue
         axis = axis_of(column)
-        shown = words_of(found.data.case.covariates, column, value, value) or (
-            f"{100.0 * value:.0f}" if role == "slip" else _rounded(axis.factor * value)
-        )
-        parts.append(f"{axis.name.lower()} {shown.replace('-', MINUS)}{unit_after(axis)}")
+        shown = words_of(found.data.case.covariates, column, value, value)
+        shown = shown or condition_text(column, axis.factor * value)
+        parts.append(f"{axis.name.lower()} {shown}{unit_after(axis)}")
     if "order" in matters & measured:
         parts.append("after the last run")
     return ", ".join(parts) or "the conditions of the field campaign"
@@ -236,7 +236,3 @@ def _matter(found: Diagnosis, names: Sequence[str]) -> set[str]:
             return {role_of(c) for c in found.data.view.conditions}
         matters |= {c for effect in h.effects for c in effect.covariates}
     return matters
-
-
-def _rounded(value: float) -> str:
-    return f"{value:.2g}" if abs(value) < 10.0 else f"{value:.3g}"

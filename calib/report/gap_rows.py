@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.data.numbers import plain_number
 from calib.data.quantities import OUTPUTS, role_of
 from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis, field_parts
@@ -66,7 +67,7 @@ def region_text(found: Diagnosis, region: Region) -> str:
     words = words_of(found.data.case.covariates, column, *ends)
     if words:
         return f"{axis.name.lower()} {words}"
-    low, high = (_stretch_end(column, axis.scale(np.array(v)).item()) for v in ends)
+    low, high = (condition_text(column, axis.factor * v) for v in ends)
     span = low if low == high else f"{low} to {high}"
     return f"{axis.name.lower()} {span}{unit_after(axis)}"
 
@@ -84,11 +85,11 @@ def shrink_place(found: Diagnosis) -> str:
     return "at the field's own rows, which were fitted: they are too few to leave some out"
 
 
-def _stretch_end(column: str, value: float) -> str:
-    text = f"{value:.2g}" if abs(value) < 10.0 else f"{value:.3g}"
+def condition_text(column: str, value: float) -> str:
+    """Write a condition, in the unit of its axis, to the digits that a plan or a stretch needs."""
     if role_of(column) in ("slip", "order"):
-        text = f"{value:.0f}"
-    return text.replace("-", MINUS)
+        return f"{value:.0f}".replace("-", MINUS)
+    return plain_number(value, 2 if abs(value) < 10.0 else 3).replace("-", MINUS)
 
 
 def output_word(output: str) -> str:
@@ -164,13 +165,12 @@ def panel_groups(
         return [("", everything)]
     distinct, axis = np.unique(pressure), axis_of(column)
     if distinct.size <= _MOST_PANELS:
-        return [(f"{axis.factor * p:.3g} {axis.unit}", pressure[rows] == p) for p in distinct]
+        return [(f"{axis.value_text(p)} {axis.unit}", pressure[rows] == p) for p in distinct]
     edges = np.quantile(pressure, [0.0, 1.0 / 3.0, 2.0 / 3.0, 1.0])
     groups = []
     for low, high in pairwise(edges):
         inside = (pressure[rows] >= low) & (pressure[rows] <= high)
         if low > edges[0]:
             inside &= pressure[rows] > low
-        ends = f"{axis.factor * low:.3g} to {axis.factor * high:.3g}"
-        groups.append((f"{ends} {axis.unit}", inside))
+        groups.append((axis.range_text(np.array([low, high])), inside))
     return groups

@@ -12,6 +12,7 @@ from types import MappingProxyType
 import numpy as np
 
 from calib.data.headers import parse_header
+from calib.data.numbers import plain_number
 from calib.data.quantities import QUANTITIES
 from calib.data.units import convert
 from calib.errors import CalibError
@@ -80,7 +81,7 @@ class Axis:
     def value_text(self, value: float) -> str:
         """Write one value, without the unit: whole numbers whole."""
         scaled = self.factor * value
-        text = f"{scaled:.0f}" if abs(scaled) >= 1000.0 else f"{scaled:.3g}"
+        text = f"{scaled:.0f}" if abs(scaled) >= 1000.0 else plain_number(scaled)
         return text.replace("-", MINUS)
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from calib.batch.pool import HERE, Pool
+from calib.data.numbers import plain_number
 from calib.data.registry import Registry
 from calib.report.numbers import format_number
 
@@ -136,7 +137,7 @@ def _emulators_html(documents: Mapping[str, Document]) -> str:
             "model": model,
             "n": len(d["failed"]),
             "rows": [
-                (", ".join(f"{v:.4g}" for v in f["parameters"]), f["kind"], f["reason"],
+                (", ".join(plain_number(v, 4) for v in f["parameters"]), f["kind"], f["reason"],
                  f["printed"].strip()[-200:])
                 for f in d["failed"][:_SHOWN]
             ],

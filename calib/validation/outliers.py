@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from calib.data.numbers import plain_number
 from calib.inference.problem import Problem
 from calib.inference.sampling.mode import find_modes
 from calib.models.base import Array
@@ -87,8 +88,8 @@ def outlying_notes(problem: Problem, t: Array) -> Sequence[str]:
     source = PurePath(problem.table.source).name
     column = problem.table.column(problem.bound.model.output)
     said = [
-        f"{source}, line {row.line}: {column.header} = {float(column.written(row.value)):.4g} is "
-        f"{row.sds:.1f} sds from what the "
+        f"{source}, line {row.line}: {column.header} = "
+        f"{plain_number(float(column.written(row.value)), 4)} is {row.sds:.1f} sds from what the "
         f"other rows say; check the reading, {weight}"
         for row in rows[:_MOST_NAMED]
     ]

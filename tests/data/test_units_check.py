@@ -112,7 +112,7 @@ def test_messages_are_in_the_words_and_units_of_the_file() -> None:
     table = table_from_arrays(columns, source="my.csv")
     (said,) = column_notes(table)
     assert said.startswith("my.csv, Drawbar pull [lbf]: the largest drawbar pull is 4.9")
-    assert "lbf, and 33.72 to 2.698e+04 lbf is usual" in said
+    assert "lbf, and 33.72 to 26980 lbf is usual" in said
     pressure = table_from_arrays({"Inflation pressure [kPa]": np.array([20.0, 200.0])}, source="p")
     (said,) = unit_notes(
         pressure, pressure.column("inflation_pressure_psi").quantity,

@@ -11,26 +11,17 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
+from calib.data.numbers import plain_number
 from calib.he2019 import declared
 from calib.he2019.audit.intervals import Interval
 from calib.he2019.datasets.published import PUBLISHED, Figure
+from calib.report.numbers import format_number
 from calib.report.page.template import sentences
-
-
-def number(value: float, digits: int = 3) -> str:
-    """Write a number to some significant digits, without an exponent where that is readable."""
-    if value == 0.0 or not math.isfinite(value):
-        return f"{value:g}"
-    size = int(f"{abs(value):.{digits - 1}e}".partition("e")[2])
-    if not -4 <= size < 6:
-        return f"{value:.{digits - 1}e}"
-    rounded = round(value, digits - 1 - size)
-    return f"{rounded:.{max(0, digits - 1 - size)}f}"
 
 
 def percent(fraction: float, digits: int = 3) -> str:
     """Write a fraction as a percentage."""
-    return f"{number(100.0 * fraction, digits)} %"
+    return f"{format_number(100.0 * fraction, digits)} %"
 
 
 class Verdict(StrEnum):
@@ -106,14 +97,14 @@ class Quantity:
 
     def __str__(self) -> str:
         unit = "" if self.unit == "1" else f" {self.unit}"
-        low, high = f"{self.lower:.4g}", f"{self.upper:.4g}"
+        low, high = (plain_number(end, 4) for end in (self.lower, self.upper))
         span = ""
         if not math.isnan(self.lower):
             span = f"{low} to {high}" if low != high else low
         if math.isnan(self.value):
             return f"{self.name} {span}{unit} ({self.interval})"
         around = f" ({span}, {self.interval})" if span else ""
-        return f"{self.name} {self.value:.4g}{unit}{around}"
+        return f"{self.name} {plain_number(self.value, 4)}{unit}{around}"
 
 
 def rounded(
@@ -211,8 +202,8 @@ def _expanded(item: str) -> Iterator[str]:
 
 
 def _span(interval: Interval) -> str:
-    return f"{number(float(interval.lower))} to {number(float(interval.upper))}"
+    return f"{format_number(float(interval.lower))} to {format_number(float(interval.upper))}"
 
 
 _CLAIMS = declared("audit/claims.toml")
-_said = sentences(number=number, percent=percent, span=_span)
+_said = sentences(number=format_number, percent=percent, span=_span)

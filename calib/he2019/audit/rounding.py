@@ -14,7 +14,6 @@ from calib.he2019.audit.finding import (
     Verdict,
     between,
     finding,
-    number,
 )
 from calib.he2019.audit.intervals import Interval, printed
 from calib.he2019.audit.nearness import pressure_curves, printed_coefficients
@@ -22,6 +21,7 @@ from calib.he2019.audit.pull import coefficients, pressure_box, pull, pull_from_
 from calib.he2019.audit.signs import NAMES, nearest, targets
 from calib.he2019.datasets.published import Published
 from calib.models.base import Array
+from calib.report.numbers import format_number
 
 # Digits are enough where D is fixed to this part.
 _WANTED = 0.01
@@ -72,7 +72,7 @@ def _quadratics(
     found = [
         Quantity(
             f"{what} at {p:g} psi", float(r.middle), unit, float(r.lower), float(r.upper),
-            "rounding", f"{number(value, 4)} (Table 4)",
+            "rounding", f"{format_number(value, 4)} (Table 4)",
         )
         for p, r, value in zip(pressures, ranges, wanted, strict=True)
     ]  # fmt: skip
@@ -128,12 +128,14 @@ def _curve(published: Published, study: RoundingStudy) -> Finding:
         found.append(
             between(
                 f"widest range of the pull at {psi} psi", allowed.lower[at], allowed.upper[at],
-                "kN", "rounding", f"{number(D, 4)} peak (Table 4)",
+                "kN", "rounding", f"{format_number(D, 4)} peak (Table 4)",
             )
         )  # fmt: skip
     best, worst = min(relative, key=lambda p: relative[p]), max(relative, key=lambda p: relative[p])
     gaps = {p: _gap(study.allowed[p], study.table4[p]) for p in relative}
-    outside = [f"by up to {number(gap, 2)} kN at {p} psi" for p, gap in gaps.items() if gap > 0.0]
+    outside = [
+        f"by up to {format_number(gap, 2)} kN at {p} psi" for p, gap in gaps.items() if gap > 0.0
+    ]
     return finding(
         "table5_digits_of_pull",
         Verdict.CONFIRMED if relative[worst] <= _WANTED else Verdict.CORRECTED, found,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from calib.data.numbers import plain_number
 from calib.inference.diagnostics import convergence
 from calib.models.base import Array
 
@@ -65,5 +66,5 @@ def judge(
     ):
         for name, v, ok in zip(names, value, good, strict=True):
             if not ok:
-                reasons.append(f"{label} of {name} is {v:.4g}, {limit} is needed")
+                reasons.append(f"{label} of {name} is {plain_number(v, 4)}, {limit} is needed")
     return GateReport(names, r, bulk, tail, tau, steps, not reasons, tuple(reasons))

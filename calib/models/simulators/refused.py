@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calib.data.numbers import plain_number
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Kind, Simulator
@@ -65,5 +66,6 @@ def without_value(
 def _ranges(names: Sequence[str], theta: Array) -> str:
     low, high = theta.min(axis=0), theta.max(axis=0)
     return ", ".join(
-        f"{n} {a:.4g} to {b:.4g}" for n, a, b in zip(names, low, high, strict=True)
+        f"{n} {plain_number(a, 4)} to {plain_number(b, 4)}"
+        for n, a, b in zip(names, low, high, strict=True)
     )  # fmt: skip

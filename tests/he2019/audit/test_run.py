@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from calib.he2019.audit import Basis, Quantity, Seeds, Verdict, audit_csv, audit_json, run_audit
-from calib.he2019.audit.finding import number, percent
+from calib.he2019.audit.finding import percent
 from calib.he2019.datasets.published import PUBLISHED
 from tests.he2019.audit.altered import flipped, printed_figures
 
@@ -111,15 +111,6 @@ def test_intervals_are_ordered_and_hold_their_value(audit):
                 assert q.lower <= q.upper, (f.key, q.name)
                 assert q.interval, (f.key, q.name)
                 assert np.isnan(q.value) or q.lower <= q.value <= q.upper, (f.key, q.name)
-
-
-@pytest.mark.parametrize(
-    ("value", "digits", "text"),
-    [(0.0105, 2, "0.011"), (12.184, 3, "12.2"), (1473.0, 3, "1470"), (-0.36, 3, "-0.360"),
-     (0.0, 3, "0"), (3.4e-6, 1, "3e-06"), (99.96, 3, "100"), (float("nan"), 3, "nan")],
-)  # fmt: skip
-def test_numbers_in_sentences(value, digits, text):
-    assert number(value, digits) == text
 
 
 def test_percentages():
