@@ -16,13 +16,14 @@ if TYPE_CHECKING:
 def say(model: str, emulation: Emulation | None) -> bool:
     """Say what became of an emulation; return whether it is good enough (or was not needed)."""
     from calib.data.numbers import plain_number
+    from calib.report.sections import coverage_words
 
     if emulation is None:
         return True
     h = emulation.held_out
     seen = "" if h is None else (
-        f"; on {h.runs} runs not seen it is off by {h.rmse:.3f} noise sds (rms), "
-        f"{100 * h.covered:.0f} % inside its 90 % intervals"
+        f"; on {h.runs} runs not seen it is off by {h.rmse:.3f} noise sds (rms); of their values "
+        f"its 90 % intervals hold {coverage_words(h.covered, h.pit.size)}"
     )  # fmt: skip
     n = len(emulation.runs)
     print(f"{model}: emulated {f'with {n} more' if emulation.extended else f'from {n}'} runs{seen}")

@@ -30,6 +30,8 @@ type Document = Mapping[str, Any]
 
 # So many failed runs are shown; the manifest has all.
 _SHOWN = 20
+# Of the intervals that an emulator is checked by.
+_NOMINAL = 0.9
 
 
 @dataclass(frozen=True)
@@ -154,7 +156,7 @@ def _emulator_row(model: str, d: Document) -> list[str]:
     if held:
         pit = np.histogram(held["pit"], bins=4, range=(0.0, 1.0))[0]
         seen = f"{format_number(held['rmse_in_noise_sds'])} on {held['runs']}"
-        inside = f"{100 * held['covered_90']:.0f} %"
+        inside = coverage_words(held["covered_90"], len(held["pit"]))
         shares = ", ".join(f"{100 * part:.0f} %" for part in pit / max(int(pit.sum()), 1))
     return [
         model, str(d["runs"]), str(d["nodes"]), seen, inside, shares,
@@ -162,6 +164,34 @@ def _emulator_row(model: str, d: Document) -> list[str]:
         format_number(d["simulator_noise_sd"]) if d["simulator_noise_sd"] else "none",
         "good enough" if d["passed"] else "; ".join(d["reasons"]),
     ]  # fmt: skip
+
+
+def coverage_words(share: float, n: int) -> str:
+    """Say which share of n values that it had not seen an emulator's 90 % intervals hold.
+
+    The values are the coefficients of each run, errors of which the emulator takes as independent.
+    """
+    from calib.validation.scores import jeffreys
+
+    low, high = jeffreys(round(n * share), n)
+    found = f"{100 * share:.0f} % (95 % interval {100 * low:.0f} to {100 * high:.0f} %): "
+    if high < _NOMINAL:
+        return f"{found}too narrow"
+    return found + ("wider than need be" if low > _NOMINAL else "as they should be")
+
+
+def emulation_words(d: Document) -> str:
+    """Say for a verdict that an emulator stood in for a simulator, and how well it does."""
+    said = f"an emulator, made from {d['runs']} runs, stood in for it"
+    held = d["held_out"]
+    if held is None:
+        return f"{said}; no run was left to check it on"
+    off = format_number(held["rmse_in_noise_sds"], 2)
+    inside = coverage_words(held["covered_90"], len(held["pit"]))
+    return (
+        f"{said}; off by {off} noise sds (rms) on {held['runs']} runs not seen; of their values "
+        f"its 90 % intervals hold {inside}"
+    )
 
 
 def _emulators_again(record: Any) -> Section:

@@ -4,12 +4,13 @@ The first rule that applies decides:
 
 1. not converged: the convergence gate was not passed;
 2. not scored: the validation has no finite error;
-3. miscovered: unseen rows fell outside the 90 % band more often than chance allows;
-4. misfit: residuals keep their sign along the curve for longer than chance allows;
-5. unexpected: fewer than half of the calibrated points lie inside what the priors expect;
-6. extrapolated: the prior, not the data, sets what the prediction of unseen rows hangs on;
-7. weak: the median is hardly better than the mean of the calibrated rows;
-8. fine.
+3. emulated badly: the emulator that stood in for a simulator is not good enough;
+4. miscovered: unseen rows fell outside the 90 % band more often than chance allows;
+5. misfit: residuals keep their sign along the curve for longer than chance allows;
+6. unexpected: fewer than half of the calibrated points lie inside what the priors expect;
+7. extrapolated: the prior, not the data, sets what the prediction of unseen rows hangs on;
+8. weak: the median is hardly better than the mean of the calibrated rows;
+9. fine.
 """
 
 from __future__ import annotations
@@ -92,6 +93,8 @@ class Evidence:
         What to check where the priors did not expect the data.
     notes : sequence of str
         What was assumed where the data do not say.
+    emulator_fails : sequence of str
+        Why the emulator of the simulator, if there is one, is not good enough.
     """
 
     converged: bool
@@ -117,6 +120,7 @@ class Evidence:
     prior_n: int = 0
     suspects: str = "the units"
     notes: Sequence[str] = ()
+    emulator_fails: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -158,6 +162,13 @@ def judge_evidence(e: Evidence) -> Verdict:
             Level.NO, "not scored", "Not validated", f"the fit inside {e.inside}",
             "predictions of unseen rows: they could not be scored, since the model has no value "
             "for part of the posterior there",
+        )  # fmt: skip
+    if e.emulator_fails:
+        return Verdict(
+            Level.CARE, "emulated badly", "Emulator not good enough",
+            f"the order of magnitude, to {error}",
+            "what is said of the simulator's parameters: an emulator stood in for it, and "
+            f"{'; '.join(e.emulator_fails)}",
         )  # fmt: skip
     if e.low_coverage_p < _SIGNIFICANT:
         return Verdict(

@@ -24,7 +24,8 @@ def emulation(**other: Any) -> Emulation:
     given: dict[str, Any] = {
         "problem": None, "emulator": None, "expected": 0.0,
         "between": 0.0, "own_noise": 0.0, "passed": True, "reasons": (), "history": (),
-        "runs": (ok, ok, crashed), "held_out": HeldOut(20, 0.0456, np.zeros(1), np.zeros(1), 0.95),
+        "runs": (ok, ok, crashed),
+        "held_out": HeldOut(20, 0.0456, np.zeros(20), np.zeros(20), 0.95),
     }  # fmt: skip
     return Emulation(**{**given, **other})
 
@@ -35,8 +36,8 @@ def test_a_good_one_is_said_to_be_so_and_its_failed_runs_are_told(
     assert say("sim", emulation())
     told = capsys.readouterr()
     assert told.out == (
-        "sim: emulated from 3 runs; on 20 runs not seen it is off by 0.046 noise sds (rms), "
-        "95 % inside its 90 % intervals\n"
+        "sim: emulated from 3 runs; on 20 runs not seen it is off by 0.046 noise sds (rms); of "
+        "their values its 90 % intervals hold 95 % (95 % interval 79 to 99 %): as they should be\n"
     )
     assert "1 of 3 runs failed, the first as exit code 3;" in told.err
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from calib.batch.pool import HERE
-from calib.report.sections import SECTIONS, EmulatorSection
+from calib.report.sections import SECTIONS, EmulatorSection, coverage_words, emulation_words
 
 GOOD: dict[str, Any] = {
     "runs": 60, "nodes": 12, "between_nodes_error_in_noise_sds": 0.0123, "simulator_noise_sd": 0.0,
@@ -58,14 +58,34 @@ def test_emulators_and_failed_runs_are_listed() -> None:
     assert written.anchor == "emulators"
     emulators, failed = Tables(written.html).tables
     assert emulators[1:] == [
-        ["good", "60", "12", "0.0456 on 20", "95 %", "40 %, 20 %, 0 %, 40 %", "0.0123", "none",
-         "good enough"],
+        ["good", "60", "12", "0.0456 on 20",
+         "95 % (95 % interval 62 to 100 %): as they should be", "40 %, 20 %, 0 %, 40 %",
+         "0.0123", "none", "good enough"],
         ["bad", "60", "12", "none left", "", "none", "0.0123", "0.300", "too few runs; too coarse"],
     ]  # fmt: skip
     assert "25 runs of bad failed" in written.html
     assert "The first 20:" in written.html
     assert "<no>" not in written.html
     assert failed[1:] == [["1, 2.5e+06", "exit", f"exit code {i}", "<no> mesh"] for i in range(20)]
+
+
+@pytest.mark.parametrize(
+    ("share", "n", "words"),
+    [
+        (0.77, 200, "77 % (95 % interval 71 to 82 %): too narrow"),
+        (0.84, 20, "84 % (95 % interval 65 to 96 %): as they should be"),
+        (1.0, 200, "100 % (95 % interval 99 to 100 %): wider than need be"),
+    ],
+)
+def test_the_coverage_of_an_emulator_is_judged(share: float, n: int, words: str) -> None:
+    assert coverage_words(share, n) == words
+
+
+def test_a_verdict_says_what_stood_in_for_a_simulator() -> None:
+    said = emulation_words(GOOD)
+    assert "made from 60 runs" in said
+    assert "off by 0.046 noise sds (rms) on 20 runs" in said
+    assert emulation_words(BAD).endswith("no run was left to check it on")
 
 
 def test_the_record_makes_the_section_again() -> None:

@@ -39,6 +39,7 @@ RULES = {
         "reasons": ("R-hat of C is 1.2, at most 1.01 is needed",),
     },
     "not scored": {"rmse": float("nan")},
+    "emulated badly": {"emulator_fails": ("the emulator is off by 0.3 noise sds (rms)",)},
     "miscovered": {"hits": 6, "low_coverage_p": 0.001},
     "misfit": {"sign_changes": 4},
     "unexpected": {"prior_hits": 2, "prior_n": 20},

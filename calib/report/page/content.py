@@ -6,7 +6,7 @@ import math
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import PurePath
 from typing import Any
 
@@ -35,7 +35,7 @@ from calib.report.page.template import (
 from calib.report.publish import Publication
 from calib.report.reference import reference_of
 from calib.report.rows import held_table, x_column
-from calib.report.sections import Written
+from calib.report.sections import Document, Written, emulation_words
 from calib.report.study import Failure, OutputResult, Study
 from calib.report.verdict import Evidence, Level, gather, judge_evidence
 
@@ -164,12 +164,19 @@ def failed_section(key: str, failure: Failure) -> dict[str, Any]:
 
 
 def section(
-    key: str, result: OutputResult, plates: Sequence[Plate], images: Mapping[str, bytes]
+    key: str,
+    result: OutputResult,
+    plates: Sequence[Plate],
+    images: Mapping[str, bytes],
+    emulation: Document | None = None,
 ) -> dict[str, Any]:
-    """Return everything that is said of an output; images by ``{key}_{plate.name}.png``."""
+    """Return everything that is said of an output; images by ``{key}_{plate.name}.png``.
+
+    `emulation` is the `Emulation.document` of an emulator that stood in for its simulator.
+    """
     calibration = result.calibration
     problem = calibration.problem
-    evidence = gather(result)
+    evidence = replace(gather(result), emulator_fails=(emulation or {}).get("reasons", ()))
     verdict = judge_evidence(evidence)
     reference = reference_of(problem.table.label)
     names = [*problem.bound.model.reported, *(p.name for p in problem.priors.entries)]
@@ -185,7 +192,7 @@ def section(
         "trust": prose(verdict.trust, names),
         "doubt": prose(verdict.doubt, names),
         "label": problem.table.label,
-        "facts": _card_facts(result, evidence),
+        "facts": _card_facts(result, evidence, emulation),
         "equation": equation(bound),
         "likelihood": prose(likelihood(problem, axis_of(bound.model.output).name.lower()), names),
         "parametrisation": prose(parametrisation(bound), names),
@@ -218,7 +225,9 @@ def _validation_title(result: OutputResult) -> str:
     return f"Validation on held-out rows: {held.words}"
 
 
-def _card_facts(result: OutputResult, evidence: Evidence) -> list[list[str]]:
+def _card_facts(
+    result: OutputResult, evidence: Evidence, emulation: Document | None
+) -> list[list[str]]:
     """The few numbers that belong on the card."""
     calibration, s = result.calibration, result.validation.scores
     report, c = calibration.draws.report, s.coverage[0.9]
@@ -247,6 +256,7 @@ def _card_facts(result: OutputResult, evidence: Evidence) -> list[list[str]]:
         ],
         ["Error of the median on those rows", error],
         *([["Repeats", repeats]] if repeats else []),
+        *([["Simulator", emulation_words(emulation)]] if emulation else []),
     ]
 
 
@@ -293,10 +303,11 @@ def render_page(
         Tables and methods beside the page.
     """
     sections = []
+    emulations: Mapping[str, Document] = manifest.get("emulators", {})
     for key, result in study.results.items():
         with units_of(result.task.table.header):
             sections.append(
-                section(key, result, plates.get(key, ()), images)
+                section(key, result, plates.get(key, ()), images, emulations.get(result.task.model))
                 if isinstance(result, OutputResult)
                 else failed_section(key, result)
             )

@@ -311,6 +311,21 @@ def test_each_pressure_stands_beside_tables_3_and_4(drawbar):
     assert all("\N{CHECK MARK}" in cell for cell in least[1:])
 
 
+def test_a_card_says_that_an_emulator_stood_in_and_how_well(rut, monkeypatch):
+    held = {"runs": 20, "rmse_in_noise_sds": 0.0456, "covered_90": 0.77, "pit": [0.5] * 200}
+    found = {"runs": 60, "reasons": [], "held_out": held}
+    monkeypatch.setitem(MANIFEST, "emulators", {rut.task.model: found})
+    html, _ = page({"rut_depth": rut})
+    cards = html[: html.index("<nav")]
+    assert "made from 60 runs, stood in for it" in cards
+    assert "too narrow" in cards
+    assert "Emulator not good enough" not in cards
+    found["reasons"] = ["the emulator is off by 0.30 noise sds"]
+    cards = page({"rut_depth": rut})[0].partition("<nav")[0]
+    assert "Emulator not good enough" in cards
+    assert "off by 0.30 noise sds" in cards
+
+
 def test_validation_facts_have_the_numbers(rut):
     s = rut.validation.scores
     facts = dict(validation_facts(rut, 6.5, 0.9))
