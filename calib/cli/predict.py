@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import math
 import sys
 from pathlib import Path
@@ -164,9 +165,9 @@ def _give(columns: Mapping[str, Any], out: Path | None) -> None:
         write_table(out, {name: [_cell(c, "") for c in column] for name, column in columns.items()})
         print(f"{len(next(iter(columns.values())))} rows written to {out}")
         return
-    print(",".join(columns))
-    for row in zip(*columns.values(), strict=True):
-        print(",".join(map(_cell, row)))
+    writer = csv.writer(sys.stdout, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(map(_cell, row) for row in zip(*columns.values(), strict=True))
 
 
 def _cell(cell: Any, empty: str = "nan") -> str:
