@@ -161,12 +161,18 @@ def match_headers(
     Raises
     ------
     CalibError
-        For a wrong or missing unit, a quantity given twice, or a required one that is missing.
+        For wrong or missing units, of all columns at once, a quantity given twice, or a required
+        one that is missing.
     """
     found: dict[str, Column] = {}
     ignored: list[str] = []
+    errors: dict[str, CalibError] = {}
     for position, header in enumerate(headers):
-        column = parse_header(header, where=where, position=position)
+        try:
+            column = parse_header(header, position=position)
+        except CalibError as error:
+            errors[header] = error
+            continue
         if column is None:
             ignored.append(header)
             continue
@@ -179,9 +185,24 @@ def match_headers(
                 allowed="one column per quantity",
                 mend="delete or rename one of the two",
             )
+    if errors:
+        raise _together(errors, where)
     if missing := [name for name in required if name not in found]:
         raise missing_columns(missing, headers, ignored, where)
     return tuple(found.values()), tuple(ignored)
+
+
+def _together(errors: Mapping[str, CalibError], where: str) -> CalibError:
+    """Return one error of all headers whose units cannot be read: they are mended at once."""
+    if len(errors) == 1:
+        return next(iter(errors.values())).within(where)
+    said = "; ".join(error.message for error in errors.values())
+    allowed = "; ".join(error.allowed or "" for error in errors.values())
+    mend = "; ".join(f"{header!r}: {error.mend}" for header, error in errors.items())
+    columns = f"columns {', '.join(map(repr, errors))}"
+    return CalibError(
+        said, where=f"{where}, {columns}" if where else columns, allowed=allowed, mend=mend
+    )
 
 
 def missing_columns(

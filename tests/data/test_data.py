@@ -192,6 +192,17 @@ def test_wrong_columns(my_csv: Write, header: str, words: list[str]) -> None:
         assert word in message
 
 
+def test_all_columns_whose_unit_cannot_be_read_are_named_at_once(my_csv: Write) -> None:
+    message = refusal(my_csv("slip,Drawbar pull,rut_depth_kn,note\n0.1,2,3,wet\n"))
+    found, allowed, mend = message.splitlines()
+    assert "line 1, columns 'slip', 'Drawbar pull', 'rut_depth_kn': " in found
+    assert "the column name 'slip' does not say the unit; the column name 'Drawbar pull'" in found
+    assert "'kn' is a unit of force, but rut_depth is a length" in found
+    for header, word in (("slip", "slip_ratio"), ("Drawbar pull", "drawbar_pull_kn")):
+        assert word in allowed
+        assert f"{header!r}: rename the column, for example {word}" in mend
+
+
 # What is refused: cells
 
 
