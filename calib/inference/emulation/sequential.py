@@ -175,13 +175,18 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
         state.problem, chosen.spread(d, deterministic, before), state.seed,
         latin=not chosen.sequential,
     )  # fmt: skip
-    values = state.carry_out(theta[:FIRST])
+    values, across = state.carry_out(theta[:FIRST]), state.across
     if fail_alike(state.runs[before:]) and fail_alike(state.runs):
         raise state.without_value(FROM_THE_START)
+    # An output in another unit, too, need not be paid for with the whole design.
+    check_scale(state.problem, state.outputs(values), state.keeper.simulator)
     state.runs = [*map(across_too, state.runs[:before]), *state.runs[before:]]
     # Runs that failed across zero and were made again may have taken some of them.
     theta = theta[: FIRST + state.left]
-    values = np.concatenate([values, state.carry_out(theta[FIRST:])])
+    more = state.carry_out(theta[FIRST:])
+    if more.shape[1] < values.shape[1]:  # one of these had a value but for the nodes across zero
+        values = values[:, ~across]
+    values = np.concatenate([values, more])
     ok = np.isfinite(values).all(axis=1)
     if ok.mean() < _LEAST_OK:
         raise state.without_value("the simulator fails in most of its prior")

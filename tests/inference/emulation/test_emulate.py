@@ -254,12 +254,14 @@ def test_what_grows_beyond_bounds_across_zero_does_not_matter_to_a_fit() -> None
     agree(calib.calibrate(emulation.problem, seed=1), exact(data, parameters=vague))
 
 
-def test_runs_that_fail_across_zero_alone_are_made_without() -> None:
+@pytest.mark.parametrize("edge", [0.08, 0.04])
+def test_runs_that_fail_across_zero_alone_are_made_without(edge: float) -> None:
+    """From the first runs, or from later ones of the first design."""
     made = []
 
     def stops(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
         made.append(theta)
-        if x["slip_ratio"].min() < 0.0 and theta[0, 1] < 0.08:
+        if x["slip_ratio"].min() < 0.0 and theta[0, 1] < edge:
             raise RuntimeError("the wheel is braked")
         return pull(theta, x)
 
@@ -270,9 +272,13 @@ def test_runs_that_fail_across_zero_alone_are_made_without() -> None:
     assert len(emulation.runs) == len(made) - len(emulation.failed) <= 40
     assert any("below zero" in r.failure.reason for r in emulation.failed if r.failure)
     theta = emulation.emulator.training.theta
-    assert (theta[:, 1] < 0.08).sum() > 5
+    assert (theta[:, 1] < edge).any()
     assert emulation.emulator.training.ok.all()
-    # What fails by chance, or anywhere, is no reason to do without.
+
+
+def test_what_fails_by_chance_or_anywhere_is_no_reason_to_do_without_what_lies_across_zero() -> (
+    None
+):
     rng = np.random.default_rng(1)
 
     def now_and_then(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
