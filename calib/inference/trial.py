@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import Timer
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +19,13 @@ from calib.models.base import Array
 if TYPE_CHECKING:
     from calib.models.simulators.base import Simulator
 
+_log = logging.getLogger(__name__)
+
 _SEED = 0
+# A trial that takes so many seconds is spoken of.
+_PATIENCE = 5.0
+# What rounding makes of equal runs, which may add up in another order, is less than this part.
+_SAME = 1e-6
 # Outputs that differ by this factor from what was measured, wherever in the prior, are in another
 # unit: kN and N differ by 1000, mm and cm with m by 1000 and 100, a ratio and percent by 100.
 _FAR = 30.0
@@ -24,13 +34,14 @@ _FAR = 30.0
 def try_simulator(problem: Problem) -> None:
     """Try the simulator that a problem asks for each parameter vector, if it does.
 
-    At the middle of the prior and at five points spread over it; once for each process.
+    At the middle of the prior and at five points spread over it, twice at the first of them that
+    has a value; once for each process.
 
     Raises
     ------
     CalibError
         If all of these fail in one way: with file and key, what the first printed, and where. If
-        the output is in another unit than declared.
+        the output is in another unit than declared, or another at equal parameters.
     """
     direct = problem.bound.model.predict
     if direct is None:
@@ -43,9 +54,54 @@ def try_simulator(problem: Problem) -> None:
         return
     spread = prior_design(problem, FIRST, _SEED)
     thetas = np.concatenate([prior_middle(problem), spread])
-    direct.try_first(thetas, problem.conditions)
-    check_scale(problem, problem.bound.predict(thetas, problem.conditions), direct.simulator)
+    with _told_if_long(direct.simulator):
+        direct.try_first(thetas, problem.conditions)
+        outputs = problem.bound.predict(thetas, problem.conditions)
+    check_scale(problem, outputs, direct.simulator)
+    for i in np.flatnonzero(np.isfinite(outputs).all(axis=1))[:1]:
+        again = problem.bound.predict(thetas[i : i + 1], problem.conditions)[0]
+        _check_repeats(outputs[i], again, direct.simulator)
     direct.tally.tried = True
+
+
+@contextmanager
+def _told_if_long(simulator: Simulator) -> Iterator[None]:
+    """Say what is waited for if it is not over soon."""
+    timer = Timer(
+        _PATIENCE, _log.warning,
+        ("still trying the simulator %s, after %g s, at a few points of its prior; with emulate = "
+         "false it is then asked some 300,000 times, so one that takes seconds is to be emulated",
+         simulator.name, _PATIENCE),
+    )  # fmt: skip
+    timer.daemon = True
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
+
+
+def _check_repeats(outputs: Array, again: Array, simulator: Simulator) -> None:
+    """Check that equal parameters have given equal outputs, (n,).
+
+    Raises
+    ------
+    CalibError
+        If not: a sampler that meets other values where it has been does not converge.
+    """
+    apart = np.abs(again - outputs) / max(np.abs(outputs).max(), 1e-300)
+    # No value the second time is a failure, and counted as such.
+    if not (apart > _SAME).any():
+        return
+    raise CalibError(
+        "called twice with equal parameters and conditions it gives other outputs (apart by "
+        f"{plain_number(100.0 * float(np.nanmax(apart)), 2)} % of the largest)",
+        where=simulator.place(),
+        allowed="equal output for equal input where emulate = false: no sampler converges on a "
+        "posterior that changes under it",
+        mend="fix the seed of its random numbers; or, if the scatter is what it is to have, have "
+        "it emulated with deterministic = false, which allows for it",
+    )
 
 
 def check_scale(problem: Problem, outputs: Array, simulator: Simulator) -> None:

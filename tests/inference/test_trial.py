@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -88,7 +89,7 @@ def of_function(f: Callable, **changes: object) -> calib.Problem:
     calib.register(
         calib.from_callable(
             f, conditions=["slip_ratio", "normal_load_kn"], output="drawbar_pull_kn", name="own",
-            batched=False, **({"parameters": PRIORS} | changes),  # type: ignore[arg-type]
+            **({"parameters": PRIORS, "batched": False} | changes),  # type: ignore[arg-type]
         )
     )  # fmt: skip
     return calib.build_problem("own", calib.table_from_arrays(lab(np.random.default_rng(1))))
@@ -139,18 +140,72 @@ def test_one_that_fails_now_and_then_or_in_several_ways_is_not_refused() -> None
     try_simulator(of_function(several))
 
 
+def scattered(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+    return pull(theta[None], x)[0] * (1.0 + 0.01 * np.random.default_rng().standard_normal())
+
+
+def scattered_at_once(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+    return pull(theta, x) * (1.0 + 0.01 * np.random.default_rng().standard_normal((len(theta), 1)))
+
+
+@pytest.mark.parametrize(("f", "batched"), [(scattered, False), (scattered_at_once, True)])
+def test_one_that_gives_other_values_the_second_time_is_refused(f: Callable, batched: bool) -> None:
+    problem = of_function(f, batched=batched)
+    with pytest.raises(CalibError, match="called twice with equal parameters") as caught:
+        calib.calibrate(problem, seed=1)
+    for word in ("simulator own: ", "% of the largest", "fix the seed", "deterministic = false"):
+        assert word in str(caught.value)
+
+
+def test_sums_in_another_order_are_equal_values() -> None:
+    calls = iter(range(100))
+
+    def rounded(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        return pull(theta[None], x)[0] * (1.0 + 1e-12 * (next(calls) % 2))
+
+    try_simulator(of_function(rounded))
+
+
+def test_a_simulator_that_hangs_is_spoken_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    spoken = threading.Event()
+
+    def warn(text: str, *of: object) -> None:
+        said.append(text % of)
+        spoken.set()
+
+    monkeypatch.setattr("calib.inference.trial._PATIENCE", 0.0)
+    monkeypatch.setattr("calib.inference.trial._log.warning", warn)
+
+    def hanging(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        assert spoken.wait(60.0)
+        return pull(theta[None], x)[0]
+
+    try_simulator(of_function(hanging))
+    assert len(said) == 1
+    assert "still trying the simulator own" in said[0]
+    assert "emulated" in said[0]
+
+
+too_small_at: list[np.ndarray] = []
+
+
 def too_small(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+    too_small_at.append(theta)
     return 0.001 * pull(theta[None], x)[0]
 
 
 @pytest.mark.parametrize("emulate", [True, False])
 def test_an_output_in_another_unit_is_named(emulate: bool) -> None:
     """By the factor of kN and N, wherever in the prior."""
+    too_small_at.clear()
     problem = of_function(too_small, emulate=emulate)
     with pytest.raises(CalibError, match="times the largest that was measured") as caught:
         (calib.emulated if emulate else calib.calibrate)(problem, seed=1)
     for word in ("simulator own: ", "in the unit of drawbar_pull_kn", "to mend: name the column"):
         assert word in str(caught.value)
+    # Before sixty runs of a slow one are paid for.
+    assert len(too_small_at) <= 7
 
 
 def test_a_prior_that_reaches_the_data_somewhere_is_no_other_unit() -> None:
