@@ -226,11 +226,11 @@ def missing_columns(
 
 def renamed(headers: Iterable[str], names: Iterable[str]) -> str:
     """Begin a way to mend with what headers may have been meant to be; empty if nothing."""
-    guesses = "; ".join(meant(headers, names, shortened=True))
+    guesses = "; ".join(columns_meant(headers, names, shortened=True))
     return f"{guesses} Rename it, or " if guesses else ""
 
 
-def meant(
+def columns_meant(
     headers: Iterable[str], names: Iterable[str], cutoff: float = 0.7, *, shortened: bool = False
 ) -> list[str]:
     """Ask of headers that name no quantity whether one of some was meant.

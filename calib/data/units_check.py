@@ -13,7 +13,7 @@ from pathlib import PurePath
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.headers import CHECKED, accepted_headers, meant
+from calib.data.headers import CHECKED, accepted_headers, columns_meant
 from calib.data.numbers import plain_number
 from calib.data.quantities import QUANTITIES, Quantity, columns_of
 from calib.data.table import Table
@@ -241,7 +241,7 @@ def _written(unit: str) -> str:
 
 def spelling_notes(table: Table) -> Iterator[str]:
     """Ask after columns that are not used, and are named nearly as one that the table lacks."""
-    for guess in meant(table.ignored, [n for n in QUANTITIES if n not in table], _ALIKE):
+    for guess in columns_meant(table.ignored, [n for n in QUANTITIES if n not in table], _ALIKE):
         yield f"{source_of(table)}: a column is not used: {guess}"
 
 

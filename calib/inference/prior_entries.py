@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import tomllib
 from collections.abc import Iterable, Mapping
 from typing import Annotated, Any, Literal
@@ -12,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from scipy.special import digamma, polygamma
 
 from calib.data.quantities import QUANTITIES
-from calib.errors import CalibError
+from calib.errors import CalibError, meant
 from calib.inference.noise import DEFAULT_PRIORS, Along, Family
 from calib.inference.priors import Prior
 
@@ -202,16 +201,8 @@ def no_such_key(key: object, known: Iterable[str], where: str) -> CalibError:
     """Return the refusal of a key that is not `known`."""
     return CalibError(
         f"there is no key {str(key)!r}", where=where, allowed=", ".join(known),
-        mend=f"{meant_by([str(key)], known)}correct it, or take it out",
+        mend=meant(str(key), known, "correct it, or take it out"),
     )  # fmt: skip
-
-
-def meant_by(found: Iterable[str], known: Iterable[str]) -> str:
-    """Say which names may have been meant."""
-    known = list(known)
-    pairs = ((name, difflib.get_close_matches(name, known, n=2, cutoff=0.5)) for name in found)
-    said = ", ".join(f"{' or '.join(near)} by {name}" for name, near in pairs if near)
-    return f"did you mean {said}? " if said else ""
 
 
 def explain(error: ValidationError, source: str) -> CalibError:
@@ -244,5 +235,5 @@ def _no_such_dist(entry: Mapping[str, Any], where: str) -> CalibError:
     found = "there is no dist" if dist is None else f"there is no distribution {dist!r}"
     return CalibError(
         found, where=where, allowed=", ".join(_DISTS),
-        mend=f"{meant_by([str(dist)], _DISTS)}choose one of these",
+        mend=meant(str(dist), _DISTS, "choose one of these"),
     )  # fmt: skip

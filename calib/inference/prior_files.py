@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from calib.batch.plugins import declared_in
-from calib.errors import CalibError
+from calib.errors import CalibError, meant
 from calib.inference.noise import USUAL, NoiseChoice
 from calib.inference.prior_entries import (
     NOISE_ENTRIES,
@@ -22,7 +22,6 @@ from calib.inference.prior_entries import (
     PriorFileContent,
     explain,
     likeliest,
-    meant_by,
     no_such_key,
     prior_of,
 )
@@ -268,11 +267,14 @@ def _check_names(
             for what, names in (("unknown parameter", unknown), ("missing parameter", missing))
             if names
         )
+        guesses = "".join(
+            f"{name}: {guess} " for name in unknown if (guess := meant(name, missing, ""))
+        )
         raise CalibError(
             found,
             where=f"{source}, [parameters]",
             allowed=", ".join(parameters),
-            mend=f"{meant_by(unknown, missing)}give exactly these parameters{_example(model_name)}",
+            mend=f"{guesses}give exactly these parameters{_example(model_name)}",
         )
 
 

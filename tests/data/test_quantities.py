@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from calib.data.headers import accepted_headers, match_headers, meant, parse_header
+from calib.data.headers import accepted_headers, columns_meant, match_headers, parse_header
 from calib.data.quantities import QUANTITIES, UNITS, Quantity, Range
 from calib.data.reader import table_from_arrays
 from calib.errors import CalibError
@@ -103,7 +103,7 @@ def test_a_table_that_lacks_a_column_suggests_the_misspelt_one() -> None:
 
 
 def test_of_several_quantities_the_nearest_is_suggested() -> None:
-    assert meant(["operator", "inflaton_presure_bar"], QUANTITIES) == [
+    assert columns_meant(["operator", "inflaton_presure_bar"], QUANTITIES) == [
         "'inflaton_presure_bar': did you mean inflation_pressure_bar?"
     ]
 
@@ -139,7 +139,7 @@ def test_all_missing_columns_are_told_at_once_each_with_its_guess() -> None:
 
 
 def test_the_last_words_of_a_name_are_no_misspelling() -> None:
-    assert meant(["Pull (lbf)"], ["drawbar_pull_kn"], 0.8) == []
+    assert columns_meant(["Pull (lbf)"], ["drawbar_pull_kn"], 0.8) == []
 
 
 @pytest.mark.parametrize("second", ["slip_ratio", "Slip_Percent"])

@@ -375,10 +375,10 @@ def test_a_prior_may_be_relative_to_any_column() -> None:
 @pytest.mark.parametrize(
     ("right", "wrong", "words"),
     [
-        ("sd_log", "sdlog", ["my.toml, parameters.x: ", "no key 'sdlog'", "mean sd_log by sdlog"]),
+        ("sd_log", "sdlog", ["my.toml, parameters.x: ", "no key 'sdlog'", "mean sd_log?"]),
         ("[parameters.x]", "[parameters.sigm]", ["[parameters]", "sigm; missing parameter x"]),
-        ("[parameters.x]", "[parameters.xx]", ["unknown parameter xx", "mean x by xx"]),
-        ('model = "m"', 'modle = "m"', ["my.toml: ", "no key 'modle'", "mean model by modle"]),
+        ("[parameters.x]", "[parameters.xx]", ["unknown parameter xx", "xx: did you mean x?"]),
+        ('model = "m"', 'modle = "m"', ["my.toml: ", "no key 'modle'", "mean model?"]),
     ],
 )
 def test_a_misspelt_key_is_named_with_the_nearest_ones(
@@ -393,7 +393,7 @@ def test_a_misspelt_key_is_named_with_the_nearest_ones(
 
 
 def test_a_misspelt_key_of_the_likelihood_is_named() -> None:
-    with pytest.raises(CalibError, match="did you mean family by famly") as refused:
+    with pytest.raises(CalibError, match="did you mean family\\?") as refused:
         parse_priors('model = "m"\n[likelihood]\nfamly = 1\n', "my.toml", "m", ("sigma",), {})
     assert refused.value.where == "my.toml, [likelihood]"
 
