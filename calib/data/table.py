@@ -8,7 +8,7 @@ from functools import cached_property
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from calib.data.headers import CHECKED, Column, missing_columns, parse_header, renamed
 from calib.data.quantities import QUANTITIES
@@ -110,6 +110,22 @@ class Table:
         """
         sure = {name for name, column in self._headers.items() if column.checked}
         return {f"{n} {CHECKED}" if n in sure else n: v for n, v in columns.items()}
+
+    def as_in_file(self, columns: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
+        """Return columns of this table, by canonical name, with its file's headers and units.
+
+        Values that are converted have fifteen digits, which hides what rounding has done to them.
+        """
+        found: dict[str, ArrayLike] = {}
+        for name, values in columns.items():
+            column = self._headers.get(name)
+            if column is None:
+                found[name] = values
+            elif column.unit == column.quantity.unit:
+                found[column.header] = values
+            else:
+                found[column.header] = [float(f"{v:.15g}") for v in column.written(values)]
+        return found
 
     def must_have(self, *names: str) -> None:
         """Raise a CalibError unless there are columns of these canonical names."""

@@ -97,7 +97,7 @@ def save_corrected(corrected: Corrected, folder: Path) -> None:
     lines = []
     for key, (name, table) in zip(("calibration", "field", "predict"), tables.items(), strict=True):
         if table is not None:
-            written = table.to_write(cells(table.columns, case.covariates))
+            written = table.as_in_file(cells(table.columns, case.covariates))
             write_table(inner / f"{name}.csv", written)
             lines.append(f'{key} = "{name}.csv"')
     lines += ["", "[models]", *(f'{output} = "{model}"' for output, model in case.models.items())]

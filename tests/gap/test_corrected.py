@@ -433,3 +433,23 @@ def test_what_is_left_out_must_be_a_cause(saved, tmp_path):
     assert mended.exit_code == 0
     assert "what is predicted is the reading" not in mended.stderr
     assert mended.stdout != told.stdout
+
+
+def test_the_case_that_is_kept_has_the_headers_and_units_of_the_files(made, tmp_path):
+    """A diagnosis made again from it shows its numbers as the first did."""
+    own = {"drawbar_pull_kn": "Drawbar pull [lbf] (checked)", "slip_ratio": "Slip (%)"}
+    case = make_case("force_offset")
+    tables = {
+        part: replace(table, header=tuple(own.get(n, n) for n in table), text=())
+        for part, table in (("lab", case.lab), ("field", case.field))
+    }
+    data = campaigns(replace(case, **tables))
+    fit = fit_of(data, Hypothesis("none"), made.lab_mode)
+    save_corrected(Corrected(Mixture(data, (fit,), (1.0,), 1), made.lab_mode), tmp_path)
+    again = read_case(tmp_path / "case")
+    for was, now in ((tables["lab"], again.lab), (tables["field"], again.field)):
+        assert now.header == was.header
+        assert now.column("drawbar_pull_kn").checked
+        for column in was:
+            np.testing.assert_allclose(now[column], was[column], rtol=1e-12)
+    load_corrected(tmp_path)
