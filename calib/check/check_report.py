@@ -122,6 +122,10 @@ def _compared(
         kept.append((folder / FOLDER / HELD_OUT, held))
     own = record.seed == manifest.seed and all(_of_rows(path, table) for path, table in kept)
     items.append(_agrees(own, f"{FOLDER}/comparison.json", "of the report's own rows and seed"))
+    # By them values are shown in the units of the file.
+    named = {OUTPUTS[key]: said.data.header for key, said in manifest.tasks.items()}
+    items.append(_agrees(record.header == named.get(output), f"{FOLDER}/comparison.json: header",
+                         "the column names of the report's own file"))  # fmt: skip
     return items
 
 

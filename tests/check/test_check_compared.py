@@ -77,12 +77,19 @@ def change_rows(folder: Path) -> None:
     path.write_text("\n".join(path.read_text().splitlines()[:-1]) + "\n")
 
 
+def change_header(folder: Path) -> None:
+    header = [*read_table(folder / "compared/held_out.csv").header]
+    header[header.index("rut_depth_mm")] = "rut_depth_in"
+    edit_json(folder / "compared/comparison.json", lambda m: m.update(header=header))
+
+
 @pytest.mark.parametrize(
     ("change", "named"),
     [
         (change_manifest, "manifest.json: comparison"),
         (change_seed, "compared/comparison.json"),
         (change_rows, "compared/comparison.json"),
+        (change_header, "compared/comparison.json: header"),
     ],
 )
 def test_what_does_not_belong_together_is_found(
