@@ -102,8 +102,9 @@ def diagnose(
             f"{unit} rms, shrink {100 * s.fraction:.0f} % (90 % interval {100 * low:.0f} to "
             f"{100 * high:.0f} %), noise sd {format_number(s.noise_floor)} {unit}"
         )
-    if "Not tested" in dict(judged.facts):
-        print(f"not tested: {dict(judged.facts)['Not tested']}")
+    for label, said in judged.facts:
+        if label in ("Not tested", "Assumed"):
+            print(f"{label.lower()}: {said}")
     print(out / "index.html")
     finish(
         0 if all(told) else 3, out / "diagnosis.json", folder=str(out),

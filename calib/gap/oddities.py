@@ -88,10 +88,17 @@ def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, 
             "swapped?"
         )
     extra = [n for n in field if n not in lab and n not in OUTPUTS.values()]
-    if extra:
+    passes = [n for n in extra if n in columns_of("passes")]
+    if passes:
         said.append(
-            f"the calibration has no {', '.join(extra)}: its effects are taken about the field's "
-            "median, and a constant difference from the calibration cannot be seen"
+            f"the calibration has no {passes[0]}: fresh soil, pass 1, is assumed for it; if it was "
+            "another, another cause may be named for the difference: add the column"
+        )
+    if others := [n for n in extra if n not in passes]:
+        said.append(
+            f"the calibration has no {', '.join(others)}: what depends on it shows in how field "
+            "rows differ from one another alone; what it does to all of them alike is put down to "
+            "other causes"
         )
     for output in models:
         missing = int(np.isnan(field[OUTPUTS[output]]).sum()) if OUTPUTS[output] in field else 0

@@ -8,9 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from calib.data.quantities import role_of
+from calib.gap.assumed import assumed
 from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import EFFECTS
+from calib.gap.fit import Fit
 from calib.gap.inclusion import UNLISTED, Included
 from calib.gap.next_measurement import NextMeasurement
 from calib.gap.shrink import Shrink
@@ -82,6 +84,7 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         remainder=_cause(found, UNLISTED, found.inclusion.remainder),
         remainder_where=_remainder_where(found),
         untested=_untested(found),
+        assumed=_assumed(found, ranking.best(best)),
         put_in="; ".join(case_context.words()),
         without=_without(found),
     )
@@ -113,9 +116,12 @@ def _untested(found: Diagnosis) -> list[str]:
         lacking = [c for r in effect.covariates if r != "order" and (c := view.column(r))]
         lacking = [c for c in lacking if c not in view.lab]
         if lacking and name not in acting and fits_in(effect.outputs):
+            fit = next(f for f in fits if effect in f.forward.hypothesis.effects)
+            taken = joined(_assumed(found, fit)) if assumed(fit) else ""
             said.append(
-                f"{short_name(name)} in part (the calibration has no {', '.join(lacking)}, so that "
-                "a constant difference from it cannot be seen)"
+                f"{short_name(name)} in part (the calibration has no {', '.join(lacking)}, "
+                f"{taken and f'for which {taken} was assumed, '}so that a constant difference from "
+                "it cannot be seen)"
             )
     return said
 
@@ -217,13 +223,22 @@ def conditions_text(found: Diagnosis, measurement: NextMeasurement) -> str:
         follows = role == "ground_pressure" and "pressure" in measured
         if np.ptp(both) == 0.0 or follows or role == "order" or role not in matters:
             continue
-        axis = axis_of(column)
-        shown = words_of(found.data.case.covariates, column, value, value)
-        shown = shown or condition_text(column, axis.factor * value)
-        parts.append(f"{axis.name.lower()} {shown}{unit_after(axis)}")
+        parts.append(_condition(found, column, value))
     if "order" in matters & measured:
         parts.append("after the last run")
     return ", ".join(parts) or "the conditions of the field campaign"
+
+
+def _assumed(found: Diagnosis, fit: Fit) -> list[str]:
+    return [_condition(found, column, value) for column, value in assumed(fit).items()]
+
+
+def _condition(found: Diagnosis, column: str, value: float) -> str:
+    """Write a condition, in canonical units, with its name."""
+    axis = axis_of(column)
+    shown = words_of(found.data.case.covariates, column, value, value)
+    shown = shown or condition_text(column, axis.factor * value)
+    return f"{axis.name.lower()} {shown}{unit_after(axis)}"
 
 
 def _matter(found: Diagnosis, names: Sequence[str]) -> set[str]:

@@ -122,6 +122,9 @@ class GapEvidence:
         Where that lies.
     untested : sequence of str
         Listed effects on the outputs of the named causes that a column is missing for, with which.
+    assumed : sequence of str
+        What was taken for conditions of the calibration that it does not record, on which the best
+        hypothesis rests.
     put_in, without : str
         What was put into the diagnosis besides the data, and what it finds without that.
     """
@@ -140,6 +143,7 @@ class GapEvidence:
     remainder: CauseFact | None = None
     remainder_where: str = ""
     untested: Sequence[str] = ()
+    assumed: Sequence[str] = ()
     put_in: str = ""
     without: str = ""
 
@@ -254,6 +258,11 @@ def _facts(e: GapEvidence) -> list[tuple[str, str]]:
         facts.append(
             ("Not tested", f"{'; '.join(e.untested)}. If {one} trace is put down to what is named")
         )
+    if e.assumed:
+        facts.append(
+            ("Assumed", f"{joined(list(e.assumed))}, which the calibration does not record. If it "
+             "was otherwise, sizes are wrong, and a second cause may be named for the difference")
+        )  # fmt: skip
     if e.sizes:
         facts.append(("How large", f"{'; '.join(e.sizes)}"))
     facts += [("Where", _where(e)), ("How far", _how_far(e)), *_next(e)]

@@ -286,8 +286,15 @@ def test_a_state_that_one_table_lacks_was_not_swapped():
     assert "swapped" not in said(without)
     bare = replace(case, lab=table_without(case.lab, "speed_m_s"))
     assert "swapped" not in said(bare)
-    assert "the calibration has no speed_m_s: its effects are taken about" in said(bare)
+    assert "the calibration has no speed_m_s: what depends on it shows in how field" in said(bare)
     assert "the calibration has no" not in said(without)
+
+
+def test_where_the_passes_of_the_calibration_are_not_recorded_it_is_said_what_is_assumed():
+    case = make_case(None)
+    told = said(replace(case, lab=table_without(case.lab, "pass_number")))
+    assert "the calibration has no pass_number: fresh soil, pass 1, is assumed" in told
+    assert "what depends on it" not in told
 
 
 def test_an_output_that_the_calibration_lacks_is_no_condition():

@@ -536,6 +536,15 @@ def test_effects_that_a_missing_column_hides_are_named_beside_the_cause(found):
     assert told.endswith("If any acts, its trace is put down to what is named")
 
 
+def test_what_is_assumed_of_the_calibration_stands_beside_the_cause(found):
+    e = replace(gap_evidence(found), verdict="effect", assumed=["pass 1"])
+    told = dict(judge_gap(e).facts)["Assumed"]
+    assert told.startswith("Pass 1, which the calibration does not record. If it was otherwise")
+    assert "Assumed" not in dict(judge_gap(replace(e, assumed=())).facts)
+    # As its hypotheses have it, whose own campaigns are asked.
+    assert not gap_evidence(found).assumed
+
+
 def test_conditions_that_neither_hypothesis_depends_on_are_not_asked_for(found):
     conditions = {
         "slip_ratio": 0.651, "normal_load_kn": 5.0, "inflation_pressure_psi": 42.0,
