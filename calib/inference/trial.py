@@ -34,8 +34,9 @@ _FAR = 30.0
 def try_simulator(problem: Problem) -> None:
     """Try the simulator that a problem asks for each parameter vector, if it does.
 
-    At the middle of the prior and at five points spread over it, twice at the first of them that
-    has a value; once for each process.
+    At the middle of the prior and at five points spread over it, and twice more at the first of
+    them that has a value; once for each process. Of another model's function only whether it gives
+    the same again is tried, at the middle.
 
     Raises
     ------
@@ -50,7 +51,10 @@ def try_simulator(problem: Problem) -> None:
     from calib.models.simulators.refused import FIRST
     from calib.models.simulators.registered import Direct
 
-    if not isinstance(direct, Direct) or direct.simulator.emulate or direct.tally.tried:
+    if not isinstance(direct, Direct):
+        _check_repeats(problem, prior_middle(problem), f"model {problem.bound.model.name}")
+        return
+    if direct.simulator.emulate or direct.tally.tried:
         return
     spread = prior_design(problem, FIRST, _SEED)
     thetas = np.concatenate([prior_middle(problem), spread])
@@ -59,8 +63,7 @@ def try_simulator(problem: Problem) -> None:
         outputs = problem.bound.predict(thetas, problem.conditions)
     check_scale(problem, outputs, direct.simulator)
     for i in np.flatnonzero(np.isfinite(outputs).all(axis=1))[:1]:
-        again = problem.bound.predict(thetas[i : i + 1], problem.conditions)[0]
-        _check_repeats(outputs[i], again, direct.simulator)
+        _check_repeats(problem, thetas[i : i + 1], direct.simulator.place())
     direct.tally.tried = True
 
 
@@ -81,26 +84,28 @@ def _told_if_long(simulator: Simulator) -> Iterator[None]:
         timer.cancel()
 
 
-def _check_repeats(outputs: Array, again: Array, simulator: Simulator) -> None:
-    """Check that equal parameters have given equal outputs, (n,).
+def _check_repeats(problem: Problem, theta: Array, where: str) -> None:
+    """Check that equal parameters (1, d) give equal outputs.
 
     Raises
     ------
     CalibError
         If not: a sampler that meets other values where it has been does not converge.
     """
-    apart = np.abs(again - outputs) / max(np.abs(outputs).max(), 1e-300)
+    with np.errstate(all="ignore"):
+        first, again = (problem.bound.predict(theta, problem.conditions) for _ in range(2))
+    apart = np.abs(again - first) / max(np.abs(first).max(), 1e-300)
     # No value the second time is a failure, and counted as such.
     if not (apart > _SAME).any():
         return
     raise CalibError(
         "called twice with equal parameters and conditions it gives other outputs (apart by "
         f"{plain_number(100.0 * float(np.nanmax(apart)), 2)} % of the largest)",
-        where=simulator.place(),
-        allowed="equal output for equal input where emulate = false: no sampler converges on a "
+        where=where,
+        allowed="equal output for equal input, unless it is emulated: no sampler converges on a "
         "posterior that changes under it",
-        mend="fix the seed of its random numbers; or, if the scatter is what it is to have, have "
-        "it emulated with deterministic = false, which allows for it",
+        mend="fix the seed of its random numbers; or, if a simulator is to scatter, have it "
+        "emulated with deterministic = false, which allows for it",
     )
 
 

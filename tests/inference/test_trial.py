@@ -157,6 +157,20 @@ def test_one_that_gives_other_values_the_second_time_is_refused(f: Callable, bat
         assert word in str(caught.value)
 
 
+def test_a_model_of_ones_own_that_gives_other_values_the_second_time_is_refused() -> None:
+    calib.register(
+        calib.Model(
+            name="scattered", title="Scattered", output="drawbar_pull_kn",
+            conditions=("slip_ratio", "normal_load_kn"), parameters=("mu", "s0"),
+            predict=scattered_at_once, priors=f'model = "scattered"\n{PRIORS}',
+        )
+    )  # fmt: skip
+    data = calib.table_from_arrays(lab(np.random.default_rng(1)))
+    with pytest.raises(CalibError, match="model scattered: called twice with equal") as caught:
+        calib.calibrate(calib.build_problem("scattered", data), seed=1)
+    assert "fix the seed" in str(caught.value)
+
+
 def test_sums_in_another_order_are_equal_values() -> None:
     calls = iter(range(100))
 
