@@ -114,7 +114,7 @@ class Table:
     def as_in_file(self, columns: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
         """Return columns of this table, by canonical name, with its file's headers and units.
 
-        Values that are converted have fifteen digits, which hides what rounding has done to them.
+        Read again they are the same values, wherever a number in the file's unit gives them.
         """
         found: dict[str, ArrayLike] = {}
         for name, values in columns.items():
@@ -124,7 +124,7 @@ class Table:
             elif column.unit == column.quantity.unit:
                 found[column.header] = values
             else:
-                found[column.header] = [float(f"{v:.15g}") for v in column.written(values)]
+                found[column.header] = _written_exactly(column, np.asarray(values))
         return found
 
     def must_have(self, *names: str) -> None:
@@ -141,6 +141,15 @@ class Table:
             lines=self.lines[index],
             text=tuple(self.text[i] for i in index) if self.text else (),
         )
+
+
+def _written_exactly(column: Column, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return values in a column's unit with the fewest digits that give them back."""
+    written = column.written(values)
+    for digits in (17, 16, 15):
+        shorter = np.array([float(f"{v:.{digits}g}") for v in written])
+        written = np.where(column.to_canonical(shorter) == values, shorter, written)
+    return written
 
 
 def hold_out(

@@ -537,3 +537,12 @@ def test_every_case_is_read() -> None:
         table = read_table(path)
         assert table.ignored == ()
         assert len(table) > 0
+
+
+def test_columns_are_written_in_the_units_of_their_file(my_csv: Write, tmp_path: Path) -> None:
+    text = "Slip (%),Drawbar pull [lbf],rut_depth_mm\n0.7,2851.464474674471,12.5\n5.3,12,\n"
+    table = read_table(my_csv(text), allow_missing=("rut_depth_mm",))
+    write_table(tmp_path / "again.csv", table.as_in_file(table.columns))
+    assert (tmp_path / "again.csv").read_text() == (
+        "Slip (%),Drawbar pull [lbf],rut_depth_mm\n0.7,2851.464474674471,12.5\n5.3,12.0,\n"
+    )
