@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 
 def say(model: str, emulation: Emulation | None) -> bool:
     """Say what became of an emulation; return whether it is good enough (or was not needed)."""
+    if emulation is None:
+        return True
     from calib.data.numbers import plain_number
     from calib.report.sections import coverage_words
 
-    if emulation is None:
-        return True
     h = emulation.held_out
     seen = "" if h is None else (
         f"; on {h.runs} runs not seen it is off by {h.rmse:.3f} noise sds (rms); of their values "
