@@ -86,6 +86,11 @@ def prepare_case(
 
     from calib.batch.plugins import load_files
     from calib.data.quantities import OUTPUTS
+    from calib.models.simulators.registered import simulated_by
+
+    if run is None and not any(map(simulated_by, case.models.values())):
+        return []
+    # Of which most cases have no need.
     from calib.inference.emulation.prepared import prepare, prepare_field, reaches
 
     said = []
