@@ -16,12 +16,12 @@ class _Asked(View):
 
     defaults: dict[str, float] = field(default_factory=dict)
 
-    def lab_of(self, role: str, otherwise: float) -> float:
+    def lab_of(self, role: str, otherwise: float | None = None) -> float:
         """Return the median in the calibration data, and note where there is none."""
-        column = self.column(role) or role
+        column, value = self.column(role) or role, super().lab_of(role, otherwise)
         if column not in self.lab:
-            self.defaults[column] = otherwise
-        return super().lab_of(role, otherwise)
+            self.defaults[column] = value
+        return value
 
 
 def assumed(fit: Fit) -> dict[str, float]:

@@ -70,9 +70,9 @@ class View:
     def with_base(self, base: Mapping[str, Array]) -> View:
         """Return the same campaign with other predictions."""
         # Fits do this a thousand times: `dataclasses.replace` takes five times as long.
-        return View(
-            self.conditions, self.lab, self.load_kn, self.ground_exponent, self.order_range, base
-        )
+        other = object.__new__(type(self))
+        vars(other).update(vars(self), base=base)
+        return other
 
     def slip(self) -> Array:
         """Recorded slip (fraction), zero where it is not recorded, shape (n,)."""
