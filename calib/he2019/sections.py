@@ -89,6 +89,6 @@ class FoundAudit:
     def begin(
         self, folder: Path, *, versions: Mapping[str, str], pdf: bool, pool: Pool
     ) -> Callable[[Progress], Written]:
-        """Write the files and the piece of the page."""
-        html = write_audit(self.audit, folder)
-        return lambda tell: Written("audit", "Audit of the published tables", "", html)
+        """Ask for the files and the piece of the page."""
+        piece = pool.submit(write_audit, self.audit, folder)
+        return lambda tell: Written("audit", "Audit of the published tables", "", piece.result())
