@@ -251,8 +251,8 @@ def work_out(
         tasks, seed, pool, settings=settings, progress=progress,
         workers=workers if pool.here else 1,
     )  # fmt: skip
-    begun = [section.begin(seed, pool) for section in sections]
+    begun = [section.begin(seed, pool) for section in reversed(sections)]
     studied = study(tell)
-    # What was asked for last comes last; what its section has to do here is done meanwhile.
-    found = [finish(studied, tell) for finish in reversed(begun)]
+    # What a section has to do here is done while the pieces of those before it are worked out.
+    found = [finish(studied, tell) for finish in begun]
     return Contents(studied, tuple(reversed(found)))
