@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.gap.case import Campaigns
-from calib.gap.forward import Forward, departed_of_all
+from calib.gap.departed import departed_of_all
+from calib.gap.forward import Forward
 from calib.gap.noise import Noise, most_probable
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array

@@ -255,7 +255,7 @@ def test_a_form_error_is_of_the_functions_it_is_named_for(data, effect, beyond):
         reference, own = (np.log(v.conditions["pass_number"]) for v in (data.view, view))
         middle = (reference.max() + reference.min()) / 2.0
         written += [np.clip((own - middle) / (np.ptp(reference) / 2.0), -1.5, 1.5)]
-    (basis,) = forward._form(view)
+    (basis,) = forward.form(view)
     np.testing.assert_allclose(basis, np.stack(written, axis=1), atol=1e-12)
 
 
@@ -356,7 +356,7 @@ def test_of_density_a_simulator_is_inadequate_and_gauges_errors_have_forms():
         assert forms == [(0.0, 0.2), (0.0, 0.15), (0.0, 0.1)]
     # What the form errors multiply: one, cone index and water content on a scale of -1..1.
     over = [forward.covariates.over(density.view, what) for what in ("cone", "water")]
-    for basis in forward._form(density.view):
+    for basis in forward.form(density.view):
         np.testing.assert_array_equal(basis, np.stack([np.ones(36), *over], axis=1))
 
 
@@ -438,7 +438,7 @@ def test_form_errors_scale_what_each_effect_adds_to_those_before_it(data):
         p.to_natural(psi[:, part])
         for p, part in zip(h.effect_priors, forward.phi_slices, strict=True)
     ]
-    basis = forward._form(data.view)
+    basis = forward.form(data.view)
     for o in data.outputs:
         bound, role = o.problem.bound, o.role
         factor = [
@@ -490,7 +490,7 @@ class Along(Effect):
 def test_along_its_own_covariate_it_is_on_the_fields_scale(data, values, basis):
     h = Hypothesis("along", (Along(values),), (Priors(()),))
     forward = Forward(data, h, SIGMA)
-    (found,) = forward._form(data.view)
+    (found,) = forward.form(data.view)
     part = forward.form_slices["drawbar_pull"][0]
     if basis is None:
         assert found.shape == (27, 0)
@@ -510,7 +510,7 @@ def test_beyond_the_field_the_form_of_an_effect_ends(data):
     middle, half = 0.5 * (slip.max() + slip.min()), 0.5 * np.ptp(slip)
     u = np.array([-9.0, -1.6, -1.4, -1.0, 0.5, 1.4, 1.6, 9.0])
     elsewhere = data.at_conditions({"slip_ratio": middle + half * u})
-    (found,) = Forward(data, h, SIGMA)._form(elsewhere)
+    (found,) = Forward(data, h, SIGMA).form(elsewhere)
     np.testing.assert_allclose(found[:, 0], [-1.5, -1.5, -1.4, -1.0, 0.5, 1.4, 1.5, 1.5])
 
 
