@@ -22,7 +22,7 @@ from calib.gap.declared import cells, with_declared
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import dependences, effect_priors
+from calib.gap.hypotheses import effect_priors, with_own
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
@@ -213,7 +213,7 @@ def _load_fit(
     effects: Mapping[str, Effect],
     lab_mode: Mapping[str, Array],
 ) -> Fit:
-    effects = {**effects, **dependences(data)}
+    effects = with_own(data, effects)
     unknown = [name for name in document["effects"] if name not in effects]
     if unknown:
         raise CalibError(

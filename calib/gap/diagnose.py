@@ -17,7 +17,7 @@ from calib.gap.corrected import Corrected, conditions_outside
 from calib.gap.declared import new_values
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.effects.check import check_effects
-from calib.gap.hypotheses import dependences, inseparable
+from calib.gap.hypotheses import inseparable, with_own
 from calib.gap.inclusion import UNLISTED, Inclusion, inclusion, inclusion_probability
 from calib.gap.isolate import Isolability
 from calib.gap.mixture import Truth, mixture
@@ -158,7 +158,7 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
     causes = inclusion(mixed, ranking)
     said += [
         *_beyond(corrected, before),
-        *_confounded(data, causes, {**effects, **dependences(data)}),
+        *_confounded(data, causes, with_own(data, effects)),
     ]
     return Diagnosis(
         data,

@@ -8,12 +8,13 @@ from typing import Literal
 
 import numpy as np
 
-from calib.data.quantities import QUANTITIES, role_of
+from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
 from calib.gap.case import Campaigns
 from calib.gap.covariates import columns_over, other_conditions
 from calib.gap.discrepancy import SETTINGS
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.dependence import DependsOn, DiffersBy
+from calib.gap.effects.readings import ReadingDrift, ReadingStep
 from calib.gap.hypothesis import Hypothesis, OnsetOver, SmoothOver
 from calib.gap.shifts import ShiftAs
 from calib.inference.prior_files import (
@@ -74,6 +75,9 @@ WIDE, WIDER, WIDER_LOG = 0.1, 4.0, 2.0
 # How probable it is, beside that of a listed effect, that an output depends on a condition for
 # which an effect is listed in another way than that effect says.
 COVERED = 0.02
+# The same of a reading other than the drawbar cell's that drifts or jumps over the runs: what is
+# gauged by hand does so more seldom. (As probable as an unlisted onset, whose place they take.)
+SELDOM = 0.2
 # Conditions that listed effects are about, and those effects.
 _COVERED_BY = {
     "speed": "rate_effect", "passes": "multipass_compaction", "water": "moisture_softening",
@@ -90,9 +94,10 @@ type _Over = Literal["slip", "level", "sinkage", "order"]
 type _Touched = tuple[str, ...]
 
 # One output that changes beyond some slip or run is what listed effects are: post-peak softening,
-# slip sinkage, rebound and drift may set in anywhere. Nobody could tell the unlisted from them.
+# slip sinkage, rebound, and drifts and steps of any reading may set in anywhere. Nobody could tell
+# the unlisted from them.
 _LISTED_ONSETS: tuple[tuple[_Over, str], ...] = (
-    ("slip", "pull"), ("slip", "sinkage"), ("order", "pull"),
+    ("slip", "pull"), ("slip", "sinkage"),
 )  # fmt: skip
 
 
@@ -149,6 +154,40 @@ def dependences(data: Campaigns) -> dict[str, Effect]:
             effect = DependsOn(quantity.physical, quantity.stem, logs, 0.5 * float(np.ptp(both)))
             found.setdefault(effect.name, effect)
     return found | _declared(data)
+
+
+def readings(data: Campaigns) -> dict[str, Effect]:
+    """Return what the reading of each output but the drawbar pull may do over the runs, by name.
+
+    Parameters
+    ----------
+    data : Campaigns
+    """
+    found: dict[str, Effect] = {}
+    if not _varies(data, "order"):
+        return found
+    for o in data.outputs:
+        if o.role == "pull":
+            continue
+        log = o.problem.bound.model.response == "log"
+        typical = 1.0 if log else float(np.median(np.abs(o.problem.response)))
+        unit = "1" if log else QUANTITIES[OUTPUTS[o.name]].unit
+        for effect in (kind(o.role, o.name, unit, typical) for kind in (ReadingDrift, ReadingStep)):
+            found[effect.name] = effect
+    return found
+
+
+def with_own(data: Campaigns, effects: Mapping[str, Effect]) -> dict[str, Effect]:
+    """Return effects, and those that a case brings with it: dependences, and its readings'."""
+    own = {**dependences(data), **readings(data)}
+    return {**effects, **{name: effect for name, effect in own.items() if name not in effects}}
+
+
+def aside(effect: Effect, listed: Collection[str]) -> float | None:
+    """How probable an effect is beside a listed one that is tried in sets; None if it is such."""
+    if covered(effect, listed):
+        return COVERED
+    return SELDOM if isinstance(effect, ReadingDrift | ReadingStep) else None
 
 
 def _declared(data: Campaigns) -> dict[str, Effect]:
@@ -221,6 +260,7 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
     ]
     probes: tuple[OnsetOver, ...] = ("water", "cone") if density else ()
     listed = [(over, data.with_role(role)) for over, role in _LISTED_ONSETS]
+    listed += [("order", t) for t in each]
     setting_in: list[tuple[OnsetOver, _Touched]] = [
         *(choice for choice in choices if choice not in listed),
         *((over, density) for over in probes if _varies(data, over)),

@@ -12,16 +12,16 @@ from calib.errors import CalibError
 from calib.gap.case import Campaigns, OutputData
 from calib.gap.context import Context
 from calib.gap.effects import EFFECTS, Effect
+from calib.gap.effects.readings import ReadingDrift, ReadingStep
 from calib.gap.fit import Fit
 from calib.gap.guesses import Guesses
 from calib.gap.hypotheses import (
-    COVERED,
-    covered,
-    dependences,
+    aside,
     shifts,
     singles,
     split_testable,
     wider,
+    with_own,
 )
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.isolate import Isolability, isolability
@@ -29,6 +29,7 @@ from calib.gap.noise import Noise
 from calib.gap.odds import Odds, probabilities, with_prior
 from calib.gap.refine import PLENTY, refine
 from calib.gap.relevance import relevance
+from calib.gap.runs import follows_runs
 from calib.gap.sets import IN_PLAY, far_out, sets_and_unlisted
 from calib.inference.defined import check_defined
 from calib.inference.random import generator
@@ -123,15 +124,16 @@ def rank(
     plenty : int, optional
         Effective draws of a posterior, and draws for its relevance, that are enough.
     """
-    able, unable = split_testable(data, {**effects, **dependences(data)})
+    able, unable = split_testable(data, with_own(data, effects))
     lab_mode, noise = lab or calibrate_lab(data, seed)
     single = singles(data, able)
-    beside = {h.name for h in single if covered(h.effects[0], able)}
+    shares = {h.name: aside(h.effects[0], able) for h in single}
+    beside = {name for name, share in shares.items() if share is not None}
     listed = [h for h in single if h.name not in beside]
     design = design or isolability(data, listed, lab_mode, noise, seed)
     single = [h for h in single if h.name not in design.idle]
     unable |= dict.fromkeys(design.idle, _IDLE)
-    single = [replace(h, share=COVERED) if h.name in beside else h for h in single]
+    single = [replace(h, share=shares[h.name] or 1.0) for h in single]
     context = data.case.context
     _check_names(context, {*able, *unable})
     single = [context.sized(h) for h in single if h.name not in context.excluded]
@@ -139,7 +141,14 @@ def rank(
     beside -= set(context.excluded)
     odds = Odds.of(len(single) - len(beside), context)
     guesses = Guesses(data, lab_mode, noise, seed, odds)
-    fits = guesses.fit([Hypothesis("none"), *shifts(data), *single])
+    asked = [h for h in single if not isinstance(h.effects[0], ReadingDrift | ReadingStep)]
+    fits = guesses.fit([Hypothesis("none"), *shifts(data), *asked])
+    following = follows_runs(data, fits["none"][0])
+    readings = [h for h in single if h not in asked]
+    single = asked + [
+        h for h in readings if h.name in context.names or following & set(h.effects[0].outputs)
+    ]
+    fits |= guesses.fit(single[len(asked) :])
     far = [h for h in single if far_out(fits[h.name][0], 0, h.effect_priors[0])]
     for name, more in guesses.fit([wider(h) for h in far]).items():
         fits[name] += more

@@ -33,7 +33,6 @@ _N_DRAWS = 400
 _SMALL = 0.3
 # The part of the rows at an end of a condition that stands for the end.
 _END = 0.2
-_READINGS = ("force_offset", "sensor_drift")
 
 
 @dataclass(frozen=True)
@@ -81,6 +80,8 @@ def where_to_look(found: Diagnosis) -> str:
         vary = "one condition at a time, the others held"
     elif (h.onset_over or h.smooth_over) == "before":
         vary = "in another order, and a condition several times in a row"
+    elif (h.onset_over or h.smooth_over) == "order":
+        vary = "of one condition every few runs, and the first runs once more at the end"
     elif h.onset_over is not None:
         vary = f"in small steps about {_threshold(found, fit)}, the other conditions held"
     elif h.smooth_over == "ripple":
@@ -232,21 +233,30 @@ def _instrument_sentences(found: Diagnosis, effect: Effect, phi: Array) -> list[
 
 
 def _step_sentence(found: Diagnosis, fit: Fit, psi: Array) -> str:
-    """Say by how much the reading jumps, and after which run."""
+    """Say by how much the reading jumps, and after which run or between which."""
     (effect,), (priors,) = fit.forward.hypothesis.effects, fit.forward.hypothesis.effect_priors
     natural = priors.to_natural(psi[:, fit.forward.phi_slices[0]])
-    before, after, at = (
-        natural[:, effect.parameters.index(p)] for p in ("before", "after", "change_point")
+    before, after, at, lasts = (
+        natural[:, effect.parameters.index(p)]
+        for p in ("before", "after", "change_point", "duration")
     )
-    (output,) = found.data.with_role("pull")
-    axis = output_axis(found, output)
-    jump = axis.factor * (after - before)
+    (o,) = (o for o in found.data.outputs if o.role in effect.outputs)
+    axis, word = output_axis(found, o.name), output_word(o.name)
+    jump, unit = axis.factor * (after - before), axis.unit
+    if o.problem.bound.model.response == "log":
+        jump, unit = 100.0 * np.expm1(after - before), "%"
     first, last = found.data.view.order_range
-    run = first + float(np.median(at)) * (last - first)
-    way = "higher" if jump.mean() > 0.0 else "lower"
+    way = _way(o.name, bool(jump.mean() > 0.0))
     amount = format_value(abs(float(jump.mean())), float(jump.std()))
-    word = output_word(output)
-    return f"{word} reads {amount} {axis.unit} {way} after run {np.floor(run):.0f} than before"
+    run, half = (
+        first + float(np.median(at)) * (last - first),
+        0.5 * (float(np.median(lasts)) * (last - first) + 1.0),
+    )
+    when = f"after run {np.floor(run):.0f} than before"
+    if half > 1.0:  # not from one run to the next
+        low, high = max(np.floor(run - half), first), min(np.ceil(run + half), last)
+        when = f"after run {high:.0f} than up to run {low:.0f}, and changes in between"
+    return f"{word} reads {amount} {unit} {way} {when}"
 
 
 def _end_sentences(
@@ -271,7 +281,7 @@ def _end_sentences(
             continue
         unit = output_axis(found, output).unit
         amount = f"{format_value(abs(centre), sd)} {unit}"
-        if effect.name in _READINGS:
+        if effect.instrument and type(effect).on_output is not Effect.on_output:
             text = f"{output_word(output)} reads {amount} {'high' if centre > 0.0 else 'low'}"
         else:
             way = _way(output, centre > 0.0)

@@ -16,6 +16,7 @@ import pytest
 from calib.data.quantities import role_of
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.effects.dependence import DependsOn, DiffersBy
+from calib.gap.effects.readings import ReadingDrift, ReadingStep
 from calib.inference.prior_files import DeclaredPriors, read_priors
 from calib.inference.priors import Priors
 
@@ -355,6 +356,26 @@ def test_a_fit_of_a_step_begins_with_the_means_of_its_sides():
         before /= sum(1.0 - beyond[i] for i in known) + 0.5
         after = sum(beyond[i] * left[i] for i in known) / (sum(beyond[i] for i in known) + 0.5)
         np.testing.assert_allclose(begun[k], [before, after, phi[k, 2], 0.1], rtol=1e-12)
+
+
+@pytest.mark.parametrize("role", ["sinkage", "torque"])
+@pytest.mark.parametrize(
+    ("kind", "of_cell"), [(ReadingDrift, "sensor_drift"), (ReadingStep, "sensor_step")]
+)
+def test_another_reading_changes_over_the_runs_as_the_drawbar_cells(kind, of_cell, role):
+    """By the same equation, and no other output with it."""
+    view, effect = VIEWS["everything recorded"], kind(role, "some_output", "1", 1.0)
+    phi = drawn(effect)
+    y = np.random.default_rng(4).normal(2.0, 1.0, (K, N))
+    expected = [
+        [PULL[of_cell](dict(zip(effect.parameters, phi[k], strict=True)), row, y[k, i])
+         for i, row in enumerate(rows(view, k))]
+        for k in range(K)
+    ]  # fmt: skip
+    np.testing.assert_allclose(effect.on_output(phi, role, y, view), expected, rtol=1e-12)
+    assert effect.on_output(phi, "pull", y, view) is y
+    begun = effect.begun(phi, {role: np.full(N, 0.1), "pull": np.full(N, np.nan)}, view)
+    assert np.isfinite(begun).all()
 
 
 @pytest.mark.parametrize("name", EFFECTS)

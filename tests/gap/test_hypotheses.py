@@ -16,18 +16,21 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import (
     COVERED,
     SHIFTS,
+    aside,
     covered,
     dependences,
     effect_priors,
     inseparable,
     joined,
     pair,
+    readings,
     resized,
     shifts,
     singles,
     split_testable,
     unknowns,
     wider,
+    with_own,
     with_remainder,
 )
 from calib.gap.hypothesis import Hypothesis
@@ -102,6 +105,8 @@ def test_no_onset_of_one_output_over_slip_or_drift_is_unlisted(data):
     assert ("slip", ("drawbar_pull",)) not in alone
     assert ("slip", ("rut_depth",)) not in alone
     assert ("order", ("drawbar_pull",)) not in alone
+    assert ("order", ("rut_depth",)) not in alone
+    assert ("order", ("drawbar_pull", "rut_depth")) in alone
     assert ("slip", ("drawbar_pull", "rut_depth")) in alone
 
 
@@ -302,6 +307,7 @@ def test_a_condition_that_a_simulator_knows_is_no_dependence(data):
 
 
 PULL, RUT = ("drawbar_pull",), ("rut_depth",)
+_SIZES = ("drift", "before", "after")
 BOTH = PULL + RUT
 
 
@@ -324,7 +330,7 @@ def test_what_may_be_unlisted_is_all_that_a_wheel_shows_and_its_shares_are_as_st
     for over in ("slip", "order", "ripple", "before", "all", "pressure", "speed", "passes"):
         smooth += [(over, t) for t in all_three]
     onsets = [("level", PULL), ("level", RUT), ("sinkage", PULL), ("sinkage", BOTH)]
-    onsets += [("slip", BOTH), ("order", RUT), ("order", BOTH)]
+    onsets += [("slip", BOTH), ("order", BOTH)]  # of one over the runs a drift or a step is listed
     expected = {
         **{(over, False, t, size): 0.25 / len(smooth) for over, t in smooth for size in (1.5, 5.0)},
         **{(over, True, t, 4.0): 0.44 / len(onsets) for over, t in onsets},
@@ -467,3 +473,52 @@ def test_shifts_are_a_part_of_what_all_soils_span(data):
     assert sizes == [0.1, 0.25, 0.6]
     assert [h.share for h in shifts(data) if h.shift_as == "soil"] == pytest.approx([2 / 9] * 3)
     assert {h.name for h in shifts(data)} == {"parameter_shift"}
+
+
+def test_every_reading_but_the_drawbar_cells_may_drift_or_jump_in_its_own_unit(data):
+    """Of ruts, whose logarithms are compared, by a factor; else by parts of a typical reading."""
+    found = readings(data)
+    assert set(found) == {"rut_depth_drift", "rut_depth_step"}
+    assert [effect.outputs for effect in found.values()] == [("sinkage",)] * 2
+    sizes = {name: [p.scale for p in effect_priors(data, e).free if p.name in _SIZES]
+             for name, e in found.items()}  # fmt: skip
+    assert sizes == {"rut_depth_drift": [0.25], "rut_depth_step": [0.2, 0.2]}
+    dense = campaigns(density_campaigns())
+    assert not readings(dense)  # nothing is known of the order of its runs
+    (o,) = dense.outputs
+    order = {"run_order": np.arange(len(dense.case.field), dtype=float)}
+    timed = campaigns(
+        replace(dense.case, field=table_from_arrays({**dense.case.field.columns, **order}))
+    )
+    found = readings(timed)
+    assert set(found) == {"bulk_density_drift", "bulk_density_step"}
+    drift = effect_priors(timed, found["bulk_density_drift"]).free[0]
+    assert (drift.unit, drift.scale) == (
+        "g/cm**3", pytest.approx(0.25 * np.median(o.problem.response)),
+    )  # fmt: skip
+
+
+def test_over_the_runs_a_reading_changes_in_the_shapes_of_the_drawbar_cells(data):
+    for name, effect in readings(data).items():
+        cell = EFFECTS["sensor_" + name.removeprefix("rut_depth_")]
+        of_cell = {p.name: p for p in effect_priors(data, cell).free if p.name not in _SIZES}
+        for prior in effect_priors(data, effect).free:
+            if prior.name not in _SIZES:
+                mine, theirs = ((p.log, p.loc, p.scale, p.lower, p.upper)
+                                for p in (prior, of_cell[prior.name]))  # fmt: skip
+                assert mine == theirs
+
+
+def test_what_a_case_brings_with_it_gives_way_to_an_effect_of_its_name(data):
+    mine = EFFECTS["rut_rebound"]
+    found = with_own(data, {"rut_depth_step": mine})
+    assert found["rut_depth_step"] is mine
+    assert {"rut_depth_drift", *dependences(data)} <= set(found)
+
+
+def test_what_is_tried_beside_listed_effects_is_less_probable_than_they(data):
+    everything = with_own(data, EFFECTS)
+    shares = {name: aside(effect, EFFECTS) for name, effect in everything.items()}
+    assert {shares[name] for name in EFFECTS} == {None}
+    assert shares["rut_depth_drift"] == shares["rut_depth_step"] == 0.2
+    assert shares["depends_on_speed"] == 0.02

@@ -130,6 +130,50 @@ def test_a_step_and_a_drift_are_told_apart(name, seed):
     assert not any({"force_offset", "sensor_step"} <= set(n.split("+")) for n in ranking.fits)
 
 
+# Of ruts, whose noise is 0.05 on their logarithm.
+RUTS_OVER_ORDER = {
+    "rut_depth_step": lambda u: 0.25 * (u > 0.45),
+    "rut_depth_drift": lambda u: 0.45 * u,
+    None: lambda u: 0.0 * u,
+}
+
+
+def scaled_ruts(case, change):
+    """Read the ruts of a field campaign wrong by a factor that changes over the runs."""
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    u = columns["run_order"] / columns["run_order"].max()
+    columns["rut_depth_mm"] = columns["rut_depth_mm"] * np.exp(change(u))
+    return replace(case, field=table_from_arrays(columns))
+
+
+@pytest.mark.parametrize("name", RUTS_OVER_ORDER)
+def test_a_gauge_of_ruts_that_jumps_or_drifts_is_named(name):
+    case = scaled_ruts(make_case(None, n_field=30), RUTS_OVER_ORDER[name])
+    few = {n: EFFECTS[n] for n in ("sensor_drift", "rut_rebound", "slip_zero_shift")}
+    ranking = rank(campaigns(case), 1, effects=few)
+    assert ranking.order[0] == (name or "none")
+    assert inclusion_probability(ranking.probability).get(name or "", 1.0) >= 0.8
+    # Where nothing follows the runs they are not worth a fit.
+    assert ("rut_depth_step" in ranking.fits) == ("rut_depth_drift" in ranking.fits)
+    assert ("rut_depth_step" in ranking.fits) == (name is not None)
+
+
+def test_ground_that_changes_over_the_runs_is_no_instrument():
+    """Pull and ruts change together: it is unlisted, and not the drift of one reading."""
+    case = scaled_ruts(make_case(None, n_field=30), lambda u: 0.45 * u)
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    columns["drawbar_pull_kn"] = columns["drawbar_pull_kn"] - 0.009 * columns["run_order"]
+    case = replace(case, field=table_from_arrays(columns))
+    few = {n: EFFECTS[n] for n in ("sensor_drift", "sensor_step", "rut_rebound")}
+    ranking = rank(campaigns(case), 1, effects=few)
+    assert ranking.order[0] == "unknown"
+    best = ranking.best("unknown").forward.hypothesis
+    assert "order" in (best.smooth_over, best.onset_over)
+    assert best.smooth_outputs == ("drawbar_pull", "rut_depth")
+    acting = inclusion_probability(ranking.probability)
+    assert max(p for name, p in acting.items() if name != "unknown") < 0.1
+
+
 def wave(data, output: str, size: float):
     """Add three waves over the order of the runs to an output: nothing that is listed."""
     columns = {name: np.array(v) for name, v in data.field.columns.items()}

@@ -68,7 +68,7 @@ class SensorDrift(_Fault):
 
     name = "sensor_drift"
     title = "the drawbar reading drifts with run order"
-    latex = (
+    latex: tuple[str, ...] = (
         r"$P_\mathrm{f} = P + \text{drift}\,[g(u) - \text{zero at}]$ for the pull $P$",
         (
             r"$g(u) = (1 + h^c)\, u^c / (u^c + h^c)$, $u$ being the part of the campaign that is "
@@ -81,8 +81,8 @@ class SensorDrift(_Fault):
     covariates = ("order",)
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
-        """Add the drift (kN from the first run to the last)."""
-        if output != "pull":
+        """Add the drift (from the first run to the last)."""
+        if output not in self.outputs:
             return location
         drift, curvature, half_way, zero_at = each(phi)
         u = np.maximum(_progress(view), 1e-3)
@@ -101,7 +101,7 @@ class SensorStep(_Fault):
 
     name = "sensor_step"
     title = "the drawbar reading jumps at some run, as when a sensor is replaced or slips"
-    latex = (
+    latex: tuple[str, ...] = (
         r"$P_\mathrm{f} = P + \text{before} + (\text{after} - \text{before})\, H(u)$ for the pull "
         r"$P$",
         (
@@ -111,7 +111,7 @@ class SensorStep(_Fault):
     )
     parameters = ("before", "after", "change_point", "duration")
     outputs = ("pull",)
-    holds = ("force_offset",)
+    holds: tuple[str, ...] = ("force_offset",)
     covariates = ("order",)
 
     def _beyond(self, phi: Array, view: View) -> Array:
@@ -122,8 +122,8 @@ class SensorStep(_Fault):
         return np.asarray(np.clip((_progress(view) - change_point) / lasts + 0.5, 0.0, 1.0))
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
-        """Add the errors before and after the change point (kN)."""
-        if output != "pull":
+        """Add the errors before and after the change point."""
+        if output not in self.outputs:
             return location
         before, after, *_ = each(phi)
         return np.asarray(location + before + (after - before) * self._beyond(phi, view))
@@ -132,10 +132,11 @@ class SensorStep(_Fault):
         """Begin with mean residuals on both sides, and wide: from a sharp step no fit gets away."""
         begun = phi.copy()
         begun[:, 3] = _WIDE
-        known = np.isfinite(left["pull"])
+        residual = left[self.outputs[0]]
+        known = np.isfinite(residual)
         beyond = self._beyond(begun, view)[:, known]
         for i, part in enumerate((1.0 - beyond, beyond)):
-            begun[:, i] = part @ left["pull"][known] / (part.sum(axis=1) + 0.5)
+            begun[:, i] = part @ residual[known] / (part.sum(axis=1) + 0.5)
         return begun
 
 
