@@ -30,6 +30,7 @@ from calib.report.gap_rows import (
     title_of,
     unit_after,
 )
+from calib.report.gap_runs import over_runs
 from calib.report.gap_sizes import size_sentences, where_to_look
 from calib.report.gap_verdict import (
     Candidate,
@@ -87,6 +88,7 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         assumed=_assumed(found, ranking.best(best)),
         put_in="; ".join(case_context.words()),
         without=_without(found),
+        runs=over_runs(found),
     )
 
 

@@ -4,11 +4,14 @@ The first rule that applies decides:
 
 1. none: no gap, at a probability of 90 % or more;
 2. not shown: no hypothesis of a gap is named, and none is not certain either;
-3. unknown: there is a gap, and nothing that is listed explains it;
-4. tie: there is a gap, and several explanations are about as probable;
-5. recalibrate: the same model with other parameter values closes the gap;
-6. named: one effect, or pair, at a probability of 90 % or more;
-7. likely: one effect, or pair, that is more probable than all others together.
+3. trend: outputs change together over the runs, and nothing that is listed does that;
+4. wander: one reading changes over the runs, neither as a drift nor as a step;
+5. over runs: one reading changes over the runs, in which form cannot be told;
+6. unknown: there is a gap, and nothing that is listed explains it;
+7. tie: there is a gap, and several explanations are about as probable;
+8. recalibrate: the same model with other parameter values closes the gap;
+9. named: one effect, or pair, at a probability of 90 % or more;
+10. likely: one effect, or pair, that is more probable than all others together.
 """
 
 from __future__ import annotations
@@ -24,6 +27,8 @@ SURE = 0.9
 # Hypotheses within this factor of the best are read as a tie with it.
 TIE = 0.2
 _MOST_TIED = 4
+# A change over the runs that nothing listed explains.
+NEITHER = "something that is neither"
 # ln 20: the evidence that makes odds of twenty to one.
 _ENOUGH_NATS = math.log(20.0)
 _PREDICT = "calib predict DIAGNOSIS --at NEW.csv"
@@ -94,6 +99,35 @@ class NextFact:
 
 
 @dataclass(frozen=True)
+class RunsFact:
+    """A change over the order of the runs: of what, and how probable in whichever form.
+
+    Parameters
+    ----------
+    outputs : str
+        In words.
+    probability : float
+    forms : sequence of (str, float)
+        "a drift", "a step", `NEITHER`, the most probable first.
+    together : bool
+        Whether it is a change of several outputs at once.
+    only : bool
+        Whether no other output is measured.
+    """
+
+    outputs: str
+    probability: float
+    forms: Sequence[tuple[str, float]]
+    together: bool = False
+    only: bool = False
+
+    @property
+    def rivals(self) -> list[tuple[str, float]]:
+        """Forms about as probable as the first."""
+        return [form for form in self.forms if form[1] >= TIE * self.forms[0][1]]
+
+
+@dataclass(frozen=True)
 class GapEvidence:
     """What a verdict is made from.
 
@@ -127,6 +161,8 @@ class GapEvidence:
         hypothesis rests.
     put_in, without : str
         What was put into the diagnosis besides the data, and what it finds without that.
+    runs : RunsFact, optional
+        A change over the order of the runs, of the outputs that most probably do.
     """
 
     verdict: str
@@ -146,6 +182,7 @@ class GapEvidence:
     assumed: Sequence[str] = ()
     put_in: str = ""
     without: str = ""
+    runs: RunsFact | None = None
 
     @property
     def acting(self) -> list[CauseFact]:
@@ -189,6 +226,9 @@ def _judge(e: GapEvidence) -> GapVerdict:
     if e.verdict == "none":
         return _no_gap(e, best)
     facts = _facts(e)
+    changes = _over_runs(e, facts)
+    if changes is not None:
+        return changes
     if e.verdict == "unknown":
         return GapVerdict(
             Tone.NO, "unknown", "Cause unknown",
@@ -220,6 +260,32 @@ def _judge(e: GapEvidence) -> GapVerdict:
     return GapVerdict(
         tone, "named" if sure else "likely", named if sure else likely,
         f"{_hedge(sure)}{several}{', and '.join(c.title for c in acting)}{rest}", facts,
+    )  # fmt: skip
+
+
+def _over_runs(e: GapEvidence, facts: Sequence[tuple[str, str]]) -> GapVerdict | None:
+    """Say what is sure of a change over the runs where its form, or its cause, is not."""
+    r = e.runs
+    if r is None or r.probability < 0.5:
+        return None
+    hedge = _hedge(r.probability >= SURE)
+    if r.together:
+        return GapVerdict(
+            Tone.NO, "trend", "Trend over the runs",
+            f"{hedge}{r.outputs} change together over the runs: rather the ground, the weather or "
+            "the wheel than one instrument", facts,
+        )  # fmt: skip
+    if r.forms[0][0] == NEITHER and len(r.rivals) == 1:
+        return GapVerdict(
+            Tone.NO, "wander", "Wanders over the runs",
+            f"{hedge}{r.outputs} changes over the runs, neither as a drift nor as a step", facts,
+        )  # fmt: skip
+    if len(r.rivals) < 2 or any(c.probability >= SURE for c in e.acting):
+        return None
+    forms = joined([f"{form} ({odds_text(p)})" for form, p in r.rivals])
+    return GapVerdict(
+        Tone.CARE, "over runs", "Not told apart",
+        f"{hedge}{r.outputs} changes over the runs, but the data cannot tell {forms} apart", facts,
     )  # fmt: skip
 
 
@@ -331,13 +397,19 @@ def advice(e: GapEvidence) -> str:
     """Say what to do that is no measurement between causes; nothing where one comes first."""
     if e.verdict == "unknown":
         return e.look
-    if e.verdict != "effect":
+    runs = _reading(e)
+    if runs is None and e.verdict != "effect":
         return ""
-    faults = [c.words for c in e.acting if c.instrument]
+    faults = [runs] if runs else [c.words for c in e.acting if c.instrument]
     if faults:
+        ground = ""
+        if e.runs is not None and e.runs.only and e.runs.probability >= 0.5:
+            ground = f". If it is sound, the ground changed over the runs: {e.runs.outputs} alone "
+            ground += "cannot tell"
         return (
             f"check the instrument before the model ({joined(faults)}): zero and span, and an "
             "early run once more. What is predicted with the cause is the reading, not the truth"
+            f"{ground}"
         )
     if _measure_first(e):
         return ""
@@ -352,6 +424,13 @@ def advice(e: GapEvidence) -> str:
         f"predict with the {causes} in the model ({joined(missing)}): {_PREDICT}. Or put "
         f"{'it' if len(missing) == 1 else 'them'} into the simulator, and calibrate that again"
     )
+
+
+def _reading(e: GapEvidence) -> str | None:
+    """Name a reading that changes over the runs, though not in which form."""
+    changes = _over_runs(e, ())
+    told = changes is None or changes.rule != "over runs"
+    return None if told or e.runs is None else e.runs.outputs
 
 
 def _measure_first(e: GapEvidence) -> bool:

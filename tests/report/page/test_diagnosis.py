@@ -10,11 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
+import numpy as np
 import pytest
 from matplotlib.text import Text
 
 from calib.check.derived import verify_gaps
 from calib.check.outcome import Status
+from calib.data import table_from_arrays
 from calib.gap.case import Case, read_case
 from calib.gap.diagnose import diagnose, diagnose_once
 from calib.gap.effects import EFFECTS
@@ -26,10 +28,12 @@ from calib.report.gap_evidence import gap_evidence
 from calib.report.gap_rows import shrink_place
 from calib.report.gap_sizes import size_sentences
 from calib.report.gap_verdict import (
+    NEITHER,
     Candidate,
     CauseFact,
     GapEvidence,
     NextFact,
+    RunsFact,
     ShrinkFact,
     Tone,
     WhereFact,
@@ -130,6 +134,55 @@ def test_less_than_sure_is_hedged_with_rivals_and_a_measurement():
     assert "also possible: lug thrust (25 %)" in facts["Which"]
     # ln 20 = 3.0 nats at 1.2 each.
     assert facts["Next"] == "To separate lug thrust from drift: about 3 measurements at slip 65 %"
+
+
+def over_runs(*forms: tuple[str, float], **kind: bool) -> RunsFact:
+    return RunsFact("drawbar pull", sum(p for _, p in forms), forms, **kind)
+
+
+@pytest.mark.parametrize(
+    ("verdict", "forms", "kind", "rule", "words"),
+    [
+        # What is sure is said, and what is not told apart.
+        ("ambiguous", [("a drift", 0.48), ("a step", 0.45), (NEITHER, 0.03)], {}, "over runs",
+         "Drawbar pull changes over the runs, but the data cannot tell a drift (48 %) and a step "
+         "(45 %) apart"),
+        ("effect", [("a step", 0.6), ("a drift", 0.2)], {}, "over runs",
+         "Probably drawbar pull changes over the runs, but the data cannot tell a step (60 %) and"),
+        ("effect", [("a drift", 0.85), ("a step", 0.1)], {}, "likely", "Probably what drift does"),
+        ("ambiguous", [("a drift", 0.24), ("a step", 0.2)], {}, "tie", "There is a gap"),
+        ("unknown", [(NEITHER, 0.95), ("a step", 0.04)], {}, "wander",
+         "Drawbar pull changes over the runs, neither as a drift nor as a step"),
+        ("unknown", [(NEITHER, 0.8)], {"together": True}, "trend",
+         "Probably drawbar pull change together over the runs: rather the ground"),
+        ("unknown", [(NEITHER, 0.3), ("a step", 0.04)], {}, "unknown", "There is a real gap"),
+        ("none", [("a drift", 0.2), ("a step", 0.2)], {}, "not shown", "The data show no gap"),
+    ],
+)  # fmt: skip
+def test_of_a_change_over_the_runs_is_said_what_is_sure_of_it(verdict, forms, kind, rule, words):
+    shown = {"none": {"none": 0.6, "drift": 0.2}, "unknown": {"unknown": 0.95, "drift": 0.04}}
+    usual = {"drift": dict(forms).get("a drift", 0.0) or 0.5, "lug_thrust": 0.3}
+    e = replace(evidence(verdict, **shown.get(verdict, usual)), runs=over_runs(*forms, **kind))
+    found = judge_gap(e)
+    assert found.rule == rule
+    assert found.headline.startswith(words)
+
+
+def test_a_sure_form_is_named_whatever_else_may_be():
+    sure = CauseFact("sensor_step", "sensor step", "a jump", 0.93, 0.9, (0.8, 1.0), True)
+    runs = over_runs(("a step", 0.6), ("a drift and a step at once", 0.33))
+    e = replace(evidence("effect", sensor_step=0.6), causes=[sure], runs=runs)
+    assert judge_gap(e).rule == "named"
+
+
+def test_where_the_form_is_not_told_the_reading_is_to_be_checked_all_the_same():
+    runs = over_runs(("a step", 0.45), ("a drift", 0.4))
+    e = replace(evidence("ambiguous", sensor_step=0.45, sensor_drift=0.4), runs=runs)
+    text = dict(judge_gap(e).facts)["Next"]
+    assert text.startswith("Check the instrument before the model (drawbar pull)")
+    assert "alone cannot tell" not in text
+    alone = dict(judge_gap(replace(e, runs=replace(runs, only=True))).facts)["Next"]
+    assert alone.endswith("the ground changed over the runs: drawbar pull alone cannot tell")
 
 
 def test_where_an_instrument_is_at_fault_it_is_to_be_checked_first():
@@ -400,6 +453,28 @@ def test_the_size_of_a_step_names_its_run():
     assert match[3] == "12"
 
 
+def test_of_a_step_that_takes_some_runs_it_is_said_between_which():
+    """Of ruts in parts of them, for their logarithm is compared."""
+    case = make_case(None, n_field=40)
+    columns = {name: np.array(v) for name, v in case.field.columns.items()}
+    rising = np.clip((columns["run_order"] - 17.0) / 6.0, 0.0, 1.0)
+    columns["rut_depth_mm"] = columns["rut_depth_mm"] * 1.8**rising
+    case = replace(case, field=table_from_arrays(columns))
+    few = {n: EFFECTS[n] for n in ("sensor_drift", "rut_rebound")}
+    found = diagnose_once(case, 1, effects=few)
+    (sentence,) = size_sentences(found, "rut_depth_step")
+    match = re.fullmatch(
+        r"rut depth reads ([\d.]+) ± ([\d.]+) % deeper after run (\d+) than up to run (\d+), and "
+        r"changes in between",
+        sentence,
+    )
+    assert match
+    assert abs(float(match[1]) - 80.0) < 4.0 * float(match[2])
+    # From the seventeenth to the twenty-third, within two runs.
+    assert abs(int(match[4]) - 17) <= 2
+    assert abs(int(match[3]) - 23) <= 2
+
+
 def test_sizes_of_other_kinds_of_effect():
     (sentence,) = size_sentences(diagnosis_of("slip_zero_shift"), "slip_zero_shift")
     match = re.fullmatch(
@@ -469,7 +544,8 @@ def test_warnings_and_names_of_the_case_are_shown_and_escaped(found):
     ("verdict", "best", "words"),
     [
         ("ambiguous", "lug_thrust", "the data cannot tell"),
-        ("unknown", "unknown", "no effect on the list explains it"),
+        # Of what is unlisted here, most would follow the order of the runs: it is a drift.
+        ("unknown", "unknown", "change together over the runs"),
         ("effect", "parameter_shift", "the same model with other parameter values"),
         ("effect", "force_offset+lug_thrust", "wo causes at once"),
     ],
@@ -565,7 +641,6 @@ def test_what_is_unknown_is_described_by_what_it_goes_along_with():
 
     import numpy as np
 
-    from calib.data import table_from_arrays
     from calib.gap.diagnose import diagnose
     from calib.gap.effects import EFFECTS
     from calib.report.gap_sizes import size_sentences
@@ -596,7 +671,6 @@ def test_what_sets_in_at_low_pressure_is_said_so():
 
     import numpy as np
 
-    from calib.data import table_from_arrays
     from calib.gap.diagnose import diagnose
     from calib.gap.effects import EFFECTS
     from calib.report.gap_sizes import size_sentences
@@ -623,7 +697,6 @@ def test_short_waves_are_said_so_beside_the_noise_that_is_left():
 
     import numpy as np
 
-    from calib.data import table_from_arrays
     from calib.gap.diagnose import diagnose
     from calib.gap.effects import EFFECTS
     from calib.report.gap_sizes import size_sentences
@@ -657,7 +730,6 @@ def test_what_comes_and_goes_is_not_told_by_its_end(tmp_path):
 
     import numpy as np
 
-    from calib.data import table_from_arrays
     from calib.gap.diagnose import diagnose
     from calib.gap.effects.load import load_effects
     from calib.report.gap_sizes import size_sentences
