@@ -137,7 +137,7 @@ def _pairs(single: Sequence[str], best: Mapping[str, Fit]) -> list[_Started]:
     for i, a in enumerate(single):
         for b in single[i + 1 :]:
             one, other = (best[m].forward.hypothesis for m in (a, b))
-            if (a in seeds or b in seeds) and _apart(one, other):
+            if a in seeds or b in seeds:
                 found.append((joined(one, other), [best[a], best[b]]))
     return found
 
@@ -204,7 +204,7 @@ def _exchanged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis
         members = [h for h in alone if h.name in names]
         for out in members:
             kept = joined(*(h for h in members if h is not out))
-            added = [h for h in alone if h.name not in names and _apart(h, kept)]
+            added = [h for h in alone if h.name not in names]
             promises += guesses.beside(kept, found, added)
     return promises
 
@@ -215,7 +215,7 @@ def _enlarged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis]
     for found in sets:
         kept = found.forward.hypothesis
         names = {e.name for e in kept.effects}
-        added = [h for h in alone if h.name not in names and _apart(h, kept)]
+        added = [h for h in alone if h.name not in names]
         promises += guesses.beside(kept, found, added)
     return promises
 
@@ -232,13 +232,6 @@ def _fitted(
     searched |= {p.hypothesis.name for p in chosen}
     truncated = truncated_fits([guesses.begun_as_promised(p) for p in chosen])
     return _finished(truncated, listed - _SEARCHED, guesses.odds)
-
-
-def _apart(a: Hypothesis, b: Hypothesis) -> bool:
-    """Whether no effect of one hypothesis holds one of the other already."""
-    return not any(
-        e.name in other.holds or other.name in e.holds for e in a.effects for other in b.effects
-    )
 
 
 def _finished(truncated: Sequence[Sequence[Fit]], hopeless: float, odds: Odds) -> list[Fit]:

@@ -236,15 +236,14 @@ def _step_sentence(found: Diagnosis, fit: Fit, psi: Array) -> str:
     """Say by how much the reading jumps, and after which run or between which."""
     (effect,), (priors,) = fit.forward.hypothesis.effects, fit.forward.hypothesis.effect_priors
     natural = priors.to_natural(psi[:, fit.forward.phi_slices[0]])
-    before, after, at, lasts = (
-        natural[:, effect.parameters.index(p)]
-        for p in ("before", "after", "change_point", "duration")
+    size, at, lasts = (
+        natural[:, effect.parameters.index(p)] for p in ("jump", "change_point", "duration")
     )
     (o,) = (o for o in found.data.outputs if o.role in effect.outputs)
     axis, word = output_axis(found, o.name), output_word(o.name)
-    jump, unit = axis.factor * (after - before), axis.unit
+    jump, unit = axis.factor * size, axis.unit
     if o.problem.bound.model.response == "log":
-        jump, unit = 100.0 * np.expm1(after - before), "%"
+        jump, unit = 100.0 * np.expm1(size), "%"
     first, last = found.data.view.order_range
     way = _way(o.name, bool(jump.mean() > 0.0))
     amount = format_value(abs(float(jump.mean())), float(jump.std()))

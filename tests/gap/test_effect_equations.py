@@ -97,7 +97,7 @@ def sunk(r: Row) -> float:
 
 def step(p: Row, r: Row) -> float:
     h = clip((over(r) - p["change_point"]) / (p["duration"] + 1.0 / r["length"]) + 0.5, 0.0, 1.0)
-    return p["before"] * (1.0 - h) + p["after"] * h
+    return p["jump"] * (h - p["zero_at"])
 
 
 def transferred(p: Row, r: Row) -> float:
@@ -349,13 +349,16 @@ def test_a_fit_of_a_step_begins_with_the_means_of_its_sides():
     left[[2, 9]] = np.nan
     begun = effect.begun(phi, {"pull": left}, view)
     for k in range(K):
-        wide = {"change_point": phi[k, 2], "duration": 0.1, "before": 0.0, "after": 1.0}
+        wide = {"change_point": phi[k, 2], "duration": 0.1, "jump": 1.0, "zero_at": 0.0}
         beyond = [step(wide, row) for row in rows(view, k)]
         known = [i for i in range(N) if not math.isnan(left[i])]
         before = sum((1.0 - beyond[i]) * left[i] for i in known)
         before /= sum(1.0 - beyond[i] for i in known) + 0.5
         after = sum(beyond[i] * left[i] for i in known) / (sum(beyond[i] for i in known) + 0.5)
-        np.testing.assert_allclose(begun[k], [before, after, phi[k, 2], 0.1], rtol=1e-12)
+        zero_at = clip(-before / (after - before), 0.05, 0.95)
+        np.testing.assert_allclose(
+            begun[k], [after - before, zero_at, phi[k, 2], 0.1], rtol=1e-12
+        )  # fmt: skip
 
 
 @pytest.mark.parametrize("role", ["sinkage", "torque"])

@@ -22,7 +22,7 @@ SIZES = {
     "slip_zero_shift": ("radius_error",),
     "force_offset": ("offset",),
     "sensor_drift": ("drift",),
-    "sensor_step": ("before", "after"),
+    "sensor_step": ("jump",),
     "pressure_gauge_bias": ("gain", "offset"),
     "multipass_compaction": ("pull", "slope", "resistance", "rut", "rut_slip"),
     "rate_effect": ("pull", "slope", "resistance", "rut", "rut_slip"),
@@ -41,7 +41,7 @@ SOME: Mapping[str, tuple[Mapping[str, float], int | None, int | None]] = {
     "slip_zero_shift": ({"radius_error": 0.05}, 1, 1),
     "force_offset": ({"offset": 0.2}, 1, None),
     "sensor_drift": ({"drift": 0.2, "curvature": 1.0, "half_way": 1e9, "zero_at": 0.0}, 1, None),
-    "sensor_step": ({"before": 0.1, "after": 0.2}, 1, None),
+    "sensor_step": ({"jump": 0.2, "zero_at": 0.0}, 1, None),
     "pressure_gauge_bias": ({"gain": 0.3}, -1, 1),
     "multipass_compaction": ({"pull": 0.1, "rut": -0.1}, 1, -1),
     "rate_effect": ({"pull": 0.1, "rut": -0.1}, 1, -1),
@@ -178,7 +178,7 @@ def test_amounts(view):
 
 
 def test_a_step_is_one_constant_before_a_run_and_another_after_it(view):
-    size = {"before": -0.1, "after": 0.2, "change_point": 9.5 / 19.0, "duration": 1e-9}
+    size = {"jump": 0.3, "zero_at": 1.0 / 3.0, "change_point": 9.5 / 19.0, "duration": 1e-9}
     step = apply("sensor_step", size, "pull", view)[0]
     np.testing.assert_allclose(step, np.where(np.arange(20) < 10, -0.1, 0.2), atol=1e-6)
     # In the middle of a run it reads in between; over a longer time it rises with the runs.
@@ -195,9 +195,14 @@ def test_a_fit_of_a_step_begins_with_what_is_left_on_its_sides(view):
     left[3] = np.nan
     begun = effect.begun(drawn, {"pull": left}, view)
     # Begun wide, a tenth of the campaign, so that the sides mix a little.
-    np.testing.assert_allclose(begun[:, :2], [[0.3, -0.1]] * 2, atol=0.04)
+    np.testing.assert_allclose(begun[:, :2], [[-0.4, 0.75]] * 2, atol=0.06)
     np.testing.assert_allclose(begun[:, 2], 0.5)
     assert drawn[0, 0] == 0.0
+    # An error of both sides alike, or none at all, is no step: it begins zeroed within itself.
+    for alike in (0.3, 0.0):
+        begun = effect.begun(drawn, {"pull": np.full(20, alike)}, view)
+        assert np.isfinite(begun).all()
+        assert ((begun[:, 1] > 0.0) & (begun[:, 1] < 1.0)).all()
 
 
 def test_true_slip_from_a_wrong_rolling_radius(view):

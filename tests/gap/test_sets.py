@@ -23,7 +23,6 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.inclusion import inclusion_probability
 from calib.gap.odds import Odds, with_prior
 from calib.gap.sets import (
-    _apart,
     _as_sized,
     _begun_again,
     _best_of_each,
@@ -175,17 +174,6 @@ def test_a_shift_with_something_besides_begins_where_it_was_led_by_itself(guesse
     assert theirs.tolist() == ours.tolist() == list(range(old.n_shared))
 
 
-def test_an_effect_that_holds_another_is_not_set_beside_it(guesses):
-    """A step with the same error before and after it is an offset; the order does not matter."""
-    names = ("sensor_step", "force_offset", "lug_thrust")
-    step, offset, lugs = singles(guesses.data, {n: EFFECTS[n] for n in names})
-    assert not _apart(step, offset)
-    assert not _apart(offset, step)
-    assert not _apart(joined(step, lugs), offset)
-    assert _apart(step, lugs)
-    assert _apart(offset, lugs)
-
-
 EVEN = Odds(1, {})
 
 
@@ -198,7 +186,7 @@ def fit_of(hypothesis, score: float):
 
 
 def named(name: str, **options) -> Hypothesis:
-    effects = tuple(SimpleNamespace(name=n, holds=()) for n in name.split("+"))
+    effects = tuple(SimpleNamespace(name=n) for n in name.split("+"))
     return Hypothesis(name, effects, **options)
 
 
@@ -218,21 +206,14 @@ def test_the_best_fit_of_each_hypothesis_counts():
     assert _best_of_each(fits) == [fits[2], fits[1], fits[3]]
 
 
-def test_pairs_hold_one_of_the_six_best_and_no_effect_twice():
+def test_pairs_hold_one_of_the_six_best():
     names = [f"e{i}" for i in range(9)]
     best = {n: fit_of(named(n), 10.0 - i) for i, n in enumerate(names)}
-    holder = SimpleNamespace(name="e0", holds=("e3",))
-    held = replace(named("e0"), effects=(holder,), effect_priors=(None,))
     for n in names:
         best[n].forward.hypothesis = replace(named(n), effect_priors=(None,))
-    best["e0"].forward.hypothesis = held
     mixed = [names[i] for i in (4, 8, 0, 6, 2, 7, 1, 3, 5)]
     found = _pairs(mixed, best)
-    expected = {
-        "+".join(p)
-        for p in combinations(names, 2)
-        if (set(p) & set(names[:6])) and p != ("e0", "e3")
-    }
+    expected = {"+".join(p) for p in combinations(names, 2) if set(p) & set(names[:6])}
     assert sorted(h.name for h, _ in found) == sorted(expected)
     for h, members in found:
         assert {f.forward.hypothesis.name for f in members} == set(h.name.split("+"))
@@ -309,18 +290,17 @@ def test_the_six_sets_that_promise_most_are_fitted_once_each(at_once):
     assert searched == {f"s{i}+t" for i in range(8)}
 
 
-def test_an_effect_takes_anothers_place_or_is_added_if_neither_holds_the_other():
+def test_every_other_effect_takes_ones_place_or_is_added():
     class Noted(Stub):
         def beside(self, kept, found, added):
             return [(kept.name, found, h.name) for h in added]
 
     alone = [replace(named(n), effect_priors=(None,)) for n in ("a", "b", "c", "d")]
-    alone[3] = replace(alone[3], effects=(SimpleNamespace(name="d", holds=("a",)),))
     found = fit_of(joined(*alone[:2]), 0.0)
     assert _exchanged(Noted(), [found], alone) == [
-        ("b", found, "c"), ("b", found, "d"), ("a", found, "c"),
+        ("b", found, "c"), ("b", found, "d"), ("a", found, "c"), ("a", found, "d"),
     ]  # fmt: skip
-    assert _enlarged(Noted(), [found], alone) == [("a+b", found, "c")]
+    assert _enlarged(Noted(), [found], alone) == [("a+b", found, "c"), ("a+b", found, "d")]
 
 
 def test_sets_grow_step_by_step_up_to_four_causes_as_long_as_they_are_in_play(monkeypatch):

@@ -112,7 +112,7 @@ def test_a_warming_gauge_is_found_from_several_guesses():
 
 # Of the size of five noise sds: a step of them, a drift of them in the rms from zero at its start.
 OVER_ORDER = {
-    "sensor_step": {"after": 0.15, "change_point": 0.5, "duration": 1e-9},
+    "sensor_step": {"jump": 0.15, "zero_at": 0.0, "change_point": 0.5, "duration": 1e-9},
     "sensor_drift": {"drift": 0.26, "curvature": 1.0, "half_way": 10.0, "zero_at": 0.0},
     None: {},
 }
@@ -126,8 +126,33 @@ def test_a_step_and_a_drift_are_told_apart(name, seed):
     ranking = rank(campaigns(case), 1, effects=few)
     assert ranking.order[0] == (name or "none")
     assert inclusion_probability(ranking.probability).get(name or "", 1.0) >= 0.8
-    # A step is an offset on either side of its change point: beside it one more would be idle.
-    assert not any({"force_offset", "sensor_step"} <= set(n.split("+")) for n in ranking.fits)
+
+
+# Eight noise sds from end to end, in forms that are no effect's own; seeds as they come.
+FORMS = {
+    "settling": ("sensor_drift", lambda u: -np.expm1(-u / 0.3)),
+    "late": ("sensor_drift", lambda u: np.clip((u - 0.2) / 0.6, 0.0, 1.0)),
+    "at once": ("sensor_step", lambda u: (u > 0.35) * 1.0),
+    "slipping for three runs": ("sensor_step", lambda u: np.clip((u - 0.6) / 0.1, 0.0, 1.0)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("seed", range(11, 15))
+def test_whatever_its_form_no_change_over_the_runs_is_surely_called_another(form, seed):
+    """Named is one of the two, and the other not with nine tenths."""
+    name, shape = FORMS[form]
+    case = make_case(None, models=PULL_ONLY, seed=seed, n_field=30)
+    columns = {column: np.array(v) for column, v in case.field.columns.items()}
+    u = columns["run_order"] / columns["run_order"].max()
+    columns["drawbar_pull_kn"] = columns["drawbar_pull_kn"] + 0.24 * shape(u)
+    case = replace(case, field=table_from_arrays(columns))
+    few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "sensor_step", "lug_thrust")}
+    acting = inclusion_probability(rank(campaigns(case), 1, effects=few).probability)
+    drift, step = (acting.get(n, 0.0) for n in ("sensor_drift", "sensor_step"))
+    assert drift + step >= 0.9
+    assert (step if name == "sensor_drift" else drift) < 0.9
 
 
 # Of ruts, whose noise is 0.05 on their logarithm.

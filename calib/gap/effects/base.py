@@ -139,8 +139,6 @@ class Effect:
         Along what its size may depart from its formula, by the form error of the diagnosis
         (extrapolation: along inflation pressure, to values the simulator was not fitted at);
         empty where the formula is exact.
-    holds : tuple of str
-        Names of effects that it is with some of its own parameters: beside it they add nothing.
     instrument : bool
         Whether an instrument is at fault, not wheel or soil; predicted with it is what it reads.
     priors : str
@@ -158,7 +156,6 @@ class Effect:
     covariates: tuple[str, ...] = ()
     varies: bool = True
     form: tuple[str, ...] = ()
-    holds: tuple[str, ...] = ()
     instrument: bool = False
     priors: str = ""
     prior_file: Path | None = None

@@ -35,7 +35,7 @@ _TRIALS = 8
 _MISSPELT = 0.8
 _BASE = tuple(name for name in vars(Effect) if not name.startswith("_"))
 _METHODS = tuple(name for name in _BASE if callable(getattr(Effect, name)))
-_TUPLES = ("latex", "parameters", "outputs", "needs", "covariates", "form", "holds")
+_TUPLES = ("latex", "parameters", "outputs", "needs", "covariates", "form")
 _FORMS = ("size", "slip", "pressure", "cone", "water", "shape", "extrapolation")
 
 

@@ -16,6 +16,8 @@ __all__ = [
 
 # Part of the campaign over which a step is first taken to happen.
 _WIDE = 0.1
+# Parts of a step at which it is first taken to have been zeroed.
+_ZEROED = (0.05, 0.95)
 
 
 class _Fault(Effect):
@@ -94,7 +96,7 @@ class SensorDrift(_Fault):
 
 
 class SensorStep(_Fault):
-    """A jump of the drawbar reading at some run: off by one constant before it, another after.
+    """A jump of the drawbar reading at some run; zeroed before it, after it or in between.
 
     It takes at least one run, so that a fit can move the change point from one to the next.
     """
@@ -102,16 +104,14 @@ class SensorStep(_Fault):
     name = "sensor_step"
     title = "the drawbar reading jumps at some run, as when a sensor is replaced or slips"
     latex: tuple[str, ...] = (
-        r"$P_\mathrm{f} = P + \text{before} + (\text{after} - \text{before})\, H(u)$ for the pull "
-        r"$P$",
+        r"$P_\mathrm{f} = P + \text{jump}\,[H(u) - \text{zero at}]$ for the pull $P$",
         (
             r"$H(u)$ rises from 0 to 1 about the change point, during one run and the duration, "
             r"$u$ being the part of the campaign that is over"
         ),
     )
-    parameters = ("before", "after", "change_point", "duration")
+    parameters = ("jump", "zero_at", "change_point", "duration")
     outputs = ("pull",)
-    holds: tuple[str, ...] = ("force_offset",)
     covariates = ("order",)
 
     def _beyond(self, phi: Array, view: View) -> Array:
@@ -122,11 +122,11 @@ class SensorStep(_Fault):
         return np.asarray(np.clip((_progress(view) - change_point) / lasts + 0.5, 0.0, 1.0))
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
-        """Add the errors before and after the change point."""
+        """Add the jump, and the error before it."""
         if output not in self.outputs:
             return location
-        before, after, *_ = each(phi)
-        return np.asarray(location + before + (after - before) * self._beyond(phi, view))
+        jump, zero_at, *_ = each(phi)
+        return np.asarray(location + jump * (self._beyond(phi, view) - zero_at))
 
     def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
         """Begin with mean residuals on both sides, and wide: from a sharp step no fit gets away."""
@@ -135,8 +135,13 @@ class SensorStep(_Fault):
         residual = left[self.outputs[0]]
         known = np.isfinite(residual)
         beyond = self._beyond(begun, view)[:, known]
-        for i, part in enumerate((1.0 - beyond, beyond)):
-            begun[:, i] = part @ residual[known] / (part.sum(axis=1) + 0.5)
+        before, after = (
+            part @ residual[known] / (part.sum(axis=1) + 0.5) for part in (1.0 - beyond, beyond)
+        )
+        begun[:, 0] = after - before
+        with np.errstate(divide="ignore", invalid="ignore"):
+            zero_at = np.nan_to_num(-before / begun[:, 0], nan=0.5)
+        begun[:, 1] = np.clip(zero_at, *_ZEROED)
         return begun
 
 

@@ -10,9 +10,9 @@ from calib.gap.effects.instruments import SensorDrift, SensorStep
 
 __all__ = ["ReadingDrift", "ReadingStep"]
 
-# Sizes as parts of the typical reading: as large as the drawbar cell's beside a pull of a fifth of
-# the load.
-_DRIFT, _ERROR = 0.25, 0.2
+# A size as a part of the typical reading: as large as the drawbar cell's beside a pull of
+# a fifth of the load.
+_SIZE = 0.25
 _SHAPES = {
     "curvature": 'dist = "lognormal"\nmedian = 1.0\nsd_log = 0.6',
     "half_way": 'dist = "lognormal"\nmedian = 1.0\nsd_log = 1.0',
@@ -40,21 +40,18 @@ class ReadingDrift(SensorDrift):
         self.name, self.outputs = f"{output}_drift", (role,)
         self.title = f"the {word} reading drifts with run order"
         self.latex = tuple(_of(word, unit, line) for line in SensorDrift.latex)
-        self.priors = _priors(self.name, {"drift": _DRIFT * typical}, unit, self.parameters[1:])
+        self.priors = _priors(self.name, {"drift": _SIZE * typical}, unit, self.parameters[1:])
 
 
 class ReadingStep(SensorStep):
     """A jump of an output's reading at some run; parameters as of `ReadingDrift`."""
-
-    holds = ()
 
     def __init__(self, role: str, output: str, unit: str, typical: float) -> None:
         word = output.replace("_", " ")
         self.name, self.outputs = f"{output}_step", (role,)
         self.title = f"the {word} reading jumps at some run, as when a gauge is replaced or slips"
         self.latex = tuple(_of(word, unit, line) for line in SensorStep.latex)
-        sizes = dict.fromkeys(self.parameters[:2], _ERROR * typical)
-        self.priors = _priors(self.name, sizes, unit, self.parameters[2:])
+        self.priors = _priors(self.name, {"jump": _SIZE * typical}, unit, self.parameters[1:])
 
 
 def _of(word: str, unit: str, line: str) -> str:

@@ -441,7 +441,7 @@ def test_the_size_is_that_of_the_drift(found):
 
 
 def test_the_size_of_a_step_names_its_run():
-    size = {"after": -0.2, "change_point": 12.5 / 26.0, "duration": 1e-9}
+    size = {"jump": -0.2, "zero_at": 0.0, "change_point": 12.5 / 26.0, "duration": 1e-9}
     few = {n: EFFECTS[n] for n in ("force_offset", "sensor_drift", "sensor_step")}
     case = make_case("sensor_step", size=size, models=PULL_ONLY)
     (sentence,) = size_sentences(diagnose_once(case, 1, effects=few), "sensor_step")
