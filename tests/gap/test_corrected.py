@@ -25,7 +25,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.effects.load import load_effects
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import pair, singles
+from calib.gap.hypotheses import pair, readings, singles
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
@@ -168,6 +168,19 @@ def test_everything_is_kept(made, kept):
         assert set(now) == set(was)
         for column in was:
             np.testing.assert_allclose(now[column], was[column], rtol=1e-9)
+
+
+def test_the_readings_that_a_case_brings_with_it_are_known_again(made, tmp_path):
+    data = made.data
+    (step,) = singles(data, {"rut_depth_step": readings(data)["rut_depth_step"]})
+    one = Corrected(Mixture(data, (fit_of(data, step, made.lab_mode, draws=3),), (1.0,), 7),
+                    made.lab_mode)  # fmt: skip
+    save_corrected(one, tmp_path)
+    (again,) = load_corrected(tmp_path).mixture.fits
+    (effect,) = again.forward.hypothesis.effects
+    assert (effect.name, effect.outputs) == ("rut_depth_step", ("sinkage",))
+    assert again.forward.priors.entries == one.mixture.fits[0].forward.priors.entries
+    assert load_corrected(tmp_path).faults == ["rut_depth_step"]
 
 
 def test_without_declared_columns_and_priors_none_are_read(made, tmp_path):
