@@ -99,7 +99,7 @@ def _ink(content: bytes) -> Counter[str]:
             text = zlib.decompress(stream).decode("latin-1")
         except zlib.error:
             continue
-        found.update(NUMBER.sub("#", line) for line in text.splitlines())
+        found.update(NUMBER.sub("#", text).splitlines())
     return found
 
 

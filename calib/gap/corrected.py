@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
 from calib.gap.shifts import ShiftMap
 from calib.gap.shrink import predict_new
+from calib.inference.priors import Priors
 from calib.models.base import Array
 from calib.validation.prediction import echoed, outside
 
@@ -197,7 +199,9 @@ def load_corrected(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> Cor
             raise ValueError
         data = campaigns(read_case(Path(folder) / "case"))
         lab_mode = {name: np.array(t) for name, t in content["lab_mode"].items()}
-        fits = tuple(_load_fit(data, f, effects, lab_mode) for f in content["fits"])
+        known = with_own(data, effects)
+        priors = cache(lambda name: effect_priors(data, known[name]))
+        fits = tuple(_load_fit(data, f, known, priors, lab_mode) for f in content["fits"])
         probability = tuple(float(f["probability"]) for f in content["fits"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CalibError(
@@ -211,9 +215,9 @@ def _load_fit(
     data: Campaigns,
     document: dict[str, Any],
     effects: Mapping[str, Effect],
+    priors: Callable[[str], Priors],
     lab_mode: Mapping[str, Array],
 ) -> Fit:
-    effects = with_own(data, effects)
     unknown = [name for name in document["effects"] if name not in effects]
     if unknown:
         raise CalibError(
@@ -222,9 +226,9 @@ def _load_fit(
             mend="pass the Python file that defines it as the diagnosis was given it: "
             "--models FILE if it registers the effect, else --effects FILE",
         )
-    chosen = tuple(effects[name] for name in document["effects"])
     hypothesis = Hypothesis(
-        document["name"], chosen, tuple(effect_priors(data, e) for e in chosen),
+        document["name"], tuple(effects[name] for name in document["effects"]),
+        tuple(map(priors, document["effects"])),
         document["shift"], document["shift_as"], document["smooth"],
         tuple(document["smooth_outputs"]), document["smooth_over"], document["smooth_decay"],
         document["onset_over"],

@@ -20,12 +20,14 @@ import pytest
 import calib.check.check_report as check_report_module
 import calib.check.check_run as check_run_module
 from calib.batch.environment import sha256
-from calib.check import posteriors
+from calib.check import montecarlo, posteriors
 from calib.check.check import check
+from calib.check.montecarlo import posterior_errors
 from calib.check.outcome import Outcome, Status
 from calib.check.recompute import recompute_report, recompute_run
 from calib.he2019 import sections
 from calib.he2019.audit.run import begin_audit
+from calib.inference.calibration import Calibration
 from calib.report.publish import publication
 from calib.report.writer import file_hashes
 from tests.check.kernels import ALL, FEW, Setting
@@ -101,7 +103,24 @@ def _read() -> dict[Any, Any]:
 
 
 @pytest.fixture
-def computed_once(_made, _read, monkeypatch: pytest.MonkeyPatch) -> None:
+def audited_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Audit once with the same calibration."""
+    cache, _ = _made
+
+    def audit_again(seed, seeds, pool):
+        def finish(calibration, tell):
+            key = "audit", seed, seeds, calibration and calibration.draws.t.tobytes()
+            if key not in cache:
+                cache[key] = begin_audit(seed, seeds, pool)(calibration, tell)
+            return cache[key]
+
+        return finish
+
+    monkeypatch.setattr(sections, "begin_audit", audit_again)
+
+
+@pytest.fixture
+def computed_once(_made, _read, audited_once, monkeypatch: pytest.MonkeyPatch) -> None:
     """Do the work of equal inputs once, and read equal posteriors once.
 
     Most tampering leaves them as they are.
@@ -143,16 +162,13 @@ def computed_once(_made, _read, monkeypatch: pytest.MonkeyPatch) -> None:
 
         return read_once
 
-    def audit_again(seed, seeds, pool):
-        def finish(calibration, tell):
-            key = "audit", seed, seeds, calibration and calibration.draws.t.tobytes()
-            if key not in cache:
-                cache[key] = begin_audit(seed, seeds, pool)(calibration, tell)
-            return cache[key]
+    def errors_once(calibration: Calibration) -> dict[Any, Any]:
+        key = "errors", id(calibration)
+        if key not in cache:
+            cache[key] = calibration, posterior_errors(calibration)
+        return dict(cache[key][1])
 
-        return finish
-
-    monkeypatch.setattr(sections, "begin_audit", audit_again)
+    monkeypatch.setattr(montecarlo, "posterior_errors", errors_once)
     monkeypatch.setattr(check_report_module, "recompute_report", report_again)
     monkeypatch.setattr(check_run_module, "recompute_run", run_again)
     monkeypatch.setattr(posteriors, "_groups", reading_once(posteriors._groups))

@@ -47,7 +47,7 @@ def perturb(monkeypatch: pytest.MonkeyPatch, by: float) -> None:
 
 @pytest.mark.parametrize("by", [1e-15, pytest.param(1e-12, marks=pytest.mark.slow)])
 def test_one_evaluation_rounded_otherwise_is_no_difference(
-    whole: Path, monkeypatch: pytest.MonkeyPatch, by: float
+    whole: Path, monkeypatch: pytest.MonkeyPatch, by: float, audited_once: None
 ) -> None:
     perturb(monkeypatch, by)
     outcome = check(whole)

@@ -20,6 +20,7 @@ import hashlib
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -76,6 +77,7 @@ class PaperGap:
     variants: Mapping[str, Case] = field(default_factory=dict)
 
 
+@cache
 def paper_gaps() -> tuple[PaperGap, ...]:
     """Return the four gaps, made from the embedded data."""
     return (_plain_bekker(), _nominal_slip(), _held_out_pull(), _post_peak())

@@ -36,6 +36,13 @@ class _Sampler(emcee.EnsembleSampler):  # type: ignore[misc]
         """Return the state of the random numbers."""
         return self._random.get_state()
 
+    def compute_log_prob(self, coords: Array) -> tuple[Array, None]:
+        """Evaluate walkers at once; emcee takes the values apart one by one."""
+        log_prob: Array = self.log_prob_fn(coords)
+        if np.isnan(log_prob).any():
+            raise ValueError("a log density is not a number")
+        return log_prob, None
+
 
 class _Backend(emcee.backends.Backend):  # type: ignore[misc]
     """emcee's, in arrays that are given: memory new from the system is as dear as arithmetic."""

@@ -69,6 +69,7 @@ def escape(text: str) -> str:
     )
 
 
+@cache
 def _letter(letter: str) -> str:
     known = _SPECIAL.get(letter) or _SIGNS.get(letter) or _greek(letter)
     if known is not None:
