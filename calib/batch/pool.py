@@ -213,6 +213,7 @@ def _begin(files: Sequence[Path]) -> None:
     """Leave an interruption to the process that waits for the pieces; know what it knows."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     gc.freeze()  # what was imported stays: the garbage collector need not look at it again
+    gc.set_threshold(20_000, 20)  # as `calib.cli.main` has it
     Thread(target=_leave_with_parent, daemon=True).start()
     load_files(files)
 

@@ -203,7 +203,7 @@ def test_first_runs_that_fail_in_several_ways_are_no_reason_to_stop() -> None:
             raise RuntimeError("no licence")
         return np.nan * pull(theta, x) if count < 7 else pull(theta, x)
 
-    declared(fickle, "fickle", emulate=True, runs=40)
+    declared(fickle, "fickle", emulate=True, runs=30)
     emulation = calib.emulated(calib.build_problem("fickle", table()), seed=1)
     assert len(emulation.failed) == 6
 
@@ -353,7 +353,7 @@ def test_slow_simulators_are_not_called_by_the_sampler() -> None:
 
 
 def test_a_prepared_model_is_the_emulator_here_and_elsewhere(tmp_path: Path) -> None:
-    declared(pull, "slow", emulate=True, folder=tmp_path, runs=40)
+    declared(pull, "slow", emulate=True, folder=tmp_path, runs=25)
     emulation = prepare("slow", table(), 1)
     assert emulation is not None
     problem = calib.build_problem("slow", table())
