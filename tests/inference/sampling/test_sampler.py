@@ -19,12 +19,14 @@ from calib.inference.sampling.adapt import Guess
 from calib.inference.sampling.gate import Gate, judge
 from calib.inference.sampling.mixture import Mixture, StudentT
 from calib.inference.sampling.mode import find_modes
+from calib.inference.sampling.proposal import Proposal
 from calib.inference.sampling.sampler import (
     Draws,
     SamplerSettings,
     sample_density,
     sample_posterior,
 )
+from calib.inference.sampling.straighten import Straightener
 from tests.custom_problems import fixed, normal, problem_of
 from tests.inference.sampling.closed_form import (
     SIGMAS,
@@ -281,6 +283,40 @@ def test_what_is_discarded_of_a_good_proposals_chain_is_bounded(
     )  # fmt: skip
     assert draws.efficiency > ensemble_module.GOOD
     assert seen[0] == 4 * (steps + discarded)
+
+
+def normal_ensemble(log_prob) -> tuple[ensemble_module.Ensemble, Proposal]:
+    mixture = Mixture(np.ones(1), (StudentT(np.zeros(2), np.eye(2), 6.0),))
+    proposal = Proposal(Straightener.identity(2), mixture)
+    seed = np.random.SeedSequence(1)
+    return ensemble_module.Ensemble(log_prob, proposal, seed, walkers=64, ahead=16), proposal
+
+
+def test_under_a_poor_proposal_walkers_keep_a_normal() -> None:
+    """Local moves do most of the work: their densities are those of where the walkers are."""
+
+    def log_prob(t):
+        return -0.5 * np.square(t).sum(axis=1)
+
+    ensemble, proposal = normal_ensemble(log_prob)
+    t, value = np.empty((500, 64, 2)), np.empty((500, 64))
+    ensemble.run(proposal, 0.0, t, value)
+    np.testing.assert_allclose(value[1:].ravel(), log_prob(t[1:].reshape(-1, 2)), rtol=1e-12)
+    for values in (t, np.square(t) - 1.0):
+        size = ess(values.transpose(1, 0, 2), "mean")
+        assert np.all(np.abs(values.mean(axis=(0, 1))) < SIGMAS * values.std() / np.sqrt(size))
+
+
+def test_a_density_that_is_no_number_ends_a_run() -> None:
+    calls = []
+
+    def log_prob(t):
+        calls.append(len(t))
+        return np.zeros(len(t)) if len(calls) < 10 else np.full(len(t), np.nan)
+
+    ensemble, proposal = normal_ensemble(log_prob)
+    with pytest.raises(ValueError, match="not a number"):
+        ensemble.run(proposal, 0.0, np.empty((100, 64, 2)), np.empty((100, 64)))
 
 
 def test_emcee_takes_the_random_state(monkeypatch: pytest.MonkeyPatch) -> None:
