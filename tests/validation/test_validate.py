@@ -86,6 +86,7 @@ def test_rows_that_cannot_be_smoothed_are_refitted(
     assert found.elpd == pytest.approx(elpd.sum(), abs=bound)
 
 
+@pytest.mark.slow
 def test_two_workers_refit_to_the_same_numbers(small, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(validate_module, "PARETO_K_MAX", -np.inf)
     one, two = (leave_one_out(small, settings=FEW, workers=workers) for workers in (1, 2))

@@ -228,6 +228,7 @@ def below_zero(emulation: calib.Emulation) -> bool:
     return bool(emulation.emulator.training.nodes["slip_ratio"].min() < 0.0)
 
 
+@pytest.mark.slow
 def test_what_grows_beyond_bounds_across_zero_does_not_matter_to_a_fit() -> None:
     """At slips below zero exp(-slip/s0) is 1e200 for some s0 of this prior, and its posterior."""
     vague = PRIORS.replace("sd_log = 0.8", "sd_log = 2.5")

@@ -195,7 +195,7 @@ def test_thin_bent_ridges_come_out_right_or_are_refused(d: int, thinness: float)
         assert_distributed(draws, lambda t: t[:, 0], stats.norm())
 
 
-@pytest.mark.parametrize("seed", [0, *(slow(seed) for seed in range(1, 5))])
+@pytest.mark.parametrize("seed", [slow(seed) for seed in range(5)])
 def test_distant_modes_come_out_in_their_proportions(seed: int) -> None:
     """A square tells no sign: modes 80 sd apart, which no local move ever crosses."""
     slip = np.linspace(0.0, 0.2, 12)
