@@ -18,6 +18,14 @@ from calib.gap.next_measurement import NextMeasurement
 from calib.gap.shrink import Shrink
 from calib.gap.where import Region
 from calib.models import get_model
+from calib.report.gap_facts import (
+    Candidate,
+    CauseFact,
+    GapEvidence,
+    NextFact,
+    ShrinkFact,
+    WhereFact,
+)
 from calib.report.gap_rows import (
     OutputRows,
     condition_text,
@@ -32,18 +40,8 @@ from calib.report.gap_rows import (
 )
 from calib.report.gap_runs import over_runs
 from calib.report.gap_sizes import size_sentences, where_to_look
-from calib.report.gap_verdict import (
-    Candidate,
-    CauseFact,
-    GapEvidence,
-    GapVerdict,
-    NextFact,
-    ShrinkFact,
-    WhereFact,
-    judge_gap,
-    odds_text,
-)
-from calib.report.labels import MINUS, axis_of, joined, short
+from calib.report.gap_verdict import GapVerdict, judge_gap
+from calib.report.labels import MINUS, axis_of, joined, odds_text, short
 
 
 def gap_verdict(found: Diagnosis) -> GapVerdict:

@@ -9,8 +9,8 @@ from scipy.special import softmax
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import Effect
 from calib.gap.inclusion import UNLISTED
+from calib.report.gap_facts import NEITHER, RunsFact
 from calib.report.gap_rows import output_word
-from calib.report.gap_verdict import NEITHER, RunsFact
 from calib.report.labels import joined
 
 

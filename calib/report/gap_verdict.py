@@ -21,14 +21,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from calib.report.labels import joined
+from calib.report.gap_facts import (
+    MOST_TIED,
+    NEITHER,
+    TIE,
+    Candidate,
+    GapEvidence,
+    NextFact,
+    causes_text,
+    how_far_text,
+    where_text,
+    which_text,
+)
+from calib.report.labels import joined, odds_text
 
 SURE = 0.9
-# Hypotheses within this factor of the best are read as a tie with it.
-TIE = 0.2
-_MOST_TIED = 4
-# A change over the runs that nothing listed explains.
-NEITHER = "something that is neither"
 # ln 20: the evidence that makes odds of twenty to one.
 _ENOUGH_NATS = math.log(20.0)
 _PREDICT = "calib predict DIAGNOSIS --at NEW.csv"
@@ -40,162 +47,6 @@ class Tone(StrEnum):
     FINE = "fine"
     CARE = "care"
     NO = "no"
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A hypothesis: its name, its name in words, its claim, its probability."""
-
-    name: str
-    words: str
-    title: str
-    probability: float
-
-
-@dataclass(frozen=True)
-class WhereFact:
-    """A region: "drawbar pull, at slips from 30 to 60 %", "0.09 kN lower", its probability."""
-
-    place: str
-    gap: str
-    probability: float
-
-
-@dataclass(frozen=True)
-class CauseFact:
-    """A cause: its name, in words, what happens, whether it acts, and its share of the gap.
-
-    `instrument` says that it is a fault of one, not of wheel or soil.
-    """
-
-    name: str
-    words: str
-    title: str
-    probability: float
-    share: float
-    interval: tuple[float, float]
-    instrument: bool = False
-
-
-@dataclass(frozen=True)
-class ShrinkFact:
-    """Errors in words with units; fraction and interval as ratios."""
-
-    output: str
-    before: str
-    after: str
-    floor: str
-    fraction: float
-    interval: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class NextFact:
-    """A measurement: the two hypotheses in words, where, and what it is expected to tell."""
-
-    separates: tuple[str, str]
-    conditions: str
-    gain_nats: float
-
-
-@dataclass(frozen=True)
-class RunsFact:
-    """A change over the order of the runs: of what, and how probable in whichever form.
-
-    Parameters
-    ----------
-    outputs : str
-        In words.
-    probability : float
-    forms : sequence of (str, float)
-        "a drift", "a step", `NEITHER`, the most probable first.
-    together : bool
-        Whether it is a change of several outputs at once.
-    only : bool
-        Whether no other output is measured.
-    """
-
-    outputs: str
-    probability: float
-    forms: Sequence[tuple[str, float]]
-    together: bool = False
-    only: bool = False
-
-    @property
-    def rivals(self) -> list[tuple[str, float]]:
-        """Forms about as probable as the first."""
-        return [form for form in self.forms if form[1] >= TIE * self.forms[0][1]]
-
-
-@dataclass(frozen=True)
-class GapEvidence:
-    """What a verdict is made from.
-
-    Parameters
-    ----------
-    verdict : {"effect", "none", "unknown", "ambiguous"}
-    ranked : sequence of Candidate
-        Most probable first.
-    sizes : sequence of str
-        What the best hypothesis amounts to.
-    where : sequence of WhereFact
-        One of each output that has any.
-    shrink_place : str
-        On which rows the shrink was judged.
-    alike : sequence of str
-        Effects that look like the best one on this design, in words.
-    smallest : float
-        Smallest size that this design can name, in noise sds of the laboratory.
-    look : str
-        What to measure where nothing that is listed explains the gap.
-    causes : sequence of CauseFact
-        Listed causes, whatever acts besides.
-    remainder : CauseFact, optional
-        Something that is not listed, by itself or beside listed causes.
-    remainder_where : str
-        Where that lies.
-    untested : sequence of str
-        Listed effects on the outputs of the named causes that a column is missing for, with which.
-    assumed : sequence of str
-        What was taken for conditions of the calibration that it does not record, on which the best
-        hypothesis rests.
-    put_in, without : str
-        What was put into the diagnosis besides the data, and what it finds without that.
-    runs : RunsFact, optional
-        A change over the order of the runs, of the outputs that most probably do.
-    """
-
-    verdict: str
-    ranked: Sequence[Candidate]
-    sizes: Sequence[str]
-    where: Sequence[WhereFact]
-    shrink: Sequence[ShrinkFact]
-    shrink_place: str
-    next_facts: Sequence[NextFact]
-    alike: Sequence[str] = ()
-    smallest: float = float("nan")
-    look: str = ""
-    causes: Sequence[CauseFact] = ()
-    remainder: CauseFact | None = None
-    remainder_where: str = ""
-    untested: Sequence[str] = ()
-    assumed: Sequence[str] = ()
-    put_in: str = ""
-    without: str = ""
-    runs: RunsFact | None = None
-
-    @property
-    def acting(self) -> list[CauseFact]:
-        """Causes that are more likely to act than not, the largest share first."""
-        found = [c for c in self.causes if c.probability >= 0.5]
-        if not self.causes:
-            # Of the best explanation alone, where nothing is known of its parts.
-            best = self.ranked[0]
-            nan = float("nan")
-            found = [
-                CauseFact(best.name, best.words, best.title, best.probability, nan, (nan, nan))
-            ]
-        return sorted(found, key=lambda c: -c.share)
 
 
 @dataclass(frozen=True)
@@ -315,10 +166,10 @@ def _no_gap(e: GapEvidence, best: Candidate) -> GapVerdict:
 
 
 def _facts(e: GapEvidence) -> list[tuple[str, str]]:
-    facts = [("Causes", _causes(e))] if e.causes else []
+    facts = [("Causes", causes_text(e))] if e.causes else []
     if e.put_in:
         facts.append(("Put in", f"{e.put_in}. Without that: {e.without}"))
-    facts.append(("Which", _which(e)))
+    facts.append(("Which", which_text(e)))
     if e.untested:
         one = "it acts, its" if len(e.untested) == 1 else "any acts, its"
         facts.append(
@@ -331,66 +182,8 @@ def _facts(e: GapEvidence) -> list[tuple[str, str]]:
         )  # fmt: skip
     if e.sizes:
         facts.append(("How large", f"{'; '.join(e.sizes)}"))
-    facts += [("Where", _where(e)), ("How far", _how_far(e)), *_next(e)]
+    facts += [("Where", where_text(e)), ("How far", how_far_text(e)), *_next(e)]
     return facts
-
-
-def _causes(e: GapEvidence) -> str:
-    """Say what acts, whatever acts besides, and what part of the gap it is."""
-    named = e.acting or [c for c in e.causes if c.probability >= 0.05][:2]
-    parts = [
-        f"{c.words} acts ({odds_text(c.probability)}) and is {_share(c)} of the gap" for c in named
-    ]
-    rest = e.remainder
-    if rest is not None and rest.probability >= 0.05:
-        where = f", {e.remainder_where}," if e.remainder_where else ""
-        parts.append(
-            f"what is of no listed shape{where} is there with {odds_text(rest.probability)} and is "
-            f"{_share(rest)} of it"
-        )
-    return "; ".join(parts) or "No listed cause reaches 5 %"
-
-
-def _share(c: CauseFact) -> str:
-    low, high = (_per_cent(v) for v in c.interval)
-    return f"{_per_cent(c.share)} % ({low} to {high} %)"
-
-
-def _which(e: GapEvidence) -> str:
-    best = e.ranked[0]
-    text = f"As a whole: {best.words}, probability {odds_text(best.probability)}"
-    rivals = [c for c in e.ranked[1:_MOST_TIED] if c.probability >= 0.05]
-    if rivals:
-        listed = joined([f"{c.words} ({odds_text(c.probability)})" for c in rivals])
-        text += f"; also possible: {listed}"
-    else:
-        text += "; nothing else reaches 5 %"
-    if e.alike:
-        text += f". On these conditions it looks like {joined(list(e.alike))}"
-    return text
-
-
-def _where(e: GapEvidence) -> str:
-    if not e.where:
-        return "In no stretch of the conditions does the gap probably exceed the noise"
-    return "; ".join(f"{w.place}: {w.gap} ({odds_text(w.probability)})" for w in e.where)
-
-
-def _how_far(e: GapEvidence) -> str:
-    if not e.shrink:
-        return "No output has a gap that could shrink"
-    parts = []
-    for s in e.shrink:
-        low, high = (_per_cent(v) for v in s.interval)
-        shrinks = "it shrinks by" if s.fraction > 0.0 else "it does not shrink:"
-        part = (
-            f"{s.output} error from {s.before} to {s.after} rms (noise {s.floor}): {shrinks} "
-            f"{_per_cent(s.fraction)} % (90 % interval {low} to {high} %)"
-        )
-        if s.interval[0] <= 0.0 < s.fraction:
-            part += ", so it may not shrink at all"
-        parts.append(part)
-    return f"{'; '.join(parts)}, {e.shrink_place}"
 
 
 def advice(e: GapEvidence) -> str:
@@ -469,21 +262,10 @@ def repeats_needed(gain_nats: float) -> int | None:
     return repeats if repeats <= 50 else None
 
 
-def odds_text(p: float) -> str:
-    """Write a probability as a percentage without claiming certainty."""
-    if p > 0.995:
-        return "above 99 %"
-    return "below 1 %" if p < 0.01 else f"{100.0 * p:.0f} %"
-
-
 def _tied(e: GapEvidence) -> list[Candidate]:
     best = e.ranked[0].probability
-    return [c for c in e.ranked if c.probability >= TIE * best][:_MOST_TIED]
+    return [c for c in e.ranked if c.probability >= TIE * best][:MOST_TIED]
 
 
 def _hedge(sure: bool) -> str:
     return "" if sure else "probably "
-
-
-def _per_cent(ratio: float) -> str:
-    return f"{100.0 * ratio:.0f}".replace("-", "\N{MINUS SIGN}")

@@ -166,6 +166,13 @@ def percent_range(ends: tuple[float, float]) -> str:
     return f"{low} to {high} %"
 
 
+def odds_text(p: float) -> str:
+    """Write a probability as a percentage without claiming certainty."""
+    if p > 0.995:
+        return "above 99 %"
+    return "below 1 %" if p < 0.01 else f"{100.0 * p:.0f} %"
+
+
 def joined(words: list[str]) -> str:
     """Join words as a sentence does."""
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"

@@ -17,8 +17,7 @@ from calib.report.figures.plate import Plate
 from calib.report.figures.style import pdf_bytes, png, png_size
 from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_rows import short_name
-from calib.report.gap_verdict import odds_text
-from calib.report.labels import percent, percent_range
+from calib.report.labels import odds_text, percent, percent_range
 from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
 from calib.report.page.template import data_uri, sentences, template
 from calib.report.study import Progress

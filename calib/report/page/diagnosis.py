@@ -29,22 +29,15 @@ from calib.report.gap_evidence import (
     region_words,
     shrink_facts,
 )
+from calib.report.gap_facts import TIE, GapEvidence
 from calib.report.gap_rows import (
     output_axis,
     output_word,
     short_name,
     title_of,
 )
-from calib.report.gap_verdict import (
-    TIE,
-    GapEvidence,
-    Tone,
-    advice,
-    judge_gap,
-    odds_text,
-    repeats_needed,
-)
-from calib.report.labels import MINUS, degrees, percent, percent_range, short
+from calib.report.gap_verdict import Tone, advice, judge_gap, repeats_needed
+from calib.report.labels import MINUS, degrees, odds_text, percent, percent_range, short
 from calib.report.numbers import format_number, format_value
 from calib.report.page.template import equation, parametrisation, picture, prose, template
 

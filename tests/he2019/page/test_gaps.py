@@ -13,8 +13,7 @@ from calib.he2019.page.gaps import _withheld, check_text
 from calib.he2019.sections import FoundGaps
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.gap_rows import short_name
-from calib.report.gap_verdict import odds_text
-from calib.report.labels import short
+from calib.report.labels import odds_text, short
 from calib.report.study import Study
 from calib.report.writer import file_hashes, write_report
 from tests.browser import faults

@@ -25,9 +25,7 @@ from calib.gap.inclusion import Included, Inclusion, inclusion_probability
 from calib.gap.next_measurement import NextMeasurement
 from calib.inference.priors import Prior
 from calib.report.gap_evidence import gap_evidence
-from calib.report.gap_rows import shrink_place
-from calib.report.gap_sizes import size_sentences
-from calib.report.gap_verdict import (
+from calib.report.gap_facts import (
     NEITHER,
     Candidate,
     CauseFact,
@@ -35,13 +33,12 @@ from calib.report.gap_verdict import (
     NextFact,
     RunsFact,
     ShrinkFact,
-    Tone,
     WhereFact,
-    judge_gap,
-    odds_text,
-    repeats_needed,
 )
-from calib.report.labels import short
+from calib.report.gap_rows import shrink_place
+from calib.report.gap_sizes import size_sentences
+from calib.report.gap_verdict import Tone, judge_gap, repeats_needed
+from calib.report.labels import odds_text, short
 from calib.report.page.diagnosis import (
     conditions_text,
     hypothesis_groups,

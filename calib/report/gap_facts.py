@@ -1,0 +1,233 @@
+"""What was found about a gap: the facts that a verdict is made from, and how each is said."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from calib.report.labels import MINUS, joined, odds_text, percent_range
+
+# Hypotheses within this factor of the best are read as a tie with it.
+TIE = 0.2
+MOST_TIED = 4
+# A change over the runs that nothing listed explains.
+NEITHER = "something that is neither"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A hypothesis: its name, its name in words, its claim, its probability."""
+
+    name: str
+    words: str
+    title: str
+    probability: float
+
+
+@dataclass(frozen=True)
+class WhereFact:
+    """A region: "drawbar pull, at slips from 30 to 60 %", "0.09 kN lower", its probability."""
+
+    place: str
+    gap: str
+    probability: float
+
+
+@dataclass(frozen=True)
+class CauseFact:
+    """A cause: its name, in words, what happens, whether it acts, and its share of the gap.
+
+    `instrument` says that it is a fault of one, not of wheel or soil.
+    """
+
+    name: str
+    words: str
+    title: str
+    probability: float
+    share: float
+    interval: tuple[float, float]
+    instrument: bool = False
+
+
+@dataclass(frozen=True)
+class ShrinkFact:
+    """Errors in words with units; fraction and interval as ratios."""
+
+    output: str
+    before: str
+    after: str
+    floor: str
+    fraction: float
+    interval: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class NextFact:
+    """A measurement: the two hypotheses in words, where, and what it is expected to tell."""
+
+    separates: tuple[str, str]
+    conditions: str
+    gain_nats: float
+
+
+@dataclass(frozen=True)
+class RunsFact:
+    """A change over the order of the runs: of what, and how probable in whichever form.
+
+    Parameters
+    ----------
+    outputs : str
+        In words.
+    probability : float
+    forms : sequence of (str, float)
+        "a drift", "a step", `NEITHER`, the most probable first.
+    together : bool
+        Whether it is a change of several outputs at once.
+    only : bool
+        Whether no other output is measured.
+    """
+
+    outputs: str
+    probability: float
+    forms: Sequence[tuple[str, float]]
+    together: bool = False
+    only: bool = False
+
+    @property
+    def rivals(self) -> list[tuple[str, float]]:
+        """Forms about as probable as the first."""
+        return [form for form in self.forms if form[1] >= TIE * self.forms[0][1]]
+
+
+@dataclass(frozen=True)
+class GapEvidence:
+    """What a verdict is made from.
+
+    Parameters
+    ----------
+    verdict : {"effect", "none", "unknown", "ambiguous"}
+    ranked : sequence of Candidate
+        Most probable first.
+    sizes : sequence of str
+        What the best hypothesis amounts to.
+    where : sequence of WhereFact
+        One of each output that has any.
+    shrink_place : str
+        On which rows the shrink was judged.
+    alike : sequence of str
+        Effects that look like the best one on this design, in words.
+    smallest : float
+        Smallest size that this design can name, in noise sds of the laboratory.
+    look : str
+        What to measure where nothing that is listed explains the gap.
+    causes : sequence of CauseFact
+        Listed causes, whatever acts besides.
+    remainder : CauseFact, optional
+        Something that is not listed, by itself or beside listed causes.
+    remainder_where : str
+        Where that lies.
+    untested : sequence of str
+        Listed effects on the outputs of the named causes that a column is missing for, with which.
+    assumed : sequence of str
+        What was taken for conditions of the calibration that it does not record, on which the best
+        hypothesis rests.
+    put_in, without : str
+        What was put into the diagnosis besides the data, and what it finds without that.
+    runs : RunsFact, optional
+        A change over the order of the runs, of the outputs that most probably do.
+    """
+
+    verdict: str
+    ranked: Sequence[Candidate]
+    sizes: Sequence[str]
+    where: Sequence[WhereFact]
+    shrink: Sequence[ShrinkFact]
+    shrink_place: str
+    next_facts: Sequence[NextFact]
+    alike: Sequence[str] = ()
+    smallest: float = float("nan")
+    look: str = ""
+    causes: Sequence[CauseFact] = ()
+    remainder: CauseFact | None = None
+    remainder_where: str = ""
+    untested: Sequence[str] = ()
+    assumed: Sequence[str] = ()
+    put_in: str = ""
+    without: str = ""
+    runs: RunsFact | None = None
+
+    @property
+    def acting(self) -> list[CauseFact]:
+        """Causes that are more likely to act than not, the largest share first."""
+        found = [c for c in self.causes if c.probability >= 0.5]
+        if not self.causes:
+            # Of the best explanation alone, where nothing is known of its parts.
+            best = self.ranked[0]
+            nan = float("nan")
+            found = [
+                CauseFact(best.name, best.words, best.title, best.probability, nan, (nan, nan))
+            ]
+        return sorted(found, key=lambda c: -c.share)
+
+
+def causes_text(e: GapEvidence) -> str:
+    """Say what acts, whatever acts besides, and what part of the gap it is."""
+    named = e.acting or [c for c in e.causes if c.probability >= 0.05][:2]
+    parts = [
+        f"{c.words} acts ({odds_text(c.probability)}) and is {_share(c)} of the gap" for c in named
+    ]
+    rest = e.remainder
+    if rest is not None and rest.probability >= 0.05:
+        where = f", {e.remainder_where}," if e.remainder_where else ""
+        parts.append(
+            f"what is of no listed shape{where} is there with {odds_text(rest.probability)} and is "
+            f"{_share(rest)} of it"
+        )
+    return "; ".join(parts) or "No listed cause reaches 5 %"
+
+
+def _share(c: CauseFact) -> str:
+    return f"{_per_cent(c.share)} % ({percent_range(c.interval)})"
+
+
+def which_text(e: GapEvidence) -> str:
+    """Say which hypothesis is the best, what else is possible, and what looks like it."""
+    best = e.ranked[0]
+    text = f"As a whole: {best.words}, probability {odds_text(best.probability)}"
+    rivals = [c for c in e.ranked[1:MOST_TIED] if c.probability >= 0.05]
+    if rivals:
+        listed = joined([f"{c.words} ({odds_text(c.probability)})" for c in rivals])
+        text += f"; also possible: {listed}"
+    else:
+        text += "; nothing else reaches 5 %"
+    if e.alike:
+        text += f". On these conditions it looks like {joined(list(e.alike))}"
+    return text
+
+
+def where_text(e: GapEvidence) -> str:
+    """Say in which regions the gap probably exceeds the noise."""
+    if not e.where:
+        return "In no stretch of the conditions does the gap probably exceed the noise"
+    return "; ".join(f"{w.place}: {w.gap} ({odds_text(w.probability)})" for w in e.where)
+
+
+def how_far_text(e: GapEvidence) -> str:
+    """Say by how much the error of each output shrinks."""
+    if not e.shrink:
+        return "No output has a gap that could shrink"
+    parts = []
+    for s in e.shrink:
+        shrinks = "it shrinks by" if s.fraction > 0.0 else "it does not shrink:"
+        part = (
+            f"{s.output} error from {s.before} to {s.after} rms (noise {s.floor}): {shrinks} "
+            f"{_per_cent(s.fraction)} % (90 % interval {percent_range(s.interval)})"
+        )
+        if s.interval[0] <= 0.0 < s.fraction:
+            part += ", so it may not shrink at all"
+        parts.append(part)
+    return f"{'; '.join(parts)}, {e.shrink_place}"
+
+
+def _per_cent(ratio: float) -> str:
+    return f"{100.0 * ratio:.0f}".replace("-", MINUS)
