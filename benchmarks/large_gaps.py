@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.gap.case import Campaigns, Case, campaigns, read_case
+from calib.gap.campaigns import Campaigns, campaigns
+from calib.gap.case import Case, read_case
 from calib.gap.diagnose import diagnose
 from calib.gap.hypotheses import split_testable
 from calib.gap.noise import noise_conditions

@@ -21,7 +21,8 @@ from scipy.special import logsumexp
 
 from calib.batch.tasks import completed
 from calib.batch.threads import one_thread
-from calib.gap.case import OutputData, campaigns, read_case
+from calib.gap.campaigns import OutputData, campaigns
+from calib.gap.case import read_case
 from calib.gap.fit import Fit, fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import SHIFTS

@@ -12,7 +12,8 @@ from calib.data.numbers import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
 from calib.data.units_check import mixed_units
 from calib.errors import CalibError
-from calib.gap.case import MAX_RATIO, Case
+from calib.gap.campaigns import MAX_RATIO
+from calib.gap.case import Case
 from calib.models import get_model
 from calib.models.base import Array
 

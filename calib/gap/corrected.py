@@ -18,7 +18,8 @@ import numpy as np
 from calib.data import Table, write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.gap.case import Campaigns, campaigns, read_case
+from calib.gap.campaigns import Campaigns, campaigns
+from calib.gap.case import read_case
 from calib.gap.declared import cells, with_declared
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Fit

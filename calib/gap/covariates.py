@@ -12,7 +12,7 @@ from calib.gap.effects import View
 from calib.models.base import Array
 
 if TYPE_CHECKING:
-    from calib.gap.case import Campaigns
+    from calib.gap.campaigns import Campaigns
 
 __all__ = ["Covariates", "columns_over", "other_conditions"]
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
-from calib.gap.case import MIN_FIELD_ROWS, Campaigns, Case, campaigns, read_case
+from calib.gap.campaigns import MIN_FIELD_ROWS, Campaigns, campaigns
+from calib.gap.case import Case, read_case
 from calib.gap.context import Context
 from calib.gap.corrected import Corrected, conditions_outside
 from calib.gap.declared import new_values

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.special import expit
 
-from calib.gap.case import Campaigns, OutputData
+from calib.gap.campaigns import Campaigns, OutputData
 from calib.gap.covariates import other_conditions
 from calib.gap.effects import View
 from calib.gap.effects.base import each

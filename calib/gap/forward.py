@@ -19,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 
 from calib.data.quantities import columns_of
-from calib.gap.case import Campaigns
+from calib.gap.campaigns import Campaigns
 from calib.gap.departed import departed_of_all
 from calib.gap.discrepancy import THRESHOLDS, Bases, Discrepancy
 from calib.gap.effects import Effect, View

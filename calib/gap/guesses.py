@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.gap.case import Campaigns
+from calib.gap.campaigns import Campaigns
 from calib.gap.discrepancy import Bases
 from calib.gap.effects import Effect
 from calib.gap.fit import Fit, Start, finished, truncated_fits

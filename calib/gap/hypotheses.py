@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from calib.data.quantities import OUTPUTS, QUANTITIES, role_of
-from calib.gap.case import Campaigns
+from calib.gap.campaigns import Campaigns
 from calib.gap.covariates import columns_over, other_conditions
 from calib.gap.discrepancy import SETTINGS
 from calib.gap.effects import EFFECTS, Effect

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calib.gap.case import Campaigns
+from calib.gap.campaigns import Campaigns
 from calib.gap.fit import Fit
 from calib.gap.forward import FORM_ERROR
 from calib.gap.mixture import Mixture

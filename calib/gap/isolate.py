@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import brentq
 
-from calib.gap.case import Campaigns
+from calib.gap.campaigns import Campaigns
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.hypothesis import Hypothesis

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.gap.case import Campaigns
+from calib.gap.campaigns import Campaigns
 from calib.gap.effects import View
 from calib.gap.fit import Fit
 from calib.gap.noise import noise_conditions

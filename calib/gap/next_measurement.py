@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from calib.data.quantities import QUANTITIES, role_of
-from calib.gap.case import Campaigns
+from calib.gap.campaigns import Campaigns
 from calib.gap.effects import View
 from calib.gap.fit import Fit
 from calib.gap.noise import noise_conditions

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.gap.case import Campaigns
+from calib.gap.campaigns import Campaigns
 from calib.gap.departed import departed_of_all
 from calib.gap.forward import Forward
 from calib.gap.noise import Noise, most_probable

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from calib.data import Table
 from calib.data.numbers import plain_number
 from calib.data.quantities import OUTPUTS
-from calib.gap.case import Campaigns, Case, OutputData, campaigns
+from calib.gap.campaigns import Campaigns, OutputData, campaigns
+from calib.gap.case import Case
 from calib.gap.conditions import check_units, without_far_conditions
 from calib.gap.which import Lab, Ranking, calibrate_lab
 from calib.models.base import Array

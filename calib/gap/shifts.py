@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from scipy.linalg import block_diag
 
 from calib.errors import CalibError
-from calib.gap.case import OutputData
+from calib.gap.campaigns import OutputData
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calib.gap.case import Campaigns
+from calib.gap.campaigns import Campaigns
 from calib.gap.mixture import Truth
 from calib.models.base import Array
 

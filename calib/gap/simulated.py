@@ -17,7 +17,7 @@ from calib.models.base import Array
 from calib.models.simulators.emulator.model import emulator_of
 
 if TYPE_CHECKING:
-    from calib.gap.case import OutputData
+    from calib.gap.campaigns import OutputData
 
 __all__ = ["Simulated"]
 

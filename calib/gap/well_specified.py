@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from calib.data import Table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.gap.case import Campaigns, campaigns, read_case
+from calib.gap.campaigns import Campaigns, campaigns
+from calib.gap.case import read_case
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import pair, shifts, singles, split_testable, unknowns
 from calib.gap.hypothesis import Hypothesis

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data.quantities import columns_of
-from calib.gap.case import Campaigns
+from calib.gap.campaigns import Campaigns
 from calib.gap.covariates import other_conditions
 from calib.gap.mixture import Truth
 from calib.models.base import Array

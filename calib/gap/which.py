@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from calib.errors import CalibError
-from calib.gap.case import Campaigns, OutputData
+from calib.gap.campaigns import Campaigns, OutputData
 from calib.gap.context import Context
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.readings import ReadingDrift, ReadingStep

@@ -23,7 +23,8 @@ from calib.cli.verbs import app
 from calib.data import read_table
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
-from calib.gap.case import campaigns, read_case
+from calib.gap.campaigns import campaigns
+from calib.gap.case import read_case
 from calib.inference.prior_files import default_priors, parse_priors, read_priors
 from calib.inference.problem import build_problem
 from calib.models import MODELS, example_csv

@@ -11,7 +11,8 @@ import numpy as np
 
 from calib.data import Table, table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS, physical_role, role_of
-from calib.gap.case import Campaigns, Case, campaigns
+from calib.gap.campaigns import Campaigns, campaigns
+from calib.gap.case import Case
 from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.which import Ranking

@@ -19,7 +19,7 @@ from calib.gap.ascent import (
     slopes,
     together,
 )
-from calib.gap.case import Campaigns, campaigns
+from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.fit import Fit, Start, finished, log_joint, truncated_fits
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import pair, shifts, singles, split_testable, unknowns

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.gap.assumed import assumed
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import pair, singles
 from calib.gap.hypothesis import Hypothesis

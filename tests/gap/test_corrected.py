@@ -12,7 +12,8 @@ from calib.cli.verbs import app
 from calib.data import Table, table_from_arrays, write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.gap.case import campaigns, read_case
+from calib.gap.campaigns import campaigns
+from calib.gap.case import read_case
 from calib.gap.corrected import (
     Corrected,
     conditions_outside,

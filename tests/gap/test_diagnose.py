@@ -10,7 +10,7 @@ import pytest
 
 import calib.gap.diagnose as module
 from calib.batch.pool import HERE
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.context import Context
 from calib.gap.diagnose import (
     _beyond,

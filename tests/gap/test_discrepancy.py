@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.gap.case import Campaigns, campaigns
+from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.discrepancy import Discrepancy
 from calib.gap.hypothesis import Hypothesis
 from tests.gap.cases import campaigns_of, make_case

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import calib
-from calib.gap.case import Campaigns, Case, campaigns
+from calib.gap.campaigns import Campaigns, campaigns
+from calib.gap.case import Case
 from calib.gap.fit import fit, log_joint
 from calib.gap.forward import Forward
 from calib.gap.hypothesis import Hypothesis

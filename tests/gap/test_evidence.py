@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_normal, norm
 
 import calib.gap.fit as module
-from calib.gap.case import Campaigns, OutputData, campaigns
+from calib.gap.campaigns import Campaigns, OutputData, campaigns
 from calib.gap.fit import Fit, _bounds_correction, _near, _within, finished, fit, log_joint
 from calib.gap.forward import Forward
 from calib.gap.hypothesis import Hypothesis

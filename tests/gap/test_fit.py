@@ -14,7 +14,8 @@ from scipy.special import logsumexp
 from scipy.stats import multivariate_t
 
 from calib.data import table_from_arrays
-from calib.gap.case import Campaigns, Case, campaigns
+from calib.gap.campaigns import Campaigns, campaigns
+from calib.gap.case import Case
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit, _ln_mass, fit
 from calib.gap.fit import log_joint as joint

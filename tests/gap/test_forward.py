@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calib.data.quantities import role_of
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors, pair, shifts, singles, unknowns, with_remainder

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Start

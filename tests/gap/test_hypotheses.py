@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from calib.data import table_from_arrays
-from calib.gap.case import Case, campaigns
+from calib.gap.campaigns import campaigns
+from calib.gap.case import Case
 from calib.gap.diagnose import diagnose, diagnose_once
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward

@@ -11,7 +11,7 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from calib.data import table_from_arrays
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import LN_PRIOR, singles
 from calib.gap.isolate import ALIKE, isolability, smallest_shown

@@ -7,7 +7,7 @@ import pytest
 import calib
 from calib.batch.plugins import run_file
 from calib.errors import CalibError
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.check import check_effects

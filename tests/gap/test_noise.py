@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.data import table_from_arrays
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.noise import (
     KAPPA,
     RHO,

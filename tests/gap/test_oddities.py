@@ -10,7 +10,7 @@ import pytest
 from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
 from calib.gap.noise import noise_conditions

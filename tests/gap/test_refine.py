@@ -8,7 +8,7 @@ import emcee
 import numpy as np
 import pytest
 
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import fit, log_joint
 from calib.gap.forward import Forward

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import singles

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 import calib.gap.screening as module
 from calib.errors import CalibError
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.diagnose import screened_ranking
 from calib.gap.effects import EFFECTS
 from calib.gap.screening import (

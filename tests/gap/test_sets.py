@@ -13,7 +13,8 @@ from scipy.stats import norm
 import calib.gap.sets as module
 from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS, physical_role
-from calib.gap.case import Case, campaigns
+from calib.gap.campaigns import campaigns
+from calib.gap.case import Case
 from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward

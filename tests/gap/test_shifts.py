@@ -10,7 +10,7 @@ import pytest
 
 from calib.errors import CalibError
 from calib.gap import shifts as module
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.corrected import Corrected, load_corrected, predict_columns, save_corrected
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit

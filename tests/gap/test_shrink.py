@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib.data import table_from_arrays
-from calib.gap.case import campaigns
+from calib.gap.campaigns import campaigns
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
 from calib.gap.mixture import Truth, mixture

@@ -15,7 +15,8 @@ import pytest
 import calib.gap.well_specified as module
 from calib.errors import CalibError
 from calib.gap.batch import case_folders, diagnose_cases
-from calib.gap.case import campaigns, read_case
+from calib.gap.campaigns import campaigns
+from calib.gap.case import read_case
 from calib.gap.noise import Noise, noise_conditions
 from calib.gap.well_specified import SIZE_RATIO, draw_from_hypothesis, well_specified_case
 from calib.gap.which import calibrate_lab

@@ -12,7 +12,8 @@ import pytest
 from calib.data import table_from_arrays
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.gap.case import Case, campaigns
+from calib.gap.campaigns import campaigns
+from calib.gap.case import Case
 from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import dependences

@@ -11,7 +11,8 @@ from scipy import integrate, stats
 
 from calib.data import Table, read_for_model, table_from_arrays
 from calib.errors import CalibError
-from calib.gap.case import campaigns, case_from_run
+from calib.gap.campaigns import campaigns
+from calib.gap.case import case_from_run
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.emulation.prepared import emulated
 from calib.inference.estimators import estimate, methods_for
@@ -291,7 +292,7 @@ def test_an_emulator_and_a_diagnosis_refuse_another_noise(
     problem = problem_with(tmp_path, STUDENT, he2019_table("rut_depth"))
     with pytest.raises(CalibError, match="an emulator takes normal noise"):
         emulated(problem, 1)
-    monkeypatch.setattr("calib.gap.case.build_problem", lambda model, lab, priors: problem)
+    monkeypatch.setattr("calib.gap.campaigns.build_problem", lambda model, lab, priors: problem)
     with pytest.raises(CalibError, match="a diagnosis takes normal noise"):
         campaigns(make_case())
     uncertain = replace(problem.bound.model, uncertain=lambda theta, conditions: None)

@@ -18,7 +18,8 @@ import numpy as np
 from calib.batch.plugins import declared_in
 from calib.data.quantities import QUANTITIES, role_of
 from calib.errors import CalibError, meant
-from calib.gap.case import Campaigns, Case, OutputData, campaigns
+from calib.gap.campaigns import Campaigns, OutputData, campaigns
+from calib.gap.case import Case
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from calib.gap.case import OutputData
+from calib.gap.campaigns import OutputData
 from calib.gap.diagnose import NAMED, Diagnosis
 from calib.gap.effects.dependence import PREFIX
 from calib.gap.fit import Fit
