@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from calib.report.figures.bands import (
-    bands_plate,
-    cone_and_water,
-    density_plate,
-    prior_predictive_plate,
-)
+from calib.report.figures.bands import bands_plate, prior_predictive_plate
 from calib.report.figures.corner import corner_plate
+from calib.report.figures.density import cone_and_water, density_plate
 from calib.report.figures.estimates import by_pressure_plate, estimates_plate
 from calib.report.figures.plate import Plate, draw_all
 from calib.report.figures.posterior import ensembles_plate, learned_plate

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from calib.data.quantities import role_of
 from calib.models.base import Array
-from calib.report.figures.bands import cone_and_water, draw_predicted_observed
+from calib.report.figures.density import cone_and_water, draw_predicted_observed
 from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,

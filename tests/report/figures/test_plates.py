@@ -15,9 +15,10 @@ from calib.data import table_from_arrays
 from calib.data.quantities import QUANTITIES
 from calib.he2019.figures.reference import HE2019
 from calib.report.figures import collect
-from calib.report.figures.bands import bands_plate, density_plate, prior_predictive_plate
+from calib.report.figures.bands import bands_plate, prior_predictive_plate
 from calib.report.figures.collect import plates
 from calib.report.figures.corner import corner_plate
+from calib.report.figures.density import density_plate
 from calib.report.figures.estimates import estimates_plate
 from calib.report.figures.plate import Plate
 from calib.report.figures.posterior import ensembles_plate, learned_plate
