@@ -21,9 +21,13 @@ from calib.report.publish.records import (
     write_csv,
     write_latex,
 )
-from calib.report.publish.tables import (
+from calib.report.publish.scores import (
     convergence_csv,
     convergence_latex,
+    validation_csv,
+    validation_latex,
+)
+from calib.report.publish.tables import (
     estimates_csv,
     estimates_latex,
     posterior_csv,
@@ -31,8 +35,6 @@ from calib.report.publish.tables import (
     pressure_latex,
     priors_csv,
     priors_latex,
-    validation_csv,
-    validation_latex,
 )
 
 _WIDTH = 96
