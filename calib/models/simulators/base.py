@@ -1,7 +1,7 @@
 """What every simulator is: parameters and conditions in, outputs or a reason why not out.
 
 A run is one parameter vector at all conditions asked for. That is the unit that is counted, kept
-and limited in time, whatever carries it out (`calib.models.simulators.ways`).
+and limited in time, whatever carries it out (`ways` and `umbridge`, beside this).
 """
 
 from __future__ import annotations

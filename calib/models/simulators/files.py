@@ -16,7 +16,8 @@ from calib.errors import CalibError, meant
 from calib.models.simulators.base import Way
 from calib.models.simulators.exchange import check_template
 from calib.models.simulators.registered import SIMULATED, Simulated, declare, written
-from calib.models.simulators.ways import CallableWay, CommandWay, TableWay, UmbridgeWay
+from calib.models.simulators.umbridge import UmbridgeWay
+from calib.models.simulators.ways import CallableWay, CommandWay, TableWay
 
 _WAYS = ("run", "python", "url", "table")
 
