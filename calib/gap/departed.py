@@ -76,7 +76,7 @@ class _Acting:
     def apart(self, moved: NDArray[np.int64]) -> Iterator[tuple[int, _Acting]]:
         """Part the rows by what was moved there before."""
         before = moved[self.rows]
-        if (before == before[0]).all():
+        if before.size and (before == before[0]).all():
             yield int(before[0]), self
             return
         places = np.arange(moved.size)[self.rows]

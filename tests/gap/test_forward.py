@@ -47,6 +47,15 @@ def test_shapes(data):
             assert forward.field(psi, data.view)[o.name].shape == (4, 27)
 
 
+def test_of_no_vectors_there_are_no_predictions(data):
+    forward = Forward(data, single(data, "lug_thrust"), SIGMA)
+    plain = {o.name: np.empty((0, 27)) for o in data.outputs}
+    found = forward.departed(np.empty((0, forward.n_dim)), data.view, plain)
+    assert {name: values.shape for name, values in found.items()} == {
+        o.name: (0, 27) for o in data.outputs
+    }
+
+
 def test_none_is_the_simulator_in_both_campaigns(data):
     forward = Forward(data, Hypothesis("none"), SIGMA)
     psi = centre(forward)
