@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from functools import partial
 from multiprocessing import (
     forkserver,
     get_all_start_methods,
@@ -22,8 +23,8 @@ from multiprocessing import (
 )
 from multiprocessing.context import BaseContext
 from pathlib import Path
-from threading import Thread
-from typing import Protocol
+from threading import Lock, Thread
+from typing import Any, Protocol
 
 from calib.batch.plugins import load_files, loaded_files
 from calib.errors import CalibError
@@ -31,6 +32,8 @@ from calib.errors import CalibError
 __all__ = ["HERE", "Later", "Pool", "begin_imports", "end_server", "pool", "without_interruptions"]
 
 _LOOK_SECONDS = 2.0
+_SAFE = "PYTHONSAFEPATH"
+_SERVING = Lock()
 # What a report needs, and what its figures and files import when they are first made.
 _REPORT = (
     "calib.report.sections", "calib.report.writer", "calib.report.figures.collect",
@@ -57,18 +60,36 @@ class _Here[R]:
 
 
 class _There[R]:
-    """A piece that another process works out."""
+    """A piece that another process works out, or this one while there is no other."""
 
-    def __init__(self, future: Future[R], executor: ProcessPoolExecutor) -> None:
-        self._future, self._executor = future, executor
+    def __init__(self, work: Callable[[], R], executor: ProcessPoolExecutor) -> None:
+        self._work, self._executor = work, executor
+        self._place: Future[Future[R]] = Future()
+
+    def send(self) -> None:
+        """Hand it over to the processes."""
+        try:
+            self._place.set_result(self._executor.submit(self._work))
+        except Exception as error:  # for the one who waits for it
+            self._place.set_exception(error)
+
+    def work(self) -> None:
+        """Work it out in this process."""
+        done: Future[R] = Future()
+        try:
+            done.set_result(self._work())
+        except Exception as error:  # for the one who waits for it
+            done.set_exception(error)
+        self._place.set_result(done)
 
     def result(self) -> R:
         try:
-            while not wait([self._future], timeout=_LOOK_SECONDS).done:
+            future = self._place.result()
+            while not wait([future], timeout=_LOOK_SECONDS).done:
                 # An executor that starts a process watches it from the next call on only: without
                 # one, its death might never be seen.
                 self._executor.submit(_begun)
-            return self._future.result()
+            return future.result()
         except BrokenProcessPool:
             raise CalibError(
                 "a process died while it worked: it was killed, or there was no memory left",
@@ -82,11 +103,14 @@ class Pool:
     Parameters
     ----------
     executor : ProcessPoolExecutor, optional
-        Here, by default.
+        Here, by default. Until it is said to have `begun`, pieces wait, and may be worked out here.
     """
 
     def __init__(self, executor: ProcessPoolExecutor | None = None) -> None:
         self._executor = executor
+        self._lock = Lock()
+        self._waiting: list[_There[Any]] = []
+        self._has_begun = False
 
     @property
     def here(self) -> bool:
@@ -101,9 +125,41 @@ class Pool:
         It takes every random number from a stream of its own, so that it does not matter where
         it is worked out.
         """
+        return self._ask(partial(function, *args, **kwargs))
+
+    def submit_long[**P, R](
+        self, function: Callable[P, R], *args: P.args, **kwargs: P.kwargs
+    ) -> Later[R]:
+        """Ask for a piece that takes longer than others: before those that still wait."""
+        return self._ask(partial(function, *args, **kwargs), first=True)
+
+    def _ask[R](self, work: Callable[[], R], *, first: bool = False) -> Later[R]:
         if self._executor is None:
-            return _Here(lambda: function(*args, **kwargs))
-        return _There(self._executor.submit(function, *args, **kwargs), self._executor)
+            return _Here(work)
+        piece = _There(work, self._executor)
+        with self._lock:
+            if not self._has_begun:
+                self._waiting.insert(0 if first else len(self._waiting), piece)
+                return piece
+        piece.send()
+        return piece
+
+    def begun(self) -> None:
+        """Hand over to the processes, which have begun, what waited for them."""
+        with self._lock:
+            self._has_begun = True
+            for piece in self._waiting:
+                piece.send()
+            self._waiting.clear()
+
+    def help(self) -> None:
+        """Work out here what was asked for last, piece by piece, until the processes have begun."""
+        while piece := self._last():
+            piece.work()
+
+    def _last(self) -> _There[Any] | None:
+        with self._lock:
+            return self._waiting.pop() if self._waiting else None
 
 
 HERE = Pool()
@@ -130,17 +186,19 @@ def pool(
     context = _context(modules)
     # Handed over: a server that forks keeps the environment it was started with.
     executor = ProcessPoolExecutor(
-        workers, mp_context=context, initializer=_begin, initargs=([*loaded_files(), *files],)
-    )
+        workers, mp_context=context, initializer=_begin,
+        initargs=([*loaded_files(), *files], os.environ.get(_SAFE)),
+    )  # fmt: skip
+    side = Pool(executor)
     # A first process starts now, not when there is work for it; it starts where it can wait.
-    Thread(target=_start, args=(executor,), daemon=True).start()
+    Thread(target=_start, args=(executor, side), daemon=True).start()
     try:
-        yield Pool(executor)
+        yield side
     except BaseException:
         _stop(executor)  # nobody waits for the pieces
-        raise
-    finally:
         executor.shutdown(wait=False, cancel_futures=True)
+        raise
+    executor.shutdown()
 
 
 def begin_imports(workers: int, modules: Sequence[str] = _REPORT) -> None:
@@ -171,16 +229,30 @@ def _serve() -> None:
     It is for the process that waits for the pieces; they would end with tracebacks.
     """
     without_interruptions()
-    with suppress(EOFError, OSError):  # stopped meanwhile
-        forkserver.ensure_running()
+    with _SERVING:
+        before = os.environ.get(_SAFE)
+        # It would take a `corner.py` of the working folder for the library of that name.
+        os.environ[_SAFE] = "1"
+        with suppress(EOFError, OSError):  # stopped meanwhile
+            forkserver.ensure_running()
+        _restore(before)
 
 
-def _start(executor: ProcessPoolExecutor) -> None:
-    """Start a first process, and what it is forked from."""
+def _restore(safe_path: str | None) -> None:
+    """Have what is started from here on look for modules as it was said before."""
+    if safe_path is None:
+        os.environ.pop(_SAFE, None)
+    else:
+        os.environ[_SAFE] = safe_path
+
+
+def _start(executor: ProcessPoolExecutor, side: Pool) -> None:
+    """Start a first process, and what it is forked from; then hand over what waits for it."""
     if "forkserver" in get_all_start_methods():
         _serve()
     with suppress(EOFError, OSError, RuntimeError):  # stopped meanwhile
         executor.submit(_begun)
+    side.begun()
 
 
 def without_interruptions() -> None:
@@ -209,9 +281,10 @@ def _stop(executor: ProcessPoolExecutor) -> None:
         process.terminate()
 
 
-def _begin(files: Sequence[Path]) -> None:
+def _begin(files: Sequence[Path], safe_path: str | None) -> None:
     """Leave an interruption to the process that waits for the pieces; know what it knows."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _restore(safe_path)
     gc.freeze()  # what was imported stays: the garbage collector need not look at it again
     gc.set_threshold(20_000, 20)  # as `calib.cli.main` has it
     Thread(target=_leave_with_parent, daemon=True).start()

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import norm
+import scipy
 
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import mcse, tail_shape
@@ -45,7 +45,7 @@ def multiple(n: int) -> float:
     So many that one check in a thousand finds a difference where there is none: seven of the
     some hundred numbers of a report.
     """
-    return float(_SAFETY * norm.isf(_FAMILY / (2 * max(n, 1))))
+    return float(_SAFETY * scipy.stats.norm.isf(_FAMILY / (2 * max(n, 1))))
 
 
 def describe(n: int) -> str:

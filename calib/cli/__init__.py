@@ -7,7 +7,9 @@ import gc
 import os
 import signal
 import sys
+import threading
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from threading import Timer
 from typing import Any
@@ -55,12 +57,21 @@ def program() -> None:
     except SystemExit as ended:
         if ended.code == INTERRUPTED:
             _end_server()
-            # The interpreter would take as long again to give back, one by one, what it holds.
-            atexit._run_exitfuncs()
-            sys.stdout.flush()
-            sys.stderr.flush()
-            os._exit(INTERRUPTED)
-        raise
+        elif isinstance(ended.code, str):
+            raise  # the interpreter says it
+        _leave(ended.code)
+
+
+def _leave(code: int | None) -> None:
+    """End at once: the interpreter would take long to give back, one by one, what it holds."""
+    for thread in threading.enumerate():
+        if thread is not threading.current_thread() and not thread.daemon:
+            thread.join()
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(BrokenPipeError):  # nobody reads it any more
+            stream.flush()
+    os._exit(code or 0)
 
 
 def interruptible() -> None:

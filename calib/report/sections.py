@@ -252,6 +252,7 @@ def work_out(
         workers=workers if pool.here else 1,
     )  # fmt: skip
     begun = [section.begin(seed, pool) for section in reversed(sections)]
+    pool.help()
     studied = study(tell)
     # What a section has to do here is done while the pieces of those before it are worked out.
     found = [finish(studied, tell) for finish in begun]

@@ -20,9 +20,7 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.simulators.emulator.files import save_emulator
 from calib.models.simulators.emulator.model import emulator_of
-from calib.report.figures.collect import plates
 from calib.report.figures.plate import Plate
-from calib.report.figures.style import pdf_bytes, png
 from calib.report.labels import units_of
 from calib.report.page.content import render_page
 from calib.report.publish import publication
@@ -131,11 +129,13 @@ def write_report(
         inputs = _copy_inputs(study, folder)
         (folder / "figures").mkdir()
         pieces = {
-            key: pool.submit(_write_output, key, result, folder, pdf)
+            key: pool.submit(_draw_output, key, result, folder, pdf)
             for key, result in successes.items()
         }
         versions = (environment or Environment.here()).versions
         begun = [s.begin(folder, versions=versions, pdf=pdf, pool=pool) for s in sections]
+        # Short, so last: both processes end at about the same time.
+        kept = [pool.submit(_keep, key, result, folder) for key, result in successes.items()]
         summary = summarise(study)
         for section in sections:
             numbers = section.summary()
@@ -158,6 +158,8 @@ def write_report(
             drawn[key], shown = piece.result()
             images |= shown
         tell("drawing figures", len(pieces), len(pieces))
+        for netcdf in kept:
+            netcdf.result()
         page = render_page(
             study,
             drawn,
@@ -179,11 +181,19 @@ def write_report(
     return Path(out) / "index.html"
 
 
-def _write_output(
+def _keep(key: str, result: OutputResult, folder: Path) -> None:
+    """Write the posterior of an output."""
+    write_netcdf(groups_of(result.calibration), folder / f"{key}.nc")
+
+
+def _draw_output(
     key: str, result: OutputResult, folder: Path, pdf: bool
 ) -> tuple[list[Plate], dict[str, bytes]]:
-    """Write posterior and figures of an output; return what the page shows of the figures."""
-    write_netcdf(groups_of(result.calibration), folder / f"{key}.nc")
+    """Write the figures of an output; return what the page shows of them."""
+    # Late: where the figures are drawn, which as a rule is another process.
+    from calib.report.figures.collect import plates
+    from calib.report.figures.style import pdf_bytes, png
+
     drawn, images = [], {}
     with units_of(result.task.table.header):
         figures = plates(result, reference_of(result.task.table.label))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 import numpy as np
-from scipy import stats
+import scipy
 
 from calib.data import Table
 from calib.data.quantities import QUANTITIES
@@ -128,7 +128,7 @@ def _copies(problem: Problem, scatter: float) -> Iterable[str]:
     # Two readings at one condition differ by a normal of sd sqrt(2) sigma, whose density at zero
     # times the last digit is the chance that they agree.
     agree = _last_digit(problem) / (2.0 * np.sqrt(np.pi) * max(scatter, 1e-300))
-    if stats.poisson.sf(int(copied.sum()) - 1, pairs * min(agree, 1.0)) > _COPIED:
+    if scipy.stats.poisson.sf(int(copied.sum()) - 1, pairs * min(agree, 1.0)) > _COPIED:
         return
     yield (
         f"{source_of(table)}, {lines_of(table, copied)}: {_rows(int(copied.sum()))} another one "
@@ -183,7 +183,7 @@ def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[st
     # On (0, 4) as d is.
     x, v = mean / 4.0, variance / 16.0
     size = x * (1.0 - x) / v - 1.0
-    if not stats.beta.cdf(d / 4.0, x * size, (1.0 - x) * size) < LEVEL:
+    if not scipy.stats.beta.cdf(d / 4.0, x * size, (1.0 - x) * size) < LEVEL:
         return
     r = float(np.clip(1.0 - d / mean, 0.0, 0.99))
     yield (
@@ -225,7 +225,7 @@ def _uneven(problem: Problem, residual: Array, judged: np.ndarray) -> Iterable[s
     """Spearman's rank correlation of the residuals' sizes with each condition that varies."""
     varying = {k: v[judged] for k, v in problem.conditions.items() if np.ptp(v[judged]) > 0.0}
     for name, values in varying.items():
-        found = stats.spearmanr(np.abs(residual), values)
+        found = scipy.stats.spearmanr(np.abs(residual), values)
         if found.pvalue < LEVEL / len(varying):
             word, stem = word_of(problem.table, QUANTITIES[name]), QUANTITIES[name].stem
             grows = "grows" if found.statistic > 0.0 else "falls"
@@ -240,11 +240,12 @@ def _heavy_tailed(problem: Problem, residual: Array) -> Iterable[str]:
     """Anscombe and Glynn's (1983) test of the kurtosis, one-sided."""
     if residual.size < _FEWEST_FOR_TAILS or problem.noise.student:
         return
-    if stats.kurtosistest(residual, alternative="greater").pvalue < LEVEL:
+    if scipy.stats.kurtosistest(residual, alternative="greater").pvalue < LEVEL:
         yield (
             f"{source_of(problem.table)}: the residuals have heavier tails than normal noise "
-            f"(excess kurtosis {stats.kurtosis(residual):.1f}); single readings then weigh too "
-            'much: correct those that are wrong, or write family = "student_t" in the prior file'
+            f"(excess kurtosis {scipy.stats.kurtosis(residual):.1f}); single readings then weigh "
+            "too much: correct those that are wrong, or write "
+            'family = "student_t" in the prior file'
         )
 
 

@@ -8,8 +8,8 @@ from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 
 from calib.data.numbers import plain_number
 from calib.inference.problem import Problem
@@ -152,4 +152,4 @@ def _fitted(problem: Problem, t: Array, used: NDArray[np.bool_]) -> Array:
 
 def _probability(sds: Array | float, n: int, left: int) -> Any:
     """Of so large a distance in any of n rows of normal noise (Bonferroni's bound)."""
-    return np.minimum(2.0 * n * stats.t.sf(sds, left), 1.0)
+    return np.minimum(2.0 * n * scipy.stats.t.sf(sds, left), 1.0)

@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import stats
 from scipy.special import betaincinv, ndtri
 
 from calib.inference.calibration import Calibration
@@ -66,7 +66,7 @@ def normal_order(n: int) -> tuple[Array, Array, Array]:
 
 def normality_p(residual: Array) -> float:
     """Shapiro and Wilk's p value of residuals (n,); NaN of fewer than three."""
-    return float(stats.shapiro(residual).pvalue) if residual.size >= 3 else float("nan")
+    return float(scipy.stats.shapiro(residual).pvalue) if residual.size >= 3 else float("nan")
 
 
 def spreads(
@@ -79,5 +79,5 @@ def spreads(
     raw = problem.response - problem.bound.to_response(predicted)
     found = [raw[rows] for rows in groups]
     judged = [r for r in found if r.size >= _FEWEST]
-    p = float(stats.levene(*judged).pvalue) if len(judged) > 1 else float("nan")
+    p = float(scipy.stats.levene(*judged).pvalue) if len(judged) > 1 else float("nan")
     return np.array([r.std(ddof=1) if r.size >= _FEWEST else np.nan for r in found]), p

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 import time
 from multiprocessing import active_children, forkserver
 from pathlib import Path
@@ -95,3 +96,59 @@ def test_a_death_that_the_executor_did_not_see_is_noticed(
         assert slow.result() is None
         with pytest.raises(CalibError, match="a process died"):
             side.submit(die).result()
+
+
+def test_what_was_asked_last_is_worked_out_here_until_the_processes_have_begun(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("calib.batch.pool._start", lambda executor, side: None)
+    with pool(2) as side:
+        first, long = side.submit(square, 1), side.submit_long(square, 2)
+        last = side.submit(square, 3)
+        assert side._last() is last  # type: ignore[comparison-overlap]
+        last.work()  # type: ignore[attr-defined]
+        assert last.result() == (9, os.getpid())
+        assert side._waiting == [long, first]
+        side.begun()
+        assert [piece.result()[0] for piece in (first, long)] == [1, 4]
+        assert os.getpid() not in {piece.result()[1] for piece in (first, long)}
+        side.help()  # nothing is left to do here
+        wrong = side.submit(fail, "over there")
+        with pytest.raises(CalibError, match="over there"):
+            wrong.result()
+
+
+def test_what_goes_wrong_here_is_raised_where_it_is_wanted(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("calib.batch.pool._start", lambda executor, side: None)
+    with pool(2) as side:
+        wrong = side.submit(fail, "mine")
+        side.help()
+        with pytest.raises(CalibError, match="mine"):
+            wrong.result()
+
+
+@pytest.mark.parametrize("safe", [None, "1"])
+def test_modules_of_the_working_folder_are_not_taken_for_libraries(
+    safe: str | None, tmp_path: Path
+) -> None:
+    """A user's own `corner.py`, say; what the processes start finds the environment as it was."""
+    (tmp_path / "corner.py").write_text("raise SystemExit('the user's own')")
+    script = tmp_path / "elsewhere" / "script.py"
+    script.parent.mkdir()
+    script.write_text(
+        "import os\n"
+        "from calib.batch.pool import pool\n"
+        "if __name__ == '__main__':\n"
+        "    with pool(2, ('corner',)) as side:\n"
+        "        print(side.submit(os.getenv, 'PYTHONSAFEPATH').result())\n"
+        "    print(os.getenv('PYTHONSAFEPATH'))\n"
+    )
+    own = {k: v for k, v in os.environ.items() if k != "PYTHONSAFEPATH"}
+    ran = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, capture_output=True, text=True, check=True,
+        env=own if safe is None else own | {"PYTHONSAFEPATH": safe},
+    )  # fmt: skip
+    assert ran.stdout.split() == [str(safe), str(safe)]
+    assert "the user" not in ran.stderr

@@ -56,7 +56,7 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(autouse=True)
 def _few_figures() -> Any:
-    with patch("calib.report.writer.plates", made.two_plates):
+    with patch("calib.report.figures.collect.plates", made.two_plates):
         yield
 
 

@@ -63,7 +63,7 @@ def rut_study(seed: int = 2019) -> Study:
 
 
 def write(study: Study, out: Path, **kwargs: Any) -> Path:
-    with patch("calib.report.writer.plates", two_plates):
+    with patch("calib.report.figures.collect.plates", two_plates):
         write_report(
             study, out, settings=SETTINGS, command=["calib", "report"], title="A report", **kwargs
         )

@@ -251,7 +251,7 @@ def test_a_report_of_own_data_is_complete_and_its_hashes_hold(
     calib: Calib, he2019: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """One output works; the other has too few rows, which ends with 1 and leaves the first."""
-    monkeypatch.setattr("calib.report.writer.plates", lambda *args: plates(*args)[:1])
+    monkeypatch.setattr("calib.report.figures.collect.plates", lambda *args: plates(*args)[:1])
     Path("few.csv").write_text("slip_ratio,drawbar_pull_kn\n0.1,1\n0.2,1.1\n")
     before = contents(tmp_path)
     ran = calib(

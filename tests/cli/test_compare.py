@@ -45,7 +45,7 @@ def test_models_are_compared_and_the_stack_predicts(calib: Calib) -> None:
 
 
 def test_a_report_has_it_as_a_section(calib: Calib, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib.report.writer.plates", lambda *args: plates(*args)[:1])
+    monkeypatch.setattr("calib.report.figures.collect.plates", lambda *args: plates(*args)[:1])
     rows = [line.rpartition(",") for line in example_csv("reece").split()[1:]]
     lines = ["average_ground_pressure_kpa,plate_width_mm,Sinkage [inch]"]
     lines += [f"{conditions},{float(depth) / 25.4!r}" for conditions, _, depth in rows]

@@ -178,16 +178,58 @@ def test_an_interruption_in_a_callback_is_not_lost(
     assert "interrupted" in ran.err
 
 
-def test_a_stopped_program_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_ends_at_once_however_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python would take half a second to give back what it holds."""
     (script,) = entry_points(group="console_scripts", name="calib")
     left: list[int] = []
     monkeypatch.setattr("calib.cli.os._exit", left.append)
     monkeypatch.setattr("calib.cli.atexit._run_exitfuncs", lambda: None)
-    for code in (130, 0):
+    for code in (130, 0, None, 3):
         monkeypatch.setattr("calib.cli.main", lambda code=code: sys.exit(code))
-        with pytest.raises(SystemExit):
-            script.load()()
-    assert left == [130]
+        script.load()()
+    assert left == [130, 0, 0, 3]
+    monkeypatch.setattr("calib.cli.main", lambda: sys.exit("words"))
+    with pytest.raises(SystemExit, match="words"):
+        script.load()()
+
+
+ENDING = """
+import atexit, sys, threading, time
+import calib.cli
+atexit.register(print, "at exit")
+def late():
+    time.sleep(0.3)
+    print("a thread")
+def main():
+    threading.Thread(target=late).start()
+    print("x" * 100_000)
+    sys.exit(3)
+calib.cli.main = main
+calib.cli.program()
+"""
+
+
+def test_nothing_is_lost_where_a_program_ends_at_once() -> None:
+    ran = subprocess.run(
+        [sys.executable, "-c", ENDING], capture_output=True, text=True, check=False
+    )
+    assert ran.returncode == 3
+    assert ran.stdout.splitlines() == ["x" * 100_000, "a thread", "at exit"]
+    assert ran.stderr == ""
+
+
+def test_a_reader_that_has_gone_is_no_error() -> None:
+    """As `calib models | head -1` has it."""
+    with subprocess.Popen(
+        [sys.executable, "-c", ENDING.replace("100_000", "10")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == ""
 
 
 @pytest.mark.parametrize("module", ["calib.cli.verbs", "typer", "calib.inference.problem"])

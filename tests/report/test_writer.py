@@ -98,7 +98,7 @@ def test_every_figure_has_its_pdf_and_its_size_in_print(report):
 
 
 def test_pdfs_come_on_request_only(plate, tmp_path, monkeypatch):
-    monkeypatch.setattr("calib.report.writer.plates", lambda *a, **k: plates(*a, **k)[:1])
+    monkeypatch.setattr("calib.report.figures.collect.plates", lambda *a, **k: plates(*a, **k)[:1])
     report = write(plate, tmp_path / "rep")
     assert list(report.rglob("*.png"))
     assert not list(report.rglob("*.pdf"))
@@ -112,7 +112,7 @@ def test_made_again_it_is_the_same_to_the_last_byte(rut, report, tmp_path):
 
 
 def test_it_may_be_replaced(rut, tmp_path, monkeypatch):
-    monkeypatch.setattr("calib.report.writer.plates", lambda result, published: [])
+    monkeypatch.setattr("calib.report.figures.collect.plates", lambda result, published: [])
     out = write(rut, tmp_path / "rep", pdf=True)
     (out / "methods.txt").write_text("old")
     assert write(rut, out, overwrite=True) == out

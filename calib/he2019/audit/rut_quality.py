@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import binom, norm
+import scipy
 
 from calib.he2019.audit.finding import (
     Finding,
@@ -165,9 +165,9 @@ def _held_out_errors(published: Published, study: QualityStudy) -> Finding:
         quality[f"held_out_{name}"].value for name in ("max_relative_error", "threshold")
     )
     few = int(quality["held_out_above_threshold"].value)
-    beyond = 2.0 * float(norm.sf(np.log1p(threshold) / sd))
-    at_most = float(binom.cdf(few, levels, beyond))
-    all_within = float((1.0 - 2.0 * norm.sf(np.log1p(largest) / sd)) ** levels)
+    beyond = 2.0 * float(scipy.stats.norm.sf(np.log1p(threshold) / sd))
+    at_most = float(scipy.stats.binom.cdf(few, levels, beyond))
+    all_within = float((1.0 - 2.0 * scipy.stats.norm.sf(np.log1p(largest) / sd)) ** levels)
     fine = min(at_most, all_within) > _HELD_OUT_LEAST
     return finding(
         "table6_held_out_errors", Verdict.CONSISTENT if fine else Verdict.CONTRADICTED,

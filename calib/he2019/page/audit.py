@@ -14,9 +14,7 @@ from markupsafe import Markup
 from calib.he2019.audit import Audit, Finding, Quantity, Verdict
 from calib.he2019.audit.run import audit_csv, audit_json
 from calib.he2019.datasets.published import DOI
-from calib.he2019.figures.audit import audit_plates
 from calib.report.figures.plate import Plate
-from calib.report.figures.style import png
 from calib.report.labels import unbroken
 from calib.report.numbers import NOTHING, format_number
 from calib.report.page.template import picture, template, unit_html
@@ -40,6 +38,10 @@ def write_audit(audit: Audit, folder: Path) -> str:
 
     The folder gets ``audit.json``, ``audit.csv`` and ``figures/audit_*.png``.
     """
+    # Late: where the figures are drawn, which as a rule is another process.
+    from calib.he2019.figures.audit import audit_plates
+    from calib.report.figures.style import png
+
     (folder / "audit.json").write_text(audit_json(audit), encoding="utf-8")
     (folder / "audit.csv").write_text(audit_csv(audit.findings), encoding="utf-8")
     plates = audit_plates(audit)

@@ -9,17 +9,14 @@ from typing import Any
 from calib.batch.pool import Pool
 from calib.gap.files import write_diagnosis
 from calib.he2019 import declared
-from calib.he2019.figures.gaps import gap_plate
 from calib.he2019.gaps.find import Check, FoundGap, checks, probability_of
 from calib.models import get_model
-from calib.report.figures.gap import gap_plates
 from calib.report.figures.plate import Plate
-from calib.report.figures.style import pdf_bytes, png, png_size
 from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_rows import short_name
 from calib.report.labels import odds_text, percent, percent_range
 from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
-from calib.report.page.template import data_uri, sentences, template
+from calib.report.page.template import data_uri, png_size, sentences, template
 from calib.report.study import Progress
 
 _CHECKS = declared("page/checks.toml")
@@ -69,6 +66,11 @@ def begin_gaps_section(
 def _write_gap(
     result: FoundGap, folder: Path, versions: Mapping[str, str], pdf: bool
 ) -> dict[str, Any]:
+    # Late: where the figures are drawn, which as a rule is another process.
+    from calib.he2019.figures.gaps import gap_plate
+    from calib.report.figures.gap import gap_plates
+    from calib.report.figures.style import pdf_bytes, png
+
     plate = gap_plate(result)
     image = png(plate)
     (folder / "figures" / f"gap_{plate.name}.png").write_bytes(image)

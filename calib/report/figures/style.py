@@ -223,11 +223,6 @@ def _set_powers(figure: Figure) -> None:
                 formatter.set_useMathText(not _PLAIN[0] < ends.max() < _PLAIN[1])
 
 
-def png_size(image: bytes) -> tuple[int, int]:
-    """Return width and height of a PNG file, which keep the page from jumping while it loads."""
-    return int.from_bytes(image[16:20]), int.from_bytes(image[20:24])
-
-
 def pdf_bytes(figure: Figure) -> bytes:
     """Render a figure as PDF: fonts inside as TrueType, no date, so that its hash repeats."""
     return _saved(figure, format="pdf", metadata={"CreationDate": None})

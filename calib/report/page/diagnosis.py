@@ -17,11 +17,11 @@ from calib.gap.effects.dependence import PREFIX
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.inclusion import UNLISTED
+from calib.gap.placebo import placebos
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
 from calib.inference.priors import Prior
 from calib.models import get_model
-from calib.report.figures.gap import placebos
 from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import (
     conditions_text,

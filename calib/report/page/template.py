@@ -17,7 +17,6 @@ from calib.inference.problem import Problem
 from calib.models import BoundModel
 from calib.models.latex import html
 from calib.report.figures.plate import Plate
-from calib.report.figures.style import png_size
 from calib.report.labels import (
     MINUS,
     axis_of,
@@ -52,6 +51,11 @@ _FILTERS: dict[str, Callable[..., str]] = {
     "g": lambda value: f"{value:g}",
     "lower_first": lambda text: text[0].lower() + text[1:],
 }
+
+
+def png_size(image: bytes) -> tuple[int, int]:
+    """Return width and height of a PNG file, which keep the page from jumping while it loads."""
+    return int.from_bytes(image[16:20]), int.from_bytes(image[20:24])
 
 
 @cache

@@ -6,7 +6,8 @@ from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from calib.report.figures.style import png_bytes, png_size, style
+from calib.report.figures.style import png_bytes, style
+from calib.report.page.template import png_size
 
 
 def _figure(title: str) -> Figure:

@@ -15,7 +15,6 @@ from calib.he2019.figures.reference import HE2019
 from calib.inference.noise import Noise, NoiseChoice
 from calib.models import MODELS, example_csv
 from calib.report.figures.plate import Plate
-from calib.report.figures.style import png_size
 from calib.report.labels import units_of
 from calib.report.page.content import failed_section, render_page, repeats_words, validation_facts
 from calib.report.page.tables import (
@@ -28,6 +27,7 @@ from calib.report.page.template import (
     equation,
     likelihood,
     parametrisation,
+    png_size,
     prose,
     symbol_html,
     unit_html,
