@@ -219,12 +219,14 @@ def test_nothing_is_lost_where_a_program_ends_at_once() -> None:
 
 
 def test_a_reader_that_has_gone_is_no_error() -> None:
-    """As `calib models | head -1` has it."""
+    """As `calib models | head -1` has it: what is still to be written has nowhere to go."""
+    buffered = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
     with subprocess.Popen(
         [sys.executable, "-c", ENDING.replace("100_000", "10")],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
+        env=buffered,
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None
