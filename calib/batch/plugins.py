@@ -37,7 +37,8 @@ def run_file(path: Path, what: str) -> ModuleType:
     if known is not None and known.__file__ == str(path):
         return known
     spec = importlib.util.spec_from_file_location(name, path)
-    if not path.is_file() or spec is None or spec.loader is None:
+    # `Path.is_file` fails where a name is too long for one.
+    if not os.path.isfile(path) or spec is None or spec.loader is None:  # noqa: PTH113
         raise CalibError(
             f"the {what} cannot be read", where=str(path), allowed="a Python file ending in .py",
             mend="give the path of such a file",

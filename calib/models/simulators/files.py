@@ -7,9 +7,9 @@ import shlex
 import tomllib
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from calib.batch.plugins import run_file
 from calib.errors import CalibError, meant
@@ -31,6 +31,15 @@ class _Budget(BaseModel):
     nodes: int | None = Field(default=None, ge=2)
 
 
+def _without_null(text: str) -> str:
+    if "\x00" in text:
+        raise ValueError("no path and no command holds a null character")
+    return text
+
+
+_Text = Annotated[str, AfterValidator(_without_null)]
+
+
 class SimulatorFile(BaseModel):
     """What a simulator file may say; exactly one of run, python, url and table."""
 
@@ -38,13 +47,13 @@ class SimulatorFile(BaseModel):
     name: str = Field(pattern=r"^[A-Za-z]\w*$")
     title: str = ""
     source: str = ""
-    run: str = ""
-    python: str = ""
-    url: str = ""
-    model: str = ""
-    table: str = ""
+    run: _Text = ""
+    python: _Text = ""
+    url: _Text = ""
+    model: _Text = ""
+    table: _Text = ""
     input: Literal["json", "csv", "template"] = "json"
-    template: str = ""
+    template: _Text = ""
     output: Literal["json", "csv", "pattern"] = "json"
     rows: Literal["all", "each"] = "all"
     batched: bool = True
@@ -52,8 +61,8 @@ class SimulatorFile(BaseModel):
     retries: int = Field(default=1, ge=0)
     deterministic: bool = True
     emulate: bool = True
-    cache: str = ""
-    files: tuple[str, ...] = ()
+    cache: _Text = ""
+    files: tuple[_Text, ...] = ()
     conditions: dict[str, str] = Field(min_length=1)
     outputs: dict[str, str] = Field(min_length=1)
     patterns: dict[str, str] = {}
@@ -166,7 +175,18 @@ def _way(file: SimulatorFile, path: Path) -> Way:
 
 
 def _command(file: SimulatorFile, path: Path) -> CommandWay:
-    arguments = tuple(shlex.split(file.run))
+    try:
+        arguments = tuple(shlex.split(file.run))
+    except ValueError as error:
+        found = str(error)
+    else:
+        found = "" if arguments else "no words"
+    if found:
+        raise CalibError(
+            f"{file.run!r} is no command ({found})", where=f"{path}, run",
+            allowed='run = "program {input} {output}", in quotes what has spaces in it',
+            mend="correct it",
+        )  # fmt: skip
     template = ""
     if file.input == "template" or file.template:
         template = _template(file, path)

@@ -162,8 +162,11 @@ class CommandWay:
         """Return the file beside the simulator file that an argument names."""
         if "{" in argument:
             return None
-        path = (self.folder / argument).resolve()
-        return path if path.is_file() else None
+        try:
+            path = (self.folder / argument).resolve()
+            return path if path.is_file() else None
+        except OSError:  # such as a text too long for a name
+            return None
 
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
         """Run it once, or once for each row."""

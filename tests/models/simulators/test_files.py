@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +70,19 @@ def test_what_is_wrong_is_named(tmp_path: Path, old: str, new: str, words: list[
 def test_a_command_that_does_not_exist(tmp_path: Path) -> None:
     file = write_program(tmp_path, run='"./no-wheel {input} {output}"')
     with pytest.raises(CalibError, match=r"there is no program './no-wheel'"):
+        read_simulator(file)
+
+
+@pytest.mark.parametrize("key", ["run", "python", "table", "template"])
+@pytest.mark.parametrize(
+    "text", ["'", '"', "\\", " ", "\0", "a\0b", "./a\0b {input}", "A" * 5000, "A" * 300 + ".py:f"]
+)
+def test_what_no_command_and_no_path_can_be(tmp_path: Path, key: str, text: str) -> None:
+    given = {} if key == "run" else {"run": '""'}
+    if key == "template":
+        given = {"input": '"template"'}
+    file = write_program(tmp_path, **given | {key: json.dumps(text)})
+    with pytest.raises(CalibError, match=rf"wheel.toml.*{key}|simulator cannot be read"):
         read_simulator(file)
 
 
