@@ -133,15 +133,15 @@ def test_what_goes_wrong_here_is_raised_where_it_is_wanted(
 def test_modules_of_the_working_folder_are_not_taken_for_libraries(
     safe: str | None, tmp_path: Path
 ) -> None:
-    """A user's own `corner.py`, say; what the processes start finds the environment as it was."""
-    (tmp_path / "corner.py").write_text("raise SystemExit('the user's own')")
+    """A user's own `colorsys.py`, say; what the processes start finds the environment as it was."""
+    (tmp_path / "colorsys.py").write_text("raise SystemExit('the user's own')")
     script = tmp_path / "elsewhere" / "script.py"
     script.parent.mkdir()
     script.write_text(
         "import os\n"
         "from calib.batch.pool import pool\n"
         "if __name__ == '__main__':\n"
-        "    with pool(2, ('corner',)) as side:\n"
+        "    with pool(2, ('colorsys',)) as side:\n"
         "        print(side.submit(os.getenv, 'PYTHONSAFEPATH').result())\n"
         "    print(os.getenv('PYTHONSAFEPATH'))\n"
     )

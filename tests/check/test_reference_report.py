@@ -39,7 +39,7 @@ def checked(setting: Setting, *, drawn: bool = True) -> dict:
 
 @pytest.mark.parametrize("setting", FEW, ids=str)
 def test_the_reference_report_is_what_is_computed_again(setting: Setting) -> None:
-    document = checked(setting, drawn=setting == FEW[0])
+    document = checked(setting, drawn=setting == FEW[-1])
     names = {item["name"] for item in document["items"]}
     summary = json.loads((FOLDER / "summary.json").read_text())
     manifest = json.loads((FOLDER / "manifest.json").read_text())
@@ -58,6 +58,6 @@ def test_the_reference_report_is_what_is_computed_again(setting: Setting) -> Non
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("setting", [s for s in ALL if s not in FEW[:1]], ids=str)
+@pytest.mark.parametrize("setting", [s for s in ALL if s not in FEW[-1:]], ids=str)
 def test_the_reference_report_is_the_same_on_every_processor(setting: Setting) -> None:
     checked(setting)

@@ -255,7 +255,7 @@ def test_what_grows_beyond_bounds_across_zero_does_not_matter_to_a_fit() -> None
     agree(calib.calibrate(emulation.problem, seed=1), exact(data, parameters=vague))
 
 
-@pytest.mark.parametrize("edge", [0.08, 0.04])
+@pytest.mark.parametrize("edge", [0.08, pytest.param(0.04, marks=pytest.mark.slow)])
 def test_runs_that_fail_across_zero_alone_are_made_without(edge: float) -> None:
     """From the first runs, or from later ones of the first design."""
     made = []
