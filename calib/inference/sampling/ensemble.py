@@ -71,7 +71,7 @@ class Ensemble:
         self.log_prob_fn = log_prob
         self.ahead = ahead
         start, self.rng = (np.random.default_rng(child) for child in seed.spawn(2))
-        self.random_state = np.random.RandomState(np.random.MT19937(seed)).get_state()
+        self.random_state: Any = np.random.RandomState(np.random.MT19937(seed)).get_state()
         self.state = _start(log_prob, proposal, walkers, start)
 
     def run(self, proposal: Proposal, efficiency: float, t: Array, log_prob: Array) -> None:
