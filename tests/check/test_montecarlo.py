@@ -11,6 +11,7 @@ from scipy.stats import norm
 from calib.check.montecarlo import (
     drawn_in_output,
     drawn_in_run,
+    multiple,
     posterior_errors,
     validation_errors,
 )
@@ -26,6 +27,12 @@ from calib.report.sections import work_out
 from calib.report.summary import summarise
 from calib.validation.scores import score
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
+
+
+@pytest.mark.parametrize("n", [1, 54, 400])
+def test_one_check_in_a_thousand_cries_wolf(n: int) -> None:
+    """Of n differences of a standard error each, to either side, the safety of 1.5 left aside."""
+    assert n * 2.0 * norm.sf(multiple(n) / 1.5) == pytest.approx(1e-3)
 
 
 def test_errors_of_a_posterior_are_fractions_of_its_sd(rut_calibration) -> None:

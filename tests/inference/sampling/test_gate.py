@@ -120,6 +120,12 @@ def test_fewer_than_four_ensembles_cannot_be_compared() -> None:
     assert "3 ensembles, at least 4 are needed" in report.reasons
 
 
+def test_its_limits_are_those_that_are_recommended() -> None:
+    """Vehtari et al. (2021) for R-hat and effective sizes; fifty times of emcee's documentation."""
+    gate = Gate()
+    assert (gate.rhat_max, gate.ess_min, gate.taus_min) == (1.01, 400.0, 50.0)
+
+
 def test_the_limits_are_those_of_the_gate() -> None:
     assert not judged(good(), ess_min=50_000.0).passed
     assert not judged(good(), rhat_max=0.9).passed
