@@ -11,6 +11,7 @@ from dataclasses import FrozenInstanceError
 import numpy as np
 import pytest
 
+from calib.he2019 import declared
 from calib.he2019.audit import Basis, Quantity, Seeds, Verdict, audit_csv, audit_json, run_audit
 from calib.he2019.audit.finding import percent
 from calib.he2019.datasets.published import PUBLISHED
@@ -20,6 +21,16 @@ from tests.he2019.audit.altered import flipped, printed_figures
 def test_every_printed_figure_is_judged(audit):
     judged = {figure for f in audit.findings for figure in f.figures}
     assert judged == set(printed_figures(PUBLISHED))
+
+
+def test_every_claim_has_its_finding(audit):
+    """Those of two claims are made for each table and row apart, under names of their own."""
+    apart = {
+        "sign_of_E": {f"table{t}_{p}_sign_of_E" for t in (3, 4) for p in (18, 30, 42)},
+        "table5_signs": {"table5_signs_of_D", "table5_signs_of_BCD"},
+    }
+    expected = set().union(*(apart.get(claim, {claim}) for claim in declared("audit/claims.toml")))
+    assert {f.key for f in audit.findings} == expected
 
 
 def test_findings_are_whole(audit):
