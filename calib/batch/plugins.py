@@ -19,6 +19,8 @@ PLUGINS = "terracalib.plugins"
 # What the names of modules begin with that were loaded by their paths.
 USER_MODULE = "calib_user_"
 _LOADED: set[str] = set()
+# Code that is not calib's own, which may leave threads and files open.
+_OTHERS: set[str] = set()
 # Worker processes find here what this one has loaded.
 _VARIABLE = "CALIB_MODELS"
 
@@ -31,7 +33,8 @@ def run_file(path: Path, what: str) -> ModuleType:
     CalibError
         If it cannot be read, naming `what` it holds, or does not run, with the line.
     """
-    path = Path(path).resolve()
+    # `Path.resolve` fails where a link leads to itself.
+    path = Path(os.path.realpath(path))
     name = f"{USER_MODULE}{path.stem}"
     known = sys.modules.get(name)
     if known is not None and known.__file__ == str(path):
@@ -46,6 +49,7 @@ def run_file(path: Path, what: str) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     # Known by its name, so that what it defines can be handed to other processes.
     sys.modules[name] = module
+    _OTHERS.add(name)
     try:
         spec.loader.exec_module(module)
     except CalibError as error:
@@ -81,6 +85,11 @@ def load_files(paths: Sequence[Path]) -> None:
     if new:
         known = map(str, loaded_files())
         os.environ[_VARIABLE] = os.pathsep.join(dict.fromkeys([*known, *new]))
+
+
+def others_loaded() -> bool:
+    """Whether this process has run code that is not calib's own."""
+    return bool(_OTHERS)
 
 
 def loaded_files() -> list[Path]:
@@ -126,6 +135,8 @@ def load_installed(group: str) -> None:
         return
     _LOADED.add(group)
     for point in entry_points(group=group):
+        if not point.value.startswith("calib."):
+            _OTHERS.add(point.value)
         try:
             found = point.load()
         except (Exception, SystemExit) as error:

@@ -152,6 +152,11 @@ class Pool:
                 piece.send()
             self._waiting.clear()
 
+    def drop(self) -> None:
+        """Forget what waits: nobody wants it any more."""
+        # Without the lock, which may be held by what hands it over and waits for a process.
+        self._waiting.clear()
+
     def help(self) -> None:
         """Work out here what was asked for last, piece by piece, until the processes have begun."""
         while piece := self._last():
@@ -185,20 +190,23 @@ def pool(
         return
     context = _context(modules)
     # Handed over: a server that forks keeps the environment it was started with.
+    with _SERVING:
+        safe_path = os.environ.get(_SAFE)
     executor = ProcessPoolExecutor(
         workers, mp_context=context, initializer=_begin,
-        initargs=([*loaded_files(), *files], os.environ.get(_SAFE)),
+        initargs=([*loaded_files(), *files], safe_path),
     )  # fmt: skip
     side = Pool(executor)
     # A first process starts now, not when there is work for it; it starts where it can wait.
     Thread(target=_start, args=(executor, side), daemon=True).start()
     try:
         yield side
+        executor.shutdown()
     except BaseException:
-        _stop(executor)  # nobody waits for the pieces
+        side.drop()  # nobody waits for the pieces
+        _stop(executor)
         executor.shutdown(wait=False, cancel_futures=True)
         raise
-    executor.shutdown()
 
 
 def begin_imports(workers: int, modules: Sequence[str] = _REPORT) -> None:
@@ -248,11 +256,13 @@ def _restore(safe_path: str | None) -> None:
 
 def _start(executor: ProcessPoolExecutor, side: Pool) -> None:
     """Start a first process, and what it is forked from; then hand over what waits for it."""
-    if "forkserver" in get_all_start_methods():
-        _serve()
-    with suppress(EOFError, OSError, RuntimeError):  # stopped meanwhile
-        executor.submit(_begun)
-    side.begun()
+    try:
+        with suppress(EOFError, OSError, RuntimeError):  # stopped meanwhile, or short of processes
+            if "forkserver" in get_all_start_methods():
+                _serve()
+            executor.submit(_begun)
+    finally:
+        side.begun()
 
 
 def without_interruptions() -> None:

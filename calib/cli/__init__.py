@@ -9,7 +9,6 @@ import signal
 import sys
 import threading
 from collections.abc import Callable
-from contextlib import suppress
 from functools import partial
 from threading import Timer
 from typing import Any
@@ -41,7 +40,7 @@ def main() -> None:
     try:
         app(prog_name="calib")
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _print_nowhere()
         raise SystemExit(0) from None
     finally:
         sys.unraisablehook = usual
@@ -55,23 +54,38 @@ def program() -> None:
     try:
         main()
     except SystemExit as ended:
+        written = _written()
         if ended.code == INTERRUPTED:
             _end_server()
-        elif isinstance(ended.code, str):
-            raise  # the interpreter says it
-        _leave(ended.code)
+        elif isinstance(ended.code, str) or _others_at_work() or not written:
+            raise
+        # The interpreter would take long to give back, one by one, what it holds.
+        atexit._run_exitfuncs()
+        os._exit(ended.code or 0)
 
 
-def _leave(code: int | None) -> None:
-    """End at once: the interpreter would take long to give back, one by one, what it holds."""
-    for thread in threading.enumerate():
-        if thread is not threading.current_thread() and not thread.daemon:
-            thread.join()
-    atexit._run_exitfuncs()
-    for stream in (sys.stdout, sys.stderr):
-        with suppress(BrokenPipeError):  # nobody reads it any more
-            stream.flush()
-    os._exit(code or 0)
+def _others_at_work() -> bool:
+    """Whether threads, or code that is not calib's, may still have something to do or to write."""
+    plugins: Any = sys.modules.get("calib.batch.plugins")
+    threads = set(threading.enumerate()) - {threading.main_thread()}
+    return any(not t.daemon for t in threads) or (plugins is not None and plugins.others_loaded())
+
+
+def _written() -> bool:
+    """Whether what was printed has gone out; what has not is for the interpreter to say."""
+    try:
+        for stream in (sys.stdout, sys.stderr):
+            if stream is not None:
+                stream.flush()
+    except BrokenPipeError:  # nobody reads it any more
+        _print_nowhere()
+    except OSError:
+        return False
+    return True
+
+
+def _print_nowhere() -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def interruptible() -> None:

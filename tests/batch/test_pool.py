@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 import time
+from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import active_children, forkserver
 from pathlib import Path
 
@@ -70,6 +71,51 @@ def test_a_server_that_is_gone_hides_no_error(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(forkserver._forkserver, "_forkserver_pid", gone.pid)
     with pytest.raises(CalibError, match="of the work"), pool(2):
         raise CalibError("of the work")
+
+
+def test_an_interruption_while_the_last_pieces_are_waited_for_ends_the_processes(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A piece that nobody waits for would keep a script from ending."""
+    orderly = ProcessPoolExecutor.shutdown
+
+    def interrupted(executor: ProcessPoolExecutor, wait: bool = True, **how: bool) -> None:
+        if wait:
+            raise KeyboardInterrupt
+        orderly(executor, wait, **how)
+
+    monkeypatch.setattr(ProcessPoolExecutor, "shutdown", interrupted)
+    with pytest.raises(KeyboardInterrupt), pool(2) as side:  # noqa: PT012
+        side.submit(square, 2).result()
+        side.submit(time.sleep, 600.0)
+        working = active_children()
+    assert working
+    for process in working:
+        process.join(60.0)
+        assert process.exitcode
+
+
+def test_where_no_process_can_start_it_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    def short(*_: object) -> None:
+        raise OSError(24, "too many open files")
+
+    monkeypatch.setattr("calib.batch.pool._serve", short)
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", short)
+    with pool(2) as side:
+        piece = side.submit(square, 2)
+        with pytest.raises(OSError, match="too many"):
+            piece.result()
+
+
+def test_what_waits_is_not_begun_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("calib.batch.pool._start", lambda executor, side: None)
+    asked: list[object] = []
+    monkeypatch.setattr(ProcessPoolExecutor, "submit", lambda _, work: asked.append(work))
+    with pytest.raises(CalibError, match="stop"), pool(2) as side:  # noqa: PT012
+        side.submit(square, 2)
+        raise CalibError("stop")
+    side.begun()
+    assert asked == []
 
 
 @pytest.mark.parametrize("workers", [1, 2])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import shutil
 import signal
 import subprocess
@@ -184,6 +185,7 @@ def test_a_program_ends_at_once_however_it_ends(monkeypatch: pytest.MonkeyPatch)
     left: list[int] = []
     monkeypatch.setattr("calib.cli.os._exit", left.append)
     monkeypatch.setattr("calib.cli.atexit._run_exitfuncs", lambda: None)
+    monkeypatch.setattr("calib.cli._others_at_work", lambda: False)
     for code in (130, 0, None, 3):
         monkeypatch.setattr("calib.cli.main", lambda code=code: sys.exit(code))
         script.load()()
@@ -197,36 +199,81 @@ ENDING = """
 import atexit, sys, threading, time
 import calib.cli
 atexit.register(print, "at exit")
-def late():
-    time.sleep(0.3)
-    print("a thread")
 def main():
-    threading.Thread(target=late).start()
     print("x" * 100_000)
     sys.exit(3)
 calib.cli.main = main
-calib.cli.program()
 """
+# What the interpreter waits for and writes by itself.
+BESIDE = {
+    "nothing": ("", []),
+    "a thread": (
+        """
+def late():
+    time.sleep(0.3)
+    print("a thread")
+threading.Thread(target=late).start()
+""",
+        ["a thread"],
+    ),
+    "an idle worker": (
+        """
+from concurrent.futures import ThreadPoolExecutor
+executor = ThreadPoolExecutor(1)
+executor.submit(int).result()
+""",
+        [],
+    ),
+}
+BUFFERED = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
 
 
-def test_nothing_is_lost_where_a_program_ends_at_once() -> None:
+def ending(text: str) -> list[str]:
+    return [sys.executable, "-c", f"{text}\ncalib.cli.program()"]
+
+
+@pytest.mark.parametrize("beside", BESIDE)
+def test_nothing_is_lost_where_a_program_ends(beside: str) -> None:
+    text, more = BESIDE[beside]
     ran = subprocess.run(
-        [sys.executable, "-c", ENDING], capture_output=True, text=True, check=False
+        ending(ENDING + text), capture_output=True, text=True, check=False, timeout=60
     )
     assert ran.returncode == 3
-    assert ran.stdout.splitlines() == ["x" * 100_000, "a thread", "at exit"]
+    assert sorted(ran.stdout.splitlines()) == sorted(["x" * 100_000, "at exit", *more])
     assert ran.stderr == ""
 
 
-def test_a_reader_that_has_gone_is_no_error() -> None:
+def test_what_code_of_ones_own_has_open_is_written(tmp_path: Path) -> None:
+    (tmp_path / "own.py").write_text("LOG = open('log.txt', 'w')\nLOG.write('loaded')\n")
+    program = [sys.executable, "-c", "from calib.cli import program; program()"]
+    ran = subprocess.run(
+        [*program, "models", "--models", "own.py"], cwd=tmp_path, capture_output=True, text=True,
+        check=False, env=BUFFERED,
+    )  # fmt: skip
+    assert (ran.returncode, "bekker" in ran.stdout) == (0, True)
+    assert (tmp_path / "log.txt").read_text() == "loaded"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="of a shell")
+@pytest.mark.parametrize(("to", "code"), [(">&-", 3), ("2>&-", 3), (">/dev/full", 120)])
+def test_without_a_place_to_write_to_the_exit_code_says_it(to: str, code: int) -> None:
+    command = shlex.join(ending(ENDING.replace("100_000", "10")))
+    ran = subprocess.run(
+        f"{command} {to}", shell=True, capture_output=True, text=True, check=False, env=BUFFERED
+    )
+    assert ran.returncode == code
+    assert "Traceback" not in ran.stderr
+
+
+@pytest.mark.parametrize("beside", BESIDE)
+def test_a_reader_that_has_gone_is_no_error(beside: str) -> None:
     """As `calib models | head -1` has it: what is still to be written has nowhere to go."""
-    buffered = {k: v for k, v in os.environ.items() if k != "PYTHONUNBUFFERED"}
     with subprocess.Popen(
-        [sys.executable, "-c", ENDING.replace("100_000", "10")],
+        ending(ENDING.replace("100_000", "10") + BESIDE[beside][0]),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=buffered,
+        env=BUFFERED,
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None

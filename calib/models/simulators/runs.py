@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.batch.folders import writing
 from calib.batch.tasks import read_seconds, run_tasks
 from calib.errors import CalibError
 from calib.models.base import Array
@@ -113,7 +114,8 @@ class RunKeeper:
 
     def _on_disk(self, items: Mapping[str, _Item]) -> Mapping[str, Mapping[str, Any]]:
         folder = Path(self.folder or ".") / self.simulator.digest[:16]
-        self._forget_failures(folder, items)
+        with writing(folder):
+            self._forget_failures(folder, items)
         if self.workers > 1 and not self.seconds:
             # The first run tells how long one takes.
             missing = [name for name in items if not (folder / f"{name}.json").exists()]

@@ -165,7 +165,7 @@ class CommandWay:
         try:
             path = (self.folder / argument).resolve()
             return path if path.is_file() else None
-        except OSError:  # such as a text too long for a name
+        except (OSError, RuntimeError):  # a text too long for a name, a link to itself
             return None
 
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:

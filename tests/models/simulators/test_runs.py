@@ -92,3 +92,8 @@ def test_what_is_no_fault_of_the_parameters_is_not_kept(tmp_path: Path) -> None:
     with pytest.raises(CalibError, match=r"^3 of 3 runs could not be made: simulator line: the"):
         RunKeeper(broken, tmp_path).runs(THETAS, X)
     assert not list(tmp_path.rglob("*-0.json"))
+
+
+def test_a_folder_that_cannot_be_one_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(CalibError, match="cannot be written"):
+        RunKeeper(simulator(), tmp_path / ("A" * 300)).runs(THETAS, X)
