@@ -64,7 +64,8 @@ def part_of(group: str) -> str:
 def is_document(name: str) -> bool:
     """Whether a file of a report is compared entry by entry, beside its summary."""
     diagnosed = name.startswith("gaps/") and name.endswith((".json", ".csv"))
-    # What a corrected model predicts is held against its diagnosis (`derived`).
+    # What a corrected model predicts is held against its diagnosis (`derived`), and the mode of the
+    # laboratory's rows, by which it predicts what was before, against that found again.
     return name == AUDIT_JSON or (diagnosed and not name.endswith("corrected.json"))
 
 
@@ -85,6 +86,8 @@ def compare_numbers(again: Again) -> list[Item]:
     names = {p.relative_to(again.made).as_posix() for p in again.made.rglob("*") if p.is_file()}
     for name in sorted(filter(is_document, names)):
         items += _document(name, again)
+    for name in sorted(n for n in names if n.endswith("/corrected.json")):
+        items += _document(name, again, "lab_mode")
     return items
 
 
@@ -178,17 +181,20 @@ def _comparable(manifest: dict[str, Any]) -> dict[str, Any]:
     return kept
 
 
-def _document(name: str, again: Again) -> list[Item]:
+def _document(name: str, again: Again, only: str = "") -> list[Item]:
+    """Compare a document entry by entry, or what it has below one of its keys."""
     group = "audit" if name == AUDIT_JSON else f"gap: {name.split('/')[1]}"
     path = again.folder / name
     if not path.is_file():
         return [Item(group, name, Status.DIFFERENT, note="missing")]
     try:
-        old = _entries(name, _read(path))
+        old, new = (_entries(name, _read(f / name)) for f in (again.folder, again.made))
     except (OSError, ValueError, RecursionError) as error:
         note = f"it cannot be read ({type(error).__name__})"
         return [Item(group, name, Status.DIFFERENT, note=note)]
-    return compare_entries(old, _entries(name, _read(again.made / name)), lambda _: group)
+    if only:
+        old, new = ({p: v for p, v in e.items() if only in p[1:2]} for e in (old, new))
+    return compare_entries(old, new, lambda _: group)
 
 
 def _read(path: Path) -> Any:

@@ -109,6 +109,8 @@ def _size(
 def _number(
     group: str, name: str, old: float, new: float, tolerance: Tolerance, size: float | None
 ) -> Item:
+    if math.isnan(old) or math.isnan(new):
+        return Item(group, name, Status.DIFFERENT, old, new, note="not a number")
     rounded = 1e-6 * max(abs(old), abs(new)) if isinstance(old, float) else 0.0
     if abs(old - new) <= max(size or 0.0, rounded):
         return Item(group, name, Status.WITHIN, old, new, size, tolerance.kind)

@@ -178,6 +178,8 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     ("summary.json/paper_gaps/*/checks/*/*", Tolerance("diagnosis", 0.2)),
     ("summary.json/paper_gaps/*/probability/*", _chance(0.05)),
     ("summary.json/paper_gaps/*/open_sd_rms", Tolerance("diagnosis", 0.05)),
+    # A hundredth of a posterior sd, of coordinates of the order of one.
+    ("gaps/*/corrected.json/lab_mode/*/*", Tolerance("optimum", 1e-3, floor=1e-3)),
     ("gaps/*/diagnosis.json/effects/*/probability", _chance(0.05)),
     ("gaps/*/diagnosis.json/inclusion/*/probability", _chance(0.05)),
     ("gaps/*/diagnosis.json/remainder/probability", _chance(0.05)),

@@ -31,6 +31,7 @@ def main() -> None:
     # Little of what is made is garbage that refers to itself: to look for it takes a twelfth of a
     # report's time as Python does by default, after every 700 objects.
     gc.set_threshold(20_000, 20)
+    _open_what_is_closed()
     from calib.cli.verbs import app
 
     # A polite kill cleans up as an interrupt does.
@@ -82,6 +83,13 @@ def _written() -> bool:
     except OSError:
         return False
     return True
+
+
+def _open_what_is_closed() -> None:
+    """Have a place to print to where there is none, as of a job that closed its output."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: PTH123, SIM115
 
 
 def _print_nowhere() -> None:

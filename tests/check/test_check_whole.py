@@ -83,6 +83,13 @@ def change_corrected(whole: Path) -> None:
     path.write_text(json.dumps(content) + "\n")
 
 
+def change_lab_mode(whole: Path) -> None:
+    path = whole / "gaps/plain_bekker/corrected.json"
+    content = json.loads(path.read_text())
+    content["lab_mode"]["rut_depth"][0] += 0.02  # two per cent of the rut depth
+    path.write_text(json.dumps(content) + "\n")
+
+
 def change_case(whole: Path) -> None:
     path = whole / "gaps/plain_bekker/case/field.csv"
     *rows, last = path.read_text().splitlines()
@@ -192,6 +199,9 @@ TAMPERING: dict[str, tuple[Callable[[Path], None], str, list[str]]] = {
     "a corrected model": (
         change_corrected, "gaps/plain_bekker/corrected.json",
         ["gaps/plain_bekker/corrected.json"]),
+    "what a corrected model has of the laboratory": (
+        change_lab_mode, "gaps/plain_bekker/corrected.json",
+        ["gaps/plain_bekker/corrected.json: lab_mode.rut_depth.0"]),
     "a row of a gap": (
         change_case, "gaps/plain_bekker/case/field.csv",
         ["gaps/plain_bekker/case/field.csv: 13.rut_depth_mm"]),

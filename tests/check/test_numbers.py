@@ -68,6 +68,12 @@ def test_what_has_no_monte_carlo_error_is_not_judged() -> None:
     assert "tail" in item.note
 
 
+def test_what_is_not_a_number_is_judged_without_one() -> None:
+    drawn = {(*POSTERIOR, "mean"): None}
+    found = compare({"mean": math.nan}, {"mean": 1.0}, *POSTERIOR[1:], drawn=drawn)
+    assert statuses(found) == {"mean": Status.DIFFERENT}
+
+
 def test_one_number_does_not_depend_on_the_others() -> None:
     """A number that moved within its error is the same beside numbers that did not move at all."""
     drawn = {(*POSTERIOR, key): 0.3 for key in ("mean", "sd", "median")}

@@ -33,6 +33,7 @@ def test_every_row_of_the_table_is_used() -> None:
     """By the embedded data's report, or by what a run or a comparison has."""
     paths = ["/".join(path) for name in documents() for path in entries(name)]
     paths += [
+        "gaps/plain_bekker/corrected.json/lab_mode/rut_depth/0",
         "run.json/estimates/0/cost", "run.json/estimates/0/reported/n0",
         "run.json/estimates/0/theta/1", "run.json/shape/0",
         "summary.json/models/rut_depth/sampling/reasons/0",

@@ -265,6 +265,19 @@ def test_without_a_place_to_write_to_the_exit_code_says_it(to: str, code: int) -
     assert "Traceback" not in ran.stderr
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="of a shell")
+def test_a_job_that_closed_its_output_is_told_the_same(tmp_path: Path) -> None:
+    (tmp_path / "my.csv").write_text(example_csv("bekker"))
+    program = [sys.executable, "-c", "from calib.cli import program; program()"]
+    for words in (["fit", "my.csv", "--model", "bekker", "--out", "run", "--max-steps", "800"],
+                  ["check", "run"], ["predict", "run", "--at", "my.csv"]):  # fmt: skip
+        ran = subprocess.run(
+            f"{shlex.join([*program, *words])} >&-", shell=True, cwd=tmp_path, text=True,
+            capture_output=True, check=False,
+        )  # fmt: skip
+        assert (ran.returncode, "Traceback" in ran.stderr) == (0, False), ran.stderr
+
+
 @pytest.mark.parametrize("beside", BESIDE)
 def test_a_reader_that_has_gone_is_no_error(beside: str) -> None:
     """As `calib models | head -1` has it: what is still to be written has nowhere to go."""
