@@ -1,6 +1,6 @@
 """Whatever a file holds, it is read or refused with a `CalibError`: thousands of mutilated files.
 
-`make test` tries eighty of each kind, `make test-slow` 30,000 together, and says how many.
+`make test` tries fifty of each kind, `make test-slow` 30,000 together, and says how many.
 Command lines as well: each ends in an exit code and words, never in a traceback.
 """
 
@@ -32,7 +32,7 @@ from calib.models.simulators.files import read_simulator
 from calib.models.simulators.registered import models_of
 from tests.models.simulators.examples import PROGRAM, write_program
 
-FEW, MANY = 80, 5_000
+FEW, MANY = 50, 5_000
 
 # What turns up in files, by accident or by malice.
 TOKENS = (

@@ -210,7 +210,7 @@ def test_first_runs_that_fail_in_several_ways_are_no_reason_to_stop() -> None:
 
 
 @pytest.mark.parametrize("deterministic", [True, False])
-@pytest.mark.parametrize("runs", [10, 25])
+@pytest.mark.parametrize("runs", [10, pytest.param(25, marks=pytest.mark.slow)])
 def test_the_budget_is_of_all_runs_that_are_made(runs: int, deterministic: bool) -> None:
     """Probes, repeats and checks among them; what cannot be reached with so few is told."""
     made = []
