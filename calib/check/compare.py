@@ -188,10 +188,11 @@ def _document(name: str, again: Again, only: str = "") -> list[Item]:
     if not path.is_file():
         return [Item(group, name, Status.DIFFERENT, note="missing")]
     try:
-        old, new = (_entries(name, _read(f / name)) for f in (again.folder, again.made))
+        old = _entries(name, _read(path))
     except (OSError, ValueError, RecursionError) as error:
         note = f"it cannot be read ({type(error).__name__})"
         return [Item(group, name, Status.DIFFERENT, note=note)]
+    new = _entries(name, _read(again.made / name))
     if only:
         old, new = ({p: v for p, v in e.items() if only in p[1:2]} for e in (old, new))
     return compare_entries(old, new, lambda _: group)
