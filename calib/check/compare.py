@@ -188,14 +188,18 @@ def _document(name: str, again: Again, only: str = "") -> list[Item]:
     if not path.is_file():
         return [Item(group, name, Status.DIFFERENT, note="missing")]
     try:
-        old = _entries(name, _read(path))
+        old = _entries(name, _part(_read(path), only))
     except (OSError, ValueError, RecursionError) as error:
         note = f"it cannot be read ({type(error).__name__})"
         return [Item(group, name, Status.DIFFERENT, note=note)]
-    new = _entries(name, _read(again.made / name))
-    if only:
-        old, new = ({p: v for p, v in e.items() if only in p[1:2]} for e in (old, new))
+    new = _entries(name, _part(_read(again.made / name), only))
     return compare_entries(old, new, lambda _: group)
+
+
+def _part(document: Any, only: str) -> Any:
+    if not only:
+        return document
+    return {only: document[only]} if isinstance(document, dict) and only in document else {}
 
 
 def _read(path: Path) -> Any:

@@ -16,6 +16,8 @@ from calib.check.tolerances import ARITHMETIC, Of, Tolerance, natural_scale, tol
 NUMBER = re.compile(
     r"[-+\u2212]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+|\u00d710[\u2070-\u2079\u00b2\u00b3\u00b9\u207b]+)?"
 )
+# Most entries by far; to ask whether they are an abstract collection takes longer than the rest.
+_PLAIN = (float, str, int, type(None))
 _ABSENT = object()
 SAME_WORDS = "the same words"
 
@@ -35,10 +37,12 @@ def flatten(document: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
     Entries of a list are known by their ``name`` or ``key`` where each has its own, otherwise by
     their position.
     """
-    if isinstance(document, Mapping):
+    if isinstance(document, _PLAIN):
+        yield place, document
+    elif isinstance(document, Mapping):
         for key, value in document.items():
             yield from flatten(value, (*place, str(key)))
-    elif isinstance(document, Sequence) and not isinstance(document, str):
+    elif isinstance(document, Sequence):
         for name, value in zip(_names(document), document, strict=True):
             yield from flatten(value, (*place, name))
     else:
@@ -46,7 +50,7 @@ def flatten(document: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
 
 
 def _names(entries: Sequence[Any]) -> list[str]:
-    for key in ("name", "key"):
+    for key in ("name", "key") if entries and isinstance(entries[0], Mapping) else ():
         names = [entry.get(key) for entry in entries if isinstance(entry, Mapping)]
         if len(names) == len(set(map(str, names))) == len(entries) and None not in names:
             return [str(name) for name in names]

@@ -52,7 +52,13 @@ def fitted_and_checked(calib: Calib, model: str) -> None:
     assert f"{MODELS[model].output}_predictive_90_lower" in lines[0]
 
 
-@pytest.mark.parametrize("model", QUICK)
+# Another of the same output, of the same kind, is quick.
+ALIKE = {"brixius", "bekker_plate", "lyasko", "upadhyaya"}
+
+
+@pytest.mark.parametrize(
+    "model", [pytest.param(m, marks=[pytest.mark.slow] if m in ALIKE else []) for m in QUICK]
+)
 def test_a_model_from_template_to_bands(calib: Calib, model: str) -> None:
     fitted_and_checked(calib, model)
 

@@ -278,6 +278,7 @@ def test_runs_that_fail_across_zero_alone_are_made_without(edge: float) -> None:
     assert emulation.emulator.training.ok.all()
 
 
+@pytest.mark.slow
 def test_what_fails_by_chance_or_anywhere_is_no_reason_to_do_without_what_lies_across_zero() -> (
     None
 ):

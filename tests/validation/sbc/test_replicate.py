@@ -62,6 +62,7 @@ def test_a_few_posteriors_of_the_cheapest_model_are_calibrated(few) -> None:
         assert abs(band.proportion - band.level) < 4.5 * band.se
 
 
+@pytest.mark.slow  # quick with exact draws (`test_power`)
 def test_posteriors_half_as_wide_are_found(few) -> None:
     found = score_model(few[0.5])
     assert min(q.p for q in found.quantities) * len(found.quantities) < RARE

@@ -68,7 +68,7 @@ def test_what_is_not_uniform_is_found(shape: tuple[float, float]) -> None:
     assert p_value(stats.beta(*shape).rvs(300, random_state=1)) < 1e-4
 
 
-@pytest.mark.parametrize("n", [40, 300])
+@pytest.mark.parametrize("n", [40, pytest.param(300, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("level", [0.9, 0.95])
 def test_arviz_bands_hold_the_whole_curve_as_often_as_they_say(n: int, level: float) -> None:
     rng = np.random.default_rng(3)
