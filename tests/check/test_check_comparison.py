@@ -49,6 +49,7 @@ def test_an_untouched_comparison_is_the_same_bit_for_bit(tmp_path: Path) -> None
     } <= names  # fmt: skip
 
 
+@pytest.mark.slow  # quick for a report and for a run
 def test_a_comparison_of_other_draws_is_the_same_within_their_error(tmp_path: Path) -> None:
     """Another seed stands for another processor: it says a seed that it was not made with."""
     folder = made.comparison(tmp_path / "c", seed=5)

@@ -270,7 +270,7 @@ def test_a_job_that_closed_its_output_is_told_the_same(tmp_path: Path) -> None:
     (tmp_path / "my.csv").write_text(example_csv("bekker"))
     program = [sys.executable, "-c", "from calib.cli import program; program()"]
     for words in (["fit", "my.csv", "--model", "bekker", "--out", "run", "--max-steps", "800"],
-                  ["check", "run"], ["predict", "run", "--at", "my.csv"]):  # fmt: skip
+                  ["check", "run", "--quick"], ["predict", "run", "--at", "my.csv"]):  # fmt: skip
         ran = subprocess.run(
             f"{shlex.join([*program, *words])} >&-", shell=True, cwd=tmp_path, text=True,
             capture_output=True, check=False,

@@ -34,14 +34,21 @@ def problem_of(file: Path) -> calib.Problem:
     return calib.build_problem("wheel", calib.table_from_arrays(lab(np.random.default_rng(1))))
 
 
-def refused(problem: calib.Problem, *words: str) -> None:
+def estimated(problem: calib.Problem) -> None:
+    calib.estimate(problem, "least_squares", generator(1))
+
+
+def sampled(problem: calib.Problem) -> None:
+    calib.calibrate(problem, seed=1)
+
+
+def refused(
+    problem: calib.Problem, *words: str, asking: tuple[Callable, ...] = (estimated, sampled)
+) -> None:
     """Whoever asks first: the estimator or the sampler."""
-    for ask in (
-        lambda: calib.estimate(problem, "least_squares", generator(1)),
-        lambda: calib.calibrate(problem, seed=1),
-    ):
+    for ask in asking:
         with pytest.raises(CalibError, match="fails from the start") as caught:
-            ask()
+            ask(problem)
         for word in ("none of the 6 runs has a value", "to mend: ", *words):
             assert word in str(caught.value)
 
@@ -62,8 +69,8 @@ def test_a_command_says_file_and_key_and_what_it_printed(
 ) -> None:
     counted = f"open({str(tmp_path / 'made')!r}, 'a').write('x'); {extra}"
     problem = problem_of(write_program(tmp_path, extra=counted, **QUICK))
-    refused(problem, f"wheel.toml, {key}: ", *words)
-    assert len((tmp_path / "made").read_text()) == 2 * MADE
+    refused(problem, f"wheel.toml, {key}: ", *words, asking=(sampled,))
+    assert len((tmp_path / "made").read_text()) == MADE
 
 
 @pytest.mark.parametrize(
