@@ -90,11 +90,11 @@ def test_two_do_not_hide_each_other(second: float) -> None:
 def test_data_as_the_likelihood_says_are_left_alone() -> None:
     """No more often than Bonferroni's bound says."""
     rng, named = np.random.default_rng(2), 0
-    for _ in range(100):
+    for _ in range(200):
         slip = rng.random(12)
         pull = slip + rng.standard_normal(12)
         named += bool(outlying_rows(line_problem(slip, pull), fitted_line(slip, pull)))
-    assert stats.binom.sf(named - 1, 100, LEVEL) > 1e-3
+    assert stats.binom.sf(named - 1, 200, LEVEL) > 1e-3
 
 
 @pytest.mark.parametrize("output", ["bulk_density", "drawbar_pull", "rut_depth"])

@@ -21,6 +21,7 @@ from calib.gap.case import read_case
 from calib.gap.diagnose import diagnose
 from calib.he2019.datasets import embedded
 from calib.inference.calibration import calibrate
+from calib.inference.emulation.prepared import emulated
 from calib.inference.estimators import estimate
 from calib.inference.io import load_calibration
 from calib.inference.problem import build_problem
@@ -128,15 +129,16 @@ def test_a_slow_simulator_is_emulated_where_the_campaign_is_started(wheel, tmp_p
     ((name, told),) = numbers.items()
     task = read_plan(tmp_path / "plan.toml").tasks[name]
     assert task.settings["simulators"] == {"campaign_wheel": found.simulator.digest}
+    problem = build_problem("campaign_wheel", read_table(tmp_path / "lab.csv"))
+    emulation = emulated(problem, task.seed)
+    assert told["emulator"]["runs"] == len(emulation.runs)
     assert told["emulator"]["passed"] is told["converged"] is True
     # What is sent to a worker has the emulator with it, and asks nothing of the simulator.
     item = pickle.loads(pickle.dumps(KINDS["fit"].load(task)))
     SIMULATED.discard("campaign_wheel")
     assert KINDS["fit"].work(item, task.seed).numbers == told
     kept = tmp_path / "out" / "results" / name
-    (emulation,) = json.loads((kept / "emulation.json").read_text())["campaign_wheel"]
-    assert emulation["passed"]
-    assert told["emulator"]["runs"] == emulation["runs"]
+    assert json.loads((kept / "emulation.json").read_text())["campaign_wheel"][0]["passed"]
     assert (kept / "run" / "emulator.npz").exists()
 
 
