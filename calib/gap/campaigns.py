@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ from calib.inference.priors import Priors
 from calib.inference.problem import Problem, build_problem
 from calib.models import MODELS, get_model
 from calib.models.base import Array
+
+if TYPE_CHECKING:
+    from calib.gap.shifts import ShiftAs, ShiftMap
 
 # Fewer field rows cannot tell a gap from noise; a larger ratio is a wrong unit.
 MIN_FIELD_ROWS = 5
@@ -100,6 +104,11 @@ class Campaigns:
     @cached_property
     def forms(self) -> dict[Effect, tuple[Array, list[float]]]:
         """Bases of effects' form errors at the field's rows, kept as hypotheses need them."""
+        return {}
+
+    @cached_property
+    def shift_maps(self) -> dict[ShiftAs, tuple[ShiftMap, list[float]]]:
+        """What shifts of the parameters do, of either kind, kept as hypotheses need them."""
         return {}
 
     @cached_property

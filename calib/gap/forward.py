@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from calib.gap.shifts import ShiftMap, shift_map
 from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
 
-__all__ = ["FORM_ERROR", "Forward"]
+__all__ = ["FORM_ERROR", "Forward", "shifted_of_all"]
 
 # Relative size by which a formula may misrepresent its effect along one direction: the effect's
 # size, its tilt and bend over slip, its tilt over other conditions. Estimated from the true
@@ -112,7 +112,10 @@ class Forward:
         self.shift_slice = slice(len(entries), len(entries))
         self.shift: ShiftMap | None = None
         if hypothesis.shift > 0.0:
-            current, relative = shift_map(data.outputs, hypothesis.shift_as)
+            kind, kept = hypothesis.shift_as, data.shift_maps
+            if kind not in kept:
+                kept[kind] = shift_map(data.outputs, kind)
+            current, relative = kept[kind]
             self.shift = current if shift is None else shift
             shifts = [_normal("field.shift", hypothesis.shift * sd) for sd in relative]
             self.shift_slice = _append(entries, shifts)
@@ -128,7 +131,7 @@ class Forward:
             entries.append(_uniform("threshold", *THRESHOLDS))
         self.priors = Priors(tuple(entries))
 
-    @property
+    @cached_property
     def n_shared(self) -> int:
         """Length of the first part of psi, which is that of the simulators."""
         return int(max(part.stop for part in self.misfit_slices.values()))
@@ -223,13 +226,7 @@ class Forward:
         """Predict field rows with the hypothesis in force, but for effects that are idle."""
         if self.shift is None:
             return self.departed(psi, view, self.simulator(psi, view), idle)
-        plain: dict[str, Array] = {}
-        shift = psi[:, self.shift_slice]
-        for name, s in self.simulated.items():
-            t = psi[:, self.theta_slices[name]] + shift @ self.shift.parameters[name].T
-            conditions = _shifted(shift @ self.shift.radius_error, s.conditions(view))
-            plain[name] = s.predict(t, psi[:, self.misfit_slices[name]], conditions)
-        return self.departed(psi, view, plain, idle)
+        return self.departed(psi, view, shifted_of_all([(self, psi)], view), idle)
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -267,6 +264,30 @@ class Forward:
         if self.shift is not None:
             return self.field(psi, view), plain
         return self.departed(psi, view, plain), plain
+
+
+@_SILENT
+def shifted_of_all(asked: Sequence[tuple[Forward, Array]], view: View) -> dict[str, Array]:
+    """Predict field rows with the simulators at the shifted parameters of hypotheses.
+
+    Parameters
+    ----------
+    asked : sequence of (Forward, ndarray)
+        On the same campaigns, each with a shift, and psi of each, shape (k, d).
+    view : View
+    """
+    some, _ = asked[0]
+    shared = np.concatenate([psi[:, : some.n_shared] for _, psi in asked])
+    shifts = [(f.shift, psi[:, f.shift_slice]) for f, psi in asked if f.shift is not None]
+    errors = np.concatenate([shift @ by.radius_error for by, shift in shifts])
+    found: dict[str, Array] = {}
+    for name, s in some.simulated.items():
+        moved = np.concatenate([shift @ by.parameters[name].T for by, shift in shifts])
+        found[name] = s.predict(
+            shared[:, some.theta_slices[name]] + moved, shared[:, some.misfit_slices[name]],
+            _shifted(errors, s.conditions(view)),
+        )  # fmt: skip
+    return found
 
 
 def _shifted(radius_error: Array, conditions: dict[str, Array]) -> dict[str, Array]:

@@ -28,8 +28,9 @@ from calib.models.base import Array
 
 __all__ = ["Isolability", "isolability", "smallest_shown"]
 
-# Draws of each effect's prior: for its sizes, and of these for how alike effects look.
-_N_SIZES, _N_DRAWS = 1024, 64
+# Draws of each effect's prior: for its sizes (which gives the detectable ones to 1 %), and of these
+# for how alike effects look.
+_N_SIZES, _N_DRAWS = 512, 64
 _Z_POWER = 0.8416  # 80 % power
 _LN_ODDS = float(np.log(10.0))  # an effect shows when it is ten times as probable as none
 ALIKE = 0.95
@@ -167,9 +168,9 @@ def _signatures(
         psi[:, forward.theta_slices[o.name]] = lab_mode[o.name]
     plain = forward.simulator(psi, data.view)
     full = forward.departed(psi, data.view, plain)
+    at = noise_conditions(data.view)
     parts = [
-        (full[o.name] - plain[o.name])[:, o.rows]
-        / noise[o.name].sd(noise_conditions(data.view).rows(o.rows))
+        (full[o.name] - plain[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))
         for o in data.outputs
     ]
     g = np.concatenate(parts, axis=1)

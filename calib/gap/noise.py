@@ -55,6 +55,17 @@ class NoiseConditions:
         growth = np.array([[_growth(self, rho, kappa) for kappa in kappas] for rho in RHO])
         return growth, np.log(growth).sum(axis=2)
 
+    def growth(self, rho: float, kappa: float) -> Array:
+        """Growth of the noise, shape (n,); a fit asks for the same few a thousand times."""
+        known = self._growths
+        if (rho, kappa) not in known:
+            known[rho, kappa] = _growth(self, rho, kappa)
+        return known[rho, kappa]
+
+    @cached_property
+    def _growths(self) -> dict[tuple[float, float], Array]:
+        return {}
+
     def rows(self, rows: NDArray[np.int64]) -> NoiseConditions:
         """Some of the rows."""
         return NoiseConditions(self.slip[rows], self.softness[rows])
@@ -77,7 +88,7 @@ class Noise:
 
     def sd(self, at: NoiseConditions) -> Array:
         """Noise sd, shape (n,)."""
-        return self.sigma * _growth(at, self.rho, self.kappa)
+        return self.sigma * at.growth(self.rho, self.kappa)
 
 
 def noise_conditions(view: View) -> NoiseConditions:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from calib.gap.campaigns import Campaigns
 from calib.gap.departed import departed_of_all
-from calib.gap.forward import Forward
+from calib.gap.forward import Forward, shifted_of_all
 from calib.gap.noise import Noise, most_probable
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
@@ -185,10 +185,7 @@ def residuals_of_all(asked: Sequence[tuple[Residuals, Array]]) -> list[Array]:
     found: dict[int, Array] = {}
     batch: list[int] = []
     size = 0
-    for i, (problem, psi) in enumerate(asked):
-        if problem.forward.shift is not None:
-            found[i] = problem.raw(psi)
-            continue
+    for i, (_, psi) in enumerate(asked):
         if batch and size + len(psi) > _AT_ONCE:
             found |= _batched(asked, batch)
             batch, size = [], 0
@@ -201,14 +198,18 @@ def residuals_of_all(asked: Sequence[tuple[Residuals, Array]]) -> list[Array]:
 def _batched(asked: Sequence[tuple[Residuals, Array]], batch: list[int]) -> dict[int, Array]:
     if not batch:
         return {}
-    forward = asked[batch[0]][0].forward
-    shared = np.concatenate([asked[i][1][:, : forward.n_shared] for i in batch])
+    forward, view = asked[batch[0]][0].forward, asked[batch[0]][0].data.view
+    parts = [(asked[i][0].forward, asked[i][1]) for i in batch]
+    shared = np.concatenate([psi[:, : forward.n_shared] for _, psi in parts])
     # Guesses and differences mostly leave the simulators' parameters as in the row before.
     new = np.append(True, (shared[1:] != shared[:-1]).any(axis=1))
     index = np.cumsum(new) - 1
     lab, plain = ({o: v[index] for o, v in p.items()} for p in forward.plain(shared[new]))
-    view = forward.data.view
-    field = departed_of_all([(asked[i][0].forward, asked[i][1]) for i in batch], view, plain)
-    raw = asked[batch[0]][0].beside(lab, field)
-    ends = np.cumsum([len(asked[i][1]) for i in batch])[:-1]
-    return dict(zip(batch, np.split(raw, ends), strict=True))
+    ends = np.cumsum([len(psi) for _, psi in parts]).tolist()
+    shifted = [j for j, (f, _) in enumerate(parts) if f.shift is not None]
+    if shifted:
+        rows = np.concatenate([np.arange(ends[j] - len(parts[j][1]), ends[j]) for j in shifted])
+        for name, there in shifted_of_all([parts[j] for j in shifted], view).items():
+            plain[name][rows] = there
+    raw = asked[batch[0]][0].beside(lab, departed_of_all(parts, view, plain))
+    return dict(zip(batch, np.split(raw, ends[:-1]), strict=True))

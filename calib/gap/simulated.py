@@ -114,11 +114,14 @@ class Simulated:
         if not beyond.any():
             return self.predict(t, misfit, conditions)
         location = self.predict(t, misfit, {**conditions, column: inside})
-        # Both ends in one call, each a pressure of all vectors.
-        twice = {name: np.concatenate([v, v], axis=-1) for name, v in conditions.items()}
-        twice[column] = np.repeat([low, high], pressure.shape[-1])
-        at_low, at_high = np.split(self.predict(t, misfit, twice), 2, axis=1)
-        return np.asarray(location + (at_high - at_low) * beyond)
+        # Both ends in one call, each a pressure of all vectors, for the rows that any takes beyond.
+        rows = np.flatnonzero(np.atleast_2d(beyond).any(axis=0))
+        twice = np.concatenate([rows, rows])
+        ends = {name: v[..., twice] for name, v in conditions.items()}
+        ends[column] = np.repeat([low, high], rows.size)
+        at_low, at_high = np.split(self.predict(t, misfit, ends), 2, axis=1)
+        location[:, rows] += (at_high - at_low) * beyond[..., rows]
+        return location
 
     def _error_of(self, conditions: Mapping[str, Array]) -> Array:
         """What the coefficients of the error make of an emulator's curves, shape (j, n_errors)."""

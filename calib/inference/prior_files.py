@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -71,10 +72,14 @@ def default_priors(model_name: str) -> PriorFile:
     known = MODELS.get(model_name)
     if known is not None and known.priors:
         return declared_priors("model", model_name, known.priors, known.predict)
+    return _shipped() / f"{model_name}.toml"
+
+
+@cache
+def _shipped() -> Path:
     packaged = Path(str(resources.files("calib"))) / "_priors"
     # An editable install has no packaged copy: the priors then lie beside the package.
-    folder = packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "priors"
-    return folder / f"{model_name}.toml"
+    return packaged if packaged.is_dir() else Path(__file__).resolve().parents[2] / "priors"
 
 
 def prior_file_model(path: Path) -> str:
@@ -136,11 +141,17 @@ def _text(path: PriorFile) -> str:
 
 def _content(text: str, source: str) -> dict[str, Any]:
     try:
-        return tomllib.loads(text)
+        return _parsed(text)
     except tomllib.TOMLDecodeError as error:
         raise CalibError(
             f"the prior file is not valid TOML: {error}", where=source, mend="correct that line"
         ) from None
+
+
+@lru_cache(maxsize=64)
+def _parsed(text: str) -> dict[str, Any]:
+    """What a text says, which a diagnosis asks of the same few again and again; not to change."""
+    return tomllib.loads(text)
 
 
 def prior_references(columns: Mapping[str, NDArray[np.float64]]) -> dict[str, float]:
@@ -155,7 +166,7 @@ def prior_references(columns: Mapping[str, NDArray[np.float64]]) -> dict[str, fl
 
 def relative_columns(text: str) -> dict[str, float]:
     """Return the columns that priors are relative to, and what is assumed without one."""
-    entries = tomllib.loads(text)["parameters"].values()
+    entries = _parsed(text)["parameters"].values()
     return {
         e["relative_to"]: float(e.get("default_reference", 1.0))
         for e in entries
@@ -291,7 +302,7 @@ def _check_units(file: PriorFileContent, source: str, model_name: str) -> None:
         return
     units = {
         name: entry.get("unit")
-        for name, entry in tomllib.loads(shipped.read_text(encoding="utf-8"))["parameters"].items()
+        for name, entry in _parsed(shipped.read_text(encoding="utf-8"))["parameters"].items()
     } | {name: entry.unit for name, entry in NOISE_ENTRIES.items()}
     for name, entry in file.parameters.items():
         if name in units and entry.unit != units[name]:

@@ -75,7 +75,7 @@ def _nearest_everywhere(table: FittedTable, C: float, levels: int) -> Array:
 
     found = minimize(
         norm, _start(table, C, _COARSE), method="Nelder-Mead",
-        options={"xatol": 1e-7, "fatol": 1e-7, "maxiter": 1000, "maxfev": 1000},
+        options={"xatol": 1e-5, "fatol": 1e-5, "maxiter": 1000, "maxfev": 1000},
     )  # fmt: skip
     return np.asarray(found.x)
 

@@ -23,9 +23,8 @@ _NEGLIGIBLE, _NEAR = 15.0, 25.0
 
 def prior_widths(priors: Priors) -> Array:
     """Prior standard deviation (uniform: a quarter of the range) of each free parameter, (d,)."""
-    return np.array(
-        [p.scale if np.isfinite(p.scale) else 0.25 * (p.upper - p.lower) for p in priors.free]
-    )
+    _, scale, lower, upper, _ = priors._arrays
+    return np.where(np.isfinite(scale), scale, 0.25 * (upper - lower))
 
 
 def find_mode(
