@@ -6,6 +6,7 @@ import json
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -87,7 +88,7 @@ def check_comparison(
                 items += _of(c.model, found)
             if (folder / FIGURE).is_file():
                 old, new = ((f / FIGURE).read_bytes() for f in (folder, made))
-                items.append(compare_figure(FIGURE, old, new, thumbnails(made)))
+                items.append(compare_figure(FIGURE, old, new, partial(thumbnails, made)))
     return items, allowed
 
 

@@ -6,7 +6,7 @@ import csv
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -255,7 +255,8 @@ def compare_files(again: Again, moved: Moved) -> list[Item]:
     made = {p.relative_to(again.made).as_posix() for p in again.made.rglob("*") if p.is_file()}
     own = {RECORD, SUMMARY, *derived_files(dict.fromkeys(made, ""))}
     made = {n for n in made - own if not is_document(n) and not n.endswith("corrected.json")}
-    pictures, prints = thumbnails(again.made), sorted(n for n in made if n.endswith(".pdf"))
+    pictures = cache(partial(thumbnails, again.made))
+    prints = sorted(n for n in made if n.endswith(".pdf"))
     items = []
     for name in sorted(made - set(prints)):
         if name in again.manifest.left_out:

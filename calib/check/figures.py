@@ -6,7 +6,8 @@ import io
 import re
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -35,14 +36,19 @@ def thumbnails(folder: Path) -> dict[str, Array]:
     return found
 
 
-def compare_figure(name: str, recorded: bytes, drawn: bytes, others: Mapping[str, Array]) -> Item:
-    """Compare a figure with the one drawn again, among the `thumbnails` of all drawn again."""
+def compare_figure(
+    name: str, recorded: bytes, drawn: bytes, others: Callable[[], Mapping[str, Array]]
+) -> Item:
+    """Compare a figure with the one drawn again, among the `thumbnails` of all drawn again.
+
+    These are asked for where the figure is not the same byte for byte.
+    """
     if recorded == drawn:
         return Item(GROUP, name, Status.IDENTICAL)
     image = _thumbnail(recorded)
     if image is None:
         return Item(GROUP, name, Status.DIFFERENT, note="it is no readable image")
-    apart = {other: _distance(image, shown) for other, shown in others.items()}
+    apart = {other: _distance(image, shown) for other, shown in others().items()}
     nearest = min(apart, key=lambda other: apart[other])
     facts: dict[str, Any] = {"recorded": round(apart[name], 4), "found": 0.0, "allowed": _ALIKE}
     if apart[nearest] < apart[name]:
@@ -59,8 +65,12 @@ def compare_pictures(page: str, recorded: Sequence[bytes], drawn: Sequence[bytes
         note = f"it has {len(recorded)} pictures of its own, not {len(drawn)}"
         return [Item(GROUP, page, Status.DIFFERENT, note=note)]
     names = [f"{page}: picture {i + 1}" for i in range(len(drawn))]
-    reduced = {name: _thumbnail(image) for name, image in zip(names, drawn, strict=True)}
-    others = {name: image for name, image in reduced.items() if image is not None}
+
+    @cache
+    def others() -> dict[str, Array]:
+        reduced = {name: _thumbnail(image) for name, image in zip(names, drawn, strict=True)}
+        return {name: image for name, image in reduced.items() if image is not None}
+
     return [
         compare_figure(name, old, new, others)
         for name, old, new in zip(names, recorded, drawn, strict=True)
@@ -69,14 +79,18 @@ def compare_pictures(page: str, recorded: Sequence[bytes], drawn: Sequence[bytes
 
 def compare_prints(recorded: Mapping[str, bytes], drawn: Mapping[str, bytes]) -> list[Item]:
     """Compare figures as PDF that are in both by what is drawn in them, numbers apart."""
-    inks = {name: _ink(content) for name, content in drawn.items()}
+
+    @cache
+    def inks() -> dict[str, Counter[str]]:
+        return {name: _ink(content) for name, content in drawn.items()}
+
     items = []
     for name in sorted(set(recorded) & set(drawn)):
         if recorded[name] == drawn[name]:
             items.append(Item(GROUP, name, Status.IDENTICAL))
             continue
         ink = _ink(recorded[name])
-        apart = {other: _unshared(ink, shown) for other, shown in inks.items()}
+        apart = {other: _unshared(ink, shown) for other, shown in inks().items()}
         nearest = min(apart, key=lambda other: apart[other])
         if not ink or apart[nearest] < apart[name]:
             items.append(_like_another(name, nearest))

@@ -11,6 +11,7 @@ import os
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -20,7 +21,7 @@ import pytest
 import calib.check.check_report as check_report_module
 import calib.check.check_run as check_run_module
 from calib.batch.environment import sha256
-from calib.check import montecarlo, posteriors
+from calib.check import figures, montecarlo, posteriors
 from calib.check.check import check
 from calib.check.montecarlo import posterior_errors
 from calib.check.outcome import Outcome, Status
@@ -102,6 +103,12 @@ def _read() -> dict[Any, Any]:
     return {}
 
 
+@pytest.fixture(scope="package")
+def _shown() -> dict[str, Callable[[bytes], Any]]:
+    """What is seen of figures, of which most are those of the test before."""
+    return {name: lru_cache(maxsize=100)(getattr(figures, name)) for name in ("_thumbnail", "_ink")}
+
+
 @pytest.fixture
 def audited_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
     """Audit once with the same calibration."""
@@ -120,7 +127,7 @@ def audited_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def computed_once(_made, _read, audited_once, monkeypatch: pytest.MonkeyPatch) -> None:
+def computed_once(_made, _read, _shown, audited_once, monkeypatch: pytest.MonkeyPatch) -> None:
     """Do the work of equal inputs once, and read equal posteriors once.
 
     Most tampering leaves them as they are.
@@ -168,6 +175,8 @@ def computed_once(_made, _read, audited_once, monkeypatch: pytest.MonkeyPatch) -
             cache[key] = calibration, posterior_errors(calibration)
         return dict(cache[key][1])
 
+    for name, shown in _shown.items():
+        monkeypatch.setattr(figures, name, shown)
     monkeypatch.setattr(montecarlo, "posterior_errors", errors_once)
     monkeypatch.setattr(check_report_module, "recompute_report", report_again)
     monkeypatch.setattr(check_run_module, "recompute_run", run_again)

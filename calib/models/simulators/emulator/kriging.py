@@ -6,17 +6,16 @@
 with b the constant and the coordinates, beta flat beforehand (Rasmussen & Williams 2006, *Gaussian
 Processes for Machine Learning*, section 2.7).
 
-The length scales, the only part that is easy to get wrong, are those of the greatest marginal
-likelihood as scikit-learn's `GaussianProcessRegressor` finds it. It is the oldest and best kept of
-the libraries at hand, adds no other array library to what is here already (GPyTorch, GPflow and
-tinygp bring torch, TensorFlow or JAX), and 300 values need none of what those are for. It has no
-trend, and its predictions check and copy their input at each call; both matter where a sampler
-asks a million times, so prediction with the trend is the 20 lines below.
+The length scales are those of the greatest marginal likelihood, as scikit-learn's
+`GaussianProcessRegressor` would find them (a test holds one against the other). It has no trend,
+its predictions check and copy their input at each call, and its search, mostly spent on kernel
+objects, takes ten times as long; where a sampler asks a million times and an emulator is built anew
+after every few runs, that matters. GPyTorch, GPflow and tinygp bring torch, TensorFlow or JAX, and
+300 values need none of what those are for.
 """
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,12 +24,15 @@ from scipy.optimize import minimize
 
 from calib.models.base import Array
 
-__all__ = ["Kriging", "Scales", "find_scales", "krige"]
+__all__ = ["Kriging", "Scales", "find_scales", "krige", "minus_log_likelihood"]
 
 # Relative to the process: smaller and the matrix has no factor, larger and values are not met.
 _NUGGET, _NOISY = 1e-9, 1.0
 _LENGTHS = (0.2, 100.0)
+_LEVELS = (1e-2, 1e6)  # of the process's variance, in units of the values'
 _STEPS = 40
+# What keeps the matrix of the smallest nugget from having no factor.
+_JITTER = 1e-10
 
 
 @dataclass(frozen=True)
@@ -153,10 +155,6 @@ def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None
     start : Scales, optional
         Where to begin.
     """
-    from sklearn.exceptions import ConvergenceWarning
-    from sklearn.gaussian_process import GaussianProcessRegressor
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-
     b = trend_of(x)
     rest = y - b @ np.linalg.lstsq(b, y, rcond=None)[0]
     spread = float(rest.std())
@@ -165,24 +163,42 @@ def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None
     lengths = np.full(x.shape[1], 2.0) if start is None else np.clip(start.lengths, 0.3, 60.0)
     most = _NOISY if noisy else 1e-3
     nugget = 1e-5 if start is None else float(np.clip(start.nugget, 2 * _NUGGET, 0.5 * most))
-    kernel = ConstantKernel(1.0, (1e-2, 1e6)) * RBF(lengths, _LENGTHS) + WhiteKernel(
-        nugget, (_NUGGET, most)
-    )
-    regressor = GaussianProcessRegressor(kernel, alpha=1e-10, optimizer=_climb)
-    with warnings.catch_warnings():
-        # At a bound of a length is where a coordinate that does not matter belongs.
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        fitted = regressor.fit(x, rest / spread).kernel_
-    level = float(fitted.k1.k1.constant_value)
-    return Scales(
-        np.atleast_1d(fitted.k1.k2.length_scale) * np.ones(x.shape[1]),
-        max(float(fitted.k2.noise_level) / level, _NUGGET),
-    )
-
-
-def _climb(objective: object, start: Array, bounds: Array) -> tuple[Array, float]:
-    """A climb of few steps: the last digit of a length scale changes no prediction."""
+    start_at = np.log([1.0, *lengths, nugget])
+    bounds = np.log([_LEVELS, *[_LENGTHS] * x.shape[1], (_NUGGET, most)])
+    # Few steps: the last digit of a length scale changes no prediction.
     found = minimize(
-        objective, start, method="L-BFGS-B", jac=True, bounds=bounds, options={"maxiter": _STEPS}
-    )  # type: ignore[call-overload]
-    return found.x, float(found.fun)
+        minus_log_likelihood, start_at, (np.square(x.T[:, :, None] - x.T[:, None]), rest / spread),
+        method="L-BFGS-B", jac=True, bounds=bounds, options={"maxiter": _STEPS},
+    )  # fmt: skip
+    scales = np.exp(found.x)
+    return Scales(scales[1:-1], max(float(scales[-1] / scales[0]), _NUGGET))
+
+
+def minus_log_likelihood(logs: Array, squares: Array, y: Array) -> tuple[float, Array]:
+    """Return minus the log marginal likelihood of values without a trend, and its gradient.
+
+    Rasmussen & Williams (2006), equations 2.30 and 5.9.
+
+    Parameters
+    ----------
+    logs : ndarray, shape (d + 2,)
+        Logarithms of the process's variance, its length scales and the nugget.
+    squares : ndarray, shape (d, n, n)
+        Squared distances along each coordinate.
+    y : ndarray, shape (n,)
+    """
+    level, lengths, nugget = np.exp(logs[0]), np.exp(logs[1:-1]), np.exp(logs[-1])
+    inverse_squares = lengths**-2.0
+    smooth = level * np.exp(-0.5 * np.tensordot(inverse_squares, squares, axes=1))
+    eye = np.eye(len(y))
+    try:
+        lower = cholesky(smooth + (nugget + _JITTER) * eye, lower=True)
+    except np.linalg.LinAlgError:
+        return np.inf, np.zeros_like(logs)
+    inverse = cho_solve((lower, True), eye)
+    gamma = inverse @ y
+    value = 0.5 * y @ gamma + np.log(np.diag(lower)).sum() + 0.5 * len(y) * np.log(2.0 * np.pi)
+    off = 0.5 * (inverse - np.outer(gamma, gamma))
+    along = (off * smooth).ravel()
+    by_length = inverse_squares * (squares.reshape(len(lengths), -1) @ along)
+    return float(value), np.array([along.sum(), *by_length, nugget * np.trace(off)])

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from calib.models.simulators.emulator.kriging import (
     Scales,
     correlation,
     find_scales,
     krige,
+    minus_log_likelihood,
     trend_of,
 )
 
@@ -63,3 +68,40 @@ def test_a_constant_is_no_trouble() -> None:
     y = np.full(12, 5.0)
     found = krige(x, y, find_scales(x, y))
     np.testing.assert_allclose(found.mean(x + 0.3), 5.0)
+
+
+def sklearns(
+    lengths: np.ndarray, nugget: float, most: float = 1e-3, **kwargs: Any
+) -> GaussianProcessRegressor:
+    kernel = ConstantKernel(1.0, (1e-2, 1e6)) * RBF(lengths, (0.2, 100.0))
+    return GaussianProcessRegressor(
+        kernel + WhiteKernel(nugget, (1e-9, most)), alpha=1e-10, **kwargs
+    )
+
+
+def test_the_likelihood_and_its_gradient_are_scikit_learns() -> None:
+    rng = np.random.default_rng(4)
+    x = rng.uniform(-2.0, 2.0, (25, 3))
+    y = np.sin(x[:, 0]) + 0.1 * x[:, 1] * x[:, 2]
+    regressor = sklearns(np.ones(3), 1e-4, optimizer=None).fit(x, y)
+    squares = np.square(x.T[:, :, None] - x.T[:, None])
+    for logs in rng.uniform([-2.0, -1.0, -1.0, 0.0, -12.0], [3.0, 2.0, 2.0, 3.0, -7.0], (8, 5)):
+        value, gradient = minus_log_likelihood(logs, squares, y)
+        theirs, slope = regressor.log_marginal_likelihood(logs, eval_gradient=True)
+        assert value == pytest.approx(-theirs, rel=1e-6)
+        np.testing.assert_allclose(gradient, -slope, rtol=1e-4, atol=1e-4 * abs(slope).max())
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_scales_are_those_that_scikit_learn_finds(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-2.0, 2.0, (60, 2))
+    y = np.sin(1.5 * x[:, 0]) + 0.2 * x[:, 1] ** 2 + 0.05 * rng.standard_normal(60)
+    b = trend_of(x)
+    rest = y - b @ np.linalg.lstsq(b, y)[0]
+    theirs = sklearns(np.full(2, 2.0), 1e-5, 1.0).fit(x, rest / rest.std()).kernel_
+    found = find_scales(x, y, noisy=True)
+    np.testing.assert_allclose(found.lengths, theirs.k1.k2.length_scale, rtol=0.02)
+    assert found.nugget == pytest.approx(
+        theirs.k2.noise_level / theirs.k1.k1.constant_value, rel=0.02
+    )
