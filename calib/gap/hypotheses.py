@@ -34,7 +34,6 @@ __all__ = [
     "effect_priors",
     "inseparable",
     "joined",
-    "pair",
     "read_effect_priors",
     "resized",
     "shifts",
@@ -362,8 +361,3 @@ def joined(*causes: Hypothesis) -> Hypothesis:
         tuple(priors for _, _, priors in parts),
         share=float(np.prod([h.share for h in causes])),
     )
-
-
-def pair(a: Hypothesis, b: Hypothesis) -> Hypothesis:
-    """Two effects at once, named in alphabetical order."""
-    return joined(a, b)

@@ -22,7 +22,7 @@ from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import read_case
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import pair, shifts, singles, split_testable, unknowns
+from calib.gap.hypotheses import joined, shifts, singles, split_testable, unknowns
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, noise_conditions
 from calib.gap.relevance import RELEVANT_IN_PAIR, sizes
@@ -49,7 +49,7 @@ def well_specified_case(
     folder : Path
         The other case, with a ``fresh.csv``; its name is part of the seed.
     truth : str
-        What happens in the field: a contract name, pairs in alphabetical order.
+        What happens in the field: a contract name, sets of effects in alphabetical order.
     gap_over_noise : float
         The size wanted, rms in noise sds; met within a ratio of 1.25.
 
@@ -58,7 +58,7 @@ def well_specified_case(
     files : dict of str to str
         Name to text.
     key : dict
-        Noise-free values with and without what happens, noise, size and hypothesis.
+        Noise-free values with and without what happens, noise, sizes and hypothesis.
 
     Raises
     ------
@@ -84,6 +84,10 @@ def well_specified_case(
     key: dict[str, Any] = {
         "gap_over_noise": draw.gap_over_noise,
         "mechanism": f"as the diagnosis believes: {forward.hypothesis.name}",
+        "contributions": {
+            effect.name: float(_gap(forward, psi, noise, effect.name)[0])
+            for effect in forward.hypothesis.effects
+        },
         "noise_sd": {},
     }
     lab_readings, field_readings = {}, {}
@@ -153,7 +157,7 @@ def draw_from_hypothesis(
     noise : mapping of str to Noise
         Of each output, on the scale of the response.
     truth : str
-        Contract name; pairs in alphabetical order.
+        Contract name; sets of effects in alphabetical order.
     gap_over_noise : float
         The size wanted, rms in noise sds; met within a ratio of 1.25.
     rng : Generator
@@ -198,16 +202,20 @@ def _hypothesis(data: Campaigns, truth: str, rng: np.random.Generator) -> Hypoth
         if name not in known:
             reason = unable.get(name, "no such effect")
             raise CalibError(f"{name} is not tested on this design: {reason}")
-    return known[truth] if len(names) == 1 else pair(known[names[0]], known[names[1]])
+    return joined(*(known[name] for name in names))
 
 
-def _gap(forward: Forward, psi: Array, noise: Mapping[str, Noise]) -> NDArray[np.float64]:
+def _gap(
+    forward: Forward, psi: Array, noise: Mapping[str, Noise], cause: str = ""
+) -> NDArray[np.float64]:
+    """Size of what happens in the field, or of what goes with one of its causes, shape (k,)."""
     data = forward.data
     at = noise_conditions(data.view)
     with np.errstate(all="ignore"):
-        full, plain = forward.field(psi, data.view), forward.simulator(psi, data.view)
+        full, rest = forward.field(psi, data.view), forward.simulator(psi, data.view)
+        rest = forward.without(psi, data.view, cause, plain=rest) if cause else rest
     each = [
-        ((full[o.name] - plain[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))) ** 2
+        ((full[o.name] - rest[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))) ** 2
         for o in data.outputs
     ]
     # Where the model has no value somewhere, it is NaN, which is of no size.

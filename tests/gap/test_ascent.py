@@ -22,7 +22,7 @@ from calib.gap.ascent import (
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.fit import Fit, Start, finished, log_joint, truncated_fits
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import pair, shifts, singles, split_testable, unknowns
+from calib.gap.hypotheses import joined, shifts, singles, split_testable, unknowns
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
 from calib.gap.residuals import Residuals, residuals_of_all
@@ -43,7 +43,7 @@ def problems(data) -> list[Residuals]:
     free = unknowns(data)
     onset = next(h for h in free if h.onset_over is not None)
     gauge, lugs = effects["pressure_gauge_bias"], effects["lug_thrust"]
-    kinds = (Hypothesis("none"), shifts(data)[0], gauge, lugs, pair(gauge, lugs), free[0], onset)
+    kinds = (Hypothesis("none"), shifts(data)[0], gauge, lugs, joined(gauge, lugs), free[0], onset)
     mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in data.outputs}
     return [Residuals(data, Forward(data, h, SIGMA, mode)) for h in kinds]
 
@@ -71,7 +71,7 @@ def test_all_at_once_have_the_residuals_of_each_alone(problems):
 def test_each_effect_is_asked_once_for_all_hypotheses_that_have_it(data):
     """Whatever conditions those before it have changed in some of them and in others not."""
     one = singles(data, split_testable(data)[0])
-    both = [pair(a, b) for i, a in enumerate(one) for b in one[i + 1 :]]
+    both = [joined(a, b) for i, a in enumerate(one) for b in one[i + 1 :]]
     asked = []
     for h in (*one, *both):
         problem = Residuals(data, Forward(data, h, SIGMA))

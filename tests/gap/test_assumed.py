@@ -10,7 +10,7 @@ import pytest
 from calib.gap.assumed import assumed
 from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS
-from calib.gap.hypotheses import pair, singles
+from calib.gap.hypotheses import joined, singles
 from calib.gap.hypothesis import Hypothesis
 from tests.gap.cases import make_case, table_without
 from tests.gap.fits import fit_at
@@ -38,7 +38,7 @@ def data_without(*columns):
 def test_only_what_the_hypothesis_rests_on_is_named(lacking, effects, value):
     data = data_without(*lacking)
     chosen = singles(data, {name: EFFECTS[name] for name in effects})
-    hypothesis = chosen[0] if len(chosen) == 1 else pair(*chosen)
+    hypothesis = chosen[0] if len(chosen) == 1 else joined(*chosen)
     median = float(np.median(data.case.field["speed_m_s"]))
     assert assumed(fit_at(data, hypothesis)) == {
         column: median if v == "median" else v for column, v in value.items()

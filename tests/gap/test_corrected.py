@@ -26,7 +26,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.effects.load import load_effects
 from calib.gap.fit import Fit
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import pair, readings, singles
+from calib.gap.hypotheses import joined, readings, singles
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.mixture import Mixture
 from calib.gap.noise import Noise
@@ -118,7 +118,7 @@ def made() -> Corrected:
     pull = ("drawbar_pull",)
     few = singles(data, {n: EFFECTS[n] for n in ("sensor_drift", "rate_effect")})
     hypotheses = [
-        pair(*few),
+        joined(*few),
         Hypothesis("parameter_shift", shift=0.25, shift_as="soil"),
         Hypothesis("unknown", smooth=2.0, smooth_outputs=pull, smooth_over="slip",
                    smooth_decay=3.0),

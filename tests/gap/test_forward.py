@@ -12,7 +12,7 @@ from calib.data.quantities import role_of
 from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import Forward
-from calib.gap.hypotheses import effect_priors, pair, shifts, singles, unknowns, with_remainder
+from calib.gap.hypotheses import effect_priors, joined, shifts, singles, unknowns, with_remainder
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.shifts import shift_map
 from calib.inference.priors import Prior, Priors
@@ -101,7 +101,7 @@ def test_an_effect_acts_in_the_field_only(data):
 
 def test_a_pair_does_what_both_do(data):
     a, b = single(data, "force_offset"), single(data, "sensor_drift")
-    both = pair(b, a)
+    both = joined(b, a)
     assert both.name == "force_offset+sensor_drift"
     sizes = ((0.1,), (0.2, 0.0, 0.5, 0.3))  # internal: logarithms but for the first and last
 
@@ -171,7 +171,7 @@ def test_a_formula_is_trusted_less_along_some_directions(data, effect, sds):
 
 
 def test_each_of_two_effects_departs_from_its_own_formula(data):
-    both = pair(single(data, "lug_thrust"), single(data, "sensor_drift"))
+    both = joined(single(data, "lug_thrust"), single(data, "sensor_drift"))
     forward = Forward(data, both, SIGMA)
     lugs, drift = forward.form_slices["drawbar_pull"]
     assert [p.scale for p in forward.priors.free[lugs]] == pytest.approx([0.15, 0.1, 0.13])
@@ -353,7 +353,7 @@ def test_a_threshold_lies_within_the_campaign(data):
 def test_of_density_a_simulator_is_inadequate_and_gauges_errors_have_forms():
     """Bends by the noise at the ends of the lab's range; sizes, cone index and water."""
     density = campaigns(density_campaigns())
-    h = pair(single(density, "cone_index_bias"), single(density, "water_content_bias"))
+    h = joined(single(density, "cone_index_bias"), single(density, "water_content_bias"))
     forward = Forward(density, h, {"bulk_density": 0.02})
     entries = {p.name: [] for p in forward.priors.entries}
     for p in forward.priors.entries:
@@ -435,7 +435,7 @@ def test_what_knows_no_slip_does_not_mind_where_its_zero_is():
 def test_form_errors_scale_what_each_effect_adds_to_those_before_it(data):
     """Of conditions first, of the output then: each by its own factor over rows."""
     names = ("slip_zero_shift", "rate_effect")
-    h = pair(*(single(data, name) for name in names))
+    h = joined(*(single(data, name) for name in names))
     assert [e.name for e in h.effects] == sorted(names)
     rate, zero = h.effects
     forward = Forward(data, h, SIGMA)

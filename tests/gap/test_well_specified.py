@@ -172,6 +172,27 @@ def test_what_is_drawn_has_the_size_that_it_says_and_that_was_asked_for(truth, s
     assert 4.0 / 1.25 < found.gap_over_noise < 4.0 * 1.25
 
 
+def test_the_key_says_what_each_cause_adds(tmp_path):
+    folder = write_case(make_case(None, n_fresh=5), tmp_path / "design")
+    _, key = well_specified_case(3, folder, "force_offset+rut_rebound", 5.0)
+    truth, without = (
+        {o: np.array(v) for o, v in key[k].items()} for k in ("field_truth", "field_without")
+    )
+    sd = {o: np.array(v) for o, v in key["noise_sd"].items()}
+    # Each acts on an output of its own; those of ruts live on the logarithm.
+    pull = (truth["drawbar_pull"] - without["drawbar_pull"]) / sd["drawbar_pull"]
+    relative = sd["rut_depth"] / truth["rut_depth"]
+    rut = np.log(truth["rut_depth"] / without["rut_depth"]) / relative
+    assert key["contributions"] == pytest.approx(
+        {
+            name: np.sqrt(np.square(z).mean() / 2.0)
+            for name, z in (("force_offset", pull), ("rut_rebound", rut))
+        }
+    )
+    _, key = well_specified_case(3, folder, "unknown", 5.0)
+    assert key["contributions"] == {}
+
+
 def test_without_a_gap_one_vector_is_drawn():
     data, found = draw("none", 4.0)
     assert found.gap_over_noise == 0.0
@@ -179,10 +200,14 @@ def test_without_a_gap_one_vector_is_drawn():
     assert not any(z.any() for z in gaps(data, found.forward, found.psi).values())
 
 
-def test_of_a_pair_each_is_large_enough_to_count():
+@pytest.mark.parametrize(
+    "truth", ["force_offset+rut_rebound", "force_offset+rut_rebound+slip_zero_shift"]
+)
+def test_of_several_each_is_large_enough_to_count(truth):
     for seed in range(2):
-        data, found = draw("force_offset+rut_rebound", 1.3, seed)
-        for cause in ("force_offset", "rut_rebound"):
+        data, found = draw(truth, 2.0, seed)
+        assert found.forward.hypothesis.name == truth
+        for cause in truth.split("+"):
             each = gaps(data, found.forward, found.psi, cause)
             assert max(np.sqrt(np.square(z).mean()) for z in each.values()) >= 1.0
 
