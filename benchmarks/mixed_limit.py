@@ -5,8 +5,8 @@
     calib challenge score believed --results results --key believed.key
 
 Where readings are drawn by the formulas and priors of the diagnosis itself, and it knows how often
-the bench mixes causes, its probabilities are those of Bayes' theorem: whoever believes the same of
-the effects names no more of them. No prior of the diagnosis is chosen by this.
+the bench mixes causes, its probabilities are close to those of Bayes' theorem: whoever believes the
+same of the effects names hardly more of them. No prior of the diagnosis is chosen by this.
 """
 
 from __future__ import annotations

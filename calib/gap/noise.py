@@ -52,18 +52,19 @@ class NoiseConditions:
     def growths(self) -> tuple[Array, Array]:
         """Growth of the noise for every rho and kappa, (rho, kappa, n); of its log the sums."""
         kappas = KAPPA if np.ptp(self.softness) else KAPPA[:1]
-        growth = np.array([[_growth(self, rho, kappa) for kappa in kappas] for rho in RHO])
+        growth = np.array([[self.growth(rho, kappa) for kappa in kappas] for rho in RHO])
         return growth, np.log(growth).sum(axis=2)
 
     def growth(self, rho: float, kappa: float) -> Array:
         """Growth of the noise, shape (n,); a fit asks for the same few a thousand times."""
-        known = self._growths
+        known = self._known
         if (rho, kappa) not in known:
-            known[rho, kappa] = _growth(self, rho, kappa)
+            with_slip = 1.0 + rho * np.maximum(self.slip, 0.0)
+            known[rho, kappa] = with_slip * np.exp(kappa * self.softness)
         return known[rho, kappa]
 
     @cached_property
-    def _growths(self) -> dict[tuple[float, float], Array]:
+    def _known(self) -> dict[tuple[float, float], Array]:
         return {}
 
     def rows(self, rows: NDArray[np.int64]) -> NoiseConditions:
@@ -110,10 +111,6 @@ def _at(conditions: Mapping[str, Array], lab: Mapping[str, float], size: int) ->
     if pressure is not None and reference is not None:
         softness = -np.log(np.maximum(pressure, 1e-6) / max(reference, 1e-6))
     return NoiseConditions(conditions.get(slip, np.zeros(size)), softness)
-
-
-def _growth(at: NoiseConditions, rho: float, kappa: float) -> Array:
-    return np.asarray((1.0 + rho * np.maximum(at.slip, 0.0)) * np.exp(kappa * at.softness))
 
 
 def ln_prior(noise: Noise) -> float:

@@ -43,7 +43,11 @@ def problems(data) -> list[Residuals]:
     free = unknowns(data)
     onset = next(h for h in free if h.onset_over is not None)
     gauge, lugs = effects["pressure_gauge_bias"], effects["lug_thrust"]
-    kinds = (Hypothesis("none"), shifts(data)[0], gauge, lugs, joined(gauge, lugs), free[0], onset)
+    alone, together = shifts(data)[:2]
+    assert alone.shift_as != together.shift_as
+    kinds = (
+        Hypothesis("none"), alone, gauge, lugs, joined(gauge, lugs), free[0], onset, together,
+    )  # fmt: skip
     mode = {o.name: np.array([p.loc for p in o.priors.free]) for o in data.outputs}
     return [Residuals(data, Forward(data, h, SIGMA, mode)) for h in kinds]
 

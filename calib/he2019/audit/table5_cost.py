@@ -108,11 +108,9 @@ def any_slips_bound(published: Published) -> float:
             cost += float((r + _largest_norm(table, C, levels)) ** 2)
         return cost
 
-    printed = [table.values["C"] for table in published.genetic.values()]
+    between = _common_C(published)[[0, -1]]
     # It bounds the optimum whatever C is; the last digit of the best C is of no use.
-    found = minimize_scalar(
-        total, bounds=(min(printed), max(printed)), method="bounded", options={"xatol": 5e-3}
-    )
+    found = minimize_scalar(total, bounds=between, method="bounded", options={"xatol": 5e-3})
     return float(found.fun)
 
 
