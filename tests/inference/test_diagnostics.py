@@ -5,7 +5,6 @@ from __future__ import annotations
 import emcee
 import numpy as np
 import pytest
-from arviz_stats.base import array_stats
 
 from calib.inference.diagnostics import (
     autocorrelation_time,
@@ -39,6 +38,9 @@ def sticky(seed: int, shape: tuple[int, ...], share: float) -> np.ndarray:
 @pytest.mark.parametrize("shape", [(4, 20, 60, 3), (4, 6, 200, 2), (5, 1, 40, 1)])
 @pytest.mark.parametrize("share", [1.0, 0.3])
 def test_convergence_is_arviz_own(shape: tuple[int, ...], share: float) -> None:
+    # Not at the top: to import it takes every process of the tests a second.
+    from arviz_stats.base import array_stats
+
     draws = sticky(1, shape, share)
     ensembles, walkers, steps, d = shape
     found = convergence(draws)

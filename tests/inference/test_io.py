@@ -8,7 +8,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import arviz as az
 import numpy as np
 import pytest
 
@@ -115,6 +114,9 @@ def test_the_tree_has_its_groups_and_dimensions(rut_calibration: Calibration) ->
 def test_other_programs_find_the_same_figures_in_the_file(
     rut_calibration: Calibration, saved: Path
 ) -> None:
+    # Not at the top: to import it takes every process of the tests a second.
+    import arviz as az
+
     with az.from_netcdf(saved / "posterior.nc", engine="h5netcdf") as tree:
         summary = az.summary(tree, round_to="none")
         loo = az.loo(tree, pointwise=True)

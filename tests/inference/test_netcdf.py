@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from calib.inference.calibration import Calibration
 from calib.inference.io import groups_of, to_datatree
@@ -16,6 +15,9 @@ from calib.inference.netcdf import Groups, read_netcdf, write_netcdf
 
 
 def test_a_file_holds_what_the_tree_holds(rut_calibration: Calibration, tmp_path: Path) -> None:
+    # Not at the top: to import it takes every process of the tests half a second.
+    import xarray as xr
+
     write_netcdf(groups_of(rut_calibration), tmp_path / "posterior.nc")
     tree = to_datatree(rut_calibration)
     with xr.open_datatree(tmp_path / "posterior.nc", engine="h5netcdf") as file:

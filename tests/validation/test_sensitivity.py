@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import arviz as az
 import numpy as np
 import pytest
-import xarray as xr
 from scipy import stats
 
 from calib.inference.calibration import Calibration, calibrate
@@ -102,6 +100,10 @@ def test_two_parameters_of_which_only_the_sum_is_seen() -> None:
 
 
 def test_it_is_what_arviz_works_out_of_the_saved_tree(rut_calibration: Calibration) -> None:
+    # Not at the top: to import them takes every process of the tests a second.
+    import arviz as az
+    import xarray as xr
+
     ours = prior_sensitivity(rut_calibration)
     tree = to_datatree(rut_calibration)
     logged = tree["posterior"].to_dataset()

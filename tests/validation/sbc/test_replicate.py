@@ -19,7 +19,7 @@ from calib.validation.sbc.score import score, score_model
 
 # One chance in ten thousand of a false alarm in all quantities together.
 RARE = 1e-4
-SEED, CHEAP, FEW = 40, "bekker", 24
+SEED, CHEAP, FEW, FEWEST = 40, "bekker", 24, 6
 
 
 def narrowed(calibration: Calibration, factor: float) -> Calibration:
@@ -49,6 +49,12 @@ def records(model: str, n: int, factors: tuple[float, ...]) -> dict[float, list[
 @pytest.fixture(scope="module")
 def few() -> dict[float, list[dict]]:
     return records(CHEAP, FEW, (1.0, 0.5))
+
+
+@pytest.fixture(scope="module")
+def fewest() -> list[dict]:
+    """As many as are counted and left out, which takes no more."""
+    return records(CHEAP, FEWEST, (1.0,))[1.0]
 
 
 @pytest.mark.slow
@@ -116,19 +122,19 @@ def test_a_replicate_is_a_pure_function_of_its_item() -> None:
     assert set(first["covered"]) == {"50", "90", "95"}
 
 
-def test_one_that_does_not_converge_is_counted_and_left_out(few) -> None:
-    spoilt = [dict(r) for r in few[1.0]]
+def test_one_that_does_not_converge_is_counted_and_left_out(fewest) -> None:
+    spoilt = [dict(r) for r in fewest]
     spoilt[5] = {**spoilt[5], "converged": False}
-    whole, found = score_model(few[1.0]), score_model(spoilt)
-    assert found.replicates == FEW
+    whole, found = score_model(fewest), score_model(spoilt)
+    assert found.replicates == FEWEST
     assert found.unconverged == 1
     for a, b in zip(whole.quantities, found.quantities, strict=True):
-        assert b.pit.size == FEW - 1
+        assert b.pit.size == FEWEST - 1
         assert b.p_all == a.p
 
 
-def test_a_truth_without_a_value_is_left_out_of_its_quantity_alone(few) -> None:
-    lacking = [dict(r) for r in few[1.0]]
+def test_a_truth_without_a_value_is_left_out_of_its_quantity_alone(fewest) -> None:
+    lacking = [dict(r) for r in fewest]
     lacking[0] = {
         **lacking[0],
         "ranks": {k: v for k, v in lacking[0]["ranks"].items() if k != "prediction"},
@@ -136,6 +142,6 @@ def test_a_truth_without_a_value_is_left_out_of_its_quantity_alone(few) -> None:
     }  # fmt: skip
     found = score_model(lacking)
     sizes = {q.name: q.pit.size for q in found.quantities}
-    assert sizes.pop("prediction") == FEW - 1
-    assert set(sizes.values()) == {FEW}
-    assert found.coverage[0].replicates == FEW - 1
+    assert sizes.pop("prediction") == FEWEST - 1
+    assert set(sizes.values()) == {FEWEST}
+    assert found.coverage[0].replicates == FEWEST - 1

@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from calib.models.simulators.emulator.kriging import (
     Scales,
@@ -70,9 +68,11 @@ def test_a_constant_is_no_trouble() -> None:
     np.testing.assert_allclose(found.mean(x + 0.3), 5.0)
 
 
-def sklearns(
-    lengths: np.ndarray, nugget: float, most: float = 1e-3, **kwargs: Any
-) -> GaussianProcessRegressor:
+def sklearns(lengths: np.ndarray, nugget: float, most: float = 1e-3, **kwargs: Any) -> Any:
+    # Not at the top: to import it takes every process of the tests half a second.
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
     kernel = ConstantKernel(1.0, (1e-2, 1e6)) * RBF(lengths, (0.2, 100.0))
     return GaussianProcessRegressor(
         kernel + WhiteKernel(nugget, (1e-9, most)), alpha=1e-10, **kwargs
