@@ -29,7 +29,6 @@ from tests.report.figures.fixtures import (  # noqa: F401
 )
 from tests.together import (  # noqa: F401
     pytest_collection_modifyitems,
-    pytest_xdist_auto_num_workers,
     pytest_xdist_make_scheduler,
 )
 

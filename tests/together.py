@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import cache
 from pathlib import Path
 
@@ -61,13 +60,6 @@ def group_of(path: str) -> str:
     file = path.removeprefix("tests/")
     place = place_of(file)
     return f"group {place}" if place < len(GROUPS) else file
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_auto_num_workers(config) -> int:
-    """One process more than processors: tests wait for a browser, a limit, another process."""
-    own = hasattr(os, "sched_getaffinity")
-    return 1 + (len(os.sched_getaffinity(0)) if own else os.cpu_count() or 1)
 
 
 @pytest.hookimpl(optionalhook=True)
