@@ -140,7 +140,7 @@ def _cause(found: Diagnosis, name: str, c: Included) -> CauseFact:
     words = "something unlisted" if name == UNLISTED else short_name(name)
     fits = (fit for group in found.ranking.fits.values() for fit in group)
     effects = (e for fit in fits for e in fit.forward.hypothesis.effects if e.name == name)
-    fault = any(e.instrument for e in effects)
+    fault = next((e.check for e in effects if e.instrument), "")
     return CauseFact(
         name, words, title_of(found, name), c.probability, c.share, c.share_interval, fault
     )  # fmt: skip

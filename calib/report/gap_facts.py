@@ -37,7 +37,7 @@ class WhereFact:
 class CauseFact:
     """A cause: its name, in words, what happens, whether it acts, and its share of the gap.
 
-    `instrument` says that it is a fault of one, not of wheel or soil.
+    `instrument` says how to check the one that is at fault; empty if wheel or soil is.
     """
 
     name: str
@@ -46,7 +46,7 @@ class CauseFact:
     probability: float
     share: float
     interval: tuple[float, float]
-    instrument: bool = False
+    instrument: str = ""
 
 
 @dataclass(frozen=True)

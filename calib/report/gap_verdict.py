@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from calib.gap.effects.instruments import EARLY
 from calib.report.gap_facts import (
     MOST_TIED,
     NEITHER,
@@ -193,15 +194,18 @@ def advice(e: GapEvidence) -> str:
     runs = _reading(e)
     if runs is None and e.verdict != "effect":
         return ""
-    faults = [runs] if runs else [c.words for c in e.acting if c.instrument]
+    faults = {c.words: c.instrument for c in e.acting if c.instrument}
+    if runs:
+        faults = {runs: EARLY}
     if faults:
+        checks = joined([f"{words} ({check})" for words, check in faults.items()])
         ground = ""
         if e.runs is not None and e.runs.only and e.runs.probability >= 0.5:
             ground = f". If it is sound, the ground changed over the runs: {e.runs.outputs} alone "
             ground += "cannot tell"
         return (
-            f"check the instrument before the model ({joined(faults)}): zero and span, and an "
-            "early run once more. What is predicted with the cause is the reading, not the truth"
+            f"check the instrument before the model: {checks}. With the cause, what the faulty "
+            "instrument reads is predicted; once it is mended, predict without it (--without)"
             f"{ground}"
         )
     if _measure_first(e):

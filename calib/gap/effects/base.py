@@ -141,6 +141,8 @@ class Effect:
         empty where the formula is exact.
     instrument : bool
         Whether an instrument is at fault, not wheel or soil; predicted with it is what it reads.
+    check : str
+        How such an instrument is checked, in words.
     priors : str
         Its priors as the text of a prior file, if they are in no file.
     prior_file : Path, optional
@@ -157,6 +159,7 @@ class Effect:
     varies: bool = True
     form: tuple[str, ...] = ()
     instrument: bool = False
+    check: str = "zero and span"
     priors: str = ""
     prior_file: Path | None = None
 

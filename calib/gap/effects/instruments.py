@@ -14,6 +14,9 @@ __all__ = [
     "SlipZeroShift", "WaterContentBias",
 ]  # fmt: skip
 
+EARLY = "zero and span, and an early run once more"
+"""How a reading that changes over the runs is checked."""
+
 # Part of the campaign over which a step is first taken to happen.
 _WIDE = 0.1
 # Parts of a step at which it is first taken to have been zeroed.
@@ -28,6 +31,7 @@ class SlipZeroShift(_Fault):
     """A rolling radius wrong by a factor: 1 - s_true = (1 - s_recorded)(1 - error)."""
 
     name = "slip_zero_shift"
+    check = "the rolling radius once more, at each pressure"
     form = ("pressure",)  # a tyre rolls on a smaller radius at less inflation
     title = "the rolling radius behind the recorded slip is wrong"
     latex = (r"$1 - s_\mathrm{f} = (1 - s)(1 - \text{radius error})$ for the slip $s$",)
@@ -69,6 +73,7 @@ class SensorDrift(_Fault):
     """A drift with run order: steady, settling, or from some run on; zeroed at any part of it."""
 
     name = "sensor_drift"
+    check = EARLY
     title = "the drawbar reading drifts with run order"
     latex: tuple[str, ...] = (
         r"$P_\mathrm{f} = P + \text{drift}\,[g(u) - \text{zero at}]$ for the pull $P$",
@@ -102,6 +107,7 @@ class SensorStep(_Fault):
     """
 
     name = "sensor_step"
+    check = EARLY
     title = "the drawbar reading jumps at some run, as when a sensor is replaced or slips"
     latex: tuple[str, ...] = (
         r"$P_\mathrm{f} = P + \text{jump}\,[H(u) - \text{zero at}]$ for the pull $P$",
@@ -153,6 +159,7 @@ class PressureGaugeBias(_Fault):
     """
 
     name = "pressure_gauge_bias"
+    check = "against another gauge, at each pressure"
     form = ("extrapolation",)  # the simulator is used at pressures it was not fitted at
     title = "true inflation pressure differs from the recorded one"
     latex = (
@@ -228,6 +235,7 @@ class WaterContentBias(_Fault):
     """A moisture probe that reads wrong by a gain and an offset."""
 
     name = "water_content_bias"
+    check = "against samples dried in an oven"
     title = "the moisture probe reads wrong"
     latex = (
         (

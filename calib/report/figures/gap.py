@@ -139,7 +139,7 @@ def _which_caption(found: Diagnosis, tied: list[str]) -> str:
     others = len(order) - min(len(order), _MOST)
     if others:
         text += f" {others} more hypotheses share {probability_text(rest)}."
-    return text + " Beyond the dashed line a hypothesis is named in the verdict."
+    return f"{text} Beyond the dashed line a hypothesis is the verdict; causes have theirs besides."
 
 
 def placebo_plate(found: Diagnosis) -> Plate:
@@ -177,7 +177,7 @@ def placebo_plate(found: Diagnosis) -> Plate:
         ax.text(placebo.before, top, "simulator", ha="center", va="bottom", fontsize=7.0,
                 color=EMBER)  # fmt: skip
     ax.text(1.015, 1.0, "removed", transform=ax.transAxes, va="bottom", fontsize=7.0, color=GREY)
-    ax.set_yticks(y, [short_name(n) for n in order])
+    ax.set_yticks(y, [textwrap.fill(short_name(n), 38) for n in order], linespacing=0.85)
     ax.set_ylim(-0.6, len(order) - 0.4)
     ax.tick_params(axis="y", length=0.0)
     ax.set_xlabel("Residual on the field rows, rms over the noise (noise sd)")

@@ -125,7 +125,8 @@ def _design_caption(design: Isolability) -> str:
     alike = sorted(design.alike, key=lambda pair: -design.likeness[pair])
     if alike:
         listed = joined([f"{short_name(a)} with {short_name(b)}" for a, b in alike[:4]])
-        more = f", and {len(alike) - 4} pairs more" if len(alike) > 4 else ""
+        rest = len(alike) - 4
+        more = f", and {rest} more pair{'s' * (rest > 1)}" if rest > 0 else ""
         text = f"On these conditions some effects look the same (framed): {listed}{more}."
     else:
         text = f"No two effects look alike here (no cosine of {ALIKE:g} or more)."

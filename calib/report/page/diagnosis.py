@@ -54,7 +54,7 @@ def hypothesis_groups(found: Diagnosis) -> list[dict[str, Any]]:
     rest = [n for n in order if n not in tied]
     possible = [n for n in rest if p[n] >= _POSSIBLE]
     out = [n for n in rest if p[n] < _POSSIBLE and "+" not in n]
-    pairs = [n for n in rest if p[n] < _POSSIBLE and "+" in n]
+    sets = [n for n in rest if p[n] < _POSSIBLE and "+" in n]
     left = placebos(found).left
     first = "Tied: the data do not tell these apart"
     if len(tied) == 1:
@@ -65,12 +65,12 @@ def hypothesis_groups(found: Diagnosis) -> list[dict[str, Any]]:
         (first, tied),
         ("Less probable", possible),
         ("Ruled out (below 1 %)", out),
-        (f"Pairs ruled out (below 1 %): {len(pairs)}", pairs),
+        (f"Sets ruled out (below 1 %): {len(sets)}", sets),
     )
     return [
         {
             "heading": heading,
-            "folded": heading.startswith("Pairs"),
+            "folded": heading.startswith("Sets"),
             "rows": [_row(found, name, left) for name in names],
         }
         for heading, names in groups

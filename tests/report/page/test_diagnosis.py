@@ -166,7 +166,7 @@ def test_of_a_change_over_the_runs_is_said_what_is_sure_of_it(verdict, forms, ki
 
 
 def test_a_sure_form_is_named_whatever_else_may_be():
-    sure = CauseFact("sensor_step", "sensor step", "a jump", 0.93, 0.9, (0.8, 1.0), True)
+    sure = CauseFact("sensor_step", "sensor step", "a jump", 0.93, 0.9, (0.8, 1.0), "its zero")
     runs = over_runs(("a step", 0.6), ("a drift and a step at once", 0.33))
     e = replace(evidence("effect", sensor_step=0.6), causes=[sure], runs=runs)
     assert judge_gap(e).rule == "named"
@@ -176,18 +176,19 @@ def test_where_the_form_is_not_told_the_reading_is_to_be_checked_all_the_same():
     runs = over_runs(("a step", 0.45), ("a drift", 0.4))
     e = replace(evidence("ambiguous", sensor_step=0.45, sensor_drift=0.4), runs=runs)
     text = dict(judge_gap(e).facts)["Next"]
-    assert text.startswith("Check the instrument before the model (drawbar pull)")
+    assert text.startswith("Check the instrument before the model: drawbar pull (zero and span")
     assert "alone cannot tell" not in text
     alone = dict(judge_gap(replace(e, runs=replace(runs, only=True))).facts)["Next"]
     assert alone.endswith("the ground changed over the runs: drawbar pull alone cannot tell")
 
 
 def test_where_an_instrument_is_at_fault_it_is_to_be_checked_first():
-    step = CauseFact("sensor_step", "sensor step", "a jump", 0.97, 0.9, (0.8, 1.0), True)
+    step = CauseFact("sensor_step", "sensor step", "a jump", 0.97, 0.9, (0.8, 1.0), "its zero")
     soil = CauseFact("lug_thrust", "lug thrust", "more thrust", 0.6, 0.1, (0.0, 0.2))
     e = replace(evidence("effect", sensor_step=0.97), causes=[step, soil])
-    assert "the instrument before the model (sensor step)" in dict(judge_gap(e).facts)["Next"]
-    others = dict(judge_gap(replace(e, causes=[replace(step, instrument=False)])).facts)
+    text = dict(judge_gap(e).facts)["Next"]
+    assert "the instrument before the model: sensor step (its zero). With" in text
+    others = dict(judge_gap(replace(e, causes=[replace(step, instrument="")])).facts)
     assert "instrument" not in others.get("Next", "")
 
 
@@ -407,7 +408,7 @@ def test_the_verdict_comes_first_with_the_whole_story(found, page):
 
 
 def test_what_to_do_is_on_the_card_and_under_next(page):
-    assert page[2].text.count("Check the instrument before the model (sensor drift)") == 2
+    assert page[2].text.count("Check the instrument before the model: sensor drift (zero") == 2
 
 
 def test_every_hypothesis_is_in_the_table(found, page):
