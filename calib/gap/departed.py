@@ -104,11 +104,15 @@ def _acting(
         (forward, _, _), i = having[0]
         effect, basis = forward.hypothesis.effects[i], forward.form(view)[i]
         phi = np.concatenate([psi[:, f.phi_slices[j]] for (f, psi, _), j in having])
-        # One plus what its form errors say: by how much it departs from its formula.
+        # One plus what its form errors say: by how much it departs from its formula, but for what
+        # is known of it: its sign, and where it is nothing.
         factors = {
-            name: 1.0
-            + np.concatenate([psi[:, f.form_slices[name][j]] for (f, psi, _), j in having])
-            @ basis.T
+            name: np.maximum(
+                1.0
+                + np.concatenate([psi[:, f.form_slices[name][j]] for (f, psi, _), j in having])
+                @ basis.T,
+                0.0,
+            )
             for name, role in forward.roles.items()
             if role in effect.outputs
         }

@@ -69,18 +69,19 @@ class Discrepancy:
         """Discrepancy of an output, amplitudes (k, m), thresholds (k,) if it sets in, (k, n)."""
         if self.hypothesis.onset_over is None:
             return np.asarray(amplitudes @ self._smooth(view, output).T)
-        step, bend = self.onset(view, output, threshold)
-        of_step, of_bend = each(amplitudes)
-        return np.asarray(of_step * step + of_bend * bend)
+        shapes = self.onset(view, output, threshold)
+        return np.asarray(sum(a * s for a, s in zip(each(amplitudes), shapes, strict=True)))
 
     def _smooth(self, view: View, output: str) -> Array:
         same = view.conditions is self.data.view.conditions
         return (self._of_field[output] if same else self._smooth_basis(view, output))[0]
 
-    def onset(self, view: View, output: str, threshold: Array) -> tuple[Array, Array]:
-        """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n).
+    def onset(self, view: View, output: str, threshold: Array) -> tuple[Array, ...]:
+        """Step, bend and level of a discrepancy that sets in at thresholds (k,), shapes (k, n).
 
-        Below a pressure it is a step and a part of the output's level instead.
+        The laboratory's rows are of both sides of what gives way at a threshold, so the field may
+        differ from them before it as well. Below a pressure it is a step and a part of the
+        output's level instead.
         """
         u = self.onset_covariate(view, output)
         beyond = (u - threshold[:, None]) / _ONSET_WIDTH
@@ -88,7 +89,7 @@ class Discrepancy:
         if self.hypothesis.onset_over == "low_pressure":
             # An underinflated tyre may lose a part of the pull, and more of it the more it pulls.
             return step, step * self._known(self._level(view, output))
-        return step, _ONSET_WIDTH * np.logaddexp(0.0, beyond)
+        return step, _ONSET_WIDTH * np.logaddexp(0.0, beyond), np.ones_like(step)
 
     def onset_covariate(self, view: View, output: str) -> Array:
         """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
@@ -107,8 +108,9 @@ class Discrepancy:
         """Basis of an output's free discrepancy, shape (n, m), and its coefficients' sds."""
         over = self.hypothesis.smooth_over
         if self.hypothesis.onset_over is not None:
-            # Its shape depends on the threshold; here are its two amplitudes.
-            return np.array([]), np.array([1.0, 2.0])
+            # Its shape depends on the threshold; here are its amplitudes.
+            soft = self.hypothesis.onset_over == "low_pressure"
+            return np.array([]), np.array([1.0, 2.0] if soft else [1.0, 2.0, 0.5])
         if over == "before":
             change = self._from_the_run_before(view, output)
             return change[:, None], np.ones(1)

@@ -5,7 +5,7 @@ The vector psi of a hypothesis stacks, all with (truncated) normal or uniform pr
     simulator parameters of each output (internal coordinates)
     inadequacy of each simulator, in the lab and the field alike
     parameters of each effect
-    form errors of each effect: its size departs from its formula by 1 + sum_j c_j b_j(x)
+    form errors of each effect: what it adds is its formula's times max(1 + sum_j c_j b_j(x), 0)
     shifts of the simulator's parameters in the field (parameter_shift only)
     coefficients of a free smooth discrepancy (unknown only)
 """

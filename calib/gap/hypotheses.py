@@ -258,8 +258,7 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
         for size in SMOOTHS
     ]
     probes: tuple[OnsetOver, ...] = ("water", "cone") if density else ()
-    listed = [(over, data.with_role(role)) for over, role in _LISTED_ONSETS]
-    listed += [("order", t) for t in each]
+    listed: list[tuple[OnsetOver, _Touched]] = [("order", t) for t in each]
     setting_in: list[tuple[OnsetOver, _Touched]] = [
         *(choice for choice in choices if choice not in listed),
         *((over, density) for over in probes if _varies(data, over)),

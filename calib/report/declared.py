@@ -16,6 +16,7 @@ from calib.inference.prior_files import default_priors, read_priors
 from calib.inference.priors import Prior
 from calib.models import MODELS, Model
 from calib.models.latex import text
+from calib.report.labels import joined
 
 type Facts = dict[str, Any]
 
@@ -73,7 +74,32 @@ def form_words(effect: Effect) -> str:
     if not effect.form:
         return "The formula is taken as exact."
     errors = ", ".join(f"{FORM_ERROR[f]:g} along {_ALONG[f]}" for f in effect.form)
-    return f"No formula is exact: its effect may depart from it (relative sd {errors})."
+    return (
+        f"No formula is exact: its effect may depart from it (relative sd {errors}), but not "
+        "change its sign."
+    )
+
+
+def known_words(effect: Effect) -> list[str]:
+    """Say what is known of an effect whatever its formula, a sentence for each output."""
+    found = []
+    for known in effect.known:
+        parts = []
+        if known.sign:
+            parts.append(f"is never {'negative' if known.sign > 0 else 'positive'}")
+        parts += [f"is nothing {_zero(condition)}" for condition in known.zero_at]
+        parts += [f"does not shrink as {_word(c)} grows" for c in known.grows_with]
+        found.append(f"What it adds to the {known.output} {joined(parts)}.")
+    return found
+
+
+def _zero(role: str) -> str:
+    return "at no slip" if role == "slip" else f"at the laboratory's {_word(role)}"
+
+
+def _word(role: str) -> str:
+    columns = role_columns([role], output=False)
+    return QUANTITIES[columns[0]].title.lower() if columns else role
 
 
 def users(quantity: Quantity) -> dict[str, list[str]]:
@@ -113,6 +139,7 @@ def effect_facts(effect: Effect) -> Facts:
         "equation": ", ".join(text(part) for part in effect.latex),
         "testable": " ".join(how_testable(effect)),
         "form": form_words(effect),
+        "known": " ".join(known_words(effect)),
         "outputs": role_columns(effect.outputs, output=True),
         "covariates": role_columns(effect.covariates, output=False),
         "parameters": list(effect.parameters),

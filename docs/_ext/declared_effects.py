@@ -6,7 +6,7 @@ from declared_text import code, priors_table, quantity_link, role_links, table, 
 
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.hypotheses import read_effect_priors
-from calib.report.declared import form_words, how_testable
+from calib.report.declared import form_words, how_testable, known_words
 
 TITLE = "Effects"
 LEAD = (
@@ -54,7 +54,7 @@ def _use(effect: Effect) -> list[str]:
         "## When it can be tested, and its limits\n",
         *(f"- {sentence}" for sentence in how_testable(effect, quantity_link)),
         "\nWhere that does not hold, the diagnosis lists it as not testable, with the reason.\n",
-        f"{form} {more}".rstrip() + "\n",
+        f"{' '.join([form, *known_words(effect), more])}".rstrip() + "\n",
     ]
 
 

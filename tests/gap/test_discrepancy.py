@@ -80,16 +80,17 @@ def test_it_is_the_same_function_at_other_conditions(data, over):
     np.testing.assert_allclose(part, whole[:, rows], atol=1e-12)
 
 
-def test_it_sets_in_at_a_threshold_as_a_step_and_a_bend(data):
+def test_it_sets_in_at_a_threshold_as_a_step_and_a_bend_of_what_it_was_before(data):
     found = of(data, onset_over="slip")
-    np.testing.assert_array_equal(found.sds("drawbar_pull"), [1.0, 2.0])
+    np.testing.assert_array_equal(found.sds("drawbar_pull"), [1.0, 2.0, 0.5])
     u = found.onset_covariate(data.view, "drawbar_pull")
-    step, bend = found.onset(data.view, "drawbar_pull", np.array([0.1]))
+    step, bend, before = found.onset(data.view, "drawbar_pull", np.array([0.1]))
     far = abs(u - 0.1) > 0.6  # ten widths
     np.testing.assert_allclose(step[0, far], (u > 0.1)[far], atol=1e-4)
     np.testing.assert_allclose(bend[0, far], np.maximum(u - 0.1, 0.0)[far], atol=1e-4)
-    both = found.at(np.array([[0.2, -0.3]]), np.array([0.1]), data.view, "drawbar_pull")
-    np.testing.assert_allclose(both, 0.2 * step - 0.3 * bend)
+    np.testing.assert_array_equal(before, 1.0)
+    all_three = found.at(np.array([[0.2, -0.3, 0.4]]), np.array([0.1]), data.view, "drawbar_pull")
+    np.testing.assert_allclose(all_three, 0.2 * step - 0.3 * bend + 0.4)
 
 
 def test_a_reading_that_keeps_part_of_the_run_before(data):
@@ -268,7 +269,7 @@ def test_an_onset_rises_by_its_width(data):
     found = of(data, onset_over="slip")
     u = found.onset_covariate(data.view, "drawbar_pull")
     for threshold in (-0.3, 0.2):
-        step, bend = found.onset(data.view, "drawbar_pull", np.array([threshold]))
+        step, bend, _ = found.onset(data.view, "drawbar_pull", np.array([threshold]))
         np.testing.assert_allclose(step[0], 1.0 / (1.0 + np.exp(-(u - threshold) / 0.06)))
         np.testing.assert_allclose(
             bend[0], 0.06 * np.log1p(np.exp((u - threshold) / 0.06)), rtol=1e-9, atol=1e-12

@@ -334,20 +334,22 @@ def test_a_threshold_lies_within_the_campaign(data):
     """On a scale of -1..1, with some rows on both of its sides."""
     h = Hypothesis("unknown", smooth=4.0, smooth_outputs=("drawbar_pull",), onset_over="slip")
     forward = Forward(data, h, SIGMA)
-    step, bend, threshold = forward.priors.entries[-3:]
-    assert (step.scale, bend.scale) == pytest.approx((4.0 * 0.03, 4.0 * 0.03 * 2.0))
+    step, bend, before, threshold = forward.priors.entries[-4:]
+    sds = (step.scale, bend.scale, before.scale)
+    assert sds == pytest.approx((4.0 * 0.03, 4.0 * 0.03 * 2.0, 4.0 * 0.03 * 0.5))
     assert (threshold.lower, threshold.upper) == (-0.85, 0.9)
     assert threshold.loc == pytest.approx(0.025)
     assert not np.isfinite(threshold.scale)
     assert not threshold.log
     assert forward.threshold == forward.n_dim - 1
     psi = centre(forward, 3)
-    psi[:, -3:] = [[0.1, -0.2, -0.4], [0.0, 0.3, 0.0], [0.2, 0.1, 0.6]]
+    psi[:, -4:] = [[0.1, -0.2, 0.0, -0.4], [0.0, 0.3, 0.1, 0.0], [0.2, 0.1, -0.1, 0.6]]
     gap = (forward.field(psi, data.view)["drawbar_pull"]
            - forward.simulator(psi, data.view)["drawbar_pull"])  # fmt: skip
     u = (forward.covariates.over(data.view, "slip") - psi[:, -1:]) / 0.06
     step, bend = 1.0 / (1.0 + np.exp(-u)), 0.06 * np.logaddexp(0.0, u)
-    np.testing.assert_allclose(gap, psi[:, -3:-2] * step + psi[:, -2:-1] * bend, atol=1e-12)
+    of_step, of_bend, before = psi[:, -4:-3], psi[:, -3:-2], psi[:, -2:-1]
+    np.testing.assert_allclose(gap, of_step * step + of_bend * bend + before, atol=1e-12)
 
 
 def test_of_density_a_simulator_is_inadequate_and_gauges_errors_have_forms():
@@ -451,7 +453,7 @@ def test_form_errors_scale_what_each_effect_adds_to_those_before_it(data):
     for o in data.outputs:
         bound, role = o.problem.bound, o.role
         factor = [
-            1.0 + psi[:, part] @ b.T
+            np.maximum(1.0 + psi[:, part] @ b.T, 0.0)
             for part, b in zip(forward.form_slices[o.name], basis, strict=True)
         ]
         assert np.abs(factor[0] - 1.0).max() > 0.1

@@ -16,7 +16,7 @@ from calib.gap.hypotheses import effect_priors
 from tests.gap.cases import make_case
 
 CODE = """
-from calib.gap.effects import Effect
+from calib.gap.effects import Effect, Known
 
 
 class CrossWind(Effect):
@@ -98,6 +98,13 @@ RETURN = "        return location + phi[:, :1]\n"
         ('    outputs', '    covariates = ("speed")\n    outputs', "is the text 'speed'"),
         ('    outputs', '    latex = (1,)\n    outputs', "latex is (1,)"),
         ('    outputs', '    form = ("slope",)\n    outputs', "unknown name 'slope' in form"),
+        ('    outputs', '    known = {"pull": 1}\n    outputs', "write known = (Known("),
+        ('    outputs', '    known = (Known("sinkage", 1),)\n    outputs', "output one of pull"),
+        ('    outputs', '    known = (Known("pull", 2),)\n    outputs', "sign -1, 0 or 1"),
+        ('    outputs', '    known = (Known("pull", zero_at="slip"),)\n    outputs',
+         "with the comma"),
+        ('    outputs', '    known = (Known("pull", zero_at=("slipp",)),)\n    outputs',
+         "did you mean slip?"),
         ("def on_output", "def on_outputs", "did you mean on_output?"),
     ],
 )  # fmt: skip
@@ -231,6 +238,27 @@ def test_an_output_is_numbers(tmp_path, form):
 def test_an_effect_may_be_of_some_rows(tmp_path, form):
     code = "import numpy as np\n" + CODE.replace("location + phi[:, :1]", form)
     check_effects(load_effects(write(tmp_path, code)), make_case("force_offset"))
+
+
+@pytest.mark.parametrize(
+    ("sign", "kept", "broken"),
+    [(1, "abs(phi[:, :1])", "phi[:, :1] - 1.0"), (-1, "-abs(phi[:, :1])", "phi[:, :1] + 1.0"),
+     (0, "phi[:, :1]", None)],
+)  # fmt: skip
+def test_an_effect_adds_nothing_against_its_known_sign(tmp_path, sign, kept, broken):
+    case = make_case("force_offset")
+
+    def checked(added: str) -> None:
+        known = f'    known = (Known("pull", {sign}),)\n    outputs'
+        code = CODE.replace("    outputs", known).replace("phi[:, :1]", added)
+        folder = tmp_path / str(len(list(tmp_path.iterdir())))  # a file is run once
+        folder.mkdir()
+        check_effects(load_effects(write(folder, code)), case)
+
+    checked(kept)
+    if broken is not None:
+        with pytest.raises(CalibError, match=f"nothing {'below' if sign > 0 else 'above'} zero"):
+            checked(broken)
 
 
 def test_an_effect_that_a_case_cannot_show_is_not_tried(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from calib.data.registry import Registry
-from calib.gap.effects.base import Effect, View
+from calib.gap.effects.base import Effect, Known, View
 from calib.gap.effects.instruments import (
     ConeIndexBias,
     ForceOffset,
@@ -23,7 +23,7 @@ from calib.gap.effects.wheel import (
     SlipSinkage,
 )
 
-__all__ = ["EFFECTS", "Effect", "View"]
+__all__ = ["EFFECTS", "Effect", "Known", "View"]
 
 EFFECTS: Registry[Effect] = Registry(
     "effect",

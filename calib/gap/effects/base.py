@@ -18,7 +18,34 @@ import numpy as np
 from calib.data.quantities import QUANTITIES, columns_of
 from calib.models.base import Array
 
-__all__ = ["Effect", "View", "each", "saturating"]
+__all__ = ["Effect", "Known", "View", "each", "saturating"]
+
+
+@dataclass(frozen=True)
+class Known:
+    """What physics says of what an effect adds to an output, whatever its formula.
+
+    A formula is the centre of a family of shapes: what the effect adds is the formula's times a
+    factor that varies with the conditions (its form error) and is never negative. So the sign and
+    the zeros that are stated here hold for the whole family.
+
+    Parameters
+    ----------
+    output : str
+        Its physical role.
+    sign : {-1, 0, 1}
+        Of what it adds; 0 where either is possible.
+    zero_at : tuple of str
+        Physical roles of conditions without which it adds nothing: at no slip, and of any other
+        condition at the laboratory's value.
+    grows_with : tuple of str
+        Physical roles of conditions with which what the formula adds does not shrink.
+    """
+
+    output: str
+    sign: int = 0
+    zero_at: tuple[str, ...] = ()
+    grows_with: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -139,6 +166,8 @@ class Effect:
         Along what its size may depart from its formula, by the form error of the diagnosis
         (extrapolation: along inflation pressure, to values the simulator was not fitted at);
         empty where the formula is exact.
+    known : tuple of Known
+        What is known of its shape, an entry for each output of which anything is.
     instrument : bool
         Whether an instrument is at fault, not wheel or soil; predicted with it is what it reads.
     check : str
@@ -158,6 +187,7 @@ class Effect:
     covariates: tuple[str, ...] = ()
     varies: bool = True
     form: tuple[str, ...] = ()
+    known: tuple[Known, ...] = ()
     instrument: bool = False
     check: str = "zero and span"
     priors: str = ""

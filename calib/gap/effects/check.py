@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import difflib
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ from calib.data.quantities import QUANTITIES, role_of
 from calib.errors import CalibError, meant
 from calib.gap.campaigns import Campaigns, OutputData, campaigns
 from calib.gap.case import Case
-from calib.gap.effects import EFFECTS, Effect, View
+from calib.gap.effects import EFFECTS, Effect, Known, View
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
 from calib.gap.hypothesis import Hypothesis
@@ -32,6 +32,8 @@ __all__ = ["check_declared", "check_effects"]
 
 # Draws of the priors that an effect is evaluated with.
 _TRIALS = 8
+# Relative, of what an effect may add against its known sign.
+_ROUNDING = 1e-9
 # Likeness from which another attribute is taken for a misspelt one.
 _MISSPELT = 0.8
 _BASE = tuple(name for name in vars(Effect) if not name.startswith("_"))
@@ -79,7 +81,7 @@ def check_declared(effect: Effect) -> None:
     ------
     CalibError
         If the name is taken, an output, covariate or form is unknown, plain text stands for a
-        tuple, or a method is misspelt.
+        tuple, what is known of it is of no such thing, or a method is misspelt.
     """
     where = _place(effect)
     taken = EFFECTS.get(effect.name)
@@ -97,14 +99,38 @@ def check_declared(effect: Effect) -> None:
         ("outputs", outputs), ("needs", outputs), ("covariates", conditions), ("form", _FORMS),
     ):  # fmt: skip
         for name in getattr(effect, attribute):
-            if name not in known:
-                raise CalibError(
-                    f"unknown name {name!r} in {attribute}", where=where,
-                    allowed=", ".join(known), mend=_role_of_column(name) or meant(name, known),
-                )  # fmt: skip
+            _check_name(name, attribute, known, where)
+    for fact in effect.known if isinstance(effect.known, tuple) else [effect.known]:
+        _check_known(effect, fact, conditions, where)
     for kind in type(effect).__mro__[:-2]:
         for name, value in vars(kind).items():
             _check_attribute(name, value, where)
+
+
+def _check_known(effect: Effect, fact: object, conditions: Mapping[str, str], where: str) -> None:
+    if (
+        not isinstance(fact, Known)
+        or fact.output not in effect.outputs
+        or fact.sign not in (-1, 0, 1)
+    ):
+        raise CalibError(
+            f"known has {fact!r}", where=where,
+            allowed=f"a tuple of Known(output, sign, ...), output one of "
+            f"{', '.join(effect.outputs)}, sign -1, 0 or 1",
+            mend='write known = (Known("pull", -1, zero_at=("slip",)),), with the comma',
+        )  # fmt: skip
+    for attribute in ("zero_at", "grows_with"):
+        check_tuple(attribute, getattr(fact, attribute), where)
+        for name in getattr(fact, attribute):
+            _check_name(name, attribute, conditions, where)
+
+
+def _check_name(name: str, attribute: str, known: Collection[str], where: str) -> None:
+    if name not in known:
+        raise CalibError(
+            f"unknown name {name!r} in {attribute}", where=where,
+            allowed=", ".join(known), mend=_role_of_column(name) or meant(name, known),
+        )  # fmt: skip
 
 
 def _check_attribute(name: str, value: object, where: str) -> None:
@@ -173,6 +199,13 @@ def _changes_output(effect: Effect, phi: Array, o: OutputData, plain: Array, vie
     if not np.isfinite(found[np.isfinite(plain)]).any():
         raise _wrong(f"on_output returned no finite number for {o.name}", where,
                      "numbers wherever the location is one")  # fmt: skip
+    sign = next((fact.sign for fact in effect.known if fact.output == o.role), 0)
+    added = sign * (found - plain)
+    if (added < -_ROUNDING * np.abs(plain)).any():
+        raise _wrong(
+            f"on_output adds {sign * np.nanmin(added):.3g} to {o.name} at some draw of its prior",
+            where, f"{'nothing below' if sign > 0 else 'nothing above'} zero, as known says",
+        )  # fmt: skip
     return not np.array_equal(found, plain, equal_nan=True)
 
 

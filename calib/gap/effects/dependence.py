@@ -21,7 +21,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from calib.data.quantities import QUANTITIES, columns_of
-from calib.gap.effects.base import Effect, View, each
+from calib.gap.effects.base import Effect, Known, View, each
 from calib.models.base import Array
 
 __all__ = ["PREFIX", "DependsOn", "DiffersBy"]
@@ -57,6 +57,7 @@ class DependsOn(Effect):
         self.title = f"the output depends on the {stem.replace('_', ' ')}, which its model ignores"
         self.outputs = tuple(logs)
         self.covariates = (role,)
+        self.known = tuple(Known(output, zero_at=(role,)) for output in self.outputs)
         self.of_factors = any(QUANTITIES[c].of_factors for c in columns_of(role))
         self._additive = tuple(o for o, log in logs.items() if not log and o in _FORCES)
         self.parameters = (

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import Effect, View, each
+from calib.gap.effects.base import Effect, Known, View, each
 from calib.models.base import Array
 
 __all__ = ["MoistureSoftening", "MultipassCompaction", "RateEffect"]
@@ -75,6 +75,7 @@ class MultipassCompaction(_SoilStrength):
         r"$h = \ln(N/N_\mathrm{lab})$, $N$ being the pass number",
     )
     covariates = ("passes",)
+    known = tuple(Known(output, zero_at=("passes",)) for output in ("pull", "sinkage"))
 
     def covariate(self, view: View) -> Array:
         """Logarithm of the pass number over the laboratory's."""
@@ -91,6 +92,7 @@ class RateEffect(_SoilStrength):
         r"$h = \ln(v/v_\mathrm{lab})$, $v$ being the speed",
     )
     covariates = ("speed",)
+    known = tuple(Known(output, zero_at=("speed",)) for output in ("pull", "sinkage"))
 
     def covariate(self, view: View) -> Array:
         """Logarithm of the speed over the laboratory's."""
@@ -109,6 +111,7 @@ class MoistureSoftening(_SoilStrength):
         r"$h = (w - w_\mathrm{lab})/0.02$, $w$ being the gravimetric water content",
     )
     covariates = ("water",)
+    known = tuple(Known(output, zero_at=("water",)) for output in ("pull", "sinkage"))
 
     def covariate(self, view: View) -> Array:
         """Water content above the laboratory's, in steps of 0.02 g/g."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from calib.gap.effects.base import Effect, View, each, saturating
+from calib.gap.effects.base import Effect, Known, View, each, saturating
 from calib.models.base import Array
 
 __all__ = [
@@ -30,6 +30,7 @@ class BulldozingResistance(Effect):
     )
     parameters = ("resistance", "sinkage_exponent", "slip_growth")
     form = ("slip", "pressure")
+    known = (Known("pull", -1),)
     outputs = ("pull",)
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
@@ -59,6 +60,7 @@ class LugThrust(Effect):
     )
     parameters = ("thrust", "slip_scale", "digging")
     form = ("slip", "pressure")
+    known = tuple(Known(output, 1, ("slip",), ("slip",)) for output in ("pull", "sinkage"))
     outputs = ("pull", "sinkage")
     needs = ("pull",)  # a rut alone does not tell lugs that dig from slip sinkage
     covariates = ("slip",)
@@ -92,6 +94,7 @@ class SlipSinkage(Effect):
     )
     parameters = ("growth", "slip_exponent", "pull_loss")
     form = ("slip", "pressure")
+    known = (Known("pull", -1, ("slip",)), Known("sinkage", 1, ("slip",), ("slip",)))
     outputs = ("pull", "sinkage")
     needs = ("sinkage",)  # a pull alone does not tell the sinkage that costs it
     covariates = ("slip",)
@@ -99,7 +102,7 @@ class SlipSinkage(Effect):
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Deepen the rut; take the extra compaction resistance from the pull."""
         growth, exponent, pull_loss = each(phi)
-        deeper = growth * np.maximum(view.slip(), 1e-4) ** exponent
+        deeper = growth * np.maximum(view.slip(), 0.0) ** exponent
         if output == "sinkage":
             return np.asarray(location + deeper)
         if output == "pull":
@@ -125,6 +128,7 @@ class RutRebound(Effect):
     )
     parameters = ("towed", "growth", "slip_exponent", "half_way")
     form = ("slip", "pressure")
+    known = (Known("sinkage", -1, grows_with=("slip",)),)
     outputs = ("sinkage",)
     covariates = ("slip",)
 
@@ -151,6 +155,7 @@ class PostPeakSoftening(Effect):
     )
     parameters = ("loss", "peak_slip", "slip_scale")
     form = ("slip", "pressure")
+    known = (Known("pull", -1, ("slip",)),)
     outputs = ("pull",)
     covariates = ("slip",)
 

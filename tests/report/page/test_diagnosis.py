@@ -100,7 +100,7 @@ def test_a_named_effect_says_everything_at_once():
     assert found.headline == "What drift does"
     assert facts["Which"] == "As a whole: drift, probability 93 %; nothing else reaches 5 %"
     assert facts["How large"] == "Pull reads 0.13 ± 0.04 kN high"
-    assert facts["Where"].endswith("0.1 kN above the simulator (97 %)")
+    assert facts["Where"].endswith("0.1 kN above the simulator (probability 97 %)")
     assert "0.11 to 0.04 kN rms (noise 0.03 kN): it shrinks by 63 %" in facts["How far"]
     assert "90 % interval 45 to 80 %" in facts["How far"]
     assert facts["Next"].startswith(

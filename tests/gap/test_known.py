@@ -1,0 +1,101 @@
+"""What physics says of an effect holds for its formula and for the family of shapes about it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calib.gap.campaigns import campaigns
+from calib.gap.effects import EFFECTS, Effect, Known, View
+from calib.gap.forward import Forward
+from calib.gap.hypotheses import dependences, effect_priors
+from calib.gap.hypothesis import Hypothesis
+from calib.models.base import Array
+from tests.gap.cases import NOISE, campaigns_of, make_case
+
+FACTS = [(e, known) for e in EFFECTS.values() for known in e.known]
+SLIPS = np.linspace(0.0, 0.65, 40)
+DRAWS = 400
+
+
+@pytest.fixture(scope="module")
+def data():
+    return campaigns_of(None)
+
+
+def along(data, role: str, values: Array) -> View:
+    """The field's first row, at several values of one condition."""
+    rows = {c: np.full(values.size, v[0]) for c, v in data.view.conditions.items()}
+    rows[data.view.column(role)] = values
+    return data.at_conditions(rows)
+
+
+def drawn(data, effect: Effect, output: str, *, family: bool) -> tuple[Forward, str, Array]:
+    """Parameters from the priors, with the form errors or without."""
+    h = Hypothesis(effect.name, (effect,), (effect_priors(data, effect),))
+    forward = Forward(data, h, {o: NOISE[o] for o in data.names})
+    psi = forward.priors.sample(np.random.default_rng(3), DRAWS)
+    name = next(o for o, role in forward.roles.items() if role == output)
+    if not family:
+        psi[:, forward.form_slices[name][0]] = 0.0
+    return forward, name, psi
+
+
+def added(forward: Forward, name: str, psi: Array, view: View) -> Array:
+    full, plain = forward.field_and_plain(psi, view)
+    change = full[name] - plain[name]
+    return change[np.isfinite(change).all(axis=1)]
+
+
+def shown(data, effect: Effect) -> bool:
+    return effect.not_testable(data.view, data.roles) is None
+
+
+@pytest.mark.parametrize(("effect", "known"), FACTS, ids=[f"{e.name}-{k.output}" for e, k in FACTS])
+def test_sign_and_zeros_hold_for_every_shape_of_an_effect(data, effect, known):
+    if not shown(data, effect):  # water content is not recorded in this case
+        assert effect.name == "moisture_softening"
+        return
+    forward, name, psi = drawn(data, effect, known.output, family=True)
+    # Ten times the form errors: no shape of whatever size changes the sign.
+    psi[:, forward.form_slices[name][0]] *= 10.0
+    assert (known.sign * added(forward, name, psi, data.view) >= 0.0).all()
+    for role in known.zero_at:
+        none = 0.0 if role == "slip" else data.view.lab_of(role)
+        at = added(forward, name, psi, along(data, role, np.array([none])))
+        assert at.size > 0.8 * DRAWS
+        np.testing.assert_allclose(at, 0.0, atol=1e-12)
+
+
+GROWING = [(e, k) for e, k in FACTS if k.grows_with]
+
+
+@pytest.mark.parametrize(
+    ("effect", "known"), GROWING, ids=[f"{e.name}-{k.output}" for e, k in GROWING]
+)
+def test_what_grows_grows_by_the_formula_and_in_nine_of_ten_of_its_family(data, effect, known):
+    assert known.grows_with == ("slip",)
+    for family, part, most in ((False, 1e-6, 0.0), (True, 0.25, 0.1)):
+        forward, name, psi = drawn(data, effect, known.output, family=family)
+        size = np.abs(added(forward, name, psi, along(data, "slip", SLIPS)))
+        fall = (np.maximum.accumulate(size, axis=1) - size).max(axis=1)
+        assert (fall > part * size.max(axis=1)).mean() <= most
+
+
+def test_a_dependence_is_nothing_at_the_laboratorys_condition():
+    data = campaigns(make_case("rate_effect"))
+    effects = [e for e in dependences(data).values() if shown(data, e)]
+    assert effects
+    for effect in effects:
+        assert [k.output for k in effect.known] == list(effect.outputs)
+        for known in effect.known:
+            (role,) = known.zero_at
+            forward, name, psi = drawn(data, effect, known.output, family=True)
+            lab = np.array([data.view.lab_of(role)])
+            at = added(forward, name, psi, along(data, role, lab))
+            np.testing.assert_allclose(at, 0.0, atol=1e-12)
+
+
+def test_facts_compare_by_what_they_say():
+    assert Known("pull", -1) == Known("pull", -1, (), ())
+    assert EFFECTS["lug_thrust"].known[0].sign == 1
