@@ -92,9 +92,9 @@ _SAME: Mapping[str, set[str]] = {
 type _Over = Literal["slip", "level", "sinkage", "order"]
 type _Touched = tuple[str, ...]
 
-# One output that changes beyond some slip or run is what listed effects are: post-peak softening,
-# slip sinkage, rebound, and drifts and steps of any reading may set in anywhere. Nobody could tell
-# the unlisted from them.
+# One output that changes beyond some slip is mostly what listed effects are, post-peak softening,
+# slip sinkage and rebound: what is unlisted does so more seldom. (Beyond some run it is always a
+# drift or a step, which may set in anywhere. Nobody could tell the unlisted from them.)
 _LISTED_ONSETS: tuple[tuple[_Over, str], ...] = (
     ("slip", "pull"), ("slip", "sinkage"),
 )  # fmt: skip
@@ -258,15 +258,20 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
         for size in SMOOTHS
     ]
     probes: tuple[OnsetOver, ...] = ("water", "cone") if density else ()
-    listed: list[tuple[OnsetOver, _Touched]] = [("order", t) for t in each]
+    listed = [("order", t) for t in each]
+    seldom = [(over, data.with_role(role)) for over, role in _LISTED_ONSETS]
     setting_in: list[tuple[OnsetOver, _Touched]] = [
         *(choice for choice in choices if choice not in listed),
         *((over, density) for over in probes if _varies(data, over)),
     ]
     sudden = [
-        Hypothesis("unknown", smooth=ONSET, smooth_outputs=t, onset_over=over)
+        Hypothesis(
+            "unknown", smooth=ONSET, smooth_outputs=t, onset_over=over,
+            share=SELDOM if (over, t) in seldom else 1.0,
+        )
         for over, t in setting_in
-    ]
+    ]  # fmt: skip
+    often = sum(h.share for h in sudden)
     # At low inflation a tyre may creep on its rim, buckle or run on it.
     soft: list[Hypothesis] = []
     if _varies(data, "low_pressure"):
@@ -277,7 +282,7 @@ def unknowns(data: Campaigns) -> list[Hypothesis]:
     onsets = 0.5 - UNDERINFLATED if soft else 0.5
     return [
         *(replace(h, share=0.5 / len(smooth)) for h in smooth),
-        *(replace(h, share=onsets / len(sudden)) for h in sudden),
+        *(replace(h, share=onsets * h.share / often) for h in sudden),
         *(replace(h, share=UNDERINFLATED / len(soft)) for h in soft),
     ]
 

@@ -1,4 +1,17 @@
-"""Probabilities of hypotheses before the data, and after them from their evidence."""
+"""Probabilities of hypotheses before the data, and after them from their evidence.
+
+No formula is right to the last: besides the form errors that a hypothesis has, some shape of a real
+gap stays that nothing explains, a part of the gap's size. Of a small gap it is lost in the noise;
+of one of twenty noise sds it is as large as the noise, and evidence that reckons with the noise
+alone would be surer than the data are. So posterior probabilities p become p^(1/T), renormalised,
+
+    T = 1 + (0.05 g)^2,
+
+with g the gap's size in noise sds: the likelihood is coarsened as if the noise had that part of the
+gap in it (J. W. Miller, D. B. Dunson, J. Am. Stat. Assoc. 114 (2019) 1113-1125, doi
+10.1080/01621459.2018.1469995), and with it the prior, so that the order of hypotheses stays. T is 1
+where there is no gap, 1.04 for one of four noise sds, 2 for twenty.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +25,25 @@ from calib.gap.context import Context
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PAIR_TO_SINGLE, LN_PRIOR, REMAINDER
 
-__all__ = ["Odds", "probabilities", "with_prior"]
+__all__ = ["LEFT", "Odds", "coarsening", "probabilities", "with_prior"]
+
+# Part of a gap that no formula has the shape of. Where true single effects of other mechanics, of 5
+# to 24 noise sds, were fitted free of noise, 0.1 to 1.4 noise sds were left, mostly half a one. The
+# mean log score of 480 development cases of `calib challenge make` (large gaps of the seeds 4242 to
+# 4245, easy and hard ones of 4242) is -0.715 with it, -0.729 with none, -0.724 with 0.07.
+LEFT = 0.05
 
 
-def probabilities(log_evidence: Mapping[str, float], odds: Odds) -> dict[str, float]:
-    """Posterior probabilities of hypotheses from their evidence."""
-    score = {name: value + odds.ln_prior(name) for name, value in log_evidence.items()}
+def coarsening(gap: float) -> float:
+    """Return the exponent's inverse T for a gap's size in noise sds."""
+    return 1.0 + (LEFT * gap) ** 2
+
+
+def probabilities(
+    log_evidence: Mapping[str, float], odds: Odds, coarse: float = 1.0
+) -> dict[str, float]:
+    """Posterior probabilities of hypotheses from their evidence, coarsened by T."""
+    score = {name: (value + odds.ln_prior(name)) / coarse for name, value in log_evidence.items()}
     total = logsumexp(list(score.values()))
     return {name: float(np.exp(value - total)) for name, value in score.items()}
 

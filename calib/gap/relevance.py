@@ -24,7 +24,7 @@ from calib.gap.noise import Noise, noise_conditions
 from calib.inference.random import generator
 from calib.models.base import Array
 
-__all__ = ["RELEVANT", "RELEVANT_IN_PAIR", "relevance", "sizes"]
+__all__ = ["RELEVANT", "RELEVANT_IN_PAIR", "gap_size", "relevance", "sizes"]
 
 RELEVANT = 1.5
 RELEVANT_IN_PAIR = 1.0
@@ -78,18 +78,31 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
         without = [
             plain if alone else forward.without(psi, data.view, c, plain=plain) for c in causes
         ]
-    at = noise_conditions(data.view)
     columns = []
     for other in without:
-        squares = {
-            o.name: np.square(
-                (full[o.name] - other[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))
-            )
-            for o in data.outputs
-        }
-        each = {name: np.sqrt(values.mean(axis=1)) for name, values in squares.items()}
+        each = _rms(forward, noise, {name: full[name] - other[name] for name in full})
         if alone and len(forward.hypothesis.smooth_outputs) > 1:
             columns.append(np.min([each[n] for n in forward.hypothesis.smooth_outputs], axis=0))
         else:
             columns.append(np.max(list(each.values()), axis=0))
     return np.stack(columns, axis=1)
+
+
+def gap_size(fit: Fit) -> float:
+    """Size of all that a fit adds to its simulators, in noise sds (rms, where it is largest)."""
+    full, plain = fit.forward.field_and_plain(fit.psi[None], fit.forward.data.view)
+    each = _rms(fit.forward, fit.noise, {name: full[name] - plain[name] for name in full})
+    return float(np.nanmax([size[0] for size in each.values()]))
+
+
+def _rms(
+    forward: Forward, noise: Mapping[str, Noise], change: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Rms of changes (k, n) of each output over its field rows, in noise sds, shape (k,)."""
+    data, at = forward.data, noise_conditions(forward.data.view)
+    return {
+        o.name: np.sqrt(
+            np.square(change[o.name][:, o.rows] / noise[o.name].sd(at.rows(o.rows))).mean(axis=1)
+        )
+        for o in data.outputs
+    }

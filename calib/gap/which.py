@@ -26,9 +26,9 @@ from calib.gap.hypotheses import (
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.isolate import Isolability, isolability
 from calib.gap.noise import Noise
-from calib.gap.odds import Odds, probabilities, with_prior
+from calib.gap.odds import Odds, coarsening, probabilities, with_prior
 from calib.gap.refine import PLENTY, refine
-from calib.gap.relevance import relevance
+from calib.gap.relevance import gap_size, relevance
 from calib.gap.runs import follows_runs
 from calib.gap.sets import IN_PLAY, far_out, sets_and_unlisted
 from calib.inference.defined import check_defined
@@ -71,6 +71,9 @@ class Ranking:
         What the design could show before its outcomes were looked at.
     odds : Odds
         Probabilities of the hypotheses before the data.
+    gap : float
+        Size of the gap by the best explanation, in noise sds (rms over the field rows of the output
+        where it is largest).
     """
 
     fits: Mapping[str, tuple[Fit, ...]]
@@ -81,6 +84,7 @@ class Ranking:
     lab_mode: Mapping[str, Array]
     isolability: Isolability
     odds: Odds
+    gap: float
 
     @property
     def order(self) -> list[str]:
@@ -155,8 +159,20 @@ def rank(
     fits |= sets_and_unlisted(guesses, [h.name for h in single if h.name not in beside], fits)
     fits, scores = _scored(fits, guesses.odds, seed, plenty)
     log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
-    probability = probabilities(log_evidence, guesses.odds)
-    return Ranking(fits, scores, log_evidence, probability, unable, lab_mode, design, guesses.odds)
+    gap = _gap(fits, scores, log_evidence, guesses.odds)
+    probability = probabilities(log_evidence, guesses.odds, coarsening(gap))
+    return Ranking(
+        fits, scores, log_evidence, probability, unable, lab_mode, design, guesses.odds, gap
+    )
+
+
+def _gap(
+    fits: Mapping[str, tuple[Fit, ...]], scores: Mapping[str, tuple[float, ...]],
+    log_evidence: Mapping[str, float], odds: Odds,
+) -> float:  # fmt: skip
+    """Size of the gap by the most probable explanation, in noise sds; see `Ranking.gap`."""
+    best = max(log_evidence, key=lambda name: log_evidence[name] + odds.ln_prior(name))
+    return gap_size(fits[best][int(np.argmax(scores[best]))])
 
 
 def _check_names(context: Context, known: set[str]) -> None:

@@ -209,7 +209,9 @@ def where_text(e: GapEvidence) -> str:
     """Say in which regions the gap probably exceeds the noise."""
     if not e.where:
         return "In no stretch of the conditions does the gap probably exceed the noise"
-    return "; ".join(f"{w.place}: {w.gap} (probability {odds_text(w.probability)})" for w in e.where)
+    return "; ".join(
+        f"{w.place}: {w.gap} (probability {odds_text(w.probability)})" for w in e.where
+    )
 
 
 def how_far_text(e: GapEvidence) -> str:

@@ -18,7 +18,8 @@ from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import dependences
 from calib.gap.inclusion import inclusion_probability
-from calib.gap.odds import Odds, probabilities
+from calib.gap.odds import Odds, coarsening, probabilities
+from calib.gap.relevance import RELEVANT, sizes
 from calib.gap.which import Ranking, _check_names, _score, _scored, calibrate_lab, rank
 from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
@@ -85,6 +86,26 @@ def test_probabilities_from_evidence():
     better = probabilities(even | {"a": np.log(10.0)}, odds)
     # Ten times the evidence is ten times the odds.
     assert better["a"] / better["b"] == pytest.approx(10.0)
+
+
+def test_a_large_gap_is_not_surer_than_shapes_are_known():
+    evidence = {"none": -300.0, "a": 0.0, "b": -4.0}
+    odds = Odds(2, {})
+    assert coarsening(0.0) == 1.0
+    assert coarsening(20.0) == pytest.approx(2.0)
+    plain, coarse = (probabilities(evidence, odds, coarsening(g)) for g in (0.0, 20.0))
+    assert plain["a"] / plain["b"] == pytest.approx(np.exp(4.0))
+    assert coarse["a"] / coarse["b"] == pytest.approx(np.exp(2.0))
+    assert sum(coarse.values()) == pytest.approx(1.0)
+
+
+def test_the_gap_is_as_large_as_the_best_explanation_has_it():
+    ranking = ranking_of("force_offset", "pull")
+    fit = ranking.best(ranking.order[0])
+    assert ranking.order[0] == "force_offset"
+    assert ranking.gap == pytest.approx(sizes(fit.forward, fit.noise, fit.psi[None])[0, 0])
+    assert ranking.gap > RELEVANT
+    assert ranking_of(None, "pull").gap == 0.0
 
 
 def test_an_effect_that_changes_nothing_is_not_testable():
@@ -327,7 +348,7 @@ def test_a_ranking_is_by_probability_and_its_best_variant_by_score():
     }  # fmt: skip
     scores = {"a": (1.0, 2.0), "none": (0.0,), "b": (0.0,)}
     p = {"none": 0.2, "a": 0.7, "b": 0.1}
-    ranking = Ranking(fits, scores, {}, p, {}, {}, None, odds)
+    ranking = Ranking(fits, scores, {}, p, {}, {}, None, odds, 0.0)
     assert ranking.order == ["a", "none", "b"]
     assert ranking.best("a") is fits["a"][1]
     # Before the data each name has the shares of its variants, all of it at most.

@@ -17,6 +17,7 @@ from calib.gap.effects.dependence import PREFIX
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.inclusion import UNLISTED
+from calib.gap.odds import LEFT, coarsening
 from calib.gap.placebo import placebos
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
@@ -289,6 +290,9 @@ def render_diagnosis(
         causes=_cause_rows(evidence),
         groups=hypothesis_groups(found),
         prior=prior_text(found),
+        left=f"{100.0 * LEFT:g}",
+        gap=f"{found.ranking.gap:.1f}",
+        coarse=f"{coarsening(found.ranking.gap):.2f}",
         relevant=f"{RELEVANT:g}",
         relevant_in_pair=f"{RELEVANT_IN_PAIR:g}",
         parameters=parameter_rows(found),
