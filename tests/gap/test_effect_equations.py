@@ -105,7 +105,7 @@ def transferred(p: Row, r: Row) -> float:
 
 
 def deeper(p: Row, r: Row) -> float:
-    return p["growth"] * max(r["slip"], 1e-4) ** p["slip_exponent"]
+    return p["growth"] * max(r["slip"], 0.0) ** p["slip_exponent"]
 
 
 def true_psi(p: Row, r: Row) -> float:
@@ -324,7 +324,7 @@ def test_sizes_are_drawn_so_wide_that_the_ends_are_reached(name, output, ends):
     elif name == "load_transfer":
         reached = 1.0 + p["transfer"] * view.base["pull"] / W
     else:
-        reached = p["growth"] * np.maximum(view.slip(), 1e-4) ** p["slip_exponent"]
+        reached = p["growth"] * np.maximum(view.slip(), 0.0) ** p["slip_exponent"]
     low, high = ends
     assert low is None or reached.min() < low
     assert high is None or reached.max() > high

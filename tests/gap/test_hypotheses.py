@@ -100,10 +100,8 @@ def test_effects_are_joined_in_alphabetical_order(data):
     assert [e.name for e in joined(*few).effects] == joined(*few).name.split("+")
 
 
-def test_no_onset_of_one_output_over_slip_or_drift_is_unlisted(data):
+def test_no_drift_of_one_output_is_unlisted(data):
     alone = [(h.onset_over, h.smooth_outputs) for h in unknowns(data) if h.onset_over]
-    assert ("slip", ("drawbar_pull",)) not in alone
-    assert ("slip", ("rut_depth",)) not in alone
     assert ("order", ("drawbar_pull",)) not in alone
     assert ("order", ("rut_depth",)) not in alone
     assert ("order", ("drawbar_pull", "rut_depth")) in alone
@@ -323,7 +321,10 @@ def weighed(hypotheses: list[Hypothesis]) -> dict[tuple, float]:
 
 
 def test_what_may_be_unlisted_is_all_that_a_wheel_shows_and_its_shares_are_as_stated(data):
-    """Half of it smooth in either size, the rest setting in, 0.06 of all below a pressure."""
+    """Half of it smooth in either size, the rest setting in, 0.06 of all below a pressure.
+
+    One output that sets in beyond a slip, as listed effects do, is so a fifth as often.
+    """
     each, all_three = (PULL, RUT), (PULL, RUT, BOTH)
     smooth = [("level", t) for t in each]
     smooth += [("sinkage", t) for t in (PULL, BOTH)]  # of ruts alone it would be their level
@@ -333,7 +334,8 @@ def test_what_may_be_unlisted_is_all_that_a_wheel_shows_and_its_shares_are_as_st
     onsets += [("slip", BOTH), ("order", BOTH)]  # of one over the runs a drift or a step is listed
     expected = {
         **{(over, False, t, size): 0.25 / len(smooth) for over, t in smooth for size in (1.5, 5.0)},
-        **{(over, True, t, 4.0): 0.44 / len(onsets) for over, t in onsets},
+        **{(over, True, t, 4.0): 0.44 / (len(onsets) + 0.4) for over, t in onsets},
+        **{("slip", True, t, 4.0): 0.2 * 0.44 / (len(onsets) + 0.4) for t in each},
         **{("low_pressure", True, t, 4.0): 0.06 / 3 for t in all_three},
     }
     assert weighed(unknowns(data)) == pytest.approx(expected)

@@ -100,12 +100,12 @@ def test_a_large_gap_is_not_surer_than_shapes_are_known():
 
 
 def test_the_gap_is_as_large_as_the_best_explanation_has_it():
-    ranking = ranking_of("force_offset", "pull")
+    ranking = ranking_of("force_offset")
     fit = ranking.best(ranking.order[0])
     assert ranking.order[0] == "force_offset"
     assert ranking.gap == pytest.approx(sizes(fit.forward, fit.noise, fit.psi[None])[0, 0])
     assert ranking.gap > RELEVANT
-    assert ranking_of(None, "pull").gap == 0.0
+    assert ranking_of(None).gap == 0.0
 
 
 def test_an_effect_that_changes_nothing_is_not_testable():
@@ -289,9 +289,13 @@ def test_what_a_listed_effect_leaves_is_unknown():
 def test_prior_and_evidence_give_the_probabilities():
     ranking = ranking_of("lug_thrust")
     assert sum(ranking.prior.values()) == pytest.approx(1.0)
+    coarse = 1.0 + (0.05 * ranking.gap) ** 2
+    assert coarse > 1.02
     odds = {
-        name: ranking.prior[name] * np.exp(value - max(ranking.log_evidence.values()))
-        / min(sum(f.forward.hypothesis.share for f in ranking.fits[name]), 1.0)
+        name: (
+            ranking.prior[name] * np.exp(value - max(ranking.log_evidence.values()))
+            / min(sum(f.forward.hypothesis.share for f in ranking.fits[name]), 1.0)
+        ) ** (1.0 / coarse)
         for name, value in ranking.log_evidence.items()
     }  # fmt: skip
     total = sum(odds.values())
