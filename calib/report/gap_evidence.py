@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from calib.data.quantities import role_of
+from calib.data.quantities import OUTPUTS, role_of
 from calib.gap.assumed import assumed
 from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
@@ -227,6 +227,21 @@ def conditions_text(found: Diagnosis, measurement: NextMeasurement) -> str:
     if "order" in matters & measured:
         parts.append("after the last run")
     return ", ".join(parts) or "the conditions of the field campaign"
+
+
+def covered_text(found: Diagnosis) -> str:
+    """Write what the two campaigns cover together, of each condition that is recorded."""
+    parts = []
+    for column, values in found.data.view.conditions.items():
+        both = np.append(found.data.case.lab.columns.get(column, values), values)
+        if column in OUTPUTS.values() or role_of(column) == "order" or not np.isfinite(both).all():
+            continue
+        axis, low, high = axis_of(column), float(both.min()), float(both.max())
+        words = words_of(found.data.case.covariates, column, low, high)
+        least = "" if low == high else f"{condition_text(column, axis.factor * low)} to "
+        most = f"{condition_text(column, axis.factor * high)}{unit_after(axis)}"
+        parts.append(f"{axis.name.lower()} {words or least + most}")
+    return ", ".join(parts)
 
 
 def _assumed(found: Diagnosis, fit: Fit) -> list[str]:

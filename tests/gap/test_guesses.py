@@ -166,7 +166,10 @@ def test_what_sets_in_begins_where_the_laboratorys_residuals_show_it_best(guesse
                 basis = np.stack([s[0] for s in shapes], axis=1)[o.rows] / sigma
                 ridge = np.diag([1.0 / p.scale for p in free[part]])
                 residual = (o.field - plain[o.name][0, o.rows]) / sigma
-                stacked, target = np.vstack([basis, ridge]), np.append(residual, np.zeros(len(shapes)))
+                stacked, target = (
+                    np.vstack([basis, ridge]),
+                    np.append(residual, np.zeros(len(shapes))),
+                )
                 best = np.linalg.lstsq(stacked, target)[0]
                 total += np.square(target - stacked @ best).sum()
                 amplitudes[o.name] = best

@@ -26,6 +26,7 @@ from calib.models import get_model
 from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import (
     conditions_text,
+    covered_text,
     gap_evidence,
     region_words,
     shrink_facts,
@@ -290,6 +291,7 @@ def render_diagnosis(
         causes=_cause_rows(evidence),
         groups=hypothesis_groups(found),
         prior=prior_text(found),
+        covered=covered_text(found),
         left=f"{100.0 * LEFT:g}",
         gap=f"{found.ranking.gap:.1f}",
         coarse=f"{coarsening(found.ranking.gap):.2f}",

@@ -24,7 +24,7 @@ from calib.gap.files import document, write_diagnosis
 from calib.gap.inclusion import Included, Inclusion, inclusion_probability
 from calib.gap.next_measurement import NextMeasurement
 from calib.inference.priors import Prior
-from calib.report.gap_evidence import gap_evidence
+from calib.report.gap_evidence import covered_text, gap_evidence
 from calib.report.gap_facts import (
     NEITHER,
     Candidate,
@@ -358,7 +358,9 @@ def test_it_is_in_the_units_of_the_files_and_checks(tmp_path):
     assert f"noise sd of a reading {noise} N" in reader.text
     # Parameters are in their own units, here kN; their definitions name a pressure.
     assert set(re.findall(r"[\d.]+ (mm|psi|kPa|m/s|kN)\b", reader.text)) == {"kN", "kPa", "psi"}
-    assert re.findall(r".{7}[\d.]+ psi\b", reader.text) == ["18 and 42 psi"]
+    # The ground pressure is in the file's psi.
+    assert re.findall(r".{7}[\d.]+ psi\b", reader.text) == ["18 and 42 psi", "8.5 to 28.2 psi"]
+    assert "ground pressure 18.5 to 28.2 psi" in reader.text
     labels = {text.get_text() for f in drawn for text in f.findobj(Text)}
     assert {"Gap in drawbar pull (N)", "Gap in rut depth (inch)", "Speed\n(ft/s)"} <= labels
     assert not [t for t in labels if re.search(r"\((kN|mm|psi|m/s)\)", t)]
@@ -759,3 +761,17 @@ def test_prior_probabilities_are_said():
     prior = pull_diagnosis(None).ranking.prior
     assert sum(prior.values()) == pytest.approx(1.0)
     assert prior["none"] > prior["force_offset"] > prior["force_offset+sensor_drift"]
+
+
+def test_what_the_campaigns_cover_is_said_where_a_correction_is_judged(found, page):
+    said = covered_text(found)
+    assert f"cover together: {said}." in page[2].text
+    slip = np.concatenate([t["slip_ratio"] for t in (found.data.case.lab, found.data.case.field)])
+    assert f"slip {100.0 * slip.min():.0f} to {100.0 * slip.max():.0f} %" in said
+    assert "run order" not in said
+
+
+def test_a_large_gap_says_how_far_its_probabilities_are_coarsened(found, page):
+    coarse = 1.0 + (0.05 * found.ranking.gap) ** 2
+    assert coarse > 1.01
+    assert f"1/{coarse:.2f}, the gap being of {found.ranking.gap:.1f} noise sd" in page[2].text
