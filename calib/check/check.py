@@ -2,24 +2,28 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
 
 from calib.batch.environment import Environment
 from calib.batch.pool import HERE, Pool
 from calib.check.check_comparison import check_comparison
 from calib.check.check_report import check_report
 from calib.check.check_run import check_run
+from calib.check.compare import count_drawn
+from calib.check.montecarlo import describe
+from calib.check.numbers import inside, read_json
 from calib.check.outcome import Outcome
+from calib.check.recompute import Job
 from calib.check.schema import (
+    SUMMARY,
     ComparisonRecord,
     Manifest,
     Record,
     RunRecord,
-    read_comparison,
     read_folder,
+    read_record,
 )
 from calib.errors import CalibError
 from calib.report.compared import FOLDER
@@ -56,29 +60,21 @@ def check(
     """
     folder = Path(folder)
     record = read_folder(folder)
-    here = Environment.here()
     tell = progress or (lambda what, done, planned: None)
-    kind: Literal["report", "run", "comparison"]
-    with tempfile.TemporaryDirectory(prefix="calib-check-") as name:
-        scratch = Path(name)
+    with tempfile.TemporaryDirectory(prefix="calib-check-") as scratch:
+        made, here = Path(scratch) / "again", Environment.here()
+        job = Job(folder, made, tell, here, quick=quick, pool=pool, workers=workers)
         match record:
             case Manifest():
-                kind = "report"
-                items, allowed = check_report(
-                    record, folder, scratch, here, tell, quick=quick, pool=pool, workers=workers
-                )
+                items = check_report(record, job)
             case ComparisonRecord():
-                kind = "comparison"
-                items, allowed = check_comparison(
-                    record, folder, scratch, here, tell, quick=quick, workers=workers
-                )
+                items = check_comparison(record, job)
             case RunRecord():
-                kind = "run"
-                items, allowed = check_run(record, folder, scratch, tell, quick=quick)
+                items = check_run(record, job)
+        allowed = describe(count_drawn(made)) if made.is_dir() else ""
     differing = record.environment.differences(here)
-    return Outcome(
-        str(folder), kind, quick, tuple(items), differing, allowed, _not_converged(record, folder)
-    )
+    missed = _not_converged(record, folder)
+    return Outcome(str(folder), record.kind, quick, tuple(items), differing, allowed, missed)
 
 
 def _not_converged(record: Record, folder: Path) -> tuple[str, ...]:
@@ -88,14 +84,14 @@ def _not_converged(record: Record, folder: Path) -> tuple[str, ...]:
     """
     if isinstance(record, ComparisonRecord):
         return record.unsound
-    try:
-        if isinstance(record, RunRecord):
-            gate: Any = record.document["gate"]
-            return () if gate["passed"] else (record.model,)
-        models = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["models"]
-        missed = [m["model"] for m in models.values() if not m["sampling"]["converged"]]
-        if "comparison" in record.sections:
-            missed += read_comparison(folder / FOLDER).unsound
-        return tuple(dict.fromkeys(missed))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, CalibError):
-        return ()
+    if isinstance(record, RunRecord):
+        return (record.model,) if inside(record.document, "gate").get("passed") is False else ()
+    models = inside(read_json(folder / SUMMARY), "models")
+    missed = [
+        str(m.get("model")) for m in map(inside, models.values())
+        if inside(m, "sampling").get("converged") is False
+    ]  # fmt: skip
+    if "comparison" in record.sections:
+        with suppress(CalibError):
+            missed += read_record(ComparisonRecord, folder / FOLDER).unsound
+    return tuple(dict.fromkeys(missed))

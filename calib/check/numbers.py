@@ -6,6 +6,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,16 @@ SAME_WORDS = "the same words"
 def read_json(path: Path) -> dict[str, Any]:
     """Return a JSON object; empty where the file is missing or damaged."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        return inside(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError, RecursionError):
         return {}
-    return content if isinstance(content, dict) else {}
+
+
+def inside(document: Any, *keys: str) -> dict[str, Any]:
+    """Return the object below some keys of a document; empty where there is none."""
+    for key in keys:
+        document = document.get(key) if isinstance(document, dict) else None
+    return document if isinstance(document, dict) else {}
 
 
 def flatten(document: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
@@ -67,32 +74,27 @@ def compare_entries(
 
     `drawn` is what Monte Carlo error allows, by path; None where there is no such error.
     """
-    errors = drawn or {}
-    paths = [*recorded, *(path for path in found if path not in recorded)]
     items = []
-    for path in paths:
-        tolerance = tolerance_of(path, found)
+    for path in [*recorded, *(path for path in found if path not in recorded)]:
         name, group = f"{path[0]}: {'.'.join(path[1:])}", group_of(path)
         old, new = recorded.get(path, _ABSENT), found.get(path, _ABSENT)
-        if old is _ABSENT or new is _ABSENT:
-            items.append(_one_sided(group, name, old, new, tolerance))
-        elif _equal(old, new):
+        if _equal(old, new):
             items.append(Item(group, name, Status.IDENTICAL, old, new))
+            continue
+        tolerance = tolerance_of(path, found)
+        beyond = Status.DIFFERENT if tolerance.judged else Status.UNJUDGED
+        if old is _ABSENT:
+            items.append(Item(group, name, beyond, found=new, note="missing"))
+        elif new is _ABSENT:
+            items.append(Item(group, name, beyond, old, note="not computed by this version"))
         elif _is_number(old) and type(old) is type(new):
-            size = _size(tolerance, path, min(abs(old), abs(new)), found, errors)
-            items.append(_number(group, name, old, new, tolerance, size))
+            size = _size(tolerance, path, min(abs(old), abs(new)), found, drawn or {})
+            items.append(_number(Item(group, name, beyond, old, new, size, tolerance.kind)))
+        elif tolerance.words and without_numbers(str(old)) == without_numbers(str(new)):
+            items.append(Item(group, name, Status.WITHIN, old, new, note=SAME_WORDS))
         else:
-            same = tolerance.words and without_numbers(str(old)) == without_numbers(str(new))
-            status = Status.WITHIN if same else _beyond(tolerance)
-            note = SAME_WORDS if same else tolerance.kind
-            items.append(Item(group, name, status, old, new, note=note))
+            items.append(Item(group, name, beyond, old, new, note=tolerance.kind))
     return items
-
-
-def _one_sided(group: str, name: str, old: Any, new: Any, tolerance: Tolerance) -> Item:
-    if old is _ABSENT:
-        return Item(group, name, _beyond(tolerance), found=new, note="missing")
-    return Item(group, name, _beyond(tolerance), old, note="not computed by this version")
 
 
 def _size(
@@ -110,22 +112,18 @@ def _size(
     return tolerance.part * scale + tolerance.floor
 
 
-def _number(
-    group: str, name: str, old: float, new: float, tolerance: Tolerance, size: float | None
-) -> Item:
+def _number(item: Item) -> Item:
+    """Judge two numbers that are not equal, given how they are judged beyond what is allowed."""
+    old, new = item.recorded, item.found
     if math.isnan(old) or math.isnan(new):
-        return Item(group, name, Status.DIFFERENT, old, new, note="not a number")
+        return replace(item, status=Status.DIFFERENT, allowed=None, note="not a number")
     rounded = 1e-6 * max(abs(old), abs(new)) if isinstance(old, float) else 0.0
-    if abs(old - new) <= max(size or 0.0, rounded):
-        return Item(group, name, Status.WITHIN, old, new, size, tolerance.kind)
-    if size is None:
+    if abs(old - new) <= max(item.allowed or 0.0, rounded):
+        return replace(item, status=Status.WITHIN)
+    if item.allowed is None:
         note = "tail too heavy for a Monte Carlo error"
-        return Item(group, name, Status.UNJUDGED, old, new, note=note)
-    return Item(group, name, _beyond(tolerance), old, new, size, tolerance.kind)
-
-
-def _beyond(tolerance: Tolerance) -> Status:
-    return Status.DIFFERENT if tolerance.judged else Status.UNJUDGED
+        return replace(item, status=Status.UNJUDGED, note=note)
+    return item
 
 
 def _is_number(value: Any) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, Literal
@@ -52,11 +52,17 @@ class Item:
         return float(abs(self.recorded - self.found) / self.allowed)
 
 
-def mostly_different(items: Sequence[Item]) -> bool:
+def claim(group: str, name: str, wrong: str, right: str = "", *, sure: bool = True) -> Item:
+    """Return an item for what is `wrong`, if that is `sure`; if nothing is, for what is `right`."""
+    if not wrong:
+        return Item(group, name, Status.IDENTICAL, note=right)
+    return Item(group, name, Status.DIFFERENT if sure else Status.UNJUDGED, note=wrong)
+
+
+def mostly_different(items: Iterable[Item]) -> bool:
     """Whether more than half of the numbers among some items are different."""
-    numbers = [item for item in items if isinstance(item.recorded, float)]
-    different = sum(item.status is Status.DIFFERENT for item in numbers)
-    return different > 0.5 * len(numbers)
+    different = [i.status is Status.DIFFERENT for i in items if isinstance(i.recorded, float)]
+    return sum(different) > 0.5 * len(different)
 
 
 SCHEMA = "calib/check/1"
@@ -111,10 +117,9 @@ class Outcome:
     @property
     def verdict(self) -> str:
         """The verdict in one sentence."""
-        different = list(dict.fromkeys(item.name for item in self.of(Status.DIFFERENT)))
-        if different:
-            shown = ", ".join(different[:4]) + (", ..." if len(different) > 4 else "")
-            return f"DIFFERENT: {shown}"
+        if not self.same:
+            first, *more = dict.fromkeys(item.name for item in self.of(Status.DIFFERENT))
+            return f"DIFFERENT: {', '.join([first, *more[:3], *(['...'] if more[3:] else [])])}"
         unjudged = len(self.of(Status.UNJUDGED))
         rest = f"; {unjudged} not judged" if unjudged else ""
         if self.not_converged:

@@ -10,15 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from calib.check.outcome import Item, Status
+from calib.check.outcome import Item, Status, claim
 from calib.errors import CalibError
-from calib.inference.diagnostics import hdi
-from calib.inference.netcdf import DRAWN, read_netcdf
+from calib.inference.calibration import moments
+from calib.inference.netcdf import DRAWN, Groups, read_netcdf
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
 GROUP = "posteriors"
-_HDI = 0.95
 # The summary is computed from the same draws in another order of summation.
 _ROUNDING = 1e-6
 # Of the sd of what goes with draws: chains of the shortest run that passes the gate agree so far.
@@ -34,16 +33,16 @@ class DrawsFile:
     draws: Mapping[str, Array]
     log_prob: Array
 
+    @property
+    def summary(self) -> dict[str, dict[str, float]]:
+        """Mean, sd, median and 95 % highest-density interval of each parameter."""
+        return {name: moments(values.reshape(-1)) for name, values in self.draws.items()}
+
 
 def read_draws(path: Path) -> DrawsFile:
     """Read the posterior draws in a file; a CalibError if it cannot be read."""
-    try:
-        groups = read_netcdf(path, "posterior", "sample_stats").values
-        draws, log_prob = groups["posterior"], groups["sample_stats"]["lp"]
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise CalibError(
-            f"the file cannot be read ({type(error).__name__})", where=str(path)
-        ) from None
+    groups = _read(path, "posterior", "sample_stats").values
+    draws, log_prob = groups["posterior"], groups["sample_stats"].get("lp", np.array([]))
     if log_prob.ndim != 2 or not log_prob.size:
         raise CalibError("there are no draws in it", where=str(path))
     if not draws or any(v.shape != log_prob.shape for v in draws.values()):
@@ -51,38 +50,27 @@ def read_draws(path: Path) -> DrawsFile:
     return DrawsFile(draws, log_prob)
 
 
-def summary_of(draws: Mapping[str, Array]) -> dict[str, dict[str, float]]:
-    """Return mean, sd, median and 95 % highest-density interval of each parameter."""
-    found = {}
-    for name, values in draws.items():
-        flat = values.reshape(-1)
-        low, high = hdi(flat, _HDI)
-        found[name] = {
-            "mean": float(flat.mean()),
-            "sd": float(flat.std(ddof=1)),
-            "median": float(np.median(flat)),
-            "hdi_lower": low,
-            "hdi_upper": high,
-        }
-    return found
+def _read(path: Path, *only: str) -> Groups:
+    try:
+        return read_netcdf(path, *only)
+    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        note = f"the file cannot be read ({type(error).__name__})"
+        raise CalibError(note, where=str(path)) from None
 
 
 def verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Item:
     """Check that a file's draws have the summary that is stated of them."""
-    computed = summary_of(file.draws)
-    for parameter, values in computed.items():
-        entry = stated.get(parameter)
-        entry = entry if isinstance(entry, Mapping) else {}
-        scale = values["sd"]
+    for parameter, values in file.summary.items():
         for key, value in values.items():
-            given = entry.get(key)
+            entry = stated.get(parameter)
+            given = entry.get(key) if isinstance(entry, Mapping) else None
             if not isinstance(given, int | float) or not math.isclose(
-                given, value, rel_tol=_ROUNDING, abs_tol=_ROUNDING * scale
+                given, value, rel_tol=_ROUNDING, abs_tol=_ROUNDING * values["sd"]
             ):
                 # Which of the two is wrong is for the sampling to say.
                 both, note = f"summary.json and {name}", f"{key} of {parameter} is not the same"
                 return Item(GROUP, both, Status.DIFFERENT, given, value, note=note)
-    return Item(GROUP, name, Status.IDENTICAL, note="its draws have the summary that is stated")
+    return claim(GROUP, name, "", "its draws have the summary that is stated")
 
 
 def verify_density(name: str, file: DrawsFile, problem: Problem) -> Item:
@@ -93,7 +81,7 @@ def verify_density(name: str, file: DrawsFile, problem: Problem) -> Item:
     stated = file.log_prob.reshape(-1)
     missing = [p.name for p in problem.priors.entries if not p.fixed and p.name not in file.draws]
     if missing:
-        return Item(GROUP, name, Status.DIFFERENT, note=f"there is no {missing[0]} in it")
+        return claim(GROUP, name, f"there is no {missing[0]} in it")
     natural = np.stack(
         [
             np.full(stated.size, p.loc) if p.fixed else file.draws[p.name].reshape(-1)
@@ -107,55 +95,50 @@ def verify_density(name: str, file: DrawsFile, problem: Problem) -> Item:
     for key, values in derived.items():
         said = file.draws.get(key, values)
         if not np.allclose(said.reshape(-1), values, rtol=_ROUNDING, atol=0.0, equal_nan=True):
-            note = f"{key} does not follow from the other parameters"
-            return Item(GROUP, name, Status.DIFFERENT, note=note)
+            return claim(GROUP, name, f"{key} does not follow from the other parameters")
     computed = problem.log_prob(t)
     close = np.abs(computed - stated) <= _ROUNDING * (1.0 + np.abs(stated))
     if np.mean(close) < 1.0 - _AT_BOUNDS:
-        worst = int(np.argmin(close))
+        pair = float(stated[close.argmin()]), float(computed[close.argmin()])
         note = "the log density of its draws is not what data and priors give"
-        return Item(GROUP, name, Status.DIFFERENT, float(stated[worst]), float(computed[worst]),
-                    note=note)  # fmt: skip
-    return Item(GROUP, name, Status.IDENTICAL, note="its draws have the density of data and priors")
+        return Item(GROUP, name, Status.DIFFERENT, *pair, note=note)
+    return claim(GROUP, name, "", "its draws have the density of data and priors")
 
 
-def compare_posterior(name: str, recorded: Path, drawn: Path) -> list[Item]:
+def compare_posterior(name: str, recorded: Path, drawn: Path) -> Item:
     """Compare what is beside the posterior draws in a file with the same written again.
 
     The draws themselves may be others. They are held against their summary and their density; all
     that goes with them may be apart by a part of its own sd.
     """
     if recorded.read_bytes() == drawn.read_bytes():
-        return [Item(GROUP, name, Status.IDENTICAL)]
+        return Item(GROUP, name, Status.IDENTICAL)
     try:
         old, new = (_groups(path) for path in (recorded, drawn))
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        note = f"the file cannot be read ({type(error).__name__})"
-        return [Item(GROUP, name, Status.DIFFERENT, note=note)]
+    except CalibError as error:
+        return claim(GROUP, name, error.message)
     apart = [key for key in {**old, **new} if not _alike(old.get(key), new.get(key))]
     if apart:
-        note = f"{', '.join(sorted(apart)[:3])} in it: not what is written again"
-        return [Item(GROUP, name, Status.DIFFERENT, note=note)]
-    return [Item(GROUP, name, Status.WITHIN, note="its draws are compared by their summary")]
+        return claim(
+            GROUP, name, f"{', '.join(sorted(apart)[:3])} in it: not what is written again"
+        )
+    return Item(GROUP, name, Status.WITHIN, note="its draws are compared by their summary")
 
 
 def _groups(path: Path) -> dict[str, Array]:
-    """Read every variable of a file by its path; of drawn ones, moments by row."""
-    groups = read_netcdf(path)
+    """Read every variable of a file by its path; of drawn ones, median and sd by row."""
+    groups = _read(path)
     found: dict[str, Array] = {}
     for group, variables in groups.values.items():
         for name, values in variables.items():
             x = values.astype(np.float64)
             if x.ndim >= 2 and groups.dims_of(group, name)[:2] == DRAWN:
-                x = _moments(x.reshape(x.shape[0] * x.shape[1], -1))
+                draws = x.reshape(x.shape[0] * x.shape[1], -1)
+                # Whatever their tails.
+                low, median, high = np.quantile(draws, [0.16, 0.5, 0.84], axis=0)
+                x = np.stack([median, 0.5 * (high - low)])
             found[f"{group}/{name}"] = x
     return found
-
-
-def _moments(draws: Array) -> Array:
-    """Median and sd of each row over the draws, (draws, n) to (2, n), whatever their tails."""
-    low, median, high = np.quantile(draws, [0.16, 0.5, 0.84], axis=0)
-    return np.stack([median, 0.5 * (high - low)])
 
 
 def _alike(old: Array | None, new: Array | None) -> bool:

@@ -5,14 +5,15 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from calib.batch.environment import Environment
 from calib.batch.pool import HERE, Pool
 from calib.check.inputs import GROUP as INPUTS
-from calib.check.outcome import Item, Status
+from calib.check.outcome import Item, claim
 from calib.check.schema import Manifest, RunRecord, TaskRecord
 from calib.data import read_table
 from calib.data.quantities import OUTPUTS
@@ -24,8 +25,25 @@ from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.report.sections import SECTIONS, work_out
 from calib.report.study import Progress, Study
-from calib.report.study_tasks import HoldOut, Task
+from calib.report.study_tasks import Task
 from calib.report.writer import write_report
+
+
+@dataclass(frozen=True)
+class Job:
+    """A folder to be checked, where it is made again (not there yet), and how."""
+
+    folder: Path
+    made: Path
+    progress: Progress
+    here: Environment
+    quick: bool = False
+    pool: Pool = HERE
+    workers: int = 1
+
+    def inside(self, name: str) -> Job:
+        """Return the job of a folder in it."""
+        return replace(self, folder=self.folder / name, made=self.made / name)
 
 
 @contextmanager
@@ -39,11 +57,10 @@ def not_computed(items: list[Item], folder: Path, record: str) -> Iterator[None]
     except CalibError as error:
         path = Path((error.where or "").partition(",")[0])
         where = path.relative_to(folder).as_posix() if path.is_relative_to(folder) else record
-        note = f"not computed again: {error.message}"
-        items.append(Item(INPUTS, where, Status.DIFFERENT, note=note))
+        items.append(claim(INPUTS, where, f"not computed again: {error.message}"))
     except Exception as error:
         note = f"not computed again: {type(error).__name__}: {error}"
-        items.append(Item(INPUTS, record, Status.DIFFERENT, note=note))
+        items.append(claim(INPUTS, record, note))
 
 
 def report_tasks(manifest: Manifest, folder: Path, scratch: Path) -> tuple[Task, ...]:
@@ -55,54 +72,31 @@ def report_tasks(manifest: Manifest, folder: Path, scratch: Path) -> tuple[Task,
 
 
 def _task(key: str, entry: TaskRecord, folder: Path, scratch: Path) -> Task:
-    table = read_table(folder / entry.data.file, allow_missing=tuple(OUTPUTS.values()))
+    said = entry.data
+    table = read_table(folder / said.file, allow_missing=tuple(OUTPUTS.values()))
     table = replace(
-        table,
-        source=entry.data.source,
-        sha256=entry.data.source_sha256,
-        label=entry.label,
-        header=entry.data.header or table.header,
-        text=(),
-        ignored=entry.data.ignored,
-    )
+        table, source=said.source, sha256=said.source_sha256, label=entry.label,
+        header=said.header or table.header, text=(), ignored=said.ignored,
+    )  # fmt: skip
     scratch.mkdir(parents=True)
     prior_path = scratch / entry.priors.source
     shutil.copyfile(folder / entry.priors.file, prior_path)
-    held = entry.held_out
-    return Task(
-        key, entry.model, table, None if held is None else HoldOut(held.column, held.value),
-        prior_path,
-    )  # fmt: skip
+    return Task(key, entry.model, table, entry.held_out, prior_path)
 
 
 def recompute_report(
-    manifest: Manifest,
-    tasks: tuple[Task, ...],
-    out: Path,
-    progress: Progress,
-    pool: Pool = HERE,
+    manifest: Manifest, tasks: tuple[Task, ...], out: Path, progress: Progress, pool: Pool = HERE
 ) -> Study:
     """Work a report out again and write it into a new folder."""
     contents = work_out(
-        tasks,
-        manifest.seed,
-        settings=manifest.settings,
+        tasks, manifest.seed, settings=manifest.settings, progress=progress, pool=pool,
         sections=[SECTIONS[name].again(record) for name, record in manifest.sections.items()],
-        progress=progress,
-        pool=pool,
-    )
+    )  # fmt: skip
     write_report(
-        contents.study,
-        out,
-        sections=contents.found,
-        pdf=manifest.pdf,
-        settings=manifest.settings,
-        command=manifest.command,
-        title=manifest.title,
-        environment=manifest.environment,
-        progress=progress,
-        pool=pool,
-    )
+        contents.study, out, sections=contents.found, pdf=manifest.pdf, settings=manifest.settings,
+        command=manifest.command, title=manifest.title, environment=manifest.environment,
+        progress=progress, pool=pool,
+    )  # fmt: skip
     return contents.study
 
 
@@ -130,13 +124,9 @@ def recompute_run(
         for e in record.estimates
     )  # fmt: skip
     calibration = calibrate(
-        problem,
-        record.seed,
-        label=record.label,
-        estimates=starts,
-        settings=record.settings,
+        problem, record.seed, label=record.label, estimates=starts, settings=record.settings,
         progress=lambda done, planned: progress("sampling", done, planned),
-    )
+    )  # fmt: skip
     calibration = replace(calibration, estimates=estimate_again(record, problem))
     out.mkdir()
     save_calibration(calibration, out, environment=record.environment)

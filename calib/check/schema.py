@@ -1,14 +1,10 @@
-"""What a folder says of itself, checked.
-
-`manifest.json` of a report, `run.json` of a run, `comparison.json` of a comparison.
-"""
+"""What a folder says of itself, checked: a report, a run, or a comparison."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import (
     AfterValidator,
@@ -18,18 +14,20 @@ from pydantic import (
     JsonValue,
     StringConstraints,
     ValidationError,
+    model_validator,
 )
 
 from calib.batch.environment import Environment
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.inference.io import SCHEMA as RUN_SCHEMA
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS
 from calib.report.comparison import FILE as COMPARISON
-from calib.report.comparison import SCHEMA as COMPARISON_SCHEMA
 from calib.report.sections import SECTIONS
-from calib.report.writer import SCHEMA as REPORT_SCHEMA
+from calib.report.study_tasks import HoldOut
+
+MANIFEST, SUMMARY = "manifest.json", "summary.json"
+RUN, POSTERIOR, PRIORS, DATA = "run.json", "posterior.nc", "priors.toml", "data.csv"
 
 
 def _inside(path: str) -> str:
@@ -46,19 +44,27 @@ def _name(text: str) -> str:
     return text
 
 
-class _UnknownModel(ValueError):
-    """A model that is not known here: most likely its file was not passed."""
+def _output(key: str) -> str:
+    if key not in OUTPUTS:
+        raise ValueError(f"there is no output {key}")
+    return key
 
 
 def _known_model(name: str) -> str:
     if name not in MODELS:
-        raise _UnknownModel(f"{name} is not one of {', '.join(MODELS)}")
+        raise CalibError(
+            f"model: {name} is not one of {', '.join(MODELS)}",
+            allowed="a model that is known here",
+            mend="pass the file of your own that declares it (--models FILE or --simulator FILE); "
+            "if there is none, restore the folder's",
+        )
     return name
 
 
 type _Hash = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 type _File = Annotated[str, AfterValidator(_inside)]
 type _Name = Annotated[str, AfterValidator(_name)]
+type _Output = Annotated[str, AfterValidator(_output)]
 type _Model = Annotated[str, AfterValidator(_known_model)]
 type _Seed = Annotated[int, Field(ge=0)]
 
@@ -66,11 +72,6 @@ type _Seed = Annotated[int, Field(ge=0)]
 class _Record(BaseModel):
     # What later versions add is compared as numbers are, and not needed to compute again.
     model_config = ConfigDict(frozen=True, extra="ignore")
-
-
-class _HeldOut(_Record):
-    column: str
-    value: float
 
 
 class _Data(_Record):
@@ -94,16 +95,20 @@ class TaskRecord(_Record):
     """One output of a report: model, rows held out, data and priors."""
 
     model: _Model
-    held_out: _HeldOut | None
+    held_out: HoldOut | None
     label: str
     data: _Data
     priors: _PriorFile
 
 
 class _Made(_Record):
+    FILE: ClassVar[str]
+    kind: ClassVar[Literal["report", "run", "comparison"]]
     versions: dict[str, str]
     machine: dict[str, str]
     code: str
+    document: dict[str, JsonValue]
+    """The whole file."""
 
     @property
     def environment(self) -> Environment:
@@ -114,16 +119,30 @@ class _Made(_Record):
 class Manifest(_Made):
     """`manifest.json` of a report folder."""
 
+    FILE, kind = MANIFEST, "report"
     schema_: Literal["calib/manifest/2"] = Field(alias="schema")
     title: str
     command: tuple[str, ...]
     seed: _Seed
     settings: SamplerSettings
-    tasks: dict[str, TaskRecord]
+    tasks: Annotated[dict[_Output, TaskRecord], Field(min_length=1)]
     pdf: bool = False
-    sections: dict[str, JsonValue] = {}
     files: dict[_File, _Hash]
     left_out: dict[_File, _Hash]
+
+    @property
+    def sections(self) -> dict[str, Any]:
+        """What it says of the sections that are known here."""
+        return {name: self.document[name] for name in SECTIONS if name in self.document}
+
+    @model_validator(mode="after")
+    def _check_sections(self) -> Self:
+        for name, record in self.sections.items():
+            try:
+                SECTIONS[name].again(record)
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from None
+        return self
 
 
 class _Estimate(_Record):
@@ -137,6 +156,7 @@ class _Estimate(_Record):
 class RunRecord(_Made):
     """`run.json` of a run folder."""
 
+    FILE, kind = RUN, "run"
     schema_: Literal["calib/run/1"] = Field(alias="schema")
     model: _Model
     seed: _Seed
@@ -151,13 +171,9 @@ class RunRecord(_Made):
     data_source: str
     data_label: str
     sha256: dict[_File, _Hash]
-    document: dict[str, JsonValue]
-    """The whole file."""
 
 
 class _Compared(_Record):
-    """What is said of a model that was compared."""
-
     elpd_rows: Annotated[tuple[float, ...], Field(min_length=2)]
     converged: bool
     refits_not_converged: int
@@ -166,6 +182,7 @@ class _Compared(_Record):
 class ComparisonRecord(_Made):
     """`comparison.json` of a comparison folder."""
 
+    FILE, kind = COMPARISON, "comparison"
     schema_: Literal["calib/comparison/2"] = Field(alias="schema")
     seed: _Seed
     settings: SamplerSettings
@@ -174,8 +191,6 @@ class ComparisonRecord(_Made):
     command: tuple[str, ...]
     models: Annotated[dict[_Model, _Compared], Field(min_length=2)]
     files: dict[_File, _Hash]
-    document: dict[str, JsonValue]
-    """The whole file."""
 
     @property
     def unsound(self) -> tuple[str, ...]:
@@ -196,86 +211,38 @@ def read_folder(folder: Path) -> Record:
     CalibError
         If it is none that can be checked, or its record is damaged or of an earlier version.
     """
-    readers: dict[str, Callable[[Any, Path], Record]] = {
-        "manifest.json": _manifest, "run.json": _run, COMPARISON: _comparison,
-    }  # fmt: skip
-    found = [name for name in readers if (folder / name).is_file()]
-    if not found:
-        raise _unchecked(folder, f"no {', '.join(readers)} in it")
-    return readers[found[0]](_content(folder / found[0]), folder / found[0])
+    kinds: tuple[type[Record], ...] = (Manifest, RunRecord, ComparisonRecord)
+    for kind in kinds:
+        if (folder / kind.FILE).is_file():
+            return read_record(kind, folder)
+    raise _unchecked(folder, f"no {', '.join(kind.FILE for kind in kinds)} in it")
 
 
-def read_run(folder: Path) -> RunRecord:
-    """Read what a run folder inside another says of itself; see `read_folder`."""
-    return _run(_content(folder / "run.json"), folder / "run.json")
-
-
-def read_comparison(folder: Path) -> ComparisonRecord:
-    """Read what a comparison inside a report says of itself; see `read_folder`."""
-    return _comparison(_content(folder / COMPARISON), folder / COMPARISON)
-
-
-def _content(path: Path) -> Any:
+def read_record[R: _Made](kind: type[R], folder: Path) -> R:
+    """Read the record of a kind in a folder; see `read_folder`."""
+    path = folder / kind.FILE
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise _damaged(path, f"it cannot be read ({type(error).__name__})") from None
-
-
-def _comparison(content: Any, path: Path) -> ComparisonRecord:
-    _check_schema(content, COMPARISON_SCHEMA, path)
-    return _validated(ComparisonRecord, content, path, document=content)
-
-
-def _manifest(content: Any, path: Path) -> Manifest:
-    _check_schema(content, REPORT_SCHEMA, path)
-    sections = {name: content[name] for name in SECTIONS if name in content}
-    manifest = _validated(Manifest, content, path, sections=sections)
-    for name, record in sections.items():
-        try:
-            SECTIONS[name].again(record)
-        except ValueError as error:
-            raise _damaged(path, f"{name}: {error}") from None
-    unknown = [key for key in manifest.tasks if key not in OUTPUTS]
-    if unknown or not manifest.tasks:
-        raise _damaged(path, f"tasks: there is no output {', '.join(unknown) or 'at all'}")
-    return manifest
-
-
-def _run(content: Any, path: Path) -> RunRecord:
-    _check_schema(content, RUN_SCHEMA, path)
-    return _validated(RunRecord, content, path, document=content)
-
-
-def _check_schema(content: Any, schema: str, path: Path) -> None:
-    given = content.get("schema") if isinstance(content, Mapping) else None
-    # A folder of `calib sbc` has a run.json as well, which is no record of a run.
-    if given is None and (path.parent / "sbc.json").is_file():
-        raise _unchecked(path.parent, "it is one of `calib sbc`")
-    if given != schema:
-        raise CalibError(
-            f"the schema is {given!r}",
-            where=str(path),
-            allowed=schema,
-            mend="make the folder again with this version, or check it with the one that made it",
-        )
-
-
-def _validated[R: _Made](kind: type[R], content: Any, path: Path, **more: Any) -> R:
-    try:
-        return kind.model_validate({**content, **more})
+        content = json.loads(path.read_text(encoding="utf-8"))
+        return kind.model_validate({**content, "document": content})
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(str(part) for part in first["loc"])
-        unknown = first.get("ctx", {}).get("error")
-        if isinstance(unknown, _UnknownModel):
-            raise CalibError(
-                f"{place}: {unknown}", where=str(path),
-                allowed="a model that is known here",
-                mend="pass the file of your own that declares it (--models FILE or --simulator "
-                "FILE); if there is none, restore the folder's",
-            ) from None  # fmt: skip
-        raise _damaged(path, f"{place}: {first['msg']}") from None
+        found = error.errors()
+    except CalibError as error:
+        raise error.within(str(path)) from None
+    except (OSError, ValueError, TypeError, RecursionError) as error:
+        raise _damaged(path, f"it cannot be read ({type(error).__name__})") from None
+    of_schema = next((e for e in found if e["loc"] == ("schema",)), None)
+    if of_schema is None:
+        places = (".".join(map(str, found[0]["loc"])), found[0]["msg"])
+        raise _damaged(path, ": ".join(filter(None, places)))
+    # A folder of `calib sbc` has a run.json as well, which is no record of a run.
+    if "schema" not in content and (folder / "sbc.json").is_file():
+        raise _unchecked(folder, "it is one of `calib sbc`")
+    raise CalibError(
+        f"the schema is {content.get('schema')!r}",
+        where=str(path),
+        allowed=of_schema.get("ctx", {}).get("expected"),
+        mend="make the folder again with this version, or check it with the one that made it",
+    )
 
 
 def _unchecked(folder: Path, why: str) -> CalibError:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from calib.batch.environment import sha256
 from calib.check.numbers import NUMBER, without_numbers
-from calib.check.outcome import Item, Status
+from calib.check.outcome import Item, Status, claim
 from calib.report.compared import FOLDER as COMPARED
 
 GROUP = "page and tables"
@@ -32,29 +32,24 @@ _PLAIN = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻\u2212", "0123456789--")
 def verify_images(page: str, folder: Path) -> list[Item]:
     """Check that every picture in a page is one of the folder's figures, and the other way."""
     figures = _figures(folder)
-    shown = {_hash(match) for match in _IMAGE.findall(page)}
+    shown = {sha256(_decoded(text)) for text in _IMAGE.findall(page)}
     items = [
-        Item(GROUP, name, Status.DIFFERENT, note="it is not the picture that index.html shows")
+        claim(GROUP, name, "it is not the picture that index.html shows")
         for key, name in figures.items()
         if key not in shown
     ]
     strangers = len(shown - set(figures))
     if strangers:
-        note = f"{strangers} of its pictures are none of the figures"
-        items.append(Item(GROUP, "index.html", Status.DIFFERENT, note=note))
-    return items or [
-        Item(GROUP, "pictures in index.html", Status.IDENTICAL, note="they are the figures")
-    ]
+        items.append(
+            claim(GROUP, "index.html", f"{strangers} of its pictures are none of the figures")
+        )
+    return items or [claim(GROUP, "pictures in index.html", "", "they are the figures")]
 
 
 def _figures(folder: Path) -> dict[str, str]:
     """Names of the PNG files of a folder by their hashes; a comparison in it has its own page."""
     names = (path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*.png")))
     return {sha256((folder / n).read_bytes()): n for n in names if not n.startswith(f"{COMPARED}/")}
-
-
-def _hash(encoded: str) -> str:
-    return sha256(_decoded(encoded))
 
 
 def _decoded(encoded: str) -> bytes:
@@ -67,7 +62,8 @@ def _decoded(encoded: str) -> bytes:
 def own_pictures(content: str, folder: Path) -> list[bytes]:
     """Return the pictures of a page that are none of the folder's figures, in their order."""
     known = _figures(folder)
-    return [_decoded(text) for text in _IMAGE.findall(content) if _hash(text) not in known]
+    pictures = map(_decoded, _IMAGE.findall(content))
+    return [picture for picture in pictures if sha256(picture) not in known]
 
 
 def compare_page(
@@ -87,35 +83,33 @@ def compare_page(
     if old == new:
         note = "the same but for its pictures, which are compared as figures, or its line ends"
         return Item(GROUP, name, Status.WITHIN, note=note)
-    if _pictures(old) != _pictures(new):
-        note = "it shows other pictures, or in another order"
-        return Item(GROUP, name, Status.DIFFERENT, note=note)
-    parts, again = list(_sections(old)), list(_sections(new))
-    if [section for section, _ in parts] != [section for section, _ in again]:
-        return Item(GROUP, name, Status.DIFFERENT, note="it has other sections")
-    status, note = Status.WITHIN, "the same words; numbers are judged where they come from"
-    for (section, lines), (_, lines_again) in zip(parts, again, strict=True):
+    pictures, again = (_PICTURE.findall("\n".join(lines)) for lines in (old, new))
+    if pictures != again:
+        return claim(GROUP, name, "it shows other pictures, or in another order")
+    both = list(_sections(old)), list(_sections(new))
+    if [section for section, _ in both[0]] != [section for section, _ in both[1]]:
+        return claim(GROUP, name, "it has other sections")
+    found = Item(GROUP, name, Status.WITHIN,
+                 note="the same words; numbers are judged where they come from")  # fmt: skip
+    for (section, lines), (_, lines_again) in zip(*both, strict=True):
         why, numbers = judged(section)
-        if _alike(lines, lines_again, numbers=numbers):
-            continue
-        said = differing_lines(lines, lines_again)
-        if why is None:
-            return Item(GROUP, name, Status.DIFFERENT, note=said)
-        status, note = Status.UNJUDGED, f"{why}: {said}"
-    return Item(GROUP, name, status, note=note)
+        if not _alike(lines, lines_again, numbers=numbers):
+            said = differing_lines(lines, lines_again)
+            if why is None:
+                return claim(GROUP, name, said)
+            found = claim(GROUP, name, f"{why}: {said}", sure=False)
+    return found
 
 
 def _readable(folder: Path, name: str) -> list[str]:
     """Lines of a text, with the names of the folder's figures in the place of the pictures."""
     text = (folder / name).read_text(encoding="utf-8", errors="replace")
     names = _figures(folder) if _IMAGE.search(text) else {}
-    return _IMAGE.sub(
-        lambda m: f"[picture {names.get(_hash(m[1]), 'of its own')}]", text
-    ).splitlines()
 
+    def named(match: re.Match[str]) -> str:
+        return f"[picture {names.get(sha256(_decoded(match[1])), 'of its own')}]"
 
-def _pictures(lines: Sequence[str]) -> list[str]:
-    return [picture for line in lines for picture in _PICTURE.findall(line)]
+    return _IMAGE.sub(named, text).splitlines()
 
 
 def _sections(lines: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
@@ -141,20 +135,18 @@ def _alike(old: Sequence[str], new: Sequence[str], *, numbers: bool) -> bool:
 def _near(old: str, new: str) -> bool:
     """Whether the numbers of two lines differ by one unit of their last digit at the most."""
     numbers = (NUMBER.findall(_TAG.sub(" ", line)) for line in (old, new))
-    return all(a == b or _one_unit(a, b) for a, b in zip(*numbers, strict=False))
+    return all(a == b or _one_unit(_parsed(a), _parsed(b)) for a, b in zip(*numbers, strict=False))
 
 
-def _one_unit(old: str, new: str) -> bool:
-    (a, unit_a), (b, unit_b) = _parsed(old), _parsed(new)
-    return abs(a - b) <= 1.001 * max(unit_a, unit_b)
+def _one_unit(old: tuple[float, float], new: tuple[float, float]) -> bool:
+    return abs(old[0] - new[0]) <= 1.001 * max(old[1], new[1])
 
 
 def _parsed(text: str) -> tuple[float, float]:
     """Return a number as shown and one unit of its last digit."""
     plain = text.translate(_PLAIN).replace("\u00d710", "e").replace(",", "")
     mantissa, _, exponent = plain.lower().partition("e")
-    decimals = len(mantissa.partition(".")[2])
-    power = int(exponent or 0)
+    decimals, power = len(mantissa.partition(".")[2]), int(exponent or 0)
     try:
         return float(f"{mantissa}e{power}"), 10.0 ** (power - decimals)
     except ValueError:  # such as 1.2.3 of a version
@@ -163,10 +155,8 @@ def _parsed(text: str) -> tuple[float, float]:
 
 def differing_lines(old: Sequence[str], new: Sequence[str]) -> str:
     """Return how many lines two texts do not share, and the first of them."""
-    changed = [
-        line
-        for line in difflib.unified_diff(old, new, "recorded", "written again", n=0, lineterm="")
-        if line[0] in "+-" and not line.startswith(("---", "+++"))
-    ]
+    # Below the names of the two.
+    diff = list(difflib.unified_diff(old, new, n=0, lineterm=""))[2:]
+    changed = [line for line in diff if not line.startswith("@@")]
     shown = "; ".join(f"{line[0]} {line[1:].strip()[:_WIDTH]}" for line in changed[: 2 * _SHOWN])
     return f"{len(changed)} lines differ: {shown}"

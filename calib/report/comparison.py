@@ -27,7 +27,7 @@ from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
 from calib.report.page.template import data_uri, template
 from calib.report.writer import file_hashes, own_names
-from calib.validation.comparison import Candidate, Comparison, difference
+from calib.validation.comparison import Candidate, Comparison, difference, sentence
 from calib.validation.prediction import N_DRAWS
 from calib.validation.validate import PARETO_K_MAX
 
@@ -159,35 +159,57 @@ FILE, PAGE, FIGURE, HELD_OUT = (
 )  # fmt: skip
 
 
-def document(comparison: Comparison, hold_out: str = "", best: str | None = None) -> dict[str, Any]:
+def document(comparison: Comparison, hold_out: str = "") -> dict[str, Any]:
     """Return every number of a comparison as plain dictionaries.
 
-    What was held out is said in words. Differences are from the model `best`, where another
-    comparison had it for the best.
+    What was held out is said in words. Differences are from the first model.
     """
-    first = next(c for c in comparison.candidates if best in (None, c.model))
-    rows = first.calibration.problem.table
+    candidates = {c.model: c for c in comparison.candidates}
+    first = comparison.candidates[0].calibration.problem.table
+    stated = stated_of_rows(
+        {name: c.rows for name, c in candidates.items()}, comparison.weights,
+        [name for name, c in candidates.items() if not c.sound],
+    )  # fmt: skip
     return {
         "schema": SCHEMA,
         "seed": comparison.seed,
-        "rows": len(rows),
-        **own_names(rows),
+        **own_names(first),
         "held_out": hold_out,
         "converged": comparison.sound,
-        "verdict": comparison.sentence,
-        "models": {c.model: _model(comparison, c, first) for c in comparison.candidates},
+        **stated,
+        "models": {name: {**m, **_model(candidates[name])} for name, m in stated["models"].items()},
     }
 
 
-def _model(comparison: Comparison, c: Candidate, best: Candidate) -> dict[str, Any]:
-    below, loo = difference(best.rows - c.rows), c.loo
+def stated_of_rows(
+    rows: Mapping[str, Array], weights: Mapping[str, float], unsound: Sequence[str]
+) -> dict[str, Any]:
+    """Return what is stated of models by the log predictive densities of rows without them, (n,).
+
+    And by their stacking weights, which follow as well; the best first, `unsound` did not converge.
+    """
+    best = next(iter(rows.values()))
+    below = {name: difference(best - r) for name, r in rows.items()}
+    return {
+        "rows": best.size,
+        "verdict": sentence({name: d.clear for name, d in below.items()}, unsound),
+        "models": {
+            name: {
+                "weight": weights[name],
+                "elpd": float(r.sum()),
+                "below_best": below[name].elpd,
+                "below_best_se": below[name].se,
+                "told_apart": below[name].clear,
+            }
+            for name, r in rows.items()
+        },
+    }
+
+
+def _model(c: Candidate) -> dict[str, Any]:
+    loo = c.loo
     found: dict[str, Any] = {
-        "weight": comparison.weights[c.model],
-        "elpd": loo.elpd,
         "elpd_se": loo.elpd_se,
-        "below_best": below.elpd,
-        "below_best_se": below.se,
-        "told_apart": below.clear,
         "elpd_rows": c.rows.tolist(),
         "converged": c.calibration.converged,
         "pareto_k_max": None if loo.pareto_k is None else finite(float(loo.pareto_k.max())),

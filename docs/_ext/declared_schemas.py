@@ -18,7 +18,7 @@ def schemas() -> dict[str, dict[str, Any]]:
         "priors": json_schema(),
         "plan": _plan(),
         "simulator": SimulatorFile.model_json_schema(),
-        "manifest": Manifest.model_json_schema(),
+        "manifest": _without_document(Manifest.model_json_schema()),
         "run": _without_document(RunRecord.model_json_schema()),
         "comparison": _without_document(ComparisonRecord.model_json_schema()),
         **{name: of.model_json_schema() for name, of in RESULTS.items()},
