@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from calib.batch.environment import Environment
 from calib.batch.pool import HERE, Pool
 from calib.check.check_comparison import check_comparison
 from calib.check.check_report import check_report
 from calib.check.check_run import check_run
-from calib.check.compare import count_drawn
+from calib.check.compare import Job, count_drawn
 from calib.check.montecarlo import describe
 from calib.check.numbers import inside, read_json
-from calib.check.outcome import Outcome
-from calib.check.recompute import Job
-from calib.check.schema import (
-    SUMMARY,
-    ComparisonRecord,
-    Manifest,
-    Record,
-    RunRecord,
-    read_folder,
-    read_record,
-)
+from calib.check.outcome import Item, Outcome
+from calib.check.schema import SUMMARY, ComparisonRecord, Record, read_folder, read_record
 from calib.errors import CalibError
 from calib.report.compared import FOLDER
 from calib.report.study import Progress
+
+_CHECKS: Mapping[str, Callable[[Any, Job], list[Item]]] = {
+    "report": check_report, "run": check_run, "comparison": check_comparison,
+}  # fmt: skip
 
 
 def check(
@@ -64,13 +61,7 @@ def check(
     with tempfile.TemporaryDirectory(prefix="calib-check-") as scratch:
         made, here = Path(scratch) / "again", Environment.here()
         job = Job(folder, made, tell, here, quick=quick, pool=pool, workers=workers)
-        match record:
-            case Manifest():
-                items = check_report(record, job)
-            case ComparisonRecord():
-                items = check_comparison(record, job)
-            case RunRecord():
-                items = check_run(record, job)
+        items = _CHECKS[record.kind](record, job)
         allowed = describe(count_drawn(made)) if made.is_dir() else ""
     differing = record.environment.differences(here)
     missed = _not_converged(record, folder)
@@ -84,14 +75,11 @@ def _not_converged(record: Record, folder: Path) -> tuple[str, ...]:
     """
     if isinstance(record, ComparisonRecord):
         return record.unsound
-    if isinstance(record, RunRecord):
-        return (record.model,) if inside(record.document, "gate").get("passed") is False else ()
-    models = inside(read_json(folder / SUMMARY), "models")
-    missed = [
-        str(m.get("model")) for m in map(inside, models.values())
-        if inside(m, "sampling").get("converged") is False
-    ]  # fmt: skip
-    if "comparison" in record.sections:
-        with suppress(CalibError):
+    gates = {str(record.document.get("model")): inside(record.document, "gate").get("passed")}
+    for found in inside(read_json(folder / SUMMARY), "models").values():
+        gates[str(inside(found).get("model"))] = inside(found, "sampling").get("converged")
+    missed = [model for model, passed in gates.items() if passed is False]
+    with suppress(CalibError):
+        if record.kind == "report" and (folder / FOLDER).is_dir():
             missed += read_record(ComparisonRecord, folder / FOLDER).unsound
     return tuple(dict.fromkeys(missed))

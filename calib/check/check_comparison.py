@@ -3,34 +3,33 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from calib.check.check_run import compare_run, consistent_run, verify_run
-from calib.check.compare import compare_document, compare_file, count_drawn
+from calib.check.compare import (
+    Job,
+    compare_document,
+    compare_file,
+    count_drawn,
+    not_computed,
+    within,
+)
 from calib.check.derived import verify_derived
 from calib.check.inputs import verify_files
 from calib.check.montecarlo import drawn_in_comparison
 from calib.check.numbers import flatten, inside
 from calib.check.outcome import Item, Status, claim
-from calib.check.recompute import Job, not_computed
-from calib.check.schema import DATA, ComparisonRecord, RunRecord, read_record
-from calib.data import Table, read_for_model
+from calib.check.schema import COMPARISON as FILE
+from calib.check.schema import DATA, RUN, ComparisonRecord, RunRecord, read_record
+from calib.data import read_for_model
 from calib.inference.io import run_problem
 from calib.inference.problem import Problem
-from calib.report.comparison import (
-    FIGURE,
-    FILE,
-    HELD_OUT,
-    PAGE,
-    page,
-    stated_of_rows,
-    write_comparison,
-)
-from calib.validation.comparison import compare_problems, stacking_weights
+from calib.report.comparison import FIGURE, HELD_OUT, PAGE, page, stated_of_rows, write_comparison
+from calib.validation.comparison import Comparison, compare_problems, stacking_weights
 
 _GROUP = "comparison"
 # Of what follows from rows by arithmetic; weights by iterations that stop at a billionth.
@@ -39,56 +38,54 @@ _ROUNDING = 1e-6
 
 def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
     """Return what was found in a comparison."""
-    folder = job.folder
-    items = verify_files(folder, FILE, record.files) + _follows(record, job)
-    with not_computed(items, folder, FILE):
-        runs = {name: read_record(RunRecord, folder / "runs" / name) for name in record.models}
-        problems = {
-            name: _problem(run, folder / "runs" / name / DATA, record) for name, run in runs.items()
-        }
+    items = verify_files(job.folder, FILE, record.files) + _follows(record, job)
+    with not_computed(items, job.folder, FILE):
+        inner = {name: job.inside(f"runs/{name}") for name in record.models}
+        runs = {name: read_record(RunRecord, of.folder) for name, of in inner.items()}
+        problems = {n: _problem(run, inner[n].folder / DATA, record) for n, run in runs.items()}
         for name, run in runs.items():
-            inner = job.inside(f"runs/{name}")
-            found = verify_run(run, inner.folder) + consistent_run(run, problems[name], inner)
+            found = verify_run(run, inner[name].folder)
+            found += consistent_run(run, problems[name], inner[name])
             if run.model != name:
-                other = Item(
-                    _GROUP, "run.json", Status.DIFFERENT, run.model, name, note="the model"
-                )
-                found.append(other)
-            items += _of(name, found)
-        same = len({(folder / "runs" / name / DATA).read_bytes() for name in runs}) == 1
-        items.append(claim(_GROUP, "runs/*/data.csv",
-                           "" if same else "the models were fitted to different rows",
-                           "the rows of all models are the same"))  # fmt: skip
+                found.append(claim(_GROUP, RUN, f"it is of the model {run.model}"))
+            items += within(f"runs/{name}", name, found)
+        same = len({(of.folder / DATA).read_bytes() for of in inner.values()}) == 1
+        wrong = "" if same else "the models were fitted to different rows"
+        right = "the rows of all models are the same"
+        items.append(claim(_GROUP, f"runs/*/{DATA}", wrong, right))
         if not job.quick:
-            items += _compare_again(record, runs, problems, job)
+            again = _recompute(record, problems, job)
+            steps = {name: inside(r.document, "gate").get("steps") for name, r in runs.items()}
+            drawn = drawn_in_comparison(again, count_drawn(job.made), steps)
+            sizes = {(FILE, "models", *place): size for place, size in drawn.items()}
+            items += compare_document(FILE, job, sizes)
+            for c in again.candidates:
+                found = compare_run(runs[c.model], c.calibration, inner[c.model])
+                items += within(f"runs/{c.model}", c.model, found)
+            if (job.folder / FIGURE).is_file():
+                items += compare_file(FIGURE, job, lambda section: (None, True))
     return items
 
 
-def _compare_again(
-    record: ComparisonRecord, runs: Mapping[str, RunRecord], problems: Mapping[str, Problem],
-    job: Job,
-) -> list[Item]:  # fmt: skip
+def _recompute(record: ComparisonRecord, problems: Mapping[str, Problem], job: Job) -> Comparison:
+    """Compare the models again, and write that into a new folder, as in the record."""
+    held_out = None
+    if record.held_out:
+        models = [p.bound.model for p in problems.values()]
+        used = sorted({c for m in models for c in (*m.conditions, m.output)})
+        held_out = read_for_model(job.folder / HELD_OUT, used)
     again = compare_problems(
-        list(problems.values()), record.seed, held_out=_held_out(record, job.folder, problems),
-        settings=record.settings, progress=job.progress, workers=job.workers,
+        list(problems.values()), record.seed, held_out=held_out, settings=record.settings,
+        progress=job.progress, workers=job.workers,
     )  # fmt: skip
-    # Differences are from the first, which may be another one with other draws.
-    order = list(record.models)
-    ranked = sorted(again.candidates, key=lambda c: order.index(c.model))
-    again = replace(again, candidates=tuple(ranked))
+    # Differences are from the first, which with other draws may not be the best.
+    by_name = {c.model: c for c in again.candidates}
+    again = replace(again, candidates=tuple(by_name[name] for name in record.models))
     job.made.mkdir()
     write_comparison(
         again, job.made, record.command, record.held_out, environment=record.environment
     )
-    steps = {name: inside(run.document, "gate").get("steps") for name, run in runs.items()}
-    drawn = drawn_in_comparison(again, count_drawn(job.made), steps)
-    items = compare_document(FILE, job, {(FILE, "models", *k): size for k, size in drawn.items()})
-    for c in ranked:
-        found = compare_run(runs[c.model], c.calibration, job.inside(f"runs/{c.model}"))
-        items += _of(c.model, found)
-    if (job.folder / FIGURE).is_file():
-        items += compare_file(FIGURE, job, lambda section: (None, True))
-    return items
+    return again
 
 
 def _follows(record: ComparisonRecord, job: Job) -> list[Item]:
@@ -109,11 +106,9 @@ def _follows(record: ComparisonRecord, job: Job) -> list[Item]:
         status = Status.IDENTICAL if same else Status.DIFFERENT
         items.append(Item(_GROUP, name, status, stated, value))
 
-    def written() -> dict[str, str]:
-        return {PAGE: page(record.document, (job.folder / FIGURE).read_bytes())}
-
+    shown = {FILE: lambda: {PAGE: page(record.document, (job.folder / FIGURE).read_bytes())}}
     sure = record.environment.same_program(job.here)
-    return items + verify_derived(job.folder, (), {FILE: written}, sure=sure)
+    return items + verify_derived(job.folder, (), shown, sure=sure)
 
 
 def _problem(run: RunRecord, data: Path, record: ComparisonRecord) -> Problem:
@@ -125,21 +120,3 @@ def _problem(run: RunRecord, data: Path, record: ComparisonRecord) -> Problem:
     if not record.header:
         return problem
     return problem.with_table(replace(problem.table, header=record.header, text=()))
-
-
-def _of(model: str, items: Iterable[Item]) -> list[Item]:
-    """Name items after the run that they were found in."""
-    return [
-        replace(item, name=f"runs/{model}/{item.name}", group=f"{model}: {item.group}")
-        for item in items
-    ]
-
-
-def _held_out(
-    record: ComparisonRecord, folder: Path, problems: Mapping[str, Problem]
-) -> Table | None:
-    if not record.held_out:
-        return None
-    models = [p.bound.model for p in problems.values()]
-    used = sorted({c for m in models for c in (*m.conditions, m.output)})
-    return read_for_model(folder / HELD_OUT, used)

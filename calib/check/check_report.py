@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import partial
@@ -11,40 +12,42 @@ from typing import Any
 import numpy as np
 
 from calib.batch.environment import sha256
+from calib.batch.pool import Pool
 from calib.check.check_comparison import check_comparison
 from calib.check.compare import (
-    blame,
+    Job,
     compare_document,
     compare_estimates,
     compare_file,
     count_drawn,
     is_document,
     moved_parts,
+    not_computed,
     part_of,
+    within,
 )
 from calib.check.derived import derived_files, verify_derived, verify_form, verify_gaps
-from calib.check.inputs import verify_files, verify_label, verify_priors
-from calib.check.montecarlo import Errors, drawn_in_output
+from calib.check.inputs import blame, files_in, verify_files, verify_label, verify_priors
+from calib.check.montecarlo import Place, drawn_in_output
 from calib.check.numbers import inside, read_json
 from calib.check.outcome import Item, claim
 from calib.check.posteriors import GROUP as POSTERIORS
-from calib.check.posteriors import DrawsFile, read_draws, verify_density, verify_summary
-from calib.check.recompute import Job, not_computed, recompute_report, report_tasks
-from calib.check.schema import MANIFEST, SUMMARY, ComparisonRecord, Manifest, read_record
+from calib.check.posteriors import verify_posterior
+from calib.check.schema import DATA, MANIFEST, SUMMARY, ComparisonRecord, Manifest, read_record
 from calib.check.text import GROUP as TEXT
-from calib.check.text import verify_images
+from calib.check.text import read_text, verify_images
 from calib.data import Table, read_table
 from calib.data.quantities import OUTPUTS
-from calib.errors import CalibError
-from calib.inference.problem import build_problem
+from calib.inference.problem import Problem, build_problem
 from calib.models import get_model
 from calib.report.compared import FOLDER
 from calib.report.comparison import HELD_OUT
 from calib.report.publish import publication
-from calib.report.sections import SECTIONS
-from calib.report.study import Study, estimate_task
+from calib.report.sections import SECTIONS, work_out
+from calib.report.study import Progress, Study, estimate_task
 from calib.report.study_tasks import Task, fitted_rows
 from calib.report.summary import summarise_estimates
+from calib.report.writer import write_report
 
 _PAGE = "index.html"
 _SEARCHES = (".genetic.", ".differential_evolution.")
@@ -57,30 +60,21 @@ def check_report(manifest: Manifest, job: Job) -> list[Item]:
     items = verify_files(folder, MANIFEST, manifest.files, more=inputs, left_out=manifest.left_out)
     summary = read_json(folder / SUMMARY)
     if (folder / _PAGE).is_file():
-        text = (folder / _PAGE).read_text(encoding="utf-8", errors="replace")
-        items += verify_images(text, folder)
-    posteriors = dict[str, DrawsFile]()
-    for key in manifest.tasks:
-        if (folder / f"{key}.nc").is_file():
-            try:
-                posteriors[key] = read_draws(folder / f"{key}.nc")
-            except CalibError as error:
-                items.append(claim(POSTERIORS, f"{key}.nc", error.message))
-    for key, file in posteriors.items():
-        stated = inside(summary, "models", key, "posterior")
-        items.append(verify_summary(f"{key}.nc", file, stated))
+        items += verify_images(read_text(folder / _PAGE), folder)
     with not_computed(items, folder, MANIFEST):
         tasks = report_tasks(manifest, folder, job.made.with_name("inputs"))
         for task in tasks:
-            said = manifest.tasks[task.output]
+            said, stated = manifest.tasks[task.output], inside(summary, "models", task.output)
             items.append(verify_label(said.data.file, task.table, said.label))
             items.append(verify_priors(task.output, said, folder, same_code=same_code))
-            if task.output in posteriors:
-                items.append(_density(task, posteriors[task.output]))
+            items += verify_posterior(
+                folder / f"{task.output}.nc", partial(_problem, task), inside(stated, "posterior")
+            )
+            if job.quick:
+                items += _estimates(task, stated, manifest, job)
         if job.quick:
-            note = "left out on purpose, and not made again"
-            items += [claim(POSTERIORS, name, note, sure=False) for name in manifest.left_out]
-            items += [item for task in tasks for item in _estimates(task, manifest, summary, job)]
+            wrong = "left out on purpose, and not made again"
+            items += [claim(POSTERIORS, name, wrong, sure=False) for name in manifest.left_out]
         else:
             study = recompute_report(manifest, tasks, job.made, job.progress, job.pool)
             numbers = _numbers(manifest, study, summary, job)
@@ -95,29 +89,59 @@ def check_report(manifest: Manifest, job: Job) -> list[Item]:
     return items + verify_derived(folder, manifest.files, writers, sure=same_code)
 
 
-def _density(task: Task, file: DrawsFile) -> Item:
-    try:
-        problem = build_problem(task.model, fitted_rows(task)[0], task.prior_path)
-    except CalibError as error:
-        return claim(POSTERIORS, f"{task.output}.nc", error.message)
-    return verify_density(f"{task.output}.nc", file, problem)
+def report_tasks(manifest: Manifest, folder: Path, scratch: Path) -> tuple[Task, ...]:
+    """Return the tasks of a report, with the folder's own data and priors.
+
+    These are copied into `scratch` under their first names, which the page shows.
+    """
+    tasks = []
+    for key, entry in manifest.tasks.items():
+        said = entry.data
+        table = read_table(folder / said.file, allow_missing=tuple(OUTPUTS.values()))
+        table = replace(
+            table, source=said.source, sha256=said.source_sha256, label=entry.label, text=(),
+            header=said.header or table.header, ignored=said.ignored,
+        )  # fmt: skip
+        (scratch / key).mkdir(parents=True)
+        priors = shutil.copyfile(folder / entry.priors.file, scratch / key / entry.priors.source)
+        tasks.append(Task(key, entry.model, table, entry.held_out, priors))
+    return tuple(tasks)
 
 
-def _estimates(task: Task, manifest: Manifest, summary: Mapping[str, Any], job: Job) -> list[Item]:
+def _problem(task: Task) -> Problem:
+    return build_problem(task.model, fitted_rows(task)[0], task.prior_path)
+
+
+def recompute_report(
+    manifest: Manifest, tasks: tuple[Task, ...], out: Path, progress: Progress, pool: Pool
+) -> Study:
+    """Work a report out again and write it into a new folder."""
+    contents = work_out(
+        tasks, manifest.seed, settings=manifest.settings, progress=progress, pool=pool,
+        sections=[SECTIONS[name].again(record) for name, record in manifest.sections.items()],
+    )  # fmt: skip
+    write_report(
+        contents.study, out, sections=contents.found, pdf=manifest.pdf, settings=manifest.settings,
+        command=manifest.command, title=manifest.title, environment=manifest.environment,
+        progress=progress, pool=pool,
+    )  # fmt: skip
+    return contents.study
+
+
+def _estimates(task: Task, stated: Mapping[str, Any], manifest: Manifest, job: Job) -> list[Item]:
     """Compare the point estimates of an output, computed again without sampling."""
-    place, recorded = (SUMMARY, "models", task.output), inside(summary, "models", task.output)
-    if "error" in recorded:
-        note = "it failed; to see whether it does again, check without --quick"
+    place = (SUMMARY, "models", task.output)
+    if "error" in stated:
+        wrong = "it failed; to see whether it does again, check without --quick"
         name = f"{SUMMARY}: models.{task.output}"
-        return [claim(f"{task.output}: error", name, note, sure=False)]
-    estimates, by_pressure = estimate_task(task, manifest.seed, progress=job.progress)
-    return compare_estimates(place, recorded, summarise_estimates(estimates, by_pressure))
+        return [claim(f"{task.output}: error", name, wrong, sure=False)]
+    found = summarise_estimates(*estimate_task(task, manifest.seed, progress=job.progress))
+    return compare_estimates(job, place, found)
 
 
 def _numbers(manifest: Manifest, study: Study, summary: Mapping[str, Any], job: Job) -> list[Item]:
     """Compare every document entry by entry, and name the inputs that do not belong to them."""
-    n = count_drawn(job.made)
-    drawn: Errors = {}
+    n, drawn = count_drawn(job.made), dict[Place, float | None]()
     for key, result in study.successes.items():
         steps = inside(summary, "models", key, "sampling").get("steps")
         sizes = drawn_in_output(result.calibration, result.validation, n, steps)
@@ -125,21 +149,16 @@ def _numbers(manifest: Manifest, study: Study, summary: Mapping[str, Any], job: 
     items = compare_document(SUMMARY, job, drawn)
     for key, task in manifest.tasks.items():
         own = [item for item in items if part_of(item.group) == key]
-        points = [item for item in own if item.group.endswith("estimates")]
-        points = [i for i in points if not any(search in i.name for search in _SEARCHES)]
+        points = [
+            item for item in own if item.group.endswith("estimates")
+            and not any(search in item.name for search in _SEARCHES)
+        ]  # fmt: skip
         mode = [item for item in own if ".sampling.mode." in item.name]
-        found = blame(points, task.data.file,
-                      "most estimates in summary.json do not follow from these rows")  # fmt: skip
-        items += found or blame(
-            mode, task.priors.file,
-            "the posterior mode in summary.json does not follow from these priors and the data",
-        )  # fmt: skip
-    others = sorted(name for name in _names(job.made) if is_document(name) and name != SUMMARY)
+        wrong = "most estimates in summary.json do not follow from these rows"
+        other = "the posterior mode in summary.json does not follow from these priors and the data"
+        items += blame(points, task.data.file, wrong) or blame(mode, task.priors.file, other)
+    others = sorted(name for name in files_in(job.made) if is_document(name) and name != SUMMARY)
     return items + [item for name in others for item in compare_document(name, job)]
-
-
-def _names(folder: Path) -> set[str]:
-    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
 
 
 def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
@@ -156,8 +175,7 @@ def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
         why = "its numbers moved within their tolerance" if about & readings else None
         return why, not about & moved
 
-    made = _names(job.made)
-    items = []
+    made, items = files_in(job.made), []
     for name in sorted(n for n in made - derived_files(made) if not is_document(n)):
         if name in manifest.left_out:
             same = sha256((job.made / name).read_bytes()) == manifest.left_out[name]
@@ -190,16 +208,13 @@ def _about(manifest: Manifest, name: str, section: str) -> set[str]:
 def _compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list[Item]:
     """Check the comparison of models in a report: of its rows and seed, stated as it was found."""
     record = read_record(ComparisonRecord, job.folder)
-    items = [
-        replace(item, name=f"{FOLDER}/{item.name}", group=f"{FOLDER}: {item.group}")
-        for item in check_comparison(record, job)
-    ]
+    items = within(FOLDER, FOLDER, check_comparison(record, job))
     stated = inside(manifest.sections, "comparison")
     same = all(record.document.get(key) == value for key, value in stated.items())
     output = get_model(next(iter(record.models))).output
     fitted = {OUTPUTS[task.output]: fitted_rows(task) for task in tasks}
     rows, held = fitted.get(output, (None, None))
-    kept = [(job.folder / "runs" / name / "data.csv", rows) for name in record.models]
+    kept = [(job.folder / "runs" / name / DATA, rows) for name in record.models]
     if record.held_out or held is not None:
         kept.append((job.folder / HELD_OUT, held))
     own = record.seed == manifest.seed and all(_has_rows(path, table) for path, table in kept)

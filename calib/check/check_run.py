@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
-from calib.check.compare import blame, compare_document, compare_estimates, count_drawn
+import numpy as np
+
+from calib.check.compare import (
+    Job,
+    compare_document,
+    compare_estimates,
+    count_drawn,
+    not_computed,
+)
 from calib.check.derived import verify_derived
-from calib.check.inputs import verify_files, verify_label
+from calib.check.inputs import blame, verify_files, verify_label
 from calib.check.montecarlo import drawn_in_run
 from calib.check.numbers import inside
-from calib.check.outcome import Item, claim
-from calib.check.posteriors import GROUP as POSTERIORS
-from calib.check.posteriors import compare_posterior, read_draws, verify_density
-from calib.check.recompute import Job, estimate_again, not_computed, recompute_run
+from calib.check.outcome import Item
+from calib.check.posteriors import compare_posterior, verify_posterior
 from calib.check.schema import DATA, POSTERIOR, PRIORS, RUN, RunRecord
-from calib.errors import CalibError
-from calib.inference.calibration import Calibration
-from calib.inference.io import describe_estimates, run_problem
+from calib.inference.calibration import Calibration, calibrate
+from calib.inference.estimators import PointEstimate, estimate
+from calib.inference.io import describe_estimates, run_problem, save_calibration
 from calib.inference.problem import Problem
+from calib.inference.random import generator
+from calib.report.study import Progress
 
 
 def check_run(record: RunRecord, job: Job) -> list[Item]:
@@ -44,17 +53,11 @@ def verify_run(record: RunRecord, folder: Path) -> list[Item]:
 
 def consistent_run(record: RunRecord, problem: Problem, job: Job) -> list[Item]:
     """Hold the parts of a run against each other; of a quick check, its estimates too."""
-    items, summary = [verify_label(DATA, problem.table, record.data_label)], {}
-    if (job.folder / POSTERIOR).is_file():
-        try:
-            file = read_draws(job.folder / POSTERIOR)
-            summary = file.summary
-            items.append(verify_density(POSTERIOR, file, problem))
-        except CalibError as error:
-            items.append(claim(POSTERIORS, POSTERIOR, error.message))
+    items = [verify_label(DATA, problem.table, record.data_label)]
+    items += verify_posterior(job.folder / POSTERIOR, lambda: problem)
     if job.quick:
-        again = {"estimates": describe_estimates(estimate_again(record, problem))}
-        items += compare_estimates((RUN,), {**record.document, "posterior": summary}, again)
+        again = {"estimates": describe_estimates(_estimate_again(record, problem))}
+        items += compare_estimates(job, (RUN,), again)
     return items
 
 
@@ -66,5 +69,36 @@ def compare_run(record: RunRecord, calibration: Calibration, job: Job) -> list[I
     if (job.folder / POSTERIOR).is_file():
         items.append(compare_posterior(POSTERIOR, job.folder / POSTERIOR, job.made / POSTERIOR))
     mode = (item for item in items if item.name.startswith(f"{RUN}: mode."))
-    note = "the posterior mode in run.json does not follow from the data and priors here"
-    return items + blame(mode, f"{DATA} or {PRIORS}", note)
+    wrong = "the posterior mode in run.json does not follow from the data and priors here"
+    return items + blame(mode, f"{DATA} or {PRIORS}", wrong)
+
+
+def _estimate_again(record: RunRecord, problem: Problem) -> tuple[PointEstimate, ...]:
+    return tuple(
+        estimate(problem, e.method, generator(record.seed, record.model, e.method))
+        for e in record.estimates
+    )
+
+
+def recompute_run(
+    record: RunRecord, problem: Problem, out: Path, progress: Progress
+) -> Calibration:
+    """Sample a run again and write it into a new folder.
+
+    Sampled from the recorded starts, whoever chose them; the estimates in the new folder are
+    computed again, to be compared with them.
+    """
+    nan = float("nan")
+    starts = tuple(
+        PointEstimate(e.method, np.array(e.theta), dict(e.reported), e.cost, "", e.rmse, nan, 0,
+                      nan, True)
+        for e in record.estimates
+    )  # fmt: skip
+    calibration = calibrate(
+        problem, record.seed, label=record.label, estimates=starts, settings=record.settings,
+        progress=lambda done, planned: progress("sampling", done, planned),
+    )  # fmt: skip
+    calibration = replace(calibration, estimates=_estimate_again(record, problem))
+    out.mkdir()
+    save_calibration(calibration, out, environment=record.environment)
+    return calibration

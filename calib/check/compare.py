@@ -4,26 +4,28 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from calib.batch.environment import Environment
+from calib.batch.pool import HERE, Pool
+from calib.check.figures import GROUP as FIGURES
 from calib.check.figures import compare_figure
 from calib.check.inputs import GROUP as INPUTS
 from calib.check.montecarlo import MONTE_CARLO, Errors, Place
 from calib.check.numbers import SAME_WORDS, compare_entries, flatten
-from calib.check.outcome import ROUNDED, Item, Status, claim, mostly_different
+from calib.check.outcome import ROUNDED, Item, Status, claim
 from calib.check.posteriors import compare_posterior, read_draws
-from calib.check.recompute import Job
-from calib.check.schema import MANIFEST, POSTERIOR, RUN, SUMMARY
+from calib.check.schema import AUDIT, COMPARISON, MANIFEST, POSTERIOR, RUN, SUMMARY
 from calib.check.text import GROUP as TEXT
-from calib.check.text import compare_page, own_pictures
+from calib.check.text import compare_page, own_pictures, read_text
 from calib.check.tolerances import ORDER_OF_MAGNITUDE, is_drawn
 from calib.errors import CalibError
-from calib.report.comparison import FILE as COMPARISON
+from calib.report.study import Progress
 
-_DOCUMENTS = (SUMMARY, MANIFEST, COMPARISON, RUN, "audit.json")
 # What a record has about its own folder: durations, and hashes that are verified as such.
 _OWN, _OF_FILES = ("seconds", "files", "left_out", "sha256"), ("sha256", "shipped")
 _POINTS = ("estimates", "fit", "by_pressure")
@@ -34,9 +36,51 @@ _CHAIN = ("posterior", "prior_sensitivity", "validation", "sampling", "gate", "m
 _ROUNDED_PART = 1e-6
 
 
+@dataclass(frozen=True)
+class Job:
+    """A folder to be checked, where it is made again (not there yet), and how."""
+
+    folder: Path
+    made: Path
+    progress: Progress
+    here: Environment
+    quick: bool = False
+    pool: Pool = HERE
+    workers: int = 1
+
+    def inside(self, name: str) -> Job:
+        """Return the job of a folder in it."""
+        return replace(self, folder=self.folder / name, made=self.made / name)
+
+
+@contextmanager
+def not_computed(items: list[Item], folder: Path, record: str) -> Iterator[None]:
+    """Turn whatever stops the work into one more item.
+
+    The record is somebody else's: what it makes fail is a finding, with what was found before.
+    """
+    try:
+        yield
+    except Exception as error:
+        where, why = record, f"{type(error).__name__}: {error}"
+        if isinstance(error, CalibError):
+            path, why = Path((error.where or "").partition(",")[0]), error.message
+            where = path.relative_to(folder).as_posix() if path.is_relative_to(folder) else record
+        items.append(claim(INPUTS, where, f"not computed again: {why}"))
+
+
+def within(folder: str, group: str, items: Iterable[Item]) -> list[Item]:
+    """Name items after the folder, inside the one that is checked, in which they were found."""
+    return [
+        replace(item, name=f"{folder}/{item.name}", group=f"{group}: {item.group}")
+        for item in items
+    ]
+
+
 def is_document(name: str) -> bool:
     """Whether a file is compared entry by entry."""
-    return name in _DOCUMENTS or (name.startswith("gaps/") and name.endswith((".json", ".csv")))
+    of_gap = name.startswith("gaps/") and name.endswith((".json", ".csv"))
+    return of_gap or name in (SUMMARY, MANIFEST, AUDIT, COMPARISON, RUN)
 
 
 def group_of(place: Place) -> str:
@@ -50,7 +94,7 @@ def group_of(place: Place) -> str:
     if file == SUMMARY and keys[:1] == ["models"]:
         owner, keys = f"{keys[1]}: ", keys[2:]
     elif file != RUN:
-        return {COMPARISON: "comparison", "audit.json": "audit"}.get(file, file)
+        return file.removesuffix(".json") if file in (AUDIT, COMPARISON) else file
     what = keys[0] if keys else ""
     if what in _POINTS:
         return f"{owner}estimates"
@@ -95,7 +139,22 @@ def _compared(file: str, first: str = "", *more: str) -> bool:
 def count_drawn(made: Path) -> int:
     """Return how many numbers of a folder made again follow from posterior draws."""
     there = [name for name in (SUMMARY, COMPARISON, RUN) if (made / name).is_file()]
-    return sum(is_drawn(place) for name in there[:1] for place in read_entries(made, name))
+    return sum(is_drawn(place) for name in there for place in read_entries(made, name))
+
+
+def compare_estimates(job: Job, place: Place, found: Mapping[str, Any]) -> list[Item]:
+    """Compare point estimates alone, below a place of a document.
+
+    The recorded posterior says how wide a parameter's scale is.
+    """
+    recorded, new = read_entries(job.folder, place[0]).items(), dict(flatten(found, place))
+    scale, *points = (
+        {path: value for path, value in recorded if path[: len(place) + 1] == (*place, key)}
+        for key in ("posterior", *found)
+    )
+    old = {path: value for part in points for path, value in part.items()}
+    items = compare_entries(old | scale, new | scale, group_of)
+    return [item for item in items if item.group.endswith("estimates")]
 
 
 def compare_document(name: str, job: Job, drawn: Errors | None = None) -> list[Item]:
@@ -103,31 +162,17 @@ def compare_document(name: str, job: Job, drawn: Errors | None = None) -> list[I
     try:
         old = read_entries(job.folder, name)
     except (OSError, ValueError, TypeError, RecursionError) as error:
-        note = f"it cannot be read ({type(error).__name__})"
-        return [claim(group_of((name,)), name, note)]
+        wrong = f"it cannot be read ({type(error).__name__})"
+        return [claim(group_of((name,)), name, wrong)]
     return compare_entries(old, read_entries(job.made, name), group_of, drawn)
-
-
-def compare_estimates(
-    place: Place, recorded: Mapping[str, Any], found: Mapping[str, Any]
-) -> list[Item]:
-    """Compare point estimates alone, below a place of a document.
-
-    The recorded posterior says how wide a parameter's scale is.
-    """
-    scale = {"posterior": recorded.get("posterior", {})}
-    points = {key: recorded.get(key, {}) for key in found}
-    old, new = (dict(flatten({**part, **scale}, place)) for part in (points, found))
-    items = compare_entries(old, new, group_of)
-    return [item for item in items if item.group.endswith("estimates")]
 
 
 def compare_file(
     name: str, job: Job, judged: Callable[[str], tuple[str | None, bool]], *, sure: bool = True
 ) -> list[Item]:
-    """Compare a file with the one made again; of a page `judged` as `compare_page` asks for it.
+    """Compare another file with the one made again; a page is `judged` as by `compare_page`.
 
-    Where one is missing, that is a difference if it is `sure` that it must be there.
+    Where it is missing, that is a difference if it is `sure` that it must be there.
     """
     old, new = job.folder / name, job.made / name
     if not old.is_file():
@@ -135,36 +180,19 @@ def compare_file(
     if name.endswith(".nc"):
         return [compare_posterior(name, old, new)]
     if name.endswith((".png", ".pdf")):
-
-        def others() -> dict[str, bytes]:
-            paths = job.made.rglob(f"*{new.suffix}")
-            return {p.relative_to(job.made).as_posix(): p.read_bytes() for p in paths}
-
-        return [compare_figure(name, old.read_bytes(), new.read_bytes(), others)]
+        drawn = {p.relative_to(job.made).as_posix(): p for p in job.made.rglob(f"*{new.suffix}")}
+        return [compare_figure(name, old.read_bytes(), drawn)]
     items = [compare_page(name, job.folder, job.made, judged)]
-    if name.endswith(".html") and items[0].status is not Status.IDENTICAL:
-        items += _own_pictures(name, job)
-    return items
-
-
-def _own_pictures(page: str, job: Job) -> list[Item]:
-    """Compare the pictures that a page alone has with those drawn again, in their order."""
-    folders = (job.folder, job.made)
-    texts = [(f / page).read_text(encoding="utf-8", errors="replace") for f in folders]
-    recorded, drawn = map(own_pictures, texts, folders)
-    if len(recorded) != len(drawn):
-        note = f"it has {len(recorded)} pictures of its own, not {len(drawn)}"
-        return [claim("figures", page, note)]
-    named = {f"{page}: picture {i + 1}": image for i, image in enumerate(drawn)}
-    return [
-        compare_figure(name, old, named[name], lambda: named)
-        for name, old in zip(named, recorded, strict=True)
-    ]
-
-
-def blame(items: Iterable[Item], file: str, note: str) -> list[Item]:
-    """Name the input that some numbers cannot have been computed from, if most are different."""
-    return [claim(INPUTS, file, note)] if mostly_different(items) else []
+    if items[0].status is Status.IDENTICAL:
+        return items
+    # The pictures that a page alone has, in their order.
+    recorded, again = (own_pictures(read_text(f / name), f) for f in (job.folder, job.made))
+    if len(recorded) != len(again):
+        wrong = f"it has {len(recorded)} pictures of its own, not {len(again)}"
+        return [*items, claim(FIGURES, name, wrong)]
+    named = {f"{name}: picture {i + 1}": picture for i, picture in enumerate(again)}
+    pairs = zip(named, recorded, strict=True)
+    return items + [compare_figure(picture, shown, named) for picture, shown in pairs]
 
 
 def moved_parts(items: Iterable[Item]) -> tuple[set[str], set[str]]:

@@ -15,7 +15,7 @@ import numpy as np
 
 from calib.check.numbers import flatten, inside, read_json
 from calib.check.outcome import Item, Status, claim
-from calib.check.text import GROUP, differing_lines
+from calib.check.text import GROUP, differing_lines, read_text
 from calib.errors import CalibError
 from calib.gap.corrected import load_corrected
 from calib.gap.files import answer
@@ -49,32 +49,25 @@ def verify_derived(
     failed, found = [], dict[str, Item]()
     for source, write in writers.items():
         try:
-            found |= {
-                name: _written(folder / name, name, source, text, sure=sure)
-                for name, text in write().items()
-            }
+            for name, text in write().items():
+                wrong = _wrong(folder / name, text, source)
+                found[name] = claim(GROUP, name, wrong, f"it follows from {source}", sure=sure)
         except (CalibError, *_FAULTS) as error:
-            note = f"what follows from it cannot be written ({type(error).__name__}: {error})"
-            failed.append(claim(GROUP, source, note, sure=sure))
-    if not failed:
-        for name in derived_files(files) - set(found):
-            found[name] = _judged(name, "it follows from nothing here", sure=sure)
+            wrong = f"what follows from it cannot be written ({type(error).__name__}: {error})"
+            failed.append(claim(GROUP, source, wrong, sure=sure))
+    for name in derived_files(files) - set(found) if not failed else ():
+        found[name] = claim(GROUP, name, "it follows from nothing here", sure=sure)
     return failed + [found[name] for name in sorted(found)]
 
 
-def _written(path: Path, name: str, source: str, text: str, *, sure: bool) -> Item:
+def _wrong(path: Path, text: str, source: str) -> str:
+    """Say what is wrong with a file that must have some text; nothing where it has."""
     if not path.is_file():
-        return _judged(name, f"missing, though {source} gives it", sure=sure)
+        return f"missing, though {source} gives it"
     if path.read_bytes() == text.encode():
-        return _judged(name, "", f"it follows from {source}", sure=sure)
-    found = path.read_text(encoding="utf-8", errors="replace").splitlines()
-    lines = differing_lines(found, text.splitlines())
-    return _judged(name, f"it does not follow from {source}: {lines}", sure=sure)
-
-
-def _judged(name: str, wrong: str, right: str = "", *, sure: bool) -> Item:
-    other = "another version wrote it; " if wrong and not sure else ""
-    return claim(GROUP, name, other + wrong, right, sure=sure)
+        return ""
+    lines = differing_lines(read_text(path).splitlines(), text.splitlines())
+    return f"it does not follow from {source}: {lines}"
 
 
 def verify_form(folder: Path) -> list[Item]:
@@ -111,7 +104,7 @@ def verify_gaps(folder: Path, summary: Mapping[str, Any], *, same_code: bool) ->
             )
             wrong = _mispredicted(place, diagnosis)
             right = "it predicts the gaps of diagnosis.json"
-            items.append(_judged(f"gaps/{name}/corrected.json", wrong, right, sure=same_code))
+            items.append(claim(GROUP, f"gaps/{name}/corrected.json", wrong, right, sure=same_code))
     return items
 
 

@@ -12,6 +12,7 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from functools import lru_cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,30 +25,26 @@ from calib.models.base import Array
 GROUP = "figures"
 # Root mean square difference of grey levels from 0 to 1 of figures reduced to 64 x 64. Other draws
 # of the same posterior move a figure by up to 0.05, most by 0.02; two different ones by over 0.04.
-_ALIKE = 0.08
-_SIDE = 64
+_ALIKE, _SIDE = 0.08, 64
 _STREAM = re.compile(rb"stream\r?\n(.*?)\r?\nendstream", re.DOTALL)
 
 
-def compare_figure(
-    name: str, recorded: bytes, drawn: bytes, others: Callable[[], Mapping[str, bytes]]
-) -> Item:
-    """Compare a figure with the one drawn again, among all drawn again (PNG or PDF files).
+def compare_figure(name: str, recorded: bytes, drawn: Mapping[str, Path | bytes]) -> Item:
+    """Compare a figure with the one of its name among all drawn again, all of them PNG or PDF.
 
-    `others` are asked for where the figure is not the same byte for byte.
+    They are looked at where it is not the same byte for byte.
     """
-    if recorded == drawn:
+    again = _content(drawn[name])
+    if recorded == again:
         return Item(GROUP, name, Status.IDENTICAL)
-    printed = drawn.startswith(b"%PDF")
+    printed = again.startswith(b"%PDF")
     look: Callable[[bytes], Any] = _ink if printed else _thumbnail
     distance: Callable[[Any, Any], float] = _unshared if printed else _distance
     seen = look(recorded)
     if seen is None:
         return claim(GROUP, name, "it is no readable image")
-    all_again = {other: look(content) for other, content in {**others(), name: drawn}.items()}
-    apart = {
-        other: distance(seen, shown) for other, shown in all_again.items() if shown is not None
-    }
+    shown = {other: look(_content(image)) for other, image in drawn.items()}
+    apart = {other: distance(seen, one) for other, one in shown.items() if one is not None}
     nearest, own = min(apart, key=lambda other: apart[other]), apart[name]
     status, note = Status.WITHIN, "it looks like the one drawn again"
     if apart[nearest] < own:
@@ -57,6 +54,10 @@ def compare_figure(
     elif own > _ALIKE:
         status, note = Status.DIFFERENT, "it does not look like the one drawn again"
     return Item(GROUP, name, status, round(own, 4), 0.0, _ALIKE, f"{note} (grey difference)")
+
+
+def _content(image: Path | bytes) -> bytes:
+    return image.read_bytes() if isinstance(image, Path) else image
 
 
 @lru_cache(maxsize=100)

@@ -29,8 +29,13 @@ def verify_files(
     for name in left_out:
         if not name.endswith(".nc") or "/" in name:
             items.append(claim(FILES, name, "missing: only posteriors may be left out"))
-    there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
-    return items + [claim(FILES, name, "not listed") for name in sorted(there - {own, *listed})]
+    strangers = files_in(folder) - {own, *listed}
+    return items + [claim(FILES, name, "not listed") for name in sorted(strangers)]
+
+
+def files_in(folder: Path) -> set[str]:
+    """Return the names of all files below a folder."""
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
 
 
 def _listed(path: Path, own: str, name: str, expected: str) -> Item:
@@ -65,3 +70,9 @@ def verify_priors(key: str, entry: TaskRecord, folder: Path, *, same_code: bool)
     same = (folder / file).read_bytes() == shipped.read_bytes()
     wrong = "" if same else f"not the {shipped.name} of this version"
     return claim(GROUP, file, wrong, f"the shipped {shipped.name}", sure=same_code)
+
+
+def blame(items: Iterable[Item], file: str, wrong: str) -> list[Item]:
+    """Name the input that some numbers cannot have been computed from, if most are different."""
+    different = [i.status is Status.DIFFERENT for i in items if isinstance(i.recorded, float)]
+    return [claim(GROUP, file, wrong)] if sum(different) > 0.5 * len(different) else []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, Literal
@@ -57,12 +57,6 @@ def claim(group: str, name: str, wrong: str, right: str = "", *, sure: bool = Tr
     if not wrong:
         return Item(group, name, Status.IDENTICAL, note=right)
     return Item(group, name, Status.DIFFERENT if sure else Status.UNJUDGED, note=wrong)
-
-
-def mostly_different(items: Iterable[Item]) -> bool:
-    """Whether more than half of the numbers among some items are different."""
-    different = [i.status is Status.DIFFERENT for i in items if isinstance(i.recorded, float)]
-    return sum(different) > 0.5 * len(different)
 
 
 SCHEMA = "calib/check/1"

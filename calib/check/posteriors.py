@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -56,6 +56,22 @@ def _read(path: Path, *only: str) -> Groups:
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
         note = f"the file cannot be read ({type(error).__name__})"
         raise CalibError(note, where=str(path)) from None
+
+
+def verify_posterior(
+    path: Path, problem: Callable[[], Problem], stated: Mapping[str, Any] | None = None
+) -> list[Item]:
+    """Hold a file of draws, if it is there, against its summary if stated, data and priors."""
+    if not path.is_file():
+        return []
+    items = []
+    try:
+        file = read_draws(path)
+        items += [] if stated is None else [verify_summary(path.name, file, stated)]
+        items.append(verify_density(path.name, file, problem()))
+    except CalibError as error:
+        items.append(claim(GROUP, path.name, error.message))
+    return items
 
 
 def verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Item:

@@ -22,12 +22,12 @@ from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS
-from calib.report.comparison import FILE as COMPARISON
 from calib.report.sections import SECTIONS
 from calib.report.study_tasks import HoldOut
 
-MANIFEST, SUMMARY = "manifest.json", "summary.json"
-RUN, POSTERIOR, PRIORS, DATA = "run.json", "posterior.nc", "priors.toml", "data.csv"
+MANIFEST, SUMMARY, AUDIT = "manifest.json", "summary.json", "audit.json"
+COMPARISON, RUN = "comparison.json", "run.json"
+POSTERIOR, PRIORS, DATA = "posterior.nc", "priors.toml", "data.csv"
 
 
 def _inside(path: str) -> str:

@@ -29,6 +29,11 @@ _WIDTH = 120
 _PLAIN = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻\u2212", "0123456789--")
 
 
+def read_text(path: Path) -> str:
+    """Return a text, whatever somebody made of it."""
+    return path.read_text(encoding="utf-8", errors="replace")
+
+
 def verify_images(page: str, folder: Path) -> list[Item]:
     """Check that every picture in a page is one of the folder's figures, and the other way."""
     figures = _figures(folder)
@@ -61,8 +66,8 @@ def _decoded(encoded: str) -> bytes:
 
 def own_pictures(content: str, folder: Path) -> list[bytes]:
     """Return the pictures of a page that are none of the folder's figures, in their order."""
-    known = _figures(folder)
-    pictures = map(_decoded, _IMAGE.findall(content))
+    pictures = [_decoded(encoded) for encoded in _IMAGE.findall(content)]
+    known = _figures(folder) if pictures else {}
     return [picture for picture in pictures if sha256(picture) not in known]
 
 
@@ -103,7 +108,7 @@ def compare_page(
 
 def _readable(folder: Path, name: str) -> list[str]:
     """Lines of a text, with the names of the folder's figures in the place of the pictures."""
-    text = (folder / name).read_text(encoding="utf-8", errors="replace")
+    text = read_text(folder / name)
     names = _figures(folder) if _IMAGE.search(text) else {}
 
     def named(match: re.Match[str]) -> str:

@@ -22,9 +22,10 @@ import calib.check.check_run as check_run_module
 from calib.batch.environment import sha256
 from calib.check import compare, montecarlo, posteriors
 from calib.check.check import check
+from calib.check.check_report import recompute_report
+from calib.check.check_run import recompute_run
 from calib.check.montecarlo import posterior_errors
 from calib.check.outcome import Outcome, Status
-from calib.check.recompute import recompute_report, recompute_run
 from calib.he2019 import sections
 from calib.he2019.audit.run import begin_audit
 from calib.inference.calibration import Calibration
@@ -144,7 +145,7 @@ def computed_once(_made, _read, audited_once, monkeypatch: pytest.MonkeyPatch) -
             *(t.table[c].tobytes() for t in tasks for c in t.table),
             *(t.prior_path.read_bytes() for t in tasks),
         )
-        return once(key, out, lambda kept: recompute_report(manifest, tasks, kept, progress))
+        return once(key, out, lambda kept: recompute_report(manifest, tasks, kept, progress, pool))
 
     def run_again(record, problem, out, progress):
         # All but its numbers that nothing is computed from.
@@ -175,7 +176,7 @@ def computed_once(_made, _read, audited_once, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(check_report_module, "recompute_report", report_again)
     monkeypatch.setattr(check_run_module, "recompute_run", run_again)
     monkeypatch.setattr(posteriors, "_groups", reading_once(posteriors._groups))
-    for module in (check_report_module, check_run_module, compare):
+    for module in (posteriors, compare):
         monkeypatch.setattr(module, "read_draws", reading_once(posteriors.read_draws))
 
 
