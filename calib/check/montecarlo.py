@@ -13,9 +13,10 @@ import scipy
 
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import mcse, tail_shape
+from calib.inference.random import generator
 from calib.models.base import Array
 from calib.validation.comparison import Comparison
-from calib.validation.scores import LEVELS, RELATIVE_ERROR_FAR
+from calib.validation.scores import LEVELS, RELATIVE_ERROR_FAR, crps
 from calib.validation.validate import Validation
 
 MONTE_CARLO = "Monte Carlo"
@@ -36,6 +37,8 @@ _FAMILY = 1e-3
 # Over 24 seeds of the embedded problems, numbers moved by up to 1.4 times what ArviZ expects: the
 # walkers of an ensemble are not quite independent chains.
 _SAFETY = 1.5
+# Of random draws, among which scores scatter; their sd is known to a twentieth.
+_GROUPS = 200
 # Draws of the round of importance sampling that estimates the evidence, at least.
 _EVIDENCE_DRAWS = 1500
 
@@ -43,27 +46,23 @@ _EVIDENCE_DRAWS = 1500
 def multiple(n: int) -> float:
     """Return how many standard errors of a difference are allowed where `n` are looked at.
 
-    So many that one check in a thousand finds a difference where there is none: seven of the
-    some hundred numbers of a report.
+    One check in a thousand finds a difference where there is none: seven of some hundred numbers.
     """
     return float(_SAFETY * scipy.stats.norm.isf(_FAMILY / (2 * max(n, 1))))
 
 
 def describe(n: int) -> str:
     """Say in words what is allowed to `n` numbers that follow from posterior draws."""
-    return (
-        f"{multiple(n):.1f} Monte Carlo errors of a difference (one false alarm in "
-        f"{1.0 / _FAMILY:g} checks of {n} such numbers, times {_SAFETY:g})"
-    )
+    chance = f"one false alarm in {1.0 / _FAMILY:g} checks of {n} such numbers"
+    return f"{multiple(n):.1f} Monte Carlo errors of a difference ({chance}, times {_SAFETY:g})"
 
 
 def drawn_in_output(
     calibration: Calibration, validation: Validation, n: int, steps: object
 ) -> Errors:
-    """Return what Monte Carlo error allows to the numbers of one output of a report.
+    """Return what Monte Carlo error allows to an output of a report with n drawn numbers in all.
 
-    Of the whole report n numbers follow from posterior draws; `steps` is the recorded length of the
-    other run.
+    `steps` is the recorded length of the other run.
     """
     times = multiple(n) * _of_difference(calibration, steps)
     scores = validation_errors(calibration, validation, times)
@@ -166,24 +165,27 @@ def validation_errors(
     """Return the Monte Carlo standard errors of a validation's scores.
 
     A part p of the predictive draws has the error sqrt(p (1 - p) (1/N + 1/ESS)): N draws of the
-    noise on top of ESS effective draws of the parameters. What is a mean over rows has the error of
-    the mean influence of a draw on them. How many errors will be allowed decides which rows may
-    cross the edge of a band.
+    noise on top of ESS effective draws of the parameters; others follow from the scatter among
+    groups of the draws. Rows within so many errors of the edge of a band may cross it.
     """
     draws, observed, scores = validation.draws, validation.observed, validation.scores
     n_draws, n = draws.shape
     part = float(np.sqrt(1.0 / n_draws + 1.0 / _least_ess(calibration)))
     p = np.clip(scores.pit, 4.0 / n_draws, 1.0 - 4.0 / n_draws)
     pit = np.sqrt(p * (1.0 - p)) * part
-    slope = (np.quantile(draws, 0.55, axis=0) - np.quantile(draws, 0.45, axis=0)) / 0.1
-    errors: dict[Place, float] = {}
-    errors["rmse",] = part * _rmse_influence(draws, observed, slope, scores.rmse)
+    size = max(n_draws // _GROUPS, 1)
+    groups = generator(0, "groups of draws").permutation(draws)[: n_draws - n_draws % size]
+    groups = groups.reshape(-1, size, n)
+    of_group = part * float(np.sqrt(size))
+    medians = np.median(groups, axis=1)
+    rmses = np.sqrt(np.square(medians - observed).mean(axis=1))
+    errors: dict[Place, float] = {("pit", str(i)): float(pit[i]) for i in range(n)}
+    errors["rmse",] = of_group * float(rmses.std())
     if np.isfinite(scores.crps):
-        errors["crps",] = part * _crps_influence(draws, observed)
-    errors |= {("pit", str(i)): float(pit[i]) for i in range(n)}
+        errors["crps",] = of_group * float(np.std([crps(g, observed).mean() for g in groups]))
     large = ~np.isnan(scores.relative_error)
     if large.any():
-        relative = 0.5 * part * slope[large] / np.abs(observed[large])
+        relative = of_group * medians.std(axis=0)[large] / np.abs(observed[large])
         errors["max_relative_error",] = float(relative.max())
         from_edge = np.abs(np.abs(scores.relative_error[large]) - RELATIVE_ERROR_FAR)
         near = float((from_edge <= multiple * relative).sum())
@@ -200,29 +202,6 @@ def validation_errors(
         errors["elpd",] = float(moves.sum(axis=1).std())
         errors["elpd_se",] = float((moves @ _lever_of(elpd)).std())
     return {("validation", *place): error for place, error in errors.items()}
-
-
-def _rmse_influence(draws: Array, observed: Array, slope: Array, rmse: float) -> float:
-    """Standard deviation of one draw's influence on the RMSE of the medians."""
-    if rmse == 0.0:
-        return 0.0
-    medians = np.median(draws, axis=0)
-    influence = slope * (0.5 - (draws < medians))
-    return float(((medians - observed) * influence).mean(axis=1).std() / rmse)
-
-
-def _crps_influence(draws: Array, observed: Array) -> float:
-    """Standard deviation of one draw's influence on the mean CRPS."""
-    m = draws.shape[0]
-    order = np.argsort(draws, axis=0)
-    ordered = np.take_along_axis(draws, order, axis=0)
-    total = np.cumsum(ordered, axis=0)
-    rank = np.arange(1, m + 1)[:, None]
-    # Mean absolute difference of each draw to all others, from the sums of the sorted draws.
-    sorted_apart = (ordered * (2 * rank - m) + total[-1] - 2.0 * total) / m
-    apart = np.empty_like(draws)
-    np.put_along_axis(apart, order, sorted_apart, axis=0)
-    return float((np.abs(draws - observed) - apart).mean(axis=1).std())
 
 
 def _row_moves(calibration: Calibration) -> tuple[Array, Array]:

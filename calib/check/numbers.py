@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from calib.check.montecarlo import Place
+from calib.check.montecarlo import Errors, Place
 from calib.check.outcome import Item, Status
-from calib.check.tolerances import ARITHMETIC, Of, Tolerance, natural_scale, tolerance_of
+from calib.check.tolerances import ARITHMETIC, Entries, Tolerance, natural_scale, tolerance_of
 
 NUMBER = re.compile(
     r"[-+\u2212]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+|\u00d710[\u2070-\u2079\u00b2\u00b3\u00b9\u207b]+)?"
@@ -39,10 +39,9 @@ def inside(document: Any, *keys: str) -> dict[str, Any]:
 
 
 def flatten(document: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
-    """Yield the path and the value of every entry of a JSON document.
+    """Yield path and value of every entry of a JSON document.
 
-    Entries of a list are known by their ``name`` or ``key`` where each has its own, otherwise by
-    their position.
+    Those of a list are known by their ``name`` or ``key`` where each has its own, or by position.
     """
     if isinstance(document, _PLAIN):
         yield place, document
@@ -65,11 +64,9 @@ def _names(entries: Sequence[Any]) -> list[str]:
 
 
 def compare_entries(
-    recorded: Mapping[Place, Any],
-    found: Mapping[Place, Any],
-    group_of: Callable[[Place], str],
-    drawn: Mapping[Place, float | None] | None = None,
-) -> list[Item]:
+    recorded: Entries, found: Entries, group_of: Callable[[Place], str],
+    drawn: Errors | None = None,
+) -> list[Item]:  # fmt: skip
     """Return one item for each entry, by path, the file first, of a document or a part of one.
 
     `drawn` is what Monte Carlo error allows, by path; None where there is no such error.
@@ -88,7 +85,7 @@ def compare_entries(
         elif new is _ABSENT:
             items.append(Item(group, name, beyond, old, note="not computed by this version"))
         elif _is_number(old) and type(old) is type(new):
-            size = _size(tolerance, path, min(abs(old), abs(new)), found, drawn or {})
+            size = _size(tolerance, path, old, found, drawn or {})
             items.append(_number(Item(group, name, beyond, old, new, size, tolerance.kind)))
         elif tolerance.words and without_numbers(str(old)) == without_numbers(str(new)):
             items.append(Item(group, name, Status.WITHIN, old, new, note=SAME_WORDS))
@@ -98,18 +95,16 @@ def compare_entries(
 
 
 def _size(
-    tolerance: Tolerance, path: Place, smaller: float, found: Mapping[Place, Any],
-    errors: Mapping[Place, float | None],
-) -> float | None:  # fmt: skip
+    tolerance: Tolerance, path: Place, old: float, entries: Entries, errors: Errors
+) -> float | None:
     """Largest difference that is taken for the same; None where none can be stated."""
-    if tolerance == ARITHMETIC and isinstance(found[path], int):
+    new = entries[path]
+    if tolerance == ARITHMETIC and isinstance(new, int):
         return 0.0  # a count, or a seed
-    scale = natural_scale(tolerance.of, path, found, errors)
-    if scale is None:
-        return None
-    if tolerance.of is Of.RATIO:
-        return (tolerance.part - 1.0) * smaller
-    return tolerance.part * scale + tolerance.floor
+    scale = natural_scale(tolerance.of, path, entries, errors)
+    if scale is not None and tolerance.of == "ratio":
+        return float((tolerance.part - 1.0) * min(abs(old), abs(new)))
+    return None if scale is None else tolerance.part * scale + tolerance.floor
 
 
 def _number(item: Item) -> Item:
@@ -120,10 +115,8 @@ def _number(item: Item) -> Item:
     rounded = 1e-6 * max(abs(old), abs(new)) if isinstance(old, float) else 0.0
     if abs(old - new) <= max(item.allowed or 0.0, rounded):
         return replace(item, status=Status.WITHIN)
-    if item.allowed is None:
-        note = "tail too heavy for a Monte Carlo error"
-        return replace(item, status=Status.UNJUDGED, note=note)
-    return item
+    heavy = replace(item, status=Status.UNJUDGED, note="tail too heavy for a Monte Carlo error")
+    return heavy if item.allowed is None else item
 
 
 def _is_number(value: Any) -> bool:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.check.numbers import inside
 from calib.check.outcome import Item, Status, claim
 from calib.errors import CalibError
 from calib.inference.calibration import moments
@@ -67,19 +68,18 @@ def verify_posterior(
     items = []
     try:
         file = read_draws(path)
-        items += [] if stated is None else [verify_summary(path.name, file, stated)]
-        items.append(verify_density(path.name, file, problem()))
+        items += [] if stated is None else [_verify_summary(path.name, file, stated)]
+        items.append(_verify_density(path.name, file, problem()))
     except CalibError as error:
         items.append(claim(GROUP, path.name, error.message))
     return items
 
 
-def verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Item:
+def _verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Item:
     """Check that a file's draws have the summary that is stated of them."""
     for parameter, values in file.summary.items():
         for key, value in values.items():
-            entry = stated.get(parameter)
-            given = entry.get(key) if isinstance(entry, Mapping) else None
+            given = inside(stated, parameter).get(key)
             if not isinstance(given, int | float) or not math.isclose(
                 given, value, rel_tol=_ROUNDING, abs_tol=_ROUNDING * values["sd"]
             ):
@@ -89,22 +89,13 @@ def verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Ite
     return claim(GROUP, name, "", "its draws have the summary that is stated")
 
 
-def verify_density(name: str, file: DrawsFile, problem: Problem) -> Item:
-    """Check that a file's draws have the log density that data and priors give them.
-
-    And that what is derived from parameters follows from them.
-    """
+def _verify_density(name: str, file: DrawsFile, problem: Problem) -> Item:
+    """Check that draws have the density of data and priors, and derived ones follow from them."""
     stated = file.log_prob.reshape(-1)
     missing = [p.name for p in problem.priors.entries if not p.fixed and p.name not in file.draws]
     if missing:
         return claim(GROUP, name, f"there is no {missing[0]} in it")
-    natural = np.stack(
-        [
-            np.full(stated.size, p.loc) if p.fixed else file.draws[p.name].reshape(-1)
-            for p in problem.priors.entries
-        ],
-        axis=-1,
-    )
+    natural = problem.priors.stack(file.draws, stated.shape)
     with np.errstate(all="ignore"):
         t = problem.priors.to_internal(natural, margin=0.0)
         derived = problem.bound.report(problem.of_model(natural))
@@ -124,8 +115,7 @@ def verify_density(name: str, file: DrawsFile, problem: Problem) -> Item:
 def compare_posterior(name: str, recorded: Path, drawn: Path) -> Item:
     """Compare what is beside the posterior draws in a file with the same written again.
 
-    The draws themselves may be others. They are held against their summary and their density; all
-    that goes with them may be apart by a part of its own sd.
+    It may be apart by a part of its own sd. Draws are held against their summary and density.
     """
     if recorded.read_bytes() == drawn.read_bytes():
         return Item(GROUP, name, Status.IDENTICAL)

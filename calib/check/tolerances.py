@@ -2,21 +2,15 @@
 
 Every entry of a document has one tolerance, that of the first row whose pattern fits its path. It
 follows from what the entry is, never from how others compare; what no row names is arithmetic, and
-text, flags and counts must be equal where no row says otherwise.
+text, flags and counts must be equal where no row says otherwise. The kinds:
 
-arithmetic
-    follows by sums and closed forms, which processors round otherwise in the last bits.
-optimum
-    where a deterministic search stopped: off by its stopping rule, a small part of a posterior sd.
-random search
-    one comparison of nearly equal costs that falls the other way sends it along another path.
-Monte Carlo
-    follows from posterior draws, which may be others (`calib.check.montecarlo.multiple`).
-diagnosis
-    follows from evidence and importance sampling with recorded seeds: rounding moves it only where
-    a draw changes sides of a threshold; a part of its own sd, or of one in probability.
-order of magnitude
-    tells how the work went, not what was found.
+- arithmetic: by sums and closed forms, which processors round otherwise in the last bits.
+- optimum: where a deterministic search stopped, off by a small part of a posterior sd.
+- random search: one comparison of nearly equal costs that falls the other way sends it elsewhere.
+- Monte Carlo: of posterior draws, which may be others (`calib.check.montecarlo.multiple`).
+- diagnosis: of evidence and importance sampling with recorded seeds, which rounding moves where a
+  draw changes sides of a threshold; a part of its own sd, or of one in probability.
+- order of magnitude: how the work went, not what was found.
 """
 
 from __future__ import annotations
@@ -24,65 +18,48 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from functools import cache
-from typing import Any
+from itertools import product
+from typing import Any, Literal
 
-from calib.check.montecarlo import MONTE_CARLO, Place
+from calib.check.montecarlo import MONTE_CARLO, Errors, Place
+from calib.validation.sensitivity import Sensitivity
 
 ORDER_OF_MAGNITUDE = "order of magnitude"
 
 type Entries = Mapping[Place, Any]
-
-
-class Of(StrEnum):
-    """The natural scale that a tolerance is a part of."""
-
-    ITSELF = "of it"
-    ONE = ""
-    POSTERIOR = "posterior sd"
-    ERROR = "Monte Carlo errors"
-    ITS_SD = "of the sd beside it"
-    BAND = "of its band's width"
-    INTERVAL = "of its interval's width"
-    RATIO = "times smaller or larger"
-    UNEXPLAINED = "of it over what is left unexplained"
-    REST = "of what it leaves to one"
+type Of = Literal[
+    "itself", "one", "posterior sd", "Monte Carlo error", "sd beside it", "width of its interval",
+    "ratio", "what is left unexplained", "what is left to one",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Tolerance:
     """What is taken for the same, of entries of a kind that the module's docstring names.
 
-    Parameters
-    ----------
-    part : float
-        Largest difference in units of the natural scale.
-    floor : float
-        Added to it, in the entry's own unit.
-    words : bool
-        Text, which may differ in its numbers.
-    judged : bool
-        Whether a difference beyond it is called one; if not, it is listed as not judged.
+    The largest difference is a `part` of the natural scale that it is `of`, and a `floor` in the
+    entry's own unit. Text may differ in its numbers if `words`; a difference beyond is called one
+    if it is `judged`.
     """
 
     kind: str
     part: float = 0.0
-    of: Of = Of.ITSELF
+    of: Of = "itself"
     floor: float = 0.0
     words: bool = False
     judged: bool = True
 
 
 ARITHMETIC = Tolerance("arithmetic", 1e-6)
-_DRAWN = Tolerance(MONTE_CARLO, 1.0, Of.ERROR)
+_DRAWN = Tolerance(MONTE_CARLO, 1.0, "Monte Carlo error")
 _JUMPS = Tolerance("one of several nearly equal modes", judged=False)
 _READ_OFF = Tolerance("read off numbers against thresholds")
 _SIDES = Tolerance("which side of a threshold a number is on", judged=False)
 
 
 def _chance(part: float) -> Tolerance:
-    return Tolerance("diagnosis", part, Of.ONE)
+    return Tolerance("diagnosis", part, "one")
 
 
 _M, _GAP, _FOUND = "summary.json/models/*", "summary.json/paper_gaps/*", "gaps/*/diagnosis.json"
@@ -96,46 +73,46 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     (f"({_M}/fit/*/evaluations|{_M}/sampling/gate/smallest_*|run.json/shape/*|"
      f"({_M}/posterior/*|run.json/gate)/(ess_bulk|ess_tail)(|/*)|"
      f"({_M}/sampling|run.json|run.json/gate)/(steps|tau|evaluations|efficiency)(|/*))",
-     Tolerance(ORDER_OF_MAGNITUDE, 10.0, Of.RATIO)),
-    (f"{_M}/posterior/*/mcse_*", Tolerance(ORDER_OF_MAGNITUDE, 5.0, Of.RATIO)),
+     Tolerance(ORDER_OF_MAGNITUDE, 10.0, "ratio")),
+    (f"{_M}/posterior/*/mcse_*", Tolerance(ORDER_OF_MAGNITUDE, 5.0, "ratio")),
     (f"({_M}/posterior/*/rhat|{_M}/sampling/gate/largest_rhat|run.json/gate/rhat/*)",
-     Tolerance(ORDER_OF_MAGNITUDE, 0.01, Of.ONE)),
-    (f"({_M}/sampling|run.json)/acceptance", Tolerance(ORDER_OF_MAGNITUDE, 0.1, Of.ONE)),
+     Tolerance(ORDER_OF_MAGNITUDE, 0.01, "one")),
+    (f"({_M}/sampling|run.json)/acceptance", Tolerance(ORDER_OF_MAGNITUDE, 0.1, "one")),
     (f"({_M}/fit/*/note|audit.json/findings/*/evidence)", Tolerance("words", words=True)),
     # Some from the mode, which stops a little elsewhere.
     (f"(({_M}/sampling|run.json/gate)/reasons|{_M}/warnings|{_M}/noise/against_normal/sentence)"
      "(|/*)", Tolerance("words", words=True, judged=False)),
     # Point estimates
-    (f"{_M}/estimates/{_SEARCHES}/*", Tolerance("random search", 1.0, Of.POSTERIOR)),
+    (f"{_M}/estimates/{_SEARCHES}/*", Tolerance("random search", 1.0, "posterior sd")),
     (f"({_M}/(estimates/*|sampling/mode)|run.json/(estimates/*/reported|mode))/*",
-     Tolerance("optimum", 0.005, Of.POSTERIOR)),
+     Tolerance("optimum", 0.005, "posterior sd")),
     (f"{_M}/(fit|by_pressure/*)/{_SEARCHES}/(cost|rmse|r_squared)",
      Tolerance("random search", 1e-3)),
-    (f"{_M}/fit/*/(cost|rmse)", Tolerance("arithmetic", 1e-6, Of.UNEXPLAINED)),
-    (f"{_M}/by_pressure/*/*/cost", ARITHMETIC),
+    (f"{_M}/fit/*/(cost|rmse)", Tolerance("arithmetic", 1e-6, "what is left unexplained")),
+    (f"({_M}/by_pressure/*|run.json/estimates)/*/(cost|rmse)",
+     Tolerance("arithmetic", 1e-6, floor=1e-12)),
     (f"{_M}/by_pressure/*/{_SEARCHES}/*", Tolerance("random search", 0.05)),
     (f"{_M}/by_pressure/*/*/*", Tolerance("optimum", 1e-4)),
-    ("run.json/estimates/*/(cost|rmse)", Tolerance("arithmetic", 1e-6, floor=1e-12)),
     ("run.json/estimates/*/theta/*", Tolerance("optimum", 0.01, floor=1e-6)),
-    (f"{_M}/sampling/log_posterior_at_mode", Tolerance("optimum", 1e-5, Of.ONE)),
+    (f"{_M}/sampling/log_posterior_at_mode", Tolerance("optimum", 1e-5, "one")),
     # What is drawn from posteriors
-    (f"({_M}|run.json)/posterior/*/(mean|sd|median|hdi_lower|hdi_upper|posterior_to_prior_sd)",
-     _DRAWN),
-    (f"({_M}/sampling|run.json)/log_evidence", _DRAWN),
+    (f"({_M}|run.json)/(posterior/*/(mean|sd|median|hdi_lower|hdi_upper|posterior_to_prior_sd)|"
+     "(sampling/|)log_evidence)", _DRAWN),
     (f"{_M}/validation/(rmse|crps|max_relative_error|elpd|elpd_se|n_relative_error_above_6_percent|"
      "(pit|coverage|coverage_interval)/*)", _DRAWN),
     (f"{_COMPARED}/(elpd|elpd_rows/*|elpd_se|below_best|below_best_se|rmse|crps|coverage_90|"
      "log_evidence)", _DRAWN),
     # Fitted to the 190 largest of 4000 weights, k has an sd of (1 + k)/sqrt(190), which is 0.1.
     (f"({_M}/validation/largest_pareto_k|{_COMPARED}/pareto_k_max)",
-     Tolerance(MONTE_CARLO, 1.0, Of.ONE)),
+     Tolerance(MONTE_CARLO, 1.0, "one")),
     # Smoothed importance sampling of two posteriors: three seeds moved the sum of 24 rows by 0.08,
     # and by half of it where it was that of one row off by a hundred times.
     (f"{_M}/noise/against_normal/(elpd_difference|se)", Tolerance(MONTE_CARLO, 0.7, floor=1.0)),
     # Eight seeds moved it by no more than half of this.
     (f"{_M}/prior_sensitivity/parameters/*/(prior|likelihood)",
      Tolerance(MONTE_CARLO, 1.0, floor=0.04)),
-    (f"{_M}/prior_sensitivity/parameters/*/contraction", Tolerance(MONTE_CARLO, 0.7, Of.REST)),
+    (f"{_M}/prior_sensitivity/parameters/*/contraction",
+     Tolerance(MONTE_CARLO, 0.7, "what is left to one")),
     (f"{_M}/prior_sensitivity/parameters/*/(identified|reading)", _READ_OFF),
     # What is read off differences of models is held against their rows (check_comparison); of two
     # models much alike either may take all the weight.
@@ -162,18 +139,18 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     (f"({_GAP}/probability/*|{_FOUND}/(effects/*|inclusion/*|remainder)/probability)",
      _chance(0.05)),
     (f"{_GAP}/open_sd_rms", Tolerance("diagnosis", 0.05)),
-    (f"{_PARAMETERS}/mean", Tolerance("diagnosis", 0.1, Of.ITS_SD)),
+    (f"{_PARAMETERS}/mean", Tolerance("diagnosis", 0.1, "sd beside it")),
     (f"{_PARAMETERS}/sd", Tolerance("diagnosis", 0.1)),
-    (f"{_FOUND}/where/*/gap", Tolerance("diagnosis", 0.3, Of.ITS_SD)),
+    (f"{_FOUND}/where/*/gap", Tolerance("diagnosis", 0.3, "sd beside it")),
     (f"{_FOUND}/where/*/gap_sd", Tolerance("diagnosis", 0.25)),
     (f"{_FOUND}/where/*/probability", _chance(0.15)),
     ("gaps/*/fresh_prediction.csv/*/*_(before|after|after_lower|after_upper)",
-     Tolerance("diagnosis", 0.2, Of.BAND)),
+     Tolerance("diagnosis", 0.2, "width of its interval")),
     # A hundredth of a posterior sd, of coordinates of the order of one.
     ("gaps/*/corrected.json/lab_mode/*/*", Tolerance("optimum", 1e-3, floor=1e-3)),
     # The audit: least costs of searches from many starts; two findings rest on posterior draws.
     ("audit.json/findings/(table6_likelihood|table6_prediction_at_30)/found/*",
-     Tolerance(MONTE_CARLO, 0.15, Of.INTERVAL)),
+     Tolerance(MONTE_CARLO, 0.15, "width of its interval")),
     ("audit.json/findings/*/found/*", Tolerance("random search", 1e-3)),
 )  # fmt: skip
 
@@ -186,7 +163,7 @@ def tolerance_of(place: Place, entries: Entries) -> Tolerance:
     found = _row("/".join(place))
     if found is _READ_OFF:
         return _SIDES if _near_threshold(place, entries) else ARITHMETIC
-    if found.of is Of.ITS_SD and "effects" in place:
+    if found.of == "sd beside it" and "effects" in place:
         hypothesis = place[: place.index("effects") + 2]
         if (entries.get((*hypothesis, "probability")) or 0.0) < _COUNTS:
             return replace(found, judged=False)
@@ -199,22 +176,18 @@ def is_drawn(place: Place) -> bool:
 
 
 def _near_threshold(place: Place, entries: Entries) -> bool:
-    """Whether a number that a reading is read off is near its threshold."""
-    for name, threshold in (
-        ("contraction", "contraction_at_least"),
-        ("prior", "power_scaling_threshold"),
-        ("likelihood", "power_scaling_threshold"),
-    ):
+    """Whether numbers that a reading is read off turn it when they move a little."""
+    ends = []
+    for name in ("prior", "likelihood", "contraction"):
         at = (*place[:-1], name)
-        value, limit = entries.get(at), entries.get((*place[:-3], "criteria", threshold))
-        if not isinstance(value, float) or not isinstance(limit, float):
+        value, row = entries.get(at), _row("/".join(at))
+        if not isinstance(value, float):
             return True
-        row = _row("/".join(at))
         # Other seeds moved it by no more than half of its tolerance.
-        scale = natural_scale(row.of, at, entries, {}) or 0.0
-        if abs(value - limit) <= 0.5 * (row.part * scale + row.floor):
-            return True
-    return False
+        size = 0.5 * (row.part * (natural_scale(row.of, at, entries, {}) or 0.0) + row.floor)
+        ends.append((value - size, value + size))
+    moved = (Sensitivity("", *numbers) for numbers in product(*ends))
+    return len({(s.identified, s.reading) for s in moved}) > 1
 
 
 @cache
@@ -229,51 +202,44 @@ _PATTERNS = tuple(
 )
 
 
-def natural_scale(
-    of: Of, place: Place, entries: Entries, errors: Mapping[Place, float | None]
-) -> float | None:
+def natural_scale(of: Of, place: Place, entries: Entries, errors: Errors) -> float | None:
     """Return the natural scale of a number, by its path among entries computed again, or None.
 
-    `errors` is what Monte Carlo error allows, by paths; None where a tail is too heavy for one.
+    `errors` is what Monte Carlo error allows, by paths.
     """
     *above, last = place
     value = entries.get(place)
     size = abs(value) if isinstance(value, int | float) else 0.0
     match of:
-        case Of.ONE:
+        case "one":
             return 1.0
-        case Of.ERROR:
+        case "Monte Carlo error":
             return errors.get(place, 0.0)
-        case Of.REST:
+        case "what is left to one":
             return 1.0 - size
-        case Of.UNEXPLAINED:
+        case "what is left unexplained":
             return size / max(1.0 - (entries.get((*above, "r_squared")) or 0.0), 1e-9)
-        case Of.RATIO if last.startswith("mcse_") and errors.get((*above, "sd"), 0.0) is None:
+        case "ratio" if last.startswith("mcse_") and errors.get((*above, "sd"), 0.0) is None:
             return None
-        case Of.POSTERIOR:
+        case "posterior sd":
             return _posterior_sd(place, entries, errors) or size
-        case Of.ITS_SD:
+        case "sd beside it":
             return entries.get((*above, {"mean": "sd", "gap": "gap_sd"}[last]))
-        case Of.BAND:
-            stem = re.sub(r"_(before|after|after_lower|after_upper)$", "_after_", last)
-            return _between((*above, stem), entries)
-        case Of.INTERVAL:
-            return _between((*above, ""), entries)
+        case "width of its interval":
+            band = re.fullmatch(r"(.*)_(before|after|after_lower|after_upper)", last)
+            return _width((*above, f"{band[1]}_after_" if band else ""), entries)
     return size
 
 
-def _posterior_sd(place: Place, entries: Entries, errors: Mapping[Place, float | None]) -> float:
+def _posterior_sd(place: Place, entries: Entries, errors: Errors) -> float:
     """A quarter of the 95 % interval of the parameter, from the posterior in the same document."""
     if place in errors:
         return errors[place] or 0.0
-    for end in range(len(place) - 1, 0, -1):
-        ends = (*place[:end], "posterior", place[-1], "hdi_")
-        if (*ends[:-1], "hdi_lower") in entries:
-            return 0.25 * (_between(ends, entries) or 0.0)
-    return 0.0
+    ends = ((*place[:i], "posterior", place[-1], "hdi_") for i in range(len(place) - 1, 0, -1))
+    return next((0.25 * width for width in (_width(e, entries) for e in ends) if width), 0.0)
 
 
-def _between(ends: Place, entries: Entries) -> float | None:
+def _width(ends: Place, entries: Entries) -> float | None:
     """Width of an interval, by the path of both ends without lower or upper."""
     low, high = (entries.get((*ends[:-1], f"{ends[-1]}{end}")) for end in ("lower", "upper"))
     if isinstance(low, int | float) and isinstance(high, int | float):

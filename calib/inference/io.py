@@ -294,15 +294,7 @@ def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
 def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Return the internal coordinates, of a shape, and their log densities."""
     groups = read_netcdf(path, "posterior", "sample_stats").values
-    natural = np.stack(
-        [
-            np.full(shape[:-1], p.loc)
-            if p.fixed
-            else groups["posterior"][p.name].reshape(shape[:-1])
-            for p in priors.entries
-        ],
-        axis=-1,
-    )
+    natural = priors.stack(groups["posterior"], shape[:-1])
     log_prob = groups["sample_stats"]["lp"].reshape(shape[:-1])
     t = priors.to_internal(natural.reshape(-1, natural.shape[-1]), margin=0.0).reshape(shape)
     return t, log_prob
