@@ -3,32 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from calib.check import compare, verify
 from calib.check.check_run import compare_run, consistent_run, verify_run
-from calib.check.compare import (
-    Job,
-    compare_document,
-    compare_file,
-    count_drawn,
-    not_computed,
-    within,
-)
-from calib.check.derived import verify_derived
-from calib.check.inputs import verify_files
+from calib.check.compare import Job
 from calib.check.montecarlo import drawn_in_comparison
 from calib.check.numbers import flatten, inside
 from calib.check.outcome import Item, Status, claim
 from calib.check.schema import COMPARISON as FILE
-from calib.check.schema import DATA, RUN, ComparisonRecord, RunRecord, read_record
-from calib.data import read_for_model
+from calib.check.schema import (
+    DATA,
+    MANIFEST,
+    RUN,
+    ComparisonRecord,
+    Manifest,
+    RunRecord,
+    read_record,
+)
+from calib.data import Table, read_for_model, read_table
+from calib.data.quantities import OUTPUTS
 from calib.inference.io import run_problem
 from calib.inference.problem import Problem
+from calib.models import get_model
+from calib.report.compared import FOLDER
 from calib.report.comparison import FIGURE, HELD_OUT, PAGE, page, stated_of_rows, write_comparison
+from calib.report.study_tasks import Task, fitted_rows
 from calib.validation.comparison import Comparison, compare_problems, stacking_weights
 
 _GROUP = "comparison"
@@ -38,8 +42,8 @@ _ROUNDING = 1e-6
 
 def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
     """Return what was found in a comparison."""
-    items = verify_files(job.folder, FILE, record.files) + _follows(record, job)
-    with not_computed(items, job.folder, FILE):
+    items = verify.files(job.folder, FILE, record.files) + _follows(record, job)
+    with compare.not_computed(items, job.folder, FILE):
         inner = {name: job.inside(f"runs/{name}") for name in record.models}
         runs = {name: read_record(RunRecord, of.folder) for name, of in inner.items()}
         problems = {n: _problem(run, inner[n].folder / DATA, record) for n, run in runs.items()}
@@ -48,7 +52,7 @@ def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
             found += consistent_run(run, problems[name], inner[name])
             if run.model != name:
                 found.append(claim(_GROUP, RUN, f"it is of the model {run.model}"))
-            items += within(f"runs/{name}", name, found)
+            items += compare.within(f"runs/{name}", name, found)
         same = len({(of.folder / DATA).read_bytes() for of in inner.values()}) == 1
         wrong = "" if same else "the models were fitted to different rows"
         right = "the rows of all models are the same"
@@ -56,14 +60,13 @@ def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
         if not job.quick:
             again = _recompute(record, problems, job)
             steps = {name: inside(r.document, "gate").get("steps") for name, r in runs.items()}
-            drawn = drawn_in_comparison(again, count_drawn(job.made), steps)
+            drawn = drawn_in_comparison(again, compare.count_drawn(job.made), steps)
             sizes = {(FILE, "models", *place): size for place, size in drawn.items()}
-            items += compare_document(FILE, job, sizes)
+            items += compare.document(FILE, job, sizes)
             for c in again.candidates:
                 found = compare_run(runs[c.model], c.calibration, inner[c.model])
-                items += within(f"runs/{c.model}", c.model, found)
-            if (job.folder / FIGURE).is_file():
-                items += compare_file(FIGURE, job, lambda section: (None, True))
+                items += compare.within(f"runs/{c.model}", c.model, found)
+            items += compare.file(FIGURE, job)
     return items
 
 
@@ -108,7 +111,7 @@ def _follows(record: ComparisonRecord, job: Job) -> list[Item]:
 
     shown = {FILE: lambda: {PAGE: page(record.document, (job.folder / FIGURE).read_bytes())}}
     sure = record.environment.same_program(job.here)
-    return items + verify_derived(job.folder, (), shown, sure=sure)
+    return items + verify.derived(job.folder, (), shown, sure=sure)
 
 
 def _problem(run: RunRecord, data: Path, record: ComparisonRecord) -> Problem:
@@ -120,3 +123,48 @@ def _problem(run: RunRecord, data: Path, record: ComparisonRecord) -> Problem:
     if not record.header:
         return problem
     return problem.with_table(replace(problem.table, header=record.header, text=()))
+
+
+def check_compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list[Item]:
+    """Check the comparison of models in a report: of its rows and seed, stated as it was found."""
+    record = read_record(ComparisonRecord, job.folder)
+    items = compare.within(FOLDER, FOLDER, check_comparison(record, job))
+    stated = inside(manifest.sections, "comparison")
+    same = {
+        "models",
+        "verdict",
+        "seed",
+    } <= stated.keys() and stated.items() <= record.document.items()
+    output = get_model(next(iter(record.models))).output
+    [task] = [task for task in tasks if OUTPUTS[task.output] == output]
+    rows, held = fitted_rows(task)
+    kept = {job.folder / "runs" / name / DATA: rows for name in record.models}
+    held_out = {job.folder / HELD_OUT: held} if record.held_out or held is not None else {}
+    own = all(_has_rows(path, table) for path, table in {**kept, **held_out}.items())
+    # By the names of columns values are shown in the units of the file.
+    header = record.header == manifest.tasks[task.output].data.header
+    for fits, name, what in (
+        (
+            same and {"models", "verdict", "seed"} <= stated.keys(),
+            f"{MANIFEST}: comparison",
+            "what its comparison.json has",
+        ),
+        (
+            own and record.seed == manifest.seed,
+            f"{FOLDER}/{FILE}",
+            "of the report's own rows and seed",
+        ),
+        (header, f"{FOLDER}/{FILE}: header", "the column names of the report's own file"),
+    ):
+        items.append(claim(FOLDER, name, "" if fits else f"it is not {what}", what))
+    return items
+
+
+def _has_rows(path: Path, table: Table | None) -> bool:
+    """Whether a file has the rows of a table."""
+    if table is None:
+        return False
+    kept = read_table(path, allow_missing=tuple(OUTPUTS.values())).columns
+    return kept.keys() == table.columns.keys() and all(
+        np.array_equal(values, table[name], equal_nan=True) for name, values in kept.items()
+    )

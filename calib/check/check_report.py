@@ -9,39 +9,27 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calib.batch.environment import sha256
 from calib.batch.pool import Pool
-from calib.check.check_comparison import check_comparison
-from calib.check.compare import (
-    Job,
-    compare_document,
-    compare_estimates,
-    compare_file,
-    count_drawn,
-    is_document,
-    moved_parts,
-    not_computed,
-    part_of,
-    within,
-)
-from calib.check.derived import derived_files, verify_derived, verify_form, verify_gaps
-from calib.check.inputs import blame, files_in, verify_files, verify_label, verify_priors
+from calib.check import compare, verify
+from calib.check.check_comparison import check_compared
+from calib.check.compare import Job
 from calib.check.montecarlo import Place, drawn_in_output
 from calib.check.numbers import inside, read_json
 from calib.check.outcome import Item, claim
 from calib.check.posteriors import GROUP as POSTERIORS
 from calib.check.posteriors import verify_posterior
-from calib.check.schema import DATA, MANIFEST, SUMMARY, ComparisonRecord, Manifest, read_record
+from calib.check.schema import (
+    MANIFEST,
+    SUMMARY,
+    Manifest,
+)
 from calib.check.text import GROUP as TEXT
 from calib.check.text import read_text, verify_images
-from calib.data import Table, read_table
+from calib.data import read_table
 from calib.data.quantities import OUTPUTS
 from calib.inference.problem import Problem, build_problem
-from calib.models import get_model
 from calib.report.compared import FOLDER
-from calib.report.comparison import HELD_OUT
 from calib.report.publish import publication
 from calib.report.sections import SECTIONS, work_out
 from calib.report.study import Progress, Study, estimate_task
@@ -57,16 +45,16 @@ def check_report(manifest: Manifest, job: Job) -> list[Item]:
     """Return what was found in a report."""
     folder, same_code = job.folder, manifest.code == job.here.code
     inputs = [(f.file, f.sha256) for t in manifest.tasks.values() for f in (t.data, t.priors)]
-    items = verify_files(folder, MANIFEST, manifest.files, more=inputs, left_out=manifest.left_out)
+    items = verify.files(folder, MANIFEST, manifest.files, more=inputs, left_out=manifest.left_out)
     summary = read_json(folder / SUMMARY)
     if (folder / _PAGE).is_file():
         items += verify_images(read_text(folder / _PAGE), folder)
-    with not_computed(items, folder, MANIFEST):
+    with compare.not_computed(items, folder, MANIFEST):
         tasks = report_tasks(manifest, folder, job.made.with_name("inputs"))
         for task in tasks:
             said, stated = manifest.tasks[task.output], inside(summary, "models", task.output)
-            items.append(verify_label(said.data.file, task.table, said.label))
-            items.append(verify_priors(task.output, said, folder, same_code=same_code))
+            items.append(verify.label(said.data.file, task.table, said.label))
+            items.append(verify.priors(task.output, said, folder, same_code=same_code))
             items += verify_posterior(
                 folder / f"{task.output}.nc", partial(_problem, task), inside(stated, "posterior")
             )
@@ -80,13 +68,13 @@ def check_report(manifest: Manifest, job: Job) -> list[Item]:
             numbers = _numbers(manifest, study, summary, job)
             items += numbers + _files(manifest, numbers, job)
         if "comparison" in manifest.sections:
-            items += _compared(manifest, tasks, job.inside(FOLDER))
-    items += verify_form(folder) + verify_gaps(folder, summary, same_code=same_code)
+            items += check_compared(manifest, tasks, job.inside(FOLDER))
+    items += verify.form(folder) + verify.gaps(folder, summary, same_code=same_code)
     writers: dict[str, Callable[[], Mapping[str, str]]] = {
         f"{SUMMARY} and {MANIFEST}": lambda: publication(manifest.document, summary).files,
         **{kind.name: partial(kind.derived, folder, manifest.files) for kind in SECTIONS.values()},
     }
-    return items + verify_derived(folder, manifest.files, writers, sure=same_code)
+    return items + verify.derived(folder, manifest.files, writers, sure=same_code)
 
 
 def report_tasks(manifest: Manifest, folder: Path, scratch: Path) -> tuple[Task, ...]:
@@ -136,19 +124,19 @@ def _estimates(task: Task, stated: Mapping[str, Any], manifest: Manifest, job: J
         name = f"{SUMMARY}: models.{task.output}"
         return [claim(f"{task.output}: error", name, wrong, sure=False)]
     found = summarise_estimates(*estimate_task(task, manifest.seed, progress=job.progress))
-    return compare_estimates(job, place, found)
+    return compare.estimates(job, place, found)
 
 
 def _numbers(manifest: Manifest, study: Study, summary: Mapping[str, Any], job: Job) -> list[Item]:
     """Compare every document entry by entry, and name the inputs that do not belong to them."""
-    n, drawn = count_drawn(job.made), dict[Place, float | None]()
+    n, drawn = compare.count_drawn(job.made), dict[Place, float | None]()
     for key, result in study.successes.items():
         steps = inside(summary, "models", key, "sampling").get("steps")
         sizes = drawn_in_output(result.calibration, result.validation, n, steps)
         drawn |= {(SUMMARY, "models", key, *path): size for path, size in sizes.items()}
-    items = compare_document(SUMMARY, job, drawn)
+    items = compare.document(SUMMARY, job, drawn)
     for key, task in manifest.tasks.items():
-        own = [item for item in items if part_of(item.group) == key]
+        own = [item for item in items if compare.part_of(item.group) == key]
         points = [
             item for item in own if item.group.endswith("estimates")
             and not any(search in item.name for search in _SEARCHES)
@@ -156,15 +144,19 @@ def _numbers(manifest: Manifest, study: Study, summary: Mapping[str, Any], job: 
         mode = [item for item in own if ".sampling.mode." in item.name]
         wrong = "most estimates in summary.json do not follow from these rows"
         other = "the posterior mode in summary.json does not follow from these priors and the data"
-        items += blame(points, task.data.file, wrong) or blame(mode, task.priors.file, other)
-    others = sorted(name for name in files_in(job.made) if is_document(name) and name != SUMMARY)
-    return items + [item for name in others for item in compare_document(name, job)]
+        items += verify.blame(points, task.data.file, wrong) or verify.blame(
+            mode, task.priors.file, other
+        )
+    others = sorted(
+        name for name in verify.files_in(job.made) if compare.is_document(name) and name != SUMMARY
+    )
+    return items + [item for name in others for item in compare.document(name, job)]
 
 
 def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
     """Compare every file but the documents and what follows from them."""
     same_program = manifest.environment.same_program(job.here)
-    readings, moved = moved_parts(numbers)
+    readings, moved = compare.moved_parts(numbers)
 
     def judged(name: str, section: str) -> tuple[str | None, bool]:
         if name.startswith(("data/", "priors/")) or "/case/" in name:
@@ -175,16 +167,16 @@ def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
         why = "its numbers moved within their tolerance" if about & readings else None
         return why, not about & moved
 
-    made, items = files_in(job.made), []
-    for name in sorted(n for n in made - derived_files(made) if not is_document(n)):
+    made, items = verify.files_in(job.made), []
+    for name in sorted(n for n in made - verify.derived_files(made) if not compare.is_document(n)):
         if name in manifest.left_out:
             same = sha256((job.made / name).read_bytes()) == manifest.left_out[name]
             wrong = "" if same else "left out on purpose; its summary is compared"
             right = "left out on purpose; made again, it has the recorded hash"
             items.append(claim(POSTERIORS, name, wrong, right, sure=False))
         else:
-            items += compare_file(name, job, partial(judged, name), sure=same_program)
-    strangers = set(manifest.files) - derived_files(manifest.files) - made
+            items += compare.file(name, job, partial(judged, name), sure=same_program)
+    strangers = set(manifest.files) - verify.derived_files(manifest.files) - made
     if "comparison" in manifest.sections:
         # Checked as a folder of `calib compare`.
         strangers = {name for name in strangers if not name.startswith(f"{FOLDER}/")}
@@ -203,39 +195,3 @@ def _about(manifest: Manifest, name: str, section: str) -> set[str]:
         "comparison": set[str](),
     }
     return parts.get(section, {section} & set(manifest.tasks) or set(manifest.tasks))
-
-
-def _compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list[Item]:
-    """Check the comparison of models in a report: of its rows and seed, stated as it was found."""
-    record = read_record(ComparisonRecord, job.folder)
-    items = within(FOLDER, FOLDER, check_comparison(record, job))
-    stated = inside(manifest.sections, "comparison")
-    same = all(record.document.get(key) == value for key, value in stated.items())
-    output = get_model(next(iter(record.models))).output
-    fitted = {OUTPUTS[task.output]: fitted_rows(task) for task in tasks}
-    rows, held = fitted.get(output, (None, None))
-    kept = [(job.folder / "runs" / name / DATA, rows) for name in record.models]
-    if record.held_out or held is not None:
-        kept.append((job.folder / HELD_OUT, held))
-    own = record.seed == manifest.seed and all(_has_rows(path, table) for path, table in kept)
-    # By them values are shown in the units of the file.
-    named = {OUTPUTS[key]: said.data.header for key, said in manifest.tasks.items()}
-    for fits, name, what in (
-        (same and {"models", "verdict", "seed"} <= stated.keys(),
-         "manifest.json: comparison", "what its comparison.json has"),
-        (own, f"{FOLDER}/comparison.json", "of the report's own rows and seed"),
-        (record.header == named.get(output),
-         f"{FOLDER}/comparison.json: header", "the column names of the report's own file"),
-    ):  # fmt: skip
-        items.append(claim(FOLDER, name, "" if fits else f"it is not {what}", what))
-    return items
-
-
-def _has_rows(path: Path, table: Table | None) -> bool:
-    """Whether a file has the rows of a table."""
-    if table is None:
-        return False
-    kept = read_table(path, allow_missing=tuple(OUTPUTS.values())).columns
-    return kept.keys() == table.columns.keys() and all(
-        np.array_equal(values, table[name], equal_nan=True) for name, values in kept.items()
-    )

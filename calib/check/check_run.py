@@ -7,19 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from calib.check.compare import (
-    Job,
-    compare_document,
-    compare_estimates,
-    count_drawn,
-    not_computed,
-)
-from calib.check.derived import verify_derived
-from calib.check.inputs import blame, verify_files, verify_label
+from calib.check import compare, verify
+from calib.check.compare import Job
 from calib.check.montecarlo import drawn_in_run
 from calib.check.numbers import inside
 from calib.check.outcome import Item
-from calib.check.posteriors import compare_posterior, verify_posterior
+from calib.check.posteriors import verify_posterior
 from calib.check.schema import DATA, POSTERIOR, PRIORS, RUN, RunRecord
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import PointEstimate, estimate
@@ -32,7 +25,7 @@ from calib.report.study import Progress
 def check_run(record: RunRecord, job: Job) -> list[Item]:
     """Return what was found in a run."""
     items = verify_run(record, job.folder)
-    with not_computed(items, job.folder, RUN):
+    with compare.not_computed(items, job.folder, RUN):
         problem = run_problem(record.document, job.folder / DATA)
         items += consistent_run(record, problem, job)
         if not job.quick:
@@ -46,31 +39,30 @@ def verify_run(record: RunRecord, folder: Path) -> list[Item]:
     missed = [(n, "") for n in (POSTERIOR, PRIORS, DATA) if n not in record.sha256]
     priors = {RUN: lambda: {PRIORS: record.prior_text}}
     return [
-        *verify_files(folder, RUN, record.sha256, more=missed),
-        *verify_derived(folder, (), priors, sure=True),
+        *verify.files(folder, RUN, record.sha256, more=missed),
+        *verify.derived(folder, (), priors, sure=True),
     ]
 
 
 def consistent_run(record: RunRecord, problem: Problem, job: Job) -> list[Item]:
     """Hold the parts of a run against each other; of a quick check, its estimates too."""
-    items = [verify_label(DATA, problem.table, record.data_label)]
+    items = [verify.label(DATA, problem.table, record.data_label)]
     items += verify_posterior(job.folder / POSTERIOR, lambda: problem)
     if job.quick:
         again = {"estimates": describe_estimates(_estimate_again(record, problem))}
-        items += compare_estimates(job, (RUN,), again)
+        items += compare.estimates(job, (RUN,), again)
     return items
 
 
 def compare_run(record: RunRecord, calibration: Calibration, job: Job) -> list[Item]:
     """Compare a run with the same sampled again, and written."""
     steps = inside(record.document, "gate").get("steps")
-    drawn = drawn_in_run(calibration, count_drawn(job.made), steps)
-    items = compare_document(RUN, job, {(RUN, *path): size for path, size in drawn.items()})
-    if (job.folder / POSTERIOR).is_file():
-        items.append(compare_posterior(POSTERIOR, job.folder / POSTERIOR, job.made / POSTERIOR))
+    drawn = drawn_in_run(calibration, compare.count_drawn(job.made), steps)
+    items = compare.document(RUN, job, {(RUN, *path): size for path, size in drawn.items()})
+    items += compare.file(POSTERIOR, job)
     mode = (item for item in items if item.name.startswith(f"{RUN}: mode."))
     wrong = "the posterior mode in run.json does not follow from the data and priors here"
-    return items + blame(mode, f"{DATA} or {PRIORS}", wrong)
+    return items + verify.blame(mode, f"{DATA} or {PRIORS}", wrong)
 
 
 def _estimate_again(record: RunRecord, problem: Problem) -> tuple[PointEstimate, ...]:

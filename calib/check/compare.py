@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,15 +14,15 @@ from calib.batch.environment import Environment
 from calib.batch.pool import HERE, Pool
 from calib.check.figures import GROUP as FIGURES
 from calib.check.figures import compare_figure
-from calib.check.inputs import GROUP as INPUTS
 from calib.check.montecarlo import MONTE_CARLO, Errors, Place
 from calib.check.numbers import SAME_WORDS, compare_entries, flatten
 from calib.check.outcome import ROUNDED, Item, Status, claim
 from calib.check.posteriors import compare_posterior, read_draws
 from calib.check.schema import AUDIT, COMPARISON, MANIFEST, POSTERIOR, RUN, SUMMARY
 from calib.check.text import GROUP as TEXT
-from calib.check.text import compare_page, own_pictures, read_text
+from calib.check.text import Judged, compare_page, own_pictures, read_text
 from calib.check.tolerances import ORDER_OF_MAGNITUDE, is_drawn
+from calib.check.verify import INPUTS
 from calib.errors import CalibError
 from calib.report.study import Progress
 
@@ -142,7 +142,7 @@ def count_drawn(made: Path) -> int:
     return sum(is_drawn(place) for name in there for place in read_entries(made, name))
 
 
-def compare_estimates(job: Job, place: Place, found: Mapping[str, Any]) -> list[Item]:
+def estimates(job: Job, place: Place, found: Mapping[str, Any]) -> list[Item]:
     """Compare point estimates alone, below a place of a document.
 
     The recorded posterior says how wide a parameter's scale is.
@@ -157,7 +157,7 @@ def compare_estimates(job: Job, place: Place, found: Mapping[str, Any]) -> list[
     return [item for item in items if item.group.endswith("estimates")]
 
 
-def compare_document(name: str, job: Job, drawn: Errors | None = None) -> list[Item]:
+def document(name: str, job: Job, drawn: Errors | None = None) -> list[Item]:
     """Compare a document entry by entry; `drawn` is what Monte Carlo error allows."""
     try:
         old = read_entries(job.folder, name)
@@ -167,8 +167,8 @@ def compare_document(name: str, job: Job, drawn: Errors | None = None) -> list[I
     return compare_entries(old, read_entries(job.made, name), group_of, drawn)
 
 
-def compare_file(
-    name: str, job: Job, judged: Callable[[str], tuple[str | None, bool]], *, sure: bool = True
+def file(
+    name: str, job: Job, judged: Judged = lambda section: (None, True), *, sure: bool = True
 ) -> list[Item]:
     """Compare another file with the one made again; a page is `judged` as by `compare_page`.
 

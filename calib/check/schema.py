@@ -44,29 +44,20 @@ def _name(text: str) -> str:
     return text
 
 
-def _output(key: str) -> str:
-    if key not in OUTPUTS:
-        raise ValueError(f"there is no output {key}")
-    return key
-
-
 def _known_model(name: str) -> str:
     if name not in MODELS:
         raise CalibError(
-            f"model: {name} is not one of {', '.join(MODELS)}",
-            allowed="a model that is known here",
+            f"model: {name} is not one of {', '.join(MODELS)}", allowed="a model known here",
             mend="pass the file of your own that declares it (--models FILE or --simulator FILE); "
             "if there is none, restore the folder's",
-        )
+        )  # fmt: skip
     return name
 
 
 type _Hash = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
 type _File = Annotated[str, AfterValidator(_inside)]
 type _Name = Annotated[str, AfterValidator(_name)]
-type _Output = Annotated[str, AfterValidator(_output)]
 type _Model = Annotated[str, AfterValidator(_known_model)]
-type _Seed = Annotated[int, Field(ge=0)]
 
 
 class _Record(BaseModel):
@@ -74,9 +65,12 @@ class _Record(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
-class _Data(_Record):
+class _Kept(_Record):
     file: _File
     sha256: _Hash
+
+
+class _Data(_Kept):
     source: str
     source_sha256: _Hash
     # Where it is not that of the file that is kept: messages and units of the page are by it.
@@ -84,9 +78,7 @@ class _Data(_Record):
     ignored: tuple[str, ...]
 
 
-class _PriorFile(_Record):
-    file: _File
-    sha256: _Hash
+class _PriorFile(_Kept):
     source: _Name
     shipped: bool
 
@@ -107,6 +99,8 @@ class _Made(_Record):
     versions: dict[str, str]
     machine: dict[str, str]
     code: str
+    seed: Annotated[int, Field(ge=0)]
+    settings: SamplerSettings
     document: dict[str, JsonValue]
     """The whole file."""
 
@@ -123,9 +117,7 @@ class Manifest(_Made):
     schema_: Literal["calib/manifest/2"] = Field(alias="schema")
     title: str
     command: tuple[str, ...]
-    seed: _Seed
-    settings: SamplerSettings
-    tasks: Annotated[dict[_Output, TaskRecord], Field(min_length=1)]
+    tasks: Annotated[dict[str, TaskRecord], Field(min_length=1)]
     pdf: bool = False
     files: dict[_File, _Hash]
     left_out: dict[_File, _Hash]
@@ -136,7 +128,9 @@ class Manifest(_Made):
         return {name: self.document[name] for name in SECTIONS if name in self.document}
 
     @model_validator(mode="after")
-    def _check_sections(self) -> Self:
+    def _check(self) -> Self:
+        if unknown := self.tasks.keys() - OUTPUTS.keys():
+            raise ValueError(f"tasks: there is no output {', '.join(unknown)}")
         for name, record in self.sections.items():
             try:
                 SECTIONS[name].again(record)
@@ -159,9 +153,7 @@ class RunRecord(_Made):
     FILE, kind = RUN, "run"
     schema_: Literal["calib/run/1"] = Field(alias="schema")
     model: _Model
-    seed: _Seed
     label: str
-    settings: SamplerSettings
     estimates: tuple[_Estimate, ...]
     fixed: dict[str, float]
     references: dict[str, float]
@@ -184,8 +176,6 @@ class ComparisonRecord(_Made):
 
     FILE, kind = COMPARISON, "comparison"
     schema_: Literal["calib/comparison/2"] = Field(alias="schema")
-    seed: _Seed
-    settings: SamplerSettings
     held_out: str
     header: tuple[str, ...] = ()
     command: tuple[str, ...]
@@ -232,32 +222,25 @@ def read_record[R: _Made](kind: type[R], folder: Path) -> R:
         raise _damaged(path, f"it cannot be read ({type(error).__name__})") from None
     of_schema = next((e for e in found if e["loc"] == ("schema",)), None)
     if of_schema is None:
-        places = (".".join(map(str, found[0]["loc"])), found[0]["msg"])
-        raise _damaged(path, ": ".join(filter(None, places)))
+        place = ".".join(map(str, found[0]["loc"]))
+        raise _damaged(path, f"{place or 'in it'}: {found[0]['msg']}")
     # A folder of `calib sbc` has a run.json as well, which is no record of a run.
     if "schema" not in content and (folder / "sbc.json").is_file():
         raise _unchecked(folder, "it is one of `calib sbc`")
-    raise CalibError(
-        f"the schema is {content.get('schema')!r}",
-        where=str(path),
-        allowed=of_schema.get("ctx", {}).get("expected"),
-        mend="make the folder again with this version, or check it with the one that made it",
-    )
+    expected = of_schema.get("ctx", {}).get("expected")
+    mend = "make the folder again with this version, or check it with the one that made it"
+    said = f"the schema is {content.get('schema')!r}"
+    raise CalibError(said, where=str(path), allowed=expected, mend=mend)
 
 
 def _unchecked(folder: Path, why: str) -> CalibError:
     return CalibError(
-        f"this is no folder that can be checked ({why})",
-        where=str(folder),
+        f"this is no folder that can be checked ({why})", where=str(folder),
         allowed="a folder written by `calib report`, `calib fit` or `calib compare`",
         mend="give the folder that --out of one of these named",
-    )
+    )  # fmt: skip
 
 
 def _damaged(path: Path, found: str) -> CalibError:
-    return CalibError(
-        found,
-        where=str(path),
-        allowed="the file as it was written",
-        mend="restore the file, or make the folder again",
-    )
+    allowed, mend = "the file as it was written", "restore the file, or make the folder again"
+    return CalibError(found, where=str(path), allowed=allowed, mend=mend)

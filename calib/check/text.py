@@ -29,6 +29,10 @@ _WIDTH = 120
 _PLAIN = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻\u2212", "0123456789--")
 
 
+type Judged = Callable[[str], tuple[str | None, bool]]
+"""By the name of a section, why its words cannot be judged, if so; and whether its numbers can."""
+
+
 def read_text(path: Path) -> str:
     """Return a text, whatever somebody made of it."""
     return path.read_text(encoding="utf-8", errors="replace")
@@ -38,16 +42,11 @@ def verify_images(page: str, folder: Path) -> list[Item]:
     """Check that every picture in a page is one of the folder's figures, and the other way."""
     figures = _figures(folder)
     shown = {sha256(_decoded(text)) for text in _IMAGE.findall(page)}
-    items = [
-        claim(GROUP, name, "it is not the picture that index.html shows")
-        for key, name in figures.items()
-        if key not in shown
-    ]
-    strangers = len(shown - set(figures))
-    if strangers:
-        items.append(
-            claim(GROUP, "index.html", f"{strangers} of its pictures are none of the figures")
-        )
+    wrong = "it is not the picture that index.html shows"
+    items = [claim(GROUP, n, wrong) for key, n in figures.items() if key not in shown]
+    if strangers := len(shown - set(figures)):
+        wrong = f"{strangers} of its pictures are none of the figures"
+        items.append(claim(GROUP, "index.html", wrong))
     return items or [claim(GROUP, "pictures in index.html", "", "they are the figures")]
 
 
@@ -71,17 +70,8 @@ def own_pictures(content: str, folder: Path) -> list[bytes]:
     return [picture for picture in pictures if sha256(picture) not in known]
 
 
-def compare_page(
-    name: str,
-    recorded: Path,
-    written: Path,
-    judged: Callable[[str], tuple[str | None, bool]],
-) -> Item:
-    """Compare a page, or another text, by its path in two folders, with the one written again.
-
-    `judged` tells by the name of a section why its words cannot be judged (None where they can),
-    and whether its numbers can.
-    """
+def compare_page(name: str, recorded: Path, written: Path, judged: Judged) -> Item:
+    """Compare a page, or another text, by its path in two folders, with the one written again."""
     if (recorded / name).read_bytes() == (written / name).read_bytes():
         return Item(GROUP, name, Status.IDENTICAL)
     old, new = (_readable(folder, name) for folder in (recorded, written))
