@@ -17,9 +17,11 @@ from calib.check.compare import Job, count_drawn
 from calib.check.montecarlo import describe
 from calib.check.numbers import inside, read_json
 from calib.check.outcome import Item, Outcome
-from calib.check.schema import SUMMARY, ComparisonRecord, Record, read_folder, read_record
+from calib.check.schema import SUMMARY, read_folder
 from calib.errors import CalibError
+from calib.inference.record import Record, read_record
 from calib.report.compared import FOLDER
+from calib.report.comparison import ComparisonRecord
 from calib.report.study import Progress
 
 _CHECKS: Mapping[str, Callable[[Any, Job], list[Item]]] = {

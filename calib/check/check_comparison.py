@@ -15,23 +15,24 @@ from calib.check.compare import Job
 from calib.check.montecarlo import drawn_in_comparison
 from calib.check.numbers import flatten, inside
 from calib.check.outcome import Item, Status, claim
-from calib.check.schema import COMPARISON as FILE
-from calib.check.schema import (
-    DATA,
-    MANIFEST,
-    RUN,
-    ComparisonRecord,
-    Manifest,
-    RunRecord,
-    read_record,
-)
+from calib.check.schema import MANIFEST, Manifest
 from calib.data import Table, read_for_model, read_table
 from calib.data.quantities import OUTPUTS
 from calib.inference.io import run_problem
 from calib.inference.problem import Problem
+from calib.inference.record import DATA, RUN, RunRecord, read_record
 from calib.models import get_model
 from calib.report.compared import FOLDER
-from calib.report.comparison import FIGURE, HELD_OUT, PAGE, page, stated_of_rows, write_comparison
+from calib.report.comparison import (
+    FIGURE,
+    FILE,
+    HELD_OUT,
+    PAGE,
+    ComparisonRecord,
+    page,
+    stated_of_rows,
+    write_comparison,
+)
 from calib.report.study_tasks import Task, fitted_rows
 from calib.validation.comparison import Comparison, compare_problems, stacking_weights
 
@@ -119,7 +120,7 @@ def _problem(run: RunRecord, data: Path, record: ComparisonRecord) -> Problem:
 
     Units are shown by these names, where they are not those of the copy that is kept.
     """
-    problem = run_problem(run.document, data)
+    problem = run_problem(run, data)
     if not record.header:
         return problem
     return problem.with_table(replace(problem.table, header=record.header, text=()))
@@ -130,30 +131,20 @@ def check_compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list[
     record = read_record(ComparisonRecord, job.folder)
     items = compare.within(FOLDER, FOLDER, check_comparison(record, job))
     stated = inside(manifest.sections, "comparison")
-    same = {
-        "models",
-        "verdict",
-        "seed",
-    } <= stated.keys() and stated.items() <= record.document.items()
+    same = {"models", "verdict", "seed"} <= stated.keys()
+    same = same and stated.items() <= record.document.items()
     output = get_model(next(iter(record.models))).output
     [task] = [task for task in tasks if OUTPUTS[task.output] == output]
     rows, held = fitted_rows(task)
     kept = {job.folder / "runs" / name / DATA: rows for name in record.models}
     held_out = {job.folder / HELD_OUT: held} if record.held_out or held is not None else {}
     own = all(_has_rows(path, table) for path, table in {**kept, **held_out}.items())
+    own = own and record.seed == manifest.seed
     # By the names of columns values are shown in the units of the file.
     header = record.header == manifest.tasks[task.output].data.header
     for fits, name, what in (
-        (
-            same and {"models", "verdict", "seed"} <= stated.keys(),
-            f"{MANIFEST}: comparison",
-            "what its comparison.json has",
-        ),
-        (
-            own and record.seed == manifest.seed,
-            f"{FOLDER}/{FILE}",
-            "of the report's own rows and seed",
-        ),
+        (same, f"{MANIFEST}: comparison", "what its comparison.json has"),
+        (own, f"{FOLDER}/{FILE}", "of the report's own rows and seed"),
         (header, f"{FOLDER}/{FILE}: header", "the column names of the report's own file"),
     ):
         items.append(claim(FOLDER, name, "" if fits else f"it is not {what}", what))

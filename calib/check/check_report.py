@@ -19,11 +19,7 @@ from calib.check.numbers import inside, read_json
 from calib.check.outcome import Item, claim
 from calib.check.posteriors import GROUP as POSTERIORS
 from calib.check.posteriors import verify_posterior
-from calib.check.schema import (
-    MANIFEST,
-    SUMMARY,
-    Manifest,
-)
+from calib.check.schema import MANIFEST, SUMMARY, Manifest
 from calib.check.text import GROUP as TEXT
 from calib.check.text import read_text, verify_images
 from calib.data import read_table

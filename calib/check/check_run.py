@@ -13,12 +13,12 @@ from calib.check.montecarlo import drawn_in_run
 from calib.check.numbers import inside
 from calib.check.outcome import Item
 from calib.check.posteriors import verify_posterior
-from calib.check.schema import DATA, POSTERIOR, PRIORS, RUN, RunRecord
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import PointEstimate, estimate
 from calib.inference.io import describe_estimates, run_problem, save_calibration
 from calib.inference.problem import Problem
 from calib.inference.random import generator
+from calib.inference.record import DATA, POSTERIOR, PRIORS, RUN, RunRecord
 from calib.report.study import Progress
 
 
@@ -26,7 +26,7 @@ def check_run(record: RunRecord, job: Job) -> list[Item]:
     """Return what was found in a run."""
     items = verify_run(record, job.folder)
     with compare.not_computed(items, job.folder, RUN):
-        problem = run_problem(record.document, job.folder / DATA)
+        problem = run_problem(record, job.folder / DATA)
         items += consistent_run(record, problem, job)
         if not job.quick:
             calibration = recompute_run(record, problem, job.made, job.progress)

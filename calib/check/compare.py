@@ -17,13 +17,16 @@ from calib.check.figures import compare_figure
 from calib.check.montecarlo import MONTE_CARLO, Errors, Place
 from calib.check.numbers import SAME_WORDS, compare_entries, flatten
 from calib.check.outcome import ROUNDED, Item, Status, claim
-from calib.check.posteriors import compare_posterior, read_draws
-from calib.check.schema import AUDIT, COMPARISON, MANIFEST, POSTERIOR, RUN, SUMMARY
+from calib.check.posteriors import FAULTS, compare_posterior, summary_of
+from calib.check.schema import AUDIT, MANIFEST, SUMMARY
 from calib.check.text import GROUP as TEXT
 from calib.check.text import Judged, compare_page, own_pictures, read_text
 from calib.check.tolerances import ORDER_OF_MAGNITUDE, is_drawn
 from calib.check.verify import INPUTS
 from calib.errors import CalibError
+from calib.inference.netcdf import read_draws
+from calib.inference.record import POSTERIOR, RUN
+from calib.report.comparison import FILE as COMPARISON
 from calib.report.study import Progress
 
 # What a record has about its own folder: durations, and hashes that are verified as such.
@@ -115,8 +118,8 @@ def read_entries(folder: Path, name: str) -> dict[Place, Any]:
     else:
         document = json.loads(text)
     if name == RUN:
-        with suppress(CalibError):
-            document["posterior"] = read_draws(folder / POSTERIOR).summary
+        with suppress(*FAULTS):
+            document["posterior"] = summary_of(read_draws(folder / POSTERIOR))
     return {place: value for place, value in flatten(document, (name,)) if _compared(*place)}
 
 

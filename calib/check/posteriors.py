@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from calib.check.numbers import inside
 from calib.check.outcome import Item, Status, claim
 from calib.errors import CalibError
 from calib.inference.calibration import moments
-from calib.inference.netcdf import DRAWN, Groups, read_netcdf
+from calib.inference.netcdf import DRAWN, DrawsFile, read_draws, read_netcdf
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
@@ -27,36 +26,13 @@ _OF_SD = 0.5
 _AT_BOUNDS = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class DrawsFile:
-    """What is compared of a netCDF file: draws (chains, draws) by parameter, and log density."""
-
-    draws: Mapping[str, Array]
-    log_prob: Array
-
-    @property
-    def summary(self) -> dict[str, dict[str, float]]:
-        """Mean, sd, median and 95 % highest-density interval of each parameter."""
-        return {name: moments(values.reshape(-1)) for name, values in self.draws.items()}
+# What a damaged file makes the reading of it raise.
+FAULTS = (OSError, KeyError, ValueError, TypeError, RuntimeError)
 
 
-def read_draws(path: Path) -> DrawsFile:
-    """Read the posterior draws in a file; a CalibError if it cannot be read."""
-    groups = _read(path, "posterior", "sample_stats").values
-    draws, log_prob = groups["posterior"], groups["sample_stats"].get("lp", np.array([]))
-    if log_prob.ndim != 2 or not log_prob.size:
-        raise CalibError("there are no draws in it", where=str(path))
-    if not draws or any(v.shape != log_prob.shape for v in draws.values()):
-        raise CalibError("its draws differ in number", where=str(path))
-    return DrawsFile(draws, log_prob)
-
-
-def _read(path: Path, *only: str) -> Groups:
-    try:
-        return read_netcdf(path, *only)
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        note = f"the file cannot be read ({type(error).__name__})"
-        raise CalibError(note, where=str(path)) from None
+def summary_of(file: DrawsFile) -> dict[str, dict[str, float]]:
+    """Return mean, sd, median and 95 % highest-density interval of each parameter."""
+    return {name: moments(values.reshape(-1)) for name, values in file.draws.items()}
 
 
 def verify_posterior(
@@ -72,12 +48,18 @@ def verify_posterior(
         items.append(_verify_density(path.name, file, problem()))
     except CalibError as error:
         items.append(claim(GROUP, path.name, error.message))
+    except FAULTS as error:
+        items.append(_unread(path.name, error))
     return items
+
+
+def _unread(name: str, error: Exception) -> Item:
+    return claim(GROUP, name, f"the file cannot be read ({type(error).__name__}: {error})")
 
 
 def _verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Item:
     """Check that a file's draws have the summary that is stated of them."""
-    for parameter, values in file.summary.items():
+    for parameter, values in summary_of(file).items():
         for key, value in values.items():
             given = inside(stated, parameter).get(key)
             if not isinstance(given, int | float) or not math.isclose(
@@ -121,8 +103,8 @@ def compare_posterior(name: str, recorded: Path, drawn: Path) -> Item:
         return Item(GROUP, name, Status.IDENTICAL)
     try:
         old, new = (_groups(path) for path in (recorded, drawn))
-    except CalibError as error:
-        return claim(GROUP, name, error.message)
+    except FAULTS as error:
+        return _unread(name, error)
     apart = [key for key in {**old, **new} if not _alike(old.get(key), new.get(key))]
     if apart:
         return claim(
@@ -133,7 +115,7 @@ def compare_posterior(name: str, recorded: Path, drawn: Path) -> Item:
 
 def _groups(path: Path) -> dict[str, Array]:
     """Read every variable of a file by its path; of drawn ones, median and sd by row."""
-    groups = _read(path)
+    groups = read_netcdf(path)
     found: dict[str, Array] = {}
     for group, variables in groups.values.items():
         for name, values in variables.items():

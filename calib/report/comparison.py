@@ -10,16 +10,17 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
+from pydantic import Field
 
 from calib.batch.environment import Environment
 from calib.data import write_table
-from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.io import load_calibration, save_calibration
+from calib.inference.record import Entry, File, Hash, KnownModel, Record, read_record
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.figures.style import BLACK, BLUE, legend_below, panels, png_bytes, style
@@ -159,6 +160,32 @@ FILE, PAGE, FIGURE, HELD_OUT = (
 )  # fmt: skip
 
 
+class _Compared(Entry):
+    weight: float
+    elpd_rows: Annotated[tuple[float, ...], Field(min_length=2)]
+    converged: bool
+    refits_not_converged: int
+
+
+class ComparisonRecord(Record):
+    """`comparison.json` of a comparison folder."""
+
+    FILE, kind, WRITTEN_BY = FILE, "comparison", "calib compare"
+    schema_: Literal["calib/comparison/2"] = Field(alias="schema")
+    held_out: str
+    header: tuple[str, ...] = ()
+    command: tuple[str, ...]
+    models: Annotated[dict[KnownModel, _Compared], Field(min_length=2)]
+    files: dict[File, Hash]
+
+    @property
+    def unsound(self) -> tuple[str, ...]:
+        """Models of which a posterior is recorded as one that did not pass the gate."""
+        return tuple(
+            name for name, m in self.models.items() if not m.converged or m.refits_not_converged
+        )
+
+
 def document(comparison: Comparison, hold_out: str = "") -> dict[str, Any]:
     """Return every number of a comparison as plain dictionaries.
 
@@ -274,16 +301,7 @@ def load_stack(folder: Path) -> tuple[dict[str, Any], list[tuple[float, Calibrat
 
     A CalibError says that it is damaged.
     """
-    path = folder / FILE
-    try:
-        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        weights = {name: float(m["weight"]) for name, m in found["models"].items()}
-        if found["schema"] != SCHEMA:
-            raise ValueError
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise CalibError(
-            "the file cannot be read", where=str(path),
-            allowed="the file as `calib compare` wrote it", mend="run `calib compare` again",
-        ) from None  # fmt: skip
-    used = {name: w for name, w in weights.items() if round(w * N_DRAWS) > 0}
-    return found, [(w, load_calibration(folder / "runs" / name)) for name, w in used.items()]
+    record = read_record(ComparisonRecord, folder)
+    used = {name: m.weight for name, m in record.models.items() if round(m.weight * N_DRAWS) > 0}
+    runs = [(weight, load_calibration(folder / "runs" / name)) for name, weight in used.items()]
+    return record.document, runs
