@@ -22,17 +22,9 @@ from calib.inference.io import run_problem
 from calib.inference.problem import Problem
 from calib.inference.record import DATA, RUN, RunRecord, read_record
 from calib.models import get_model
+from calib.report import comparison
 from calib.report.compared import FOLDER
-from calib.report.comparison import (
-    FIGURE,
-    FILE,
-    HELD_OUT,
-    PAGE,
-    ComparisonRecord,
-    page,
-    stated_of_rows,
-    write_comparison,
-)
+from calib.report.comparison import FILE, ComparisonRecord
 from calib.report.study_tasks import Task, fitted_rows
 from calib.validation.comparison import Comparison, compare_problems, stacking_weights
 
@@ -67,7 +59,7 @@ def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
             for c in again.candidates:
                 found = compare_run(runs[c.model], c.calibration, inner[c.model])
                 items += compare.within(f"runs/{c.model}", c.model, found)
-            items += compare.file(FIGURE, job)
+            items += compare.file(comparison.FIGURE, job)
     return items
 
 
@@ -77,7 +69,7 @@ def _recompute(record: ComparisonRecord, problems: Mapping[str, Problem], job: J
     if record.held_out:
         models = [p.bound.model for p in problems.values()]
         used = sorted({c for m in models for c in (*m.conditions, m.output)})
-        held_out = read_for_model(job.folder / HELD_OUT, used)
+        held_out = read_for_model(job.folder / comparison.HELD_OUT, used)
     again = compare_problems(
         list(problems.values()), record.seed, held_out=held_out, settings=record.settings,
         progress=job.progress, workers=job.workers,
@@ -86,7 +78,7 @@ def _recompute(record: ComparisonRecord, problems: Mapping[str, Problem], job: J
     by_name = {c.model: c for c in again.candidates}
     again = replace(again, candidates=tuple(by_name[name] for name in record.models))
     job.made.mkdir()
-    write_comparison(
+    comparison.write_comparison(
         again, job.made, record.command, record.held_out, environment=record.environment
     )
     return again
@@ -99,7 +91,7 @@ def _follows(record: ComparisonRecord, job: Job) -> list[Item]:
     if len({r.size for r in rows.values()}) == 1:
         weights = stacking_weights(np.stack(list(rows.values()), axis=1))
         named = dict(zip(rows, weights.tolist(), strict=True))
-        found = stated_of_rows(rows, named, record.unsound)
+        found = comparison.stated_of_rows(rows, named, record.unsound)
     items = []
     for place, value in flatten(found):
         stated = inside(record.document, *place[:-1]).get(place[-1])
@@ -110,9 +102,12 @@ def _follows(record: ComparisonRecord, job: Job) -> list[Item]:
         status = Status.IDENTICAL if same else Status.DIFFERENT
         items.append(Item(_GROUP, name, status, stated, value))
 
-    shown = {FILE: lambda: {PAGE: page(record.document, (job.folder / FIGURE).read_bytes())}}
+    def shown() -> dict[str, str]:
+        image = (job.folder / comparison.FIGURE).read_bytes()
+        return {comparison.PAGE: comparison.page(record.document, image)}
+
     sure = record.environment.same_program(job.here)
-    return items + verify.derived(job.folder, (), shown, sure=sure)
+    return items + verify.derived(job.folder, (), {FILE: shown}, sure=sure)
 
 
 def _problem(run: RunRecord, data: Path, record: ComparisonRecord) -> Problem:
@@ -136,10 +131,9 @@ def check_compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list[
     output = get_model(next(iter(record.models))).output
     [task] = [task for task in tasks if OUTPUTS[task.output] == output]
     rows, held = fitted_rows(task)
-    kept = {job.folder / "runs" / name / DATA: rows for name in record.models}
-    held_out = {job.folder / HELD_OUT: held} if record.held_out or held is not None else {}
-    own = all(_has_rows(path, table) for path, table in {**kept, **held_out}.items())
-    own = own and record.seed == manifest.seed
+    own = record.seed == manifest.seed and bool(record.held_out) == (held is not None)
+    own = own and all(_has_rows(job.folder / "runs" / n / DATA, rows) for n in record.models)
+    own = own and (held is None or _has_rows(job.folder / comparison.HELD_OUT, held))
     # By the names of columns values are shown in the units of the file.
     header = record.header == manifest.tasks[task.output].data.header
     for fits, name, what in (
@@ -151,10 +145,8 @@ def check_compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list[
     return items
 
 
-def _has_rows(path: Path, table: Table | None) -> bool:
+def _has_rows(path: Path, table: Table) -> bool:
     """Whether a file has the rows of a table."""
-    if table is None:
-        return False
     kept = read_table(path, allow_missing=tuple(OUTPUTS.values())).columns
     return kept.keys() == table.columns.keys() and all(
         np.array_equal(values, table[name], equal_nan=True) for name, values in kept.items()

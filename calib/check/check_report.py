@@ -132,21 +132,16 @@ def _numbers(manifest: Manifest, study: Study, summary: Mapping[str, Any], job: 
         drawn |= {(SUMMARY, "models", key, *path): size for path, size in sizes.items()}
     items = compare.document(SUMMARY, job, drawn)
     for key, task in manifest.tasks.items():
-        own = [item for item in items if compare.part_of(item.group) == key]
-        points = [
-            item for item in own if item.group.endswith("estimates")
-            and not any(search in item.name for search in _SEARCHES)
-        ]  # fmt: skip
-        mode = [item for item in own if ".sampling.mode." in item.name]
+        points = [item for item in items if item.group == f"{key}: estimates"]
+        points = [i for i in points if not any(search in i.name for search in _SEARCHES)]
+        mode = [i for i in items if i.name.startswith(f"{SUMMARY}: models.{key}.sampling.mode.")]
         wrong = "most estimates in summary.json do not follow from these rows"
         other = "the posterior mode in summary.json does not follow from these priors and the data"
-        items += verify.blame(points, task.data.file, wrong) or verify.blame(
-            mode, task.priors.file, other
-        )
-    others = sorted(
-        name for name in verify.files_in(job.made) if compare.is_document(name) and name != SUMMARY
-    )
-    return items + [item for name in others for item in compare.document(name, job)]
+        blamed = verify.blame(points, task.data.file, wrong)
+        items += blamed or verify.blame(mode, task.priors.file, other)
+    for name in sorted(filter(compare.is_document, verify.files_in(job.made) - {SUMMARY})):
+        items += compare.document(name, job)
+    return items
 
 
 def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
@@ -159,9 +154,9 @@ def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
             return None, True
         if not same_program:
             return "another version wrote it", False
-        about = _about(manifest, name, section)
-        why = "its numbers moved within their tolerance" if about & readings else None
-        return why, not about & moved
+        about = partial(_about, manifest, name, section)
+        why = "its numbers moved within their tolerance" if any(map(about, readings)) else None
+        return why, not any(map(about, moved))
 
     made, items = verify.files_in(job.made), []
     for name in sorted(n for n in made - verify.derived_files(made) if not compare.is_document(n)):
@@ -172,22 +167,21 @@ def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
             items.append(claim(POSTERIORS, name, wrong, right, sure=False))
         else:
             items += compare.file(name, job, partial(judged, name), sure=same_program)
+    # A comparison is checked as a folder of `calib compare`.
+    inner = (f"{FOLDER}/",) if "comparison" in manifest.sections else ()
     strangers = set(manifest.files) - verify.derived_files(manifest.files) - made
-    if "comparison" in manifest.sections:
-        # Checked as a folder of `calib compare`.
-        strangers = {name for name in strangers if not name.startswith(f"{FOLDER}/")}
+    strangers = {name for name in strangers if not name.startswith(inner)}
     note = "this version makes no such file"
     return items + [claim(TEXT, name, note, sure=same_program) for name in sorted(strangers)]
 
 
-def _about(manifest: Manifest, name: str, section: str) -> set[str]:
-    """Return the parts of a report that a section of a page is about."""
+def _about(manifest: Manifest, name: str, section: str, part: str) -> bool:
+    """Whether a section of a page is about a part of a report: an output, a gap, or the audit."""
     if name.startswith("gaps/"):
-        return {f"gap: {name.split('/')[1]}"}
-    parts = {
-        "paper-gaps": {f"gap: {gap}" for gap in inside(manifest.sections, "paper_gaps")},
-        "audit": {"audit"},
-        # A comparison's words are those of the manifest's own numbers.
-        "comparison": set[str](),
-    }
-    return parts.get(section, {section} & set(manifest.tasks) or set(manifest.tasks))
+        return part == f"gap: {name.split('/')[1]}"
+    if section == "paper-gaps":
+        return part.startswith("gap: ")
+    if section == "audit" or section in manifest.tasks:
+        return part == section
+    # A comparison's words are those of the manifest's own numbers.
+    return part in manifest.tasks and section != "comparison"

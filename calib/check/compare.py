@@ -15,9 +15,9 @@ from calib.batch.pool import HERE, Pool
 from calib.check.figures import GROUP as FIGURES
 from calib.check.figures import compare_figure
 from calib.check.montecarlo import MONTE_CARLO, Errors, Place
-from calib.check.numbers import SAME_WORDS, compare_entries, flatten
+from calib.check.numbers import FAULTS, SAME_WORDS, compare_entries, flatten
 from calib.check.outcome import ROUNDED, Item, Status, claim
-from calib.check.posteriors import FAULTS, compare_posterior, summary_of
+from calib.check.posteriors import compare_posterior, summary_of
 from calib.check.schema import AUDIT, MANIFEST, SUMMARY
 from calib.check.text import GROUP as TEXT
 from calib.check.text import Judged, compare_page, own_pictures, read_text
@@ -124,10 +124,9 @@ def read_entries(folder: Path, name: str) -> dict[Place, Any]:
 
 
 def _cell(text: Any) -> Any:
-    try:
+    with suppress(TypeError, ValueError):
         return float(text)
-    except (TypeError, ValueError):
-        return text
+    return text
 
 
 def _compared(file: str, first: str = "", *more: str) -> bool:
@@ -146,25 +145,18 @@ def count_drawn(made: Path) -> int:
 
 
 def estimates(job: Job, place: Place, found: Mapping[str, Any]) -> list[Item]:
-    """Compare point estimates alone, below a place of a document.
-
-    The recorded posterior says how wide a parameter's scale is.
-    """
-    recorded, new = read_entries(job.folder, place[0]).items(), dict(flatten(found, place))
-    scale, *points = (
-        {path: value for path, value in recorded if path[: len(place) + 1] == (*place, key)}
-        for key in ("posterior", *found)
-    )
-    old = {path: value for part in points for path, value in part.items()}
-    items = compare_entries(old | scale, new | scale, group_of)
-    return [item for item in items if item.group.endswith("estimates")]
+    """Compare point estimates alone, below a place of a document, within what is recorded there."""
+    group, recorded = group_of((*place, "estimates")), read_entries(job.folder, place[0])
+    others = {path: value for path, value in recorded.items() if group_of(path) != group}
+    items = compare_entries(recorded, others | dict(flatten(found, place)), group_of)
+    return [item for item in items if item.group == group]
 
 
 def document(name: str, job: Job, drawn: Errors | None = None) -> list[Item]:
     """Compare a document entry by entry; `drawn` is what Monte Carlo error allows."""
     try:
         old = read_entries(job.folder, name)
-    except (OSError, ValueError, TypeError, RecursionError) as error:
+    except FAULTS as error:
         wrong = f"it cannot be read ({type(error).__name__})"
         return [claim(group_of((name,)), name, wrong)]
     return compare_entries(old, read_entries(job.made, name), group_of, drawn)

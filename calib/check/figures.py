@@ -24,7 +24,7 @@ from calib.models.base import Array
 
 GROUP = "figures"
 # Root mean square difference of grey levels from 0 to 1 of figures reduced to 64 x 64. Other draws
-# of the same posterior move a figure by up to 0.05, most by 0.02; two different ones by over 0.04.
+# move a figure by up to 0.05, most by 0.02; two figures are apart by over 0.04.
 _ALIKE, _SIDE = 0.08, 64
 _STREAM = re.compile(rb"stream\r?\n(.*?)\r?\nendstream", re.DOTALL)
 

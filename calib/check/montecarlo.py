@@ -26,16 +26,14 @@ type Place = tuple[str, ...]
 type Errors = dict[Place, float | None]
 """By path; None where a tail is too heavy for one."""
 
-# Moments that exist: the variance of a mean, and of a variance. The shape is estimated, so a
-# little less is asked of the second.
+# Shapes with which the variance of a mean exists, and of a variance: a little less, as estimated.
 _K_MEAN, _K_SD = 0.5, 0.2
-# Of an interval's width: an end at the edge of what is possible hangs on the few outermost draws,
-# whose scatter among parts of a run tells little. Between seeds k of the rut depth's moves so far.
+# Of an interval's width: an end at the edge of what is possible hangs on the few outermost draws.
+# Between seeds k of the rut depth's moves so far.
 _END = 2e-4
 # Chance of one false alarm or more in a whole check.
 _FAMILY = 1e-3
-# Over 24 seeds of the embedded problems, numbers moved by up to 1.4 times what ArviZ expects: the
-# walkers of an ensemble are not quite independent chains.
+# Over 24 seeds numbers moved by up to 1.4 times what ArviZ expects: walkers are not quite chains.
 _SAFETY = 1.5
 # Of random draws, among which scores scatter; their sd is known to a twentieth.
 _GROUPS = 200

@@ -20,6 +20,8 @@ NUMBER = re.compile(
 # Most entries by far; to ask whether they are an abstract collection takes longer than the rest.
 _PLAIN = (float, str, int, type(None))
 _ABSENT = object()
+# What somebody else's file makes the reading of it raise.
+FAULTS = (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
 SAME_WORDS = "the same words"
 
 
@@ -27,7 +29,7 @@ def read_json(path: Path) -> dict[str, Any]:
     """Return a JSON object; empty where the file is missing or damaged."""
     try:
         return inside(json.loads(path.read_text(encoding="utf-8")))
-    except (OSError, ValueError, RecursionError):
+    except FAULTS:
         return {}
 
 
@@ -45,22 +47,20 @@ def flatten(document: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
     """
     if isinstance(document, _PLAIN):
         yield place, document
-    elif isinstance(document, Mapping):
-        for key, value in document.items():
+    elif isinstance(document, Mapping | list | tuple):
+        named = document if isinstance(document, Mapping) else _named(document)
+        for key, value in named.items():
             yield from flatten(value, (*place, str(key)))
-    elif isinstance(document, Sequence):
-        for name, value in zip(_names(document), document, strict=True):
-            yield from flatten(value, (*place, name))
     else:
         yield place, document
 
 
-def _names(entries: Sequence[Any]) -> list[str]:
+def _named(entries: Sequence[Any]) -> Mapping[Any, Any]:
     for key in ("name", "key") if entries and isinstance(entries[0], Mapping) else ():
-        names = [entry.get(key) for entry in entries if isinstance(entry, Mapping)]
-        if len(names) == len(set(map(str, names))) == len(entries) and None not in names:
-            return [str(name) for name in names]
-    return [str(i) for i in range(len(entries))]
+        names = [inside(entry).get(key) for entry in entries]
+        if None not in names and len(set(map(str, names))) == len(entries):
+            return dict(zip(map(str, names), entries, strict=True))
+    return dict(enumerate(entries))
 
 
 def compare_entries(

@@ -24,8 +24,7 @@ _IMAGE = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]*)")
 _TAG = re.compile(r"<[^>]*>")
 _PICTURE = re.compile(r"\[picture [^\]]*\]")
 _SECTION = re.compile(r'<section\b[^>]*aria-labelledby="([^"]*)"')
-_SHOWN = 3
-_WIDTH = 120
+_SHOWN, _WIDTH = 6, 120
 _PLAIN = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻\u2212", "0123456789--")
 
 
@@ -84,8 +83,8 @@ def compare_page(name: str, recorded: Path, written: Path, judged: Judged) -> It
     both = list(_sections(old)), list(_sections(new))
     if [section for section, _ in both[0]] != [section for section, _ in both[1]]:
         return claim(GROUP, name, "it has other sections")
-    found = Item(GROUP, name, Status.WITHIN,
-                 note="the same words; numbers are judged where they come from")  # fmt: skip
+    note = "the same words; numbers are judged where they come from"
+    found = Item(GROUP, name, Status.WITHIN, note=note)
     for (section, lines), (_, lines_again) in zip(*both, strict=True):
         why, numbers = judged(section)
         if not _alike(lines, lines_again, numbers=numbers):
@@ -130,11 +129,11 @@ def _alike(old: Sequence[str], new: Sequence[str], *, numbers: bool) -> bool:
 def _near(old: str, new: str) -> bool:
     """Whether the numbers of two lines differ by one unit of their last digit at the most."""
     numbers = (NUMBER.findall(_TAG.sub(" ", line)) for line in (old, new))
-    return all(a == b or _one_unit(_parsed(a), _parsed(b)) for a, b in zip(*numbers, strict=False))
-
-
-def _one_unit(old: tuple[float, float], new: tuple[float, float]) -> bool:
-    return abs(old[0] - new[0]) <= 1.001 * max(old[1], new[1])
+    for a, b in zip(*numbers, strict=False):
+        (one, unit), (other, other_unit) = _parsed(a), _parsed(b)
+        if a != b and not abs(one - other) <= 1.001 * max(unit, other_unit):
+            return False
+    return True
 
 
 def _parsed(text: str) -> tuple[float, float]:
@@ -153,5 +152,5 @@ def differing_lines(old: Sequence[str], new: Sequence[str]) -> str:
     # Below the names of the two.
     diff = list(difflib.unified_diff(old, new, n=0, lineterm=""))[2:]
     changed = [line for line in diff if not line.startswith("@@")]
-    shown = "; ".join(f"{line[0]} {line[1:].strip()[:_WIDTH]}" for line in changed[: 2 * _SHOWN])
+    shown = "; ".join(f"{line[0]} {line[1:].strip()[:_WIDTH]}" for line in changed[:_SHOWN])
     return f"{len(changed)} lines differ: {shown}"

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from calib.batch.environment import sha256
-from calib.check.numbers import inside, read_json
+from calib.check.numbers import FAULTS, inside, read_json
 from calib.check.outcome import Item, Status, claim
 from calib.check.schema import TaskRecord
 from calib.check.text import GROUP as TEXT
@@ -31,8 +31,6 @@ from calib.inference.prior_files import default_priors
 INPUTS, FILES = "data and priors", "files and their hashes"
 # Of the sd of a gap; and a gap that is nil, in kN, mm or g/cm^3.
 _OF_SD, _ROUNDING = 0.3, 1e-6
-# What somebody else's file makes the reading of it raise.
-_FAULTS = (AttributeError, IndexError, KeyError, OSError, RecursionError, TypeError, ValueError)
 
 
 def files(
@@ -45,12 +43,12 @@ def files(
     missed; what was left out is not there on purpose.
     """
     pairs = dict.fromkeys([*listed.items(), *more])
-    items = [_listed(folder / name, own, name, expected) for name, expected in pairs]
-    for name in left_out:
-        if not name.endswith(".nc") or "/" in name:
-            items.append(claim(FILES, name, "missing: only posteriors may be left out"))
-    strangers = files_in(folder) - {own, *listed}
-    return items + [claim(FILES, name, "not listed") for name in sorted(strangers)]
+    wrong = "missing: only posteriors may be left out"
+    return [
+        *(_listed(folder / name, own, name, expected) for name, expected in pairs),
+        *(claim(FILES, n, wrong) for n in left_out if not n.endswith(".nc") or "/" in n),
+        *(claim(FILES, n, "not listed") for n in sorted(files_in(folder) - {own, *listed})),
+    ]
 
 
 def files_in(folder: Path) -> set[str]:
@@ -123,7 +121,7 @@ def derived(
                     lines = differing_lines(read_text(path).splitlines(), text.splitlines())
                     wrong = f"it does not follow from {source}: {lines}"
                 found[name] = claim(TEXT, name, wrong, f"it follows from {source}", sure=sure)
-        except (CalibError, *_FAULTS) as error:
+        except (CalibError, *FAULTS) as error:
             wrong = f"what follows from it cannot be written ({type(error).__name__}: {error})"
             failed.append(claim(TEXT, source, wrong, sure=sure))
     for name in derived_files(files) - set(found) if not failed else ():
@@ -140,7 +138,7 @@ def form(folder: Path) -> list[Item]:
     found = []
     for path in sorted(folder.rglob("*.json")):
         # What cannot be read is said where its entries are compared.
-        with suppress(OSError, ValueError, RecursionError):
+        with suppress(*FAULTS):
             text = path.read_text(encoding="utf-8")
             indent = 1 if text.startswith("{\n") else None
             if text != f"{json.dumps(json.loads(text), indent=indent)}\n":
@@ -169,7 +167,7 @@ def _contradicted(said: Any, diagnosis: Mapping[str, Any]) -> str:
     """Say what a summary does not repeat of a diagnosis."""
     try:
         stated = answer(diagnosis)
-    except _FAULTS:
+    except FAULTS:
         return "the diagnosis is not a whole one"
     apart = [key for key, value in stated.items() if inside(said).get(key) != value]
     return f"not the same: {', '.join(apart)}" if apart else ""
@@ -189,6 +187,6 @@ def _mispredicted(folder: Path, diagnosis: Mapping[str, Any]) -> str:
             apart = np.abs(np.stack([g.gap, g.sd], axis=1) - pairs)
             if (apart > _OF_SD * pairs[:, 1:] + _ROUNDING).any():
                 return "it does not predict the gaps that diagnosis.json states"
-    except (CalibError, *_FAULTS) as error:
+    except (CalibError, *FAULTS) as error:
         return f"it cannot be held against its diagnosis ({type(error).__name__}: {error})"
     return ""
