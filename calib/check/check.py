@@ -48,10 +48,6 @@ def check(
     workers : int
         Processes that leave rows out of a comparison.
 
-    Returns
-    -------
-    Outcome
-
     Raises
     ------
     CalibError
