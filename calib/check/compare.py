@@ -148,7 +148,8 @@ def estimates(job: Job, place: Place, found: Mapping[str, Any]) -> list[Item]:
     """Compare point estimates alone, below a place of a document, within what is recorded there."""
     group, recorded = group_of((*place, "estimates")), read_entries(job.folder, place[0])
     others = {path: value for path, value in recorded.items() if group_of(path) != group}
-    items = compare_entries(recorded, others | dict(flatten(found, place)), group_of)
+    again = dict(flatten(json.loads(json.dumps(found)), place))
+    items = compare_entries(recorded, others | again, group_of)
     return [item for item in items if item.group == group]
 
 

@@ -7,6 +7,7 @@ of the predictive distributions they are scores of.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import scipy
@@ -55,9 +56,7 @@ def describe(n: int) -> str:
     return f"{multiple(n):.1f} Monte Carlo errors of a difference ({chance}, times {_SAFETY:g})"
 
 
-def drawn_in_output(
-    calibration: Calibration, validation: Validation, n: int, steps: object
-) -> Errors:
+def drawn_in_output(calibration: Calibration, validation: Validation, n: int, steps: Any) -> Errors:
     """Return what Monte Carlo error allows to an output of a report with n drawn numbers in all.
 
     `steps` is the recorded length of the other run.
@@ -67,27 +66,26 @@ def drawn_in_output(
     return _scaled(posterior_errors(calibration) | scores, times)
 
 
-def drawn_in_run(calibration: Calibration, n: int, steps: object) -> Errors:
+def drawn_in_run(calibration: Calibration, n: int, steps: Any) -> Errors:
     """Return the same for a run, and the posterior sds that its mode is judged by."""
     errors = posterior_errors(calibration)
     errors["log_evidence",] = errors.pop(("sampling", "log_evidence"))
     sds = enumerate(calibration.draws.flat.std(axis=0).tolist())
-    return _scaled(errors, multiple(n) * _of_difference(calibration, steps)) | {
-        ("mode", str(j)): sd for j, sd in sds
-    }
+    scaled = _scaled(errors, multiple(n) * _of_difference(calibration, steps))
+    return scaled | {("mode", str(j)): sd for j, sd in sds}
 
 
-def drawn_in_comparison(comparison: Comparison, n: int, steps: Mapping[str, object]) -> Errors:
+def drawn_in_comparison(comparison: Comparison, n: int, steps: Mapping[str, Any]) -> Errors:
     """Return the same for a comparison, by paths below ``models``; `steps` are by model.
 
     Differences are from the first model.
     """
     best = comparison.candidates[0]
     found: Errors = {}
-    best_moves = _row_moves(best.calibration)[0]
+    best_moves = _row_moves(best.calibration)
     for c in comparison.candidates:
         times = multiple(n) * _of_difference(c.calibration, steps.get(c.model))
-        moves = _row_moves(c.calibration)[0]
+        moves = _row_moves(c.calibration)
         lever = _lever_of(best.rows - c.rows)
         # Draws of the row of the fewest are worth so many times less.
         heavy = np.sqrt(1.0 + _least_ess(c.calibration) * np.square(moves).mean(axis=0).max())
@@ -106,11 +104,10 @@ def drawn_in_comparison(comparison: Comparison, n: int, steps: Mapping[str, obje
     return found
 
 
-def _of_difference(calibration: Calibration, steps: object) -> float:
+def _of_difference(calibration: Calibration, steps: Any) -> float:
     """Error of the difference of two runs over that of this one, should the other be shorter."""
-    ratio = 1.0
-    if isinstance(steps, int | float) and steps > 0:
-        ratio = calibration.draws.report.steps / steps
+    known = isinstance(steps, int | float) and steps > 0
+    ratio = calibration.draws.report.steps / steps if known else 1.0
     return float(np.sqrt(1.0 + np.clip(ratio, 1.0, 4.0)))
 
 
@@ -195,23 +192,22 @@ def validation_errors(
         errors["coverage", name] = moved
         # A Jeffreys interval moves a little faster than its proportion.
         errors |= {("coverage_interval", name, end): 1.5 * moved for end in ("0", "1")}
-    if validation.method == "leave_one_out":
-        moves, elpd = _row_moves(calibration)
+    if validation.elpd_rows is not None:
+        moves = _row_moves(calibration)
         errors["elpd",] = float(moves.sum(axis=1).std())
-        errors["elpd_se",] = float((moves @ _lever_of(elpd)).std())
+        errors["elpd_se",] = float((moves @ _lever_of(validation.elpd_rows)).std())
     return {("validation", *place): error for place, error in errors.items()}
 
 
-def _row_moves(calibration: Calibration) -> tuple[Array, Array]:
+def _row_moves(calibration: Calibration) -> Array:
     """By how much draws move the log density -ln E[1/p(y_i | theta)] of each row without it.
 
-    Influences (draws, n), whose sd over the draws is the Monte Carlo error, and these themselves.
+    Influences (draws, n), whose sd over the draws is the Monte Carlo error.
     """
     rows = calibration.problem.log_likelihood_left_out(calibration.draws.flat)
     inverse = np.exp(rows.min(axis=0) - rows)
     influence = inverse / inverse.mean(axis=0) - 1.0
-    elpd = rows.min(axis=0) - np.log(inverse.mean(axis=0))
-    return influence / np.sqrt(_least_ess(calibration)), elpd
+    return np.asarray(influence / np.sqrt(_least_ess(calibration)))
 
 
 def _lever_of(elpd: Array) -> Array:

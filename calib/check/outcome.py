@@ -95,9 +95,9 @@ class Outcome:
     @property
     def verdict(self) -> str:
         """The verdict in one sentence."""
-        if not self.same:
-            first, *more = dict.fromkeys(item.name for item in self.of(Status.DIFFERENT))
-            return f"DIFFERENT: {', '.join([first, *more[:3], *(['...'] if more[3:] else [])])}"
+        different = list(dict.fromkeys(item.name for item in self.of(Status.DIFFERENT)))
+        if different:
+            return f"DIFFERENT: {', '.join(different[:4])}{', ...' if different[4:] else ''}"
         unjudged = len(self.of(Status.UNJUDGED))
         rest = f"; {unjudged} not judged" if unjudged else ""
         if self.not_converged:

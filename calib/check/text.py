@@ -11,7 +11,7 @@ import base64
 import binascii
 import difflib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from calib.batch.environment import sha256
@@ -23,7 +23,8 @@ GROUP = "page and tables"
 _IMAGE = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]*)")
 _TAG = re.compile(r"<[^>]*>")
 _PICTURE = re.compile(r"\[picture [^\]]*\]")
-_SECTION = re.compile(r'<section\b[^>]*aria-labelledby="([^"]*)"')
+# Where a section begins, and what it is labelled by.
+_SECTION = re.compile(r'(?=<section\b[^>]*aria-labelledby="([^"]*)")')
 _SHOWN, _WIDTH = 6, 120
 _PLAIN = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻\u2212", "0123456789--")
 
@@ -74,48 +75,35 @@ def compare_page(name: str, recorded: Path, written: Path, judged: Judged) -> It
     if (recorded / name).read_bytes() == (written / name).read_bytes():
         return Item(GROUP, name, Status.IDENTICAL)
     old, new = (_readable(folder, name) for folder in (recorded, written))
-    if old == new:
+    if old.splitlines() == new.splitlines():
         note = "the same but for its pictures, which are compared as figures, or its line ends"
         return Item(GROUP, name, Status.WITHIN, note=note)
-    pictures, again = (_PICTURE.findall("\n".join(lines)) for lines in (old, new))
-    if pictures != again:
+    if _PICTURE.findall(old) != _PICTURE.findall(new):
         return claim(GROUP, name, "it shows other pictures, or in another order")
-    both = list(_sections(old)), list(_sections(new))
-    if [section for section, _ in both[0]] != [section for section, _ in both[1]]:
+    parts, again = (("", *_SECTION.split(text)) for text in (old, new))
+    if parts[::2] != again[::2]:
         return claim(GROUP, name, "it has other sections")
     note = "the same words; numbers are judged where they come from"
     found = Item(GROUP, name, Status.WITHIN, note=note)
-    for (section, lines), (_, lines_again) in zip(*both, strict=True):
+    for section, one, other in zip(parts[::2], parts[1::2], again[1::2], strict=True):
         why, numbers = judged(section)
-        if not _alike(lines, lines_again, numbers=numbers):
-            said = differing_lines(lines, lines_again)
+        if not _alike(one.splitlines(), other.splitlines(), numbers=numbers):
+            said = differing_lines(one.splitlines(), other.splitlines())
             if why is None:
                 return claim(GROUP, name, said)
             found = claim(GROUP, name, f"{why}: {said}", sure=False)
     return found
 
 
-def _readable(folder: Path, name: str) -> list[str]:
-    """Lines of a text, with the names of the folder's figures in the place of the pictures."""
+def _readable(folder: Path, name: str) -> str:
+    """Return a text with the names of the folder's figures in the place of the pictures."""
     text = read_text(folder / name)
     names = _figures(folder) if _IMAGE.search(text) else {}
 
     def named(match: re.Match[str]) -> str:
         return f"[picture {names.get(sha256(_decoded(match[1])), 'of its own')}]"
 
-    return _IMAGE.sub(named, text).splitlines()
-
-
-def _sections(lines: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
-    """Yield the lines of each section of a page, by what it is labelled by; first, its head."""
-    name, part = "", list[str]()
-    for line in lines:
-        begun = _SECTION.search(line)
-        if begun:
-            yield name, part
-            name, part = begun[1], []
-        part.append(line)
-    yield name, part
+    return _IMAGE.sub(named, text)
 
 
 def _alike(old: Sequence[str], new: Sequence[str], *, numbers: bool) -> bool:
