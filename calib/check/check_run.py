@@ -80,17 +80,14 @@ def recompute_run(
     Sampled from the recorded starts, whoever chose them; the estimates in the new folder are
     computed again, to be compared with them.
     """
-    nan = float("nan")
-    starts = tuple(
-        PointEstimate(e.method, np.array(e.theta), dict(e.reported), e.cost, "", e.rmse, nan, 0,
-                      nan, True)
-        for e in record.estimates
-    )  # fmt: skip
+    estimates = _estimate_again(record, problem)
+    pairs = zip(estimates, record.estimates, strict=True)
+    starts = tuple(replace(again, theta=np.array(said.theta)) for again, said in pairs)
     calibration = calibrate(
         problem, record.seed, label=record.label, estimates=starts, settings=record.settings,
         progress=lambda done, planned: progress("sampling", done, planned),
     )  # fmt: skip
-    calibration = replace(calibration, estimates=_estimate_again(record, problem))
+    calibration = replace(calibration, estimates=estimates)
     out.mkdir()
     save_calibration(calibration, out, environment=record.environment)
     return calibration
