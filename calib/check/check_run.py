@@ -82,7 +82,9 @@ def recompute_run(
     """
     estimates = _estimate_again(record, problem)
     pairs = zip(estimates, record.estimates, strict=True)
-    starts = tuple(replace(again, theta=np.array(said.theta)) for again, said in pairs)
+    starts = tuple(
+        replace(again, theta=np.array(said.theta), rmse=said.rmse) for again, said in pairs
+    )
     calibration = calibrate(
         problem, record.seed, label=record.label, estimates=starts, settings=record.settings,
         progress=lambda done, planned: progress("sampling", done, planned),
