@@ -15,7 +15,7 @@ from calib.batch.pool import HERE, Pool
 from calib.check.figures import GROUP as FIGURES
 from calib.check.figures import compare_figure
 from calib.check.montecarlo import MONTE_CARLO, Errors, Place
-from calib.check.numbers import FAULTS, SAME_WORDS, compare_entries, flatten
+from calib.check.numbers import FAULTS, SAME_WORDS, compare_entries, flatten, inside
 from calib.check.outcome import ROUNDED, Item, Status, claim
 from calib.check.posteriors import compare_posterior, summary_of
 from calib.check.schema import AUDIT, MANIFEST, SUMMARY
@@ -117,6 +117,9 @@ def read_entries(folder: Path, name: str) -> dict[Place, Any]:
         document: Any = [{str(k): _cell(v) for k, v in row.items()} for row in rows]
     else:
         document = json.loads(text)
+    if name.endswith("/corrected.json"):
+        # Its predictions are held against its diagnosis; these by the laboratory's mode are not.
+        document = {"lab_mode": inside(document, "lab_mode")}
     if name == RUN:
         with suppress(*FAULTS):
             document["posterior"] = summary_of(read_draws(folder / POSTERIOR))
@@ -130,9 +133,6 @@ def _cell(text: Any) -> Any:
 
 
 def _compared(file: str, first: str = "", *more: str) -> bool:
-    if file.endswith("/corrected.json"):
-        # Its predictions are held against its diagnosis; these by the laboratory's mode are not.
-        return first == "lab_mode"
     if file == MANIFEST and first == "tasks":
         return more[-1] not in _OF_FILES
     return file not in (MANIFEST, RUN, COMPARISON) or first not in _OWN
