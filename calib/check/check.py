@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
-import json
 import tempfile
+from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from calib.batch.environment import Environment
 from calib.batch.pool import HERE, Pool
 from calib.check.check_comparison import check_comparison
 from calib.check.check_report import check_report
 from calib.check.check_run import check_run
-from calib.check.outcome import Outcome
-from calib.check.schema import (
-    ComparisonRecord,
-    Manifest,
-    Record,
-    RunRecord,
-    read_comparison,
-    read_folder,
-)
+from calib.check.compare import Job, count_drawn
+from calib.check.montecarlo import describe
+from calib.check.numbers import inside, read_json
+from calib.check.outcome import Item, Outcome
+from calib.check.schema import SUMMARY, read_folder
 from calib.errors import CalibError
+from calib.inference.record import Record, read_record
 from calib.report.compared import FOLDER
+from calib.report.comparison import ComparisonRecord
 from calib.report.study import Progress
+
+_CHECKS: Mapping[str, Callable[[Any, Job], list[Item]]] = {
+    "report": check_report, "run": check_run, "comparison": check_comparison,
+}  # fmt: skip
 
 
 def check(
@@ -45,10 +48,6 @@ def check(
     workers : int
         Processes that leave rows out of a comparison.
 
-    Returns
-    -------
-    Outcome
-
     Raises
     ------
     CalibError
@@ -56,29 +55,15 @@ def check(
     """
     folder = Path(folder)
     record = read_folder(folder)
-    here = Environment.here()
     tell = progress or (lambda what, done, planned: None)
-    kind: Literal["report", "run", "comparison"]
-    with tempfile.TemporaryDirectory(prefix="calib-check-") as name:
-        scratch = Path(name)
-        match record:
-            case Manifest():
-                kind = "report"
-                items, allowed = check_report(
-                    record, folder, scratch, here, tell, quick=quick, pool=pool, workers=workers
-                )
-            case ComparisonRecord():
-                kind = "comparison"
-                items, allowed = check_comparison(
-                    record, folder, scratch, here, tell, quick=quick, workers=workers
-                )
-            case RunRecord():
-                kind = "run"
-                items, allowed = check_run(record, folder, scratch, tell, quick=quick)
+    with tempfile.TemporaryDirectory(prefix="calib-check-") as scratch:
+        made, here = Path(scratch) / "again", Environment.here()
+        job = Job(folder, made, tell, here, quick=quick, pool=pool, workers=workers)
+        items = _CHECKS[record.kind](record, job)
+        allowed = describe(count_drawn(made)) if made.is_dir() else ""
     differing = record.environment.differences(here)
-    return Outcome(
-        str(folder), kind, quick, tuple(items), differing, allowed, _not_converged(record, folder)
-    )
+    missed = _not_converged(record, folder)
+    return Outcome(str(folder), record.kind, quick, tuple(items), differing, allowed, missed)
 
 
 def _not_converged(record: Record, folder: Path) -> tuple[str, ...]:
@@ -88,14 +73,11 @@ def _not_converged(record: Record, folder: Path) -> tuple[str, ...]:
     """
     if isinstance(record, ComparisonRecord):
         return record.unsound
-    try:
-        if isinstance(record, RunRecord):
-            gate: Any = record.document["gate"]
-            return () if gate["passed"] else (record.model,)
-        models = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["models"]
-        missed = [m["model"] for m in models.values() if not m["sampling"]["converged"]]
-        if "comparison" in record.sections:
-            missed += read_comparison(folder / FOLDER).unsound
-        return tuple(dict.fromkeys(missed))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, CalibError):
-        return ()
+    gates = {str(record.document.get("model")): inside(record.document, "gate").get("passed")}
+    for found in inside(read_json(folder / SUMMARY), "models").values():
+        gates[str(inside(found).get("model"))] = inside(found, "sampling").get("converged")
+    missed = [model for model, passed in gates.items() if passed is False]
+    with suppress(CalibError):
+        if record.kind == "report" and (folder / FOLDER).is_dir():
+            missed += read_record(ComparisonRecord, folder / FOLDER).unsound
+    return tuple(dict.fromkeys(missed))

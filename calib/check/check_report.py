@@ -2,198 +2,186 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import shutil
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from calib.batch.environment import Environment
-from calib.batch.pool import HERE, Pool
-from calib.check.check_comparison import check_comparison
-from calib.check.compare import (
-    RECORD,
-    SUMMARY,
-    Again,
-    compare_estimates,
-    compare_files,
-    compare_numbers,
-    count_numbers,
-    moved_parts,
-    output_entry,
-)
-from calib.check.derived import verify_derived, verify_form, verify_gaps
-from calib.check.inputs import verify_files, verify_hashes, verify_label, verify_priors
-from calib.check.montecarlo import describe
-from calib.check.numbers import read_json
-from calib.check.outcome import Item, Status
+from calib.batch.environment import sha256
+from calib.batch.pool import Pool
+from calib.check import compare, verify
+from calib.check.check_comparison import check_compared
+from calib.check.compare import Job
+from calib.check.montecarlo import Place, drawn_in_output
+from calib.check.numbers import inside, read_json
+from calib.check.outcome import Item, claim
 from calib.check.posteriors import GROUP as POSTERIORS
-from calib.check.posteriors import DrawsFile, read_draws, verify_density, verify_summary
-from calib.check.recompute import not_computed, recompute_report, report_tasks
-from calib.check.schema import Manifest, read_comparison
-from calib.check.text import verify_images
-from calib.data import Table, read_table
+from calib.check.posteriors import verify_posterior
+from calib.check.schema import MANIFEST, SUMMARY, Manifest
+from calib.check.text import GROUP as TEXT
+from calib.check.text import read_text, verify_images
+from calib.data import read_table
 from calib.data.quantities import OUTPUTS
-from calib.errors import CalibError
-from calib.inference.problem import build_problem
-from calib.models import get_model
+from calib.inference.problem import Problem, build_problem
 from calib.report.compared import FOLDER
-from calib.report.comparison import HELD_OUT
-from calib.report.study import Progress
+from calib.report.publish import publication
+from calib.report.sections import SECTIONS, work_out
+from calib.report.study import Progress, Study, estimate_task
 from calib.report.study_tasks import Task, fitted_rows
+from calib.report.summary import summarise_estimates
+from calib.report.writer import write_report
 
 _PAGE = "index.html"
+_SEARCHES = (".genetic.", ".differential_evolution.")
 
 
-def check_report(
-    manifest: Manifest,
-    folder: Path,
-    scratch: Path,
-    here: Environment,
-    progress: Progress,
-    *,
-    quick: bool,
-    pool: Pool = HERE,
-    workers: int = 1,
-) -> tuple[list[Item], str]:
-    """Return what was found in a report, and what Monte Carlo error was allowed, in words.
-
-    `scratch` is an empty folder; `quick` skips the sampling.
-    """
-    items = verify_files(folder, manifest.files, RECORD, manifest.left_out)
-    for key, said in manifest.tasks.items():
-        items += verify_hashes(key, said, folder)
+def check_report(manifest: Manifest, job: Job) -> list[Item]:
+    """Return what was found in a report."""
+    folder, same_code = job.folder, manifest.code == job.here.code
+    inputs = [(f.file, f.sha256) for t in manifest.tasks.values() for f in (t.data, t.priors)]
+    items = verify.files(folder, MANIFEST, manifest.files, more=inputs, left_out=manifest.left_out)
     summary = read_json(folder / SUMMARY)
-    posteriors, unreadable = _posteriors(folder, manifest)
-    items += unreadable + _consistent(folder, summary, posteriors)
-    allowed = ""
-    same_code = manifest.code == here.code
-    with not_computed(items, folder, RECORD):
-        tasks = report_tasks(manifest, folder, scratch / "inputs")
-        items += _named_rightly(manifest, folder, tasks, same_code=same_code)
-        there = [task for task in tasks if task.output in posteriors]
-        items += [_density(task, posteriors[task.output]) for task in there]
-        if quick:
-            items += _left_out(manifest)
-            items += compare_estimates(tasks, manifest.seed, summary, progress)
+    if (folder / _PAGE).is_file():
+        items += verify_images(read_text(folder / _PAGE), folder)
+    with compare.not_computed(items, folder, MANIFEST):
+        tasks = report_tasks(manifest, folder, job.made.with_name("inputs"))
+        for task in tasks:
+            said, stated = manifest.tasks[task.output], inside(summary, "models", task.output)
+            items.append(verify.label(said.data.file, task.table, said.label))
+            items.append(verify.priors(task.output, said, folder, same_code=same_code))
+            items += verify_posterior(
+                folder / f"{task.output}.nc", partial(_problem, task), inside(stated, "posterior")
+            )
+            if job.quick:
+                items += _estimates(task, stated, manifest, job)
+        if job.quick:
+            wrong = "left out on purpose, and not made again"
+            items += [claim(POSTERIORS, name, wrong, sure=False) for name in manifest.left_out]
         else:
-            study = recompute_report(manifest, tasks, scratch / "again", progress, pool)
-            allowed = describe(count_numbers(study))
-            again = Again(manifest, folder, scratch / "again", study, here)
-            numbers = compare_numbers(again)
-            items += numbers + compare_files(again, moved_parts(numbers))
+            study = recompute_report(manifest, tasks, job.made, job.progress, job.pool)
+            numbers = _numbers(manifest, study, summary, job)
+            items += numbers + _files(manifest, numbers, job)
         if "comparison" in manifest.sections:
-            items += _compared(
-                manifest, folder, scratch / "compared", here, progress, tasks, quick=quick,
-                workers=workers,
-            )  # fmt: skip
-    items += verify_form(folder) + verify_gaps(folder, summary, same_code=same_code)
-    record = read_json(folder / RECORD)
-    items += verify_derived(folder, manifest.files, record, summary, same_code=same_code)
-    return items, allowed
-
-
-def _compared(
-    manifest: Manifest, folder: Path, scratch: Path, here: Environment, progress: Progress,
-    tasks: tuple[Task, ...], *, quick: bool, workers: int,
-) -> list[Item]:  # fmt: skip
-    """Check the comparison of models in a report: of its rows and seed, stated as it was found."""
-    scratch.mkdir()
-    record = read_comparison(folder / FOLDER)
-    found, _ = check_comparison(
-        record, folder / FOLDER, scratch, here, progress, quick=quick, workers=workers
-    )
-    items = [
-        replace(item, name=f"{FOLDER}/{item.name}", group=f"{FOLDER}: {item.group}")
-        for item in found
-    ]
-    stated: Any = manifest.sections["comparison"]
-    same = isinstance(stated, dict) and stated == {
-        key: value for key, value in record.document.items() if key in stated
+            items += check_compared(manifest, tasks, job.inside(FOLDER))
+    items += verify.form(folder) + verify.gaps(folder, summary, same_code=same_code)
+    writers: dict[str, Callable[[], Mapping[str, str]]] = {
+        f"{SUMMARY} and {MANIFEST}": lambda: publication(manifest.document, summary).files,
+        **{kind.name: partial(kind.derived, folder, manifest.files) for kind in SECTIONS.values()},
     }
-    items.append(_agrees(same and {"models", "verdict", "seed"} <= stated.keys(),
-                         "manifest.json: comparison", "what its comparison.json has"))  # fmt: skip
-    output = get_model(next(iter(record.models))).output
-    fitted = {OUTPUTS[task.output]: fitted_rows(task) for task in tasks}
-    rows, held = fitted.get(output, (None, None))
-    kept = [(folder / FOLDER / "runs" / name / "data.csv", rows) for name in record.models]
-    if record.held_out or held is not None:
-        kept.append((folder / FOLDER / HELD_OUT, held))
-    own = record.seed == manifest.seed and all(_of_rows(path, table) for path, table in kept)
-    items.append(_agrees(own, f"{FOLDER}/comparison.json", "of the report's own rows and seed"))
-    # By them values are shown in the units of the file.
-    named = {OUTPUTS[key]: said.data.header for key, said in manifest.tasks.items()}
-    items.append(_agrees(record.header == named.get(output), f"{FOLDER}/comparison.json: header",
-                         "the column names of the report's own file"))  # fmt: skip
+    return items + verify.derived(folder, manifest.files, writers, sure=same_code)
+
+
+def report_tasks(manifest: Manifest, folder: Path, scratch: Path) -> tuple[Task, ...]:
+    """Return the tasks of a report, with the folder's own data and priors.
+
+    These are copied into `scratch` under their first names, which the page shows.
+    """
+    tasks = []
+    for key, entry in manifest.tasks.items():
+        said = entry.data
+        table = read_table(folder / said.file, allow_missing=tuple(OUTPUTS.values()))
+        table = replace(
+            table, source=said.source, sha256=said.source_sha256, label=entry.label, text=(),
+            header=said.header or table.header, ignored=said.ignored,
+        )  # fmt: skip
+        (scratch / key).mkdir(parents=True)
+        priors = shutil.copyfile(folder / entry.priors.file, scratch / key / entry.priors.source)
+        tasks.append(Task(key, entry.model, table, entry.held_out, priors))
+    return tuple(tasks)
+
+
+def _problem(task: Task) -> Problem:
+    return build_problem(task.model, fitted_rows(task)[0], task.prior_path)
+
+
+def recompute_report(
+    manifest: Manifest, tasks: tuple[Task, ...], out: Path, progress: Progress, pool: Pool
+) -> Study:
+    """Work a report out again and write it into a new folder."""
+    contents = work_out(
+        tasks, manifest.seed, settings=manifest.settings, progress=progress, pool=pool,
+        sections=[SECTIONS[name].again(record) for name, record in manifest.sections.items()],
+    )  # fmt: skip
+    write_report(
+        contents.study, out, sections=contents.found, pdf=manifest.pdf, settings=manifest.settings,
+        command=manifest.command, title=manifest.title, environment=manifest.environment,
+        progress=progress, pool=pool,
+    )  # fmt: skip
+    return contents.study
+
+
+def _estimates(task: Task, stated: Mapping[str, Any], manifest: Manifest, job: Job) -> list[Item]:
+    """Compare the point estimates of an output, computed again without sampling."""
+    place = (SUMMARY, "models", task.output)
+    if "error" in stated:
+        wrong = "it failed; to see whether it does again, check without --quick"
+        name = f"{SUMMARY}: models.{task.output}"
+        return [claim(f"{task.output}: error", name, wrong, sure=False)]
+    found = summarise_estimates(*estimate_task(task, manifest.seed, progress=job.progress))
+    return compare.estimates(job, place, found)
+
+
+def _numbers(manifest: Manifest, study: Study, summary: Mapping[str, Any], job: Job) -> list[Item]:
+    """Compare every document entry by entry, and name the inputs that do not belong to them."""
+    n, drawn = compare.count_drawn(job.made), dict[Place, float | None]()
+    for key, result in study.successes.items():
+        steps = inside(summary, "models", key, "sampling").get("steps")
+        sizes = drawn_in_output(result.calibration, result.validation, n, steps)
+        drawn |= {(SUMMARY, "models", key, *path): size for path, size in sizes.items()}
+    items = compare.document(SUMMARY, job, drawn)
+    for key, task in manifest.tasks.items():
+        points = [item for item in items if item.group == f"{key}: estimates"]
+        points = [i for i in points if not any(search in i.name for search in _SEARCHES)]
+        mode = [i for i in items if i.name.startswith(f"{SUMMARY}: models.{key}.sampling.mode.")]
+        wrong = "most estimates in summary.json do not follow from these rows"
+        other = "the posterior mode in summary.json does not follow from these priors and the data"
+        blamed = verify.blame(points, task.data.file, wrong)
+        items += blamed or verify.blame(mode, task.priors.file, other)
+    for name in sorted(filter(compare.is_document, verify.files_in(job.made) - {SUMMARY})):
+        items += compare.document(name, job)
     return items
 
 
-def _agrees(same: bool, name: str, what: str) -> Item:
-    status = Status.IDENTICAL if same else Status.DIFFERENT
-    return Item(FOLDER, name, status, note=what if same else f"it is not {what}")
+def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
+    """Compare every file but the documents and what follows from them."""
+    same_program = manifest.environment.same_program(job.here)
+    readings, moved = compare.moved_parts(numbers)
+
+    def judged(name: str, section: str) -> tuple[str | None, bool]:
+        if name.startswith(("data/", "priors/")) or "/case/" in name:
+            return None, True
+        if not same_program:
+            return "another version wrote it", False
+        about = partial(_about, manifest, name, section)
+        why = "its numbers moved within their tolerance" if any(map(about, readings)) else None
+        return why, not any(map(about, moved))
+
+    made, items = verify.files_in(job.made), []
+    for name in sorted(n for n in made - verify.derived_files(made) if not compare.is_document(n)):
+        if name in manifest.left_out:
+            same = sha256((job.made / name).read_bytes()) == manifest.left_out[name]
+            wrong = "" if same else "left out on purpose; its summary is compared"
+            right = "left out on purpose; made again, it has the recorded hash"
+            items.append(claim(POSTERIORS, name, wrong, right, sure=False))
+        else:
+            items += compare.file(name, job, partial(judged, name), sure=same_program)
+    # A comparison is checked as a folder of `calib compare`.
+    inner = (f"{FOLDER}/",) if "comparison" in manifest.sections else ()
+    strangers = set(manifest.files) - verify.derived_files(manifest.files) - made
+    strangers = {name for name in strangers if not name.startswith(inner)}
+    note = "this version makes no such file"
+    return items + [claim(TEXT, name, note, sure=same_program) for name in sorted(strangers)]
 
 
-def _of_rows(path: Path, table: Table | None) -> bool:
-    """Whether a file has the rows of a table."""
-    if table is None:
-        return False
-    kept = read_table(path, allow_missing=tuple(OUTPUTS.values())).columns
-    return kept.keys() == table.columns.keys() and all(
-        np.array_equal(values, table[name], equal_nan=True) for name, values in kept.items()
-    )
-
-
-def _left_out(manifest: Manifest) -> list[Item]:
-    note = "left out on purpose, and not made again"
-    return [Item(POSTERIORS, name, Status.UNJUDGED, note=note) for name in manifest.left_out]
-
-
-def _posteriors(folder: Path, manifest: Manifest) -> tuple[dict[str, DrawsFile], list[Item]]:
-    """Read the netCDF files that are there, by output; and what cannot be read."""
-    found, unreadable = {}, []
-    for key in manifest.tasks:
-        path = folder / f"{key}.nc"
-        if path.is_file():
-            try:
-                found[key] = read_draws(path)
-            except CalibError as error:
-                item = Item(POSTERIORS, path.name, Status.DIFFERENT, note=error.message)
-                unreadable.append(item)
-    return found, unreadable
-
-
-def _consistent(
-    folder: Path, summary: Mapping[str, Any], posteriors: Mapping[str, DrawsFile]
-) -> list[Item]:
-    """Hold the parts of the folder against each other, without computing anything again."""
-    items = []
-    page = folder / _PAGE
-    if page.is_file():
-        items += verify_images(page.read_text(encoding="utf-8", errors="replace"), folder)
-    for key, file in posteriors.items():
-        stated = output_entry(summary, key).get("posterior")
-        items.append(
-            verify_summary(f"{key}.nc", file, stated if isinstance(stated, Mapping) else {})
-        )
-    return items
-
-
-def _named_rightly(
-    manifest: Manifest, folder: Path, tasks: tuple[Task, ...], *, same_code: bool
-) -> list[Item]:
-    items = []
-    for task in tasks:
-        said = manifest.tasks[task.output]
-        items.append(verify_label(said.data.file, task.table, said.label))
-        items.append(verify_priors(task.output, said, folder, same_code=same_code))
-    return items
-
-
-def _density(task: Task, file: DrawsFile) -> Item:
-    name = f"{task.output}.nc"
-    try:
-        problem = build_problem(task.model, fitted_rows(task)[0], task.prior_path)
-    except CalibError as error:
-        return Item(POSTERIORS, name, Status.DIFFERENT, note=error.message)
-    return verify_density(name, file, problem)
+def _about(manifest: Manifest, name: str, section: str, part: str) -> bool:
+    """Whether a section of a page is about a part of a report: an output, a gap, or the audit."""
+    if name.startswith("gaps/"):
+        return part == f"gap: {name.split('/')[1]}"
+    if section == "paper-gaps":
+        return part.startswith("gap: ")
+    if section == "audit" or section in manifest.tasks:
+        return part == section
+    # A comparison's words are those of the manifest's own numbers.
+    return part in manifest.tasks and section != "comparison"

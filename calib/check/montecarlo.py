@@ -7,34 +7,37 @@ of the predictive distributions they are scores of.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy
 
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import mcse, tail_shape
+from calib.inference.random import generator
 from calib.models.base import Array
 from calib.validation.comparison import Comparison
-from calib.validation.scores import LEVELS, RELATIVE_ERROR_FAR, RELATIVE_ERROR_FLOOR
+from calib.validation.scores import LEVELS, RELATIVE_ERROR_FAR, crps
 from calib.validation.validate import Validation
 
 MONTE_CARLO = "Monte Carlo"
 
 type Place = tuple[str, ...]
 """Keys from the top of a document to one of its numbers; positions in a list count from "0"."""
+type Errors = dict[Place, float | None]
+"""By path; None where a tail is too heavy for one."""
 
-# Moments that exist: the variance of a mean, and of a variance. The shape is estimated, so a
-# little less is asked of the second.
+# Shapes with which the variance of a mean exists, and of a variance: a little less, as estimated.
 _K_MEAN, _K_SD = 0.5, 0.2
-# Of an interval's width: an end at the edge of what is possible hangs on the few outermost draws,
-# whose scatter among parts of a run tells little. Between seeds k of the rut depth's moves so far.
+# Of an interval's width: an end at the edge of what is possible hangs on the few outermost draws.
+# Between seeds k of the rut depth's moves so far.
 _END = 2e-4
 # Chance of one false alarm or more in a whole check.
 _FAMILY = 1e-3
-# Over 24 seeds of the embedded problems, numbers moved by up to 1.4 times what ArviZ expects: the
-# walkers of an ensemble are not quite independent chains.
+# Over 24 seeds numbers moved by up to 1.4 times what ArviZ expects: walkers are not quite chains.
 _SAFETY = 1.5
+# Of random draws, among which scores scatter; their sd is known to a twentieth.
+_GROUPS = 200
 # Draws of the round of importance sampling that estimates the evidence, at least.
 _EVIDENCE_DRAWS = 1500
 
@@ -42,123 +45,93 @@ _EVIDENCE_DRAWS = 1500
 def multiple(n: int) -> float:
     """Return how many standard errors of a difference are allowed where `n` are looked at.
 
-    So many that one check in a thousand finds a difference where there is none: seven of the
-    some hundred numbers of a report.
+    One check in a thousand finds a difference where there is none: seven of some hundred numbers.
     """
     return float(_SAFETY * scipy.stats.norm.isf(_FAMILY / (2 * max(n, 1))))
 
 
 def describe(n: int) -> str:
     """Say in words what is allowed to `n` numbers that follow from posterior draws."""
-    return (
-        f"{multiple(n):.1f} Monte Carlo errors of a difference (one false alarm in "
-        f"{1.0 / _FAMILY:g} checks of {n} such numbers, times {_SAFETY:g})"
-    )
+    chance = f"one false alarm in {1.0 / _FAMILY:g} checks of {n} such numbers"
+    return f"{multiple(n):.1f} Monte Carlo errors of a difference ({chance}, times {_SAFETY:g})"
 
 
-def count_drawn(calibration: Calibration, n_validated: int = 0) -> int:
-    """Return how many numbers of an output follow from posterior draws, at most.
+def drawn_in_output(calibration: Calibration, validation: Validation, n: int, steps: Any) -> Errors:
+    """Return what Monte Carlo error allows to an output of a report with n drawn numbers in all.
 
-    Six of each parameter, the evidence; of a validation one for each row, and fourteen scores.
-    """
-    return 6 * len(calibration.parameters) + 1 + (n_validated + 14 if n_validated else 0)
-
-
-def count_compared(comparison: Comparison) -> int:
-    """Return how many numbers of a comparison follow from posterior draws, those of runs too."""
-    held = sum(4 for c in comparison.candidates if c.held is not None)
-    return held + sum(8 + c.rows.size + count_drawn(c.calibration) for c in comparison.candidates)
-
-
-def drawn_in_output(
-    calibration: Calibration, validation: Validation, n: int, steps: object
-) -> dict[Place, float | None]:
-    """Return what Monte Carlo error allows to the numbers of one output of a report.
-
-    Of the whole report n numbers follow from posterior draws; `steps` is the recorded length of the
-    other run.
+    `steps` is the recorded length of the other run.
     """
     times = multiple(n) * _of_difference(calibration, steps)
-    errors = posterior_errors(calibration)
-    errors |= validation_errors(calibration, validation, times)
-    return _scaled(errors, times)
+    scores = validation_errors(calibration, validation, times)
+    return _scaled(posterior_errors(calibration) | scores, times)
 
 
-def drawn_in_run(calibration: Calibration, steps: object) -> dict[Place, float | None]:
+def drawn_in_run(calibration: Calibration, n: int, steps: Any) -> Errors:
     """Return the same for a run, and the posterior sds that its mode is judged by."""
     errors = posterior_errors(calibration)
     errors["log_evidence",] = errors.pop(("sampling", "log_evidence"))
-    times = multiple(count_drawn(calibration)) * _of_difference(calibration, steps)
     sds = enumerate(calibration.draws.flat.std(axis=0).tolist())
-    return _scaled(errors, times) | {("mode", str(j)): sd for j, sd in sds}
+    scaled = _scaled(errors, multiple(n) * _of_difference(calibration, steps))
+    return scaled | {("mode", str(j)): sd for j, sd in sds}
 
 
-def drawn_in_comparison(
-    comparison: Comparison, best: str, steps: Mapping[str, object]
-) -> dict[Place, float | None]:
-    """Return what Monte Carlo error allows to a comparison's numbers, by paths below ``models``.
+def drawn_in_comparison(comparison: Comparison, n: int, steps: Mapping[str, Any]) -> Errors:
+    """Return the same for a comparison, by paths below ``models``; `steps` are by model.
 
-    Differences are from the model `best`; `steps` are recorded lengths of the other runs, by model.
+    Differences are from the first model.
     """
-    moved = {c.model: _RowErrors.of(c.calibration) for c in comparison.candidates}
-    first = next(c for c in comparison.candidates if c.model == best)
-    n, found = count_compared(comparison), dict[Place, float | None]()
+    best = comparison.candidates[0]
+    found: Errors = {}
+    best_moves = _row_moves(best.calibration)
     for c in comparison.candidates:
         times = multiple(n) * _of_difference(c.calibration, steps.get(c.model))
-        of_sum = np.hypot(moved[c.model].of_sum(), moved[best].of_sum())
-        spread = _lever_of(first.rows - c.rows)
-        of_spread = np.hypot(moved[c.model].along(spread), moved[best].along(spread))
-        errors = _scores(validation_errors(c.calibration, c.loo, times), moved[c.model].heavy)
-        errors["below_best",] = float(of_sum)
-        errors["below_best_se",] = float(of_spread)
-        errors["log_evidence",] = posterior_errors(c.calibration)["sampling", "log_evidence"]
-        for i, error in enumerate(moved[c.model].each.tolist()):
-            errors["elpd_rows", str(i)] = error
+        moves = _row_moves(c.calibration)
+        lever = _lever_of(best.rows - c.rows)
+        # Draws of the row of the fewest are worth so many times less.
+        heavy = np.sqrt(1.0 + _least_ess(c.calibration) * np.square(moves).mean(axis=0).max())
+        errors: Errors = {
+            **_stated(validation_errors(c.calibration, c.loo, times), float(heavy)),
+            ("below_best",): float(np.hypot(moves.sum(axis=1).std(), best_moves.sum(axis=1).std())),
+            ("below_best_se",): float(np.hypot((moves @ lever).std(), (best_moves @ lever).std())),
+            ("log_evidence",): posterior_errors(c.calibration)["sampling", "log_evidence"],
+            **{("elpd_rows", str(i)): float(sd) for i, sd in enumerate(moves.std(axis=0))},
+        }
         if c.held is not None:
-            held = _scores(validation_errors(c.calibration, c.held, times), 1.0)
+            held = _stated(validation_errors(c.calibration, c.held, times), 1.0)
             held["elpd",] = _held_error(c.calibration, c.held)
             errors |= {("held_out", *place): size for place, size in held.items()}
-        found |= {(c.model, *k): size for k, size in _scaled(errors, times).items()}
+        found |= {(c.model, *place): size for place, size in _scaled(errors, times).items()}
     return found
 
 
-def _left_out(calibration: Calibration) -> tuple[Array, Array]:
-    """Influence of each draw on -ln E[1/p(y_i | theta)], (draws, n), and that itself, (n,)."""
-    rows = calibration.problem.log_likelihood_left_out(calibration.draws.flat)
-    inverse = np.exp(rows.min(axis=0) - rows)
-    influence = inverse / inverse.mean(axis=0) - 1.0
-    return influence, rows.min(axis=0) - np.log(inverse.mean(axis=0))
-
-
-def _lever_of(elpd: Array) -> Array:
-    """Derivatives of sqrt(n var) of some rows by each of them."""
-    n = elpd.size
-    spread = float(np.sqrt(n * elpd.var(ddof=1)))
-    return n * (elpd - elpd.mean()) / ((n - 1) * spread) if spread > 0.0 else np.zeros(n)
-
-
-def _of_difference(calibration: Calibration, steps: object) -> float:
+def _of_difference(calibration: Calibration, steps: Any) -> float:
     """Error of the difference of two runs over that of this one, should the other be shorter."""
-    ratio = 1.0
-    if isinstance(steps, int | float) and steps > 0:
-        ratio = calibration.draws.report.steps / steps
+    known = isinstance(steps, int | float) and steps > 0
+    ratio = calibration.draws.report.steps / steps if known else 1.0
     return float(np.sqrt(1.0 + np.clip(ratio, 1.0, 4.0)))
 
 
-def _scaled(errors: dict[Place, float | None], times: float) -> dict[Place, float | None]:
-    """Return so many times the errors, of those that exist."""
+def _scaled(errors: Mapping[Place, float | None], times: float) -> Errors:
     return {place: None if error is None else times * error for place, error in errors.items()}
 
 
-def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:
-    """Return the Monte Carlo standard errors of a posterior summary, by paths below the output.
+def _stated(errors: Mapping[Place, float], heavy: float) -> Errors:
+    """Those of a validation's errors that a comparison states, as it names them."""
+    times = {"elpd": 1.0, "elpd_se": 1.0, "rmse": heavy, "crps": heavy}
+    found: Errors = {
+        (name,): by * errors["validation", name]
+        for name, by in times.items()
+        if ("validation", name) in errors
+    }
+    return found | {("coverage_90",): errors["validation", "coverage", "90"]}
 
-    None where the posterior's tail is so heavy that there is no such error.
-    """
+
+def posterior_errors(calibration: Calibration) -> Errors:
+    """Return the Monte Carlo standard errors of a posterior summary, by paths below the output."""
     names = tuple(calibration.parameters)
     stacked = np.stack([calibration.parameters[name] for name in names], axis=-1)
     sd, shape = mcse(stacked, "sd"), tail_shape(stacked)
-    errors: dict[Place, float | None] = {}
+    errors: Errors = {}
     for j, name in enumerate(names):
         stated = calibration.summary[name]
         least = _END * (stated.hdi_upper - stated.hdi_lower)
@@ -183,123 +156,65 @@ def posterior_errors(calibration: Calibration) -> dict[Place, float | None]:
 
 def validation_errors(
     calibration: Calibration, validation: Validation, multiple: float
-) -> dict[Place, float | None]:
+) -> dict[Place, float]:
     """Return the Monte Carlo standard errors of a validation's scores.
 
     A part p of the predictive draws has the error sqrt(p (1 - p) (1/N + 1/ESS)): N draws of the
-    noise on top of ESS effective draws of the parameters. What is a mean over rows has the error of
-    the mean influence of a draw on them. How many errors will be allowed decides which rows may
-    cross the edge of a band.
+    noise on top of ESS effective draws of the parameters; others follow from the scatter among
+    groups of the draws. Rows within so many errors of the edge of a band may cross it.
     """
     draws, observed, scores = validation.draws, validation.observed, validation.scores
     n_draws, n = draws.shape
     part = float(np.sqrt(1.0 / n_draws + 1.0 / _least_ess(calibration)))
     p = np.clip(scores.pit, 4.0 / n_draws, 1.0 - 4.0 / n_draws)
     pit = np.sqrt(p * (1.0 - p)) * part
-    slope = (np.quantile(draws, 0.55, axis=0) - np.quantile(draws, 0.45, axis=0)) / 0.1
-    median = 0.5 * part * slope
-    errors: dict[Place, float | None] = {
-        ("validation", "rmse"): part * _rmse_influence(draws, observed, slope, scores.rmse),
-    }
+    size = max(n_draws // _GROUPS, 1)
+    groups = generator(0, "groups of draws").permutation(draws)[: n_draws - n_draws % size]
+    groups = groups.reshape(-1, size, n)
+    of_group = part * float(np.sqrt(size))
+    medians = np.median(groups, axis=1)
+    rmses = np.sqrt(np.square(medians - observed).mean(axis=1))
+    errors: dict[Place, float] = {("pit", str(i)): float(pit[i]) for i in range(n)}
+    errors["rmse",] = of_group * float(rmses.std())
     if np.isfinite(scores.crps):
-        errors["validation", "crps"] = part * _crps_influence(draws, observed)
-    errors |= {("validation", "pit", str(i)): float(pit[i]) for i in range(n)}
-    large = np.abs(observed) > RELATIVE_ERROR_FLOOR * np.abs(observed).max()
-    relative = median[large] / np.abs(observed[large])
-    if relative.size:
-        errors["validation", "max_relative_error"] = float(relative.max())
-        near = (
-            np.abs(np.abs(scores.relative_error[large]) - RELATIVE_ERROR_FAR) <= multiple * relative
-        )
-        errors["validation", "n_relative_error_above_6_percent"] = near.sum() / multiple
+        errors["crps",] = of_group * float(np.std([crps(g, observed).mean() for g in groups]))
+    large = ~np.isnan(scores.relative_error)
+    if large.any():
+        relative = of_group * medians.std(axis=0)[large] / np.abs(observed[large])
+        errors["max_relative_error",] = float(relative.max())
+        from_edge = np.abs(np.abs(scores.relative_error[large]) - RELATIVE_ERROR_FAR)
+        near = float((from_edge <= multiple * relative).sum())
+        errors["n_relative_error_above_6_percent",] = near / multiple
     for level in LEVELS:
         edges = 0.5 + 0.5 * level * np.array([-1.0, 1.0])
         close = np.abs(scores.pit[:, None] - edges).min(axis=1) <= multiple * pit
-        moved = float(close.sum()) / n / multiple
-        errors["validation", "coverage", f"{100 * level:g}"] = moved
+        moved, name = float(close.sum()) / n / multiple, f"{100 * level:g}"
+        errors["coverage", name] = moved
         # A Jeffreys interval moves a little faster than its proportion.
-        for end in ("0", "1"):
-            errors["validation", "coverage_interval", f"{100 * level:g}", end] = 1.5 * moved
-    if validation.method == "leave_one_out":
-        influence, elpd = _left_out(calibration)
-        rows = _RowErrors(influence, float(np.sqrt(_least_ess(calibration))))
-        errors["validation", "elpd"] = rows.of_sum()
-        errors["validation", "elpd_se"] = rows.along(_lever_of(elpd))
-    return errors
+        errors |= {("coverage_interval", name, end): 1.5 * moved for end in ("0", "1")}
+    if validation.elpd_rows is not None:
+        moves = _row_moves(calibration)
+        errors["elpd",] = float(moves.sum(axis=1).std())
+        errors["elpd_se",] = float((moves @ _lever_of(validation.elpd_rows)).std())
+    return {("validation", *place): error for place, error in errors.items()}
 
 
-def _rmse_influence(draws: Array, observed: Array, slope: Array, rmse: float) -> float:
-    """Standard deviation of one draw's influence on the RMSE of the medians."""
-    if rmse == 0.0:
-        return 0.0
-    medians = np.median(draws, axis=0)
-    influence = slope * (0.5 - (draws < medians))
-    return float(((medians - observed) * influence).mean(axis=1).std() / rmse)
+def _row_moves(calibration: Calibration) -> Array:
+    """By how much draws move the log density -ln E[1/p(y_i | theta)] of each row without it.
 
-
-def _crps_influence(draws: Array, observed: Array) -> float:
-    """Standard deviation of one draw's influence on the mean CRPS."""
-    m = draws.shape[0]
-    order = np.argsort(draws, axis=0)
-    ordered = np.take_along_axis(draws, order, axis=0)
-    total = np.cumsum(ordered, axis=0)
-    rank = np.arange(1, m + 1)[:, None]
-    # Mean absolute difference of each draw to all others, from the sums of the sorted draws.
-    sorted_apart = (ordered * (2 * rank - m) + total[-1] - 2.0 * total) / m
-    apart = np.empty_like(draws)
-    np.put_along_axis(apart, order, sorted_apart, axis=0)
-    return float((np.abs(draws - observed) - apart).mean(axis=1).std())
-
-
-@dataclass(frozen=True, eq=False)
-class _RowErrors:
-    """Monte Carlo errors of the log density of each row without it.
-
-    From the influence of each draw (draws, n), of mean zero, and the root of the effective sample
-    size.
+    Influences (draws, n), whose sd over the draws is the Monte Carlo error.
     """
-
-    influence: Array
-    root: float
-
-    @classmethod
-    def of(cls, calibration: Calibration) -> _RowErrors:
-        """Of a calibrated model."""
-        return cls(_left_out(calibration)[0], float(np.sqrt(_least_ess(calibration))))
-
-    @property
-    def each(self) -> Array:
-        """Of each row, shape (n,)."""
-        return np.asarray(self.influence.std(axis=0) / self.root)
-
-    @property
-    def heavy(self) -> float:
-        """Root of the draws over those that they are worth for the row of the fewest."""
-        return float(np.sqrt(1.0 + np.square(self.influence).mean(axis=0).max()))
-
-    def of_sum(self) -> float:
-        """Of the sum over the rows."""
-        return self.along(np.ones(self.influence.shape[1]))
-
-    def along(self, lever: Array) -> float:
-        """Of the rows times a lever, summed."""
-        return float((self.influence @ lever).std() / self.root)
+    rows = calibration.problem.log_likelihood_left_out(calibration.draws.flat)
+    inverse = np.exp(rows.min(axis=0) - rows)
+    influence = inverse / inverse.mean(axis=0) - 1.0
+    return np.asarray(influence / np.sqrt(_least_ess(calibration)))
 
 
-def _scores(errors: Mapping[Place, float | None], heavy: float) -> dict[Place, float | None]:
-    """Those of a validation's errors that a comparison states, as it names them.
-
-    They are `heavy` times as large as those of draws that all weigh the same.
-    """
-    found: dict[Place, float | None] = {
-        (name,): errors["validation", name] for name in ("elpd", "elpd_se")
-        if ("validation", name) in errors
-    }  # fmt: skip
-    for name in ("rmse", "crps"):
-        error = errors["validation", name]
-        found[name,] = None if error is None else heavy * error
-    found["coverage_90",] = errors["validation", "coverage", "90"]
-    return found
+def _lever_of(elpd: Array) -> Array:
+    """Derivatives of sqrt(n var) of some rows by each of them."""
+    n = elpd.size
+    spread = float(np.sqrt(n * elpd.var(ddof=1)))
+    return n * (elpd - elpd.mean()) / ((n - 1) * max(spread, 1e-300))
 
 
 def _held_error(calibration: Calibration, held: Validation) -> float:

@@ -6,12 +6,13 @@ import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from calib.check.montecarlo import Place
+from calib.check.montecarlo import Errors, Place
 from calib.check.outcome import Item, Status
-from calib.check.tolerances import ARITHMETIC, Of, Tolerance, natural_scale, tolerance_of
+from calib.check.tolerances import ARITHMETIC, Entries, Tolerance, natural_scale, tolerance_of
 
 NUMBER = re.compile(
     r"[-+\u2212]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+|\u00d710[\u2070-\u2079\u00b2\u00b3\u00b9\u207b]+)?"
@@ -19,113 +20,103 @@ NUMBER = re.compile(
 # Most entries by far; to ask whether they are an abstract collection takes longer than the rest.
 _PLAIN = (float, str, int, type(None))
 _ABSENT = object()
+# What somebody else's file makes the reading of it raise.
+FAULTS = (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
 SAME_WORDS = "the same words"
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Return a JSON object; empty where the file is missing or damaged."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        return inside(json.loads(path.read_text(encoding="utf-8")))
+    except FAULTS:
         return {}
-    return content if isinstance(content, dict) else {}
+
+
+def inside(document: Any, *keys: str) -> dict[str, Any]:
+    """Return the object below some keys of a document; empty where there is none."""
+    for key in keys:
+        document = document.get(key) if isinstance(document, dict) else None
+    return document if isinstance(document, dict) else {}
 
 
 def flatten(document: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:
-    """Yield the path and the value of every entry of a JSON document.
+    """Yield path and value of every entry of a JSON document.
 
-    Entries of a list are known by their ``name`` or ``key`` where each has its own, otherwise by
-    their position.
+    Those of a list are known by their ``name`` or ``key`` where each has its own, or by position.
     """
     if isinstance(document, _PLAIN):
         yield place, document
-    elif isinstance(document, Mapping):
-        for key, value in document.items():
+    elif isinstance(document, Mapping | list | tuple):
+        named = document if isinstance(document, Mapping) else _named(document)
+        for key, value in named.items():
             yield from flatten(value, (*place, str(key)))
-    elif isinstance(document, Sequence):
-        for name, value in zip(_names(document), document, strict=True):
-            yield from flatten(value, (*place, name))
     else:
         yield place, document
 
 
-def _names(entries: Sequence[Any]) -> list[str]:
+def _named(entries: Sequence[Any]) -> Mapping[Any, Any]:
     for key in ("name", "key") if entries and isinstance(entries[0], Mapping) else ():
-        names = [entry.get(key) for entry in entries if isinstance(entry, Mapping)]
-        if len(names) == len(set(map(str, names))) == len(entries) and None not in names:
-            return [str(name) for name in names]
-    return [str(i) for i in range(len(entries))]
+        names = [inside(entry).get(key) for entry in entries]
+        if None not in names and len(set(map(str, names))) == len(entries):
+            return dict(zip(map(str, names), entries, strict=True))
+    return dict(enumerate(entries))
 
 
 def compare_entries(
-    recorded: Mapping[Place, Any],
-    found: Mapping[Place, Any],
-    group_of: Callable[[Place], str],
-    drawn: Mapping[Place, float | None] | None = None,
-) -> list[Item]:
+    recorded: Entries, found: Entries, group_of: Callable[[Place], str],
+    drawn: Errors | None = None,
+) -> list[Item]:  # fmt: skip
     """Return one item for each entry, by path, the file first, of a document or a part of one.
 
     `drawn` is what Monte Carlo error allows, by path; None where there is no such error.
     """
-    errors = drawn or {}
-    paths = [*recorded, *(path for path in found if path not in recorded)]
     items = []
-    for path in paths:
-        tolerance = tolerance_of(path, found)
+    for path in [*recorded, *(path for path in found if path not in recorded)]:
         name, group = f"{path[0]}: {'.'.join(path[1:])}", group_of(path)
         old, new = recorded.get(path, _ABSENT), found.get(path, _ABSENT)
-        if old is _ABSENT or new is _ABSENT:
-            items.append(_one_sided(group, name, old, new, tolerance))
-        elif _equal(old, new):
+        if _equal(old, new):
             items.append(Item(group, name, Status.IDENTICAL, old, new))
+            continue
+        tolerance = tolerance_of(path, found)
+        beyond = Status.DIFFERENT if tolerance.judged else Status.UNJUDGED
+        if old is _ABSENT:
+            items.append(Item(group, name, beyond, found=new, note="missing"))
+        elif new is _ABSENT:
+            items.append(Item(group, name, beyond, old, note="not computed by this version"))
         elif _is_number(old) and type(old) is type(new):
-            size = _size(tolerance, path, min(abs(old), abs(new)), found, errors)
-            items.append(_number(group, name, old, new, tolerance, size))
+            size = _size(tolerance, path, old, found, drawn or {})
+            items.append(_number(Item(group, name, beyond, old, new, size, tolerance.kind)))
+        elif tolerance.words and without_numbers(str(old)) == without_numbers(str(new)):
+            items.append(Item(group, name, Status.WITHIN, old, new, note=SAME_WORDS))
         else:
-            same = tolerance.words and without_numbers(str(old)) == without_numbers(str(new))
-            status = Status.WITHIN if same else _beyond(tolerance)
-            note = SAME_WORDS if same else tolerance.kind
-            items.append(Item(group, name, status, old, new, note=note))
+            items.append(Item(group, name, beyond, old, new, note=tolerance.kind))
     return items
 
 
-def _one_sided(group: str, name: str, old: Any, new: Any, tolerance: Tolerance) -> Item:
-    if old is _ABSENT:
-        return Item(group, name, _beyond(tolerance), found=new, note="missing")
-    return Item(group, name, _beyond(tolerance), old, note="not computed by this version")
-
-
 def _size(
-    tolerance: Tolerance, path: Place, smaller: float, found: Mapping[Place, Any],
-    errors: Mapping[Place, float | None],
-) -> float | None:  # fmt: skip
+    tolerance: Tolerance, path: Place, old: float, entries: Entries, errors: Errors
+) -> float | None:
     """Largest difference that is taken for the same; None where none can be stated."""
-    if tolerance == ARITHMETIC and isinstance(found[path], int):
+    new = entries[path]
+    if tolerance == ARITHMETIC and isinstance(new, int):
         return 0.0  # a count, or a seed
-    scale = natural_scale(tolerance.of, path, found, errors)
-    if scale is None:
-        return None
-    if tolerance.of is Of.RATIO:
-        return (tolerance.part - 1.0) * smaller
-    return tolerance.part * scale + tolerance.floor
+    scale = natural_scale(tolerance.of, path, entries, errors)
+    if scale is not None and tolerance.of == "ratio":
+        return float((tolerance.part - 1.0) * min(abs(old), abs(new)))
+    return None if scale is None else tolerance.part * scale + tolerance.floor
 
 
-def _number(
-    group: str, name: str, old: float, new: float, tolerance: Tolerance, size: float | None
-) -> Item:
+def _number(item: Item) -> Item:
+    """Judge two numbers that are not equal, given how they are judged beyond what is allowed."""
+    old, new = item.recorded, item.found
     if math.isnan(old) or math.isnan(new):
-        return Item(group, name, Status.DIFFERENT, old, new, note="not a number")
+        return replace(item, status=Status.DIFFERENT, allowed=None, note="not a number")
     rounded = 1e-6 * max(abs(old), abs(new)) if isinstance(old, float) else 0.0
-    if abs(old - new) <= max(size or 0.0, rounded):
-        return Item(group, name, Status.WITHIN, old, new, size, tolerance.kind)
-    if size is None:
-        note = "tail too heavy for a Monte Carlo error"
-        return Item(group, name, Status.UNJUDGED, old, new, note=note)
-    return Item(group, name, _beyond(tolerance), old, new, size, tolerance.kind)
-
-
-def _beyond(tolerance: Tolerance) -> Status:
-    return Status.DIFFERENT if tolerance.judged else Status.UNJUDGED
+    if abs(old - new) <= max(item.allowed or 0.0, rounded):
+        return replace(item, status=Status.WITHIN)
+    heavy = replace(item, status=Status.UNJUDGED, note="tail too heavy for a Monte Carlo error")
+    return heavy if item.allowed is None else item
 
 
 def _is_number(value: Any) -> bool:

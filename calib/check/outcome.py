@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, Literal
@@ -23,16 +23,8 @@ class Status(StrEnum):
 class Item:
     """One thing that was compared: a file, the path of a number in it, or a claim.
 
-    Parameters
-    ----------
-    group : str
-        What it belongs to, such as ``"rut_depth: posterior"``.
-    recorded, found : object
-        In the folder, and computed again; None where there is no number to show.
-    allowed : float, optional
-        The largest difference that is taken for the same.
-    note : str
-        Why, in a few words.
+    It belongs to a group, such as ``"rut_depth: posterior"``. None stands for the recorded number,
+    for the one found again, and for the largest difference allowed, where there is none to show.
     """
 
     group: str
@@ -46,17 +38,15 @@ class Item:
     @property
     def share(self) -> float | None:
         """Difference over the allowed one; None where either is missing."""
-        values = (self.recorded, self.found)
-        if not self.allowed or not all(isinstance(v, int | float) for v in values):
-            return None
-        return float(abs(self.recorded - self.found) / self.allowed)
+        numbers = all(isinstance(v, int | float) for v in (self.recorded, self.found))
+        return abs(self.recorded - self.found) / self.allowed if self.allowed and numbers else None
 
 
-def mostly_different(items: Sequence[Item]) -> bool:
-    """Whether more than half of the numbers among some items are different."""
-    numbers = [item for item in items if isinstance(item.recorded, float)]
-    different = sum(item.status is Status.DIFFERENT for item in numbers)
-    return different > 0.5 * len(numbers)
+def claim(group: str, name: str, wrong: str, right: str = "", *, sure: bool = True) -> Item:
+    """Return an item for what is `wrong`, if that is `sure`; if nothing is, for what is `right`."""
+    if not wrong:
+        return Item(group, name, Status.IDENTICAL, note=right)
+    return Item(group, name, Status.DIFFERENT if sure else Status.UNJUDGED, note=wrong)
 
 
 SCHEMA = "calib/check/1"
@@ -68,14 +58,8 @@ ROUNDED = 1e-3
 class Outcome:
     """What a check found; `quick` where sampling was skipped.
 
-    Parameters
-    ----------
-    environment : mapping of str to (str, str)
-        What differs between where it was made and here: pairs of there and here.
-    allowed : str
-        What Monte Carlo error was allowed, in words.
-    not_converged : tuple of str
-        Models whose posterior did not pass the convergence gate, as recorded.
+    And what differs in the environment, there and here; what Monte Carlo error was allowed, in
+    words; the models whose posterior did not pass the convergence gate, as recorded.
     """
 
     folder: str
@@ -113,37 +97,28 @@ class Outcome:
         """The verdict in one sentence."""
         different = list(dict.fromkeys(item.name for item in self.of(Status.DIFFERENT)))
         if different:
-            shown = ", ".join(different[:4]) + (", ..." if len(different) > 4 else "")
-            return f"DIFFERENT: {shown}"
+            return f"DIFFERENT: {', '.join(different[:4])}{', ...' if different[4:] else ''}"
         unjudged = len(self.of(Status.UNJUDGED))
         rest = f"; {unjudged} not judged" if unjudged else ""
         if self.not_converged:
             rest += f"; NOT CONVERGED, not to be used: {', '.join(self.not_converged)}"
         if self.quick:
             return f"NOTHING DIFFERENT, BUT ONLY ESTIMATES WERE COMPUTED AGAIN (--quick){rest}"
-        identical = len(self.of(Status.IDENTICAL))
         if not self.of(Status.WITHIN):
+            identical = len(self.of(Status.IDENTICAL))
             return f"SAME, bit for bit: {identical} numbers and files{rest}"
-        if self.draws_differ:
-            return f"SAME within Monte Carlo error, not bit for bit{rest}"
-        return f"SAME up to rounding, not bit for bit{rest}"
+        how = "within Monte Carlo error" if self.draws_differ else "up to rounding"
+        return f"SAME {how}, not bit for bit{rest}"
 
     def document(self) -> dict[str, Any]:
         """Return everything as plain dictionaries."""
+        differing = {n: {"there": there, "here": h} for n, (there, h) in self.environment.items()}
         return {
-            "schema": SCHEMA,
-            "folder": self.folder,
-            "kind": self.kind,
-            "quick": self.quick,
-            "verdict": "same" if self.same else "different",
-            "headline": self.verdict,
+            "schema": SCHEMA, "folder": self.folder, "kind": self.kind, "quick": self.quick,
+            "verdict": "same" if self.same else "different", "headline": self.verdict,
             "exit_code": self.exit_code,
             "counts": {str(status): len(self.of(status)) for status in Status},
-            "environment": {
-                name: {"there": there, "here": here}
-                for name, (there, here) in self.environment.items()
-            },
-            "allowed": self.allowed,
+            "environment": differing, "allowed": self.allowed,
             "not_converged": list(self.not_converged),
             "items": [{**asdict(item), "status": str(item.status)} for item in self.items],
-        }
+        }  # fmt: skip

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from calib.check.outcome import Item, Status
+from calib.check.numbers import FAULTS, inside
+from calib.check.outcome import Item, Status, claim
 from calib.errors import CalibError
-from calib.inference.diagnostics import hdi
-from calib.inference.netcdf import DRAWN, read_netcdf
+from calib.inference.calibration import moments
+from calib.inference.netcdf import DRAWN, DrawsFile, read_draws, read_netcdf
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
 GROUP = "posteriors"
-_HDI = 0.95
 # The summary is computed from the same draws in another order of summation.
 _ROUNDING = 1e-6
 # Of the sd of what goes with draws: chains of the shortest run that passes the gate agree so far.
@@ -27,135 +26,99 @@ _OF_SD = 0.5
 _AT_BOUNDS = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
-class DrawsFile:
-    """What is compared of a netCDF file: draws (chains, draws) by parameter, and log density."""
-
-    draws: Mapping[str, Array]
-    log_prob: Array
-
-
-def read_draws(path: Path) -> DrawsFile:
-    """Read the posterior draws in a file; a CalibError if it cannot be read."""
-    try:
-        groups = read_netcdf(path, "posterior", "sample_stats").values
-        draws, log_prob = groups["posterior"], groups["sample_stats"]["lp"]
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise CalibError(
-            f"the file cannot be read ({type(error).__name__})", where=str(path)
-        ) from None
-    if log_prob.ndim != 2 or not log_prob.size:
-        raise CalibError("there are no draws in it", where=str(path))
-    if not draws or any(v.shape != log_prob.shape for v in draws.values()):
-        raise CalibError("its draws differ in number", where=str(path))
-    return DrawsFile(draws, log_prob)
-
-
-def summary_of(draws: Mapping[str, Array]) -> dict[str, dict[str, float]]:
+def summary_of(file: DrawsFile) -> dict[str, dict[str, float]]:
     """Return mean, sd, median and 95 % highest-density interval of each parameter."""
-    found = {}
-    for name, values in draws.items():
-        flat = values.reshape(-1)
-        low, high = hdi(flat, _HDI)
-        found[name] = {
-            "mean": float(flat.mean()),
-            "sd": float(flat.std(ddof=1)),
-            "median": float(np.median(flat)),
-            "hdi_lower": low,
-            "hdi_upper": high,
-        }
-    return found
+    return {name: moments(values.reshape(-1)) for name, values in file.draws.items()}
 
 
-def verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Item:
+def verify_posterior(
+    path: Path, problem: Callable[[], Problem], stated: Mapping[str, Any] | None = None
+) -> list[Item]:
+    """Hold a file of draws, if it is there, against its summary if stated, data and priors."""
+    if not path.is_file():
+        return []
+    items = []
+    try:
+        file = read_draws(path)
+        items += [] if stated is None else [_verify_summary(path.name, file, stated)]
+        items.append(_verify_density(path.name, file, problem()))
+    except CalibError as error:
+        items.append(claim(GROUP, path.name, error.message))
+    except FAULTS as error:
+        items.append(_unread(path.name, error))
+    return items
+
+
+def _unread(name: str, error: Exception) -> Item:
+    return claim(GROUP, name, f"the file cannot be read ({type(error).__name__}: {error})")
+
+
+def _verify_summary(name: str, file: DrawsFile, stated: Mapping[str, Any]) -> Item:
     """Check that a file's draws have the summary that is stated of them."""
-    computed = summary_of(file.draws)
-    for parameter, values in computed.items():
-        entry = stated.get(parameter)
-        entry = entry if isinstance(entry, Mapping) else {}
-        scale = values["sd"]
+    for parameter, values in summary_of(file).items():
         for key, value in values.items():
-            given = entry.get(key)
+            given = inside(stated, parameter).get(key)
             if not isinstance(given, int | float) or not math.isclose(
-                given, value, rel_tol=_ROUNDING, abs_tol=_ROUNDING * scale
+                given, value, rel_tol=_ROUNDING, abs_tol=_ROUNDING * values["sd"]
             ):
                 # Which of the two is wrong is for the sampling to say.
                 both, note = f"summary.json and {name}", f"{key} of {parameter} is not the same"
                 return Item(GROUP, both, Status.DIFFERENT, given, value, note=note)
-    return Item(GROUP, name, Status.IDENTICAL, note="its draws have the summary that is stated")
+    return claim(GROUP, name, "", "its draws have the summary that is stated")
 
 
-def verify_density(name: str, file: DrawsFile, problem: Problem) -> Item:
-    """Check that a file's draws have the log density that data and priors give them.
-
-    And that what is derived from parameters follows from them.
-    """
+def _verify_density(name: str, file: DrawsFile, problem: Problem) -> Item:
+    """Check that draws have the density of data and priors, and derived ones follow from them."""
     stated = file.log_prob.reshape(-1)
-    missing = [p.name for p in problem.priors.entries if not p.fixed and p.name not in file.draws]
-    if missing:
-        return Item(GROUP, name, Status.DIFFERENT, note=f"there is no {missing[0]} in it")
-    natural = np.stack(
-        [
-            np.full(stated.size, p.loc) if p.fixed else file.draws[p.name].reshape(-1)
-            for p in problem.priors.entries
-        ],
-        axis=-1,
-    )
+    natural = problem.priors.stack(file.draws, stated.shape)
     with np.errstate(all="ignore"):
         t = problem.priors.to_internal(natural, margin=0.0)
         derived = problem.bound.report(problem.of_model(natural))
     for key, values in derived.items():
         said = file.draws.get(key, values)
         if not np.allclose(said.reshape(-1), values, rtol=_ROUNDING, atol=0.0, equal_nan=True):
-            note = f"{key} does not follow from the other parameters"
-            return Item(GROUP, name, Status.DIFFERENT, note=note)
+            return claim(GROUP, name, f"{key} does not follow from the other parameters")
     computed = problem.log_prob(t)
     close = np.abs(computed - stated) <= _ROUNDING * (1.0 + np.abs(stated))
     if np.mean(close) < 1.0 - _AT_BOUNDS:
-        worst = int(np.argmin(close))
+        pair = float(stated[close.argmin()]), float(computed[close.argmin()])
         note = "the log density of its draws is not what data and priors give"
-        return Item(GROUP, name, Status.DIFFERENT, float(stated[worst]), float(computed[worst]),
-                    note=note)  # fmt: skip
-    return Item(GROUP, name, Status.IDENTICAL, note="its draws have the density of data and priors")
+        return Item(GROUP, name, Status.DIFFERENT, *pair, note=note)
+    return claim(GROUP, name, "", "its draws have the density of data and priors")
 
 
-def compare_posterior(name: str, recorded: Path, drawn: Path) -> list[Item]:
+def compare_posterior(name: str, recorded: Path, drawn: Path) -> Item:
     """Compare what is beside the posterior draws in a file with the same written again.
 
-    The draws themselves may be others. They are held against their summary and their density; all
-    that goes with them may be apart by a part of its own sd.
+    It may be apart by a part of its own sd. Draws are held against their summary and density.
     """
     if recorded.read_bytes() == drawn.read_bytes():
-        return [Item(GROUP, name, Status.IDENTICAL)]
+        return Item(GROUP, name, Status.IDENTICAL)
     try:
         old, new = (_groups(path) for path in (recorded, drawn))
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        note = f"the file cannot be read ({type(error).__name__})"
-        return [Item(GROUP, name, Status.DIFFERENT, note=note)]
+    except FAULTS as error:
+        return _unread(name, error)
     apart = [key for key in {**old, **new} if not _alike(old.get(key), new.get(key))]
     if apart:
-        note = f"{', '.join(sorted(apart)[:3])} in it: not what is written again"
-        return [Item(GROUP, name, Status.DIFFERENT, note=note)]
-    return [Item(GROUP, name, Status.WITHIN, note="its draws are compared by their summary")]
+        wrong = f"{', '.join(sorted(apart)[:3])} in it: not what is written again"
+        return claim(GROUP, name, wrong)
+    return Item(GROUP, name, Status.WITHIN, note="its draws are compared by their summary")
 
 
 def _groups(path: Path) -> dict[str, Array]:
-    """Read every variable of a file by its path; of drawn ones, moments by row."""
+    """Read every variable of a file by its path; of drawn ones, median and sd by row."""
     groups = read_netcdf(path)
     found: dict[str, Array] = {}
     for group, variables in groups.values.items():
         for name, values in variables.items():
             x = values.astype(np.float64)
             if x.ndim >= 2 and groups.dims_of(group, name)[:2] == DRAWN:
-                x = _moments(x.reshape(x.shape[0] * x.shape[1], -1))
+                draws = x.reshape(x.shape[0] * x.shape[1], -1)
+                # Whatever their tails.
+                low, median, high = np.quantile(draws, [0.16, 0.5, 0.84], axis=0)
+                x = np.stack([median, 0.5 * (high - low)])
             found[f"{group}/{name}"] = x
     return found
-
-
-def _moments(draws: Array) -> Array:
-    """Median and sd of each row over the draws, (draws, n) to (2, n), whatever their tails."""
-    low, median, high = np.quantile(draws, [0.16, 0.5, 0.84], axis=0)
-    return np.stack([median, 0.5 * (high - low)])
 
 
 def _alike(old: Array | None, new: Array | None) -> bool:

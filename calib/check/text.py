@@ -11,50 +11,49 @@ import base64
 import binascii
 import difflib
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from calib.batch.environment import sha256
 from calib.check.numbers import NUMBER, without_numbers
-from calib.check.outcome import Item, Status
+from calib.check.outcome import Item, Status, claim
 from calib.report.compared import FOLDER as COMPARED
 
 GROUP = "page and tables"
 _IMAGE = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]*)")
 _TAG = re.compile(r"<[^>]*>")
 _PICTURE = re.compile(r"\[picture [^\]]*\]")
-_SECTION = re.compile(r'<section\b[^>]*aria-labelledby="([^"]*)"')
-_SHOWN = 3
-_WIDTH = 120
+# Where a section begins, and what it is labelled by.
+_SECTION = re.compile(r'(?=<section\b[^>]*aria-labelledby="([^"]*)")')
+_SHOWN, _WIDTH = 6, 120
 _PLAIN = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻\u2212", "0123456789--")
+
+
+type Judged = Callable[[str], tuple[str | None, bool]]
+"""By the name of a section, why its words cannot be judged, if so; and whether its numbers can."""
+
+
+def read_text(path: Path) -> str:
+    """Return a text, whatever somebody made of it."""
+    return path.read_text(encoding="utf-8", errors="replace")
 
 
 def verify_images(page: str, folder: Path) -> list[Item]:
     """Check that every picture in a page is one of the folder's figures, and the other way."""
     figures = _figures(folder)
-    shown = {_hash(match) for match in _IMAGE.findall(page)}
-    items = [
-        Item(GROUP, name, Status.DIFFERENT, note="it is not the picture that index.html shows")
-        for key, name in figures.items()
-        if key not in shown
-    ]
-    strangers = len(shown - set(figures))
-    if strangers:
-        note = f"{strangers} of its pictures are none of the figures"
-        items.append(Item(GROUP, "index.html", Status.DIFFERENT, note=note))
-    return items or [
-        Item(GROUP, "pictures in index.html", Status.IDENTICAL, note="they are the figures")
-    ]
+    shown = {sha256(_decoded(text)) for text in _IMAGE.findall(page)}
+    wrong = "it is not the picture that index.html shows"
+    items = [claim(GROUP, n, wrong) for key, n in figures.items() if key not in shown]
+    if strangers := len(shown - set(figures)):
+        wrong = f"{strangers} of its pictures are none of the figures"
+        items.append(claim(GROUP, "index.html", wrong))
+    return items or [claim(GROUP, "pictures in index.html", "", "they are the figures")]
 
 
 def _figures(folder: Path) -> dict[str, str]:
     """Names of the PNG files of a folder by their hashes; a comparison in it has its own page."""
     names = (path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*.png")))
     return {sha256((folder / n).read_bytes()): n for n in names if not n.startswith(f"{COMPARED}/")}
-
-
-def _hash(encoded: str) -> str:
-    return sha256(_decoded(encoded))
 
 
 def _decoded(encoded: str) -> bytes:
@@ -66,68 +65,45 @@ def _decoded(encoded: str) -> bytes:
 
 def own_pictures(content: str, folder: Path) -> list[bytes]:
     """Return the pictures of a page that are none of the folder's figures, in their order."""
-    known = _figures(folder)
-    return [_decoded(text) for text in _IMAGE.findall(content) if _hash(text) not in known]
+    pictures = [_decoded(encoded) for encoded in _IMAGE.findall(content)]
+    known = _figures(folder) if pictures else {}
+    return [picture for picture in pictures if sha256(picture) not in known]
 
 
-def compare_page(
-    name: str,
-    recorded: Path,
-    written: Path,
-    judged: Callable[[str], tuple[str | None, bool]],
-) -> Item:
-    """Compare a page, or another text, by its path in two folders, with the one written again.
-
-    `judged` tells by the name of a section why its words cannot be judged (None where they can),
-    and whether its numbers can.
-    """
+def compare_page(name: str, recorded: Path, written: Path, judged: Judged) -> Item:
+    """Compare a page, or another text, by its path in two folders, with the one written again."""
     if (recorded / name).read_bytes() == (written / name).read_bytes():
         return Item(GROUP, name, Status.IDENTICAL)
     old, new = (_readable(folder, name) for folder in (recorded, written))
-    if old == new:
+    if old.splitlines() == new.splitlines():
         note = "the same but for its pictures, which are compared as figures, or its line ends"
         return Item(GROUP, name, Status.WITHIN, note=note)
-    if _pictures(old) != _pictures(new):
-        note = "it shows other pictures, or in another order"
-        return Item(GROUP, name, Status.DIFFERENT, note=note)
-    parts, again = list(_sections(old)), list(_sections(new))
-    if [section for section, _ in parts] != [section for section, _ in again]:
-        return Item(GROUP, name, Status.DIFFERENT, note="it has other sections")
-    status, note = Status.WITHIN, "the same words; numbers are judged where they come from"
-    for (section, lines), (_, lines_again) in zip(parts, again, strict=True):
+    if _PICTURE.findall(old) != _PICTURE.findall(new):
+        return claim(GROUP, name, "it shows other pictures, or in another order")
+    parts, again = (("", *_SECTION.split(text)) for text in (old, new))
+    if parts[::2] != again[::2]:
+        return claim(GROUP, name, "it has other sections")
+    note = "the same words; numbers are judged where they come from"
+    found = Item(GROUP, name, Status.WITHIN, note=note)
+    for section, one, other in zip(parts[::2], parts[1::2], again[1::2], strict=True):
         why, numbers = judged(section)
-        if _alike(lines, lines_again, numbers=numbers):
-            continue
-        said = differing_lines(lines, lines_again)
-        if why is None:
-            return Item(GROUP, name, Status.DIFFERENT, note=said)
-        status, note = Status.UNJUDGED, f"{why}: {said}"
-    return Item(GROUP, name, status, note=note)
+        if not _alike(one.splitlines(), other.splitlines(), numbers=numbers):
+            said = differing_lines(one.splitlines(), other.splitlines())
+            if why is None:
+                return claim(GROUP, name, said)
+            found = claim(GROUP, name, f"{why}: {said}", sure=False)
+    return found
 
 
-def _readable(folder: Path, name: str) -> list[str]:
-    """Lines of a text, with the names of the folder's figures in the place of the pictures."""
-    text = (folder / name).read_text(encoding="utf-8", errors="replace")
+def _readable(folder: Path, name: str) -> str:
+    """Return a text with the names of the folder's figures in the place of the pictures."""
+    text = read_text(folder / name)
     names = _figures(folder) if _IMAGE.search(text) else {}
-    return _IMAGE.sub(
-        lambda m: f"[picture {names.get(_hash(m[1]), 'of its own')}]", text
-    ).splitlines()
 
+    def named(match: re.Match[str]) -> str:
+        return f"[picture {names.get(sha256(_decoded(match[1])), 'of its own')}]"
 
-def _pictures(lines: Sequence[str]) -> list[str]:
-    return [picture for line in lines for picture in _PICTURE.findall(line)]
-
-
-def _sections(lines: Sequence[str]) -> Iterator[tuple[str, list[str]]]:
-    """Yield the lines of each section of a page, by what it is labelled by; first, its head."""
-    name, part = "", list[str]()
-    for line in lines:
-        begun = _SECTION.search(line)
-        if begun:
-            yield name, part
-            name, part = begun[1], []
-        part.append(line)
-    yield name, part
+    return _IMAGE.sub(named, text)
 
 
 def _alike(old: Sequence[str], new: Sequence[str], *, numbers: bool) -> bool:
@@ -141,20 +117,18 @@ def _alike(old: Sequence[str], new: Sequence[str], *, numbers: bool) -> bool:
 def _near(old: str, new: str) -> bool:
     """Whether the numbers of two lines differ by one unit of their last digit at the most."""
     numbers = (NUMBER.findall(_TAG.sub(" ", line)) for line in (old, new))
-    return all(a == b or _one_unit(a, b) for a, b in zip(*numbers, strict=False))
-
-
-def _one_unit(old: str, new: str) -> bool:
-    (a, unit_a), (b, unit_b) = _parsed(old), _parsed(new)
-    return abs(a - b) <= 1.001 * max(unit_a, unit_b)
+    for a, b in zip(*numbers, strict=False):
+        (one, unit), (other, other_unit) = _parsed(a), _parsed(b)
+        if a != b and not abs(one - other) <= 1.001 * max(unit, other_unit):
+            return False
+    return True
 
 
 def _parsed(text: str) -> tuple[float, float]:
     """Return a number as shown and one unit of its last digit."""
     plain = text.translate(_PLAIN).replace("\u00d710", "e").replace(",", "")
     mantissa, _, exponent = plain.lower().partition("e")
-    decimals = len(mantissa.partition(".")[2])
-    power = int(exponent or 0)
+    decimals, power = len(mantissa.partition(".")[2]), int(exponent or 0)
     try:
         return float(f"{mantissa}e{power}"), 10.0 ** (power - decimals)
     except ValueError:  # such as 1.2.3 of a version
@@ -163,10 +137,8 @@ def _parsed(text: str) -> tuple[float, float]:
 
 def differing_lines(old: Sequence[str], new: Sequence[str]) -> str:
     """Return how many lines two texts do not share, and the first of them."""
-    changed = [
-        line
-        for line in difflib.unified_diff(old, new, "recorded", "written again", n=0, lineterm="")
-        if line[0] in "+-" and not line.startswith(("---", "+++"))
-    ]
-    shown = "; ".join(f"{line[0]} {line[1:].strip()[:_WIDTH]}" for line in changed[: 2 * _SHOWN])
+    # Below the names of the two.
+    diff = list(difflib.unified_diff(old, new, n=0, lineterm=""))[2:]
+    changed = [line for line in diff if not line.startswith("@@")]
+    shown = "; ".join(f"{line[0]} {line[1:].strip()[:_WIDTH]}" for line in changed[:_SHOWN])
     return f"{len(changed)} lines differ: {shown}"

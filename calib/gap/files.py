@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from calib.gap.inclusion import Included
 from calib.gap.where import Region
 from calib.models.base import Array
 
-__all__ = ["SCHEMA", "document", "write_diagnosis"]
+__all__ = ["SCHEMA", "answer", "document", "write_diagnosis"]
 
 SCHEMA = "calib/diagnosis/1"
 
@@ -86,6 +87,18 @@ def document(found: Diagnosis) -> dict[str, Any]:
             }
             for m in found.next_measurements
         ],
+    }
+
+
+def answer(told: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is repeated elsewhere of a diagnosis' document; its first effect is the best."""
+    best = told["effects"][0]
+    return {
+        "verdict": told["verdict"],
+        "probability": {e["name"]: e["probability"] for e in told["effects"]},
+        "best": best["name"],
+        "parameters": best["parameters"],
+        "shrink": told["shrink"],
     }
 
 

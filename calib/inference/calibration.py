@@ -127,7 +127,6 @@ def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
     found = convergence(stacked.reshape(ensembles, walkers, steps, -1))
     mean_ess = ess(stacked, "mean")
     flat = stacked.reshape(-1, len(names))
-    interval = [hdi(flat[:, j], _HDI) for j in range(len(names))]
     batches = _batches(stacked.reshape(ensembles, walkers, steps, -1))
     interval_error = [hdi_error(batches[j], _HDI) for j in range(len(names))]
     prior_sd = _prior_sds(calibration)
@@ -135,11 +134,7 @@ def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
         name: ParameterSummary(
             name=name,
             unit=units[name],
-            mean=float(flat[:, j].mean()),
-            sd=float(flat[:, j].std(ddof=1)),
-            median=float(np.median(flat[:, j])),
-            hdi_lower=interval[j][0],
-            hdi_upper=interval[j][1],
+            **moments(flat[:, j]),
             ess_bulk=float(found.ess_bulk[j]),
             ess_tail=float(found.ess_tail[j]),
             rhat=float(found.rhat[j]),
@@ -150,6 +145,18 @@ def _summarise(calibration: Calibration) -> dict[str, ParameterSummary]:
             mcse_hdi_upper=float(interval_error[j][1]),
         )
         for j, name in enumerate(names)
+    }
+
+
+def moments(draws: Array) -> dict[str, float]:
+    """Return what a summary says of draws (n,) in whatever order they came."""
+    low, high = hdi(draws, _HDI)
+    return {
+        "mean": float(draws.mean()),
+        "sd": float(draws.std(ddof=1)),
+        "median": float(np.median(draws)),
+        "hdi_lower": low,
+        "hdi_upper": high,
     }
 
 

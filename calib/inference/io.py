@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from pathlib import Path, PurePath
@@ -22,12 +22,13 @@ from calib.data import read_for_model, write_table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.estimators import PointEstimate
-from calib.inference.netcdf import Groups, read_netcdf, write_netcdf
+from calib.inference.netcdf import Groups, read_draws, write_netcdf
 from calib.inference.noise import noise_of
 from calib.inference.prior_files import parse_priors, prior_references, relative_columns
 from calib.inference.priors import Priors
 from calib.inference.problem import Problem
 from calib.inference.random import generator
+from calib.inference.record import DATA, POSTERIOR, PRIORS, RunRecord, read_record
 from calib.inference.sampling.gate import GateReport
 from calib.inference.sampling.sampler import Draws
 from calib.models import BoundModel, get_model
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SCHEMA = "calib/run/1"
-_HASHED = ("posterior.nc", "priors.toml", "data.csv")
+_HASHED = (POSTERIOR, PRIORS, DATA)
 _EMULATOR = "emulator.npz"
 # Draws of a run whose log density is worked out again as it is read. It may be off by so many
 # nats, far more than rounding and far less than what moves a prediction, and for one of the draws
@@ -205,9 +206,9 @@ def save_calibration(
     (folder / "run.json").write_text(json.dumps(described, indent=1) + "\n", encoding="utf-8")
 
 
-def _check_hashes(meta: dict[str, Any], folder: Path) -> None:
+def _check_hashes(record: RunRecord, folder: Path) -> None:
     """A run is predicted from only as it was written."""
-    for name, expected in meta.get("sha256", {}).items():
+    for name, expected in record.sha256.items():
         with _damage(folder / name):
             found = sha256((folder / name).read_bytes())
         if found != expected:
@@ -228,17 +229,17 @@ def load_calibration(folder: Path) -> Calibration:
         If the folder is not one, a file in it is damaged, or the model has changed since.
     """
     folder = Path(folder)
-    meta = _read_meta(folder)
-    _check_hashes(meta, folder)
+    record = read_record(RunRecord, folder)
+    meta: dict[str, Any] = record.document
+    _check_hashes(record, folder)
     with _damage(folder / "run.json"):
-        problem = run_problem(meta, folder / "data.csv")
+        problem = run_problem(record, folder / "data.csv")
         shape = tuple(meta["shape"])
-        seed, label = meta["seed"], meta["label"]
     with _damage(folder / "posterior.nc"):
         t, log_prob = _read_posterior(folder / "posterior.nc", problem.priors, shape)
     with _damage(folder / "run.json"):
         _check_model(problem, t, log_prob, folder)
-        found = Calibration(problem, _draws(meta, t, log_prob), seed, label)
+        found = Calibration(problem, _draws(meta, t, log_prob), record.seed, record.label)
         _ = found.parameters  # what cannot be reported is damaged as well
         return found
 
@@ -272,38 +273,29 @@ def _damage(path: Path) -> Iterator[None]:
         ) from None
 
 
-def run_problem(meta: Mapping[str, Any], data: Path) -> Problem:
+def run_problem(record: RunRecord, data: Path) -> Problem:
     """Return the problem of a run folder from the content of its ``run.json`` and ``data.csv``."""
-    model = get_model(meta["model"])
+    model = get_model(record.model)
     if (data.parent / _EMULATOR).exists():
         model = emulated_model(model, load_emulator(data.parent / _EMULATOR)[1])
     priors = parse_priors(
-        meta["prior_text"], meta["prior_file"], model.name,
-        (*model.parameters, "sigma"), meta["prior_references"],
+        record.prior_text, record.prior_file, model.name, (*model.parameters, "sigma"),
+        record.prior_references,
     )  # fmt: skip
-    if meta["fixed"]:
-        priors = priors.fix(meta["fixed"])
+    if record.fixed:
+        priors = priors.fix(record.fixed)
     table = read_for_model(data, (*model.conditions, model.output))
     # What is reconstructed stays labelled so.
-    table = replace(table, source=meta["data_source"], label=meta["data_label"])
+    table = replace(table, source=record.data_source, label=record.data_label)
     # A run holds the rows that it was calibrated on: those that the noise is measured by.
-    noise = noise_of(priors.noise, model.select(table.columns), meta["prior_file"])
-    return Problem(BoundModel(model, meta["references"]), table, priors, noise=noise)
+    noise = noise_of(priors.noise, model.select(table.columns), record.prior_file)
+    return Problem(BoundModel(model, record.references), table, priors, noise=noise)
 
 
 def _read_posterior(path: Path, priors: Priors, shape: tuple[int, ...]) -> tuple[Array, Array]:
     """Return the internal coordinates, of a shape, and their log densities."""
-    groups = read_netcdf(path, "posterior", "sample_stats").values
-    natural = np.stack(
-        [
-            np.full(shape[:-1], p.loc)
-            if p.fixed
-            else groups["posterior"][p.name].reshape(shape[:-1])
-            for p in priors.entries
-        ],
-        axis=-1,
-    )
-    log_prob = groups["sample_stats"]["lp"].reshape(shape[:-1])
+    file = read_draws(path)
+    natural, log_prob = priors.stack(file.draws, shape[:-1]), file.log_prob.reshape(shape[:-1])
     t = priors.to_internal(natural.reshape(-1, natural.shape[-1]), margin=0.0).reshape(shape)
     return t, log_prob
 
@@ -323,20 +315,3 @@ def _draws(meta: dict[str, Any], t: Array, log_prob: Array) -> Draws:
         walkers=meta["walkers"] if "walkers" in meta else t.shape[1],
         **{k: meta[k] for k in (*_DRAWS, "seconds")},
     )
-
-
-def _read_meta(folder: Path) -> dict[str, Any]:
-    path = folder / "run.json"
-    try:
-        meta: dict[str, Any] = json.loads(path.read_text())
-        known = meta.get("schema") == SCHEMA
-    except (OSError, ValueError, AttributeError):
-        known = False
-    if not known:
-        raise CalibError(
-            "this is not a run folder (no readable run.json in it)",
-            where=str(folder),
-            allowed="a folder written by `calib fit`",
-            mend="give the folder that `calib fit ... --out` named",
-        )
-    return meta

@@ -97,3 +97,22 @@ def read_netcdf(path: Path, *only: str) -> Groups:
                     dims[name] = tuple(d for d in variable.dimensions if d not in DRAWN)
         attrs = {name: str(text) for name, text in file.attrs.items()}
     return Groups(values, dims, attrs)
+
+
+@dataclass(frozen=True, eq=False)
+class DrawsFile:
+    """The draws in a file (chains, draws) by parameter, and their log density."""
+
+    draws: Mapping[str, NDArray[np.float64]]
+    log_prob: NDArray[np.float64]
+
+
+def read_draws(path: Path) -> DrawsFile:
+    """Read the posterior draws in a file; raises what `read_netcdf` does, if there are none too."""
+    groups = read_netcdf(path, "posterior", "sample_stats").values
+    draws, log_prob = groups["posterior"], groups["sample_stats"]["lp"]
+    if log_prob.ndim != 2 or not log_prob.size or not draws:
+        raise ValueError("there are no draws in it")
+    if any(v.shape != log_prob.shape for v in draws.values()):
+        raise ValueError("its draws differ in number")
+    return DrawsFile(draws, log_prob)

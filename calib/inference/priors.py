@@ -145,6 +145,13 @@ class Priors:
         """Draw internal coordinates, shape (size, d)."""
         return self.ppf(rng.uniform(size=(size, len(self.free))))
 
+    def stack(self, draws: Mapping[str, Array], shape: tuple[int, ...]) -> Array:
+        """Return draws of all parameters by name, fixed ones added, as an array (*shape, d_all)."""
+        by_name = [
+            np.full(shape, p.loc) if p.fixed else draws[p.name].reshape(shape) for p in self.entries
+        ]
+        return np.stack(by_name, axis=-1)
+
     def to_natural(self, t: Array) -> Array:
         """Return all parameters, fixed ones included, shape (k, d) to (k, d_all)."""
         t = np.atleast_2d(t)

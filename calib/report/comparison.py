@@ -10,16 +10,17 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from matplotlib.figure import Figure
+from pydantic import Field
 
 from calib.batch.environment import Environment
 from calib.data import write_table
-from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.io import load_calibration, save_calibration
+from calib.inference.record import Entry, File, Hash, KnownModel, Record, read_record
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.figures.style import BLACK, BLUE, legend_below, panels, png_bytes, style
@@ -27,7 +28,7 @@ from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
 from calib.report.page.template import data_uri, template
 from calib.report.writer import file_hashes, own_names
-from calib.validation.comparison import Candidate, Comparison, difference
+from calib.validation.comparison import Candidate, Comparison, difference, sentence
 from calib.validation.prediction import N_DRAWS
 from calib.validation.validate import PARETO_K_MAX
 
@@ -159,35 +160,83 @@ FILE, PAGE, FIGURE, HELD_OUT = (
 )  # fmt: skip
 
 
-def document(comparison: Comparison, hold_out: str = "", best: str | None = None) -> dict[str, Any]:
+class _Compared(Entry):
+    weight: float
+    elpd_rows: Annotated[tuple[float, ...], Field(min_length=2)]
+    converged: bool
+    refits_not_converged: int
+
+
+class ComparisonRecord(Record):
+    """`comparison.json` of a comparison folder."""
+
+    FILE, kind, WRITTEN_BY = FILE, "comparison", "calib compare"
+    schema_: Literal["calib/comparison/2"] = Field(alias="schema")
+    held_out: str
+    header: tuple[str, ...] = ()
+    command: tuple[str, ...]
+    models: Annotated[dict[KnownModel, _Compared], Field(min_length=2)]
+    files: dict[File, Hash]
+
+    @property
+    def unsound(self) -> tuple[str, ...]:
+        """Models of which a posterior is recorded as one that did not pass the gate."""
+        return tuple(
+            name for name, m in self.models.items() if not m.converged or m.refits_not_converged
+        )
+
+
+def document(comparison: Comparison, hold_out: str = "") -> dict[str, Any]:
     """Return every number of a comparison as plain dictionaries.
 
-    What was held out is said in words. Differences are from the model `best`, where another
-    comparison had it for the best.
+    What was held out is said in words. Differences are from the first model.
     """
-    first = next(c for c in comparison.candidates if best in (None, c.model))
-    rows = first.calibration.problem.table
+    candidates = {c.model: c for c in comparison.candidates}
+    first = comparison.candidates[0].calibration.problem.table
+    stated = stated_of_rows(
+        {name: c.rows for name, c in candidates.items()}, comparison.weights,
+        [name for name, c in candidates.items() if not c.sound],
+    )  # fmt: skip
     return {
         "schema": SCHEMA,
         "seed": comparison.seed,
-        "rows": len(rows),
-        **own_names(rows),
+        **own_names(first),
         "held_out": hold_out,
         "converged": comparison.sound,
-        "verdict": comparison.sentence,
-        "models": {c.model: _model(comparison, c, first) for c in comparison.candidates},
+        **stated,
+        "models": {name: {**m, **_model(candidates[name])} for name, m in stated["models"].items()},
     }
 
 
-def _model(comparison: Comparison, c: Candidate, best: Candidate) -> dict[str, Any]:
-    below, loo = difference(best.rows - c.rows), c.loo
+def stated_of_rows(
+    rows: Mapping[str, Array], weights: Mapping[str, float], unsound: Sequence[str]
+) -> dict[str, Any]:
+    """Return what is stated of models by the log predictive densities of rows without them, (n,).
+
+    And by their stacking weights, which follow as well; the best first, `unsound` did not converge.
+    """
+    best = next(iter(rows.values()))
+    below = {name: difference(best - r) for name, r in rows.items()}
+    return {
+        "rows": best.size,
+        "verdict": sentence({name: d.clear for name, d in below.items()}, unsound),
+        "models": {
+            name: {
+                "weight": weights[name],
+                "elpd": float(r.sum()),
+                "below_best": below[name].elpd,
+                "below_best_se": below[name].se,
+                "told_apart": below[name].clear,
+            }
+            for name, r in rows.items()
+        },
+    }
+
+
+def _model(c: Candidate) -> dict[str, Any]:
+    loo = c.loo
     found: dict[str, Any] = {
-        "weight": comparison.weights[c.model],
-        "elpd": loo.elpd,
         "elpd_se": loo.elpd_se,
-        "below_best": below.elpd,
-        "below_best_se": below.se,
-        "told_apart": below.clear,
         "elpd_rows": c.rows.tolist(),
         "converged": c.calibration.converged,
         "pareto_k_max": None if loo.pareto_k is None else finite(float(loo.pareto_k.max())),
@@ -252,16 +301,7 @@ def load_stack(folder: Path) -> tuple[dict[str, Any], list[tuple[float, Calibrat
 
     A CalibError says that it is damaged.
     """
-    path = folder / FILE
-    try:
-        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        weights = {name: float(m["weight"]) for name, m in found["models"].items()}
-        if found["schema"] != SCHEMA:
-            raise ValueError
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        raise CalibError(
-            "the file cannot be read", where=str(path),
-            allowed="the file as `calib compare` wrote it", mend="run `calib compare` again",
-        ) from None  # fmt: skip
-    used = {name: w for name, w in weights.items() if round(w * N_DRAWS) > 0}
-    return found, [(w, load_calibration(folder / "runs" / name)) for name, w in used.items()]
+    record = read_record(ComparisonRecord, folder)
+    used = {name: m.weight for name, m in record.models.items() if round(m.weight * N_DRAWS) > 0}
+    runs = [(weight, load_calibration(folder / "runs" / name)) for name, weight in used.items()]
+    return record.document, runs

@@ -7,9 +7,11 @@ from typing import Any
 from result_schemas import RESULTS
 
 from calib.batch.campaign.kinds import KINDS
-from calib.check.schema import ComparisonRecord, Manifest, RunRecord
+from calib.check.schema import Manifest
 from calib.inference.prior_entries import json_schema
+from calib.inference.record import RunRecord
 from calib.models.simulators.files import SimulatorFile
+from calib.report.comparison import ComparisonRecord
 
 
 def schemas() -> dict[str, dict[str, Any]]:
@@ -18,7 +20,7 @@ def schemas() -> dict[str, dict[str, Any]]:
         "priors": json_schema(),
         "plan": _plan(),
         "simulator": SimulatorFile.model_json_schema(),
-        "manifest": Manifest.model_json_schema(),
+        "manifest": _without_document(Manifest.model_json_schema()),
         "run": _without_document(RunRecord.model_json_schema()),
         "comparison": _without_document(ComparisonRecord.model_json_schema()),
         **{name: of.model_json_schema() for name, of in RESULTS.items()},

@@ -11,7 +11,6 @@ import os
 import shutil
 from collections.abc import Callable
 from contextlib import suppress
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -21,11 +20,12 @@ import pytest
 import calib.check.check_report as check_report_module
 import calib.check.check_run as check_run_module
 from calib.batch.environment import sha256
-from calib.check import figures, montecarlo, posteriors
+from calib.check import compare, montecarlo, posteriors
 from calib.check.check import check
+from calib.check.check_report import recompute_report
+from calib.check.check_run import recompute_run
 from calib.check.montecarlo import posterior_errors
 from calib.check.outcome import Outcome, Status
-from calib.check.recompute import recompute_report, recompute_run
 from calib.he2019 import sections
 from calib.he2019.audit.run import begin_audit
 from calib.inference.calibration import Calibration
@@ -34,6 +34,9 @@ from calib.report.writer import file_hashes
 from tests.check.kernels import ALL, FEW, Setting
 
 from . import made
+
+# What a manifest has of the hashes of its files, from which nothing is computed.
+_OWN = {"files", "left_out"}
 
 
 def made_under() -> Setting | None:
@@ -103,12 +106,6 @@ def _read() -> dict[Any, Any]:
     return {}
 
 
-@pytest.fixture(scope="package")
-def _shown() -> dict[str, Callable[[bytes], Any]]:
-    """What is seen of figures, of which most are those of the test before."""
-    return {name: lru_cache(maxsize=100)(getattr(figures, name)) for name in ("_thumbnail", "_ink")}
-
-
 @pytest.fixture
 def audited_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
     """Audit once with the same calibration."""
@@ -127,7 +124,7 @@ def audited_once(_made, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def computed_once(_made, _read, _shown, audited_once, monkeypatch: pytest.MonkeyPatch) -> None:
+def computed_once(_made, _read, audited_once, monkeypatch: pytest.MonkeyPatch) -> None:
     """Do the work of equal inputs once, and read equal posteriors once.
 
     Most tampering leaves them as they are.
@@ -144,11 +141,11 @@ def computed_once(_made, _read, _shown, audited_once, monkeypatch: pytest.Monkey
 
     def report_again(manifest, tasks, out, progress, pool):
         key = (
-            manifest.model_dump_json(exclude={"files", "left_out"}),
+            manifest.model_dump_json(exclude={**dict.fromkeys(_OWN, True), "document": _OWN}),
             *(t.table[c].tobytes() for t in tasks for c in t.table),
             *(t.prior_path.read_bytes() for t in tasks),
         )
-        return once(key, out, lambda kept: recompute_report(manifest, tasks, kept, progress))
+        return once(key, out, lambda kept: recompute_report(manifest, tasks, kept, progress, pool))
 
     def run_again(record, problem, out, progress):
         # All but its numbers that nothing is computed from.
@@ -175,13 +172,11 @@ def computed_once(_made, _read, _shown, audited_once, monkeypatch: pytest.Monkey
             cache[key] = calibration, posterior_errors(calibration)
         return dict(cache[key][1])
 
-    for name, shown in _shown.items():
-        monkeypatch.setattr(figures, name, shown)
     monkeypatch.setattr(montecarlo, "posterior_errors", errors_once)
     monkeypatch.setattr(check_report_module, "recompute_report", report_again)
     monkeypatch.setattr(check_run_module, "recompute_run", run_again)
     monkeypatch.setattr(posteriors, "_groups", reading_once(posteriors._groups))
-    for module in (check_report_module, check_run_module):
+    for module in (posteriors, compare):
         monkeypatch.setattr(module, "read_draws", reading_once(posteriors.read_draws))
 
 

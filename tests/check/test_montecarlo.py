@@ -188,7 +188,7 @@ def test_no_false_alarm_over_the_pairs_of_many_seeds() -> None:
 
 
 def test_a_run_is_allowed_what_a_report_is(rut_calibration) -> None:
-    sizes = drawn_in_run(rut_calibration, None)
+    sizes = drawn_in_run(rut_calibration, 25, None)
     errors = posterior_errors(rut_calibration)
     # Seven errors of a difference, times what ensembles are short of independence.
     times = sizes["log_evidence",] / errors["sampling", "log_evidence"]

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 from pydantic import BaseModel, ValidationError
 
-from calib.check.schema import RunRecord
 from calib.data.quantities import QUANTITIES
 from calib.gap import case
 from calib.gap.effects import View
+from calib.inference.record import RunRecord
 from calib.models import example_csv
 from calib.models.simulators.files import SimulatorFile
 from tests.cli.test_cli import Calib

@@ -15,7 +15,7 @@ from calib.batch.threads import one_thread
 from calib.data.quantities import OUTPUTS
 from calib.gap.case import Case
 from calib.gap.diagnose import Diagnosis, diagnose
-from calib.gap.files import document
+from calib.gap.files import answer, document
 from calib.he2019.datasets.drawbar import SLIP_SHIFT
 from calib.he2019.datasets.published import PUBLISHED
 from calib.he2019.gaps.cases import PaperGap
@@ -349,15 +349,11 @@ def summarise_gaps(results: Sequence[FoundGap]) -> dict[str, Any]:
 
 def _one(result: FoundGap) -> dict[str, Any]:
     found = result.found
-    written = document(found)
     return {
         "models": dict(found.data.case.models),
         "rows": {"calibration": len(found.data.case.lab), "field": len(found.data.case.field)},
         "withheld": result.gap.withheld,
-        **_answer(found),
-        "best": found.ranking.order[0],
-        "parameters": written["effects"][0]["parameters"],
-        "shrink": written["shrink"],
+        **answer(document(found)),
         "open_sd_rms": float((result.open_sd**2).mean() ** 0.5),
         "checks": {check.name: dict(check.values) for check in checks(result)},
         "variants": {name: _answer(other) for name, other in result.variants.items()},

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
-from calib.check.derived import verify_gaps
+from calib.check import verify
 from calib.check.outcome import Status
 from calib.data import table_from_arrays
 from calib.gap.case import Case, read_case
@@ -377,7 +377,7 @@ def test_it_is_in_the_units_of_the_files_and_checks(tmp_path):
         "probability": {e["name"]: e["probability"] for e in told["effects"]},
         "shrink": told["shrink"],
     }  # fmt: skip
-    checked = verify_gaps(tmp_path, {"paper_gaps": {"drift": said}}, same_code=True)
+    checked = verify.gaps(tmp_path, {"paper_gaps": {"drift": said}}, same_code=True)
     assert [item.status for item in checked] == [Status.IDENTICAL] * 2
 
 

@@ -1,0 +1,192 @@
+"""Check what a folder says of itself without computing anything again.
+
+Files against their hashes; that data and priors are what they are called; that texts, and what a
+summary says of gaps, follow from other files, and a corrected model predicts what is said of it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from calib.batch.environment import sha256
+from calib.check.numbers import FAULTS, inside, read_json
+from calib.check.outcome import Item, Status, claim
+from calib.check.schema import TaskRecord
+from calib.check.text import GROUP as TEXT
+from calib.check.text import differing_lines, read_text
+from calib.data import Table
+from calib.data.labels import KNOWN_DATA, label_of
+from calib.errors import CalibError
+from calib.gap.corrected import load_corrected
+from calib.gap.files import answer
+from calib.gap.where import row_gaps
+from calib.inference.prior_files import default_priors
+
+INPUTS, FILES = "data and priors", "files and their hashes"
+# Of the sd of a gap; and a gap that is nil, in kN, mm or g/cm^3.
+_OF_SD, _ROUNDING = 0.3, 1e-6
+
+
+def files(
+    folder: Path, own: str, listed: Mapping[str, str], *, more: Iterable[tuple[str, str]] = (),
+    left_out: Iterable[str] = (),
+) -> list[Item]:  # fmt: skip
+    """Return an item for each file that is listed, by its SHA-256, or there.
+
+    `own` lists them, and so has no hash; `more` hashes are said elsewhere in it, none where one is
+    missed; what was left out is not there on purpose.
+    """
+    pairs = dict.fromkeys([*listed.items(), *more])
+    wrong = "missing: only posteriors may be left out"
+    return [
+        *(_listed(folder / name, own, name, expected) for name, expected in pairs),
+        *(claim(FILES, n, wrong) for n in left_out if not n.endswith(".nc") or "/" in n),
+        *(claim(FILES, n, "not listed") for n in sorted(files_in(folder) - {own, *listed})),
+    ]
+
+
+def files_in(folder: Path) -> set[str]:
+    """Return the names of all files below a folder."""
+    return {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file()}
+
+
+def _listed(path: Path, own: str, name: str, expected: str) -> Item:
+    if not expected:
+        return claim(INPUTS, name, f"{own} has no hash of it")
+    if not path.is_file():
+        return claim(FILES, name, "missing")
+    try:
+        found = sha256(path.read_bytes())
+    except OSError as error:
+        return claim(FILES, name, f"cannot be read ({error.strerror})")
+    if found != expected:
+        return Item(FILES, name, Status.DIFFERENT, expected, found, note="changed")
+    return Item(FILES, name, Status.IDENTICAL)
+
+
+def label(file: str, table: Table, label: str) -> Item:
+    """Check that rows which are known are called what they are, and no others are."""
+    known = label_of(table)
+    right = KNOWN_DATA[known].words if known else "data of the user"
+    wrong = f"called {label}, but not {KNOWN_DATA[label].words if label in KNOWN_DATA else 'that'}"
+    if known:
+        wrong = f"these are {right}, {known} and not measured, but not called so"
+    return claim(INPUTS, file, wrong if label != known else "", right)
+
+
+def priors(key: str, entry: TaskRecord, folder: Path, *, same_code: bool) -> Item:
+    """Check that priors which are called the shipped ones are."""
+    file, shipped = entry.priors.file, default_priors(entry.model)
+    if not entry.priors.shipped:
+        return claim(INPUTS, file, "", f"priors of the user for {key}")
+    same = (folder / file).read_bytes() == shipped.read_bytes()
+    wrong = "" if same else f"not the {shipped.name} of this version"
+    return claim(INPUTS, file, wrong, f"the shipped {shipped.name}", sure=same_code)
+
+
+def blame(items: Iterable[Item], file: str, wrong: str) -> list[Item]:
+    """Name the input that some numbers cannot have been computed from, if most are different."""
+    different = [i.status is Status.DIFFERENT for i in items if isinstance(i.recorded, float)]
+    return [claim(INPUTS, file, wrong)] if sum(different) > 0.5 * len(different) else []
+
+
+def derived_files(names: Iterable[str]) -> set[str]:
+    """Return those of a report's files that are made from others."""
+    others = {"references.bib", "audit.csv"}
+    return {n for n in names if n.startswith(("tables/", "methods.")) or n in others}
+
+
+def derived(
+    folder: Path, files: Iterable[str], writers: Mapping[str, Callable[[], Mapping[str, str]]], *,
+    sure: bool,
+) -> list[Item]:  # fmt: skip
+    """Write texts again from what they follow from, by the name of that, and compare the bytes.
+
+    Another version than the one that wrote them may word them otherwise: then it is not `sure`.
+    """
+    failed, found = [], dict[str, Item]()
+    for source, write in writers.items():
+        try:
+            for name, text in write().items():
+                wrong, path = "", folder / name
+                if not path.is_file():
+                    wrong = f"missing, though {source} gives it"
+                elif path.read_bytes() != text.encode():
+                    lines = differing_lines(read_text(path).splitlines(), text.splitlines())
+                    wrong = f"it does not follow from {source}: {lines}"
+                found[name] = claim(TEXT, name, wrong, f"it follows from {source}", sure=sure)
+        except (CalibError, *FAULTS) as error:
+            wrong = f"what follows from it cannot be written ({type(error).__name__}: {error})"
+            failed.append(claim(TEXT, source, wrong, sure=sure))
+    for name in derived_files(files) - set(found) if not failed else ():
+        found[name] = claim(TEXT, name, "it follows from nothing here", sure=sure)
+    return failed + [found[name] for name in sorted(found)]
+
+
+def form(folder: Path) -> list[Item]:
+    """Check that documents are in the form they are written in.
+
+    Of two equal keys a machine reads the last, and a person may see the first.
+    """
+    wrong = "not in the form it is written in: repeated keys, or edited by hand"
+    found = []
+    for path in sorted(folder.rglob("*.json")):
+        # What cannot be read is said where its entries are compared.
+        with suppress(*FAULTS):
+            text = path.read_text(encoding="utf-8")
+            indent = 1 if text.startswith("{\n") else None
+            if text != f"{json.dumps(json.loads(text), indent=indent)}\n":
+                found.append(claim(TEXT, path.relative_to(folder).as_posix(), wrong))
+    return found
+
+
+def gaps(folder: Path, summary: Mapping[str, Any], *, same_code: bool) -> list[Item]:
+    """Hold what a summary says of the source's gaps, and their corrected models, against diagnoses.
+
+    Another version than the one that wrote the report may predict otherwise.
+    """
+    items = []
+    for name, said in inside(summary, "paper_gaps").items():
+        place = folder / "gaps" / name
+        if (place / "diagnosis.json").is_file():
+            diagnosis = read_json(place / "diagnosis.json")
+            both = f"summary.json and gaps/{name}/diagnosis.json"
+            items.append(claim(TEXT, both, _contradicted(said, diagnosis), "they say the same"))
+            wrong, right = _mispredicted(place, diagnosis), "it predicts the gaps of diagnosis.json"
+            items.append(claim(TEXT, f"gaps/{name}/corrected.json", wrong, right, sure=same_code))
+    return items
+
+
+def _contradicted(said: Any, diagnosis: Mapping[str, Any]) -> str:
+    """Say what a summary does not repeat of a diagnosis."""
+    try:
+        stated = answer(diagnosis)
+    except FAULTS:
+        return "the diagnosis is not a whole one"
+    apart = [key for key, value in stated.items() if inside(said).get(key) != value]
+    return f"not the same: {', '.join(apart)}" if apart else ""
+
+
+def _mispredicted(folder: Path, diagnosis: Mapping[str, Any]) -> str:
+    """Say what is wrong with a corrected model that does not predict the gaps of its diagnosis.
+
+    It is drawn from, and a normal may be drawn otherwise by another processor: the means of
+    hundreds of draws agree within a third of their sd.
+    """
+    try:
+        corrected = load_corrected(folder)
+        stated = {(e["output"], e["row"]): (e["gap"], e["gap_sd"]) for e in diagnosis["where"]}
+        for g in row_gaps(corrected.data, corrected.mixture.at(corrected.data.view)):
+            pairs = np.array([stated[g.output, int(row)] for row in g.rows], dtype=np.float64)
+            apart = np.abs(np.stack([g.gap, g.sd], axis=1) - pairs)
+            if (apart > _OF_SD * pairs[:, 1:] + _ROUNDING).any():
+                return "it does not predict the gaps that diagnosis.json states"
+    except (CalibError, *FAULTS) as error:
+        return f"it cannot be held against its diagnosis ({type(error).__name__}: {error})"
+    return ""
