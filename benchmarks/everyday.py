@@ -1,6 +1,6 @@
 """What the commands of every day take, beside the same commands of an earlier commit.
 
-    python benchmarks/everyday.py --out everyday.json           # ten minutes on two cores
+    python benchmarks/everyday.py --out everyday.json           # twenty minutes on two cores
     python benchmarks/everyday.py --against HEAD~3 --repeats 1  # beside another commit, quickly
     python benchmarks/everyday.py --against ""                  # this code alone
     python benchmarks/everyday.py --tests                       # `make test` too, once
@@ -128,9 +128,9 @@ class Tree:
         check = [*_CALIB, "check", "reports/he2019"]
         found = {
             "make report": Command(
-                [*_CALIB, "report", "--out", f"{self.scratch}/report", "--overwrite"], 3, 15.0
+                [*_CALIB, "report", "--out", f"{self.scratch}/report", "--overwrite"], asked=15.0
             ),
-            "calib check reports/he2019": Command(check, 3, 20.0, ends=(0, 1)),
+            "calib check reports/he2019": Command(check, asked=20.0, ends=(0, 1)),
             "calib check reports/he2019 --quick": Command([*check, "--quick"], ends=(0, 1)),
             "calib diagnose CASE": Command(
                 [*_CALIB, "diagnose", str(cases[0]), "--overwrite",
@@ -225,7 +225,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--out", type=Path, help="JSON file to write; printed if none")
     parser.add_argument("--against", default=BEFORE, help="commit to run beside; '' for none")
-    parser.add_argument("--repeats", type=int, default=5, help="at most; long ones have three")
+    parser.add_argument("--repeats", type=int, default=5, help="at most; of the tests one")
     parser.add_argument("--only", default="", help="commands whose name has this pattern")
     parser.add_argument("--tests", action="store_true", help="`make test` too, once")
     options = parser.parse_args()
