@@ -217,8 +217,8 @@ def _beyond(corrected: Corrected, before: Mapping[str, Array]) -> list[str]:
     if new is None:
         return []
     said = [
-        f"{new.source}: {rows} of {len(new)} rows lie outside what either campaign covered in "
-        f"{name}; what is predicted there is extrapolated"
+        f"{new.source}: beyond what either campaign covered in {name}: {rows} of {len(new)} rows, "
+        "where what is predicted is extrapolated"
         for name, rows in conditions_outside(corrected, new).items()
     ]
     for name, values in before.items():

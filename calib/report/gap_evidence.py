@@ -19,6 +19,7 @@ from calib.gap.shrink import Shrink
 from calib.gap.where import Region
 from calib.models import get_model
 from calib.report.gap_facts import (
+    SHOWN,
     Candidate,
     CauseFact,
     GapEvidence,
@@ -131,7 +132,7 @@ def _without(found: Diagnosis) -> str:
     if found.without_context is None:
         return ""
     p = found.without_context
-    leading = sorted((n for n in p if p[n] >= 0.05), key=lambda n: -p[n])[:4]
+    leading = sorted((n for n in p if p[n] >= SHOWN), key=lambda n: -p[n])[:4]
     words = {"none": "no gap", UNLISTED: "something unlisted"}
     return joined([f"{words.get(n, short_name(n))} ({odds_text(p[n])})" for n in leading])
 
@@ -163,14 +164,15 @@ def region_words(found: Diagnosis, region: Region) -> tuple[str, str]:
 
 
 def _leading_regions(found: Diagnosis) -> list[Region]:
-    """One region of each output, along a condition of the best hypothesis if there is one."""
+    """Where each output has its first region, and one along a condition of the best hypothesis."""
     effects = found.ranking.best(found.ranking.order[0]).forward.hypothesis.effects
     wanted = {found.data.view.column(role) for e in effects for role in e.covariates}
     leading = []
     for o in found.data.outputs:
         own = [r for r in found.regions if r.output == o.name]
-        own.sort(key=lambda r: not wanted & set(r.conditions))
         leading += own[:1]
+        if own and not any(wanted & set(r.conditions) for r in own[:1]):
+            leading += [r for r in own if wanted & set(r.conditions)][:1]
     return leading
 
 

@@ -10,6 +10,8 @@ from calib.report.labels import MINUS, joined, odds_text, percent_range
 # Hypotheses within this factor of the best are read as a tie with it.
 TIE = 0.2
 MOST_TIED = 4
+# What is less probable is not spoken of: shown as a percentage it would be below 5.
+SHOWN = 0.045
 # A change over the runs that nothing listed explains.
 NEITHER = "something that is neither"
 
@@ -111,7 +113,7 @@ class GapEvidence:
     sizes : sequence of str
         What the best hypothesis amounts to.
     where : sequence of WhereFact
-        One of each output that has any.
+        The first of each output that has any, and one along what the best hypothesis is about.
     shrink_place : str
         On which rows the shrink was judged.
     alike : sequence of str
@@ -172,12 +174,12 @@ class GapEvidence:
 
 def causes_text(e: GapEvidence) -> str:
     """Say what acts, whatever acts besides, and what part of the gap it is."""
-    named = e.acting or [c for c in e.causes if c.probability >= 0.05][:2]
+    named = e.acting or [c for c in e.causes if c.probability >= SHOWN][:2]
     parts = [
         f"{c.words} acts ({odds_text(c.probability)}) and is {_share(c)} of the gap" for c in named
     ]
     rest = e.remainder
-    if rest is not None and rest.probability >= 0.05:
+    if rest is not None and rest.probability >= SHOWN:
         where = f", {e.remainder_where}," if e.remainder_where else ""
         parts.append(
             f"what is of no listed shape{where} is there with {odds_text(rest.probability)} and is "
@@ -194,7 +196,7 @@ def which_text(e: GapEvidence) -> str:
     """Say which hypothesis is the best, what else is possible, and what looks like it."""
     best = e.ranked[0]
     text = f"As a whole: {best.words}, probability {odds_text(best.probability)}"
-    rivals = [c for c in e.ranked[1:MOST_TIED] if c.probability >= 0.05]
+    rivals = [c for c in e.ranked[1:MOST_TIED] if c.probability >= SHOWN]
     if rivals:
         listed = joined([f"{c.words} ({odds_text(c.probability)})" for c in rivals])
         text += f"; also possible: {listed}"

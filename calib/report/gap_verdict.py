@@ -25,6 +25,7 @@ from calib.gap.effects.instruments import EARLY
 from calib.report.gap_facts import (
     MOST_TIED,
     NEITHER,
+    SHOWN,
     TIE,
     Candidate,
     GapEvidence,
@@ -40,6 +41,7 @@ SURE = 0.9
 # ln 20: the evidence that makes odds of twenty to one.
 _ENOUGH_NATS = math.log(20.0)
 _PREDICT = "calib predict DIAGNOSIS --at NEW.csv"
+_FOLDER = "DIAGNOSIS being this folder"
 
 
 class Tone(StrEnum):
@@ -150,7 +152,7 @@ def _no_gap(e: GapEvidence, best: Candidate) -> GapVerdict:
     facts = [("Which", f"No gap, probability {odds_text(best.probability)}{size}")]
     if e.put_in:
         facts.append(("Put in", f"{e.put_in}. Without that: {e.without}"))
-    others = [c for c in e.ranked[1:4] if c.probability >= 0.05]
+    others = [c for c in e.ranked[1:4] if c.probability >= SHOWN]
     if others:
         listed = joined([f"{c.words} ({odds_text(c.probability)})" for c in others])
         facts.append(("Not excluded", listed))
@@ -199,14 +201,20 @@ def advice(e: GapEvidence) -> str:
         faults = {runs: EARLY}
     if faults:
         checks = joined([f"{words} ({check})" for words, check in faults.items()])
-        ground = ""
+        names = [] if runs else [c.name for c in e.acting if c.instrument]
+        sound = ""
         if e.runs is not None and e.runs.only and e.runs.probability >= 0.5:
-            ground = f". If it is sound, the ground changed over the runs: {e.runs.outputs} alone "
-            ground += "cannot tell"
+            sound = f". If it is sound, the ground changed over the runs: {e.runs.outputs} alone "
+            sound += "cannot tell"
+        elif names:
+            listed = ", ".join(f'"{name}"' for name in names)
+            sound = f". If it is sound, put excluded = [{listed}] into [context] of case.toml, and "
+            sound += "diagnose again"
+        without = "".join(f" --without {name}" for name in names) or " --without CAUSE"
         return (
             f"check the instrument before the model: {checks}. With the cause, what the faulty "
-            "instrument reads is predicted; once it is mended, predict without it (--without)"
-            f"{ground}"
+            "instrument reads is predicted; once it is mended, predict without it: "
+            f"{_PREDICT}{without}, {_FOLDER}{sound}"
         )
     if _measure_first(e):
         return ""
@@ -214,12 +222,12 @@ def advice(e: GapEvidence) -> str:
     if not missing:
         return (
             "fit the field's rows too, and look at what changed in the soil. Until then predict "
-            f"with the other parameter values: {_PREDICT}"
+            f"with the other parameter values: {_PREDICT}, {_FOLDER}"
         )
     causes = "cause" if len(missing) == 1 else "causes"
     return (
-        f"predict with the {causes} in the model ({joined(missing)}): {_PREDICT}. Or put "
-        f"{'it' if len(missing) == 1 else 'them'} into the simulator, and calibrate that again"
+        f"predict with the {causes} in the model ({joined(missing)}): {_PREDICT}, {_FOLDER}. Or "
+        f"put {'it' if len(missing) == 1 else 'them'} into the simulator, and calibrate that again"
     )
 
 

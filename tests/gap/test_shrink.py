@@ -152,7 +152,7 @@ def test_extrapolated_conditions_are_said():
     columns["inflation_pressure_psi"][0] = 420.0
     far = replace(case, new_conditions=table_from_arrays(columns))
     said = " ".join(diagnose(far, 1, effects=few).warnings)
-    assert "1 of 9 rows lie outside what either campaign covered in inflation_pressure_psi" in said
+    assert "beyond what either campaign covered in inflation_pressure_psi: 1 of 9 rows" in said
 
 
 def test_a_folder_will_do_and_the_answer_is_short(tmp_path):

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from calib.gap.diagnose import Diagnosis
+from calib.gap.diagnose import NAMED, Diagnosis
 from calib.gap.placebo import Placebo, placebos
 from calib.report.figures.gap_design import isolability_plate
 from calib.report.figures.gap_where import conditions_plate, how_far_plate, where_plate
@@ -123,7 +123,8 @@ def which_plate(found: Diagnosis) -> Plate:
     ax.tick_params(axis="y", length=0.0)
     ax.set_xlabel(f"Probability ({NO_UNIT})")
     if len(tied) > 1:
-        note(ax, "hatched: not far apart,\nread them as a tie", x=0.98, y=0.05, color=BLACK)
+        read = "read them as a tie" if p[order[0]] < NAMED else "any of them may be right"
+        note(ax, f"hatched: not far apart,\n{read}", x=0.98, y=0.05, color=BLACK)
     return Plate(fig, "which", _which_caption(found, tied), "Which: the hypotheses")
 
 
@@ -139,7 +140,10 @@ def _which_caption(found: Diagnosis, tied: list[str]) -> str:
     others = len(order) - min(len(order), _MOST)
     if others:
         text += f" {others} more hypotheses share {probability_text(rest)}."
-    return f"{text} Beyond the dashed line a hypothesis is the verdict; causes have theirs besides."
+    return (
+        f"{text} Beyond the dashed line a hypothesis is more probable than all others together; "
+        "how probable each cause is to act, in whichever of them, is a table of its own."
+    )
 
 
 def placebo_plate(found: Diagnosis) -> Plate:
@@ -197,7 +201,7 @@ def _placebo_caption(placebo: Placebo, named: str) -> str:
     if wrong:
         runner = min(wrong, key=lambda n: wrong[n])
         text += (
-            f", and the best of the other single effects, {short_name(runner)}, "
+            f", and the best single effect besides, {short_name(runner)}, "
             f"{percent(max(placebo.shrink(runner), 0.0))}"
         )
     if "none" in placebo.left:
@@ -210,7 +214,8 @@ def _placebo_caption(placebo: Placebo, named: str) -> str:
         )
     return (
         f"{text}. Any hypothesis with free parameters removes something, a wrong one too, so the "
-        "distance between the diamond and the rest is what counts, not the percentage; "
+        "distance between the diamond and the rest is what counts, not the percentage. Where that "
+        "is small, causes are told apart by what their sizes and numbers cost, not by the fit; "
         "noise alone would leave "
         f"{short(1.0)}."
     )

@@ -17,7 +17,7 @@ from calib.gap.effects.dependence import PREFIX
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.inclusion import UNLISTED
-from calib.gap.odds import LEFT, coarsening
+from calib.gap.odds import LEFT, coarsening, probabilities
 from calib.gap.placebo import placebos
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
@@ -66,7 +66,7 @@ def hypothesis_groups(found: Diagnosis) -> list[dict[str, Any]]:
     groups = (
         (first, tied),
         ("Less probable", possible),
-        ("Ruled out (below 1 %)", out),
+        ("Ruled out by themselves (below 1 %)", out),
         (f"Sets ruled out (below 1 %): {len(sets)}", sets),
     )
     return [
@@ -295,6 +295,7 @@ def render_diagnosis(
         left=f"{100.0 * LEFT:g}",
         gap=f"{found.ranking.gap:.1f}",
         coarse=f"{coarsening(found.ranking.gap):.2f}",
+        before_coarsening=_before_coarsening(found),
         relevant=f"{RELEVANT:g}",
         relevant_in_pair=f"{RELEVANT_IN_PAIR:g}",
         parameters=parameter_rows(found),
@@ -345,6 +346,12 @@ def _shrink_rows(found: Diagnosis) -> list[list[str]]:
         fraction = f"{100.0 * f.fraction:.0f} %".replace("-", MINUS)
         rows.append([f.output, f.before, f.after, f.floor, fraction, percent_range(f.interval)])
     return rows
+
+
+def _before_coarsening(found: Diagnosis) -> str:
+    """How probable the first explanation would be if formulas were right to the last."""
+    ranking = found.ranking
+    return odds_text(probabilities(ranking.log_evidence, ranking.odds)[ranking.order[0]])
 
 
 def _case_facts(found: Diagnosis) -> list[tuple[str, str]]:

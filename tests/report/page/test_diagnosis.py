@@ -575,7 +575,7 @@ def test_evidence_is_gathered_from_the_records(found):
         found.ranking.probability.values(), reverse=True
     )
     assert len(e.where) <= len(found.data.outputs)
-    assert e.shrink_place.startswith("at new conditions")
+    assert e.shrink_place.startswith("expected at the new conditions")
     assert [s.fraction for s in e.shrink] == [s.fraction for s in found.shrink.values()]
 
 
@@ -765,7 +765,7 @@ def test_prior_probabilities_are_said():
 
 def test_what_the_campaigns_cover_is_said_where_a_correction_is_judged(found, page):
     said = covered_text(found)
-    assert f"cover together: {said}." in page[2].text
+    assert f"the two campaigns cover: {said}." in page[2].text
     slip = np.concatenate([t["slip_ratio"] for t in (found.data.case.lab, found.data.case.field)])
     assert f"slip {100.0 * slip.min():.0f} to {100.0 * slip.max():.0f} %" in said
     assert "run order" not in said
@@ -774,4 +774,6 @@ def test_what_the_campaigns_cover_is_said_where_a_correction_is_judged(found, pa
 def test_a_large_gap_says_how_far_its_probabilities_are_coarsened(found, page):
     coarse = 1.0 + (0.05 * found.ranking.gap) ** 2
     assert coarse > 1.01
-    assert f"1/{coarse:.2f}, the gap being of {found.ranking.gap:.1f} noise sd" in page[2].text
+    said = " ".join(page[2].text.split())
+    assert f"Of this gap of {found.ranking.gap:.1f} noise sd" in said
+    assert f"the logarithms of all odds are divided by {coarse:.2f}." in said
