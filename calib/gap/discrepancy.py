@@ -77,11 +77,11 @@ class Discrepancy:
         return (self._of_field[output] if same else self._smooth_basis(view, output))[0]
 
     def onset(self, view: View, output: str, threshold: Array) -> tuple[Array, ...]:
-        """Step, bend and level of a discrepancy that sets in at thresholds (k,), shapes (k, n).
+        """Step and bend of a discrepancy that sets in at thresholds (k,), shapes (k, n).
 
-        The laboratory's rows are of both sides of what gives way at a threshold, so the field may
-        differ from them before it as well. Below a pressure it is a step and a part of the
-        output's level instead.
+        Over slip a constant as well: the laboratory's rows are of both sides of what gives way at
+        a slip, so the field may differ from them before it too. Below a pressure it is a step and a
+        part of the output's level instead.
         """
         u = self.onset_covariate(view, output)
         beyond = (u - threshold[:, None]) / _ONSET_WIDTH
@@ -89,7 +89,8 @@ class Discrepancy:
         if self.hypothesis.onset_over == "low_pressure":
             # An underinflated tyre may lose a part of the pull, and more of it the more it pulls.
             return step, step * self._known(self._level(view, output))
-        return step, _ONSET_WIDTH * np.logaddexp(0.0, beyond), np.ones_like(step)
+        shapes = step, _ONSET_WIDTH * np.logaddexp(0.0, beyond)
+        return (*shapes, np.ones_like(step)) if self.hypothesis.onset_over == "slip" else shapes
 
     def onset_covariate(self, view: View, output: str) -> Array:
         """What a sudden discrepancy sets in over, scaled to -1..1, shape (n,)."""
@@ -109,8 +110,8 @@ class Discrepancy:
         over = self.hypothesis.smooth_over
         if self.hypothesis.onset_over is not None:
             # Its shape depends on the threshold; here are its amplitudes.
-            soft = self.hypothesis.onset_over == "low_pressure"
-            return np.array([]), np.array([1.0, 2.0] if soft else [1.0, 2.0, 0.5])
+            both_sides = self.hypothesis.onset_over == "slip"
+            return np.array([]), np.array([1.0, 2.0, 0.5] if both_sides else [1.0, 2.0])
         if over == "before":
             change = self._from_the_run_before(view, output)
             return change[:, None], np.ones(1)
