@@ -131,7 +131,7 @@ def test_what_was_not_covered_or_has_no_value_is_said(monkeypatch):
     monkeypatch.setattr(module, "conditions_outside", lambda corrected, new: {"speed_m_s": 3})
     values = np.array([1.0, np.nan, np.nan, 2.0])
     outside, empty = _beyond(corrected, {"drawbar_pull": values, "rut_depth": np.ones(4)})
-    assert "3 of 4 rows lie outside" in outside
+    assert "speed_m_s: 3 of 4 rows" in outside
     assert "has no drawbar pull at 2 of 4 rows" in empty
     corrected.data.case = replace(case, new_conditions=None)
     assert _beyond(corrected, {"drawbar_pull": values}) == []
