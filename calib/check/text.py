@@ -83,16 +83,22 @@ def compare_page(name: str, recorded: Path, written: Path, judged: Judged) -> It
     parts, again = (("", *_SECTION.split(text)) for text in (old, new))
     if parts[::2] != again[::2]:
         return claim(GROUP, name, "it has other sections")
-    note = "the same words; numbers are judged where they come from"
-    found = Item(GROUP, name, Status.WITHIN, note=note)
-    for section, one, other in zip(parts[::2], parts[1::2], again[1::2], strict=True):
-        why, numbers = judged(section)
-        if not _alike(one.splitlines(), other.splitlines(), numbers=numbers):
-            said = differing_lines(one.splitlines(), other.splitlines())
-            if why is None:
-                return claim(GROUP, name, said)
-            found = claim(GROUP, name, f"{why}: {said}", sure=False)
-    return found
+    why: set[str | None] = set()
+    apart: tuple[list[str], list[str]] = [], []
+    for section, *texts in zip(parts[::2], parts[1::2], again[1::2], strict=True):
+        excuse, numbers = judged(section)
+        one, other = (text.splitlines() for text in texts)
+        if not _alike(one, other, numbers=numbers):
+            why.add(excuse)
+            apart[0].extend(one)
+            apart[1].extend(other)
+    if not why:
+        note = "the same words; numbers are judged where they come from"
+        return Item(GROUP, name, Status.WITHIN, note=note)
+    said = differing_lines(*apart)
+    if None in why:
+        return claim(GROUP, name, said)
+    return claim(GROUP, name, f"{'; '.join(sorted(filter(None, why)))}: {said}", sure=False)
 
 
 def _readable(folder: Path, name: str) -> str:

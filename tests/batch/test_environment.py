@@ -45,6 +45,7 @@ def test_differences_are_named() -> None:
     ("change", "same"),
     [
         ({"versions": {"python": "3.99"}}, True),
+        ({"versions": {"terracalib": "0.1.dev1"}}, True),  # the code's fingerprint says which it is
         ({"machine": {"simd": "none"}}, True),
         ({"versions": {"matplotlib": "0"}}, False),
         ({"versions": {"jinja2": "0"}}, False),

@@ -151,6 +151,18 @@ def test_what_does_not_hang_together_is_named_without_sampling(compared: Path, w
     assert name in findings(compared, quick=True)
 
 
+@pytest.mark.parametrize("gone", ["rows", "verdict", "converged"])
+def test_what_a_record_lacks_is_a_difference_and_no_traceback(compared: Path, gone: str) -> None:
+    def change(m: dict[str, Any]) -> None:
+        (m["models"]["bekker"] if gone == "converged" else m).pop(gone)
+
+    edit_json(compared / FILE, change)  # no page can be written of it
+    try:
+        assert findings(compared, quick=True)
+    except CalibError as error:
+        assert gone in str(error)
+
+
 def test_what_only_sampling_tells_is_named(compared: Path) -> None:
     def change(m: dict[str, Any]) -> None:
         best = next(iter(m["models"].values()))

@@ -541,6 +541,17 @@ def test_another_version_explains_another_page_and_does_not_hide_it(report_here:
     assert set(outcome.environment) == {"code"}
 
 
+def test_another_commit_of_the_same_code_is_no_excuse(report_here: Path) -> None:
+    report = report_here
+    replace_text("index.html", "Do not trust:", "Trust too:")(report)
+    other = {"terracalib": "0.1.dev1"}
+    edit_json(report / "manifest.json", lambda m: m["versions"].update(other))
+    seal(report)
+    outcome = check(report)
+    assert outcome.exit_code == 1
+    assert "index.html" in {item.name for item in outcome.of(Status.DIFFERENT)}
+
+
 def test_priors_of_another_version_are_not_called_wrong(report: Path) -> None:
     shipped = default_priors("modified_bekker").read_bytes()
     assert (report / "priors/rut_depth.toml").read_bytes() == shipped

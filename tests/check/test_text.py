@@ -64,6 +64,16 @@ def test_words_that_cannot_be_judged_say_why(tmp_path: Path) -> None:
     assert found.note == "near a threshold: 2 lines differ: - it passes; + it fails"
 
 
+@pytest.mark.parametrize("why", [None, "another version wrote it"])
+def test_no_section_hides_what_differs_in_another(why: str | None, tmp_path: Path) -> None:
+    last = '<section aria-labelledby="end"><p>end</p></section>'
+    old, new = page("it passes") + last, page("it fails") + last + "<!-- a decoy -->"
+    found = compared(tmp_path, old, new, why=why)
+    assert found.status is (Status.DIFFERENT if why is None else Status.UNJUDGED)
+    for words in ("- it passes", "+ it fails", "a decoy", "4 lines differ"):
+        assert words in found.note
+
+
 @pytest.mark.parametrize(
     ("new", "note"),
     [
