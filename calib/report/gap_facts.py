@@ -230,7 +230,7 @@ def how_far_text(e: GapEvidence) -> str:
         if s.interval[0] <= 0.0 < s.fraction:
             part += ", so it may not shrink at all"
         parts.append(part)
-    return f"{'; '.join(parts)}, {e.shrink_place}"
+    return f"{'; '.join(parts)}, as expected {e.shrink_place}"
 
 
 def _per_cent(ratio: float) -> str:

@@ -75,7 +75,7 @@ def region_text(found: Diagnosis, region: Region) -> str:
 def shrink_place(found: Diagnosis) -> str:
     """Say on which rows it was judged how far the gap shrinks."""
     if found.data.case.new_conditions is not None:
-        return "expected at the new conditions, of which there are no readings"
+        return "at the new conditions, of which there are no readings"
     parts = len(field_parts(found.data, found.seed))
     if parts:
         return (

@@ -229,7 +229,7 @@ def test_a_shrink_that_may_be_nothing_says_so():
     text = dict(judge_gap(shaky).facts)["How far"]
     assert "\N{MINUS SIGN}30 to 70 %" in text
     assert "may not shrink at all" in text
-    assert text.endswith(", at new conditions, which were not fitted")
+    assert text.endswith(", as expected at new conditions, which were not fitted")
 
 
 def test_nothing_to_show_is_said():
@@ -575,7 +575,7 @@ def test_evidence_is_gathered_from_the_records(found):
         found.ranking.probability.values(), reverse=True
     )
     assert len(e.where) <= len(found.data.outputs)
-    assert e.shrink_place.startswith("expected at the new conditions")
+    assert e.shrink_place.startswith("at the new conditions")
     assert [s.fraction for s in e.shrink] == [s.fraction for s in found.shrink.values()]
 
 
