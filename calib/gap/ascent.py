@@ -25,9 +25,9 @@ __all__ = ["Ascent", "Slope", "Stack", "Walk", "climb", "in_step", "slopes", "to
 type Walk[T] = Generator[list[tuple[Residuals, Array]], list[Array], T]
 
 # Dampings that are tried at each step, relative to the last that was good.
-_DAMPINGS = 10.0 ** np.arange(-1.0, 5.0)
-# A step that gains less, in nats, and changes the noise less, is quiet; two of them are the end.
-_QUIET_GAIN, _QUIET_NOISE = 1e-3, 1e-2
+_DAMPINGS = np.array([0.1, 10.0, 1000.0])
+# A step that gains less, in nats, and changes the noise less, is quiet; two in a row are the end.
+_QUIET_GAIN, _QUIET_NOISE = 1e-2, 1e-2
 # Ascents whose derivatives stay in the processor's cache.
 _AT_ONCE = 16
 # What is taken of coordinates that one hypothesis lacks and others have: nothing depends on them.
@@ -73,6 +73,8 @@ class Ascent:
     noise : dict of str to Noise
     steps : int
         That it may still take.
+    jacobian : ndarray, shape (d, N), optional
+        Derivatives of the residuals where its last step began.
     """
 
     problem: Residuals
@@ -82,6 +84,7 @@ class Ascent:
     steps: int
     damping: float = 1e-3
     quiet: int = 0
+    jacobian: Array | None = None
 
 
 def in_step(ascents: Sequence[Ascent]) -> list[list[Ascent]]:
@@ -115,6 +118,13 @@ class Stack(Coordinates):
             self._parts.append((problem, slice(start, end)))
             start = end
 
+    def kept(self) -> Array:
+        """Derivatives where the last step of each began, shape (m, D, N)."""
+        found = np.zeros((*self.psi.shape, self.raw.shape[1]))
+        for wide, ascent in zip(found, self.ascents, strict=True):
+            wide[: ascent.psi.size] = ascent.jacobian
+        return found
+
     @property
     def each(self) -> Coordinates:
         """The same for several points of each, whose arrays are (m, t, D)."""
@@ -123,22 +133,27 @@ class Stack(Coordinates):
             setattr(other, name, getattr(self, name)[:, None])
         return other
 
-    def residuals(self, points: Array, *, own: bool = False) -> Walk[Array]:
-        """Evaluate at several points of each, shapes (m, t, D) to (m, t, N).
-
-        Of points one for each coordinate, `own` leaves out those for coordinates that are lacking;
-        residuals there are those where the ascent stands.
-        """
-        t = points.shape[1]
-        asked = [
-            (p, points[rows, : p.loc.size if own else t, : p.loc.size]) for p, rows in self._parts
-        ]
+    def residuals(self, points: Array) -> Walk[Array]:
+        """Evaluate at several points of each, shapes (m, t, D) to (m, t, N)."""
+        asked = [(p, points[rows, :, : p.loc.size]) for p, rows in self._parts]
         answers = yield [(p, some.reshape(-1, p.loc.size)) for p, some in asked]
-        found = np.repeat(self.raw[:, None], t, axis=1)
-        for (_, rows), (_, some), answer in zip(self._parts, asked, answers, strict=True):
-            found[rows, : some.shape[1]] = answer.reshape(*some.shape[:2], -1)
-        return found
+        return np.concatenate([a.reshape(-1, points.shape[1], a.shape[1]) for a in answers])
 
+    def derivatives(self) -> Walk[Array]:
+        """Derivatives of the residuals where each stands, shape (m, D, N)."""
+        points = self.around(self.psi).reshape(*self.psi.shape, -1)
+        answers = yield [
+            (p, points[rows, p.curved, : p.loc.size].reshape(-1, p.loc.size))
+            for p, rows in self._parts
+        ]
+        moved = np.repeat(self.raw[:, None], points.shape[1], axis=1)
+        for (p, rows), answer in zip(self._parts, answers, strict=True):
+            moved[rows, p.curved] = answer.reshape(-1, p.curved.size, answer.shape[1])
+        found = self.jacobian(self.psi, self.raw, moved)
+        for p, rows in self._parts:
+            if p.curved.size < p.loc.size:
+                found[rows, p.linear] = p.linear_jacobian(self.psi[rows, : p.loc.size])
+        return found
 
 def _wide(rows: Sequence[Array], value: float) -> Array:
     """Rows one below the other, the shorter ones filled up, shape (m, D)."""
@@ -175,25 +190,25 @@ def climb(ascents: Sequence[Ascent]) -> Walk[None]:
     going = ascents
     while going := [a for a in going if a.quiet < 2 and a.steps]:
         stack = Stack(going)
-        slope = yield from slopes(stack)
+        jacobian = yield from stack.derivatives()
+        slope = slopes(stack, jacobian)
         gains = yield from _step(stack, slope)
         raw = np.stack([a.raw for a in going])
         noises = stack.update_noises(raw, slope.scaled, slope.hessian)
-        for ascent, gained, noise in zip(going, gains, noises, strict=True):
+        for i, (ascent, gained, noise) in enumerate(zip(going, gains, noises, strict=True)):
+            ascent.jacobian = jacobian[i, : ascent.psi.size]
             quiet = gained < _QUIET_GAIN and _change(ascent.noise, noise) < _QUIET_NOISE
             ascent.noise, ascent.quiet = noise, ascent.quiet + 1 if quiet else 0
             ascent.steps -= 1
 
 
-def slopes(stack: Stack) -> Walk[Slope]:
-    """Work out the derivatives of ascents where they stand."""
-    psi, raw = stack.psi, stack.raw
+def slopes(stack: Stack, jacobian: Array) -> Slope:
+    """Slope and curvature of ascents where they stand, by derivatives, shape (m, d, N)."""
     sds = np.stack([a.problem.sds(a.noise) for a in stack.ascents])
-    moved = yield from stack.residuals(stack.around(psi).reshape(*psi.shape, -1), own=True)
-    scaled = stack.jacobian(psi, raw, moved) / sds[:, None]
+    scaled = jacobian / sds[:, None]
     with np.errstate(invalid="ignore", over="ignore"):
-        gradient = (scaled @ (raw / sds)[:, :, None])[..., 0]
-        gradient += (psi - stack.loc) * stack.precision**2
+        gradient = (scaled @ (stack.raw / sds)[:, :, None])[..., 0]
+        gradient += (stack.psi - stack.loc) * stack.precision**2
         hessian = scaled @ scaled.swapaxes(1, 2)
     hessian += diagonal(stack.precision**2)
     return Slope(sds, scaled, gradient, hessian)

@@ -72,6 +72,12 @@ class Discrepancy:
         shapes = self.onset(view, output, threshold)
         return np.asarray(sum(a * s for a, s in zip(each(amplitudes), shapes, strict=True)))
 
+    def shapes(self, threshold: Array, view: View, output: str) -> Array:
+        """What amplitudes are multiplied with, thresholds (k,), shape (k, m, n) or (m, n)."""
+        if self.hypothesis.onset_over is None:
+            return self._smooth(view, output).T
+        return np.stack(self.onset(view, output, threshold), axis=1)
+
     def _smooth(self, view: View, output: str) -> Array:
         same = view.conditions is self.data.view.conditions
         return (self._of_field[output] if same else self._smooth_basis(view, output))[0]

@@ -155,10 +155,9 @@ def _climbed(ascents: Sequence[Sequence[Ascent]]) -> list[list[Fit]]:
     """Climb from guesses at several hypotheses to the modes beside them."""
     groups = in_step([a for group in ascents for a in group])
     together([climb(group) for group in groups])
-    stacks = [Stack(group) for group in groups]
     found: dict[Ascent, Fit] = {}
-    for stack, slope in zip(stacks, together([slopes(s) for s in stacks]), strict=True):
-        found |= zip(stack.ascents, _laplace(stack, slope), strict=True)
+    for stack in map(Stack, groups):
+        found |= zip(stack.ascents, _laplace(stack, slopes(stack, stack.kept())), strict=True)
     return [[found[a] for a in group] for group in ascents]
 
 

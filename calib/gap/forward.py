@@ -127,6 +127,7 @@ class Forward:
                 amplitudes = [_normal(f"{o.name}.smooth", sd * w) for w in weights]
                 self.smooth_slices[o.name] = _append(entries, amplitudes)
         self.threshold = len(entries)
+        self.smooth = slice(self.shift_slice.stop, self.threshold)
         if hypothesis.onset_over is not None:
             entries.append(_uniform("threshold", *THRESHOLDS))
         self.priors = Priors(tuple(entries))

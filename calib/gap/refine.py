@@ -33,9 +33,9 @@ _ROUNDS, _SIZE, _FINAL, _KEPT = 5, 3000, 8000, 500
 _DOF = 6.0
 # Fewer effective draws than this do not replace the normal.
 _ENOUGH = 120.0
-# With this many the evidence is within 0.016 nats (one sd), and further rounds would not be seen in
+# With this many the evidence is within 0.02 nats (one sd), and further rounds would not be seen in
 # any probability.
-PLENTY = 4000
+PLENTY = 2500
 
 
 def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:

@@ -139,6 +139,12 @@ class Residuals(Coordinates):
     ----------
     data : Campaigns
     forward : Forward
+
+    Attributes
+    ----------
+    curved, linear : ndarray of int, slice
+        Coordinates whose derivatives are differences, and those of a free discrepancy, which the
+        residuals are linear in.
     """
 
     def __init__(self, data: Campaigns, forward: Forward) -> None:
@@ -147,6 +153,8 @@ class Residuals(Coordinates):
         loc, _, self.lower, self.upper, self.precision = forward.priors._arrays
         self.loc = np.where(self.precision > 0, loc, 0.0)
         self.width = prior_widths(forward.priors)
+        self.linear = forward.smooth
+        self.curved = np.delete(np.arange(self.loc.size), self.linear)
 
     def raw(self, psi: Array) -> Array:
         """Evaluate, shape (k, d) to (k, N)."""
@@ -160,6 +168,19 @@ class Residuals(Coordinates):
             predicted += lab[o.name], there if o.rows.size == there.shape[1] else there[:, o.rows]
         raw: Array = np.concatenate(predicted, axis=1)
         return np.subtract(self.data.observed, raw, out=raw)
+
+    def linear_jacobian(self, psi: Array) -> Array:
+        """Derivatives by the coordinates that residuals are linear in, shape (m, linear, N)."""
+        forward, view = self.forward, self.data.view
+        found = np.zeros((len(psi), self.linear.stop - self.linear.start, self.data.observed.size))
+        threshold = psi[:, forward.threshold :].ravel()
+        for o in self.data.outputs:
+            if o.name in forward.smooth_slices:
+                part, rows = forward.smooth_slices[o.name], self.parts[o.name]
+                here = slice(part.start - self.linear.start, part.stop - self.linear.start)
+                shapes = forward.discrepancy.shapes(threshold, view, o.name)[..., o.rows]
+                found[:, here, rows.stop - o.rows.size : rows.stop] = -shapes
+        return found
 
     def sds(self, noise: Mapping[str, Noise]) -> Array:
         """Noise sd of every row, shape (N,)."""

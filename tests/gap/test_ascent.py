@@ -10,6 +10,7 @@ import pytest
 import calib.gap.ascent as module
 from calib.gap.ascent import (
     Ascent,
+    Slope,
     Stack,
     _change,
     _directions,
@@ -111,7 +112,7 @@ def test_hypotheses_in_step_end_where_each_alone_does(problems):
     for problem, found in zip(problems, fitted(problems), strict=True):
         (alone,) = fitted([problem])
         assert found.forward.hypothesis is problem.forward.hypothesis
-        # Both stop when a step gains less than a thousandth of a nat.
+        # Both stop after two steps that gain less than a hundredth of a nat.
         assert found.log_evidence == pytest.approx(alone.log_evidence, abs=0.01)
 
 
@@ -166,11 +167,17 @@ def ascents_of(problem: Residuals, size: int) -> list[Ascent]:
     return [Ascent(problem, p, r, NOISES, 5) for p, r in zip(psi, problem.raw(psi), strict=True)]
 
 
+def sloped(stack: Stack) -> Slope:
+    """Slopes where ascents stand, by derivatives there."""
+    (jacobian,) = together([stack.derivatives()])
+    return slopes(stack, jacobian)
+
+
 def test_slopes_are_those_of_the_cost(problems):
     """The gradient by differences of the cost; the Hessian of the residuals' derivatives."""
     for problem in problems:
         ascents = ascents_of(problem, 2)
-        (slope,) = together([slopes(Stack(ascents))])
+        slope = sloped(Stack(ascents))
         sds = problem.sds(NOISES)
         np.testing.assert_array_equal(slope.sds, [sds, sds])
         for i, ascent in enumerate(ascents):
@@ -187,8 +194,23 @@ def test_slopes_are_those_of_the_cost(problems):
                 ascent.psi[None], ascent.raw[None], problem.raw(problem.around(ascent.psi[None]))
             )[0] / sds  # fmt: skip
             hessian = scaled @ scaled.T + np.diag(problem.precision**2)
-            np.testing.assert_allclose(slope.scaled[i], scaled, rtol=1e-9, atol=1e-9)
-            np.testing.assert_allclose(slope.hessian[i], hessian, rtol=1e-9, atol=1e-9)
+            # Those of a discrepancy are exact, differences to eight digits.
+            np.testing.assert_allclose(slope.scaled[i], scaled, rtol=1e-6, atol=1e-6)
+            np.testing.assert_allclose(slope.hessian[i], hessian, rtol=1e-6, atol=1e-6)
+
+
+def test_the_normal_about_a_mode_has_the_curvature_there(problems):
+    """Though it is taken from where the last step began, which is a hundredth of a nat away."""
+    noise = {o: Noise(s) for o, s in SIGMA.items()}
+    for problem in problems:
+        start = Start(problem.forward, drawn(problem, 8), noise, 3)
+        (found,) = finished(truncated_fits([start]))
+        there = problem.raw(found.psi[None])
+        slope = sloped(Stack([Ascent(problem, found.psi, there[0], dict(found.noise), 1)]))
+        flat = np.where(problem.precision > 0, 0.0, problem.width**-2.0) * 1e-6
+        sd = np.sqrt(np.diag(np.linalg.inv(slope.hessian[0] + np.diag(flat))))
+        sd = np.minimum(sd, 0.5 * (problem.upper - problem.lower))
+        np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), sd, rtol=0.05)
 
 
 def test_damped_steps_solve_marquardts_equations_and_leave_a_blocked_coordinate(problems):
@@ -196,7 +218,7 @@ def test_damped_steps_solve_marquardts_equations_and_leave_a_blocked_coordinate(
     (ascent,) = ascents_of(problem, 1)
     bounded = int(np.flatnonzero(np.isfinite(problem.lower))[0])
     dampings = np.array([[1e-3, 0.1, 10.0]])
-    (slope,) = together([slopes(Stack([ascent]))])
+    slope = sloped(Stack([ascent]))
     for sign in (1.0, -1.0):
         slope.gradient[0, bounded] = sign * abs(slope.gradient[0, bounded])
         psi = ascent.psi.copy()
@@ -213,14 +235,14 @@ def test_damped_steps_solve_marquardts_equations_and_leave_a_blocked_coordinate(
 
 
 def test_of_several_dampings_the_step_that_gains_most_is_taken(problems):
-    """From a tenth to ten thousand times the last good one; worked out again one by one."""
+    """A tenth, ten and a thousand times the last good one; worked out again one by one."""
     problem = problems[0]
     ascents = ascents_of(problem, 3)
     before = [(a.psi, a.raw) for a in ascents]
     for ascent, damping in zip(ascents, (1e-3, 1.0, 1e-9), strict=True):
         ascent.damping = damping
-    dampings = np.array([[a.damping] for a in ascents]) * [[0.1, 1.0, 10.0, 100.0, 1e3, 1e4]]
-    (slope,) = together([slopes(Stack(ascents))])
+    dampings = np.array([[a.damping] for a in ascents]) * [[0.1, 10.0, 1e3]]
+    slope = sloped(Stack(ascents))
     (gains,) = together([_step(Stack(ascents), slope)])
     sds = problem.sds(NOISES)
     for i, (psi, raw) in enumerate(before):
@@ -244,13 +266,13 @@ def test_ascents_of_other_hypotheses_change_no_slope_and_no_step(problems):
     assert sizes == sorted(sizes)
     assert set(group) == set(ascents)
     stack = Stack(group)
-    (slope,) = together([slopes(stack)])
+    slope = sloped(stack)
     before = [copy(a) for a in group]
     (gains,) = together([_step(stack, slope)])
     for i, ascent in enumerate(before):
         d = ascent.psi.size
         alone = Stack([ascent])
-        (own,) = together([slopes(alone)])
+        own = sloped(alone)
         np.testing.assert_allclose(slope.gradient[i, :d], own.gradient[0], rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(slope.hessian[i, :d, :d], own.hessian[0], rtol=1e-9, atol=1e-9)
         np.testing.assert_array_equal(slope.gradient[i, d:], 0.0)
@@ -267,10 +289,10 @@ def test_where_no_step_gains_the_next_are_shorter(problems):
     """At a mode, uphill: the ascent stays, and begins with ten times the largest damping."""
     problem = problems[0]
     (ascent,) = ascents_of(problem, 1)
-    (slope,) = together([slopes(Stack([ascent]))])
+    slope = sloped(Stack([ascent]))
     slope.gradient[:] *= -1.0
     was = ascent.psi.copy()
-    for expected in (1e-3 * 1e5, 1e6, 1e6):
+    for expected in (1e-3 * 1e4, 1e5, 1e6, 1e6):
         (gains,) = together([_step(Stack([ascent]), slope)])
         assert gains == [0.0]
         np.testing.assert_array_equal(ascent.psi, was)
@@ -287,7 +309,7 @@ def test_a_noise_has_changed_by_its_logarithm_and_by_how_it_grows():
 
 
 def test_a_climb_ends_after_two_quiet_steps_one_after_the_other(problems, monkeypatch):
-    """Quiet is to gain less than a thousandth of a nat while the noise moves less than 1 %."""
+    """Quiet is to gain less than a hundredth of a nat while the noise moves less than 1 %."""
     problem = problems[0]
     start = ascents_of(problem, 1)[0]
     calm, moved = dict(NOISES), {o: Noise(1.02 * s, 1.0, 0.0) for o, s in SIGMA.items()}
@@ -310,10 +332,10 @@ def test_a_climb_ends_after_two_quiet_steps_one_after_the_other(problems, monkey
         assert ascent.noise == noises[len(taken) - 1]
         return len(taken)
 
-    quiet, loud = 0.9e-3, 1.1e-3
+    quiet, loud = 0.9e-2, 1.1e-2
     assert steps_of([quiet] * 5, [calm] * 5) == 2
     assert steps_of([loud, quiet, quiet, 0, 0], [calm] * 5) == 3
     assert steps_of([quiet, loud, quiet, loud, quiet], [calm] * 5) == 5
     assert steps_of([quiet, loud, quiet, quiet, 0], [calm] * 5) == 4
-    assert steps_of([1e-3] * 5, [calm] * 5) == 5
+    assert steps_of([1e-2] * 5, [calm] * 5) == 5
     assert steps_of([quiet] * 5, [moved, calm, moved, moved, moved]) == 5
