@@ -5,6 +5,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+# What somebody else's file makes the reading of it raise.
+FAULTS = (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
+
 
 class CalibError(Exception):
     """Raised for every problem the user can mend.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from calib.check.montecarlo import drawn_in_comparison
 from calib.check.numbers import flatten, inside
 from calib.check.outcome import Item, Status, claim
 from calib.check.schema import MANIFEST, Manifest
-from calib.data import Table, read_for_model, read_table
+from calib.data import Table, read_table
 from calib.data.quantities import OUTPUTS
 from calib.inference.io import run_problem
 from calib.inference.problem import Problem
@@ -26,7 +26,7 @@ from calib.report import comparison
 from calib.report.compared import FOLDER
 from calib.report.comparison import FILE, ComparisonRecord
 from calib.report.study_tasks import Task, fitted_rows
-from calib.validation.comparison import Comparison, compare_problems, stacking_weights
+from calib.validation.comparison import stacking_weights
 
 _GROUP = "comparison"
 # Of what follows from rows by arithmetic; weights by iterations that stop at a billionth.
@@ -51,7 +51,10 @@ def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
         right = "the rows of all models are the same"
         items.append(claim(_GROUP, f"runs/*/{DATA}", wrong, right))
         if not job.quick:
-            again = _recompute(record, problems, job)
+            job.made.mkdir()
+            again = comparison.recompute_comparison(
+                record, problems, job.folder, job.made, job.progress, job.workers
+            )
             steps = {name: inside(r.document, "gate").get("steps") for name, r in runs.items()}
             drawn = drawn_in_comparison(again, compare.count_drawn(job.made), steps)
             sizes = {(FILE, "models", *place): size for place, size in drawn.items()}
@@ -61,27 +64,6 @@ def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
                 items += compare.within(f"runs/{c.model}", c.model, found)
             items += compare.file(comparison.FIGURE, job)
     return items
-
-
-def _recompute(record: ComparisonRecord, problems: Mapping[str, Problem], job: Job) -> Comparison:
-    """Compare the models again, and write that into a new folder, as in the record."""
-    held_out = None
-    if record.held_out:
-        models = [p.bound.model for p in problems.values()]
-        used = sorted({c for m in models for c in (*m.conditions, m.output)})
-        held_out = read_for_model(job.folder / comparison.HELD_OUT, used)
-    again = compare_problems(
-        list(problems.values()), record.seed, held_out=held_out, settings=record.settings,
-        progress=job.progress, workers=job.workers,
-    )  # fmt: skip
-    # Differences are from the first, which with other draws may not be the best.
-    by_name = {c.model: c for c in again.candidates}
-    again = replace(again, candidates=tuple(by_name[name] for name in record.models))
-    job.made.mkdir()
-    comparison.write_comparison(
-        again, job.made, record.command, record.held_out, environment=record.environment
-    )
-    return again
 
 
 def _follows(record: ComparisonRecord, job: Job) -> list[Item]:

@@ -14,7 +14,7 @@ from calib.batch.pool import Pool
 from calib.check import compare, verify
 from calib.check.check_comparison import check_compared
 from calib.check.compare import Job
-from calib.check.montecarlo import Place, drawn_in_output
+from calib.check.montecarlo import drawn_in_output
 from calib.check.numbers import inside, read_json
 from calib.check.outcome import Item, claim
 from calib.check.posteriors import GROUP as POSTERIORS
@@ -32,6 +32,7 @@ from calib.report.study import Progress, Study, estimate_task
 from calib.report.study_tasks import Task, fitted_rows
 from calib.report.summary import summarise_estimates
 from calib.report.writer import write_report
+from calib.validation.montecarlo import Place
 
 _PAGE = "index.html"
 _SEARCHES = (".genetic.", ".differential_evolution.")

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
-
-import numpy as np
 
 from calib.check import compare, verify
 from calib.check.compare import Job
@@ -13,13 +10,11 @@ from calib.check.montecarlo import drawn_in_run
 from calib.check.numbers import inside
 from calib.check.outcome import Item
 from calib.check.posteriors import verify_posterior
-from calib.inference.calibration import Calibration, calibrate
-from calib.inference.estimators import PointEstimate, estimate
-from calib.inference.io import describe_estimates, run_problem, save_calibration
+from calib.inference.again import estimate_again, recompute_run
+from calib.inference.calibration import Calibration
+from calib.inference.io import describe_estimates, run_problem
 from calib.inference.problem import Problem
-from calib.inference.random import generator
 from calib.inference.record import DATA, POSTERIOR, PRIORS, RUN, RunRecord
-from calib.report.study import Progress
 
 
 def check_run(record: RunRecord, job: Job) -> list[Item]:
@@ -49,7 +44,7 @@ def consistent_run(record: RunRecord, problem: Problem, job: Job) -> list[Item]:
     items = [verify.label(DATA, problem.table, record.data_label)]
     items += verify_posterior(job.folder / POSTERIOR, lambda: problem)
     if job.quick:
-        again = {"estimates": describe_estimates(_estimate_again(record, problem))}
+        again = {"estimates": describe_estimates(estimate_again(record, problem))}
         items += compare.estimates(job, (RUN,), again)
     return items
 
@@ -63,33 +58,3 @@ def compare_run(record: RunRecord, calibration: Calibration, job: Job) -> list[I
     mode = (item for item in items if item.name.startswith(f"{RUN}: mode."))
     wrong = "the posterior mode in run.json does not follow from the data and priors here"
     return items + verify.blame(mode, f"{DATA} or {PRIORS}", wrong)
-
-
-def _estimate_again(record: RunRecord, problem: Problem) -> tuple[PointEstimate, ...]:
-    return tuple(
-        estimate(problem, e.method, generator(record.seed, record.model, e.method))
-        for e in record.estimates
-    )
-
-
-def recompute_run(
-    record: RunRecord, problem: Problem, out: Path, progress: Progress
-) -> Calibration:
-    """Sample a run again and write it into a new folder.
-
-    Sampled from the recorded starts, whoever chose them; the estimates in the new folder are
-    computed again, to be compared with them.
-    """
-    estimates = _estimate_again(record, problem)
-    pairs = zip(estimates, record.estimates, strict=True)
-    starts = tuple(
-        replace(again, theta=np.array(said.theta), rmse=said.rmse) for again, said in pairs
-    )
-    calibration = calibrate(
-        problem, record.seed, label=record.label, estimates=starts, settings=record.settings,
-        progress=lambda done, planned: progress("sampling", done, planned),
-    )  # fmt: skip
-    calibration = replace(calibration, estimates=estimates)
-    out.mkdir()
-    save_calibration(calibration, out, environment=record.environment)
-    return calibration

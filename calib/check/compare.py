@@ -14,8 +14,8 @@ from calib.batch.environment import Environment
 from calib.batch.pool import HERE, Pool
 from calib.check.figures import GROUP as FIGURES
 from calib.check.figures import compare_figure
-from calib.check.montecarlo import MONTE_CARLO, Errors, Place
-from calib.check.numbers import FAULTS, SAME_WORDS, compare_entries, flatten, inside
+from calib.check.montecarlo import MONTE_CARLO
+from calib.check.numbers import SAME_WORDS, compare_entries, flatten, inside
 from calib.check.outcome import ROUNDED, Item, Status, claim
 from calib.check.posteriors import compare_posterior, summary_of
 from calib.check.schema import AUDIT, MANIFEST, SUMMARY
@@ -23,11 +23,12 @@ from calib.check.text import GROUP as TEXT
 from calib.check.text import Judged, compare_page, own_pictures, read_text
 from calib.check.tolerances import ORDER_OF_MAGNITUDE, is_drawn
 from calib.check.verify import INPUTS
-from calib.errors import CalibError
+from calib.errors import FAULTS, CalibError
 from calib.inference.netcdf import read_draws
 from calib.inference.record import POSTERIOR, RUN
 from calib.report.comparison import FILE as COMPARISON
 from calib.report.study import Progress
+from calib.validation.montecarlo import Errors, Place
 
 # What a record has about its own folder: durations, and hashes that are verified as such.
 _OWN, _OF_FILES = ("seconds", "files", "left_out", "sha256"), ("sha256", "shipped")

@@ -10,9 +10,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from calib.check.montecarlo import Errors, Place
 from calib.check.outcome import Item, Status
 from calib.check.tolerances import ARITHMETIC, Entries, Tolerance, natural_scale, tolerance_of
+from calib.errors import FAULTS
+from calib.validation.montecarlo import Errors, Place
 
 NUMBER = re.compile(
     r"[-+\u2212]?\d+(?:[.,]\d+)*(?:[eE][-+]?\d+|\u00d710[\u2070-\u2079\u00b2\u00b3\u00b9\u207b]+)?"
@@ -20,8 +21,6 @@ NUMBER = re.compile(
 # Most entries by far; to ask whether they are an abstract collection takes longer than the rest.
 _PLAIN = (float, str, int, type(None))
 _ABSENT = object()
-# What somebody else's file makes the reading of it raise.
-FAULTS = (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
 SAME_WORDS = "the same words"
 
 

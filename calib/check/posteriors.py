@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from calib.check.numbers import FAULTS, inside
+from calib.check.numbers import inside
 from calib.check.outcome import Item, Status, claim
-from calib.errors import CalibError
+from calib.errors import FAULTS, CalibError
 from calib.inference.calibration import moments
 from calib.inference.netcdf import DRAWN, DrawsFile, read_draws, read_netcdf
 from calib.inference.problem import Problem

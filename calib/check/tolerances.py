@@ -22,7 +22,8 @@ from functools import cache
 from itertools import product
 from typing import Any, Literal
 
-from calib.check.montecarlo import MONTE_CARLO, Errors, Place
+from calib.check.montecarlo import MONTE_CARLO
+from calib.validation.montecarlo import Errors, Place
 from calib.validation.sensitivity import Sensitivity
 
 ORDER_OF_MAGNITUDE = "order of magnitude"

@@ -12,25 +12,19 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from calib.batch.environment import sha256
-from calib.check.numbers import FAULTS, inside, read_json
+from calib.check.numbers import inside
 from calib.check.outcome import Item, Status, claim
 from calib.check.schema import TaskRecord
 from calib.check.text import GROUP as TEXT
 from calib.check.text import differing_lines, read_text
 from calib.data import Table
 from calib.data.labels import KNOWN_DATA, label_of
-from calib.errors import CalibError
-from calib.gap.corrected import load_corrected
-from calib.gap.files import answer
-from calib.gap.where import row_gaps
+from calib.errors import FAULTS
+from calib.gap.consistent import mispredicted, misquoted
 from calib.inference.prior_files import default_priors
 
 INPUTS, FILES = "data and priors", "files and their hashes"
-# Of the sd of a gap; and a gap that is nil, in kN, mm or g/cm^3.
-_OF_SD, _ROUNDING = 0.3, 1e-6
 
 
 def files(
@@ -153,40 +147,10 @@ def gaps(folder: Path, summary: Mapping[str, Any], *, same_code: bool) -> list[I
     """
     items = []
     for name, said in inside(summary, "paper_gaps").items():
-        place = folder / "gaps" / name
+        place, both = folder / "gaps" / name, f"summary.json and gaps/{name}/diagnosis.json"
         if (place / "diagnosis.json").is_file():
-            diagnosis = read_json(place / "diagnosis.json")
-            both = f"summary.json and gaps/{name}/diagnosis.json"
-            items.append(claim(TEXT, both, _contradicted(said, diagnosis), "they say the same"))
-            wrong, right = _mispredicted(place, diagnosis), "it predicts the gaps of diagnosis.json"
+            wrong, right = misquoted(said, place), "it predicts the gaps of diagnosis.json"
+            items.append(claim(TEXT, both, wrong, "they say the same"))
+            wrong = mispredicted(place)
             items.append(claim(TEXT, f"gaps/{name}/corrected.json", wrong, right, sure=same_code))
     return items
-
-
-def _contradicted(said: Any, diagnosis: Mapping[str, Any]) -> str:
-    """Say what a summary does not repeat of a diagnosis."""
-    try:
-        stated = answer(diagnosis)
-    except FAULTS:
-        return "the diagnosis is not a whole one"
-    apart = [key for key, value in stated.items() if inside(said).get(key) != value]
-    return f"not the same: {', '.join(apart)}" if apart else ""
-
-
-def _mispredicted(folder: Path, diagnosis: Mapping[str, Any]) -> str:
-    """Say what is wrong with a corrected model that does not predict the gaps of its diagnosis.
-
-    It is drawn from, and a normal may be drawn otherwise by another processor: the means of
-    hundreds of draws agree within a third of their sd.
-    """
-    try:
-        corrected = load_corrected(folder)
-        stated = {(e["output"], e["row"]): (e["gap"], e["gap_sd"]) for e in diagnosis["where"]}
-        for g in row_gaps(corrected.data, corrected.mixture.at(corrected.data.view)):
-            pairs = np.array([stated[g.output, int(row)] for row in g.rows], dtype=np.float64)
-            apart = np.abs(np.stack([g.gap, g.sd], axis=1) - pairs)
-            if (apart > _OF_SD * pairs[:, 1:] + _ROUNDING).any():
-                return "it does not predict the gaps that diagnosis.json states"
-    except (CalibError, *FAULTS) as error:
-        return f"it cannot be held against its diagnosis ({type(error).__name__}: {error})"
-    return ""

@@ -155,6 +155,7 @@ class Stack(Coordinates):
                 found[rows, p.linear] = p.linear_jacobian(self.psi[rows, : p.loc.size])
         return found
 
+
 def _wide(rows: Sequence[Array], value: float) -> Array:
     """Rows one below the other, the shorter ones filled up, shape (m, D)."""
     found = np.full((len(rows), max(row.size for row in rows)), value)

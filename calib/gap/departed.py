@@ -169,7 +169,10 @@ def _changed(
         here = location[a.rows]
         changed = a.effect.on_output(a.phi, role, here, a.view)
         if changed is not here:
-            location[a.rows] += (changed - here) * a.factors[name]
+            change = (changed - here) * a.factors[name]
+            if any(k.at_most_all and k.output == role for k in a.effect.known):
+                change = np.maximum(change, -np.maximum(here, 0.0))
+            location[a.rows] += change
     return location
 
 

@@ -212,7 +212,8 @@ def test_true_slip_from_a_wrong_rolling_radius(view):
 
 
 def test_pressure_drags_ground_pressure_along(view):
-    phi = parameters("pressure_gauge_bias", {"gain": np.log(1.21), "offset": 0.0, "ground": 1.0})
+    size = {"gain": np.log(1.21), "offset": 0.0, "rolling_radius": 0.0}
+    phi = parameters("pressure_gauge_bias", size)
     changed = EFFECTS["pressure_gauge_bias"].on_conditions(phi, "sinkage", by_role(view), view)
     # Twenty-one per cent, to the power of a half.
     ratio = changed["ground_pressure"] / view.conditions["average_ground_pressure_kpa"]

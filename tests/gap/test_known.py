@@ -67,6 +67,21 @@ def test_sign_and_zeros_hold_for_every_shape_of_an_effect(data, effect, known):
         np.testing.assert_allclose(at, 0.0, atol=1e-12)
 
 
+BOUNDED = [e for e, k in FACTS if k.at_most_all]
+
+
+def test_no_shape_takes_more_of_the_pull_than_there_is(data):
+    assert [e.name for e in BOUNDED] == ["post_peak_softening"]
+    forward, name, psi = drawn(data, BOUNDED[0], "pull", family=True)
+    psi[:, forward.form_slices[name][0]] *= 10.0
+    full, plain = forward.field_and_plain(psi, along(data, "slip", SLIPS))
+    known = np.isfinite(plain[name]).all(axis=1)
+    full, plain = full[name][known], plain[name][known]
+    assert ((full == 0.0) & (plain > 0.0)).any()  # some shapes reach the bound
+    assert (full[plain > 0.0] >= 0.0).all()
+    np.testing.assert_array_equal(full[plain <= 0.0], plain[plain <= 0.0])
+
+
 GROWING = [(e, k) for e, k in FACTS if k.grows_with]
 
 

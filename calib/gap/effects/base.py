@@ -26,8 +26,8 @@ class Known:
     """What physics says of what an effect adds to an output, whatever its formula.
 
     A formula is the centre of a family of shapes: what the effect adds is the formula's times a
-    factor that varies with the conditions (its form error) and is never negative. So the sign and
-    the zeros that are stated here hold for the whole family.
+    factor that varies with the conditions (its form error) and is never negative. So the sign, the
+    zeros and the bound that are stated here hold for the whole family.
 
     Parameters
     ----------
@@ -40,12 +40,15 @@ class Known:
         condition at the laboratory's value.
     grows_with : tuple of str
         Physical roles of conditions with which what the formula adds does not shrink.
+    at_most_all : bool
+        Whether it can take no more of a positive output than there is.
     """
 
     output: str
     sign: int = 0
     zero_at: tuple[str, ...] = ()
     grows_with: tuple[str, ...] = ()
+    at_most_all: bool = False
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ __all__ = ["ReadingDrift", "ReadingStep"]
 _SIZE = 0.25
 _SHAPES = {
     "curvature": 'dist = "lognormal"\nmedian = 1.0\nsd_log = 0.6',
-    "half_way": 'dist = "lognormal"\nmedian = 1.0\nsd_log = 1.0',
+    "half_way": 'dist = "lognormal"\nmedian = 0.5\nsd_log = 1.2',
     "zero_at": 'dist = "uniform"\nlower = 0.0\nupper = 1.0',
     "change_point": 'dist = "uniform"\nlower = 0.1\nupper = 0.9',
     "duration": 'dist = "lognormal"\nmedian = 0.02\nsd_log = 0.7',

@@ -149,13 +149,13 @@ class PostPeakSoftening(Effect):
     latex = (
         (
             r"$P_\mathrm{f} = P\, [1 - \text{loss} \cdot (1 - e^{-(s - \text{peak "
-            r"slip})/\text{slip scale}})]$ for the pull $P$ where the slip $s$ is larger than the "
-            r"peak slip"
+            r"slip})/\text{slip scale}})]$ for a pull $P > 0$ where the slip $s$ is larger than "
+            r"the peak slip"
         ),
     )
     parameters = ("loss", "peak_slip", "slip_scale")
     form = ("slip", "pressure")
-    known = (Known("pull", -1, ("slip",)),)
+    known = (Known("pull", -1, ("slip",), at_most_all=True),)
     outputs = ("pull",)
     covariates = ("slip",)
 
@@ -165,7 +165,8 @@ class PostPeakSoftening(Effect):
             return location
         loss, peak_slip, slip_scale = each(phi)
         beyond = np.maximum(view.slip() - peak_slip, 0.0) / slip_scale
-        return np.asarray(location * (1.0 - loss * -np.expm1(-beyond)))
+        # A wheel that does not pull has no strength to lose.
+        return np.asarray(location - np.maximum(location, 0.0) * loss * -np.expm1(-beyond))
 
 
 class LoadTransfer(Effect):
