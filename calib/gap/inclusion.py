@@ -19,7 +19,6 @@ import numpy as np
 
 from calib.gap.campaigns import Campaigns
 from calib.gap.fit import Fit
-from calib.gap.forward import FORM_ERROR
 from calib.gap.mixture import Mixture
 from calib.gap.noise import noise_conditions
 from calib.gap.where import Region, regions, row_gaps
@@ -32,8 +31,10 @@ __all__ = ["UNLISTED", "Included", "Inclusion", "inclusion", "inclusion_probabil
 UNLISTED = "unknown"
 _N_DRAWS = 800
 # What a cause alone is said to do is wrong by so much (relative): what fits the sum of several as
-# well may go to another of them. It changes no share of a cause that acts alone.
-_SIZE_ERROR = FORM_ERROR["size"]
+# well may go to another of them, by more than a formula is wrong about a cause alone. It changes no
+# share of a cause that acts alone. Of 347 causes of development cases (large gaps of 4243 and 4244)
+# 90 % intervals hold 290 with 0.2, 301 with 0.3, 307 with 0.4; of 78 (hard, 4244) 69, 70 and 70.
+_SIZE_ERROR = 0.35
 # Below this the remainder's place is nowhere.
 _SOMEWHERE = 0.1
 

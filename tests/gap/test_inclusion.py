@@ -10,7 +10,6 @@ import pytest
 
 import calib.gap.inclusion as module
 from calib.gap.diagnose import verdict
-from calib.gap.forward import FORM_ERROR
 from calib.gap.hypotheses import joined, singles
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.inclusion import (
@@ -171,7 +170,7 @@ def test_shares_are_of_sizes_that_are_each_wrong_by_some_part():
     np.testing.assert_array_equal(shares[:, 2], 0.0)
     offset, drift = _sizes(data, still, still.psi[None])[0]
     ratio = np.log(shares[:, 0] / shares[:, 1])
-    sd = np.sqrt(2.0) * FORM_ERROR["size"]
+    sd = np.sqrt(2.0) * 0.35
     assert ratio.mean() == pytest.approx(np.log(drift / offset), abs=4.0 * sd / 20.0)
     assert ratio.std() == pytest.approx(sd, rel=4.0 / np.sqrt(800.0))
 
