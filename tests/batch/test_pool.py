@@ -15,6 +15,9 @@ import pytest
 from calib.batch.pool import HERE, pool
 from calib.errors import CalibError
 
+# What most of these need imported: what a report does takes seconds, for each server anew.
+LIGHT = ("calib.errors",)
+
 
 def square(x: int) -> tuple[int, int]:
     return x * x, os.getpid()
@@ -52,7 +55,7 @@ def test_one_worker_is_this_process_and_works_when_the_piece_is_wanted(tmp_path:
 
 
 def test_an_interruption_ends_the_processes_at_their_work() -> None:
-    with pytest.raises(KeyboardInterrupt), pool(2) as side:  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), pool(2, LIGHT) as side:  # noqa: PT012
         side.submit(square, 2).result()
         side.submit(time.sleep, 600.0)
         working = active_children()
@@ -69,7 +72,7 @@ def test_a_server_that_is_gone_hides_no_error(monkeypatch: pytest.MonkeyPatch) -
     gone.wait()
     monkeypatch.setattr("calib.batch.pool._serve", lambda: None)
     monkeypatch.setattr(forkserver._forkserver, "_forkserver_pid", gone.pid)
-    with pytest.raises(CalibError, match="of the work"), pool(2):
+    with pytest.raises(CalibError, match="of the work"), pool(2, LIGHT):
         raise CalibError("of the work")
 
 
@@ -85,7 +88,7 @@ def test_an_interruption_while_the_last_pieces_are_waited_for_ends_the_processes
         orderly(executor, wait, **how)
 
     monkeypatch.setattr(ProcessPoolExecutor, "shutdown", interrupted)
-    with pytest.raises(KeyboardInterrupt), pool(2) as side:  # noqa: PT012
+    with pytest.raises(KeyboardInterrupt), pool(2, LIGHT) as side:  # noqa: PT012
         side.submit(square, 2).result()
         side.submit(time.sleep, 600.0)
         working = active_children()
@@ -101,7 +104,7 @@ def test_where_no_process_can_start_it_is_said(monkeypatch: pytest.MonkeyPatch) 
 
     monkeypatch.setattr("calib.batch.pool._serve", short)
     monkeypatch.setattr(ProcessPoolExecutor, "submit", short)
-    with pool(2) as side:
+    with pool(2, LIGHT) as side:
         piece = side.submit(square, 2)
         with pytest.raises(OSError, match="too many"):
             piece.result()
@@ -111,7 +114,7 @@ def test_what_waits_is_not_begun_after_an_error(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("calib.batch.pool._start", lambda executor, side: None)
     asked: list[object] = []
     monkeypatch.setattr(ProcessPoolExecutor, "submit", lambda _, work: asked.append(work))
-    with pytest.raises(CalibError, match="stop"), pool(2) as side:  # noqa: PT012
+    with pytest.raises(CalibError, match="stop"), pool(2, LIGHT) as side:  # noqa: PT012
         side.submit(square, 2)
         raise CalibError("stop")
     side.begun()
@@ -120,7 +123,7 @@ def test_what_waits_is_not_begun_after_an_error(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_what_goes_wrong_with_a_piece_is_raised_where_it_is_wanted(workers: int) -> None:
-    with pool(workers) as side:
+    with pool(workers, LIGHT) as side:
         wrong, fine = side.submit(fail, "mine"), side.submit(square, 2)
         with pytest.raises(CalibError, match="mine"):
             wrong.result()
@@ -128,7 +131,7 @@ def test_what_goes_wrong_with_a_piece_is_raised_where_it_is_wanted(workers: int)
 
 
 def test_a_process_that_dies_is_a_clear_error() -> None:
-    with pool(2) as side, pytest.raises(CalibError, match="a process died"):
+    with pool(2, LIGHT) as side, pytest.raises(CalibError, match="a process died"):
         side.submit(die).result()
 
 
@@ -137,7 +140,7 @@ def test_a_death_that_the_executor_did_not_see_is_noticed(
 ) -> None:
     """While one waits, the executor is made to look at its processes again."""
     monkeypatch.setattr("calib.batch.pool._LOOK_SECONDS", 0.05)
-    with pool(2) as side:
+    with pool(2, LIGHT) as side:
         slow = side.submit(time.sleep, 0.4)
         assert slow.result() is None
         with pytest.raises(CalibError, match="a process died"):
@@ -148,7 +151,7 @@ def test_what_was_asked_last_is_worked_out_here_until_the_processes_have_begun(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("calib.batch.pool._start", lambda executor, side: None)
-    with pool(2) as side:
+    with pool(2, LIGHT) as side:
         first, long = side.submit(square, 1), side.submit_long(square, 2)
         last = side.submit(square, 3)
         assert side._last() is last  # type: ignore[comparison-overlap]
@@ -168,7 +171,7 @@ def test_what_goes_wrong_here_is_raised_where_it_is_wanted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("calib.batch.pool._start", lambda executor, side: None)
-    with pool(2) as side:
+    with pool(2, LIGHT) as side:
         wrong = side.submit(fail, "mine")
         side.help()
         with pytest.raises(CalibError, match="mine"):

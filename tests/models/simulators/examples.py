@@ -79,7 +79,7 @@ class _Handler(BaseHTTPRequestHandler):
         given = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
         mood = given["name"]
         if mood == "slow":
-            time.sleep(3.0)
+            time.sleep(1.0)  # twice what it is given
         replies: dict[str, object] = {
             "nan": {"output": [[float("nan")]]},
             "error": {"error": {"message": "no soil"}},
@@ -99,7 +99,8 @@ class _Handler(BaseHTTPRequestHandler):
 def serving() -> Iterator[str]:
     """Serve on this machine; yield the address."""
     server = HTTPServer(("127.0.0.1", 0), _Handler)
-    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    # Looks often whether it is to stop: half a second by default.
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
     thread.start()
     try:
         yield f"http://127.0.0.1:{server.server_port}"

@@ -189,7 +189,7 @@ def test_a_command_gives_what_the_function_gives(tmp_path: Path) -> None:
     ],
 )
 def test_a_command_that_fails(tmp_path: Path, extra: str, kind: str, word: str) -> None:
-    file = write_program(tmp_path, extra=extra, limit="2", retries="0")
+    file = write_program(tmp_path, extra=extra, limit="1" if kind == "time" else "20", retries="0")
     found = failure(read_simulator(file).simulator.run(THETA, X))
     assert found.kind == kind
     assert word in found.printed
