@@ -32,14 +32,14 @@ def main() -> None:
     # report's time as Python does by default, after every 700 objects.
     gc.set_threshold(20_000, 20)
     _open_what_is_closed()
-    from calib.cli.verbs import app
+    from calib.cli.verbs import command
 
     # A polite kill cleans up as an interrupt does.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     usual = sys.unraisablehook
     sys.unraisablehook = partial(_interrupt_again, usual)
     try:
-        app(prog_name="calib")
+        command()(prog_name="calib")
     except BrokenPipeError:
         _print_nowhere()
         raise SystemExit(0) from None

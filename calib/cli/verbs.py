@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import sys
+from functools import cache
 from typing import Annotated, Any
 
 import typer
@@ -28,7 +29,7 @@ from calib.cli import (
 )
 from calib.cli.examples import add_examples
 
-__all__ = ["app"]
+__all__ = ["app", "command"]
 
 
 class _Verbs(TyperGroup):
@@ -81,6 +82,12 @@ for verb in (
     app.command()(verb)
 app.add_typer(challenge.verbs, name="challenge")
 add_examples(app)
+
+
+@cache
+def command() -> Any:
+    """Return the command line of all verbs, which takes a process 30 ms to make."""
+    return typer.main.get_command(app)
 
 
 def _version(wanted: bool) -> None:

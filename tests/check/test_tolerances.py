@@ -32,7 +32,13 @@ def documents() -> list[str]:
 
 def test_every_row_of_the_table_is_used() -> None:
     """By the embedded data's report, or by what a run or a comparison has."""
-    paths = ["/".join(path) for name in documents() for path in entries(name)]
+    # Of entries that differ by their position alone one stands for all.
+    alike = {
+        tuple("0" if key.isdecimal() else key for key in path)
+        for name in documents()
+        for path in entries(name)
+    }
+    paths = ["/".join(path) for path in alike]
     paths += [
         "gaps/plain_bekker/corrected.json/lab_mode/rut_depth/0",
         "run.json/estimates/0/cost", "run.json/estimates/0/reported/n0",
