@@ -39,7 +39,7 @@ def main() -> None:
     usual = sys.unraisablehook
     sys.unraisablehook = partial(_interrupt_again, usual)
     try:
-        command()(prog_name="calib")
+        command(sys.argv[1] if len(sys.argv) > 1 else "")(prog_name="calib")
     except BrokenPipeError:
         _print_nowhere()
         raise SystemExit(0) from None
