@@ -15,9 +15,9 @@ from calib.check.check_report import check_report
 from calib.check.check_run import check_run
 from calib.check.compare import Job, count_drawn
 from calib.check.montecarlo import describe
-from calib.check.numbers import inside, read_json
 from calib.check.outcome import Item, Outcome
 from calib.check.schema import SUMMARY, read_folder
+from calib.data.documents import inside, read_json
 from calib.errors import CalibError
 from calib.inference.record import Record, read_record
 from calib.report.compared import FOLDER

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -13,16 +11,16 @@ from calib.check import compare, verify
 from calib.check.check_run import compare_run, consistent_run, verify_run
 from calib.check.compare import Job
 from calib.check.montecarlo import drawn_in_comparison
-from calib.check.numbers import flatten, inside
+from calib.check.numbers import flatten
 from calib.check.outcome import Item, Status, claim
 from calib.check.schema import MANIFEST, Manifest
-from calib.data import Table, read_table
+from calib.data import has_rows
+from calib.data.documents import inside
 from calib.data.quantities import OUTPUTS
-from calib.inference.io import run_problem
-from calib.inference.problem import Problem
 from calib.inference.record import DATA, RUN, RunRecord, read_record
 from calib.models import get_model
 from calib.report import comparison
+from calib.report.again import problem_of, recompute_comparison
 from calib.report.compared import FOLDER
 from calib.report.comparison import FILE, ComparisonRecord
 from calib.report.study_tasks import Task, fitted_rows
@@ -39,20 +37,21 @@ def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
     with compare.not_computed(items, job.folder, FILE):
         inner = {name: job.inside(f"runs/{name}") for name in record.models}
         runs = {name: read_record(RunRecord, of.folder) for name, of in inner.items()}
-        problems = {n: _problem(run, inner[n].folder / DATA, record) for n, run in runs.items()}
+        data = {name: of.folder / DATA for name, of in inner.items()}
+        problems = {name: problem_of(run, data[name], record) for name, run in runs.items()}
         for name, run in runs.items():
             found = verify_run(run, inner[name].folder)
             found += consistent_run(run, problems[name], inner[name])
             if run.model != name:
                 found.append(claim(_GROUP, RUN, f"it is of the model {run.model}"))
             items += compare.within(f"runs/{name}", name, found)
-        same = len({(of.folder / DATA).read_bytes() for of in inner.values()}) == 1
+        same = len({path.read_bytes() for path in data.values()}) == 1
         wrong = "" if same else "the models were fitted to different rows"
         right = "the rows of all models are the same"
         items.append(claim(_GROUP, f"runs/*/{DATA}", wrong, right))
         if not job.quick:
             job.made.mkdir()
-            again = comparison.recompute_comparison(
+            again = recompute_comparison(
                 record, problems, job.folder, job.made, job.progress, job.workers
             )
             steps = {name: inside(r.document, "gate").get("steps") for name, r in runs.items()}
@@ -92,17 +91,6 @@ def _follows(record: ComparisonRecord, job: Job) -> list[Item]:
     return items + verify.derived(job.folder, (), {FILE: shown}, sure=sure)
 
 
-def _problem(run: RunRecord, data: Path, record: ComparisonRecord) -> Problem:
-    """Return a run's problem, its columns named as in the file that was compared on.
-
-    Units are shown by these names, where they are not those of the copy that is kept.
-    """
-    problem = run_problem(run, data)
-    if not record.header:
-        return problem
-    return problem.with_table(replace(problem.table, header=record.header, text=()))
-
-
 def check_compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list[Item]:
     """Check the comparison of models in a report: of its rows and seed, stated as it was found."""
     record = read_record(ComparisonRecord, job.folder)
@@ -114,8 +102,8 @@ def check_compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list[
     [task] = [task for task in tasks if OUTPUTS[task.output] == output]
     rows, held = fitted_rows(task)
     own = record.seed == manifest.seed and bool(record.held_out) == (held is not None)
-    own = own and all(_has_rows(job.folder / "runs" / n / DATA, rows) for n in record.models)
-    own = own and (held is None or _has_rows(job.folder / comparison.HELD_OUT, held))
+    own = own and all(has_rows(job.folder / "runs" / n / DATA, rows) for n in record.models)
+    own = own and (held is None or has_rows(job.folder / comparison.HELD_OUT, held))
     # By the names of columns values are shown in the units of the file.
     header = record.header == manifest.tasks[task.output].data.header
     for fits, name, what in (
@@ -125,11 +113,3 @@ def check_compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list[
     ):
         items.append(claim(FOLDER, name, "" if fits else f"it is not {what}", what))
     return items
-
-
-def _has_rows(path: Path, table: Table) -> bool:
-    """Whether a file has the rows of a table."""
-    kept = read_table(path, allow_missing=tuple(OUTPUTS.values())).columns
-    return kept.keys() == table.columns.keys() and all(
-        np.array_equal(values, table[name], equal_nan=True) for name, values in kept.items()
-    )

@@ -15,14 +15,14 @@ from calib.check import compare, verify
 from calib.check.check_comparison import check_compared
 from calib.check.compare import Job
 from calib.check.montecarlo import drawn_in_output
-from calib.check.numbers import inside, read_json
 from calib.check.outcome import Item, claim
 from calib.check.posteriors import GROUP as POSTERIORS
 from calib.check.posteriors import verify_posterior
 from calib.check.schema import MANIFEST, SUMMARY, Manifest
 from calib.check.text import GROUP as TEXT
-from calib.check.text import read_text, verify_images
+from calib.check.text import Judgement, read_text, verify_images
 from calib.data import read_table
+from calib.data.documents import inside, read_json
 from calib.data.quantities import OUTPUTS
 from calib.inference.problem import Problem, build_problem
 from calib.report.compared import FOLDER
@@ -36,6 +36,8 @@ from calib.validation.montecarlo import Place
 
 _PAGE = "index.html"
 _SEARCHES = (".genetic.", ".differential_evolution.")
+# Where no number moved by more than this part, all that follow from them can be judged.
+_LITTLE = 0.02
 
 
 def check_report(manifest: Manifest, job: Job) -> list[Item]:
@@ -150,14 +152,15 @@ def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
     same_program = manifest.environment.same_program(job.here)
     readings, moved = compare.moved_parts(numbers)
 
-    def judged(name: str, section: str) -> tuple[str | None, bool]:
+    def judged(name: str, section: str) -> Judgement:
         if name.startswith(("data/", "priors/")) or "/case/" in name:
-            return None, True
-        if not same_program:
-            return "another version wrote it", False
+            return Judgement()
         about = partial(_about, manifest, name, section)
+        size = max((by for part, by in moved.items() if about(part)), default=0.0)
+        if not same_program:
+            return Judgement("another version wrote it", size, numbers=False)
         why = "its numbers moved within their tolerance" if any(map(about, readings)) else None
-        return why, not any(map(about, moved))
+        return Judgement(why, size, size <= _LITTLE)
 
     made, items = verify.files_in(job.made), []
     for name in sorted(n for n in made - verify.derived_files(made) if not compare.is_document(n)):

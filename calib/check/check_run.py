@@ -7,9 +7,9 @@ from pathlib import Path
 from calib.check import compare, verify
 from calib.check.compare import Job
 from calib.check.montecarlo import drawn_in_run
-from calib.check.numbers import inside
 from calib.check.outcome import Item
 from calib.check.posteriors import verify_posterior
+from calib.data.documents import inside
 from calib.inference.again import estimate_again, recompute_run
 from calib.inference.calibration import Calibration
 from calib.inference.io import describe_estimates, run_problem

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -15,14 +16,15 @@ from calib.batch.pool import HERE, Pool
 from calib.check.figures import GROUP as FIGURES
 from calib.check.figures import compare_figure
 from calib.check.montecarlo import MONTE_CARLO
-from calib.check.numbers import SAME_WORDS, compare_entries, flatten, inside
+from calib.check.numbers import NUMBER, SAME_WORDS, compare_entries, flatten
 from calib.check.outcome import ROUNDED, Item, Status, claim
 from calib.check.posteriors import compare_posterior, summary_of
 from calib.check.schema import AUDIT, MANIFEST, SUMMARY
 from calib.check.text import GROUP as TEXT
-from calib.check.text import Judged, compare_page, own_pictures, read_text
+from calib.check.text import Judged, Judgement, compare_page, own_pictures, parsed, read_text
 from calib.check.tolerances import ORDER_OF_MAGNITUDE, is_drawn
 from calib.check.verify import INPUTS
+from calib.data.documents import inside
 from calib.errors import FAULTS, CalibError
 from calib.inference.netcdf import read_draws
 from calib.inference.record import POSTERIOR, RUN
@@ -165,7 +167,7 @@ def document(name: str, job: Job, drawn: Errors | None = None) -> list[Item]:
 
 
 def file(
-    name: str, job: Job, judged: Judged = lambda section: (None, True), *, sure: bool = True
+    name: str, job: Job, judged: Judged = lambda section: Judgement(), *, sure: bool = True
 ) -> list[Item]:
     """Compare another file with the one made again; a page is `judged` as by `compare_page`.
 
@@ -192,15 +194,27 @@ def file(
     return items + [compare_figure(picture, shown, named) for picture, shown in pairs]
 
 
-def moved_parts(items: Iterable[Item]) -> tuple[set[str], set[str]]:
+def moved_parts(items: Iterable[Item]) -> tuple[set[str], dict[str, float]]:
     """Return the parts of a report with entries that moved by more than rounding.
 
-    Those in which words may turn on what moved; and those with other numbers: these, and where the
+    Those in which words may turn on what moved; and by how much numbers did in any, also where the
     work merely took other steps.
     """
     moved = [item for item in items if _moved(item)]
     read = [item for item in moved if item.note not in (ORDER_OF_MAGNITUDE, SAME_WORDS)]
-    return {part_of(item.group) for item in read}, {part_of(item.group) for item in moved}
+    sizes: dict[str, float] = {}
+    for item in moved:
+        part = part_of(item.group)
+        sizes[part] = max(sizes.get(part, 0.0), _part_moved(item))
+    return {part_of(item.group) for item in read}, sizes
+
+
+def _part_moved(item: Item) -> float:
+    """By what part of it the number in an item moved, or that of a text which did most."""
+    old, new = (NUMBER.findall(str(value)) for value in (item.recorded, item.found))
+    pairs = [(parsed(a)[0], parsed(b)[0]) for a, b in zip(old, new, strict=False)]
+    parts = [abs(a - b) / max(abs(a), abs(b)) for a, b in pairs if a != b]
+    return max(parts, default=0.0) if len(old) == len(new) else math.inf
 
 
 def _moved(item: Item) -> bool:

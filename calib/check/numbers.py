@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from calib.check.outcome import Item, Status
 from calib.check.tolerances import ARITHMETIC, Entries, Tolerance, natural_scale, tolerance_of
-from calib.errors import FAULTS
+from calib.data.documents import inside
 from calib.validation.montecarlo import Errors, Place
 
 NUMBER = re.compile(
@@ -22,21 +20,6 @@ NUMBER = re.compile(
 _PLAIN = (float, str, int, type(None))
 _ABSENT = object()
 SAME_WORDS = "the same words"
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """Return a JSON object; empty where the file is missing or damaged."""
-    try:
-        return inside(json.loads(path.read_text(encoding="utf-8")))
-    except FAULTS:
-        return {}
-
-
-def inside(document: Any, *keys: str) -> dict[str, Any]:
-    """Return the object below some keys of a document; empty where there is none."""
-    for key in keys:
-        document = document.get(key) if isinstance(document, dict) else None
-    return document if isinstance(document, dict) else {}
 
 
 def flatten(document: Any, place: Place = ()) -> Iterator[tuple[Place, Any]]:

@@ -100,6 +100,8 @@ class Outcome:
             return f"DIFFERENT: {', '.join(different[:4])}{', ...' if different[4:] else ''}"
         unjudged = len(self.of(Status.UNJUDGED))
         rest = f"; {unjudged} not judged" if unjudged else ""
+        pages = [i.name for i in self.of(Status.UNJUDGED) if i.name.endswith(".html")]
+        rest += f", THE PAGE {', '.join(pages)} AMONG THEM" if pages else ""
         if self.not_converged:
             rest += f"; NOT CONVERGED, not to be used: {', '.join(self.not_converged)}"
         if self.quick:

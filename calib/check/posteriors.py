@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from calib.check.numbers import inside
 from calib.check.outcome import Item, Status, claim
+from calib.data.documents import inside
 from calib.errors import FAULTS, CalibError
 from calib.inference.calibration import moments
 from calib.inference.netcdf import DRAWN, DrawsFile, read_draws, read_netcdf

@@ -1,8 +1,8 @@
 """Compare pages, and hold a page against the figures beside it.
 
 What a page says follows from numbers. Where those agree up to rounding it must say the same, and
-show the same digits but for the last; where they moved within their tolerance, a reading beside a
-threshold may be another, and the words cannot be judged.
+show the same digits but for the last. Where they moved within their tolerance, a reading beside a
+threshold may be another and its words cannot be judged, but no number moves by far more than they.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import difflib
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from calib.batch.environment import sha256
 from calib.check.numbers import NUMBER, without_numbers
@@ -26,11 +27,21 @@ _PICTURE = re.compile(r"\[picture [^\]]*\]")
 # Where a section begins, and what it is labelled by.
 _SECTION = re.compile(r'(?=<section\b[^>]*aria-labelledby="([^"]*)")')
 _SHOWN, _WIDTH = 6, 120
+# What follows from numbers may have moved by so many times their part, but not beyond the other.
+_TIMES, _MOST = 10.0, 0.15
 _PLAIN = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻\u2212", "0123456789--")
 
 
-type Judged = Callable[[str], tuple[str | None, bool]]
-"""By the name of a section, why its words cannot be judged, if so; and whether its numbers can."""
+class Judgement(NamedTuple):
+    """Why a section cannot be judged, if so; by what part its numbers moved; whether these can."""
+
+    excuse: str | None = None
+    moved: float = 0.0
+    numbers: bool = True
+
+
+type Judged = Callable[[str], Judgement]
+"""By the name of a section."""
 
 
 def read_text(path: Path) -> str:
@@ -86,14 +97,14 @@ def compare_page(name: str, recorded: Path, written: Path, judged: Judged) -> It
     why: set[str | None] = set()
     apart: tuple[list[str], list[str]] = [], []
     for section, *texts in zip(parts[::2], parts[1::2], again[1::2], strict=True):
-        excuse, numbers = judged(section)
+        excuse, moved, numbers = judged(section)
         one, other = (text.splitlines() for text in texts)
-        if not _alike(one, other, numbers=numbers):
-            why.add(excuse)
+        if not _alike(one, other, moved):
+            why.add(None if numbers and _alike(one, other, None) else excuse)
             apart[0].extend(one)
             apart[1].extend(other)
     if not why:
-        note = "the same words; numbers are judged where they come from"
+        note = "the same words; its numbers moved no more than those that they come from"
         return Item(GROUP, name, Status.WITHIN, note=note)
     said = differing_lines(*apart)
     if None in why:
@@ -112,25 +123,27 @@ def _readable(folder: Path, name: str) -> str:
     return _IMAGE.sub(named, text)
 
 
-def _alike(old: Sequence[str], new: Sequence[str], *, numbers: bool) -> bool:
-    """Whether texts have the same words in the same order and, if asked, the same numbers."""
+def _alike(old: Sequence[str], new: Sequence[str], moved: float | None) -> bool:
+    """Whether texts have the same words in order, and numbers that moved so far, if they count."""
     return len(old) == len(new) and all(
-        a == b or (without_numbers(a) == without_numbers(b) and (not numbers or _near(a, b)))
+        a == b
+        or (without_numbers(a) == without_numbers(b) and (moved is None or _near(a, b, moved)))
         for a, b in zip(old, new, strict=True)
     )
 
 
-def _near(old: str, new: str) -> bool:
-    """Whether the numbers of two lines differ by one unit of their last digit at the most."""
-    numbers = (NUMBER.findall(_TAG.sub(" ", line)) for line in (old, new))
-    for a, b in zip(*numbers, strict=False):
-        (one, unit), (other, other_unit) = _parsed(a), _parsed(b)
-        if a != b and not abs(one - other) <= 1.001 * max(unit, other_unit):
+def _near(old: str, new: str, moved: float) -> bool:
+    """Whether the numbers of two lines differ by little more than a unit of their last digit."""
+    part = min(_TIMES * moved, _MOST)
+    for a, b in zip(*(NUMBER.findall(_TAG.sub(" ", line)) for line in (old, new)), strict=False):
+        (one, unit), (other, other_unit) = parsed(a), parsed(b)
+        allowed = 1.001 * max(unit, other_unit) + part * max(abs(one), abs(other))
+        if a != b and not abs(one - other) <= allowed:
             return False
     return True
 
 
-def _parsed(text: str) -> tuple[float, float]:
+def parsed(text: str) -> tuple[float, float]:
     """Return a number as shown and one unit of its last digit."""
     plain = text.translate(_PLAIN).replace("\u00d710", "e").replace(",", "")
     mantissa, _, exponent = plain.lower().partition("e")

@@ -161,6 +161,11 @@ def tolerance_of(place: Place, entries: Entries) -> Tolerance:
         hypothesis = place[: place.index("effects") + 2]
         if (entries.get((*hypothesis, "probability")) or 0.0) < _COUNTS:
             return replace(found, judged=False)
+    if place[-2:-1] == ("share_interval",):
+        # An end is nothing or not where a twentieth of the draws that have a gap hangs on it.
+        p = entries.get((*place[:-2], "probability")) or 0.0
+        if p < _COUNTS if place[-1] == "1" else 0.9 < p < 0.99:
+            return replace(found, judged=False)
     return found
 
 

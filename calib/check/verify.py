@@ -13,12 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from calib.batch.environment import sha256
-from calib.check.numbers import inside
 from calib.check.outcome import Item, Status, claim
 from calib.check.schema import TaskRecord
 from calib.check.text import GROUP as TEXT
 from calib.check.text import differing_lines, read_text
 from calib.data import Table
+from calib.data.documents import inside
 from calib.data.labels import KNOWN_DATA, label_of
 from calib.errors import FAULTS
 from calib.gap.consistent import mispredicted, misquoted

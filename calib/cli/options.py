@@ -19,7 +19,7 @@ MaxSteps = Annotated[int, typer.Option(help="Where extending the chains stops.",
 PriorFiles = Annotated[list[Path] | None, typer.Option(help="Prior file of a model; repeatable.")]
 # As many processes as there are cores, of which two bring most of what there is to gain.
 CORES = min(2, os.cpu_count() or 1)
-Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1)]
+Workers = Annotated[int, typer.Option(help="Processes on this machine.", min=1, max=1024)]
 Scheduler = Annotated[
     str | None,
     typer.Option(help="A Dask scheduler in the place of --workers, e.g. tcp://host:8786."),

@@ -22,7 +22,7 @@ from calib.data.cells import (
 )
 from calib.data.csvfile import CsvFile, open_csv
 from calib.data.headers import Column, match_headers
-from calib.data.quantities import QUANTITIES
+from calib.data.quantities import OUTPUTS, QUANTITIES
 from calib.data.table import MAX_TEXT_ROWS, Table
 from calib.errors import CalibError
 
@@ -253,3 +253,11 @@ def _sha256(columns: Mapping[str, NDArray[np.float64]]) -> str:
         digest.update(f"{name}\0".encode())
         digest.update(columns[name].astype("<f8").tobytes())
     return digest.hexdigest()
+
+
+def has_rows(path: str | os.PathLike[str], table: Table) -> bool:
+    """Whether a file has the rows of a table."""
+    kept = read_table(path, allow_missing=tuple(OUTPUTS.values())).columns
+    return kept.keys() == table.columns.keys() and all(
+        np.array_equal(values, table[name], equal_nan=True) for name, values in kept.items()
+    )

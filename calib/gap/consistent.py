@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from calib.data.documents import inside
 from calib.errors import FAULTS, CalibError
 from calib.gap.corrected import load_corrected
 from calib.gap.files import answer
@@ -25,8 +26,7 @@ def misquoted(said: Any, folder: Path) -> str:
         stated = answer(_diagnosis(folder))
     except FAULTS:
         return "the diagnosis is not a whole one"
-    known = said if isinstance(said, dict) else {}
-    apart = [key for key, value in stated.items() if known.get(key) != value]
+    apart = [key for key, value in stated.items() if inside(said).get(key) != value]
     return f"not the same: {', '.join(apart)}" if apart else ""
 
 

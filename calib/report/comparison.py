@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -17,10 +17,9 @@ from matplotlib.figure import Figure
 from pydantic import Field
 
 from calib.batch.environment import Environment
-from calib.data import read_for_model, write_table
+from calib.data import write_table
 from calib.inference.calibration import Calibration
 from calib.inference.io import load_calibration, save_calibration
-from calib.inference.problem import Problem
 from calib.inference.record import Entry, File, Hash, KnownModel, Record, read_record
 from calib.models import get_model
 from calib.models.base import Array
@@ -29,13 +28,7 @@ from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
 from calib.report.page.template import data_uri, template
 from calib.report.writer import file_hashes, own_names
-from calib.validation.comparison import (
-    Candidate,
-    Comparison,
-    compare_problems,
-    difference,
-    sentence,
-)
+from calib.validation.comparison import Candidate, Comparison, difference, sentence
 from calib.validation.prediction import N_DRAWS
 from calib.validation.validate import PARETO_K_MAX
 
@@ -312,24 +305,3 @@ def load_stack(folder: Path) -> tuple[dict[str, Any], list[tuple[float, Calibrat
     used = {name: m.weight for name, m in record.models.items() if round(m.weight * N_DRAWS) > 0}
     runs = [(weight, load_calibration(folder / "runs" / name)) for name, weight in used.items()]
     return record.document, runs
-
-
-def recompute_comparison(
-    record: ComparisonRecord, problems: Mapping[str, Problem], folder: Path, out: Path,
-    progress: Callable[[str, int, int], None], workers: int,
-) -> Comparison:  # fmt: skip
-    """Compare the models of a folder again, and write that into an empty one, as in the record."""
-    held_out = None
-    if record.held_out:
-        models = [p.bound.model for p in problems.values()]
-        used = sorted({c for m in models for c in (*m.conditions, m.output)})
-        held_out = read_for_model(folder / HELD_OUT, used)
-    again = compare_problems(
-        list(problems.values()), record.seed, held_out=held_out, settings=record.settings,
-        progress=progress, workers=workers,
-    )  # fmt: skip
-    # Differences are from the first, which with other draws may not be the best.
-    by_name = {c.model: c for c in again.candidates}
-    again = replace(again, candidates=tuple(by_name[name] for name in record.models))
-    write_comparison(again, out, record.command, record.held_out, environment=record.environment)
-    return again

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -527,6 +528,19 @@ def test_another_folder_cannot_be_checked(tmp_path: Path) -> None:
 # Versions
 
 
+def test_a_number_on_the_page_is_held_against_those_it_follows_from(report: Path) -> None:
+    """Made on another processor, where all of them moved by rounding."""
+    page = (report / "index.html").read_text(encoding="utf-8")
+    shown = re.search(r'<td class="num">(\d\.\d+)</td>', page)
+    assert shown
+    forged = f'<td class="num">9{shown[1][1:]}</td>'
+    (report / "index.html").write_text(page.replace(shown[0], forged, 1), encoding="utf-8")
+    seal(report)
+    (item,) = check(report).of(Status.DIFFERENT)
+    assert item.name == "index.html"
+    assert forged in item.note
+
+
 def test_another_version_explains_another_page_and_does_not_hide_it(report_here: Path) -> None:
     report = report_here
     replace_text("index.html", "Do not trust:", "Trust too:")(report)
@@ -537,7 +551,7 @@ def test_another_version_explains_another_page_and_does_not_hide_it(report_here:
     (item,) = outcome.of(Status.UNJUDGED)
     assert item.name == "index.html"
     assert "Trust too" in item.note
-    assert "1 not judged" in outcome.verdict
+    assert outcome.verdict.endswith("; 1 not judged, THE PAGE index.html AMONG THEM")
     assert set(outcome.environment) == {"code"}
 
 

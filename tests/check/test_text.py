@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from calib.check.outcome import Status
-from calib.check.text import compare_page, own_pictures, verify_images
+from calib.check.text import Judgement, compare_page, own_pictures, verify_images
 
 
 def page(*lines: str) -> str:
@@ -19,12 +19,12 @@ def shown(picture: bytes) -> str:
     return f'<img src="data:image/png;base64,{base64.b64encode(picture).decode()}">'
 
 
-def compared(tmp_path: Path, old: str, new: str, why: str | None = None, numbers: bool = True):
+def compared(tmp_path: Path, old: str, new: str, *judgement):
     for name, text in (("old", old), ("new", new)):
         (tmp_path / name).mkdir()
         (tmp_path / name / "index.html").write_text(text, encoding="utf-8")
     return compare_page(
-        "index.html", tmp_path / "old", tmp_path / "new", lambda section: (why, numbers)
+        "index.html", tmp_path / "old", tmp_path / "new", lambda section: Judgement(*judgement)
     )
 
 
@@ -54,12 +54,35 @@ def test_numbers_may_differ_by_one_unit_of_their_last_digit(
     assert found.status is (Status.WITHIN if same else Status.DIFFERENT)
 
 
-def test_numbers_that_cannot_be_judged_may_be_any(tmp_path: Path) -> None:
-    assert compared(tmp_path, page("7 mm"), page("9 mm"), numbers=False).status is Status.WITHIN
+WHY = "its numbers moved within their tolerance"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "moved", "sure", "status"),
+    [
+        # Ten times as far as what it follows from, and a unit of the last digit.
+        ("0.1100 kN", "0.1111 kN", 1e-3, True, Status.WITHIN),
+        ("0.1100 kN", "0.1115 kN", 1e-3, True, Status.DIFFERENT),
+        ("0.11 kN", "0.01 kN", 1e-3, True, Status.DIFFERENT),
+        # Where numbers moved far, what follows from them is not judged beyond a seventh of it.
+        ("-6.7 nats", "-6.0 nats", 0.5, False, Status.WITHIN),
+        ("79 %", "99 %", 0.5, False, Status.UNJUDGED),
+        ("0.11 kN", "0.01 kN", 0.9, False, Status.UNJUDGED),
+        # Words are another matter.
+        ("it passes", "it fails", 1e-3, True, Status.UNJUDGED),
+    ],
+)
+def test_numbers_move_little_more_than_what_they_follow_from(
+    old: str, new: str, moved: float, sure: bool, status: Status, tmp_path: Path
+) -> None:
+    found = compared(tmp_path, page(old), page(new), WHY, moved, sure)
+    assert found.status is status
+    if status is not Status.WITHIN:
+        assert f"- {old}; + {new}" in found.note
 
 
 def test_words_that_cannot_be_judged_say_why(tmp_path: Path) -> None:
-    found = compared(tmp_path, page("it passes"), page("it fails"), why="near a threshold")
+    found = compared(tmp_path, page("it passes"), page("it fails"), "near a threshold")
     assert found.status is Status.UNJUDGED
     assert found.note == "near a threshold: 2 lines differ: - it passes; + it fails"
 
@@ -68,7 +91,7 @@ def test_words_that_cannot_be_judged_say_why(tmp_path: Path) -> None:
 def test_no_section_hides_what_differs_in_another(why: str | None, tmp_path: Path) -> None:
     last = '<section aria-labelledby="end"><p>end</p></section>'
     old, new = page("it passes") + last, page("it fails") + last + "<!-- a decoy -->"
-    found = compared(tmp_path, old, new, why=why)
+    found = compared(tmp_path, old, new, why)
     assert found.status is (Status.DIFFERENT if why is None else Status.UNJUDGED)
     for words in ("- it passes", "+ it fails", "a decoy", "4 lines differ"):
         assert words in found.note

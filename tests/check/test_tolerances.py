@@ -105,6 +105,15 @@ def test_what_a_row_lets_pass(name: str, place: tuple[str, ...], little: Any, mu
     assert judged(name, place, much) is Status.DIFFERENT
 
 
+def test_ends_of_shares_are_not_judged_where_a_twentieth_of_the_draws_hangs_on_them() -> None:
+    """The upper one of a cause that hardly counts, the lower one of one that nearly surely acts."""
+    for p, upper, lower in ((0.02, False, True), (0.5, True, True), (0.95, True, False)):
+        above = ("gaps/plain_bekker/diagnosis.json", "inclusion", "slip_sinkage")
+        found = {(*above, "probability"): p}
+        ends = [tolerance_of((*above, "share_interval", end), found).judged for end in "10"]
+        assert ends == [upper, lower]
+
+
 def test_parameters_of_a_hypothesis_that_hardly_counts_are_not_judged() -> None:
     found = entries(DIAGNOSIS)
     mean = ("effects", "rut_rebound", "parameters", "strength", "mean")
