@@ -212,8 +212,8 @@ def moved_parts(items: Iterable[Item]) -> tuple[set[str], dict[str, float]]:
 def _part_moved(item: Item) -> float:
     """By what part of it the number in an item moved, or that of a text which did most."""
     old, new = (NUMBER.findall(str(value)) for value in (item.recorded, item.found))
-    pairs = [(parsed(a)[0], parsed(b)[0]) for a, b in zip(old, new, strict=False)]
-    parts = [abs(a - b) / max(abs(a), abs(b)) for a, b in pairs if a != b]
+    pairs = [(parsed(a)[0], parsed(b)[0]) for a, b in zip(old, new, strict=False) if a != b]
+    parts = [abs(a - b) / max(abs(a), abs(b), 1e-300) for a, b in pairs]
     return max(parts, default=0.0) if len(old) == len(new) else math.inf
 
 

@@ -100,7 +100,9 @@ def compare_page(name: str, recorded: Path, written: Path, judged: Judged) -> It
         excuse, moved, numbers = judged(section)
         one, other = (text.splitlines() for text in texts)
         if not _alike(one, other, moved):
-            why.add(None if numbers and _alike(one, other, None) else excuse)
+            if _alike(one, other, None):
+                excuse = None if numbers else excuse or "its numbers moved"
+            why.add(excuse)
             apart[0].extend(one)
             apart[1].extend(other)
     if not why:
