@@ -49,7 +49,7 @@ _WORTH_SAYING = 0.05
 # Parts the field rows are left out in, where there are no other conditions to judge by.
 _FOLDS = 5
 # Effective draws in each: they weigh predictions, in which an error of 0.03 nats is not seen.
-_OF_A_FOLD = 1000
+_OF_A_FOLD = 300
 
 
 @dataclass(frozen=True, repr=False)

@@ -21,7 +21,7 @@ from calib.gap.noise import Noise, ln_prior
 from calib.gap.residuals import Residuals, diagonal, residuals_of_all
 from calib.models.base import Array
 
-__all__ = ["Fit", "Start", "finished", "fit", "full_fits", "log_joint", "truncated_fits"]
+__all__ = ["Fit", "Start", "finished", "fit", "full_fits", "truncated_fits"]
 
 _MAX_STEPS = 40
 # Steps of a truncated fit; of one at a discrepancy alone, which predictions are linear in.
@@ -29,8 +29,6 @@ _FIRST_STEPS, _LINEAR_STEPS = 3, 1
 # How many nats behind the best of several truncated fits one is given up, and within how many
 # posterior sds of a better one.
 _WORTH, _NEAR = 6.0, 1.5
-# Draws whose predictions stay in the processor's cache; more at once take twice as long each.
-_AT_ONCE = 1024
 
 
 @dataclass(frozen=True)
@@ -223,21 +221,3 @@ def _ln_mass(low: float, high: float) -> float:
         low, high = -high, -low
     ln_high = float(log_ndtr(high))
     return ln_high + float(np.log(max(-np.expm1(float(log_ndtr(low)) - ln_high), 1e-300)))
-
-
-def log_joint(fit: Fit, psi: Array) -> Array:
-    """Log likelihood plus log prior at a fit's noise, shape (k, d) to (k,)."""
-    problem = Residuals(fit.forward.data, fit.forward)
-    sds = problem.sds(fit.noise)
-    with np.errstate(all="ignore"):
-        prior = fit.forward.priors.log_prob(psi)
-        squares = np.full(len(psi), np.inf)
-        # Where the prior has no mass nothing need be predicted: of draws from it with heavy tails
-        # that is a good part.
-        inside = np.flatnonzero(np.isfinite(prior))
-        clipped = problem.clip(psi[inside])
-        for i in range(0, inside.size, _AT_ONCE):
-            raw = problem.raw(clipped[i : i + _AT_ONCE])
-            squares[inside[i : i + _AT_ONCE]] = np.square(raw / sds).sum(axis=1)
-    constant = np.log(sds).sum() + 0.5 * sds.size * np.log(2.0 * np.pi)
-    return np.asarray(prior - 0.5 * squares - constant)

@@ -17,12 +17,12 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
 from calib.gap.odds import Odds
 from calib.gap.residuals import Residuals, residuals_of_all
-from calib.inference.random import generator
+from calib.inference.even import even_points
 from calib.models.base import Array
 
 __all__ = ["Guesses", "Promise"]
 
-_N_SCREEN = 96
+_N_SCREEN = 64
 _N_BEGUN = 5
 _N_THRESHOLDS = 24
 # Guesses at one more effect of a set, and how many of them a fit begins from.
@@ -197,11 +197,12 @@ class Guesses:
     def _spread(self, forward: Forward, start: Array, size: int, which: Sequence[int]) -> Array:
         """Guesses that differ in the parameters of some of the effects, by their priors."""
         hypothesis = forward.hypothesis
-        rng = generator(self.seed, "gap", hypothesis.name, *which)
+        ends = np.cumsum([0, *(len(hypothesis.effect_priors[i].free) for i in which)]).tolist()
+        even = even_points(size, ends[-1])
         starts = np.repeat(start[None], size, axis=0)
-        for i in which:
+        for i, first, last in zip(which, ends[:-1], ends[1:], strict=True):
             effect, priors = hypothesis.effects[i], hypothesis.effect_priors[i]
-            drawn = priors.sample(rng, size)
+            drawn = priors.ppf(even[:, first:last])
             if type(effect).begun is not Effect.begun:
                 natural = effect.begun(
                     priors.to_natural(drawn), self._left(forward, start), self.data.view

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,6 +20,8 @@ __all__ = ["Mixture", "Truth", "mixture"]
 N_DRAWS = 1200
 # Hypotheses less probable than this are not drawn from.
 _NEGLIGIBLE = 2e-3
+# Draws of each that are kept.
+_KEPT = 500
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,17 @@ def mixture(data: Campaigns, ranking: Ranking, seed: int) -> Mixture:
         share /= share.sum()
         for f, s in zip(group, share, strict=True):
             if s > 0.05:
-                fits.append(f)
+                fits.append(_thinned(f))
                 weights.append(ranking.probability[name] * float(s))
     total = sum(weights)
     return Mixture(data, tuple(fits), tuple(w / total for w in weights), seed)
+
+
+def _thinned(fit: Fit) -> Fit:
+    """A fit with as many draws as predictions need and a file should hold.
+
+    They are in the order of the pool that they were picked from: every third stands for all.
+    """
+    if fit.sample is None:
+        return fit
+    return replace(fit, sample=fit.sample[:: max(len(fit.sample) // _KEPT, 1)])

@@ -29,9 +29,9 @@ type _Started = tuple[Hypothesis, list[Fit]]
 # Effects of which one is in every pair that is tried, and sets from which others are made.
 _N_PAIR_SEEDS, _N_SETS, _MOST_CAUSES = 6, 3, 4
 # Sets made of others that are fitted at a time, of those that were guessed at.
-_N_FITTED = 6
+_N_FITTED = 8
 # Explanations beside which something unlisted is tried as well.
-_N_LEADING, _N_LEADING_SETS = 5, 2
+_N_LEADING, _N_LEADING_SETS = 7, 3
 # A discrepancy or a pair that is so many nats (prior and all) behind the best hypothesis after a
 # truncated fit is given up. Of 1344 discrepancies and 2698 pairs (14 cases) those that ended
 # within 8 nats of the best were then less than 13.5 and 10.6 behind.

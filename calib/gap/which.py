@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -44,7 +44,7 @@ type Lab = tuple[dict[str, Array], dict[str, Noise]]
 _N_TRIED = 32
 _IDLE = "it changes nothing that the models of this case predict"
 # Draws for the relevance of a hypothesis: at first, and while it is still in play.
-_QUICK, _CAREFUL = 160, 3000
+_QUICK, _CAREFUL = 160, 3
 # Variants of a hypothesis are in play within so many nats of its best; one that is farther behind
 # the best of all than the last of these is not made likely by its relevance.
 _BESIDE, _FAR_BEHIND = 2.5, 10.0
@@ -192,6 +192,7 @@ def _scored(
     fits: Mapping[str, tuple[Fit, ...]], odds: Odds, seed: int, plenty: int
 ) -> tuple[dict[str, tuple[Fit, ...]], dict[str, tuple[float, ...]]]:
     """Score every variant, and by draws of their posteriors those that are still in play."""
+    tried: set[tuple[str, int]] = set()
     promise = {name: [with_prior(f, odds) for f in group] for name, group in fits.items()}
     far = max(max(values) for values in promise.values()) - _FAR_BEHIND
     scores = {
@@ -201,19 +202,27 @@ def _scored(
         ]
         for name, group in fits.items()
     }
-    total = {name: max(values) + odds.ln_prior(name) for name, values in scores.items()}
-    least = max(total.values()) - IN_PLAY
     refined = {name: list(group) for name, group in fits.items()}
-    for name, values in scores.items():
-        beside = max(values) - _BESIDE
-        for i, value in enumerate(values):
-            if value > beside and value + odds.ln_prior(name) > least:
-                refined[name][i] = refine(fits[name][i], seed, plenty)
-                values[i] = _score(refined[name][i], seed, min(plenty, _CAREFUL))
+    while asked := _in_play(scores, odds) - tried:
+        tried |= asked
+        for name, i in sorted(asked):
+            refined[name][i] = refine(fits[name][i], seed, plenty)
+            scores[name][i] = _score(refined[name][i], seed, _CAREFUL * plenty)
     return (
         {name: tuple(group) for name, group in refined.items()},
         {name: tuple(values) for name, values in scores.items()},
     )
+
+
+def _in_play(scores: Mapping[str, Sequence[float]], odds: Odds) -> set[tuple[str, int]]:
+    """Names of hypotheses that are in play, and the places of their variants that are."""
+    least = max(max(values) + odds.ln_prior(name) for name, values in scores.items()) - IN_PLAY
+    return {
+        (name, i)
+        for name, values in scores.items()
+        for i, value in enumerate(values)
+        if value > max(values) - _BESIDE and value + odds.ln_prior(name) > least
+    }
 
 
 def _score(found: Fit, seed: int, draws: int) -> float:
@@ -227,9 +236,8 @@ def calibrate_lab(data: Campaigns, seed: int) -> Lab:
     """Mode of each output's simulator on the lab, and its noise."""
     modes, noise = {}, {}
     for o in data.outputs:
-        rng = generator(seed, "gap", "lab", o.name)
         _check_defined(data, o, generator(seed, "gap", "defined", o.name))
-        mode = find_mode(o.problem.log_prob, o.problem.priors, rng, n_climb=8)
+        mode = find_mode(o.problem.log_prob, o.problem.priors)
         modes[o.name] = mode[:-1]
         sigma = float(o.problem.theta(mode[None])[0, -1])
         noise[o.name] = Noise(sigma, 0.0)

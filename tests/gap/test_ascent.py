@@ -21,7 +21,7 @@ from calib.gap.ascent import (
     together,
 )
 from calib.gap.campaigns import Campaigns, campaigns
-from calib.gap.fit import Fit, Start, finished, log_joint, truncated_fits
+from calib.gap.fit import Fit, Start, finished, truncated_fits
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import joined, shifts, singles, split_testable, unknowns
 from calib.gap.hypothesis import Hypothesis
@@ -114,16 +114,6 @@ def test_hypotheses_in_step_end_where_each_alone_does(problems):
         assert found.forward.hypothesis is problem.forward.hypothesis
         # Both stop after two steps that gain less than a hundredth of a nat.
         assert found.log_evidence == pytest.approx(alone.log_evidence, abs=0.01)
-
-
-def test_the_log_density_is_the_same_in_parts(problems):
-    noise = {o: Noise(s) for o, s in SIGMA.items()}
-    problem = problems[0]
-    (truncated,) = truncated_fits([Start(problem.forward, drawn(problem, 1), noise)])
-    psi = drawn(problem, 2500)
-    whole = log_joint(truncated[0], psi)
-    some = np.array([0, 1023, 1024, 2047, 2048, 2499])
-    np.testing.assert_allclose(log_joint(truncated[0], psi[some]), whole[some], rtol=1e-9)
 
 
 def test_noise_does_not_depend_on_the_unit_of_a_parameter(problems):

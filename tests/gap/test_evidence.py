@@ -12,7 +12,8 @@ from scipy.stats import multivariate_normal, norm
 
 import calib.gap.fit as module
 from calib.gap.campaigns import Campaigns, OutputData, campaigns
-from calib.gap.fit import Fit, _bounds_correction, _near, _within, finished, fit, log_joint
+from calib.gap.density import Density
+from calib.gap.fit import Fit, _bounds_correction, _near, _within, finished, fit
 from calib.gap.forward import Forward
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, ln_prior, noise_conditions_of_lab
@@ -21,6 +22,7 @@ from calib.inference.priors import Prior, Priors
 from calib.inference.sampling.mixture import StudentT
 from tests.custom_problems import normal, problem_of
 from tests.gap.cases import PULL_ONLY, make_case
+from tests.gap.fits import log_joint
 
 
 def straight_line(seed: int, *idle: Prior, lower: float = -np.inf) -> Campaigns:
@@ -194,7 +196,7 @@ def test_draws_of_all_rounds_weigh_as_from_the_mixture_of_their_proposals():
     proposals = [
         StudentT(found.psi + root[:, 0], 0.5 * root, 6.0), StudentT(found.psi, 2.0 * root, 6.0)
     ]  # fmt: skip
-    pool, sizes = _Pool(found), (30, 60)
+    pool, sizes = _Pool(Density(found)), (30, 60)
     rng = np.random.default_rng(2)
     for proposal, size in zip(proposals, sizes, strict=True):
         pool.add(proposal, rng, size)
@@ -221,9 +223,9 @@ def test_draws_that_are_kept_are_as_many_of_each_part_as_it_weighs():
     found = fit(forward, np.array([0.0, 0.5]), {"drawbar_pull": Noise(0.04)})
     refined = refine(found, 1)
     assert refined.sample is not None
-    assert refined.sample.shape == (500, 2)
+    assert refined.sample.shape == (1500, 2)
     z = (refined.sample - found.psi) / np.sqrt(np.diag(found.covariance))
-    # Systematic: no more scatter than the 8000 draws behind them.
+    # Systematic: no more scatter than the draws behind them, 800 effective ones or more.
     np.testing.assert_allclose(z.mean(axis=0), 0.0, atol=0.15)
     np.testing.assert_allclose(z.std(axis=0), 1.0, atol=0.12)
     # Enough effective draws end the rounds; no normal at all is left as it is.

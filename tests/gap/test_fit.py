@@ -18,7 +18,6 @@ from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import Case
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit, _ln_mass, fit
-from calib.gap.fit import log_joint as joint
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
 from calib.gap.hypothesis import Hypothesis
@@ -185,15 +184,3 @@ def test_the_mass_between_two_ends_is_exact_in_either_tail(low, high):
     )
     expected = np.log(total) - 0.5 * nearest**2 - 0.5 * np.log(2.0 * np.pi)
     assert _ln_mass(low, high) == pytest.approx(expected, abs=1e-9)
-
-
-def test_the_joint_density_is_likelihood_times_prior_at_every_draw(data, fitted):
-    """More draws than are evaluated at once; beyond a bound it is none."""
-    rng = np.random.default_rng(6)
-    psi = fitted.draws(rng, 1500)
-    found = joint(fitted, psi)
-    np.testing.assert_allclose(found, log_joint(data, fitted, psi), rtol=1e-9, atol=1e-6)
-    assert np.isfinite(found).mean() > 0.99
-    bounded = next(i for i, p in enumerate(fitted.forward.priors.free) if np.isfinite(p.lower))
-    psi[1, bounded] = fitted.forward.priors.free[bounded].lower - 0.1
-    assert np.flatnonzero(~np.isfinite(joint(fitted, psi[:3]))).tolist() == [1]

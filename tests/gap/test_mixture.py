@@ -10,7 +10,7 @@ import pytest
 
 from calib.gap.hypotheses import singles
 from calib.gap.hypothesis import Hypothesis
-from calib.gap.mixture import Mixture, Truth, mixture
+from calib.gap.mixture import Mixture, Truth, _thinned, mixture
 from calib.gap.noise import Noise
 from tests.gap.cases import CHOICE, campaigns_of
 from tests.gap.fits import SIGMA, fit_at
@@ -99,7 +99,7 @@ def test_a_quantile_is_the_first_value_that_so_much_weight_does_not_exceed():
 
 def ranked(**groups):
     """A ranking of probabilities, and scores of the variants of each name."""
-    fits = {name: [f"{name} {i}" for i in range(len(s))] for name, (_, s) in groups.items()}
+    fits = {name: [SimpleNamespace(name=f"{name} {i}", sample=None) for i in range(len(s))] for name, (_, s) in groups.items()}
     return SimpleNamespace(
         order=list(groups), probability={name: p for name, (p, _) in groups.items()},
         fits=fits, scores={name: s for name, (_, s) in groups.items()},
@@ -110,10 +110,19 @@ def test_variants_share_their_names_probability_by_their_scores(data):
     """Of 3 to 1; one of 1 to 25 is left out, as is a hypothesis of one in a thousand."""
     scores = -900.0 + np.log([3.0, 1.0, 0.1])
     found = mixture(data, ranked(a=(0.8, scores), b=(0.199, [-5.0]), c=(0.001, [-9.0])), 7)
-    assert found.fits == ("a 0", "a 1", "b 0")
+    assert [f.name for f in found.fits] == ["a 0", "a 1", "b 0"]
     weights = np.array([0.8 * 3.0 / 4.1, 0.8 / 4.1, 0.199])
     assert found.probability == pytest.approx(tuple(weights / weights.sum()))
     assert found.seed == 7
     # The first is there however improbable: someone has to be.
-    assert mixture(data, ranked(a=(0.001, [0.0]), b=(0.001, [0.0])), 1).fits == ("a 0",)
-    assert mixture(data, ranked(a=(0.998, [0.0]), b=(0.002, [0.0])), 1).fits == ("a 0", "b 0")
+    for p_a, p_b, names in ((0.001, 0.001, ["a 0"]), (0.998, 0.002, ["a 0", "b 0"])):
+        found = mixture(data, ranked(a=(p_a, [0.0]), b=(p_b, [0.0])), 1)
+        assert [f.name for f in found.fits] == names
+
+
+def test_of_many_draws_every_third_is_kept(data):
+    many = np.arange(3000.0).reshape(1500, 2)
+    for sample, kept in ((many, many[::3]), (many[:500], many[:500]), (many[:70], many[:70])):
+        found = _thinned(replace(offset_fit(data, 0.1), sample=sample))
+        np.testing.assert_array_equal(found.sample, kept)
+    assert _thinned(offset_fit(data, 0.1)).sample is None

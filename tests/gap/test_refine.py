@@ -10,7 +10,7 @@ import pytest
 
 from calib.gap.campaigns import campaigns
 from calib.gap.effects import EFFECTS
-from calib.gap.fit import fit, log_joint
+from calib.gap.fit import fit
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
 from calib.gap.hypothesis import Hypothesis
@@ -19,6 +19,7 @@ from calib.gap.refine import refine
 from calib.gap.which import rank
 from calib.he2019.gaps.cases import paper_gaps
 from tests.gap.cases import make_case
+from tests.gap.fits import log_joint
 
 
 def fitted(name: str, models: dict[str, str], **case):

@@ -275,20 +275,22 @@ def test_pairs_in_play_are_begun_again_from_the_guesses_after_the_first(at_once)
     assert [f[0] for f in found] == [f[0] for f in begun]
 
 
-def test_the_six_sets_that_promise_most_are_fitted_once_each(at_once):
+def test_the_eight_sets_that_promise_most_are_fitted_once_each(at_once):
     stub, searched = Stub(), {"s0+t"}
     promises = [
         SimpleNamespace(hypothesis=named(f"s{i}+t"), log_joint=j)
         for i, j in ((0, 99.0), (1, 5.0), (2, 6.0), (1, 7.0), (3, 4.0), (4, 3.0), (5, 2.0),
-                     (6, 1.0), (7, 0.0))
+                     (6, 1.0), (7, 0.0), (8, -1.0), (9, -2.0))
     ]  # fmt: skip
     found = _fitted(stub, promises, searched, 12.5)
-    assert stub.asked == ["s1+t", "s2+t", "s3+t", "s4+t", "s5+t", "s6+t"]
+    assert stub.asked == [f"s{i}+t" for i in range(1, 9)]
     assert searched == {"s0+t", *stub.asked}
     # Within eight nats of the best that is listed they are fitted fully.
-    assert [with_prior(f, EVEN) for f in found] == pytest.approx([7.1, 6.1, 4.0, 3.0, 2.0, 1.0])
+    assert [with_prior(f, EVEN) for f in found] == pytest.approx(
+        [7.1, 6.1, 4.0, 3.0, 2.0, 1.0, 0.0, -1.0]
+    )
     assert _fitted(stub, promises, searched, 12.5) != []
-    assert searched == {f"s{i}+t" for i in range(8)}
+    assert searched == {f"s{i}+t" for i in range(10)}
 
 
 def test_every_other_effect_takes_ones_place_or_is_added():

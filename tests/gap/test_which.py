@@ -407,8 +407,26 @@ def test_variants_in_play_are_refined_and_those_far_behind_not_even_drawn(monkey
     drawn = {round(e - base["a"], 2) for e, n in asked if n == 160}
     assert {-3.9, -1.0, -3.4, -9.9} <= drawn
     assert -10.1 not in drawn
-    assert sum(n == 1000 for _, n in asked) == 3
-    asked.clear()
-    monkeypatch.setattr("calib.gap.which.refine", lambda found, seed, plenty: found)
-    _scored(fits, odds, 5, 4000)
     assert sum(n == 3000 for _, n in asked) == 3
+
+
+def test_what_comes_into_play_when_others_lose_by_their_draws_is_refined_too(monkeypatch):
+    """Laplace's evidence of the best was five nats too high: what was behind it is not, then."""
+    monkeypatch.setattr("calib.gap.which.relevance", lambda found, seed, draws: 0.0)
+    lost = {"a": 5.0, "b": 0.1, "none": 0.0, "c": 0.0}
+    refined: list[str] = []
+
+    def refine(found, seed, plenty):
+        name = found.forward.hypothesis.name
+        refined.append(name)
+        return variant(name, found.log_evidence - lost[name])
+
+    monkeypatch.setattr("calib.gap.which.refine", refine)
+    odds = Odds(1, {})
+    at = {"a": 0.0, "b": -5.0, "none": -9.5, "c": -8.0}
+    fits = {n: (variant(n, s - odds.ln_prior(n)),) for n, s in at.items()}
+    _, scores = _scored(fits, odds, 5, 1000)
+    # One after the other: the third is in play beside the first two as they are now.
+    assert refined == ["a", "b", "c"]
+    assert scores["a"][0] + odds.ln_prior("a") == pytest.approx(-5.0)
+    assert scores["none"][0] + odds.ln_prior("none") == pytest.approx(-9.5)

@@ -168,7 +168,7 @@ def test_every_example_is_left_alone(tmp_path: Path) -> None:
         path = tmp_path / f"{name}.csv"
         path.write_text(example_csv(name), encoding="utf-8")
         problem = build_problem(name, read_for_model(path, (*model.conditions, model.output)))
-        mode = find_mode(problem.log_prob, problem.priors, np.random.default_rng(3))
+        mode = find_mode(problem.log_prob, problem.priors)
         assert warnings_of(problem, mode) == ()
 
 
@@ -185,7 +185,7 @@ def test_residuals_are_not_judged_while_a_column_looks_to_be_in_another_unit() -
     pull = 1e3 * np.sin(20.0 * slip)
     table = table_from_arrays({"slip_ratio": slip, "drawbar_pull_kn": pull}, source="n.csv")
     problem = build_problem("magic_formula", table)
-    t = find_mode(problem.log_prob, problem.priors, np.random.default_rng(3))
+    t = find_mode(problem.log_prob, problem.priors)
     assert "neighbouring rows are alike" in " | ".join(residual_notes(problem, t))
     unit, withheld = warnings_of(problem, t)
     assert "about 1000 times too large" in unit

@@ -106,7 +106,7 @@ def test_a_slip_of_the_pen_is_found(output: str) -> None:
         values = table[column].copy()
         values[row] *= 10.0
         problem = build_problem(model, replace(table, columns={**table.columns, column: values}))
-        mode = find_mode(problem.log_prob, problem.priors, np.random.default_rng(3))
+        mode = find_mode(problem.log_prob, problem.priors)
         found = outlying_rows(problem, mode)
         assert found[0].line == table.lines[row]
         note = outlying_notes(problem, mode)[0]
@@ -121,7 +121,7 @@ def test_two_slips_of_the_pen_are_found(output: str) -> None:
     rows = [10, 18]
     values[rows] *= 10.0
     problem = build_problem(model, replace(table, columns={**table.columns, column: values}))
-    mode = find_mode(problem.log_prob, problem.priors, np.random.default_rng(3))
+    mode = find_mode(problem.log_prob, problem.priors)
     found = outlying_rows(problem, mode)
     assert {row.line for row in found} == {table.lines[i] for i in rows}
     assert max(row.sds for row in found) < 1e4
@@ -130,7 +130,7 @@ def test_two_slips_of_the_pen_are_found(output: str) -> None:
 @pytest.mark.parametrize("output", ["bulk_density", "drawbar_pull", "rut_depth"])
 def test_the_data_of_the_source_have_none(output: str) -> None:
     problem = build_problem(TASKS[output].model, TASKS[output].table)
-    mode = find_mode(problem.log_prob, problem.priors, np.random.default_rng(3))
+    mode = find_mode(problem.log_prob, problem.priors)
     assert outlying_rows(problem, mode) == ()
 
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
+from calib.inference.even import even_points
 from calib.inference.priors import Priors
 from calib.inference.sampling.climb import climb
 from calib.inference.sampling.curvature import hessian_scale
@@ -16,6 +16,8 @@ from calib.models.base import Array
 
 _WORST = 1e12
 _MOST_POLISHED = 6
+# Where `find_mode` looks, and from how many points it climbs.
+_SCREENED, _CLIMBED = 400, 8
 # Modes so many nats below the highest hold no mass worth finding; squared standard distances up to
 # this are no distance.
 _NEGLIGIBLE, _NEAR = 15.0, 25.0
@@ -27,11 +29,13 @@ def prior_widths(priors: Priors) -> Array:
     return np.where(np.isfinite(scale), scale, 0.25 * (upper - lower))
 
 
-def find_mode(
-    log_prob: Callable[[Array], Array], priors: Priors, rng: np.random.Generator, **search: Any
-) -> Array:
-    """Return the highest of `find_modes`, whose arguments these are, shape (d,)."""
-    return find_modes(log_prob, priors, rng, **search)[0].t
+def find_mode(log_prob: Callable[[Array], Array], priors: Priors) -> Array:
+    """Return the highest mode of a posterior ``(k, d) -> (k,)``, shape (d,).
+
+    As `find_modes` does, but from points that fill the prior evenly, the same for every seed.
+    """
+    pool = priors.ppf(even_points(_SCREENED, len(priors.free)))
+    return _climbed(log_prob, priors, _best_of_each(log_prob, pool, _CLIMBED))[0].t
 
 
 @dataclass(frozen=True)
@@ -69,10 +73,13 @@ def find_modes(
     neither lies in its neighbourhood nor far below it. A sampler that knows one mode only may miss
     another whatever its own diagnostics say.
     """
+    return _climbed(log_prob, priors, _starts(log_prob, priors, rng, starts, n_screen, n_climb))
+
+
+def _climbed(log_prob: Callable[[Array], Array], priors: Priors, starts: Array) -> list[Mode]:
+    """Modes that are found from some starts, the highest first."""
     width = prior_widths(priors)
-    ends, values = climb(
-        log_prob, _starts(log_prob, priors, rng, starts, n_screen, n_climb), width, *_bounds(priors)
-    )
+    ends, values = climb(log_prob, starts, width, *_bounds(priors))
     modes: list[Mode] = []
     polished = 0
     for i in np.argsort(-values):
@@ -104,12 +111,15 @@ def _starts(
 ) -> Array:
     if starts is not None and n_screen == 0:
         return np.atleast_2d(starts)
-    pool = priors.sample(rng, n_screen)
-    value = log_prob(pool)
-    # The best of each group rather than the best of all, which may share one basin.
-    groups = np.array_split(np.arange(n_screen), n_climb)
-    picked = pool[[group[value[group].argmax()] for group in groups]]
+    picked = _best_of_each(log_prob, priors.sample(rng, n_screen), n_climb)
     return picked if starts is None else np.concatenate([np.atleast_2d(starts), picked])
+
+
+def _best_of_each(log_prob: Callable[[Array], Array], pool: Array, count: int) -> Array:
+    """The best of each of so many groups: the best of all may share one basin."""
+    value = log_prob(pool)
+    groups = np.array_split(np.arange(len(pool)), count)
+    return pool[[group[value[group].argmax()] for group in groups]]
 
 
 def _bounds(priors: Priors) -> tuple[Array, Array]:

@@ -1,0 +1,29 @@
+"""Points that fill a cube evenly: where a search begins, the same whatever the seed."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from calib.models.base import Array
+
+__all__ = ["even_points"]
+
+
+@lru_cache(maxsize=64)
+def even_points(size: int, dim: int) -> Array:
+    """Spread points over the unit cube, shape (size, dim).
+
+    Multiples of the powers of a generalised golden ratio, modulo one: a Kronecker sequence
+    (H. Niederreiter, Random Number Generation and Quasi-Monte Carlo Methods, SIAM 1992, chapter 3).
+    A search that begins at them finds what it finds for every seed; random ones, of which a few
+    dozen leave holes in five dimensions, made what was found a matter of luck.
+    """
+    ratio = 2.0
+    for _ in range(60):  # to the root of x^(dim + 1) = x + 1
+        ratio = (1.0 + ratio) ** (1.0 / (dim + 1))
+    steps = ratio ** -np.arange(1.0, dim + 1)
+    points = (0.5 + np.arange(1.0, size + 1)[:, None] * steps) % 1.0
+    points.setflags(write=False)  # every caller is given the same
+    return np.asarray(points)
