@@ -21,7 +21,12 @@ _PAGE = (
 
 def diagnose(
     ctx: typer.Context,
-    case: Annotated[Path | None, typer.Argument(help="Case folder with a case.toml.")] = None,
+    case: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Folder with a case.toml; its [context] takes what is suspected or excluded."
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-diagnosis"),
     seed: opt.Seed = 1,
     run: Annotated[Path | None, typer.Option(help="Run folder of `calib fit`.")] = None,

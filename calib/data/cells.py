@@ -266,7 +266,10 @@ def _complaint(column: Column, value: float, cell: str) -> tuple[str, str]:
     """Say what is wrong with a value and how to mend it."""
     if not math.isfinite(value):
         what = f"{cell.strip()!r} is not a finite number" if cell.strip() else "an empty cell"
-        return what, "fill in the measured value, or delete the row"
+        return (
+            what,
+            "fill in the measured value, or delete the row (the column, if all of it is empty)",
+        )
     quantity = column.quantity
     if _is_code(np.array(value)):
         what = f"{cell.strip()!r} is outside the range of {quantity.stem}"

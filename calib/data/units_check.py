@@ -172,7 +172,7 @@ def _odd_columns(table: Table) -> Iterator[_Odd]:
             "thousandth (kN and N, MPa and kPa, m and mm) were mixed up"
         ] * (low <= factor * size <= high)
         read = usual_in(table, name, np.array([size]), low, high)
-        hints += [f"usual if the readings are in {read}"] * bool(read)
+        hints += [f"as where the readings are in {read}"] * bool(read)
         sizes_of = np.abs(table[name][np.isfinite(table[name])])
         # One row that is far too large is that row's fault, not the column's.
         alone = size > high and float(np.quantile(sizes_of, _MOST)) < high

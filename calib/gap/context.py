@@ -140,7 +140,8 @@ def read_context(content: Any, where: str) -> Context:
             f"{first['msg']} (found {first.get('input')!r})", where=f"{where}, context.{place}",
             allowed="suspected = {name = probability}, excluded = [names], "
             "sizes = {name = {parameter = {mean = …, sd = …}}}",
-            mend="correct this entry",
+            mend="write, for example: suspected = {lug_thrust = 0.5} and, in the next line, "
+            'excluded = ["sensor_drift"]',
         ) from None  # fmt: skip
     twice = set(written.suspected) & set(written.excluded)
     if twice:

@@ -74,8 +74,8 @@ class Covariates:
         return self._of_field[name]
 
     def _scaled(self, view: View, name: str) -> Array | None:
-        if name not in view.conditions:
-            return None
+        if name not in view.conditions or name not in self._ranges:
+            return None  # of conditions to predict, what the campaigns do not have explains nothing
         values, reference = view.conditions[name], self._ranges[name]
         if name in QUANTITIES and QUANTITIES[name].of_factors:
             values, reference = (

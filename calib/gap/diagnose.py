@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
+from calib.data.quantities import OUTPUTS, columns_of
 from calib.gap.campaigns import MIN_FIELD_ROWS, Campaigns, campaigns
 from calib.gap.case import Case, read_case
 from calib.gap.context import Context
@@ -221,6 +222,13 @@ def _beyond(corrected: Corrected, before: Mapping[str, Array]) -> list[str]:
         "where what is predicted is extrapolated"
         for name, rows in conditions_outside(corrected, new).items()
     ]
+    columns, plain = corrected.data.case.field.columns, {*OUTPUTS.values(), *columns_of("order")}
+    lacking = [n for n in columns if n not in new and n not in plain and np.ptp(columns[n]) > 0.0]
+    if lacking:
+        said.append(
+            f"{new.source}: lacks {', '.join(lacking)}, which the field campaign has; what depends "
+            "on it is not in what is predicted. Add the column"
+        )
     for name, values in before.items():
         empty = int(np.isnan(values).sum())
         if empty:

@@ -106,6 +106,9 @@ def _judge(e: GapEvidence) -> GapVerdict:
         )  # fmt: skip
     count = {1: "", 2: "two causes at once: ", 3: "three causes at once: "}
     several = count.get(len(acting), f"{len(acting)} causes at once: ")
+    # The best explanation may have one more, of which nobody knows which it is.
+    if several and len([c for c in best.name.split("+") if c != "unknown"]) > len(acting):
+        several = f"at least {several}"
     rest = ""
     if e.remainder is not None and e.remainder.probability >= 0.5:
         rest = ", and something besides that is not listed"
@@ -209,6 +212,11 @@ def advice(e: GapEvidence) -> str:
         elif names:
             listed = ", ".join(f'"{name}"' for name in names)
             sound = f". If it is sound, put excluded = [{listed}] into [context] of case.toml, and "
+            if len(names) > 1:
+                sound = (
+                    f". Put what is sound into [context] of case.toml (excluded = [{listed}] if "
+                )
+                sound += "all are), and "
             sound += "diagnose again"
         without = "".join(f" --without {name}" for name in names) or " --without CAUSE"
         return (

@@ -10,6 +10,7 @@ import pytest
 
 import calib.gap.diagnose as module
 from calib.batch.pool import HERE
+from calib.data import table_from_arrays
 from calib.gap.campaigns import campaigns
 from calib.gap.context import Context
 from calib.gap.diagnose import (
@@ -17,10 +18,12 @@ from calib.gap.diagnose import (
     _confounded,
     _left_out,
     _without_context,
+    diagnose_once,
     screened_ranking,
     verdict,
     with_unseen_rows,
 )
+from calib.gap.effects import EFFECTS
 from calib.gap.inclusion import Included
 from tests.gap.cases import PULL_ONLY, make_case
 
@@ -173,3 +176,24 @@ def test_a_context_is_taken_away_for_a_second_look(monkeypatch):
     found = _without_context(told, 4, {})
     assert found == pytest.approx({"none": 0.3, "a": 0.7, "unknown": 0.5})
     assert asked == [(Context(), 4, {})]
+
+
+FEW = {
+    "rate_effect": EFFECTS["rate_effect"],
+    "multipass_compaction": EFFECTS["multipass_compaction"],
+}
+
+
+def test_conditions_to_predict_that_lack_what_the_field_has_are_named() -> None:
+    """And one that the field lacks explains nothing there."""
+    case = make_case("rate_effect", n_fresh=9)
+    fresh = case.new_conditions
+    assert fresh is not None
+    columns = {n: v for n, v in fresh.columns.items() if n != "speed_m_s"}
+    found = diagnose_once(replace(case, new_conditions=table_from_arrays(columns)), 1, FEW)
+    assert any("lacks speed_m_s, which the field campaign has" in w for w in found.warnings)
+    whole = diagnose_once(case, 1, FEW)
+    assert not any("lacks" in w for w in whole.warnings)
+    field = {n: v for n, v in case.field.columns.items() if n != "pass_number"}
+    without = diagnose_once(replace(case, field=table_from_arrays(field)), 1, FEW)
+    assert np.isfinite(without.shrink["drawbar_pull"].rmse_after)

@@ -99,7 +99,10 @@ def test_a_quantile_is_the_first_value_that_so_much_weight_does_not_exceed():
 
 def ranked(**groups):
     """A ranking of probabilities, and scores of the variants of each name."""
-    fits = {name: [SimpleNamespace(name=f"{name} {i}", sample=None) for i in range(len(s))] for name, (_, s) in groups.items()}
+    fits = {
+        name: [SimpleNamespace(name=f"{name} {i}", sample=None) for i in range(len(scores))]
+        for name, (_, scores) in groups.items()
+    }
     return SimpleNamespace(
         order=list(groups), probability={name: p for name, (p, _) in groups.items()},
         fits=fits, scores={name: s for name, (_, s) in groups.items()},

@@ -211,6 +211,9 @@ def test_two_effects_are_said_to_be_two():
     e = replace(evidence("effect", **{"a+b": 0.95}), causes=parts)
     found = judge_gap(e)
     assert found.headline == "Two causes at once: what b does, and what a does"
+    # Where the best explanation has one more, nobody can say that there are two.
+    more = judge_gap(replace(evidence("effect", **{"a+b+c": 0.4, "a+b+d": 0.4}), causes=parts))
+    assert more.headline == "At least two causes at once: what b does, and what a does"
     causes = dict(found.facts)["Causes"]
     assert causes.startswith("B acts (96 %) and is 60 % (10 to 90 %) of the gap; a acts (95 %)")
     assert "c acts" not in causes
