@@ -59,15 +59,13 @@ class Guesses:
         Internal parameters of each simulator as the lab calibrated it.
     noise : mapping of str to Noise
         Of the laboratory.
-    seed : int
     odds : Odds
     """
 
     def __init__(
-        self, data: Campaigns, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise], seed: int,
-        odds: Odds,
-    ) -> None:  # fmt: skip
-        self.data, self.lab_mode, self.noise, self.seed = data, lab_mode, noise, seed
+        self, data: Campaigns, lab_mode: Mapping[str, Array], noise: Mapping[str, Noise], odds: Odds
+    ) -> None:
+        self.data, self.lab_mode, self.noise = data, lab_mode, noise
         self.odds = odds
         self._bases: Bases = {}
 

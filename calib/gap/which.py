@@ -144,7 +144,7 @@ def rank(
     unable |= dict.fromkeys(context.excluded, "it is excluded in the case's [context]")
     beside -= set(context.excluded)
     odds = Odds.of(len(single) - len(beside), context)
-    guesses = Guesses(data, lab_mode, noise, seed, odds)
+    guesses = Guesses(data, lab_mode, noise, odds)
     asked = [h for h in single if not isinstance(h.effects[0], ReadingDrift | ReadingStep)]
     fits = guesses.fit([Hypothesis("none"), *shifts(data), *asked])
     following = follows_runs(data, fits["none"][0])

@@ -68,7 +68,7 @@ def guesses() -> Guesses:
 def guesses_of(case: Case) -> Guesses:
     data = campaigns(case)
     mode, noise = calibrate_lab(data, 1)
-    return Guesses(data, mode, noise, 1, Odds.of(len(CHOICE), Context()))
+    return Guesses(data, mode, noise, Odds.of(len(CHOICE), Context()))
 
 
 @pytest.fixture(scope="module")
