@@ -219,14 +219,21 @@ def advice(e: GapEvidence) -> str:
                 sound += "all are), and "
             sound += "diagnose again"
         without = "".join(f" --without {name}" for name in names) or " --without CAUSE"
+        rest = joined(_missing(e))
+        besides = (
+            f". What is no fault, {rest}, belongs in the simulator; until then the same command "
+            "predicts with it"
+            if rest
+            else ""
+        )
         return (
             f"check the instrument before the model: {checks}. With the cause, what the faulty "
             "instrument reads is predicted; once it is mended, predict without it: "
-            f"{_PREDICT}{without}, {_FOLDER}{sound}"
+            f"{_PREDICT}{without}, {_FOLDER}{sound}{besides}"
         )
     if _measure_first(e):
         return ""
-    missing = [c.words for c in e.acting if c.name != "parameter_shift"]
+    missing = _missing(e)
     if not missing:
         return (
             "fit the field's rows too, and look at what changed in the soil. Until then predict "
@@ -237,6 +244,11 @@ def advice(e: GapEvidence) -> str:
         f"predict with the {causes} in the model ({joined(missing)}): {_PREDICT}, {_FOLDER}. Or "
         f"put {'it' if len(missing) == 1 else 'them'} into the simulator, and calibrate that again"
     )
+
+
+def _missing(e: GapEvidence) -> list[str]:
+    """Say what acts in the soil or at the wheel, and is not the model's own."""
+    return [c.words for c in e.acting if not c.instrument and c.name != "parameter_shift"]
 
 
 def _reading(e: GapEvidence) -> str | None:
@@ -251,22 +263,22 @@ def _measure_first(e: GapEvidence) -> bool:
 
 
 def _next(e: GapEvidence) -> list[tuple[str, str]]:
-    """Say what to do, or what would separate the first two unless the first is certain."""
+    """Say what to do, and what would separate the first two unless the first is certain."""
     text = advice(e)
-    if text:
-        return [("Next", text)]
-    if not _measure_first(e):
-        return []
+    done = [("Next", text)] if text else []
+    if not _measure_first(e) or (text and e.verdict == "unknown"):
+        return done
     n = max(e.next_facts, key=lambda fact: (_leading(e, fact), fact.gain_nats))
     repeats = repeats_needed(n.gain_nats)
     a, b = n.separates
-    if repeats is None:
-        return [
-            ("Next", f"No single condition in the range of the data separates {a} from {b}; "
-             "vary another condition, or measure another output"),
-        ]  # fmt: skip
-    many = "one measurement" if repeats == 1 else f"about {repeats} measurements"
-    return [("Next", f"To separate {a} from {b}: {many} at {n.conditions}")]
+    measure = (
+        f"no single condition in the range of the data separates {a} from {b}; vary another "
+        "condition, or measure another output"
+    )
+    if repeats is not None:
+        many = "one measurement" if repeats == 1 else f"about {repeats} measurements"
+        measure = f"to separate {a} from {b}: {many} at {n.conditions}"
+    return [*done, ("Then" if done else "Next", measure)]
 
 
 def _leading(e: GapEvidence, fact: NextFact) -> int:

@@ -105,7 +105,7 @@ def _block(result: FoundGap, plate: Plate, image: bytes) -> dict[str, Any]:
         "mark": TONE_MARKS[verdict.tone],
         "state": verdict.state,
         "headline": verdict.headline,
-        "facts": [fact for fact in verdict.facts if fact[0] != "Next"],
+        "facts": [fact for fact in verdict.facts if fact[0] not in ("Next", "Then")],
         "withheld": _withheld(result),
         "best": f"{short_name(best)} ({odds_text(ranking.probability[best])})",
         "shrink": _shrink(result),

@@ -192,6 +192,21 @@ def test_where_an_instrument_is_at_fault_it_is_to_be_checked_first():
     assert "instrument" not in others.get("Next", "")
 
 
+def test_beside_a_faulty_instrument_the_other_causes_and_a_measurement_are_said():
+    step = CauseFact("sensor_step", "sensor step", "a jump", 0.97, 0.9, (0.8, 1.0), "its zero")
+    soil = CauseFact("lug_thrust", "lug thrust", "more thrust", 0.6, 0.1, (0.0, 0.2))
+    sure = replace(evidence("effect", sensor_step=0.97), causes=[step, soil])
+    facts = dict(judge_gap(sure).facts)
+    assert "What is no fault, lug thrust, belongs in the simulator" in facts["Next"]
+    assert "Then" not in facts
+    alone = dict(judge_gap(replace(sure, causes=[step])).facts)
+    assert "no fault" not in alone["Next"]
+    unsure = replace(evidence("effect", sensor_step=0.6, lug_thrust=0.3), causes=[step, soil])
+    facts = dict(judge_gap(unsure).facts)
+    assert facts["Next"].startswith("Check the instrument")
+    assert facts["Then"] == "To separate lug thrust from drift: about 3 measurements at slip 65 %"
+
+
 def test_a_tie_names_its_members_and_not_the_rest():
     found = judge_gap(evidence("ambiguous", lug_thrust=0.45, drift=0.4, none=0.02))
     assert "cannot tell lug thrust and drift apart" in found.headline
