@@ -219,13 +219,10 @@ def advice(e: GapEvidence) -> str:
                 sound += "all are), and "
             sound += "diagnose again"
         without = "".join(f" --without {name}" for name in names) or " --without CAUSE"
-        rest = joined(_missing(e))
-        besides = (
-            f". What is no fault, {rest}, belongs in the simulator; until then the same command "
-            "predicts with it"
-            if rest
-            else ""
-        )
+        besides = ""
+        if rest := _missing(e):
+            besides = f". What is no fault, {joined(rest)}, belongs in the simulator; until then "
+            besides += f"the same command predicts with {'it' if len(rest) == 1 else 'them'}"
         return (
             f"check the instrument before the model: {checks}. With the cause, what the faulty "
             "instrument reads is predicted; once it is mended, predict without it: "
