@@ -175,9 +175,7 @@ def test_a_sure_form_is_named_whatever_else_may_be():
 def test_where_the_form_is_not_told_the_reading_is_to_be_checked_all_the_same():
     runs = over_runs(("a step", 0.45), ("a drift", 0.4))
     step = CauseFact("sensor_step", "sensor step", "a jump", 0.45, 0.9, (0.0, 1.0), "its zero")
-    e = replace(
-        evidence("ambiguous", sensor_step=0.45, sensor_drift=0.4), runs=runs, causes=[step]
-    )
+    e = replace(evidence("ambiguous", sensor_step=0.45, sensor_drift=0.4), runs=runs, causes=[step])
     text = dict(judge_gap(e).facts)["Next"]
     assert text.startswith("Check the instrument before the model: drawbar pull (zero and span")
     assert "alone cannot tell" not in text
