@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from calib.data import Table, write_table
-from calib.data.quantities import OUTPUTS
+from calib.data.quantities import OUTPUTS, role_of
 from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, campaigns
 from calib.gap.case import read_case
@@ -259,7 +259,7 @@ def _load_fit(
 
 
 def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
-    """Count rows beyond what either campaign covered.
+    """Count rows beyond what either campaign covered; of the order of runs, what the field's did.
 
     Parameters
     ----------
@@ -275,7 +275,14 @@ def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
     case = corrected.data.case
     table = with_declared(table, case.covariates)
     known = {
-        name: np.concatenate([t[name] for t in (case.lab, case.field) if name in t])
+        name: np.concatenate(
+            [
+                t[name]
+                for t in (case.lab, case.field)
+                # A drift of the field's instrument has nothing to do with the laboratory's runs.
+                if name in t and (t is case.field or role_of(name) != "order")
+            ]
+        )
         for name in corrected.data.view.conditions
         if name not in OUTPUTS.values() and name in table and not case.covariates.get(name)
     }

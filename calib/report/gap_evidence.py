@@ -43,6 +43,7 @@ from calib.report.gap_runs import over_runs
 from calib.report.gap_sizes import size_sentences, where_to_look
 from calib.report.gap_verdict import GapVerdict, judge_gap
 from calib.report.labels import MINUS, axis_of, joined, odds_text, short
+from calib.report.parameters import parameter_text
 
 
 def gap_verdict(found: Diagnosis) -> GapVerdict:
@@ -143,8 +144,25 @@ def _cause(found: Diagnosis, name: str, c: Included) -> CauseFact:
     effects = (e for fit in fits for e in fit.forward.hypothesis.effects if e.name == name)
     fault = next((e.check for e in effects if e.instrument), "")
     return CauseFact(
-        name, words, title_of(found, name), c.probability, c.share, c.share_interval, fault
+        name, words, title_of(found, name), c.probability, c.share, c.share_interval, fault,
+        _size(found, name) if fault else "",
     )  # fmt: skip
+
+
+def _size(found: Diagnosis, name: str) -> str:
+    """Write a fault's first parameter in the most probable explanation that has it."""
+    for explanation in found.ranking.order:
+        fit = found.ranking.best(explanation)
+        h = fit.forward.hypothesis
+        for effect, priors, part in zip(
+            h.effects, h.effect_priors, fit.forward.phi_slices, strict=True
+        ):
+            if effect.name == name:
+                at, prior = part.start, priors.free[0]
+                sd = float(np.sqrt(fit.covariance[at, at]))
+                text = parameter_text(prior, float(fit.psi[at]), sd)
+                return f"{prior.name.replace('_', ' ')} {text}"
+    return ""
 
 
 def _remainder_where(found: Diagnosis) -> str:

@@ -39,7 +39,8 @@ class WhereFact:
 class CauseFact:
     """A cause: its name, in words, what happens, whether it acts, and its share of the gap.
 
-    `instrument` says how to check the one that is at fault; empty if wheel or soil is.
+    `instrument` says how to check the one that is at fault; empty if wheel or soil is. `size` is
+    its first parameter in the most probable explanation that has it: "offset 0.12 ± 0.02 kN".
     """
 
     name: str
@@ -49,6 +50,7 @@ class CauseFact:
     share: float
     interval: tuple[float, float]
     instrument: str = ""
+    size: str = ""
 
 
 @dataclass(frozen=True)

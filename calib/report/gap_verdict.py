@@ -17,7 +17,7 @@ The first rule that applies decides:
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -28,6 +28,7 @@ from calib.report.gap_facts import (
     SHOWN,
     TIE,
     Candidate,
+    CauseFact,
     GapEvidence,
     NextFact,
     causes_text,
@@ -199,35 +200,11 @@ def advice(e: GapEvidence) -> str:
     runs = _reading(e)
     if runs is None and e.verdict != "effect":
         return ""
-    faults = {c.words: c.instrument for c in e.acting if c.instrument}
+    faults = {c.words: _check(c) for c in e.acting if c.instrument}
     if runs:
         faults = {runs: EARLY}
     if faults:
-        checks = joined([f"{words} ({check})" for words, check in faults.items()])
-        names = [] if runs else [c.name for c in e.acting if c.instrument]
-        sound = ""
-        if e.runs is not None and e.runs.only and e.runs.probability >= 0.5:
-            sound = f". If it is sound, the ground changed over the runs: {e.runs.outputs} alone "
-            sound += "cannot tell"
-        elif names:
-            listed = ", ".join(f'"{name}"' for name in names)
-            sound = f". If it is sound, put excluded = [{listed}] into [context] of case.toml, and "
-            if len(names) > 1:
-                sound = (
-                    f". Put what is sound into [context] of case.toml (excluded = [{listed}] if "
-                )
-                sound += "all are), and "
-            sound += "diagnose again"
-        without = "".join(f" --without {name}" for name in names) or " --without CAUSE"
-        besides = ""
-        if rest := _missing(e):
-            besides = f". What is no fault, {joined(rest)}, belongs in the simulator; until then "
-            besides += f"the same command predicts with {'it' if len(rest) == 1 else 'them'}"
-        return (
-            f"check the instrument before the model: {checks}. With the cause, what the faulty "
-            "instrument reads is predicted; once it is mended, predict without it: "
-            f"{_PREDICT}{without}, {_FOLDER}{sound}{besides}"
-        )
+        return _check_first(e, faults, runs)
     if _measure_first(e):
         return ""
     missing = _missing(e)
@@ -241,6 +218,47 @@ def advice(e: GapEvidence) -> str:
         f"predict with the {causes} in the model ({joined(missing)}): {_PREDICT}, {_FOLDER}. Or "
         f"put {'it' if len(missing) == 1 else 'them'} into the simulator, and calibrate that again"
     )
+
+
+def _check_first(e: GapEvidence, faults: Mapping[str, str], runs: str | None) -> str:
+    """Say how to check instruments, and what to do if one is at fault, or none is."""
+    checks = joined([f"{words} ({check})" for words, check in faults.items()])
+    causes = [] if runs else [c for c in e.acting if c.instrument]
+    names = [c.name for c in causes]
+    doubted = [c.name for c in causes if c.probability < SURE]
+    know = ""
+    if doubted:
+        sure = ", ".join(f"{name} = 0.99" for name in doubted)
+        know = f"put suspected = {{{sure}}} into [context] of case.toml, diagnose again, and, "
+    without = "".join(f" --without {name}" for name in names) or " --without CAUSE"
+    text = (
+        f"check the instrument before the model: {checks}. If it is at fault, {know}once it is "
+        f"mended, predict without the fault: {_PREDICT}{without}, {_FOLDER}; until then the "
+        "prediction without that option is what it reads"
+    )
+    if e.runs is not None and e.runs.only and e.runs.probability >= 0.5:
+        text += f". If it is sound, the ground changed over the runs: {e.runs.outputs} alone "
+        text += "cannot tell"
+    elif names:
+        listed = ", ".join(f'"{name}"' for name in names)
+        which = f"[{listed}]" if len(names) == 1 else f"[...], of {listed}"
+        text += (
+            f". {'If it' if len(names) == 1 else 'What'} is sound, put excluded = {which}, into "
+            "[context] of case.toml, and diagnose again"
+        )
+    also = [c for c in e.causes if c.instrument and SHOWN <= c.probability < 0.5 and not runs]
+    if also:
+        listed = joined([f"{c.words} ({odds_text(c.probability)}; {_check(c)})" for c in also])
+        text += f". Worth a check as well: {listed}"
+    if rest := _missing(e):
+        text += f". What is no fault, {joined(rest)}, belongs in the simulator; until "
+        text += f"{'it is' if len(rest) == 1 else 'they are'} there, every prediction has "
+        text += f"{'it' if len(rest) == 1 else 'them'} in"
+    return text
+
+
+def _check(c: CauseFact) -> str:
+    return f"{c.instrument}; expect {c.size}" if c.size else c.instrument
 
 
 def _missing(e: GapEvidence) -> list[str]:
@@ -274,7 +292,7 @@ def _next(e: GapEvidence) -> list[tuple[str, str]]:
     )
     if repeats is not None:
         many = "one measurement" if repeats == 1 else f"about {repeats} measurements"
-        measure = f"to separate {a} from {b}: {many} at {n.conditions}"
+        measure = f"to separate {a} from {b}: {many} at {n.conditions}, added to the field's file"
     return [*done, ("Then" if done else "Next", measure)]
 
 

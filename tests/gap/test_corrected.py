@@ -3,6 +3,7 @@
 import json
 from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -374,6 +375,21 @@ def test_conditions_beyond_both_campaigns_are_counted(saved):
         "speed_m_s": case.field["speed_m_s"] * np.array([30.0] + [1.0] * 26),
     }
     assert conditions_outside(load_corrected(folder), table_from_arrays(fast)) == {"speed_m_s": 1}
+
+
+def test_runs_after_the_fields_last_are_beyond_it_whatever_the_calibrations_order(saved):
+    """A drift of the field's instrument goes on; the laboratory's runs tell nothing of it."""
+    found, folder = saved
+    data, field = load_corrected(folder).data, found.data.case.field
+    last = field["run_order"].max()
+    lab = found.data.case.lab
+    case = replace(
+        data.case,
+        lab=replace(lab, columns={**lab.columns, "run_order": last + np.arange(float(len(lab)))}),
+    )
+    corrected = SimpleNamespace(data=SimpleNamespace(case=case, view=data.view))
+    late = {**field.columns, "run_order": field["run_order"] + 2.0}
+    assert conditions_outside(corrected, table_from_arrays(late)) == {"run_order": 2}
 
 
 def test_the_conditions_to_predict_are_kept(saved):

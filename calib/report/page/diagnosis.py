@@ -21,7 +21,6 @@ from calib.gap.odds import LEFT, coarsening, probabilities
 from calib.gap.placebo import placebos
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
-from calib.inference.priors import Prior
 from calib.models import get_model
 from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import (
@@ -39,14 +38,13 @@ from calib.report.gap_rows import (
     title_of,
 )
 from calib.report.gap_verdict import Tone, advice, judge_gap, repeats_needed
-from calib.report.labels import MINUS, degrees, odds_text, percent, percent_range, short
-from calib.report.numbers import format_number, format_value
+from calib.report.labels import MINUS, odds_text, percent, percent_range, short
+from calib.report.numbers import format_value
 from calib.report.page.template import equation, parametrisation, picture, prose, template
+from calib.report.parameters import parameter_text, unit_of
 
 # A hypothesis or a cause that is less probable is ruled out.
 _POSSIBLE = 0.01
-# An sd above this part of the prior's says that the data did not narrow the parameter.
-_NOT_NARROWED = 0.9
 
 
 def hypothesis_groups(found: Diagnosis) -> list[dict[str, Any]]:
@@ -66,7 +64,7 @@ def hypothesis_groups(found: Diagnosis) -> list[dict[str, Any]]:
     groups = (
         (first, tied),
         ("Less probable", possible),
-        ("Ruled out by themselves (below 1 %)", out),
+        ("Ruled out as the only cause (below 1 %)", out),
         (f"Sets ruled out (below 1 %): {len(sets)}", sets),
     )
     return [
@@ -155,14 +153,9 @@ def parameter_rows(found: Diagnosis) -> list[list[str]]:
                     .replace("_kn)", ")")
                     .replace("_", " ")
                 )
-                said = (words, prior.reason, text + _unit_of(prior), prior.source)
+                said = (words, prior.reason, text + unit_of(prior), prior.source)
                 rows.setdefault((effect.name, prior.name), [short_name(effect.name), *said])
     return list(rows.values())
-
-
-def _unit_of(prior: Prior) -> str:
-    """A parameter's unit, to be put after a number."""
-    return "" if prior.unit in ("1", "", "dimensionless") else f" {degrees(prior.unit)}"
 
 
 def simulators(found: Diagnosis) -> list[dict[str, Any]]:
@@ -175,36 +168,6 @@ def simulators(found: Diagnosis) -> list[dict[str, Any]]:
         }
         for o in found.data.outputs
     ]
-
-
-def parameter_text(prior: Prior, value: float, sd: float) -> str:
-    """Write a parameter, in internal coordinates, with its sd and unit.
-
-    One that cannot be told from its bound at zero is an upper limit (95 %); one that the data did
-    not narrow is called so.
-    """
-    unit = _unit_of(prior)
-    half = prior.lower == 0.0 and prior.loc == 0.0
-    spread = prior.scale * (math.sqrt(1.0 - 2.0 / math.pi) if half else 1.0)
-    if not math.isfinite(prior.scale):  # uniform between its bounds
-        spread = (prior.upper - prior.lower) / math.sqrt(12.0)
-    narrow = math.isfinite(spread) and sd > _NOT_NARROWED * spread
-    if narrow and not math.isfinite(prior.scale):
-        value, sd = 0.5 * (prior.lower + prior.upper), spread
-    mark = " (prior)" if narrow else ""
-    if prior.log:
-        centre = math.exp(value)
-        if sd < 0.35:
-            return f"{format_value(centre, centre * sd)}{unit}{mark}"
-        low, high = (math.exp(value + z * sd) for z in (-1.645, 1.645))
-        return (
-            f"{format_number(centre, 2)} ({format_number(low, 2)} to {format_number(high, 2)})"
-            f"{unit}{mark}"
-        )
-    if prior.lower == 0.0 and value < sd:
-        limit = min(value + 1.645 * sd, prior.upper)
-        return f"< {format_number(limit, 2)}{unit}{mark}"
-    return f"{format_value(value, sd)}{unit}{mark}"
 
 
 def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
@@ -220,7 +183,7 @@ def shift_sizes(outputs: Sequence[OutputData], fit: Fit) -> list[Markup]:
         for prior, value, s in zip(o.priors.free, shifts, sds, strict=True):
             if abs(value) < 1.645 * s:
                 continue
-            unit = " %" if prior.log else _unit_of(prior)
+            unit = " %" if prior.log else unit_of(prior)
             if prior.log:  # of a logarithm: the relative change
                 value, s = 100.0 * math.expm1(value), 100.0 * math.exp(value) * s
             sign = "+" if value > 0.0 else ""

@@ -43,11 +43,11 @@ from calib.report.page.diagnosis import (
     conditions_text,
     hypothesis_groups,
     parameter_rows,
-    parameter_text,
     prior_text,
     render_diagnosis,
 )
 from calib.report.page.gap_page import write_page
+from calib.report.parameters import parameter_text
 from tests.browser import faults
 from tests.gap.cases import PULL_ONLY, diagnosis_of, make_case, pull_diagnosis, write_case
 from tests.report.page.test_page import Reader
@@ -130,7 +130,10 @@ def test_less_than_sure_is_hedged_with_rivals_and_a_measurement():
     assert found.headline.startswith("Probably ")
     assert "also possible: lug thrust (25 %)" in facts["Which"]
     # ln 20 = 3.0 nats at 1.2 each.
-    assert facts["Next"] == "To separate lug thrust from drift: about 3 measurements at slip 65 %"
+    assert facts["Next"] == (
+        "To separate lug thrust from drift: about 3 measurements at slip 65 %, added to the "
+        "field's file"
+    )
 
 
 def over_runs(*forms: tuple[str, float], **kind: bool) -> RunsFact:
@@ -188,24 +191,38 @@ def test_where_an_instrument_is_at_fault_it_is_to_be_checked_first():
     soil = CauseFact("lug_thrust", "lug thrust", "more thrust", 0.6, 0.1, (0.0, 0.2))
     e = replace(evidence("effect", sensor_step=0.97), causes=[step, soil])
     text = dict(judge_gap(e).facts)["Next"]
-    assert "the instrument before the model: sensor step (its zero). With" in text
+    assert (
+        "the instrument before the model: sensor step (its zero). If it is at fault, once" in text
+    )
+    assert "suspected" not in text  # it is sure already
     others = dict(judge_gap(replace(e, causes=[replace(step, instrument="")])).facts)
     assert "instrument" not in others.get("Next", "")
 
 
 def test_beside_a_faulty_instrument_the_other_causes_and_a_measurement_are_said():
-    step = CauseFact("sensor_step", "sensor step", "a jump", 0.97, 0.9, (0.8, 1.0), "its zero")
+    step = CauseFact(
+        "sensor_step", "sensor step", "a jump", 0.97, 0.9, (0.8, 1.0), "its zero", "jump 2 kN"
+    )
     soil = CauseFact("lug_thrust", "lug thrust", "more thrust", 0.6, 0.1, (0.0, 0.2))
+    gauge = CauseFact("gauge", "gauge", "reads wrong", 0.08, 0.1, (0.0, 0.2), "another gauge")
     sure = replace(evidence("effect", sensor_step=0.97), causes=[step, soil])
     facts = dict(judge_gap(sure).facts)
+    assert "sensor step (its zero; expect jump 2 kN)" in facts["Next"]
     assert "What is no fault, lug thrust, belongs in the simulator" in facts["Next"]
     assert "Then" not in facts
     alone = dict(judge_gap(replace(sure, causes=[step])).facts)
     assert "no fault" not in alone["Next"]
-    unsure = replace(evidence("effect", sensor_step=0.6, lug_thrust=0.3), causes=[step, soil])
+    assert "as well" not in alone["Next"]
+    unsure = replace(
+        evidence("effect", sensor_step=0.6, lug_thrust=0.3),
+        causes=[replace(step, probability=0.6), soil, gauge],
+    )
     facts = dict(judge_gap(unsure).facts)
-    assert facts["Next"].startswith("Check the instrument")
-    assert facts["Then"] == "To separate lug thrust from drift: about 3 measurements at slip 65 %"
+    # Found at fault, explanations without it no longer count: what is known goes in.
+    assert "put suspected = {sensor_step = 0.99} into [context]" in facts["Next"]
+    assert "Worth a check as well: gauge (8 %; another gauge)" in facts["Next"]
+    assert facts["Then"].startswith("To separate lug thrust from drift: about 3 measurements at")
+    assert facts["Then"].endswith("added to the field's file")
 
 
 def test_a_tie_names_its_members_and_not_the_rest():
@@ -523,7 +540,7 @@ def test_what_the_parameters_are_can_be_read_on_the_page(found, page):
     assert len(rows) == len(parameter_rows(found))
     meaning, prior, source = rows["sensor drift", "curvature"]
     assert meaning.startswith("1 is linear in run order")
-    assert prior == "lognormal(1, 0.6)"
+    assert prior == "lognormal(1, 1)"
     assert rows["sensor drift", "drift"][1].endswith(" \N{MULTIPLICATION SIGN} 5 (normal load) kN")
     assert all(row[2] for row in rows.values())
     for words in (meaning, source, "sampled through its values at the lowest (", "psi"):
