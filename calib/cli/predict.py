@@ -152,7 +152,7 @@ def _predict_corrected(
     beyond = conditions_outside(corrected, table)
     if beyond:
         told = ", ".join(f"{name} in {count} rows" for name, count in beyond.items())
-        print(f"calib: outside what either campaign covered: {told}", file=sys.stderr)
+        print(f"calib: outside what the campaigns covered: {told}", file=sys.stderr)
     _give(columns, out)
     finish(0, {"columns": _lists(columns)}, outside=beyond)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
-from calib.data.quantities import OUTPUTS, columns_of
+from calib.data.quantities import OUTPUTS, columns_of, role_of
 from calib.gap.campaigns import MIN_FIELD_ROWS, Campaigns, campaigns
 from calib.gap.case import Case, read_case
 from calib.gap.context import Context
@@ -218,8 +218,9 @@ def _beyond(corrected: Corrected, before: Mapping[str, Array]) -> list[str]:
     if new is None:
         return []
     said = [
-        f"{new.source}: beyond what either campaign covered in {name}: {rows} of {len(new)} rows, "
-        "where what is predicted is extrapolated"
+        f"{new.source}: beyond what "
+        f"{'the field' if role_of(name) == 'order' else 'either campaign'} covered in {name}: "
+        f"{rows} of {len(new)} rows, where what is predicted is extrapolated"
         for name, rows in conditions_outside(corrected, new).items()
     ]
     columns, plain = corrected.data.case.field.columns, {*OUTPUTS.values(), *columns_of("order")}

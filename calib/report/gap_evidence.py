@@ -161,7 +161,8 @@ def _size(found: Diagnosis, name: str) -> str:
                 at, prior = part.start, priors.free[0]
                 sd = float(np.sqrt(fit.covariance[at, at]))
                 text = parameter_text(prior, float(fit.psi[at]), sd)
-                return f"{prior.name.replace('_', ' ')} {text}"
+                told = not text.endswith("(prior)")
+                return f"{prior.name.replace('_', ' ')} {text}" if told else ""
     return ""
 
 

@@ -241,9 +241,9 @@ def _check_first(e: GapEvidence, faults: Mapping[str, str], runs: str | None) ->
         text += "cannot tell"
     elif names:
         listed = ", ".join(f'"{name}"' for name in names)
-        which = f"[{listed}]" if len(names) == 1 else f"[...], of {listed}"
+        which = f"[{listed}]" if len(names) == 1 else f"[...], of {listed},"
         text += (
-            f". {'If it' if len(names) == 1 else 'What'} is sound, put excluded = {which}, into "
+            f". {'If it' if len(names) == 1 else 'What'} is sound, put excluded = {which} into "
             "[context] of case.toml, and diagnose again"
         )
     also = [c for c in e.causes if c.instrument and SHOWN <= c.probability < 0.5 and not runs]

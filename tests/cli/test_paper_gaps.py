@@ -139,7 +139,7 @@ def test_a_diagnosis_with_an_effect_of_ones_own_is_predicted_from_with_it(calib:
     Path("far.csv").write_text(f"{head}\n{first}\n{','.join(cells)}\n")
     far = calib("predict", "found", "--at", "far.csv", "--effects", "mine.py")
     assert far.code == 0, far.err
-    assert "outside what either campaign covered: slip_ratio in 1 rows" in far.err
+    assert "outside what the campaigns covered: slip_ratio in 1 rows" in far.err
     without = calib("predict", "found", "--at", fresh)
     assert (without.code, "soft_patch" in without.err) in {(0, False), (2, True)}
 
