@@ -45,6 +45,8 @@ _SAME = 1e-4
 
 # A cause so probable is spoken of.
 _LIKELY = 0.5
+# What depends on the order of the runs less probably than this is not spoken of.
+_WORTH_A_WORD = 0.05
 
 
 class Corrected:
@@ -75,6 +77,16 @@ class Corrected:
                 if effect.instrument:
                     probability[effect.name] = probability.get(effect.name, 0.0) + p
         return [name for name, p in probability.items() if p >= _LIKELY]
+
+    @property
+    def over_runs(self) -> bool:
+        """Whether what is predicted depends on the order of the runs, worth a word."""
+        probability = 0.0
+        for fit, p in zip(self.mixture.fits, self.mixture.probability, strict=True):
+            h = fit.forward.hypothesis
+            over = {c for effect in h.effects for c in effect.covariates}
+            probability += p * bool({"order"} & {*over, h.smooth_over, h.onset_over})
+        return probability >= _WORTH_A_WORD
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -259,7 +271,9 @@ def _load_fit(
 
 
 def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
-    """Count rows beyond what either campaign covered; of the order of runs, what the field's did.
+    """Count rows beyond what either campaign covered.
+
+    Of the order of the runs it is what the field covered, if anything depends on it.
 
     Parameters
     ----------
@@ -284,7 +298,10 @@ def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
             ]
         )
         for name in corrected.data.view.conditions
-        if name not in OUTPUTS.values() and name in table and not case.covariates.get(name)
+        if name not in OUTPUTS.values()
+        and name in table
+        and not case.covariates.get(name)
+        and (corrected.over_runs or role_of(name) != "order")
     }
     beyond = outside(known, {name: table[name] for name in known})
     return dict(Counter(name for row in beyond for name in row))

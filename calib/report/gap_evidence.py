@@ -150,19 +150,24 @@ def _cause(found: Diagnosis, name: str, c: Included) -> CauseFact:
 
 
 def _size(found: Diagnosis, name: str) -> str:
-    """Write a fault's first parameter in the most probable explanation that has it."""
+    """Write a fault's size in the most probable explanation that has it: "offset 0.12 ± 0.02 kN".
+
+    Of a gauge it is both gain and offset, of which either may be wrong.
+    """
     for explanation in found.ranking.order:
         fit = found.ranking.best(explanation)
         h = fit.forward.hypothesis
         for effect, priors, part in zip(
             h.effects, h.effect_priors, fit.forward.phi_slices, strict=True
         ):
-            if effect.name == name:
-                at, prior = part.start, priors.free[0]
-                sd = float(np.sqrt(fit.covariance[at, at]))
-                text = parameter_text(prior, float(fit.psi[at]), sd)
-                told = not text.endswith("(prior)")
-                return f"{prior.name.replace('_', ' ')} {text}" if told else ""
+            if effect.name != name:
+                continue
+            sds = np.sqrt(np.diag(fit.covariance))[part]
+            rows = zip(priors.free, fit.psi[part], sds, strict=True)
+            texts = {p.name: parameter_text(p, float(at), float(sd)) for p, at, sd in rows}
+            own = [n for n in texts if n in ("gain", "offset")] or list(texts)[:1]
+            told = [n for n in own if not texts[n].endswith("(prior)")]
+            return joined([f"{n.replace('_', ' ')} {texts[n]}" for n in told]) if told else ""
     return ""
 
 

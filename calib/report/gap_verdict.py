@@ -230,11 +230,12 @@ def _check_first(e: GapEvidence, faults: Mapping[str, str], runs: str | None) ->
     if doubted:
         sure = ", ".join(f"{name} = 0.99" for name in doubted)
         know = f"put suspected = {{{sure}}} into [context] of case.toml, diagnose again, and, "
+    folder = "DIAGNOSIS being the new folder" if know else _FOLDER
     without = "".join(f" --without {name}" for name in names) or " --without CAUSE"
     text = (
         f"check the instrument before the model: {checks}. If it is at fault, {know}once it is "
-        f"mended, predict without the fault: {_PREDICT}{without}, {_FOLDER}; until then the "
-        "prediction without that option is what it reads"
+        f"mended, predict without the fault: {_PREDICT}{without}, {folder}. Leave the option out "
+        "to predict what the faulty instrument reads"
     )
     if e.runs is not None and e.runs.only and e.runs.probability >= 0.5:
         text += f". If it is sound, the ground changed over the runs: {e.runs.outputs} alone "
@@ -251,9 +252,8 @@ def _check_first(e: GapEvidence, faults: Mapping[str, str], runs: str | None) ->
         listed = joined([f"{c.words} ({odds_text(c.probability)}; {_check(c)})" for c in also])
         text += f". Worth a check as well: {listed}"
     if rest := _missing(e):
-        text += f". What is no fault, {joined(rest)}, belongs in the simulator; until "
-        text += f"{'it is' if len(rest) == 1 else 'they are'} there, every prediction has "
-        text += f"{'it' if len(rest) == 1 else 'them'} in"
+        text += f". What is no fault, {joined(rest)}, belongs in the simulator; until then "
+        text += f"predictions include {'it' if len(rest) == 1 else 'them'}"
     return text
 
 

@@ -387,9 +387,30 @@ def test_runs_after_the_fields_last_are_beyond_it_whatever_the_calibrations_orde
         data.case,
         lab=replace(lab, columns={**lab.columns, "run_order": last + np.arange(float(len(lab)))}),
     )
-    corrected = SimpleNamespace(data=SimpleNamespace(case=case, view=data.view))
+    corrected = SimpleNamespace(data=SimpleNamespace(case=case, view=data.view), over_runs=True)
     late = {**field.columns, "run_order": field["run_order"] + 2.0}
     assert conditions_outside(corrected, table_from_arrays(late)) == {"run_order": 2}
+    corrected.over_runs = False  # runs are merely numbered on
+    assert conditions_outside(corrected, table_from_arrays(late)) == {}
+
+
+@pytest.mark.parametrize(
+    ("names", "smooth_over", "expected"),
+    [
+        (("sensor_drift",), "all", True),
+        (("force_offset", "sensor_step"), "all", True),
+        (("force_offset",), "all", False),
+        ((), "order", True),
+        ((), "slip", False),
+    ],
+)
+def test_what_depends_on_the_order_of_the_runs_is_known(names, smooth_over, expected):
+    h = Hypothesis("h", tuple(EFFECTS[n] for n in names), smooth_over=smooth_over)
+    none = Hypothesis("none", ())
+    fits = [SimpleNamespace(forward=SimpleNamespace(hypothesis=x)) for x in (h, none)]
+    for p in (0.06, 0.04):
+        mixture = SimpleNamespace(fits=fits, probability=[p, 1.0 - p])
+        assert Corrected(mixture, {}).over_runs is (expected and p > 0.05)
 
 
 def test_the_conditions_to_predict_are_kept(saved):

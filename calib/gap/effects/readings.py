@@ -14,7 +14,7 @@ __all__ = ["ReadingDrift", "ReadingStep"]
 # a fifth of the load.
 _SIZE = 0.25
 _SHAPES = {
-    "curvature": 'dist = "lognormal"\nmedian = 1.0\nsd_log = 0.6',
+    "curvature": 'dist = "lognormal"\nmedian = 1.0\nsd_log = 1.0',
     "half_way": 'dist = "lognormal"\nmedian = 0.5\nsd_log = 1.2',
     "zero_at": 'dist = "uniform"\nlower = 0.0\nupper = 1.0',
     "change_point": 'dist = "uniform"\nlower = 0.1\nupper = 0.9',
@@ -73,7 +73,8 @@ def _priors(name: str, sizes: dict[str, float], unit: str, shapes: tuple[str, ..
             ),
             *(
                 f'[parameters.{shape}]\n{_SHAPES[shape]}\nunit = "1"\n'
-                f'reason = "As of the drawbar reading"\n{said}'
+                'reason = "As of the drawbar reading"\n'
+                'source = "Those of the priors sensor_drift and sensor_step"\n'
                 for shape in shapes
             ),
         ]
