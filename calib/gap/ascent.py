@@ -19,15 +19,22 @@ from calib.gap.noise import Noise
 from calib.gap.residuals import Coordinates, Residuals, diagonal, residuals_of_all
 from calib.models.base import Array
 
-__all__ = ["Ascent", "Slope", "Stack", "Walk", "climb", "in_step", "slopes", "together"]
+__all__ = [
+    "FIRST_STEPS", "Ascent", "Slope", "Stack", "Walk", "climb", "slopes", "stacked", "together",
+]  # fmt: skip
 
 # Asks for problems' residuals at some psi (k, d), is sent them (k, N), until it has a result.
 type Walk[T] = Generator[list[tuple[Residuals, Array]], list[Array], T]
 
 # Dampings that are tried at each step, relative to the last that was good.
 _DAMPINGS = np.array([0.1, 10.0, 1000.0])
-# A step that gains less, in nats, and changes the noise less, is quiet; two in a row are the end.
-_QUIET_GAIN, _QUIET_NOISE = 1e-2, 1e-2
+# So little damping is none.
+_WHOLE = 1e-9
+# An ascent with so few nats to gain, and noise that changes by so little, is a step from its mode.
+# One that keeps gaining nothing of what its slope promises, at a kink or a bound, ends as well.
+_BESIDE, _NOTHING, _SETTLED = 1e-2, 1e-3, 1e-2
+# Steps of a truncated fit, which is not ended before.
+FIRST_STEPS = 3
 # Ascents whose derivatives stay in the processor's cache.
 _AT_ONCE = 16
 # What is taken of coordinates that one hypothesis lacks and others have: nothing depends on them.
@@ -74,7 +81,9 @@ class Ascent:
     steps : int
         That it may still take.
     jacobian : ndarray, shape (d, N), optional
-        Derivatives of the residuals where its last step began.
+        Derivatives of the residuals: at the mode, or where its last step began.
+    quiet : int
+        Last steps in a row that gained nothing to speak of.
     """
 
     problem: Residuals
@@ -83,14 +92,8 @@ class Ascent:
     noise: dict[str, Noise]
     steps: int
     damping: float = 1e-3
-    quiet: int = 0
     jacobian: Array | None = None
-
-
-def in_step(ascents: Sequence[Ascent]) -> list[list[Ascent]]:
-    """Group ascents of about as many coordinates."""
-    alike = sorted(ascents, key=lambda a: a.psi.size)
-    return [list(some) for some in batched(alike, _AT_ONCE)]
+    quiet: int = 0
 
 
 class Stack(Coordinates):
@@ -156,6 +159,12 @@ class Stack(Coordinates):
         return found
 
 
+def stacked(ascents: Sequence[Ascent]) -> list[Stack]:
+    """Stacks of ascents of about as many coordinates."""
+    alike = sorted(ascents, key=lambda a: a.psi.size)
+    return [Stack(list(some)) for some in batched(alike, _AT_ONCE)]
+
+
 def _wide(rows: Sequence[Array], value: float) -> Array:
     """Rows one below the other, the shorter ones filled up, shape (m, D)."""
     found = np.full((len(rows), max(row.size for row in rows)), value)
@@ -186,21 +195,41 @@ class Slope:
     hessian: Array
 
 
-def climb(ascents: Sequence[Ascent]) -> Walk[None]:
+def climb(ascents: Sequence[Ascent]) -> None:
     """Climb from guesses to the modes beside them; the ascents are moved in place."""
     going = ascents
-    while going := [a for a in going if a.quiet < 2 and a.steps]:
-        stack = Stack(going)
-        jacobian = yield from stack.derivatives()
-        slope = slopes(stack, jacobian)
-        gains = yield from _step(stack, slope)
-        raw = np.stack([a.raw for a in going])
-        noises = stack.update_noises(raw, slope.scaled, slope.hessian)
-        for i, (ascent, gained, noise) in enumerate(zip(going, gains, noises, strict=True)):
-            ascent.jacobian = jacobian[i, : ascent.psi.size]
-            quiet = gained < _QUIET_GAIN and _change(ascent.noise, noise) < _QUIET_NOISE
-            ascent.noise, ascent.quiet = noise, ascent.quiet + 1 if quiet else 0
-            ascent.steps -= 1
+    while going := [a for a in going if a.steps and a.quiet < 2]:
+        together([_advance(stack) for stack in stacked(going)])
+
+
+def _advance(stack: Stack) -> Walk[None]:
+    """One step of each."""
+    ascents = stack.ascents
+    jacobian = yield from stack.derivatives()
+    for ascent, own in zip(ascents, jacobian, strict=True):
+        ascent.jacobian = own[: ascent.psi.size]
+    slope = slopes(stack, jacobian)
+    _end_beside_modes(stack, slope)
+    gains = yield from _step(stack, slope)
+    raw = np.stack([a.raw for a in ascents])
+    noises = stack.update_noises(raw, slope.scaled, slope.hessian)
+    for ascent, gained, noise in zip(ascents, gains, noises, strict=True):
+        quiet = gained < _NOTHING and _change(ascent.noise, noise) < _SETTLED
+        ascent.noise, ascent.quiet = noise, ascent.quiet + 1 if quiet else 0
+        ascent.steps -= 1
+
+
+def _end_beside_modes(stack: Stack, slope: Slope) -> None:
+    """Leave ascents that are beside their modes one more step."""
+    if all(a.steps <= FIRST_STEPS for a in stack.ascents):
+        return
+    left = _left_to_gain(stack, slope)
+    if not (left < _BESIDE).any():
+        return
+    noises = stack.update_noises(stack.raw, slope.scaled, slope.hessian)
+    for ascent, nats, noise in zip(stack.ascents, left.tolist(), noises, strict=True):
+        if nats < _BESIDE and _change(ascent.noise, noise) < _SETTLED:
+            ascent.steps = 1
 
 
 def slopes(stack: Stack, jacobian: Array) -> Slope:
@@ -251,6 +280,12 @@ def _directions(stack: Coordinates, psi: Array, slope: Slope, dampings: Array) -
     damped = np.repeat(hessian[:, None], dampings.shape[1], axis=1)
     np.einsum("mtii->mti", damped)[...] += added
     return np.asarray(-np.linalg.solve(damped, gradient[:, None, :, None])[..., 0])
+
+
+def _left_to_gain(stack: Stack, slope: Slope) -> Array:
+    """What a whole step would gain in nats, if all were linear, shape (m,)."""
+    step = _directions(stack, stack.psi, slope, np.full((len(stack.psi), 1), _WHOLE))[:, 0]
+    return np.asarray(-0.5 * (step * slope.gradient).sum(axis=1))
 
 
 def _change(old: dict[str, Noise], new: dict[str, Noise]) -> float:

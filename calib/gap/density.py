@@ -116,10 +116,14 @@ class Density:
         return self._log_joint(psi, problem.beside(lab, full)) - ln_q, psi
 
     def _log_joint(self, psi: Array, raw: Array) -> Array:
-        """Log likelihood plus log prior, a discrepancy integrated out, by residuals (k, N)."""
+        """Log likelihood plus log prior, what can be integrated out, by residuals (k, N)."""
+        prior = self._forward.priors.log_prob(psi)
+        if not self._integrated.size:
+            total = prior + self._problem.ln_averaged(raw)
+            return np.where(np.isfinite(total), total, -np.inf)
         left = raw / self._sds
         left[:, self._field] = self._white(raw[:, self._field])
-        total = self._forward.priors.log_prob(psi) - 0.5 * np.square(left).sum(axis=1)
+        total = prior - 0.5 * np.square(left).sum(axis=1)
         return np.where(np.isfinite(total), total + self._constant, -np.inf)
 
     def _form_basis(self, psi: Array, plain: dict[str, Array], full: dict[str, Array]) -> Array:
@@ -162,17 +166,27 @@ class Density:
         ln_q -= self._forms.size * (np.log(_WIDER) + 0.5 * np.log(2.0 * np.pi))
         return np.linalg.solve(precision, moment[..., None])[..., 0], ln_q
 
-    def completed(self, psi: Array, rng: np.random.Generator) -> Array:
-        """Draw the coefficients that were integrated out, given the rest of psi, (k, d)."""
+    def completed(self, psi: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Draw the coefficients that were integrated out, given the rest of psi, (k, d).
+
+        Returns
+        -------
+        ndarray, shape (k, d)
+        ndarray, shape (k,)
+            Log of the factor by which averaging over the noise changes the likelihood of each.
+        """
         psi = np.array(psi)
-        if self._integrated.size:
-            left = (self._problem.raw(self._problem.clip(psi)) / self._sds)[:, self._field]
-            root = np.linalg.cholesky(self._basis @ self._basis.T + np.diag(self._prior_sd**-2.0))
-            white = np.linalg.solve(root, self._basis @ left.T)
-            psi[:, self._integrated] = np.linalg.solve(
-                root.T, white + rng.standard_normal(white.shape)
-            ).T
-        return psi
+        if not self._integrated.size:
+            return psi, np.zeros(len(psi))  # averaged already
+        raw = self._problem.raw(self._problem.clip(psi))
+        root = np.linalg.cholesky(self._basis @ self._basis.T + np.diag(self._prior_sd**-2.0))
+        white = np.linalg.solve(root, self._basis @ (raw / self._sds)[:, self._field].T)
+        drawn = np.linalg.solve(root.T, white + rng.standard_normal(white.shape)).T
+        psi[:, self._integrated] = drawn
+        raw[:, self._field] -= drawn @ self._basis * self._sds[self._field]
+        at_fit = -0.5 * np.square(raw / self._sds).sum(axis=1) - np.log(self._sds).sum()
+        at_fit -= 0.5 * self._sds.size * np.log(2.0 * np.pi)
+        return psi, self._problem.ln_averaged(raw) - at_fit
 
     @cached_property
     def _basis(self) -> Array:

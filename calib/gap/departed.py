@@ -106,16 +106,13 @@ def _acting(
         phi = np.concatenate([psi[:, f.phi_slices[j]] for (f, psi, _), j in having])
         # One plus what its form errors say: by how much it departs from its formula, but for what
         # is known of it: its sign, and where it is nothing.
-        factors = {
-            name: np.maximum(
-                1.0
-                + np.concatenate([psi[:, f.form_slices[name][j]] for (f, psi, _), j in having])
-                @ basis.T,
-                0.0,
-            )
-            for name, role in forward.roles.items()
-            if role in effect.outputs
-        }
+        factors = {}
+        for name, role in forward.roles.items():
+            if role in effect.outputs:
+                form = [psi[:, f.form_slices[name][j]] for (f, psi, _), j in having]
+                factor = (form[0] if len(form) == 1 else np.concatenate(form)) @ basis.T
+                factor += 1.0
+                factors[name] = np.maximum(factor, 0.0, out=factor)
         rows: slice | NDArray[np.int64] = having[0][0][2]
         if len(having) > 1:
             rows = np.concatenate([np.arange(p.start, p.stop) for (_, _, p), _ in having])
@@ -158,7 +155,9 @@ def _changed(
             there = simulated.predict_beyond(
                 t[rows], misfit[rows], {simulated.columns[known]: v for known, v in found.items()}
             )
-            location[rows] += (there - ahead[rows]) * some.factors[name]
+            added = there - ahead[rows]
+            added *= some.factors[name]
+            location[rows] += added
             ahead[rows] = there
             for known in (known for known, values in found.items() if values is not given[known]):
                 if known not in truly:
@@ -169,10 +168,12 @@ def _changed(
         here = location[a.rows]
         changed = a.effect.on_output(a.phi, role, here, a.view)
         if changed is not here:
-            change = (changed - here) * a.factors[name]
+            change = changed - here
+            change *= a.factors[name]
             if any(k.at_most_all and k.output == role for k in a.effect.known):
-                change = np.maximum(change, -np.maximum(here, 0.0))
-            location[a.rows] += change
+                np.maximum(change, -np.maximum(here, 0.0), out=change)
+            change += here
+            location[a.rows] = change
     return location
 
 

@@ -15,17 +15,17 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import log_ndtr
 
-from calib.gap.ascent import Ascent, Slope, Stack, climb, in_step, slopes, together
+from calib.gap.ascent import FIRST_STEPS, Ascent, Slope, Stack, climb, slopes, stacked
 from calib.gap.forward import Forward
-from calib.gap.noise import Noise, ln_prior
-from calib.gap.residuals import Residuals, diagonal, residuals_of_all
+from calib.gap.noise import Noise, ln_averaging, ln_prior
+from calib.gap.residuals import Residuals, diagonal, residuals_of_all, variance_left
 from calib.models.base import Array
 
 __all__ = ["Fit", "Start", "finished", "fit", "full_fits", "truncated_fits"]
 
 _MAX_STEPS = 40
-# Steps of a truncated fit; of one at a discrepancy alone, which predictions are linear in.
-_FIRST_STEPS, _LINEAR_STEPS = 3, 1
+# Steps of a truncated fit at a discrepancy alone, which predictions are linear in.
+_LINEAR_STEPS = 1
 # How many nats behind the best of several truncated fits one is given up, and within how many
 # posterior sds of a better one.
 _WORTH, _NEAR = 6.0, 1.5
@@ -104,7 +104,7 @@ def truncated_fits(starts: Sequence[Start]) -> list[list[Fit]]:
         begun = problem.best(costs, psi, start.count)[start.skip :]
         forward, noise = start.forward, dict(start.noise)
         linear = forward.smooth_slices and not forward.hypothesis.effects and forward.shift is None
-        steps = _LINEAR_STEPS if linear else _FIRST_STEPS
+        steps = _LINEAR_STEPS if linear else FIRST_STEPS
         ascents.append([Ascent(problem, psi[i], raw[i], noise, steps) for i in begun])
     return _climbed(ascents)
 
@@ -151,10 +151,10 @@ def full_fits(begun: Sequence[Sequence[Fit]]) -> list[list[Fit]]:
 
 def _climbed(ascents: Sequence[Sequence[Ascent]]) -> list[list[Fit]]:
     """Climb from guesses at several hypotheses to the modes beside them."""
-    groups = in_step([a for group in ascents for a in group])
-    together([climb(group) for group in groups])
+    everyone = [a for group in ascents for a in group]
+    climb(everyone)
     found: dict[Ascent, Fit] = {}
-    for stack in map(Stack, groups):
+    for stack in stacked(everyone):
         found |= zip(stack.ascents, _laplace(stack, slopes(stack, stack.kept())), strict=True)
     return [[found[a] for a in group] for group in ascents]
 
@@ -172,6 +172,10 @@ def _laplace(stack: Stack, slope: Slope) -> list[Fit]:
         + 2.0 * np.log(slope.sds).sum(axis=1)
         + residual.shape[1] * np.log(2.0 * np.pi)
     )
+    left, at = variance_left(slope.scaled, inverse), stack.data.at_rows
+    averaging = np.sum(
+        [ln_averaging(stack.raw[:, p], left[:, p], at[o]) for o, p in stack.parts.items()], axis=0
+    )
     n_lab = {o.name: o.problem.response.size for o in stack.data.outputs}
     fits = []
     for i, ascent in enumerate(stack.ascents):
@@ -180,7 +184,7 @@ def _laplace(stack: Stack, slope: Slope) -> list[Fit]:
         evidence = float(log_likelihood[i] + problem.forward.priors.log_prob(psi[None])[0])
         evidence += 0.5 * d * np.log(2.0 * np.pi) - 0.5 * float(log_det[i])
         evidence += _bounds_correction(problem, psi, slope.gradient[i, :d], covariance)
-        evidence += sum(ln_prior(n) for n in ascent.noise.values())
+        evidence += sum(ln_prior(n) for n in ascent.noise.values()) + float(averaging[i])
         field = {o: residual[i, part][n_lab[o] :] for o, part in stack.parts.items()}
         fits.append(
             Fit(

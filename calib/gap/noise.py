@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import gammaln
 
 from calib.data import Table
 from calib.data.quantities import columns_of
 from calib.gap.effects import View
+from calib.inference.sampling.mixture import log_sum
 from calib.models.base import Array
 
 __all__ = [
     "Noise",
     "NoiseConditions",
+    "ln_averaged",
+    "ln_averaging",
     "ln_prior",
     "most_probable",
     "noise_conditions",
@@ -115,9 +119,13 @@ def _at(conditions: Mapping[str, Array], lab: Mapping[str, float], size: int) ->
 
 def ln_prior(noise: Noise) -> float:
     """Log prior probability of how a noise grows."""
-    rho = int(np.argmin(np.abs(RHO - noise.rho)))
-    kappa = int(np.argmin(np.abs(KAPPA - noise.kappa)))
-    return float(LN_RHO_PRIOR[rho] + LN_KAPPA_PRIOR[kappa])
+    return _ln_prior(noise.rho, noise.kappa)
+
+
+@lru_cache(maxsize=1024)
+def _ln_prior(rho: float, kappa: float) -> float:
+    at_rho, at_kappa = np.argmin(np.abs(RHO - rho)), np.argmin(np.abs(KAPPA - kappa))
+    return float(LN_RHO_PRIOR[at_rho] + LN_KAPPA_PRIOR[at_kappa])
 
 
 def most_probable(squared: Array, at: NoiseConditions) -> list[Noise]:
@@ -133,12 +141,8 @@ def most_probable(squared: Array, at: NoiseConditions) -> list[Noise]:
     -------
     list of Noise, length m
     """
-    growth, ln_growth = at.growths
-    _, kappas, n = growth.shape
-    with np.errstate(invalid="ignore", over="ignore"):
-        variance = np.maximum(squared @ (growth**-2).reshape(-1, n).T / n, 1e-18)
-        prior = LN_RHO_PRIOR[:, None] + LN_KAPPA_PRIOR[:kappas]
-        value = -0.5 * n * np.log(variance) + (prior - ln_growth).ravel()
+    value, variance = _profile(squared, at)
+    kappas = value.shape[1] // RHO.size
     best = value.argmax(axis=1).tolist()
     # A model without a value somewhere says nothing about the noise.
     known = np.isfinite(value).all(axis=1).tolist()
@@ -148,3 +152,67 @@ def most_probable(squared: Array, at: NoiseConditions) -> list[Noise]:
         else Noise(1.0)
         for i, j in enumerate(best)
     ]
+
+
+def ln_averaged(squared: Array, at: NoiseConditions) -> Array:
+    """Log of the density of residuals, averaged over how large the noise is and how it grows.
+
+    Over rho and kappa by their prior, over ln sigma evenly, with a density of (n / pi)^(1/2) for
+    each unit: so averaging leaves it as it is at the most probable sigma, where all others are
+    averaged alike, and hypotheses' evidence can be compared with and without it.
+
+    Parameters
+    ----------
+    squared : ndarray, shape (m, n)
+        Squares of the residuals.
+    at : NoiseConditions
+
+    Returns
+    -------
+    ndarray, shape (m,)
+    """
+    n = squared.shape[1]
+    value, _ = _profile(squared, at)
+    constant = 0.5 * np.log(n / np.pi) - np.log(2.0) + gammaln(0.5 * n)
+    constant -= 0.5 * n * np.log(np.pi * n)
+    return np.asarray(log_sum(value.T) + constant)
+
+
+def ln_averaging(raw: Array, left: Array, at: NoiseConditions) -> Array:
+    """Log of how far averaging over the noise lifts a fit's evidence at its most probable noise.
+
+    Laplace's method over ln sigma: of n residuals of which parameters took up p, its sd is
+    (2 (n - p))^(-1/2), and the rest is as in `ln_averaged`.
+
+    Parameters
+    ----------
+    raw : ndarray, shape (m, n)
+        Residuals.
+    left : ndarray, shape (m, n)
+        The part of the variance of each that the parameters did not take up.
+    at : NoiseConditions
+
+    Returns
+    -------
+    ndarray, shape (m,)
+        Zero where a model has no value.
+    """
+    value, _ = _profile(np.square(raw) / left, at)
+    known = np.isfinite(value).all(axis=1)
+    value = np.where(known[:, None], value, 0.0)
+    lifted = log_sum(value.T) - value.max(axis=1) - 0.5 * np.log(left.mean(axis=1))
+    return np.where(known, lifted, 0.0)
+
+
+def _profile(squared: Array, at: NoiseConditions) -> tuple[Array, Array]:
+    """Log of likelihood times prior at the best sigma of every rho and kappa, and its square.
+
+    Both of shape (m, rho times kappa), the former but for constants.
+    """
+    growth, ln_growth = at.growths
+    _, kappas, n = growth.shape
+    with np.errstate(invalid="ignore", over="ignore"):
+        variance = np.maximum(squared @ (growth**-2).reshape(-1, n).T / n, 1e-18)
+        prior = LN_RHO_PRIOR[:, None] + LN_KAPPA_PRIOR[:kappas]
+        value = -0.5 * n * np.log(variance) + (prior - ln_growth).ravel()
+    return value, variance

@@ -15,29 +15,30 @@ development cases, against thirty times as many draws), the more the larger they
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calib.gap.density import Density
 from calib.gap.fit import Fit
-from calib.gap.noise import ln_prior
 from calib.inference.random import generator
 from calib.inference.sampling.adapt import tempered_moments
 from calib.inference.sampling.mixture import StudentT, log_sum
 from calib.models.base import Array
 
-__all__ = ["PLENTY", "refine"]
+__all__ = ["ENOUGH", "PLENTY", "Refining", "refine"]
 
 _ROUNDS, _SIZE, _FINAL, _KEPT = 7, 2000, 4000, 1500
 # Tails heavy enough for the long ends of sizes that an exponent makes up for.
 _DOF = 6.0
 # Fewer effective draws than this do not replace the normal.
-_ENOUGH = 120.0
-# With this many the evidence is within 0.04 nats (one sd), which moves no probability by more than
-# 0.01.
-PLENTY = 800
+_LEAST = 120.0
+# With so many effective draws a posterior is known, and its evidence within 0.07 nats (one sd);
+# with plenty within 0.04, which moves no probability by more than 0.01.
+ENOUGH, PLENTY = 400, 1280
 
 
 def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
@@ -55,37 +56,68 @@ def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
     Fit
         The same fit where too few draws carry the weight.
     """
-    h = fit.forward.hypothesis
-    rng = generator(
-        seed, "gap", "refine", h.name, h.smooth_over, h.onset_over or "", *h.smooth_outputs
-    )
-    density = Density(fit)
-    try:
-        proposal = StudentT(density.mode, np.linalg.cholesky(density.covariance), _DOF)
-    except np.linalg.LinAlgError:
-        return fit
-    pool = _Pool(density)
-    for size in (*(_SIZE,) * _ROUNDS, _FINAL):
-        pool.add(proposal, rng, size)
-        log_weight = pool.log_weight()
+    return Refining(fit, seed).until(plenty)
+
+
+class Refining:
+    """A fit on its way from Laplace's normal to draws, which may be taken further.
+
+    Parameters
+    ----------
+    fit : Fit
+    seed : int
+    """
+
+    def __init__(self, fit: Fit, seed: int) -> None:
+        h = fit.forward.hypothesis
+        self._fit = fit
+        self._seed = seed
+        self._key = ("gap", "refine", h.name, h.smooth_over, h.onset_over or "", *h.smooth_outputs)
+        self._rng = generator(seed, *self._key)
+        self._density = Density(fit)
+        self._pool = _Pool(self._density)
+        self._left = [*(_SIZE,) * _ROUNDS, _FINAL]
+        self._effective = 0.0
+        self._proposal: StudentT | None = None
+        with suppress(np.linalg.LinAlgError):
+            root = np.linalg.cholesky(self._density.covariance)
+            self._proposal = StudentT(self._density.mode, root, _DOF)
+
+    def until(self, plenty: int) -> Fit:
+        """Draw until so many effective draws are there, or no more rounds.
+
+        Returns
+        -------
+        Fit
+            The fit as it was where too few draws carry the weight.
+        """
+        while self._left and self._proposal is not None and self._effective < plenty:
+            self._pool.add(self._proposal, self._rng, self._left.pop(0))
+            log_weight = self._pool.log_weight()
+            total = float(logsumexp(log_weight))
+            if not np.isfinite(total):
+                self._proposal, self._effective = None, 0.0
+                break
+            self._effective = float(np.exp(2.0 * total - logsumexp(2.0 * log_weight)))
+            moved = tempered_moments(self._pool.draws, log_weight)
+            self._proposal = None if moved is None else StudentT(*moved, _DOF)
+        return self._refined() if self._effective >= _LEAST else self._fit
+
+    def _refined(self) -> Fit:
+        rng, log_weight = generator(self._seed, *self._key, "picked"), self._pool.log_weight()
         total = float(logsumexp(log_weight))
-        if not np.isfinite(total):
-            return fit
-        weight = np.exp(log_weight - total)
-        effective = 1.0 / np.square(weight).sum()
-        if effective >= plenty:
-            break
-        moved = tempered_moments(pool.draws, log_weight)
-        if moved is None:
-            return fit
-        proposal = StudentT(*moved, _DOF)
-    if effective < _ENOUGH:
-        return fit
-    # Systematic resampling: equal weights at the least added noise.
+        picked = _systematic(log_weight - total, rng)
+        sample, ln_factor = self._density.completed(self._pool.psi[picked], rng)
+        averaged = float(logsumexp(ln_factor))
+        evidence = total + averaged - np.log(_KEPT)
+        sample = sample[_systematic(ln_factor - averaged, rng)]
+        return replace(self._fit, sample=sample, log_evidence=evidence)
+
+
+def _systematic(log_share: Array, rng: np.random.Generator) -> NDArray[np.int64]:
+    """Pick draws by their shares: equal weights at the least added noise."""
     at = (rng.random() + np.arange(_KEPT)) / _KEPT
-    picked = np.minimum(np.searchsorted(np.cumsum(weight), at), weight.size - 1)
-    evidence = total + sum(ln_prior(noise) for noise in fit.noise.values())
-    return replace(fit, sample=density.completed(pool.psi[picked], rng), log_evidence=evidence)
+    return np.minimum(np.searchsorted(np.cumsum(np.exp(log_share)), at), log_share.size - 1)
 
 
 class _Pool:

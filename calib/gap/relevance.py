@@ -38,13 +38,14 @@ def relevance(fit: Fit, seed: int, draws: int) -> float:
     fit : Fit
     seed : int
     draws : int
-        Of the prior and of the posterior.
+        Of the prior, and of the posterior where it has no sample.
     """
     hypothesis = fit.forward.hypothesis
     if hypothesis.name == "none":
         return 0.0
     rng = generator(seed, "gap", "relevance", hypothesis.name)
-    posterior = fit.draws(rng, draws)
+    # Of a sample each draw once: again it would say nothing new.
+    posterior = fit.draws(rng, draws) if fit.sample is None else fit.sample
     # Prior draws of the effect about the simulator as it was fitted.
     prior = np.repeat(fit.psi[None], draws, axis=0)
     drawn = fit.forward.priors.sample(rng, draws)

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from calib.gap.campaigns import Campaigns
 from calib.gap.departed import departed_of_all
 from calib.gap.forward import Forward, shifted_of_all
-from calib.gap.noise import Noise, most_probable
+from calib.gap.noise import Noise, ln_averaged, most_probable
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 
-__all__ = ["Coordinates", "Residuals", "diagonal", "residuals_of_all"]
+__all__ = ["Coordinates", "Residuals", "diagonal", "residuals_of_all", "variance_left"]
 
 # Guesses closer than this (in prior sds) climb to the same mode.
 _APART = 0.7
@@ -119,12 +119,27 @@ class Coordinates:
         hessian : ndarray, shape (m, d, d)
         """
         inverse = np.linalg.inv(hessian + diagonal(1e-6 / self.width**2))
-        leverage = (scaled * (inverse @ scaled)).sum(axis=1)
+        at, left = self.data.at_rows, variance_left(scaled, inverse)
         # Each residual lost the part of its variance that the parameters took up.
-        corrected = np.square(raw) / np.minimum(np.maximum(1.0 - leverage, 0.1), 1.0)
-        at = self.data.at_rows
-        found = [most_probable(corrected[:, part], at[o]) for o, part in self.parts.items()]
+        squared = np.square(raw) / left
+        found = [most_probable(squared[:, part], at[o]) for o, part in self.parts.items()]
         return [dict(zip(self.parts, each, strict=True)) for each in zip(*found, strict=True)]
+
+    def ln_averaged(self, raw: Array) -> Array:
+        """Log likelihood, averaged over the noise of each output, shape (m, N) to (m,)."""
+        at = self.data.at_rows
+        return np.sum(
+            [ln_averaged(np.square(raw[:, part]), at[o]) for o, part in self.parts.items()], axis=0
+        )
+
+
+def variance_left(scaled: Array, inverse: Array) -> Array:
+    """The part of each residual's variance that parameters do not take up, shape (m, N).
+
+    By derivatives over their sds (m, d, N) and covariances (m, d, d).
+    """
+    leverage = (scaled * (inverse @ scaled)).sum(axis=1)
+    return np.minimum(np.maximum(1.0 - leverage, 0.1), 1.0)
 
 
 def diagonal(values: Array) -> Array:

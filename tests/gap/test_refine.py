@@ -19,7 +19,7 @@ from calib.gap.refine import refine
 from calib.gap.which import rank
 from calib.he2019.gaps.cases import paper_gaps
 from tests.gap.cases import make_case
-from tests.gap.fits import log_joint
+from tests.gap.fits import averaged_log_joint
 
 
 def fitted(name: str, models: dict[str, str], **case):
@@ -42,7 +42,7 @@ def long_chain(found, seed: int) -> np.ndarray:
     start = np.clip(start, lower + 1e-6, upper - 1e-6)
     moves = emcee.moves.DEMove()
     sampler = emcee.EnsembleSampler(
-        64 * d, d, lambda psi: log_joint(found, psi), vectorize=True, moves=moves
+        64 * d, d, lambda psi: averaged_log_joint(found, psi), vectorize=True, moves=moves
     )
     sampler.random_state = np.random.RandomState(seed).get_state()
     # Autocorrelation times are up to 47 steps: thousands of effective draws.
