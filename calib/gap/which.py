@@ -27,7 +27,7 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.isolate import Isolability, isolability
 from calib.gap.noise import Noise
 from calib.gap.odds import Odds, coarsening, probabilities, with_prior
-from calib.gap.refine import ENOUGH, PLENTY, Refining
+from calib.gap.refine import PLENTY, refine
 from calib.gap.relevance import gap_size, relevance
 from calib.gap.runs import follows_runs
 from calib.gap.sets import IN_PLAY, far_out, sets_and_unlisted
@@ -45,11 +45,7 @@ _N_TRIED = 32
 _IDLE = "it changes nothing that the models of this case predict"
 # Draws for the relevance of a hypothesis: of one too far behind to come into play, at first, and
 # while it is in play. Of 938 (33 cases) none gained more than 1.8 nats by its relevance.
-# In play twice as many as its evidence has effective draws.
-_FAR, _QUICK, _CAREFUL = 48, 160, 2
-# The error of evidence (one sd) of n effective draws is this over the root of n, and the most that
-# a probability may be off by it.
-_ERROR, _OFF = 1.4, 0.01
+_FAR, _QUICK, _CAREFUL = 48, 160, 3
 # Variants of a hypothesis are in play within so many nats of its best; one that is farther behind
 # the best of all than the next of these does not come into play by its relevance, and one farther
 # than the last is not likely, relevant or not.
@@ -164,20 +160,21 @@ def rank(
         fits[name] += more
     fits |= sets_and_unlisted(guesses, [h.name for h in single if h.name not in beside], fits)
     fits, scores = _scored(fits, guesses.odds, seed, plenty)
-    log_evidence, gap, probability = _weighed(fits, scores, guesses.odds)
+    log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
+    gap = _gap(fits, scores, log_evidence, guesses.odds)
+    probability = probabilities(log_evidence, guesses.odds, coarsening(gap))
     return Ranking(
         fits, scores, log_evidence, probability, unable, lab_mode, design, guesses.odds, gap
     )
 
 
-def _weighed(
-    fits: Mapping[str, Sequence[Fit]], scores: Mapping[str, Sequence[float]], odds: Odds
-) -> tuple[dict[str, float], float, dict[str, float]]:
-    """Log evidence of each name, the gap's size by the most probable, and probabilities."""
-    log_evidence = {name: float(logsumexp(values)) for name, values in scores.items()}
+def _gap(
+    fits: Mapping[str, tuple[Fit, ...]], scores: Mapping[str, tuple[float, ...]],
+    log_evidence: Mapping[str, float], odds: Odds,
+) -> float:  # fmt: skip
+    """Size of the gap by the most probable explanation, in noise sds; see `Ranking.gap`."""
     best = max(log_evidence, key=lambda name: log_evidence[name] + odds.ln_prior(name))
-    gap = gap_size(fits[best][int(np.argmax(scores[best]))])
-    return log_evidence, gap, probabilities(log_evidence, odds, coarsening(gap))
+    return gap_size(fits[best][int(np.argmax(scores[best]))])
 
 
 def _check_names(context: Context, known: set[str]) -> None:
@@ -209,22 +206,12 @@ def _scored(
         for name, group in fits.items()
     }
     refined = {name: list(group) for name, group in fits.items()}
-    refining: dict[tuple[str, int], Refining] = {}
-    reached: dict[tuple[str, int], int] = {}
-    few = min(ENOUGH, plenty)
-    while True:
-        wanted = dict.fromkeys(_in_play(scores, odds), few)
-        if wanted.keys() <= reached.keys() and plenty > few:
-            wanted |= dict.fromkeys(_hanging(refined, scores, odds) & wanted.keys(), plenty)
-        asked = {key: n for key, n in wanted.items() if n > reached.get(key, 0)}
-        if not asked:
-            break
-        for (name, i), n in sorted(asked.items()):
-            if (name, i) not in refining:
-                refining[name, i] = Refining(fits[name][i], seed)
-            refined[name][i] = refining[name, i].until(n)
-            scores[name][i] = _score(refined[name][i], seed, _CAREFUL * n)
-            reached[name, i] = n
+    tried: set[tuple[str, int]] = set()
+    while asked := _in_play(scores, odds) - tried:
+        tried |= asked
+        for name, i in sorted(asked):
+            refined[name][i] = refine(fits[name][i], seed, plenty)
+            scores[name][i] = _score(refined[name][i], seed, _CAREFUL * plenty)
     return (
         {name: tuple(group) for name, group in refined.items()},
         {name: tuple(values) for name, values in scores.items()},
@@ -239,19 +226,6 @@ def _in_play(scores: Mapping[str, Sequence[float]], odds: Odds) -> set[tuple[str
         for name, values in scores.items()
         for i, value in enumerate(values)
         if value > max(values) - _BESIDE and value + odds.ln_prior(name) > least
-    }
-
-
-def _hanging(
-    fits: Mapping[str, Sequence[Fit]], scores: Mapping[str, Sequence[float]], odds: Odds
-) -> set[tuple[str, int]]:
-    """Variants of which so few draws leave the probability of their hypothesis too uncertain."""
-    log_evidence, _, probability = _weighed(fits, scores, odds)
-    return {
-        (name, i)
-        for name, p in probability.items()
-        for i, value in enumerate(scores[name])
-        if p * (1.0 - p) * np.exp(value - log_evidence[name]) * _ERROR > _OFF * ENOUGH**0.5
     }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
@@ -374,59 +375,64 @@ def test_a_context_speaks_of_what_is_known_and_suspects_shifts_only():
             _check_names(context, known)
 
 
+def refining(monkeypatch, gained: Mapping[str, float]) -> list[str]:
+    """Let draws change evidence by so much; return where names that are refined are noted."""
+    asked: list[str] = []
+
+    def refine(found, seed, plenty):
+        assert (seed, plenty) == (5, 1000)
+        name = found.forward.hypothesis.name
+        asked.append(name)
+        return variant(name, found.log_evidence + gained[name])
+
+    monkeypatch.setattr("calib.gap.which.refine", refine)
+    return asked
+
+
 def test_variants_in_play_are_refined_and_those_far_behind_not_even_drawn(monkeypatch):
-    """Within 10 nats of the best relevance is drawn; within 4, and 2.5 of its name's best, more."""
+    """Within 10 nats of the best relevance is drawn, with few draws beyond 7.
+
+    Within 4, and 2.5 of the best of the same name, the posterior is.
+    """
     asked = []
 
     def relevance(found, seed, draws):
         asked.append((found.log_evidence, draws))
         return 0.0
 
-    def refine(found, seed, plenty):
-        assert (seed, plenty) == (5, 1000)
-        return variant(found.forward.hypothesis.name, found.log_evidence + 0.25)
-
     monkeypatch.setattr("calib.gap.which.relevance", relevance)
-    monkeypatch.setattr("calib.gap.which.refine", refine)
+    refining(monkeypatch, dict.fromkeys(("none", "a", "b"), 0.25))
     odds = Odds(1, {})
     base = {n: -odds.ln_prior(n) for n in ("none", "a", "b")}
     fits = {
         "none": (variant("none", base["none"]),),
-        "a": tuple(variant("a", base["a"] + s) for s in (-3.9, -1.0, -3.4, -9.9, -10.1)),
+        "a": tuple(variant("a", base["a"] + s) for s in (-3.9, -1.0, -3.4, -6.9, -9.9, -10.1)),
         "b": (variant("b", base["b"] - 4.1),),
     }
     refined, scores = _scored(fits, odds, 5, 1000)
-    was = np.array([-3.9, -1.0, -3.4, -9.9, -10.1])
-    gained = np.array([0.0, 0.25, 0.25, 0.0, 0.0])  # the first is 2.9 behind its name's best
+    was = np.array([-3.9, -1.0, -3.4, -6.9, -9.9, -10.1])
+    gained = np.array([0.0, 0.25, 0.25, 0.0, 0.0, 0.0])  # the first is 2.9 behind its name's best
     assert np.array(scores["a"]) - base["a"] == pytest.approx(was + gained)
     assert scores["none"] == pytest.approx((base["none"] + 0.25,))
     assert scores["b"] == pytest.approx((base["b"] - 4.1,))
     assert [a is b for a, b in zip(refined["a"], fits["a"], strict=True)] == [
-        True, False, False, True, True,
+        True, False, False, True, True, True,
     ]  # fmt: skip
-    drawn = {round(e - base["a"], 2) for e, n in asked if n == 160}
-    assert {-3.9, -1.0, -3.4, -9.9} <= drawn
-    assert -10.1 not in drawn
+    drawn = {n: {round(e - base["a"], 2) for e, m in asked if m == n} for n in (160, 48)}
+    assert {-3.9, -1.0, -3.4, -6.9} <= drawn[160]
+    assert drawn[48] == {-9.9}
     assert sum(n == 3000 for _, n in asked) == 3
 
 
 def test_what_comes_into_play_when_others_lose_by_their_draws_is_refined_too(monkeypatch):
     """Laplace's evidence of the best was five nats too high: what was behind it is not, then."""
     monkeypatch.setattr("calib.gap.which.relevance", lambda found, seed, draws: 0.0)
-    lost = {"a": 5.0, "b": 0.1, "none": 0.0, "c": 0.0}
-    refined: list[str] = []
-
-    def refine(found, seed, plenty):
-        name = found.forward.hypothesis.name
-        refined.append(name)
-        return variant(name, found.log_evidence - lost[name])
-
-    monkeypatch.setattr("calib.gap.which.refine", refine)
+    asked = refining(monkeypatch, {"a": -5.0, "b": -0.1, "c": 0.0})
     odds = Odds(1, {})
     at = {"a": 0.0, "b": -5.0, "none": -9.5, "c": -8.0}
     fits = {n: (variant(n, s - odds.ln_prior(n)),) for n, s in at.items()}
     _, scores = _scored(fits, odds, 5, 1000)
     # One after the other: the third is in play beside the first two as they are now.
-    assert refined == ["a", "b", "c"]
+    assert asked == ["a", "b", "c"]
     assert scores["a"][0] + odds.ln_prior("a") == pytest.approx(-5.0)
     assert scores["none"][0] + odds.ln_prior("none") == pytest.approx(-9.5)
