@@ -11,6 +11,9 @@ nearly, once the other coordinates u are given:
   unbiased estimate of p(u, y), exact where the linearity is (a random-weight importance sampler; P.
   Fearnhead, O. Papaspiliopoulos, G. O. Roberts, J. R. Stat. Soc. B 70 (2008) 755-777,
   doi:10.1111/j.1467-9868.2008.00661.x).
+
+The likelihood is averaged over the noise. A discrepancy is integrated out at the noise of the fit:
+its coefficients are drawn there, and weighted with what averaging changes (`completed`).
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ _LEAST = 0.2
 
 
 class Density:
-    """Likelihood times prior of a fit's hypothesis, at the noise of the fit.
+    """Likelihood times prior of a fit's hypothesis, averaged over the noise.
 
     Parameters
     ----------

@@ -4,7 +4,9 @@ Gauss-Newton on the joint posterior of simulator, effect and form errors, with t
 re-estimated between steps. Conditional on the noise the model is close to linear in psi where the
 posterior has its mass, so the evidence is Laplace's at first (`refine` mends it where it counts):
 
-    ln Z = ln p(y | psi^, sigma^) + ln p(psi^) + (d/2) ln 2 pi - (1/2) ln |H| + bounds
+    ln Z = ln p(y | psi^, sigma^) + ln p(psi^) + (d/2) ln 2 pi - (1/2) ln |H| + bounds + averaging
+
+where averaging over the noise lifts it (`calib.gap.noise.ln_averaging`).
 """
 
 from __future__ import annotations
