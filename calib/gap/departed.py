@@ -89,7 +89,7 @@ class _Acting:
 def _acting(
     parts: Sequence[_Part], view: View, plain: Mapping[str, Array], idle: Collection[int]
 ) -> list[_Acting]:
-    """Effects in alphabetical order, which is that of each hypothesis."""
+    """Effects, each once: what happens first, then what instruments make of it, by name."""
     places: dict[str, list[tuple[_Part, int]]] = {}
     for part in parts:
         for i, effect in enumerate(part[0].hypothesis.effects):
@@ -100,7 +100,7 @@ def _acting(
         return found
     outputs = parts[0][0].data.outputs
     base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in outputs}
-    for _, having in sorted(places.items()):
+    for having in sorted(places.values(), key=_rank):
         (forward, _, _), i = having[0]
         effect, basis = forward.hypothesis.effects[i], forward.form(view)[i]
         phi = np.concatenate([psi[:, f.phi_slices[j]] for (f, psi, _), j in having])
@@ -119,6 +119,12 @@ def _acting(
         natural = forward.hypothesis.effect_priors[i].to_natural(phi)
         found.append(_Acting(effect, rows, natural, factors, _seen(view, base, rows)))
     return found
+
+
+def _rank(having: Sequence[tuple[_Part, int]]) -> tuple[bool, str]:
+    (forward, _, _), i = having[0]
+    effect = forward.hypothesis.effects[i]
+    return effect.instrument, effect.name
 
 
 def _changed(

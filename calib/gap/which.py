@@ -45,7 +45,7 @@ _N_TRIED = 32
 _IDLE = "it changes nothing that the models of this case predict"
 # Draws for the relevance of a hypothesis: of one too far behind to come into play, at first, and
 # while it is in play. Of 938 (33 cases) none gained more than 1.8 nats by its relevance.
-_FAR, _QUICK, _CAREFUL = 48, 160, 2
+_FAR, _QUICK, _CAREFUL = 48, 160, 3
 # Variants of a hypothesis are in play within so many nats of its best; one that is farther behind
 # the best of all than the next of these does not come into play by its relevance, and one farther
 # than the last is not likely, relevant or not.

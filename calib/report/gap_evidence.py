@@ -88,6 +88,7 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         assumed=_assumed(found, ranking.best(best)),
         put_in="; ".join(case_context.words()),
         without=_without(found),
+        excluded=case_context.excluded,
         runs=over_runs(found),
     )
 

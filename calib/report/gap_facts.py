@@ -137,6 +137,8 @@ class GapEvidence:
         hypothesis rests.
     put_in, without : str
         What was put into the diagnosis besides the data, and what it finds without that.
+    excluded : sequence of str
+        Effects among what was put in that are known not to act.
     runs : RunsFact, optional
         A change over the order of the runs, of the outputs that most probably do.
     """
@@ -158,6 +160,7 @@ class GapEvidence:
     assumed: Sequence[str] = ()
     put_in: str = ""
     without: str = ""
+    excluded: Sequence[str] = ()
     runs: RunsFact | None = None
 
     @property

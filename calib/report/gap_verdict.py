@@ -42,6 +42,7 @@ SURE = 0.9
 # ln 20: the evidence that makes odds of twenty to one.
 _ENOUGH_NATS = math.log(20.0)
 _PREDICT = "calib predict DIAGNOSIS --at NEW.csv"
+_CONTEXT = "under [context] in case.toml (a section to add where there is none)"
 _FOLDER = "DIAGNOSIS being this folder"
 
 
@@ -229,11 +230,12 @@ def _check_first(e: GapEvidence, faults: Mapping[str, str], runs: str | None) ->
     know = ""
     if doubted:
         sure = ", ".join(f"{name} = 0.99" for name in doubted)
-        know = f"put suspected = {{{sure}}} into [context] of case.toml, diagnose again, and, "
+        know = f"put suspected = {{{sure}}} {_CONTEXT}, diagnose again, and, "
     folder = "DIAGNOSIS being the new folder" if know else _FOLDER
     without = "".join(f" --without {name}" for name in names) or " --without CAUSE"
     text = (
-        f"check the instrument before the model: {checks}. If it is at fault, {know}once it is "
+        f"check the instrument before the model: {checks}. If it is at fault, correct the field's "
+        f"readings by what the check showed and diagnose them again; or {know}once it is "
         f"mended, predict without the fault: {_PREDICT}{without}, {folder}. Leave the option out "
         "to predict what the faulty instrument reads"
     )
@@ -241,11 +243,12 @@ def _check_first(e: GapEvidence, faults: Mapping[str, str], runs: str | None) ->
         text += f". If it is sound, the ground changed over the runs: {e.runs.outputs} alone "
         text += "cannot tell"
     elif names:
+        known = "".join(f'"{name}", ' for name in e.excluded)  # a second line would replace them
         listed = ", ".join(f'"{name}"' for name in names)
-        which = f"[{listed}]" if len(names) == 1 else f"[...], of {listed},"
+        which = f"[{known}{listed}]" if len(names) == 1 else f"[{known}...], of {listed},"
         text += (
-            f". {'If it' if len(names) == 1 else 'What'} is sound, put excluded = {which} into "
-            "[context] of case.toml, and diagnose again"
+            f". {'If it' if len(names) == 1 else 'What'} is sound, put excluded = {which} "
+            f"{_CONTEXT}, and diagnose again"
         )
     also = [c for c in e.causes if c.instrument and SHOWN <= c.probability < 0.5 and not runs]
     if also:
@@ -293,6 +296,8 @@ def _next(e: GapEvidence) -> list[tuple[str, str]]:
     if repeats is not None:
         many = "one measurement" if repeats == 1 else f"about {repeats} measurements"
         measure = f"to separate {a} from {b}: {many} at {n.conditions}, added to the field's file"
+        if any(c.instrument for c in e.acting):
+            measure += ", taken with the instrument as it was, or all readings corrected alike"
     return [*done, ("Then" if done else "Next", measure)]
 
 

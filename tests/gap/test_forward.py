@@ -118,6 +118,35 @@ def test_a_pair_does_what_both_do(data):
     np.testing.assert_allclose(gap(both, sizes), expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["force_offset", "sensor_drift"])
+def test_an_instrument_adds_its_error_to_what_happens_whatever_that_is(data, name):
+    """Softening does not soften the offset of a load cell, though it is later in the alphabet.
+
+    So what goes when the fault is taken away is the same amount as of the fault alone.
+    """
+    fault, size = single(data, name), {"force_offset": 0.1, "sensor_drift": 0.2}[name]
+
+    def fields(h: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
+        forward = Forward(data, h, SIGMA)
+        psi = centre(forward, 1)
+        place = [e.name for e in h.effects].index(name)
+        psi[:, forward.phi_slices[place].start] = size
+        without = forward.without(psi, data.view, name)["drawbar_pull"]
+        return forward.field(psi, data.view)["drawbar_pull"], without
+
+    alone, simulator = fields(fault)
+    tried = 0
+    for happens, effect in EFFECTS.items():
+        if effect.instrument or "pull" not in effect.outputs:
+            continue
+        full, without = fields(joined(fault, single(data, happens)))
+        if np.abs(without - simulator).max() < 1e-3:
+            continue  # of one pass there is no compaction by passes
+        np.testing.assert_allclose(full - without, alone - simulator, atol=1e-9, err_msg=happens)
+        tried += 1
+    assert tried > 4
+
+
 def test_form_error_scales_the_effect_and_nothing_else(data):
     forward = Forward(data, single(data, "lug_thrust"), SIGMA)
     (part,) = forward.form_slices["drawbar_pull"]

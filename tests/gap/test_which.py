@@ -421,7 +421,7 @@ def test_variants_in_play_are_refined_and_those_far_behind_not_even_drawn(monkey
     drawn = {n: {round(e - base["a"], 2) for e, m in asked if m == n} for n in (160, 48)}
     assert {-3.9, -1.0, -3.4, -6.9} <= drawn[160]
     assert drawn[48] == {-9.9}
-    assert sum(n == 2000 for _, n in asked) == 3
+    assert sum(n == 3000 for _, n in asked) == 3
 
 
 def test_what_comes_into_play_when_others_lose_by_their_draws_is_refined_too(monkeypatch):

@@ -192,8 +192,10 @@ def test_where_an_instrument_is_at_fault_it_is_to_be_checked_first():
     e = replace(evidence("effect", sensor_step=0.97), causes=[step, soil])
     text = dict(judge_gap(e).facts)["Next"]
     assert (
-        "the instrument before the model: sensor step (its zero). If it is at fault, once" in text
+        "the instrument before the model: sensor step (its zero). If it is at fault, correct"
+        in text
     )
+    assert "diagnose them again; or once it is mended, predict" in text
     assert "suspected" not in text  # it is sure already
     others = dict(judge_gap(replace(e, causes=[replace(step, instrument="")])).facts)
     assert "instrument" not in others.get("Next", "")
@@ -219,10 +221,13 @@ def test_beside_a_faulty_instrument_the_other_causes_and_a_measurement_are_said(
     )
     facts = dict(judge_gap(unsure).facts)
     # Found at fault, explanations without it no longer count: what is known goes in.
-    assert "put suspected = {sensor_step = 0.99} into [context]" in facts["Next"]
+    assert "put suspected = {sensor_step = 0.99} under [context]" in facts["Next"]
     assert "Worth a check as well: gauge (8 %; another gauge)" in facts["Next"]
     assert facts["Then"].startswith("To separate lug thrust from drift: about 3 measurements at")
-    assert facts["Then"].endswith("added to the field's file")
+    # Mended readings beside faulty ones would be a change at some run.
+    assert facts["Then"].endswith("with the instrument as it was, or all readings corrected alike")
+    before = dict(judge_gap(replace(sure, causes=[step], excluded=("sensor_drift",))).facts)
+    assert 'put excluded = ["sensor_drift", "sensor_step"] under [context]' in before["Next"]
 
 
 def test_a_tie_names_its_members_and_not_the_rest():
