@@ -66,8 +66,12 @@ class Fit:
         if self.sample is not None:
             # Each draw as often as any other: chance adds nothing to what the sample has already.
             return np.asarray(self.sample[np.resize(rng.permutation(len(self.sample)), size)])
-        values, vectors = np.linalg.eigh(self.covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        try:
+            # Which is one matrix; signs of eigenvectors are another on another processor.
+            root = np.linalg.cholesky(self.covariance)
+        except np.linalg.LinAlgError:
+            values, vectors = np.linalg.eigh(self.covariance)
+            root = vectors * np.sqrt(np.maximum(values, 0.0))
         drawn = self.psi + rng.standard_normal((size, self.psi.size)) @ root.T
         _, _, lower, upper, _ = self.forward.priors._arrays
         return np.clip(drawn, lower, upper)

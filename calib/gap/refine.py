@@ -18,7 +18,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from calib.gap.density import Density
@@ -72,7 +71,8 @@ def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
         total = float(logsumexp(log_weight))
         if not np.isfinite(total):
             return fit
-        effective = 1.0 / np.square(np.exp(log_weight - total)).sum()
+        weight = np.exp(log_weight - total)
+        effective = 1.0 / np.square(weight).sum()
         if effective >= plenty:
             break
         moved = tempered_moments(pool.draws, log_weight)
@@ -81,18 +81,14 @@ def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
         proposal = StudentT(*moved, _DOF)
     if effective < _ENOUGH:
         return fit
-    picked = _systematic(log_weight - total, rng)
-    sample, ln_factor = density.completed(pool.psi[picked], rng)
-    averaged = float(logsumexp(ln_factor))
-    evidence = total + averaged - np.log(_KEPT)
-    sample = sample[_systematic(ln_factor - averaged, rng)]
-    return replace(fit, sample=sample, log_evidence=evidence)
-
-
-def _systematic(log_share: Array, rng: np.random.Generator) -> NDArray[np.int64]:
-    """Pick draws by their shares: equal weights at the least added noise."""
+    # Systematic resampling: equal weights at the least added noise.
     at = (rng.random() + np.arange(_KEPT)) / _KEPT
-    return np.minimum(np.searchsorted(np.cumsum(np.exp(log_share)), at), log_share.size - 1)
+    picked = np.minimum(np.searchsorted(np.cumsum(weight), at), weight.size - 1)
+    # Draws of what was integrated out stay those at the noise of the fit: weighted with the factor
+    # three of four would be lost.
+    sample, ln_factor = density.completed(pool.psi[picked], rng)
+    evidence = total + float(logsumexp(ln_factor)) - np.log(_KEPT)
+    return replace(fit, sample=sample, log_evidence=evidence)
 
 
 class _Pool:
