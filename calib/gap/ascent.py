@@ -10,13 +10,14 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import batched, groupby
 from math import log
 
 import numpy as np
 
 from calib.gap.noise import Noise
-from calib.gap.residuals import Coordinates, Residuals, diagonal, residuals_of_all
+from calib.gap.residuals import Coordinates, Residuals, diagonal, residuals_of_all, variance_left
 from calib.models.base import Array
 
 __all__ = [
@@ -81,7 +82,7 @@ class Ascent:
     steps : int
         That it may still take.
     jacobian : ndarray, shape (d, N), optional
-        Derivatives of the residuals: at the mode, or where its last step began.
+        Derivatives of the residuals where its last step began.
     quiet : int
         Last steps in a row that gained nothing to speak of.
     """
@@ -187,12 +188,20 @@ class Slope:
         Of the cost, minus the log posterior.
     hessian : ndarray, shape (m, d, d)
         Gauss and Newton's.
+    flat : ndarray, shape (m, d)
+        Curvature of a coordinate that nothing depends on, so that the Hessian has an inverse.
     """
 
     sds: Array
     scaled: Array
     gradient: Array
     hessian: Array
+    flat: Array
+
+    @cached_property
+    def left(self) -> Array:
+        """The part of the variance of each residual that parameters do not take up, (m, N)."""
+        return variance_left(self.scaled, np.linalg.inv(self.hessian + diagonal(self.flat)))
 
 
 def climb(ascents: Sequence[Ascent]) -> None:
@@ -212,7 +221,7 @@ def _advance(stack: Stack) -> Walk[None]:
     _end_beside_modes(stack, slope)
     gains = yield from _step(stack, slope)
     raw = np.stack([a.raw for a in ascents])
-    noises = stack.update_noises(raw, slope.scaled, slope.hessian)
+    noises = stack.update_noises(raw, slope.left)
     for ascent, gained, noise in zip(ascents, gains, noises, strict=True):
         quiet = gained < _NOTHING and _change(ascent.noise, noise) < _SETTLED
         ascent.noise, ascent.quiet = noise, ascent.quiet + 1 if quiet else 0
@@ -226,7 +235,7 @@ def _end_beside_modes(stack: Stack, slope: Slope) -> None:
     left = _left_to_gain(stack, slope)
     if not (left < _BESIDE).any():
         return
-    noises = stack.update_noises(stack.raw, slope.scaled, slope.hessian)
+    noises = stack.update_noises(stack.raw, slope.left)
     for ascent, nats, noise in zip(stack.ascents, left.tolist(), noises, strict=True):
         if nats < _BESIDE and _change(ascent.noise, noise) < _SETTLED:
             ascent.steps = 1
@@ -241,7 +250,7 @@ def slopes(stack: Stack, jacobian: Array) -> Slope:
         gradient += (stack.psi - stack.loc) * stack.precision**2
         hessian = scaled @ scaled.swapaxes(1, 2)
     hessian += diagonal(stack.precision**2)
-    return Slope(sds, scaled, gradient, hessian)
+    return Slope(sds, scaled, gradient, hessian, 1e-6 / stack.width**2)
 
 
 def _step(stack: Stack, slope: Slope) -> Walk[list[float]]:

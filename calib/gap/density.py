@@ -23,6 +23,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.gap.departed import Departed
 from calib.gap.fit import Fit
 from calib.gap.residuals import Residuals
 from calib.models.base import Array
@@ -111,12 +112,12 @@ class Density:
         if not self._forms.size:
             return self._log_joint(psi, problem.raw(psi)), psi
         lab, plain = forward.plain(psi)
-        full = forward.departed(psi, forward.data.view, plain)
-        left = self._white(problem.beside(lab, full)[:, self._field])
-        basis = self._form_basis(psi, plain, full)
+        departed = Departed([(forward, psi)], forward.data.view, plain)
+        full = departed.at([psi])
+        left = self._white(problem.beside(lab, full)[:, self._field] / self._field_sds)
+        basis = self._form_basis(psi, departed, full)
         psi[:, self._forms], ln_q = self._drawn_forms(left, basis, rng)
-        full = forward.departed(psi, forward.data.view, plain)
-        return self._log_joint(psi, problem.beside(lab, full)) - ln_q, psi
+        return self._log_joint(psi, problem.beside(lab, departed.at([psi]))) - ln_q, psi
 
     def _log_joint(self, psi: Array, raw: Array) -> Array:
         """Log likelihood plus log prior, what can be integrated out, by residuals (k, N)."""
@@ -125,18 +126,18 @@ class Density:
             total = prior + self._problem.ln_averaged(raw)
             return np.where(np.isfinite(total), total, -np.inf)
         left = raw / self._sds
-        left[:, self._field] = self._white(raw[:, self._field])
+        left[:, self._field] = self._white(left[:, self._field])
         total = prior - 0.5 * np.square(left).sum(axis=1)
         return np.where(np.isfinite(total), total + self._constant, -np.inf)
 
-    def _form_basis(self, psi: Array, plain: dict[str, Array], full: dict[str, Array]) -> Array:
+    def _form_basis(self, psi: Array, departed: Departed, full: dict[str, Array]) -> Array:
         """Minus the derivatives of white residuals by form errors, shape (k, m, n)."""
-        forward, view = self._forward, self._forward.data.view
+        forward = self._forward
         found = np.zeros((len(psi), self._forms.size, self._field.size))
-        for i, basis in enumerate(forward.form(view)):
+        for i, basis in enumerate(forward.form(forward.data.view)):
             if not basis.shape[1]:
                 continue
-            without = forward.departed(psi, view, plain, [i])
+            without = departed.at([psi], i)
             end = 0
             for o in forward.data.outputs:
                 rows, end = slice(end, end + o.rows.size), end + o.rows.size
@@ -145,9 +146,11 @@ class Density:
                     continue
                 # At all draws the form errors are those of the mode here.
                 factor = np.maximum(1.0 + basis[o.rows] @ self._fit.psi[part], _LEAST)
-                change = (full[o.name] - without[o.name])[:, o.rows] / factor
+                change = (full[o.name] - without[o.name])[:, o.rows]
+                change /= factor * self._field_sds[rows]
+                change[~np.isfinite(change)] = 0.0
                 at = slice(*np.searchsorted(self._forms, (part.start, part.stop)))
-                found[:, at, rows] = np.nan_to_num(change)[:, None] * basis[o.rows].T
+                np.multiply(change[:, None], basis[o.rows].T, out=found[:, at, rows])
         return self._white(found)
 
     def _drawn_forms(
@@ -192,6 +195,11 @@ class Density:
         return psi, self._problem.ln_averaged(raw) - at_fit
 
     @cached_property
+    def _field_sds(self) -> Array:
+        """Of the noise of the field's rows."""
+        return np.asarray(self._sds[self._field])
+
+    @cached_property
     def _basis(self) -> Array:
         """Shapes of what is integrated out, over the sds of the field's rows, (m, n)."""
         by = self._problem.linear_jacobian(self._fit.psi[None])[0] / self._sds
@@ -207,9 +215,8 @@ class Density:
     def _whitening(self) -> Array:
         return np.asarray(np.linalg.inv(self._root).T)
 
-    def _white(self, raw: Array) -> Array:
-        """Residuals of the field's rows made independent and of unit variance, shape (..., n)."""
-        left = raw / self._sds[self._field]
+    def _white(self, left: Array) -> Array:
+        """Residuals of the field's rows over their sds made independent, shape (..., n)."""
         return np.asarray(left @ self._whitening if self._integrated.size else left)
 
     @cached_property

@@ -15,13 +15,18 @@ from calib.models.base import Array
 if TYPE_CHECKING:
     from calib.gap.forward import Forward
 
-__all__ = ["departed_of_all"]
+__all__ = ["Departed", "Idle", "departed_of_all"]
+
+# Effects to leave out, by their place, of those asked for, by their place.
+type Idle = Mapping[int, Collection[int]]
+_NONE: Idle = {}
+type _Rows = slice | NDArray[np.int64]
+# Rows of the predictions, which they are of those of an effect, and what it adds in them.
+type _Added = tuple[_Rows, slice | NDArray[np.bool_], Array]
 
 
-@np.errstate(all="ignore")
 def departed_of_all(
-    asked: Sequence[tuple[Forward, Array]], view: View, plain: dict[str, Array],
-    idle: Collection[int] = (),
+    asked: Sequence[tuple[Forward, Array]], view: View, plain: dict[str, Array], idle: Idle = _NONE
 ) -> dict[str, Array]:  # fmt: skip
     """Add to what simulators predict what hypotheses on the same campaigns say.
 
@@ -34,111 +39,145 @@ def departed_of_all(
         With psi of each, shape (k, d); one below the other they are the rows of `plain`.
     view : View
     plain : dict of str to ndarray, shape (sum of k, n)
-    idle : collection of int
-        Effects to leave out, by their place.
+    idle : mapping of int to collection of int
+        Effects to leave out of one of those asked, by their place.
     """
-    changed = dict(plain)
-    ends = np.cumsum([len(psi) for _, psi in asked]).tolist()
-    parts = [
-        (forward, psi, slice(end - len(psi), end))
-        for (forward, psi), end in zip(asked, ends, strict=True)
-    ]
-    acting = _acting(parts, view, plain, idle)
-    if acting:
-        forward = asked[0][0]
-        shared = np.concatenate([psi[:, : forward.n_shared] for _, psi in asked])
-        changed = {o: _changed(forward, shared, o, view, acting, plain[o]) for o in plain}
-    for forward, psi, rows in parts:
-        threshold = psi[:, forward.threshold :].ravel()  # of one that sets in, else empty
-        for name, part in forward.smooth_slices.items():
-            if changed[name] is plain[name]:
-                changed[name] = plain[name].copy()
-            changed[name][rows] += forward.discrepancy.at(psi[:, part], threshold, view, name)
-    return changed
+    return Departed(asked, view, plain, idle).at([psi for _, psi in asked])
 
 
-type _Part = tuple[Forward, Array, slice]
+class Departed:
+    """What `departed_of_all` adds, with form errors that may be others later.
+
+    The conditions that truly held do not depend on these: simulators are asked once.
+    """
+
+    @np.errstate(all="ignore")
+    def __init__(
+        self, asked: Sequence[tuple[Forward, Array]], view: View, plain: dict[str, Array],
+        idle: Idle = _NONE,
+    ) -> None:  # fmt: skip
+        self._view, self._plain = view, plain
+        ends = np.cumsum([len(psi) for _, psi in asked]).tolist()
+        self._parts = [
+            (forward, slice(end - len(psi), end))
+            for (forward, psi), end in zip(asked, ends, strict=True)
+        ]
+        self._acting = _acting(self._parts, [psi for _, psi in asked], view, plain, idle)
+        self._added: dict[str, list[list[_Added]]] = {}
+        if self._acting:
+            forward = asked[0][0]
+            shared = np.concatenate([psi[:, : forward.n_shared] for _, psi in asked])
+            self._added = {
+                o: _added(forward, shared, o, view, self._acting, plain[o]) for o in plain
+            }
+
+    @np.errstate(all="ignore")
+    def at(self, psi: Sequence[Array], without: int | None = None) -> dict[str, Array]:
+        """Predict with the form errors and discrepancies in psi of each, shapes (k, d).
+
+        Without what one of the effects adds, by its place, though the others see that it acts.
+        """
+        acting = {
+            j: (a, self._factors(a, psi))
+            for j, a in enumerate(self._acting)
+            if a.having[0][1] != without
+        }
+        changed = dict(self._plain)
+        for name, role in self._parts[0][0].roles.items():
+            of_it = [
+                (a, factors[name], self._added[name][j])
+                for j, (a, factors) in acting.items()
+                if name in factors
+            ]
+            if of_it:
+                changed[name] = _changed(self._plain[name], role, of_it)
+        for (forward, rows), own in zip(self._parts, psi, strict=True):
+            threshold = own[:, forward.threshold :].ravel()  # of one that sets in, else empty
+            for name, part in forward.smooth_slices.items():
+                if changed[name] is self._plain[name]:
+                    changed[name] = changed[name].copy()
+                smooth = forward.discrepancy.at(own[:, part], threshold, self._view, name)
+                changed[name][rows] += smooth
+        return changed
+
+    def _factors(self, acting: _Acting, psi: Sequence[Array]) -> dict[str, Array]:
+        """By how much an effect departs from its formula in each output that it touches.
+
+        One plus what its form errors say, but for what is known of it: its sign, and where it is
+        nothing.
+        """
+        forwards = [f for f, _ in self._parts]
+        part, place = acting.having[0]
+        basis = forwards[part].form(self._view)[place]
+        found = {}
+        for name, role in forwards[part].roles.items():
+            if role in acting.effect.outputs:
+                form = [psi[j][:, forwards[j].form_slices[name][i]] for j, i in acting.having]
+                factor = (form[0] if len(form) == 1 else np.concatenate(form)) @ basis.T
+                factor += 1.0
+                found[name] = np.maximum(factor, 0.0, out=factor)
+        return found
 
 
 @dataclass(frozen=True)
 class _Acting:
     """An effect in some rows: its natural parameters there, and what it sees.
 
-    Factors by which it departs from its formula, by output.
+    Which hypotheses have it, and its place in each.
     """
 
     effect: Effect
-    rows: slice | NDArray[np.int64]
+    having: Sequence[tuple[int, int]]
+    rows: _Rows
     phi: Array
-    factors: Mapping[str, Array]
     view: View
 
-    def apart(self, moved: NDArray[np.int64]) -> Iterator[tuple[int, _Acting]]:
-        """Part the rows by what was moved there before."""
+    def apart(self, moved: NDArray[np.int64]) -> Iterator[tuple[int, _Rows, Any, Array, View]]:
+        """Part the rows by what was moved there before: that, rows, which, phi and view."""
         before = moved[self.rows]
         if before.size and (before == before[0]).all():
-            yield int(before[0]), self
+            yield int(before[0]), self.rows, slice(None), self.phi, self.view
             return
         places = np.arange(moved.size)[self.rows]
-        for some, mask in [(before == mask, mask) for mask in np.unique(before).tolist()]:
-            factors = {name: factor[some] for name, factor in self.factors.items()}
+        for mask in np.unique(before).tolist():
+            some = before == mask
             view = _seen(self.view, self.view.base, some)
-            yield mask, _Acting(self.effect, places[some], self.phi[some], factors, view)
+            yield mask, places[some], some, self.phi[some], view
 
 
 def _acting(
-    parts: Sequence[_Part], view: View, plain: Mapping[str, Array], idle: Collection[int]
-) -> list[_Acting]:
+    parts: Sequence[tuple[Forward, slice]], psi: Sequence[Array], view: View,
+    plain: Mapping[str, Array], idle: Idle,
+) -> list[_Acting]:  # fmt: skip
     """Effects, each once: what happens first, then what instruments make of it, by name."""
-    places: dict[str, list[tuple[_Part, int]]] = {}
-    for part in parts:
-        for i, effect in enumerate(part[0].hypothesis.effects):
-            if i not in idle:
-                places.setdefault(effect.name, []).append((part, i))
+    places: dict[str, list[tuple[int, int]]] = {}
+    for j, (forward, _) in enumerate(parts):
+        for i, effect in enumerate(forward.hypothesis.effects):
+            if i not in idle.get(j, ()):
+                places.setdefault(effect.name, []).append((j, i))
     found: list[_Acting] = []
     if not places:
         return found
     outputs = parts[0][0].data.outputs
     base = {o.role: o.problem.bound.from_response(plain[o.name]) for o in outputs}
-    for having in sorted(places.values(), key=_rank):
-        (forward, _, _), i = having[0]
-        effect, basis = forward.hypothesis.effects[i], forward.form(view)[i]
-        phi = np.concatenate([psi[:, f.phi_slices[j]] for (f, psi, _), j in having])
-        # One plus what its form errors say: by how much it departs from its formula, but for what
-        # is known of it: its sign, and where it is nothing.
-        factors = {}
-        for name, role in forward.roles.items():
-            if role in effect.outputs:
-                form = [psi[:, f.form_slices[name][j]] for (f, psi, _), j in having]
-                factor = (form[0] if len(form) == 1 else np.concatenate(form)) @ basis.T
-                factor += 1.0
-                factors[name] = np.maximum(factor, 0.0, out=factor)
-        rows: slice | NDArray[np.int64] = having[0][0][2]
+    for having in places.values():
+        j, i = having[0]
+        hypothesis = parts[j][0].hypothesis
+        phi = np.concatenate([psi[j][:, parts[j][0].phi_slices[i]] for j, i in having])
+        rows: _Rows = parts[j][1]
         if len(having) > 1:
-            rows = np.concatenate([np.arange(p.start, p.stop) for (_, _, p), _ in having])
-        natural = forward.hypothesis.effect_priors[i].to_natural(phi)
-        found.append(_Acting(effect, rows, natural, factors, _seen(view, base, rows)))
-    return found
+            of_each = (parts[j][1] for j, _ in having)
+            rows = np.concatenate([np.arange(part.start, part.stop) for part in of_each])
+        natural = hypothesis.effect_priors[i].to_natural(phi)
+        found.append(_Acting(hypothesis.effects[i], having, rows, natural, _seen(view, base, rows)))
+    return sorted(found, key=lambda a: (a.effect.instrument, a.effect.name))
 
 
-def _rank(having: Sequence[tuple[_Part, int]]) -> tuple[bool, str]:
-    (forward, _, _), i = having[0]
-    effect = forward.hypothesis.effects[i]
-    return effect.instrument, effect.name
-
-
-def _changed(
-    forward: Forward, shared: Array, name: str, view: View, effects: Sequence[_Acting],
+def _added(
+    forward: Forward, shared: Array, name: str, view: View, acting: Sequence[_Acting],
     plain: Array,
-) -> Array:  # fmt: skip
-    """One output with the effects in it.
-
-    What an effect adds to the output, given those before it, departs from its formula by a factor
-    of its own.
-    """
-    acting = [a for a in effects if name in a.factors]
-    if not acting:
-        return plain
+) -> list[list[_Added]]:  # fmt: skip
+    """What each effect adds to one output by the conditions that truly held, by its formula."""
     role, simulated = forward.roles[name], forward.simulated[name]
     t, misfit = shared[:, forward.theta_slices[name]], shared[:, forward.misfit_slices[name]]
     recorded = simulated.conditions(view)
@@ -147,35 +186,53 @@ def _changed(
     truly: dict[str, Array] = {}
     # Which conditions are no longer the recorded ones; with those a simulator has less to do.
     moved = np.zeros(len(plain), dtype=np.int64)
-    location, ahead = plain.copy(), plain.copy()
+    ahead = plain
+    added: list[list[_Added]] = []
     for a in acting:
-        for mask, some in a.apart(moved):
-            rows = some.rows
+        added.append([])
+        if role not in a.effect.outputs:
+            continue
+        for mask, rows, some, phi, seen in a.apart(moved):
             given = {
                 known: truly[known][rows] if mask & bits[known] else values
                 for known, values in conditions.items()
             }
-            found = some.effect.on_conditions(some.phi, role, given, some.view)
+            found = a.effect.on_conditions(phi, role, given, seen)
             if found is given:
                 continue
             there = simulated.predict_beyond(
                 t[rows], misfit[rows], {simulated.columns[known]: v for known, v in found.items()}
             )
-            added = there - ahead[rows]
-            added *= some.factors[name]
-            location[rows] += added
+            added[-1].append((rows, some, there - ahead[rows]))
+            if ahead is plain:
+                ahead = plain.copy()
             ahead[rows] = there
             for known in (known for known, values in found.items() if values is not given[known]):
                 if known not in truly:
                     truly[known] = np.empty(plain.shape)
                 truly[known][rows] = found[known]
                 moved[rows] |= bits[known]
-    for a in acting:
+    return added
+
+
+def _changed(
+    plain: Array, role: str, acting: Sequence[tuple[_Acting, Array, Sequence[_Added]]]
+) -> Array:
+    """One output with effects in it, each with its factors and what it adds by conditions.
+
+    What an effect adds to the output, given those before it, departs from its formula by a factor
+    of its own.
+    """
+    location = plain.copy()
+    for _, factor, added in acting:
+        for rows, some, change in added:
+            location[rows] += change * factor[some]
+    for a, factor, _ in acting:
         here = location[a.rows]
         changed = a.effect.on_output(a.phi, role, here, a.view)
         if changed is not here:
             change = changed - here
-            change *= a.factors[name]
+            change *= factor
             if any(k.at_most_all and k.output == role for k in a.effect.known):
                 np.maximum(change, -np.maximum(here, 0.0), out=change)
             change += here
@@ -183,6 +240,6 @@ def _changed(
     return location
 
 
-def _seen(view: View, base: Mapping[str, Array], rows: slice | NDArray[Any]) -> View:
+def _seen(view: View, base: Mapping[str, Array], rows: _Rows | NDArray[np.bool_]) -> View:
     """What an effect can see of some rows of what simulators predict."""
     return view.with_base({role: values[rows] for role, values in base.items()})

@@ -215,19 +215,19 @@ def _bounds_correction(problem: Residuals, psi: Array, gradient: Array, covarian
     One that is held at a bound has a slope there, which moves its normal beyond it.
     """
     sd = np.sqrt(np.diag(covariance))
+    bounded = np.isfinite(problem.lower) | np.isfinite(problem.upper)
     held = problem.blocked(psi[None], -gradient[None])[0]
-    total = 0.0
-    for i in np.flatnonzero(np.isfinite(problem.lower) | np.isfinite(problem.upper)).tolist():
-        slope = float(gradient[i] * sd[i]) if held[i] else 0.0
-        low = (problem.lower[i] - psi[i]) / sd[i] + slope
-        high = (problem.upper[i] - psi[i]) / sd[i] + slope
-        total += 0.5 * slope**2 + _ln_mass(low, high)
-    return total
+    slope = np.where(held, gradient * sd, 0.0)[bounded]
+    low, high = (
+        (end - psi)[bounded] / sd[bounded] + slope for end in (problem.lower, problem.upper)
+    )
+    return float((0.5 * slope**2 + _ln_mass(low, high)).sum())
 
 
-def _ln_mass(low: float, high: float) -> float:
+def _ln_mass(low: Array, high: Array) -> Array:
     """Log of the standard normal's mass between two ends."""
-    if low + high > 0.0:  # in its other tail, where differences are exact
-        low, high = -high, -low
-    ln_high = float(log_ndtr(high))
-    return ln_high + float(np.log(max(-np.expm1(float(log_ndtr(low)) - ln_high), 1e-300)))
+    # In its lower tail, where differences are exact.
+    swap = low + high > 0.0
+    low, high = np.where(swap, -high, low), np.where(swap, -low, high)
+    ln_low, ln_high = log_ndtr(low), log_ndtr(high)
+    return np.asarray(ln_high + np.log(np.maximum(-np.expm1(ln_low - ln_high), 1e-300)))

@@ -12,7 +12,7 @@ The vector psi of a hypothesis stacks, all with (truncated) normal or uniform pr
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property, lru_cache
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from calib.data.quantities import columns_of
 from calib.gap.campaigns import Campaigns
-from calib.gap.departed import departed_of_all
+from calib.gap.departed import Idle, departed_of_all
 from calib.gap.discrepancy import THRESHOLDS, Bases, Discrepancy
 from calib.gap.effects import Effect, View
 from calib.gap.hypothesis import Hypothesis
@@ -28,7 +28,7 @@ from calib.gap.shifts import ShiftMap, shift_map
 from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
 
-__all__ = ["FORM_ERROR", "Forward", "shifted_of_all"]
+__all__ = ["FORM_ERROR", "Forward", "fields_of_all"]
 
 # Relative size by which a formula may misrepresent its effect along one direction: the effect's
 # size, its tilt and bend over slip, its tilt over other conditions. Estimated from the true
@@ -43,6 +43,7 @@ FORM_ERROR = {
 }  # fmt: skip
 # Inadequacy of a simulator at the end of the lab's range of a condition, in noise sds.
 MISFIT = 1.0
+_NONE: Idle = {}
 # A prediction without a value is none, whatever the warnings.
 _SILENT = np.errstate(all="ignore")
 
@@ -180,9 +181,15 @@ class Forward:
         return np.stack([b for _, b in basis], axis=1), [FORM_ERROR[kind] for kind, _ in basis]
 
     def _predict(self, psi: Array, output: str, conditions: Mapping[str, Array]) -> Array:
-        """Simulator and its inadequacy at conditions, on the scale of the response."""
+        """Simulator and its inadequacy at conditions (n,), on the scale of the response."""
         t, misfit = psi[:, self.theta_slices[output]], psi[:, self.misfit_slices[output]]
-        return self.simulated[output].predict(t, misfit, conditions)
+        # Guesses and differences mostly leave the parameters of a simulator as in the row before.
+        new = (t[1:] != t[:-1]).any(axis=1) | (misfit[1:] != misfit[:-1]).any(axis=1)
+        if new.all():
+            return self.simulated[output].predict(t, misfit, conditions)
+        new = np.append(True, new)
+        found = self.simulated[output].predict(t[new], misfit[new], conditions)
+        return np.asarray(found[np.cumsum(new) - 1])
 
     @_SILENT
     def lab(self, psi: Array) -> dict[str, Array]:
@@ -192,13 +199,9 @@ class Forward:
     @_SILENT
     def simulator(self, psi: Array, view: View) -> dict[str, Array]:
         """Predict with the calibrated simulator alone, on the scale of the response."""
-        # Draws of what is not the simulators' have these in common.
-        once = psi[:1] if (psi[:, : self.n_shared] == psi[:1, : self.n_shared]).all() else psi
-        found = {
-            name: self._predict(once, name, s.conditions(view))
-            for name, s in self.simulated.items()
+        return {
+            name: self._predict(psi, name, s.conditions(view)) for name, s in self.simulated.items()
         }
-        return {o: np.broadcast_to(v, (len(psi), v.shape[1])) for o, v in found.items()}
 
     @_SILENT
     def campaigns(self, psi: Array) -> tuple[dict[str, Array], dict[str, Array]]:
@@ -223,11 +226,9 @@ class Forward:
         return lab, plain
 
     @_SILENT
-    def field(self, psi: Array, view: View, idle: Collection[int] = ()) -> dict[str, Array]:
-        """Predict field rows with the hypothesis in force, but for effects that are idle."""
-        if self.shift is None:
-            return self.departed(psi, view, self.simulator(psi, view), idle)
-        return self.departed(psi, view, shifted_of_all([(self, psi)], view), idle)
+    def field(self, psi: Array, view: View) -> dict[str, Array]:
+        """Predict field rows with the hypothesis in force."""
+        return self.without(psi, view)
 
     @property
     def causes(self) -> tuple[str, ...]:
@@ -236,39 +237,55 @@ class Forward:
         names += ["parameter_shift"] if self.shift is not None else []
         return (*names, *(["unknown"] if self.smooth_slices else []))
 
-    @_SILENT
-    def without(
-        self, psi: Array, view: View, *left_out: str, plain: dict[str, Array] | None = None
-    ) -> dict[str, Array]:
-        """Predict field rows with all of `causes` in force but some; plain as from `simulator`."""
+    def left_out(self, psi: Array, *causes: str) -> tuple[Array, list[int]]:
+        """Psi without some of `causes`, and effects that are idle then, by their place."""
         rest = psi.copy()
-        if "parameter_shift" in left_out:
+        if "parameter_shift" in causes:
             rest[:, self.shift_slice] = 0.0
-        if "unknown" in left_out:
+        if "unknown" in causes:
             for part in self.smooth_slices.values():
                 rest[:, part] = 0.0
-        idle = [i for i, e in enumerate(self.hypothesis.effects) if e.name in left_out]
-        if plain is None or self.shift is not None:
-            return self.field(rest, view, idle)
-        return self.departed(rest, view, plain, idle)
+        return rest, [i for i, e in enumerate(self.hypothesis.effects) if e.name in causes]
 
-    def departed(
-        self, psi: Array, view: View, plain: dict[str, Array], idle: Collection[int] = ()
-    ) -> dict[str, Array]:
-        """Add effects, but for those idle, and discrepancies to what simulators predict."""
-        return departed_of_all([(self, psi)], view, plain, idle)
+    def without(self, psi: Array, view: View, *left_out: str) -> dict[str, Array]:
+        """Predict field rows with all of `causes` in force but some."""
+        rest, idle = self.left_out(psi, *left_out)
+        plain = {} if self.shift is not None else self.simulator(psi, view)
+        return fields_of_all([(self, rest)], view, plain, {0: idle})
+
+    def departed(self, psi: Array, view: View, plain: dict[str, Array]) -> dict[str, Array]:
+        """Add effects and discrepancies to what simulators predict."""
+        return departed_of_all([(self, psi)], view, plain)
 
     @_SILENT
     def field_and_plain(self, psi: Array, view: View) -> tuple[dict[str, Array], dict[str, Array]]:
         """Predict as `field` and as `simulator` do."""
         plain = self.simulator(psi, view)
-        if self.shift is not None:
-            return self.field(psi, view), plain
-        return self.departed(psi, view, plain), plain
+        return fields_of_all([(self, psi)], view, plain), plain
 
 
 @_SILENT
-def shifted_of_all(asked: Sequence[tuple[Forward, Array]], view: View) -> dict[str, Array]:
+def fields_of_all(
+    asked: Sequence[tuple[Forward, Array]], view: View, plain: dict[str, Array], idle: Idle = _NONE
+) -> dict[str, Array]:
+    """Predict field rows with hypotheses on the same campaigns in force, as `departed_of_all` does.
+
+    Simulators of those with a shift are at other parameters than in `plain`.
+    """
+    shifted = [part for part in asked if part[0].shift is not None]
+    if not shifted:
+        return departed_of_all(asked, view, plain, idle)
+    there = _shifted_of_all(shifted, view)
+    if len(shifted) < len(asked):
+        of_it = np.concatenate([np.full(len(psi), f.shift is not None) for f, psi in asked])
+        plain = {name: values.copy() for name, values in plain.items()}
+        for name, values in there.items():
+            plain[name][of_it] = values
+        there = plain
+    return departed_of_all(asked, view, there, idle)
+
+
+def _shifted_of_all(asked: Sequence[tuple[Forward, Array]], view: View) -> dict[str, Array]:
     """Predict field rows with the simulators at the shifted parameters of hypotheses.
 
     Parameters

@@ -13,54 +13,76 @@ too small to see, and that of one effect among pairs whose other half is idle.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Mapping, Sequence
+from itertools import batched
 
 import numpy as np
+from numpy.typing import NDArray
 
+from calib.gap.campaigns import Campaigns
 from calib.gap.fit import Fit
-from calib.gap.forward import Forward
+from calib.gap.forward import Forward, fields_of_all
 from calib.gap.noise import Noise, noise_conditions
+from calib.inference.even import latin
 from calib.inference.random import generator
 from calib.models.base import Array
 
-__all__ = ["RELEVANT", "RELEVANT_IN_PAIR", "gap_size", "relevance", "sizes"]
+__all__ = ["RELEVANT", "RELEVANT_IN_PAIR", "gap_size", "relevance", "sizes", "sizes_of_all"]
 
 RELEVANT = 1.5
 RELEVANT_IN_PAIR = 1.0
+# Rows whose predictions stay in the processor's cache.
+_AT_ONCE = 1024
 
 
-def relevance(fit: Fit, seed: int, draws: int) -> float:
-    """Log of the factor by which restricting a hypothesis to relevant sizes changes its evidence.
+def relevance(asked: Sequence[tuple[Fit, int]], seed: int) -> list[float]:
+    """Log of the factor by which restricting hypotheses to relevant sizes changes their evidence.
 
     Parameters
     ----------
-    fit : Fit
+    asked : sequence of (Fit, int)
+        On the same campaigns, with the number of draws: of the prior, and of the posterior where it
+        has no sample. Zero for those that are not asked after.
     seed : int
-    draws : int
-        Of the prior, and of the posterior where it has no sample.
     """
-    hypothesis = fit.forward.hypothesis
-    if hypothesis.name == "none":
-        return 0.0
-    rng = generator(seed, "gap", "relevance", hypothesis.name)
+    known = [i for i, (f, n) in enumerate(asked) if n and f.forward.hypothesis.name != "none"]
+    drawn = [psi for i in known for psi in _drawn(*asked[i], seed)]
+    fits = [asked[i][0] for i in known for _ in range(2)]
+    found = [0.0] * len(asked)
+    every = sizes_of_all([
+        (fit.forward, fit.noise, psi) for fit, psi in zip(fits, drawn, strict=True)
+    ])  # fmt: skip
+    for i, (posterior, prior) in zip(known, batched(every, 2), strict=True):
+        found[i] = _log_share(posterior)
+        # What is relevant in no draw of the prior is no likelier for being restricted to that.
+        if _relevant(prior).any():
+            found[i] -= _log_share(prior)
+    return found
+
+
+def _drawn(fit: Fit, draws: int, seed: int) -> tuple[Array, Array]:
+    """Psi of the posterior, and of the prior of the effect about the simulator as it was fitted."""
+    rng = generator(seed, "gap", "relevance", fit.forward.hypothesis.name)
     # Of a sample each draw once: again it would say nothing new.
     posterior = fit.draws(rng, draws) if fit.sample is None else fit.sample
-    # Prior draws of the effect about the simulator as it was fitted.
     prior = np.repeat(fit.psi[None], draws, axis=0)
-    drawn = fit.forward.priors.sample(rng, draws)
-    first_effect = max(s.stop for s in fit.forward.misfit_slices.values())
+    first_effect = fit.forward.n_shared
+    drawn = fit.forward.priors.ppf(latin(rng, draws, fit.forward.n_dim))
     prior[:, first_effect:] = drawn[:, first_effect:]
-    size = partial(sizes, fit.forward, fit.noise)
-    return _log_share(size(posterior)) - _log_share(size(prior))
+    return posterior, prior
 
 
 def _log_share(size: Array) -> float:
-    # Draws for which the model has no value say nothing either way.
+    relevant = _relevant(size)
+    return float(np.log((relevant.sum() + 0.2) / (relevant.size + 0.4)))
+
+
+def _relevant(size: Array) -> NDArray[np.bool_]:
+    """Which draws are relevant, of those for which the model has a value."""
+    # Those for which it has none say nothing either way.
     size = size[np.isfinite(size).all(axis=1)]
     threshold = RELEVANT if size.shape[1] == 1 else RELEVANT_IN_PAIR
-    relevant = (size >= threshold).all(axis=1)
-    return float(np.log((relevant.sum() + 0.2) / (size.shape[0] + 0.4)))
+    return np.asarray((size >= threshold).all(axis=1))
 
 
 def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
@@ -72,35 +94,84 @@ def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
     A discrepancy of several outputs is as large as in the output where it is smallest: what changes
     one output only is not one of several.
     """
-    data, causes = forward.data, forward.causes
-    alone = len(causes) == 1
+    return sizes_of_all([(forward, noise, psi)])[0]
+
+
+def sizes_of_all(asked: Sequence[tuple[Forward, Mapping[str, Noise], Array]]) -> list[Array]:
+    """Sizes of the causes of hypotheses on the same campaigns, as `sizes` has them.
+
+    Effects are asked once for many: of few rows at a time that takes longer than the arithmetic.
+    """
+    found: list[list[Array]] = [[] for _ in asked]
+    batch: list[tuple[int, Array]] = []
+    room = _AT_ONCE
+
+    def ask() -> None:
+        parts = [(*asked[i][:2], psi) for i, psi in batch]
+        for (i, _), size in zip(batch, _sizes(parts) if parts else (), strict=True):
+            found[i].append(size)
+        batch.clear()
+
+    for i, (forward, _, psi) in enumerate(asked):
+        each = 1 + len(forward.causes)
+        for some in np.array_split(psi, max(1, -(-len(psi) * each // _AT_ONCE))):
+            if len(some) * each > room:
+                ask()
+                room = _AT_ONCE
+            batch.append((i, some))
+            room -= len(some) * each
+    ask()
+    return [np.concatenate(parts) for parts in found]
+
+
+def _sizes(asked: Sequence[tuple[Forward, Mapping[str, Noise], Array]]) -> list[Array]:
+    some, _, _ = asked[0]
+    data, view = some.data, some.data.view
+    # Every hypothesis, and if it has several causes it without each.
+    parts: list[tuple[Forward, Array]] = []
+    idle: dict[int, list[int]] = {}
+    places = []
+    for forward, _, psi in asked:
+        places.append([len(parts)])
+        parts.append((forward, psi))
+        for cause in forward.causes if len(forward.causes) > 1 else ():
+            rest, idle[len(parts)] = forward.left_out(psi, cause)
+            places[-1].append(len(parts))
+            parts.append((forward, rest))
+    plain = some.simulator(np.concatenate([psi[:, : some.n_shared] for _, psi in parts]), view)
     with np.errstate(all="ignore"):
-        full, plain = forward.field_and_plain(psi, data.view)
-        without = [
-            plain if alone else forward.without(psi, data.view, c, plain=plain) for c in causes
-        ]
-    columns = []
-    for other in without:
-        each = _rms(forward, noise, {name: full[name] - other[name] for name in full})
-        if alone and len(forward.hypothesis.smooth_outputs) > 1:
-            columns.append(np.min([each[n] for n in forward.hypothesis.smooth_outputs], axis=0))
-        else:
-            columns.append(np.max(list(each.values()), axis=0))
-    return np.stack(columns, axis=1)
+        full = fields_of_all(parts, view, plain, idle)
+    ends = np.cumsum([len(psi) for _, psi in parts]).tolist()
+    rows = [slice(end - len(psi), end) for (_, psi), end in zip(parts, ends, strict=True)]
+    found = []
+    for (forward, noise, _), (at, *without) in zip(asked, places, strict=True):
+        others = [{o: v[rows[j]] for o, v in full.items()} for j in without]
+        others = others or [{o: v[rows[at]] for o, v in plain.items()}]
+        columns: list[Array] = []
+        for other in others:
+            change = {o: full[o][rows[at]] - v for o, v in other.items()}
+            each = _rms(data, noise, change)
+            smooth = forward.hypothesis.smooth_outputs
+            if not without and len(smooth) > 1:
+                columns.append(np.stack([each[n] for n in smooth]).min(axis=0))
+            else:
+                columns.append(np.stack(list(each.values())).max(axis=0))
+        found.append(np.stack(columns, axis=1))
+    return found
 
 
 def gap_size(fit: Fit) -> float:
     """Size of all that a fit adds to its simulators, in noise sds (rms, where it is largest)."""
     full, plain = fit.forward.field_and_plain(fit.psi[None], fit.forward.data.view)
-    each = _rms(fit.forward, fit.noise, {name: full[name] - plain[name] for name in full})
+    each = _rms(fit.forward.data, fit.noise, {name: full[name] - plain[name] for name in full})
     return float(np.nanmax([size[0] for size in each.values()]))
 
 
 def _rms(
-    forward: Forward, noise: Mapping[str, Noise], change: Mapping[str, Array]
+    data: Campaigns, noise: Mapping[str, Noise], change: Mapping[str, Array]
 ) -> dict[str, Array]:
     """Rms of changes (k, n) of each output over its field rows, in noise sds, shape (k,)."""
-    data, at = forward.data, noise_conditions(forward.data.view)
+    at = noise_conditions(data.view)
     return {
         o.name: np.sqrt(
             np.square(change[o.name][:, o.rows] / noise[o.name].sd(at.rows(o.rows))).mean(axis=1)

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.gap.campaigns import Campaigns
-from calib.gap.departed import departed_of_all
-from calib.gap.forward import Forward, shifted_of_all
+from calib.gap.forward import Forward, fields_of_all
 from calib.gap.noise import Noise, ln_averaged, most_probable
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
@@ -108,19 +107,16 @@ class Coordinates:
         step = _DIFFERENCE * self.width
         return np.where(psi + step > self.upper, -step, step)
 
-    def update_noises(self, raw: Array, scaled: Array, hessian: Array) -> list[dict[str, Noise]]:
+    def update_noises(self, raw: Array, left: Array) -> list[dict[str, Noise]]:
         """Noise scales that maximise the marginal likelihood, parameters allowed for.
 
         Parameters
         ----------
         raw : ndarray, shape (m, N)
-        scaled : ndarray, shape (m, d, N)
-            Derivatives of the residuals over their sds.
-        hessian : ndarray, shape (m, d, d)
+        left : ndarray, shape (m, N)
+            The part of the variance of each that the parameters did not take up.
         """
-        inverse = np.linalg.inv(hessian + diagonal(1e-6 / self.width**2))
-        at, left = self.data.at_rows, variance_left(scaled, inverse)
-        # Each residual lost the part of its variance that the parameters took up.
+        at = self.data.at_rows
         squared = np.square(raw) / left
         found = [most_probable(squared[:, part], at[o]) for o, part in self.parts.items()]
         return [dict(zip(self.parts, each, strict=True)) for each in zip(*found, strict=True)]
@@ -237,15 +233,7 @@ def _batched(asked: Sequence[tuple[Residuals, Array]], batch: list[int]) -> dict
     forward, view = asked[batch[0]][0].forward, asked[batch[0]][0].data.view
     parts = [(asked[i][0].forward, asked[i][1]) for i in batch]
     shared = np.concatenate([psi[:, : forward.n_shared] for _, psi in parts])
-    # Guesses and differences mostly leave the simulators' parameters as in the row before.
-    new = np.append(True, (shared[1:] != shared[:-1]).any(axis=1))
-    index = np.cumsum(new) - 1
-    lab, plain = ({o: v[index] for o, v in p.items()} for p in forward.plain(shared[new]))
-    ends = np.cumsum([len(psi) for _, psi in parts]).tolist()
-    shifted = [j for j, (f, _) in enumerate(parts) if f.shift is not None]
-    if shifted:
-        rows = np.concatenate([np.arange(ends[j] - len(parts[j][1]), ends[j]) for j in shifted])
-        for name, there in shifted_of_all([parts[j] for j in shifted], view).items():
-            plain[name][rows] = there
-    raw = asked[batch[0]][0].beside(lab, departed_of_all(parts, view, plain))
+    lab, plain = forward.plain(shared)
+    ends = np.cumsum([len(psi) for _, psi in parts])
+    raw = asked[batch[0]][0].beside(lab, fields_of_all(parts, view, plain))
     return dict(zip(batch, np.split(raw, ends[:-1]), strict=True))

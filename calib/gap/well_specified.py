@@ -213,7 +213,7 @@ def _gap(
     at = noise_conditions(data.view)
     with np.errstate(all="ignore"):
         full, rest = forward.field(psi, data.view), forward.simulator(psi, data.view)
-        rest = forward.without(psi, data.view, cause, plain=rest) if cause else rest
+        rest = forward.without(psi, data.view, cause) if cause else rest
     each = [
         ((full[o.name] - rest[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))) ** 2
         for o in data.outputs

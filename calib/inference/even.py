@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.models.base import Array
 
-__all__ = ["even_points"]
+__all__ = ["even_points", "latin"]
 
 
 @lru_cache(maxsize=64)
@@ -27,3 +27,15 @@ def even_points(size: int, dim: int) -> Array:
     points = (0.5 + np.arange(1.0, size + 1)[:, None] * steps) % 1.0
     points.setflags(write=False)  # every caller is given the same
     return np.asarray(points)
+
+
+def latin(rng: np.random.Generator, size: int, dim: int) -> Array:
+    """Draw from the unit cube by a Latin hypercube, shape (size, dim).
+
+    One point in each of `size` slices of every coordinate, so that a mean over them hardly varies
+    by what depends on one coordinate at a time (M. D. McKay, R. J. Beckman, W. J. Conover,
+    Technometrics 21 (1979) 239-245, doi:10.1080/00401706.1979.10489755). `scipy.stats.qmc` has it
+    as well, which takes longer to import than a diagnosis to start.
+    """
+    slices = rng.permuted(np.tile(np.arange(size)[:, None], (1, dim)), axis=0)
+    return np.asarray((slices + rng.uniform(size=(size, dim))) / size)

@@ -130,7 +130,8 @@ def test_noise_does_not_depend_on_the_unit_of_a_parameter(problems):
         other.width = problem.width / unit
         scaled = unit * problem.jacobian(psi, raw, around) / sds
         hessian = scaled @ scaled.swapaxes(1, 2) + np.diag(other.width**-2.0)
-        noises = other.update_noises(raw, scaled, hessian)
+        slope = Slope(sds, scaled, psi, hessian, 1e-6 / other.width**2)
+        noises = other.update_noises(raw, slope.left)
         found.append([noise.sigma for each in noises for noise in each.values()])
     np.testing.assert_allclose(found[1], found[0], rtol=1e-6)
     np.testing.assert_allclose(found[2], found[0], rtol=1e-6)

@@ -10,8 +10,9 @@ import pytest
 
 from calib.data.quantities import role_of
 from calib.gap.campaigns import campaigns
+from calib.gap.departed import Departed
 from calib.gap.effects import EFFECTS, Effect
-from calib.gap.forward import Forward
+from calib.gap.forward import Forward, fields_of_all
 from calib.gap.hypotheses import (
     effect_priors,
     joined,
@@ -330,6 +331,58 @@ def test_without_a_cause_the_others_stay(data):
         neither = forward.without(psi, data.view, "parameter_shift", "unknown")
         for o in data.names:
             np.testing.assert_allclose(neither[o], plain[o], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "names", [("lug_thrust",), ("pressure_gauge_bias", "slip_zero_shift"),
+              ("load_transfer", "multipass_compaction", "sensor_drift")],
+)  # fmt: skip
+def test_what_is_added_by_conditions_serves_for_any_form_errors(data, names):
+    """Asked again with other form errors, as asked for the first time with them."""
+    forward = Forward(data, joined(*(single(data, n) for n in names)), SIGMA)
+    rng = np.random.default_rng(6)
+    psi = forward.priors.sample(rng, 5)
+    other = psi.copy()
+    for part in (s for o in forward.form_slices.values() for s in o):
+        other[:, part] = 0.3 * rng.standard_normal((5, part.stop - part.start))
+    plain = forward.simulator(psi, data.view)
+    departed = Departed([(forward, psi)], data.view, plain)
+    for form in (psi, other):
+        found, expected = departed.at([form]), forward.departed(form, data.view, plain)
+        for o in data.names:
+            np.testing.assert_array_equal(found[o], expected[o])
+    # Without what an effect adds: as by a formula that misrepresents it by all of its size.
+    last = len(names) - 1
+    found = departed.at([other], last)
+    expected = forward.without(other, data.view, names[last])
+    for o in data.names:
+        np.testing.assert_allclose(found[o], expected[o], rtol=1e-12, atol=1e-12)
+
+
+def test_of_several_that_are_asked_each_leaves_its_own_out(data):
+    one, other = single(data, "lug_thrust"), single(data, "force_offset")
+    both, shifted = joined(one, other), shifts(data)[0]
+    rng = np.random.default_rng(7)
+    asked = []
+    for h, n in ((both, 3), (one, 2), (shifted, 4), (both, 1)):
+        forward = Forward(data, h, SIGMA)
+        asked.append((forward, forward.priors.sample(rng, n)))
+    plain = asked[0][0].simulator(
+        np.concatenate([psi[:, : f.n_shared] for f, psi in asked]), data.view
+    )
+    kept = {o: v.copy() for o, v in plain.items()}
+    found = fields_of_all(asked, data.view, plain, {0: [0], 3: [0, 1]})
+    start = 0
+    without = (("force_offset",), (), (), both.name.split("+"))
+    for (f, psi), left_out in zip(asked, without, strict=True):
+        expected = f.without(psi, data.view, *left_out)
+        for o in data.names:
+            np.testing.assert_allclose(
+                found[o][start : start + len(psi)], expected[o], rtol=1e-12, atol=1e-12
+            )
+        start += len(psi)
+    for o in data.names:  # what was given is as it was
+        np.testing.assert_array_equal(plain[o], kept[o])
 
 
 def test_a_vector_stacks_the_parts_of_a_hypothesis_in_their_order(data):

@@ -13,13 +13,18 @@ import calib.gap.relevance as module
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import joined, singles, unknowns
 from calib.gap.noise import Noise, noise_conditions
-from calib.gap.relevance import _log_share, relevance, sizes
+from calib.gap.relevance import _log_share, sizes, sizes_of_all
 from tests.gap.cases import CHOICE, campaigns_of, ranking_of
 from tests.gap.fits import SIGMA, fit_at
 
 
 def fit_of(case: str | None, name: str):
     return ranking_of(case).fits[name][0]
+
+
+def relevance(fit, seed: int, draws: int) -> float:
+    (found,) = module.relevance([(fit, draws)], seed)
+    return found
 
 
 def test_none_has_no_size_to_restrict():
@@ -130,11 +135,11 @@ def test_prior_and_posterior_draws_are_told_by_their_effect_alone(monkeypatch):
     large = replace(found, psi=psi)
     asked = []
 
-    def noted(forward, noise, psi):
-        asked.append(psi)
-        return sizes(forward, noise, psi)
+    def noted(parts):
+        asked.extend(psi for _, _, psi in parts)
+        return sizes_of_all(parts)
 
-    monkeypatch.setattr(module, "sizes", noted)
+    monkeypatch.setattr(module, "sizes_of_all", noted)
     gained = relevance(large, 3, 500)
     posterior, prior = asked
     np.testing.assert_allclose(posterior, np.tile(psi, (500, 1)), atol=1e-6)
@@ -162,3 +167,47 @@ def test_of_several_causes_each_is_as_large_as_what_goes_with_it():
     psi = alone.psi.copy()
     psi[alone.forward.smooth_slices["drawbar_pull"].start] = 0.3
     assert sizes(alone.forward, alone.noise, psi[None])[0, 0] > 1.0
+
+
+def test_what_no_draw_of_the_prior_makes_relevant_gains_nothing_by_it(monkeypatch):
+    """Its share before the data is as good as none, and so is the ratio to that."""
+    fit = fit_of("lug_thrust", "lug_thrust")
+
+    def of_sizes(posterior: float, prior: float) -> float:
+        monkeypatch.setattr(
+            module, "sizes_of_all", lambda _: [np.full((n, 1), s) for n, s in (
+                (1500, posterior), (400, prior))]
+        )  # fmt: skip
+        return relevance(fit, 1, 400)
+
+    assert of_sizes(0.2, 0.3) == pytest.approx(np.log(0.2 / 1500.4))
+    assert of_sizes(9.0, 0.3) == pytest.approx(np.log(1500.2 / 1500.4))
+    assert of_sizes(9.0, 9.0) == pytest.approx(np.log(1500.2 / 1500.4 / (400.2 / 400.4)))
+
+
+def test_sizes_of_many_hypotheses_are_those_of_each():
+    """Whatever is asked for at once: of sets, shifts and discrepancies, few draws and many."""
+    ranking = ranking_of("lug_thrust")
+    rng = np.random.default_rng(4)
+    asked = []
+    for name, n in (("lug_thrust", 700), ("parameter_shift", 3), ("unknown", 90), ("none", 2),
+                    ("lug_thrust+slip_sinkage", 900), ("parameter_shift+unknown", 5)):  # fmt: skip
+        if name in ranking.fits:
+            fit = ranking.fits[name][0]
+            asked.append((fit.forward, fit.noise, fit.draws(rng, n)))
+    assert len(asked) >= 5
+    every = sizes_of_all(asked)
+    for (forward, noise, psi), found in zip(asked, every, strict=True):
+        assert found.shape == (len(psi), max(1, len(forward.causes)))
+        some = slice(None, None, max(1, len(psi) // 3))
+        np.testing.assert_allclose(found[some], sizes(forward, noise, psi[some]), rtol=1e-9)
+        full = forward.field(psi[some], forward.data.view)
+        for j, cause in enumerate(forward.causes if len(forward.causes) > 1 else ()):
+            rest = forward.without(psi[some], forward.data.view, cause)
+            at = noise_conditions(forward.data.view)
+            written = np.max([
+                np.sqrt(np.mean(np.square(
+                    (full[o.name] - rest[o.name])[:, o.rows] / noise[o.name].sd(at.rows(o.rows))
+                ), axis=1)) for o in forward.data.outputs
+            ], axis=0)  # fmt: skip
+            np.testing.assert_allclose(found[some, j], written, rtol=1e-9)

@@ -14,7 +14,8 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import singles
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, most_probable
-from calib.gap.residuals import Residuals, residuals_of_all
+from calib.gap.residuals import Residuals, residuals_of_all, variance_left
+from calib.gap.simulated import Simulated
 from tests.gap.cases import NOISE, campaigns_of, make_case
 
 SIGMA = {o: NOISE[o] for o in ("drawbar_pull", "rut_depth")}
@@ -112,7 +113,7 @@ def test_noise_is_of_residuals_that_lost_what_the_parameters_took_up(problem):
     # Of one row the parameters know hardly anything but by itself.
     scaled[0, :, 7] *= 300.0
     hessian[0] += np.outer(scaled[0, :, 7], scaled[0, :, 7])
-    found = problem.update_noises(raw, scaled, hessian)
+    found = problem.update_noises(raw, variance_left(scaled, np.linalg.inv(hessian)))
     for i in range(2):
         leverage = np.einsum("jn,jk,kn->n", scaled[i], np.linalg.inv(hessian[i]), scaled[i])
         assert (leverage[7] > 0.95) == (i == 0)
@@ -178,7 +179,25 @@ def test_no_more_than_about_a_thousand_vectors_are_predicted_at_once(problem, mo
         asked.clear()
         assert [len(r) for r in residuals_of_all([(problem, some(n)) for n in sizes])] == [*sizes]
         assert asked == expected
-    # One vector that is asked for many times is predicted once.
+
+
+def test_a_simulator_is_asked_once_while_its_own_parameters_stay(problem, monkeypatch):
+    """As from one guess at an effect to the next, and from one difference to the next."""
+    asked = []
+    predict = Simulated.predict
+
+    def noted(self, t, misfit, conditions):
+        asked.append(len(t))
+        return predict(self, t, misfit, conditions)
+
+    monkeypatch.setattr(Simulated, "predict", noted)
+    psi = np.array([p.loc for p in problem.forward.priors.free])
+    residuals_of_all([(problem, np.tile(psi, (40, 1))), (problem, psi + np.zeros((2, 1)))])
+    assert asked == [1, 1]
     asked.clear()
-    residuals_of_all([(problem, np.repeat(some(1), 40, axis=0)), (problem, some(2))])
-    assert asked == [3]
+    moved = np.tile(psi, (5, 1))
+    moved[1:4, problem.forward.theta_slices["rut_depth"].start] += [0.01, 0.02, 0.03]
+    found = problem.raw(moved)
+    assert asked == [1, 5]  # pull, then ruts
+    for i, row in enumerate(moved):
+        np.testing.assert_allclose(problem.raw(row[None])[0], found[i], rtol=1e-12)

@@ -21,7 +21,7 @@ from calib.gap.hypotheses import dependences
 from calib.gap.inclusion import inclusion_probability
 from calib.gap.odds import Odds, coarsening, probabilities
 from calib.gap.relevance import RELEVANT, sizes
-from calib.gap.which import Ranking, _check_names, _score, _scored, calibrate_lab, rank
+from calib.gap.which import Ranking, _check_names, _scored, _scores, calibrate_lab, rank
 from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 
 
@@ -335,9 +335,13 @@ def test_a_score_is_evidence_times_relevance_times_share(monkeypatch):
     forward = copy(fit.forward)
     forward.hypothesis = hypothesis
     shared = replace(fit, forward=forward)
-    monkeypatch.setattr("calib.gap.which.relevance", lambda *_: -2.0)
-    assert _score(shared, 1, 100) == pytest.approx(fit.log_evidence - 2.0 + np.log(0.3))
-    assert _score(shared, 1, 0) == pytest.approx(fit.log_evidence + np.log(0.3))
+    monkeypatch.setattr("calib.gap.which.relevance", lambda asked, _: [-2.0 for _ in asked])
+    assert _scores([(shared, 100), (fit, 100)], 1) == pytest.approx(
+        [fit.log_evidence - 2.0 + np.log(0.3), fit.log_evidence - 2.0]
+    )
+    monkeypatch.undo()
+    # Whose relevance is not asked after, it is not restricted to.
+    assert _scores([(shared, 0)], 1) == pytest.approx([fit.log_evidence + np.log(0.3)])
 
 
 def variant(name: str, evidence: float, share: float = 1.0):
@@ -396,9 +400,9 @@ def test_variants_in_play_are_refined_and_those_far_behind_not_even_drawn(monkey
     """
     asked = []
 
-    def relevance(found, seed, draws):
-        asked.append((found.log_evidence, draws))
-        return 0.0
+    def relevance(every, seed):
+        asked.extend((found.log_evidence, draws) for found, draws in every if draws)
+        return [0.0] * len(every)
 
     monkeypatch.setattr("calib.gap.which.relevance", relevance)
     refining(monkeypatch, dict.fromkeys(("none", "a", "b"), 0.25))
@@ -418,15 +422,15 @@ def test_variants_in_play_are_refined_and_those_far_behind_not_even_drawn(monkey
     assert [a is b for a, b in zip(refined["a"], fits["a"], strict=True)] == [
         True, False, False, True, True, True,
     ]  # fmt: skip
-    drawn = {n: {round(e - base["a"], 2) for e, m in asked if m == n} for n in (160, 48)}
-    assert {-3.9, -1.0, -3.4, -6.9} <= drawn[160]
-    assert drawn[48] == {-9.9}
-    assert sum(n == 3000 for _, n in asked) == 3
+    drawn = {n: {round(e - base["a"], 2) for e, m in asked if m == n} for n in (96, 32)}
+    assert {-3.9, -1.0, -3.4, -6.9} <= drawn[96]
+    assert drawn[32] == {-9.9}
+    assert sum(n == 1500 for _, n in asked) == 3
 
 
 def test_what_comes_into_play_when_others_lose_by_their_draws_is_refined_too(monkeypatch):
     """Laplace's evidence of the best was five nats too high: what was behind it is not, then."""
-    monkeypatch.setattr("calib.gap.which.relevance", lambda found, seed, draws: 0.0)
+    monkeypatch.setattr("calib.gap.which.relevance", lambda asked, _: [0.0] * len(asked))
     asked = refining(monkeypatch, {"a": -5.0, "b": -0.1, "c": 0.0})
     odds = Odds(1, {})
     at = {"a": 0.0, "b": -5.0, "none": -9.5, "c": -8.0}
