@@ -27,6 +27,7 @@ BOTH = f"summary.json and {DIAGNOSIS}"
 PICTURE = re.compile(r"(data:image/png;base64,)([A-Za-z0-9+/=]*)")
 
 
+@pytest.mark.slow  # so is the reference report, under three kernels
 def test_an_untouched_report_is_the_same(whole: Path) -> None:
     outcome = check(whole)
     assert different(outcome) == {}

@@ -73,6 +73,7 @@ def outside(address: str) -> bool:
     )
 
 
+@pytest.mark.slow  # `make docs` builds them with warnings as errors
 def test_no_page_asks_for_anything_outside(built: Path) -> None:
     pages = list(built.rglob("*.html"))
     assert len(pages) > len(MODELS) + len(EFFECTS) + len(QUANTITIES)
@@ -86,6 +87,7 @@ def test_no_page_asks_for_anything_outside(built: Path) -> None:
         assert [a + b for a, b in fetched if outside(a + b)] == [], path
 
 
+@pytest.mark.slow  # `make docs` builds them with warnings as errors
 def test_pages_hold_in_a_browser(built: Path, browser: Browser) -> None:
     for page in ("index", "formats/inputs", "declared/quantities/index"):
         assert faults(browser, built / f"{page}.html") == [], page
@@ -106,6 +108,7 @@ def test_what_is_outside_is_seen() -> None:
     assert page.alt == ["A"]
 
 
+@pytest.mark.slow  # `make docs` builds them with warnings as errors
 def test_every_declaration_has_its_page(built: Path) -> None:
     for folder, declared in (("models", MODELS), ("effects", EFFECTS), ("quantities", QUANTITIES)):
         pages = {path.stem for path in (built / "declared" / folder).glob("*.html")}
@@ -116,6 +119,7 @@ def test_every_declaration_has_its_page(built: Path) -> None:
         assert all(name in text for name in (*model.parameters, "sigma", *model.conditions))
 
 
+@pytest.mark.slow  # `make docs` builds them with warnings as errors
 def test_the_schemas_can_be_downloaded(built: Path) -> None:
     found = {path.name: json.loads(path.read_text()) for path in built.rglob("_downloads/*/*.json")}
     inputs = {"priors", "plan", "simulator", "case"}

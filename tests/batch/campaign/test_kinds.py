@@ -122,6 +122,7 @@ def wheel(tmp_path) -> Iterator[Path]:
         registry.discard("campaign_wheel")
 
 
+@pytest.mark.slow
 def test_a_slow_simulator_is_emulated_where_the_campaign_is_started(wheel, tmp_path):
     found = register_file(wheel)
     text = '[[fit]]\nname = "a"\ndata = ["lab.csv"]\nmodels = ["campaign_wheel"]\n'

@@ -231,6 +231,7 @@ def test_a_script_without_a_guard_is_told_so(tmp_path):
     assert list((tmp_path / "out").glob("*.json")) == []
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_lost_is_told(tmp_path):
     with scheduler_and_worker(tmp_path) as (address, processes):
 

@@ -70,7 +70,7 @@ def test_an_unknown_noise_scale() -> None:
     assert abs(draws.log_evidence - model.log_evidence_unknown()) < 5.0 * evidence_error(draws)
 
 
-@pytest.mark.slow  # `test_an_attempt_that_fails_teaches_the_next` ends on a harder one
+@pytest.mark.slow  # `test_an_attempt_that_fails_teaches_the_next` ends on a harder one, as slowly
 def test_a_banana() -> None:
     def log_prob(t):
         bent = t[:, 1] - t[:, 0] ** 2
@@ -179,6 +179,7 @@ def on_ridge(d: int, thinness: float, max_steps: int) -> Draws:
     return run(ridge(thinness), np.zeros(d), covariance, settings=settings)
 
 
+@pytest.mark.slow
 def test_an_attempt_that_fails_teaches_the_next() -> None:
     first, whole = (on_ridge(4, 0.3, steps) for steps in (200, 1600))
     assert not first.report.passed

@@ -69,6 +69,7 @@ def test_emulated_posteriors_are_calibrated_and_share_their_first_runs(tmp_path:
     assert len(asked) <= int(most[1])
 
 
+@pytest.mark.slow
 def test_a_few_campaigns_leave_their_records_and_make_no_run_twice(tmp_path: Path) -> None:
     asked = declared(tmp_path / "runs", runs=30, checks=4, tolerance=0.5)
     where, kept = data(tmp_path), tmp_path / "sbc"
