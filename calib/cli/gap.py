@@ -24,7 +24,7 @@ def diagnose(
     case: Annotated[
         Path | None,
         typer.Argument(
-            help="Folder with a case.toml; its [context] takes what is suspected or excluded."
+            help="Folder with a case.toml; its table context takes what is suspected or excluded."
         ),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder to write.")] = Path("calib-diagnosis"),

@@ -12,8 +12,8 @@ nearly, once the other coordinates u are given:
   Fearnhead, O. Papaspiliopoulos, G. O. Roberts, J. R. Stat. Soc. B 70 (2008) 755-777,
   doi:10.1111/j.1467-9868.2008.00661.x).
 
-The likelihood is averaged over the noise. A discrepancy is integrated out at the noise of the fit:
-its coefficients are drawn there, and weighted with what averaging changes (`completed`).
+The likelihood is averaged over the noise. A discrepancy is integrated out at the noise of the fit
+and its coefficients are drawn there; its evidence has what averaging changes in it (`completed`).
 """
 
 from __future__ import annotations

@@ -108,7 +108,11 @@ def _as_sized(
         h = found.forward.hypothesis
         if not h.effects or with_prior(found, guesses.odds) < leading - _SEARCHED:
             continue
-        large = [e.name for i, e in enumerate(h.effects) if far_out(found, i, usual[e.name])]
+        large = [
+            e.name
+            for i, e in enumerate(h.effects)
+            if e.name not in guesses.data.case.context.sizes and far_out(found, i, usual[e.name])
+        ]
         for some in ([], large):
             other = resized(h, usual, some)
             if other not in there:

@@ -156,7 +156,9 @@ def rank(
         h for h in readings if h.name in context.names or following & set(h.effects[0].outputs)
     ]
     fits |= guesses.fit(single[len(asked) :])
-    far = [h for h in single if far_out(fits[h.name][0], 0, h.effect_priors[0])]
+    # A size that is known is not several times as large.
+    free = [h for h in single if h.name not in context.sizes]
+    far = [h for h in free if far_out(fits[h.name][0], 0, h.effect_priors[0])]
     for name, more in guesses.fit([wider(h) for h in far]).items():
         fits[name] += more
     fits |= sets_and_unlisted(guesses, [h.name for h in single if h.name not in beside], fits)

@@ -40,7 +40,7 @@ from calib.report.gap_rows import (
     unit_after,
 )
 from calib.report.gap_runs import over_runs
-from calib.report.gap_sizes import size_sentences, where_to_look
+from calib.report.gap_sizes import ends_text, size_sentences, where_to_look
 from calib.report.gap_verdict import GapVerdict, judge_gap
 from calib.report.labels import MINUS, axis_of, joined, odds_text, short
 from calib.report.parameters import parameter_text
@@ -142,11 +142,16 @@ def _without(found: Diagnosis) -> str:
 def _cause(found: Diagnosis, name: str, c: Included) -> CauseFact:
     words = "something unlisted" if name == UNLISTED else short_name(name)
     fits = (fit for group in found.ranking.fits.values() for fit in group)
-    effects = (e for fit in fits for e in fit.forward.hypothesis.effects if e.name == name)
-    fault = next((e.check for e in effects if e.instrument), "")
+    effects = {e.name: e for fit in fits for e in fit.forward.hypothesis.effects}
+    own = effects.get(name)
+    if own is None or not own.instrument:
+        return CauseFact(
+            name, words, title_of(found, name), c.probability, c.share, c.share_interval
+        )
+    same = [n for n, e in effects.items() if own.device and e.device == own.device]
     return CauseFact(
-        name, words, title_of(found, name), c.probability, c.share, c.share_interval, fault,
-        _size(found, name) if fault else "",
+        name, words, title_of(found, name), c.probability, c.share, c.share_interval, own.check,
+        _size(found, name), sorted(same) or [name],
     )  # fmt: skip
 
 
@@ -158,11 +163,12 @@ def _size(found: Diagnosis, name: str) -> str:
     for explanation in found.ranking.order:
         fit = found.ranking.best(explanation)
         h = fit.forward.hypothesis
-        for effect, priors, part in zip(
-            h.effects, h.effect_priors, fit.forward.phi_slices, strict=True
-        ):
+        for i, (effect, priors) in enumerate(zip(h.effects, h.effect_priors, strict=True)):
             if effect.name != name:
                 continue
+            if ends := ends_text(found, fit, i):
+                return ends
+            part = fit.forward.phi_slices[i]
             sds = np.sqrt(np.diag(fit.covariance))[part]
             rows = zip(priors.free, fit.psi[part], sds, strict=True)
             texts = {p.name: parameter_text(p, float(at), float(sd)) for p, at, sd in rows}

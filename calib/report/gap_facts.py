@@ -41,6 +41,7 @@ class CauseFact:
 
     `instrument` says how to check the one that is at fault; empty if wheel or soil is. `size` is
     its first parameter in the most probable explanation that has it: "offset 0.12 ± 0.02 kN".
+    `faults` are the names of all faults of the same instrument that were tested.
     """
 
     name: str
@@ -51,6 +52,7 @@ class CauseFact:
     interval: tuple[float, float]
     instrument: str = ""
     size: str = ""
+    faults: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,10 @@ def causes_text(e: GapEvidence) -> str:
             f"what is of no listed shape{where} is there with {odds_text(rest.probability)} and is "
             f"{_share(rest)} of it"
         )
-    return "; ".join(parts) or "No listed cause reaches 5 %"
+    if not parts:
+        return "No listed cause reaches 5 %"
+    several = ". Shares are rms over the rows of all outputs, in noise sds"
+    return "; ".join(parts) + (several if len(e.shrink) > 1 else "")
 
 
 def _share(c: CauseFact) -> str:
@@ -235,7 +240,9 @@ def how_far_text(e: GapEvidence) -> str:
         if s.interval[0] <= 0.0 < s.fraction:
             part += ", so it may not shrink at all"
         parts.append(part)
-    return f"{'; '.join(parts)}, as expected {e.shrink_place}"
+    faulty = [c.words for c in e.acting if c.instrument]
+    meant = f". Errors are of what the instrument reads, {joined(faulty)} in it" if faulty else ""
+    return f"{'; '.join(parts)}, as expected {e.shrink_place}{meant}"
 
 
 def _per_cent(ratio: float) -> str:

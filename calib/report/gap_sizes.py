@@ -134,6 +134,27 @@ def _by_pressure(found: Diagnosis, fit: Fit) -> str:
     return ", which here is a matter of pressure alone" if alone else ""
 
 
+def ends_text(found: Diagnosis, fit: Fit, i: int) -> str:
+    """Say what a fault of a reading, the i-th effect of a fit, adds at the first and last run.
+
+    Nothing of what does not go by the order of the runs, or is a factor.
+    """
+    h, view = fit.forward.hypothesis, found.data.view
+    effect, (role, *_) = h.effects[i], h.effects[i].outputs
+    o = next((o for o in found.data.outputs if o.role == role), None)
+    if effect.covariates != ("order",) or o is None or o.problem.bound.model.response == "log":
+        return ""
+    psi = fit.draws(generator(found.seed, "gap", "size", h.name), _N_DRAWS)
+    phi = h.effect_priors[i].to_natural(psi[:, fit.forward.phi_slices[i]])
+    order, axis = view.of("order"), output_axis(found, o.name)
+    added = effect.on_output(phi, role, np.zeros((len(phi), order.size)), view)
+    first, last = (
+        f"{format_value(float(d.mean()), float(d.std()))} {axis.unit}"
+        for d in axis.factor * added[:, [order.argmin(), order.argmax()]].T
+    )
+    return f"{first} at the first run and {last} at the last"
+
+
 def _threshold(found: Diagnosis, fit: Fit) -> str:
     forward, view = fit.forward, found.data.view
     h = forward.hypothesis

@@ -113,7 +113,8 @@ def _judge(e: GapEvidence) -> GapVerdict:
         several = f"at least {several}"
     rest = ""
     if e.remainder is not None and e.remainder.probability >= 0.5:
-        rest = ", and something besides that is not listed"
+        probably = "" if e.remainder.probability >= SURE else "probably "
+        rest = f"; something that is not listed {probably}acts besides"
     named = "Cause named" if len(acting) == 1 else "Causes named"
     likely = "Likely cause" if len(acting) == 1 else "Likely causes"
     return GapVerdict(
@@ -233,31 +234,38 @@ def _check_first(e: GapEvidence, faults: Mapping[str, str], runs: str | None) ->
         know = f"put suspected = {{{sure}}} {_CONTEXT}, diagnose again, and, "
     folder = "DIAGNOSIS being the new folder" if know else _FOLDER
     without = "".join(f" --without {name}" for name in names) or " --without CAUSE"
-    text = (
-        f"check the instrument before the model: {checks}. If it is at fault, correct the field's "
-        f"readings by what the check showed and diagnose them again; or {know}once it is "
-        f"mended, predict without the fault: {_PREDICT}{without}, {folder}. Leave the option out "
-        "to predict what the faulty instrument reads"
-    )
+    one = len(faults) == 1
+    # A second line of what is excluded would replace the first.
+    settled = list(dict.fromkeys([*e.excluded, *(n for c in causes for n in c.faults or [c.name])]))
+    listed = ", ".join(f'"{name}"' for name in settled)
+    rest = "that is" if one else "leave out what was not checked, the rest is"
+    exclude = f"put excluded = [{listed}] {_CONTEXT} ({rest} settled), " if names else ""
+    steps = [
+        f"check the {'instrument' if one else 'instruments'} before the model: {checks}"
+        + ("; ± is one sd" if "±" in checks else ""),
+        "correct the field's readings by what the check showed, be it all that is expected, a part "
+        f"or nothing; {exclude}and diagnose again, into another --out, to predict from that",
+        "if it showed all that is expected, readings may stay as they are instead: "
+        f"{know}once it is mended, predict without the fault: {_PREDICT}{without}, {folder}; leave "
+        "the option out to predict what the faulty instrument reads",
+        "if it can no longer be checked, predict as in (3) but from this folder: the doubt whether "
+        "it is at fault is in the band",
+    ]
     if e.runs is not None and e.runs.only and e.runs.probability >= 0.5:
-        text += f". If it is sound, the ground changed over the runs: {e.runs.outputs} alone "
-        text += "cannot tell"
-    elif names:
-        known = "".join(f'"{name}", ' for name in e.excluded)  # a second line would replace them
-        listed = ", ".join(f'"{name}"' for name in names)
-        which = f"[{known}{listed}]" if len(names) == 1 else f"[{known}...], of {listed},"
-        text += (
-            f". {'If it' if len(names) == 1 else 'What'} is sound, put excluded = {which} "
-            f"{_CONTEXT}, and diagnose again"
+        steps.append(
+            f"if it is sound, the ground changed over the runs: {e.runs.outputs} alone cannot tell"
         )
     also = [c for c in e.causes if c.instrument and SHOWN <= c.probability < 0.5 and not runs]
     if also:
         listed = joined([f"{c.words} ({odds_text(c.probability)}; {_check(c)})" for c in also])
-        text += f". Worth a check as well: {listed}"
-    if rest := _missing(e):
-        text += f". What is no fault, {joined(rest)}, belongs in the simulator; until then "
-        text += f"predictions include {'it' if len(rest) == 1 else 'them'}"
-    return text
+        steps.append(f"worth a check as well: {listed}")
+    if missing := _missing(e):
+        them = "it" if len(missing) == 1 else "them"
+        steps.append(
+            f"what is no fault, {joined(missing)}, belongs in the simulator; until then "
+            f"predictions include {them}"
+        )
+    return ". ".join(f"({i}) {step[0].upper()}{step[1:]}" for i, step in enumerate(steps, 1))
 
 
 def _check(c: CauseFact) -> str:
@@ -298,6 +306,9 @@ def _next(e: GapEvidence) -> list[tuple[str, str]]:
         measure = f"to separate {a} from {b}: {many} at {n.conditions}, added to the field's file"
         if any(c.instrument for c in e.acting):
             measure += ", taken with the instrument as it was, or all readings corrected alike"
+        measure += ", and diagnose again"
+    if text and any(c.instrument for c in e.acting):
+        measure = f"if no check is possible, or after it two are still tied, {measure}"
     return [*done, ("Then" if done else "Next", measure)]
 
 

@@ -51,6 +51,11 @@ def test_a_known_size_takes_the_place_of_the_prior():
     priors = found.ranking.fits["force_offset"][0].forward.hypothesis.effect_priors[0]
     (offset,) = priors.free
     assert (offset.loc, offset.scale) == (0.02, 0.001)
+    # The truth is far outside: no variant with a wider prior takes what was put in back.
+    every = [f.forward.hypothesis for group in found.ranking.fits.values() for f in group]
+    own = [p for h in every for e, p in zip(h.effects, h.effect_priors, strict=True)
+           if e.name == "force_offset"]  # fmt: skip
+    assert {p.free[0].scale for p in own} == {0.001}
 
 
 @pytest.mark.parametrize(

@@ -175,6 +175,8 @@ class Effect:
         Whether an instrument is at fault, not wheel or soil; predicted with it is what it reads.
     check : str
         How such an instrument is checked, in words.
+    device : str
+        The instrument, if other effects are faults of the same: one check settles them all.
     priors : str
         Its priors as the text of a prior file, if they are in no file.
     prior_file : Path, optional
@@ -193,6 +195,7 @@ class Effect:
     known: tuple[Known, ...] = ()
     instrument: bool = False
     check: str = "zero and span"
+    device: str = ""
     priors: str = ""
     prior_file: Path | None = None
 

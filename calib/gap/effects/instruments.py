@@ -31,7 +31,7 @@ class SlipZeroShift(_Fault):
     """A rolling radius wrong by a factor: 1 - s_true = (1 - s_recorded)(1 - error)."""
 
     name = "slip_zero_shift"
-    check = "the rolling radius once more, at each pressure"
+    check = "the rolling radius once more, at each pressure; above zero the recorded is too small"
     form = ("pressure",)  # a tyre rolls on a smaller radius at less inflation
     title = "the rolling radius behind the recorded slip is wrong"
     latex = (r"$1 - s_\mathrm{f} = (1 - s)(1 - \text{radius error})$ for the slip $s$",)
@@ -53,6 +53,8 @@ class ForceOffset(_Fault):
     """A constant error of the drawbar reading."""
 
     name = "force_offset"
+    device = "load cell"
+    check = "zero and span; above zero it reads too much"
     title = "the drawbar reading is off by a constant"
     latex = (r"$P_\mathrm{f} = P + \text{offset}$ for the pull $P$",)
     parameters = ("offset",)
@@ -73,7 +75,8 @@ class SensorDrift(_Fault):
     """A drift with run order: steady, settling, or from some run on; zeroed at any part of it."""
 
     name = "sensor_drift"
-    check = EARLY
+    device = "load cell"
+    check = f"{EARLY}; above zero it reads too much"
     title = "the drawbar reading drifts with run order"
     latex: tuple[str, ...] = (
         r"$P_\mathrm{f} = P + \text{drift}\,[g(u) - \text{zero at}]$ for the pull $P$",
@@ -107,7 +110,8 @@ class SensorStep(_Fault):
     """
 
     name = "sensor_step"
-    check = EARLY
+    device = "load cell"
+    check = f"{EARLY}; above zero it reads too much"
     title = "the drawbar reading jumps at some run, as when a sensor is replaced or slips"
     latex: tuple[str, ...] = (
         r"$P_\mathrm{f} = P + \text{jump}\,[H(u) - \text{zero at}]$ for the pull $P$",
@@ -159,7 +163,7 @@ class PressureGaugeBias(_Fault):
     """
 
     name = "pressure_gauge_bias"
-    check = "against another gauge, at each pressure"
+    check = "against another gauge, at each pressure; above zero there is more than it reads"
     form = ("extrapolation",)  # the simulator is used at pressures it was not fitted at
     title = "true inflation pressure differs from the recorded one"
     latex = (
@@ -204,6 +208,7 @@ class ConeIndexBias(_Fault):
     """A cone penetrometer that reads wrong by a gain and an offset."""
 
     name = "cone_index_bias"
+    check = "zero and span; above zero there is more than it reads"
     title = "the cone penetrometer reads wrong"
     latex = (
         (
@@ -235,7 +240,7 @@ class WaterContentBias(_Fault):
     """A moisture probe that reads wrong by a gain and an offset."""
 
     name = "water_content_bias"
-    check = "against samples dried in an oven"
+    check = "against samples dried in an oven; above zero there is more than it reads"
     title = "the moisture probe reads wrong"
     latex = (
         (

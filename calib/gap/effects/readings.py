@@ -37,7 +37,7 @@ class ReadingDrift(SensorDrift):
 
     def __init__(self, role: str, output: str, unit: str, typical: float) -> None:
         word = output.replace("_", " ")
-        self.name, self.outputs = f"{output}_drift", (role,)
+        self.name, self.outputs, self.device = f"{output}_drift", (role,), f"{word} gauge"
         self.title = f"the {word} reading drifts with run order"
         self.latex = tuple(_of(word, unit, line) for line in SensorDrift.latex)
         self.priors = _priors(self.name, {"drift": _SIZE * typical}, unit, self.parameters[1:])
@@ -48,7 +48,7 @@ class ReadingStep(SensorStep):
 
     def __init__(self, role: str, output: str, unit: str, typical: float) -> None:
         word = output.replace("_", " ")
-        self.name, self.outputs = f"{output}_step", (role,)
+        self.name, self.outputs, self.device = f"{output}_step", (role,), f"{word} gauge"
         self.title = f"the {word} reading jumps at some run, as when a gauge is replaced or slips"
         self.latex = tuple(_of(word, unit, line) for line in SensorStep.latex)
         self.priors = _priors(self.name, {"jump": _SIZE * typical}, unit, self.parameters[1:])

@@ -204,6 +204,11 @@ def _placebo_caption(placebo: Placebo, named: str) -> str:
             f", and the best single effect besides, {short_name(runner)}, "
             f"{percent(max(placebo.shrink(runner), 0.0))}"
         )
+    if "unknown" in placebo.left and named != "unknown":
+        text += (
+            ". Something unlisted, which is free to follow whatever is there, removes "
+            f"{percent(max(placebo.shrink('unknown'), 0.0))}"
+        )
     if "none" in placebo.left:
         text += (
             f". Without any effect, {short_name('none')}, "

@@ -132,7 +132,7 @@ def test_less_than_sure_is_hedged_with_rivals_and_a_measurement():
     # ln 20 = 3.0 nats at 1.2 each.
     assert facts["Next"] == (
         "To separate lug thrust from drift: about 3 measurements at slip 65 %, added to the "
-        "field's file"
+        "field's file, and diagnose again"
     )
 
 
@@ -180,7 +180,7 @@ def test_where_the_form_is_not_told_the_reading_is_to_be_checked_all_the_same():
     step = CauseFact("sensor_step", "sensor step", "a jump", 0.45, 0.9, (0.0, 1.0), "its zero")
     e = replace(evidence("ambiguous", sensor_step=0.45, sensor_drift=0.4), runs=runs, causes=[step])
     text = dict(judge_gap(e).facts)["Next"]
-    assert text.startswith("Check the instrument before the model: drawbar pull (zero and span")
+    assert text.startswith("(1) Check the instrument before the model: drawbar pull (zero and")
     assert "alone cannot tell" not in text
     alone = dict(judge_gap(replace(e, runs=replace(runs, only=True))).facts)["Next"]
     assert alone.endswith("the ground changed over the runs: drawbar pull alone cannot tell")
@@ -192,10 +192,13 @@ def test_where_an_instrument_is_at_fault_it_is_to_be_checked_first():
     e = replace(evidence("effect", sensor_step=0.97), causes=[step, soil])
     text = dict(judge_gap(e).facts)["Next"]
     assert (
-        "the instrument before the model: sensor step (its zero). If it is at fault, correct"
-        in text
+        "the instrument before the model: sensor step (its zero). (2) Correct the field's readings "
+        "by what the check showed, be it all that is expected, a part or nothing; put excluded = "
+        '["sensor_step"] under [context]' in text
     )
-    assert "diagnose them again; or once it is mended, predict" in text
+    assert "(3) If it showed all that is expected, readings may stay as they are instead" in text
+    assert "(4) If it can no longer be checked" in text
+    assert "(5) What is no fault, lug thrust, belongs in the simulator" in text
     assert "suspected" not in text  # it is sure already
     others = dict(judge_gap(replace(e, causes=[replace(step, instrument="")])).facts)
     assert "instrument" not in others.get("Next", "")
@@ -211,9 +214,19 @@ def test_beside_a_faulty_instrument_the_other_causes_and_a_measurement_are_said(
     facts = dict(judge_gap(sure).facts)
     assert "sensor step (its zero; expect jump 2 kN)" in facts["Next"]
     assert "What is no fault, lug thrust, belongs in the simulator" in facts["Next"]
+    assert facts["How far"].endswith("what the instrument reads, sensor step in it")
     assert "Then" not in facts
     alone = dict(judge_gap(replace(sure, causes=[step])).facts)
     assert "no fault" not in alone["Next"]
+    two = [step, replace(gauge, probability=0.95)]
+    both = dict(judge_gap(replace(sure, causes=two)).facts)["Next"]
+    assert both.startswith("(1) Check the instruments before the model: sensor step (its zero")
+    assert 'put excluded = ["sensor_step", "gauge"] under [context]' in both
+    assert "(leave out what was not checked, the rest is settled)" in both
+    # One check settles all faults of the same instrument.
+    cell = replace(step, faults=("force_offset", "sensor_step"))
+    assert 'put excluded = ["force_offset", "sensor_step"] under [context]' in dict(
+        judge_gap(replace(sure, causes=[cell])).facts)["Next"]  # fmt: skip
     assert "as well" not in alone["Next"]
     unsure = replace(
         evidence("effect", sensor_step=0.6, lug_thrust=0.3),
@@ -223,9 +236,11 @@ def test_beside_a_faulty_instrument_the_other_causes_and_a_measurement_are_said(
     # Found at fault, explanations without it no longer count: what is known goes in.
     assert "put suspected = {sensor_step = 0.99} under [context]" in facts["Next"]
     assert "Worth a check as well: gauge (8 %; another gauge)" in facts["Next"]
-    assert facts["Then"].startswith("To separate lug thrust from drift: about 3 measurements at")
+    assert facts["Then"].startswith(
+        "If no check is possible, or after it two are still tied, to separate lug thrust from "
+        "drift: about 3 measurements at")  # fmt: skip
     # Mended readings beside faulty ones would be a change at some run.
-    assert facts["Then"].endswith("with the instrument as it was, or all readings corrected alike")
+    assert "with the instrument as it was, or all readings corrected alike" in facts["Then"]
     before = dict(judge_gap(replace(sure, causes=[step], excluded=("sensor_drift",))).facts)
     assert 'put excluded = ["sensor_drift", "sensor_step"] under [context]' in before["Next"]
 
@@ -257,7 +272,7 @@ def test_two_effects_are_said_to_be_two():
     assert "c acts" not in causes
     rest = CauseFact("unknown", "something unlisted", "", 0.8, 0.08, (0.0, 0.2))
     left = judge_gap(replace(e, remainder=rest, remainder_where="drawbar pull at slip 60 to 70 %"))
-    assert left.headline.endswith("and something besides that is not listed")
+    assert left.headline.endswith("; something that is not listed probably acts besides")
     assert (
         "what is of no listed shape, drawbar pull at slip 60 to 70 %, is there with 80 %"
         in (dict(left.facts)["Causes"])
@@ -452,6 +467,26 @@ def test_the_verdict_comes_first_with_the_whole_story(found, page):
 
 def test_what_to_do_is_on_the_card_and_under_next(page):
     assert page[2].text.count("Check the instrument before the model: sensor drift (zero") == 2
+
+
+def test_of_a_drift_it_is_said_what_a_check_of_either_end_shows(found, page):
+    """What the reading has too much at the first run and at the last: the formula, by hand."""
+    _, _, reader = page
+    said = re.search(r"expect (\S+) ± (\S+) kN at the first run and (\S+) ± (\S+) kN at the last",
+                     reader.text)  # fmt: skip
+    name = next(n for n in found.ranking.order if "sensor_drift" in n)
+    fit = found.ranking.best(name)
+    i = [e.name for e in fit.forward.hypothesis.effects].index("sensor_drift")
+    psi = fit.draws(np.random.default_rng(1), 4000)[:, fit.forward.phi_slices[i]]
+    natural = fit.forward.hypothesis.effect_priors[i].to_natural(psi)
+    drift, curvature, half_way, zero_at = natural.T
+    for u, mean, sd in ((0.0, *said.groups()[:2]), (1.0, *said.groups()[2:])):
+        u = max(u, 1e-3)
+        grown = (1 + half_way**curvature) * u**curvature / (u**curvature + half_way**curvature)
+        expected = drift * (grown - zero_at)
+        at = float(mean.replace("\N{MINUS SIGN}", "-"))
+        assert abs(at - expected.mean()) < 0.35 * expected.std()
+        assert float(sd) == pytest.approx(expected.std(), rel=0.2)
 
 
 def test_every_hypothesis_is_in_the_table(found, page):
