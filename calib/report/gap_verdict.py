@@ -238,18 +238,25 @@ def _check_first(e: GapEvidence, faults: Mapping[str, str], runs: str | None) ->
     # A second line of what is excluded would replace the first.
     settled = list(dict.fromkeys([*e.excluded, *(n for c in causes for n in c.faults or [c.name])]))
     listed = ", ".join(f'"{name}"' for name in settled)
-    rest = "that is" if one else "leave out what was not checked, the rest is"
-    exclude = f"put excluded = [{listed}] {_CONTEXT} ({rest} settled), " if names else ""
+    rest = "for that is settled" if one else "but what was not checked, with all faults of it"
+    groups = [f"{c.words} with {', '.join(c.faults)}" for c in causes if len(c.faults) > 1]
+    if groups and not one:
+        rest += f" ({joined(groups)})"
+    exclude = f"put excluded = [{listed}] {_CONTEXT}, {rest}, " if names else ""
+    every = "it" if one else "every one of them"
+    unknown = "it" if one else "one of them"
     steps = [
         f"check the {'instrument' if one else 'instruments'} before the model: {checks}"
         + ("; ± is one sd" if "±" in checks else ""),
         "correct the field's readings by what the check showed, be it all that is expected, a part "
         f"or nothing; {exclude}and diagnose again, into another --out, to predict from that",
-        "if it showed all that is expected, readings may stay as they are instead: "
+        f"only if {every} showed all that is expected, readings may stay as they are instead: "
         f"{know}once it is mended, predict without the fault: {_PREDICT}{without}, {folder}; leave "
         "the option out to predict what the faulty instrument reads",
-        "if it can no longer be checked, predict as in (3) but from this folder: the doubt whether "
-        "it is at fault is in the band",
+        f"if {unknown} can no longer be checked, {'' if one else 'do (2) for the others, then '}"
+        f"predict {'from this folder' if one else 'from the new folder'} with --without "
+        f"{'that fault' if len(names) != 1 else names[0]}, for what truly happens, or without the "
+        "option, for what it reads: the doubt whether it is at fault is in the band",
     ]
     if e.runs is not None and e.runs.only and e.runs.probability >= 0.5:
         steps.append(
@@ -308,7 +315,7 @@ def _next(e: GapEvidence) -> list[tuple[str, str]]:
             measure += ", taken with the instrument as it was, or all readings corrected alike"
         measure += ", and diagnose again"
     if text and any(c.instrument for c in e.acting):
-        measure = f"if no check is possible, or after it two are still tied, {measure}"
+        measure = f"after (2) the new page says what is next; where no check is possible, {measure}"
     return [*done, ("Then" if done else "Next", measure)]
 
 

@@ -196,8 +196,11 @@ def test_where_an_instrument_is_at_fault_it_is_to_be_checked_first():
         "by what the check showed, be it all that is expected, a part or nothing; put excluded = "
         '["sensor_step"] under [context]' in text
     )
-    assert "(3) If it showed all that is expected, readings may stay as they are instead" in text
-    assert "(4) If it can no longer be checked" in text
+    assert "(3) Only if it showed all that is expected, readings may stay as they are" in text
+    assert (
+        "(4) If it can no longer be checked, predict from this folder with --without sensor_step"
+        in text
+    )
     assert "(5) What is no fault, lug thrust, belongs in the simulator" in text
     assert "suspected" not in text  # it is sure already
     others = dict(judge_gap(replace(e, causes=[replace(step, instrument="")])).facts)
@@ -222,7 +225,14 @@ def test_beside_a_faulty_instrument_the_other_causes_and_a_measurement_are_said(
     both = dict(judge_gap(replace(sure, causes=two)).facts)["Next"]
     assert both.startswith("(1) Check the instruments before the model: sensor step (its zero")
     assert 'put excluded = ["sensor_step", "gauge"] under [context]' in both
-    assert "(leave out what was not checked, the rest is settled)" in both
+    assert "but what was not checked, with all faults of it, and diagnose again" in both
+    assert "(3) Only if every one of them showed all that is expected" in both
+    assert (
+        "(4) If one of them can no longer be checked, do (2) for the others, then predict" in both
+    )
+    faulty = [replace(step, faults=("force_offset", "sensor_step")), two[1]]
+    grouped = dict(judge_gap(replace(sure, causes=faulty)).facts)["Next"]
+    assert "with all faults of it (sensor step with force_offset, sensor_step), and" in grouped
     # One check settles all faults of the same instrument.
     cell = replace(step, faults=("force_offset", "sensor_step"))
     assert 'put excluded = ["force_offset", "sensor_step"] under [context]' in dict(
@@ -237,8 +247,8 @@ def test_beside_a_faulty_instrument_the_other_causes_and_a_measurement_are_said(
     assert "put suspected = {sensor_step = 0.99} under [context]" in facts["Next"]
     assert "Worth a check as well: gauge (8 %; another gauge)" in facts["Next"]
     assert facts["Then"].startswith(
-        "If no check is possible, or after it two are still tied, to separate lug thrust from "
-        "drift: about 3 measurements at")  # fmt: skip
+        "After (2) the new page says what is next; where no check is possible, to separate lug "
+        "thrust from drift: about 3 measurements at")  # fmt: skip
     # Mended readings beside faulty ones would be a change at some run.
     assert "with the instrument as it was, or all readings corrected alike" in facts["Then"]
     before = dict(judge_gap(replace(sure, causes=[step], excluded=("sensor_drift",))).facts)
