@@ -238,7 +238,7 @@ def _check_first(e: GapEvidence, faults: Mapping[str, str], runs: str | None) ->
     # A second line of what is excluded would replace the first.
     settled = list(dict.fromkeys([*e.excluded, *(n for c in causes for n in c.faults or [c.name])]))
     listed = ", ".join(f'"{name}"' for name in settled)
-    rest = "for that is settled" if one else "but what was not checked, with all faults of it"
+    rest = "for that is settled" if one else "save what was not checked, with all faults of it"
     groups = [f"{c.words} with {', '.join(c.faults)}" for c in causes if len(c.faults) > 1]
     if groups and not one:
         rest += f" ({joined(groups)})"
@@ -254,9 +254,9 @@ def _check_first(e: GapEvidence, faults: Mapping[str, str], runs: str | None) ->
         f"{know}once it is mended, predict without the fault: {_PREDICT}{without}, {folder}; leave "
         "the option out to predict what the faulty instrument reads",
         f"if {unknown} can no longer be checked, {'' if one else 'do (2) for the others, then '}"
-        f"predict {'from this folder' if one else 'from the new folder'} with --without "
-        f"{'that fault' if len(names) != 1 else names[0]}, for what truly happens, or without the "
-        "option, for what it reads: the doubt whether it is at fault is in the band",
+        f"predict {'from this folder' if one else 'from the new folder (this one if none can)'} "
+        f"with --without {'that fault' if len(names) != 1 else names[0]}, for what truly happens, "
+        "or without the option, for what it reads: the doubt whether it is at fault is in the band",
     ]
     if e.runs is not None and e.runs.only and e.runs.probability >= 0.5:
         steps.append(

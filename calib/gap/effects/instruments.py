@@ -31,7 +31,10 @@ class SlipZeroShift(_Fault):
     """A rolling radius wrong by a factor: 1 - s_true = (1 - s_recorded)(1 - error)."""
 
     name = "slip_zero_shift"
-    check = "the rolling radius once more, at each pressure; above zero the recorded is too small"
+    check = (
+        "the rolling radius once more, at each pressure; above zero the recorded radius is too "
+        "small"
+    )
     form = ("pressure",)  # a tyre rolls on a smaller radius at less inflation
     title = "the rolling radius behind the recorded slip is wrong"
     latex = (r"$1 - s_\mathrm{f} = (1 - s)(1 - \text{radius error})$ for the slip $s$",)

@@ -225,7 +225,7 @@ def test_beside_a_faulty_instrument_the_other_causes_and_a_measurement_are_said(
     both = dict(judge_gap(replace(sure, causes=two)).facts)["Next"]
     assert both.startswith("(1) Check the instruments before the model: sensor step (its zero")
     assert 'put excluded = ["sensor_step", "gauge"] under [context]' in both
-    assert "but what was not checked, with all faults of it, and diagnose again" in both
+    assert "save what was not checked, with all faults of it, and diagnose again" in both
     assert "(3) Only if every one of them showed all that is expected" in both
     assert (
         "(4) If one of them can no longer be checked, do (2) for the others, then predict" in both
