@@ -32,6 +32,8 @@ from calib.errors import CalibError
 __all__ = ["HERE", "Later", "Pool", "begin_imports", "end_server", "pool", "without_interruptions"]
 
 _LOOK_SECONDS = 2.0
+# Processes that are started before there is work for them.
+_AT_FIRST = 2
 _SAFE = "PYTHONSAFEPATH"
 _SERVING = Lock()
 # What a report needs, and what its figures and files import when they are first made.
@@ -197,8 +199,8 @@ def pool(
         initargs=([*loaded_files(), *files], safe_path),
     )  # fmt: skip
     side = Pool(executor)
-    # A first process starts now, not when there is work for it; it starts where it can wait.
-    Thread(target=_start, args=(executor, side), daemon=True).start()
+    # The first processes start now, not when there is work for them, and where they can wait.
+    Thread(target=_start, args=(executor, side, workers), daemon=True).start()
     try:
         yield side
         executor.shutdown()
@@ -254,13 +256,14 @@ def _restore(safe_path: str | None) -> None:
         os.environ[_SAFE] = safe_path
 
 
-def _start(executor: ProcessPoolExecutor, side: Pool) -> None:
-    """Start a first process, and what it is forked from; then hand over what waits for it."""
+def _start(executor: ProcessPoolExecutor, side: Pool, workers: int) -> None:
+    """Start the first processes, and what they are forked from; then hand over what waits."""
     try:
         with suppress(EOFError, OSError, RuntimeError):  # stopped meanwhile, or short of processes
             if "forkserver" in get_all_start_methods():
                 _serve()
-            executor.submit(_begun)
+            for _ in range(min(workers, _AT_FIRST)):
+                executor.submit(_begun)
     finally:
         side.begun()
 

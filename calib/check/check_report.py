@@ -105,12 +105,13 @@ def recompute_report(
     """Work a report out again and write it into a new folder."""
     contents = work_out(
         tasks, manifest.seed, settings=manifest.settings, progress=progress, pool=pool,
+        draw=True, pdf=manifest.pdf,
         sections=[SECTIONS[name].again(record) for name, record in manifest.sections.items()],
     )  # fmt: skip
     write_report(
         contents.study, out, sections=contents.found, pdf=manifest.pdf, settings=manifest.settings,
         command=manifest.command, title=manifest.title, environment=manifest.environment,
-        progress=progress, pool=pool,
+        drawn=contents.drawn, progress=progress, pool=pool,
     )  # fmt: skip
     return contents.study
 

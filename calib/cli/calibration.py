@@ -110,12 +110,13 @@ def report(
     with pool(workers) as side, progress_bars() as tell:
         found = work_out(
             tasks, seed, settings=settings, sections=sections, progress=tell, workers=workers,
-            pool=side,
+            pool=side, draw=True, pdf=pdf,
         )  # fmt: skip
         study = found.study
         page = write_report(
             study, out, settings=settings, command=opt.command(), title=title, sections=found.found,
-            overwrite=overwrite, posteriors=posteriors, pdf=pdf, progress=tell, pool=side,
+            overwrite=overwrite, posteriors=posteriors, pdf=pdf, drawn=found.drawn, progress=tell,
+            pool=side,
         )  # fmt: skip
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING
 from calib.report.numbers import centre_text, interval_text
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
     from calib.inference.calibration import Calibration
 
 _log = logging.getLogger("calib")
@@ -38,6 +40,29 @@ def told() -> Iterator[None]:
 @contextmanager
 def progress_bars() -> Iterator[Callable[[str, int, int], None]]:
     """Yield a callback ``(what, done, planned)`` that draws one bar for each kind of work."""
+    tasks: dict[str, TaskID] = {}
+    shown: list[Progress] = []
+
+    def tell(what: str, done: int, planned: int) -> None:
+        # Not before there is something to tell: an error that comes first has the terminal alone.
+        if not shown:
+            shown.append(_bars())
+            shown[0].start()
+        if what not in tasks:
+            tasks[what] = shown[0].add_task(what, total=planned)
+        shown[0].update(tasks[what], completed=done, total=planned)
+
+    try:
+        yield tell
+    finally:
+        for bars in shown:
+            bars.stop()
+            for t in bars.tasks:
+                _log.debug("%s: %g of %g, %.1f s", t.description, t.completed, t.total, t.elapsed)
+
+
+def _bars() -> Progress:
+    # Late: many a command has nothing to tell.
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -57,28 +82,10 @@ def progress_bars() -> Iterator[Callable[[str, int, int], None]]:
         def render(self, task: Task) -> Text:
             return Text("" if task.speed is None else f"{plain_number(task.speed, 2)}/s")
 
-    columns = (
+    return Progress(
         TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
-        TimeElapsedColumn(), TimeRemainingColumn(), _Speed(),
+        TimeElapsedColumn(), TimeRemainingColumn(), _Speed(), console=Console(stderr=True),
     )  # fmt: skip
-    tasks: dict[str, object] = {}
-    bars = Progress(*columns, console=Console(stderr=True))
-
-    def tell(what: str, done: int, planned: int) -> None:
-        # Not before there is something to tell: an error that comes first has the terminal alone.
-        if not tasks:
-            bars.start()
-        if what not in tasks:
-            tasks[what] = bars.add_task(what, total=planned)
-        bars.update(tasks[what], completed=done, total=planned)  # type: ignore[arg-type]
-
-    try:
-        yield tell
-    finally:
-        if tasks:
-            bars.stop()
-        for t in bars.tasks:
-            _log.debug("%s: %g of %g, %.1f s", t.description, t.completed, t.total, t.elapsed)
 
 
 def posterior_table(calibration: Calibration) -> None:

@@ -84,13 +84,14 @@ def diagnose(
     own_files = [] if effects is None else [effects]
     with pool(workers, _PAGE, own_files) as side:
         found = find(given, seed, effects=considered, pool=side)
-        from calib.report.page.gap_page import write_page
+        from calib.report.page.gap_page import begin_page
 
+        write_page = begin_page(found, manifest, pool=side)
         with fresh_folder(out, overwrite=overwrite) as folder:
             write_diagnosis(found, folder)
             keep_emulators(given.models.values(), folder)
             (folder / INPUTS).write_bytes(inputs_record(found.data.case, seed, files))
-            write_page(found, folder, manifest, pool=side)
+            write_page(folder)
     for warning in found.warnings:
         print(f"calib: {warning}", file=sys.stderr)
     judged = gap_verdict(found)

@@ -13,7 +13,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import brentq
 
 from calib.gap.campaigns import Campaigns
 from calib.gap.forward import Forward
@@ -34,7 +33,7 @@ _N_SIZES, _N_DRAWS = 512, 64
 _Z_POWER = 0.8416  # 80 % power
 _LN_ODDS = float(np.log(10.0))  # an effect shows when it is ten times as probable as none
 ALIKE = 0.95
-_NOTHING = 1e-6  # noise sds
+_NOTHING, _NEAR = 1e-6, 1e-4  # noise sds
 
 
 @dataclass(frozen=True)
@@ -127,17 +126,23 @@ def smallest_shown(prior: Array, sd: float, ln_odds: float) -> float:
     if not relevant.size:
         return float("inf")
 
-    def beyond(estimate: float) -> float:
+    def beyond(estimate: float) -> tuple[float, float]:
         exponent = relevant * (estimate - 0.5 * relevant) / sd**2
         top = float(exponent.max())
-        return top + float(np.log(np.exp(exponent - top).mean())) - ln_odds
+        weights = np.exp(exponent - top)
+        slope = float(weights @ relevant) / float(weights.sum()) / sd**2
+        return top + float(np.log(weights.mean())) - ln_odds, slope
 
-    largest = float(relevant.max()) + 4.0 * sd
-    if beyond(largest) < 0.0:
+    first = float(relevant.max()) + 4.0 * sd
+    value, slope = beyond(first)
+    if value < 0.0:
         return float("inf")
-    # The evidence grows with the estimate.
-    first = brentq(beyond, 0.0, largest, xtol=1e-4) if beyond(0.0) < 0.0 else 0.0
-    return float(first) + _Z_POWER * sd
+    # The evidence grows with the estimate, faster and faster: Newton's steps come down to the root
+    # and never pass it. (SciPy's search comes with all its optimisers: a tenth of a second.)
+    while first > 0.0 and value / slope > _NEAR:
+        first = max(first - value / slope, 0.0)
+        value, slope = beyond(first)
+    return first + _Z_POWER * sd
 
 
 def _likeness(left: Mapping[str, Array]) -> dict[tuple[str, str], float]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import HERE, Later, Pool
 from calib.data.numbers import plain_number
 from calib.data.registry import Registry
 from calib.report.numbers import format_number
@@ -23,6 +23,7 @@ from calib.report.numbers import format_number
 # Every command loads what plug-ins declare here, and few work a report out.
 if TYPE_CHECKING:
     from calib.inference.sampling.sampler import SamplerSettings
+    from calib.report.drawing import Drawn
     from calib.report.study import Progress, Study
     from calib.report.study_tasks import Task
 
@@ -214,10 +215,14 @@ SECTIONS: Registry[SectionKind] = Registry(
 
 @dataclass(frozen=True)
 class Contents:
-    """What `calib.report.writer.write_report` writes: the study, and what its sections found."""
+    """What `calib.report.writer.write_report` writes: the study, and what its sections found.
+
+    Figures of the study's outputs are being drawn if they were asked for, else None.
+    """
 
     study: Study
     found: tuple[Found, ...]
+    drawn: Mapping[str, Later[Drawn]] | None = None
 
 
 def work_out(
@@ -229,6 +234,8 @@ def work_out(
     progress: Progress | None = None,
     workers: int = 1,
     pool: Pool = HERE,
+    draw: bool = False,
+    pdf: bool = False,
 ) -> Contents:
     """Work everything out that a report shows.
 
@@ -243,7 +250,10 @@ def work_out(
     pool : Pool, optional
         Where outputs and sections are worked out, in any order. The numbers depend neither on it
         nor on `workers`.
+    draw, pdf : bool
+        Whether to ask for figures as soon as there are outputs, and for PDF besides.
     """
+    from calib.report.drawing import begin_figures
     from calib.report.study import begin_study
 
     tell = progress or (lambda what, done, planned: None)
@@ -254,6 +264,8 @@ def work_out(
     begun = [section.begin(seed, pool) for section in reversed(sections)]
     pool.help()
     studied = study(tell)
+    # Drawn while the last of the sections' pieces, fewer than processes, are worked out.
+    drawn = begin_figures(studied, pool, pdf=pdf) if draw else None
     # What a section has to do here is done while the pieces of those before it are worked out.
     found = [finish(studied, tell) for finish in begun]
-    return Contents(studied, tuple(reversed(found)))
+    return Contents(studied, tuple(reversed(found)), drawn)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from calib.batch.environment import Environment, sha256
 from calib.batch.folders import fresh_folder
-from calib.batch.pool import HERE, Pool
+from calib.batch.pool import HERE, Later, Pool
 from calib.data import Table, write_table
 from calib.inference.estimators import GeneticSettings
 from calib.inference.io import groups_of
@@ -20,11 +20,10 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.simulators.emulator.files import save_emulator
 from calib.models.simulators.emulator.model import emulator_of
+from calib.report.drawing import Drawn, begin_figures
 from calib.report.figures.plate import Plate
-from calib.report.labels import units_of
 from calib.report.page.content import render_page
 from calib.report.publish import publication
-from calib.report.reference import reference_of
 from calib.report.sections import Found
 from calib.report.study import OutputResult, Progress, Study
 from calib.report.study_tasks import Task
@@ -97,6 +96,7 @@ def write_report(
     posteriors: bool = True,
     environment: Environment | None = None,
     pdf: bool = False,
+    drawn: Mapping[str, Later[Drawn]] | None = None,
     progress: Progress | None = None,
     pool: Pool = HERE,
 ) -> Path:
@@ -115,6 +115,8 @@ def write_report(
         Where the manifest says the report was made: that of this process by default.
     pdf : bool
         Whether every figure also comes as PDF, for print.
+    drawn : mapping of str to Later of Drawn, optional
+        Figures of the outputs, if they were asked for already.
     pool : Pool, optional
         Where figures are drawn.
 
@@ -128,10 +130,7 @@ def write_report(
     with fresh_folder(out, overwrite=overwrite) as folder:
         inputs = _copy_inputs(study, folder)
         (folder / "figures").mkdir()
-        pieces = {
-            key: pool.submit(_draw_output, key, result, folder, pdf)
-            for key, result in successes.items()
-        }
+        pieces = begin_figures(study, pool, pdf=pdf) if drawn is None else drawn
         versions = (environment or Environment.here()).versions
         begun = [s.begin(folder, versions=versions, pdf=pdf, pool=pool) for s in sections]
         # Short, so last: both processes end at about the same time.
@@ -151,18 +150,21 @@ def write_report(
             (folder / path).parent.mkdir(exist_ok=True)
             (folder / path).write_text(text, encoding="utf-8")
         manifest |= {section.name: section.record() for section in sections}
-        drawn: dict[str, list[Plate]] = {}
+        plates: dict[str, tuple[Plate, ...]] = {}
         images: dict[str, bytes] = {}
         for i, (key, piece) in enumerate(pieces.items()):
             tell("drawing figures", i, len(pieces))
-            drawn[key], shown = piece.result()
-            images |= shown
+            found = piece.result()
+            plates[key] = found.plates
+            images |= found.images
+            for name, content in {**found.images, **found.prints}.items():
+                (folder / "figures" / name).write_bytes(content)
         tell("drawing figures", len(pieces), len(pieces))
         for netcdf in kept:
             netcdf.result()
         page = render_page(
             study,
-            drawn,
+            plates,
             images,
             manifest=manifest,
             title=title,
@@ -184,30 +186,6 @@ def write_report(
 def _keep(key: str, result: OutputResult, folder: Path) -> None:
     """Write the posterior of an output."""
     write_netcdf(groups_of(result.calibration), folder / f"{key}.nc")
-
-
-def _draw_output(
-    key: str, result: OutputResult, folder: Path, pdf: bool
-) -> tuple[list[Plate], dict[str, bytes]]:
-    """Write the figures of an output; return what the page shows of them."""
-    # Late: where the figures are drawn, which as a rule is another process.
-    from calib.report.figures.collect import plates
-    from calib.report.figures.style import pdf_bytes, png
-
-    drawn, images = [], {}
-    with units_of(result.task.table.header):
-        figures = plates(result, reference_of(result.task.table.label))
-    for plate in figures:
-        drawn.append(replace(plate, figure=None))
-        if plate.figure is None:
-            continue
-        name = f"{key}_{plate.name}.png"
-        images[name] = png(plate)
-        (folder / "figures" / name).write_bytes(images[name])
-        if pdf:
-            file = folder / "figures" / f"{key}_{plate.name}.pdf"
-            file.write_bytes(pdf_bytes(plate.figure))
-    return drawn, images
 
 
 def own_names(table: Table) -> dict[str, Any]:

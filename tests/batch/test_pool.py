@@ -111,7 +111,7 @@ def test_where_no_process_can_start_it_is_said(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_what_waits_is_not_begun_after_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("calib.batch.pool._start", lambda executor, side: None)
+    monkeypatch.setattr("calib.batch.pool._start", lambda *_: None)
     asked: list[object] = []
     monkeypatch.setattr(ProcessPoolExecutor, "submit", lambda _, work: asked.append(work))
     with pytest.raises(CalibError, match="stop"), pool(2, LIGHT) as side:  # noqa: PT012
@@ -150,7 +150,7 @@ def test_a_death_that_the_executor_did_not_see_is_noticed(
 def test_what_was_asked_last_is_worked_out_here_until_the_processes_have_begun(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("calib.batch.pool._start", lambda executor, side: None)
+    monkeypatch.setattr("calib.batch.pool._start", lambda *_: None)
     with pool(2, LIGHT) as side:
         first, long = side.submit(square, 1), side.submit_long(square, 2)
         last = side.submit(square, 3)
@@ -170,7 +170,7 @@ def test_what_was_asked_last_is_worked_out_here_until_the_processes_have_begun(
 def test_what_goes_wrong_here_is_raised_where_it_is_wanted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("calib.batch.pool._start", lambda executor, side: None)
+    monkeypatch.setattr("calib.batch.pool._start", lambda *_: None)
     with pool(2, LIGHT) as side:
         wrong = side.submit(fail, "mine")
         side.help()

@@ -18,7 +18,6 @@ the optimum is a strict one in spite of C1, C2 and C3 being all but collinear.
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import brentq
 
 from calib.he2019.datasets.published import PUBLISHED
 from calib.he2019.datasets.reconstruct import Array, nearest_errors, normalised_basis, read_only
@@ -49,6 +48,8 @@ def _design(rng: np.random.Generator, variance: float) -> tuple[Array, Array]:
     water = np.round(np.minimum(water, PUBLISHED.setup.largest_water_content.value), 4)
     place = np.tile(np.linspace(-1.0, 1.0, _INDEX_LEVELS), _WATER_LEVELS)
     place = place + 2.0 / (_INDEX_LEVELS - 1) * _SCATTER * rng.uniform(-0.5, 0.5, place.size)
+
+    from scipy.optimize import brentq  # late, as in `reconstruct`
 
     def index(spread: float) -> Array:
         return _MID_CONE_INDEX_KPA * np.exp(spread * place)

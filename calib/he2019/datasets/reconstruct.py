@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import Bounds, minimize
 
 type Array = NDArray[np.float64]
 type Conditions = Callable[[Array], tuple[Array, Array]]
@@ -53,6 +52,9 @@ def nearest_errors(
     constraints: list[Any] = [_constraint("eq", equal)]
     if at_least is not None:
         constraints.append(_constraint("ineq", at_least))
+
+    # Late: a tenth of a second, and whoever knows of the data seldom makes them.
+    from scipy.optimize import Bounds, minimize
 
     def distance(errors: Array) -> float:
         return float(np.sum((errors - drawn) ** 2))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.optimize import differential_evolution
 
 from calib.inference.estimators.base import PointEstimate
 from calib.inference.estimators.search import Box, Found, SearchSpace, search_in_box
@@ -25,6 +24,7 @@ def estimate_differential_evolution(
     `calib.inference.estimators.search.search_space`, the other settings are SciPy's, and
     so are their defaults.
     """
+    from scipy.optimize import differential_evolution  # late: a tenth of a second
 
     def minimise(space: SearchSpace) -> Found:
         evaluated = 0

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from calib.errors import CalibError
 from calib.inference.defined import check_defined
@@ -63,6 +62,8 @@ class _Descent:
         return np.asarray(np.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0).T)
 
     def polish(self, z: Array) -> _Polished:
+        from scipy.optimize import least_squares  # late: a tenth of a second
+
         result = least_squares(
             self.residuals,
             z,

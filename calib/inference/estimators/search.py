@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from calib.errors import CalibError
 from calib.inference.estimators.base import PointEstimate, goodness, residuals, sum_of_squares
@@ -69,6 +68,9 @@ class SearchSpace:
 
     def polish(self, x: Array) -> Found:
         """Descend from a point of the box (d,) by least squares; never to a higher cost."""
+        # Late: a tenth of a second, and what knows of the methods seldom uses one.
+        from scipy.optimize import least_squares
+
         result = least_squares(
             self._residuals,
             x,

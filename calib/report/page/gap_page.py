@@ -6,7 +6,8 @@ wait.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import pickle
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,26 +19,37 @@ from calib.report.figures.plate import Plate
 _HALF = (1, 2, 3)
 
 
-def write_page(
-    found: Diagnosis, folder: Path, manifest: Mapping[str, Any], *, pool: Pool = HERE
-) -> None:
+def write_page(found: Diagnosis, folder: Path, manifest: Mapping[str, Any]) -> None:
     """Draw ``figures/*.png`` and write them and ``index.html`` into an existing folder.
 
     Of the manifest ``command`` and ``versions`` are shown, if they are there.
     """
-    halves = [pool.submit(_drawn, found, half) for half in (True, False)]
-    by_place = halves[0].result() | halves[1].result()
-    drawn = [by_place[place] for place in sorted(by_place)]
-    images = {f"{plate.name}.png": image for plate, image in drawn if image}
-    plates = [plate for plate, _ in drawn]
-    page = pool.submit(_rendered, found, plates, images, dict(manifest)).result()
-    (folder / "figures").mkdir(exist_ok=True)
-    for name, image in images.items():
-        (folder / "figures" / name).write_bytes(image)
-    (folder / "index.html").write_text(page, encoding="utf-8")
+    begin_page(found, manifest)(folder)
 
 
-def _drawn(found: Diagnosis, half: bool) -> dict[int, tuple[Plate, bytes]]:
+def begin_page(
+    found: Diagnosis, manifest: Mapping[str, Any], *, pool: Pool = HERE
+) -> Callable[[Path], None]:
+    """Ask for the page of a diagnosis; return what waits for it and writes it into a folder."""
+    # Once for all pieces: it takes longer than to hand it over.
+    packed = pickle.dumps(found)
+    halves = [pool.submit(_drawn, packed, half) for half in (True, False)]
+
+    def write(folder: Path) -> None:
+        by_place = halves[0].result() | halves[1].result()
+        drawn = [by_place[place] for place in sorted(by_place)]
+        images = {f"{plate.name}.png": image for plate, image in drawn if image}
+        plates = [plate for plate, _ in drawn]
+        page = pool.submit(_rendered, packed, plates, images, dict(manifest)).result()
+        (folder / "figures").mkdir(exist_ok=True)
+        for name, image in images.items():
+            (folder / "figures" / name).write_bytes(image)
+        (folder / "index.html").write_text(page, encoding="utf-8")
+
+    return write
+
+
+def _drawn(packed: bytes, half: bool) -> dict[int, tuple[Plate, bytes]]:
     """Draw one half of the figures; return each by its place, without its canvas and as a file."""
     from dataclasses import replace
 
@@ -45,6 +57,7 @@ def _drawn(found: Diagnosis, half: bool) -> dict[int, tuple[Plate, bytes]]:
     from calib.report.figures.style import png
     from calib.report.labels import units_of
 
+    found: Diagnosis = pickle.loads(packed)
     places = {name: i for i, name in enumerate(GAP_FIGURES) if (i in _HALF) is half}
     with units_of(_headers(found)):
         plates = gap_plates(found, tuple(places))
@@ -52,7 +65,7 @@ def _drawn(found: Diagnosis, half: bool) -> dict[int, tuple[Plate, bytes]]:
 
 
 def _rendered(
-    found: Diagnosis,
+    packed: bytes,
     plates: Sequence[Plate],
     images: Mapping[str, bytes],
     manifest: Mapping[str, Any],
@@ -60,6 +73,7 @@ def _rendered(
     from calib.report.labels import units_of
     from calib.report.page.diagnosis import render_diagnosis
 
+    found: Diagnosis = pickle.loads(packed)
     with units_of(_headers(found)):
         return render_diagnosis(found, plates, images, manifest=manifest)
 

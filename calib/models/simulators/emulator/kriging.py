@@ -20,7 +20,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
-from scipy.optimize import minimize
 
 from calib.models.base import Array
 
@@ -155,6 +154,8 @@ def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None
     start : Scales, optional
         Where to begin.
     """
+    from scipy.optimize import minimize  # late: a tenth of a second, and few commands emulate
+
     b = trend_of(x)
     rest = y - b @ np.linalg.lstsq(b, y, rcond=None)[0]
     spread = float(rest.std())
