@@ -145,6 +145,11 @@ class TierScore:
         calibration error in ten bins.
     share_coverage : Proportion
         Of the acting, those whose 90 % interval of the share holds the true one.
+    by_itself : dict of str to float
+        What ``top_1``, ``confidently_wrong``, ``included`` and ``wrongly_included`` would be, on
+        average, if every stated probability were exactly right. Figures like these with a level
+        that is missed say that the cases do not tell more than what is believed beforehand allows;
+        worse figures say that the diagnosis is too sure of itself.
     """
 
     tier: str
@@ -173,6 +178,7 @@ class TierScore:
     inclusion_brier: Average
     inclusion_error: Average
     share_coverage: Proportion
+    by_itself: dict[str, float]
 
 
 @dataclass(frozen=True)
@@ -243,6 +249,25 @@ def _reliability(answers: list[CaseAnswer]) -> tuple[ReliabilityBin, ...]:
     return tuple(bins)
 
 
+def _by_itself(answers: list[CaseAnswer], stated: Array) -> dict[str, float]:
+    """Work out what figures would be if stated probabilities were right; NaN of nothing."""
+
+    def share(part: Array, whole: Array) -> float:
+        return float(part.sum() / whole.sum()) if whole.sum() > 0.0 else float("nan")
+
+    first = np.array([a.confidence for a in answers if a.ranked])
+    gaps = [a for a in answers if a.truth != NONE and a.ranked]
+    some = np.array([1.0 - dict(a.ranked).get(NONE, 0.0) for a in gaps])
+    best = np.array([0.0 if a.called == NONE else a.confidence for a in gaps])
+    p, in_it = stated[0], stated[0] >= 0.5
+    return {
+        "top_1": share(best[some > 0.0] / some[some > 0.0], np.ones(len(gaps))),
+        "confidently_wrong": share((1.0 - first)[first >= 0.9], np.ones(first.size)),
+        "included": share(p[in_it], p),
+        "wrongly_included": share(1.0 - p[in_it], 1.0 - p),
+    }
+
+
 def score_tier(tier: str, answers: list[CaseAnswer]) -> TierScore:
     """Return the figures of merit of one tier.
 
@@ -289,6 +314,7 @@ def score_tier(tier: str, answers: list[CaseAnswer]) -> TierScore:
         inclusion_brier=_over(stating, lambda s: float(np.mean((s[0] - s[1]) ** 2))),
         inclusion_error=_over(stating, _calibration_error),
         share_coverage=Proportion(sum(c.covered for c in acting), len(acting)),
+        by_itself=_by_itself(answers, stating),
     )
 
 

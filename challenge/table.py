@@ -36,11 +36,13 @@ def _span(figure: Proportion | Average) -> str:
     return f"[{low:.2f}, {high:.2f}]"
 
 
-def _line(label: str, figure: Proportion | Average, asked_for: str, mark: str) -> str:
+def _line(
+    label: str, figure: Proportion | Average, asked_for: str = "", mark: str = "", own: str = ""
+) -> str:
     count = f"{figure.successes}/{figure.n}" if isinstance(figure, Proportion) else f"n={figure.n}"
     value, span = (f"{figure.value:6.3f}", _span(figure)) if figure.n else ("-", "")
     mark = mark if figure.n else ""
-    return f"  {label:<47} {value:>6} {span:>14} {count:>8}  {asked_for:>10}  {mark}"
+    return f"  {label:<47} {value:>6} {span:>14} {count:>8} {own:>9}  {asked_for:>10}  {mark}"
 
 
 def tier_table(tier: TierScore) -> str:
@@ -52,13 +54,16 @@ def tier_table(tier: TierScore) -> str:
     """
     lines = [
         f"{tier.tier}: {tier.n_cases} cases, {tier.n_failed} failed",
-        f"  {'':<47} {'value':>6} {'95 % interval':>14} {'count':>8}  {'asked':>10}",
+        f"  {'':<47} {'value':>6} {'95 % interval':>14} {'count':>8} {'by itself':>9}  "
+        f"{'asked':>10}",
     ]
     for level in LEVELS:
         figure = _figure(tier, level.name)
-        mark = level.mark(tier.tier, figure)
-        lines.append(_line(level.label, figure, asked(level, tier.tier), mark))
-    lines += [_line(label, _figure(tier, name), "", "") for name, label in _EXTRA]
+        mark, own = level.mark(tier.tier, figure), tier.by_itself.get(level.name)
+        lines.append(_line(level.label, figure, asked(level, tier.tier), mark,
+                           "" if own is None or own != own else f"{own:.3f}"))  # fmt: skip
+    lines += [_line(label, _figure(tier, name)) for name, label in _EXTRA]
+    lines.append("  by itself: what it would be if every stated probability were exactly right")
     return "\n".join(line.rstrip() for line in lines)
 
 

@@ -368,3 +368,34 @@ def test_inclusion_and_shares_are_scored() -> None:
     assert found.inclusion_auc.value == pytest.approx(3.0 / 4.0)
     assert LEVELS[0].mark("large", found.top_1) == "too few to tell"
     assert LEVELS[1].mark("large", found.top_2) == ""
+
+
+def test_what_stated_probabilities_promise_is_what_comes_true_if_they_are_right():
+    """By hand for one case; then truths drawn from what is stated, 4,000 times."""
+    stated = (("a", 0.95), ("none", 0.04), ("b", 0.01))
+    causes = (CauseAnswer("a", 0.9, 3.0, 1.0, (0.9, 1.1)), CauseAnswer("b", 0.3, 0.0, 0.0, (0, 0)))
+    answer = CaseAnswer(
+        "case-000", "easy", "a", "effect", stated, None, (), ("rut",), causes=causes
+    )
+    own = score_tier("easy", [answer]).by_itself
+    assert own["top_1"] == pytest.approx(0.95 / 0.96)
+    assert own["confidently_wrong"] == pytest.approx(0.05)
+    assert own["included"] == pytest.approx(0.9 / 1.2)
+    assert own["wrongly_included"] == pytest.approx(0.1 / 0.8)
+
+    rng = np.random.default_rng(5)
+    answers = []
+    for i in range(4000):
+        p = rng.dirichlet([2.0, 0.4, 0.4])
+        names = np.array(["a", "b", "c"])[rng.permutation(3)]
+        truth = str(rng.choice(names, p=p))
+        ranked = tuple(sorted(zip(map(str, names), p.tolist(), strict=True), key=lambda x: -x[1]))
+        told = tuple(CauseAnswer(n, q, 3.0 * (n == truth), 0.0, (0, 0)) for n, q in ranked)
+        answers.append(
+            CaseAnswer(f"{i}", "easy", truth, "effect", ranked, None, (), ("rut",), causes=told)
+        )
+    found = score_tier("easy", answers)
+    for name, expected in found.by_itself.items():
+        value, n = getattr(found, name).value, getattr(found, name).n
+        assert abs(value - expected) < 4.0 * (expected * (1.0 - expected) / n) ** 0.5
+    assert found.by_itself["top_1"] < 0.97
