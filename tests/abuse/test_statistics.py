@@ -260,6 +260,7 @@ def test_uneven_noise(tmp_path: Path) -> None:
     assert abs(slope.mean - 5.0 * slip.std()) < 4.0 * slope.sd
 
 
+@pytest.mark.slow
 def test_rows_that_are_alike_along_a_run(tmp_path: Path) -> None:
     rng = np.random.default_rng(6)
     noise = rng.standard_normal(N)

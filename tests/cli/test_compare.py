@@ -103,6 +103,7 @@ def test_a_report_compares_an_emulated_simulator_with_a_closed_form(
     assert len(Path("bands.csv").read_text().splitlines()) == 19
 
 
+@pytest.mark.slow  # as pages of a report and a diagnosis do
 def test_the_page_holds_in_a_browser(calib: Calib, browser: Browser) -> None:
     Path("plates.csv").write_text(example_csv("reece"))
     made = calib("compare", "reece", "bekker_plate", "plates.csv", "--out", "c", *FEW)

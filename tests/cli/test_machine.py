@@ -265,6 +265,7 @@ def test_without_a_place_to_write_to_the_exit_code_says_it(to: str, code: int) -
     assert "Traceback" not in ran.stderr
 
 
+@pytest.mark.slow  # what it rests on is above
 @pytest.mark.skipif(sys.platform == "win32", reason="of a shell")
 def test_a_job_that_closed_its_output_is_told_the_same(tmp_path: Path) -> None:
     (tmp_path / "my.csv").write_text(example_csv("bekker"))

@@ -287,6 +287,7 @@ def test_the_documentations_own_model_goes_as_printed(run: Calib) -> None:
     assert "janosi_pull" in Path("report/summary.json").read_text()
 
 
+@pytest.mark.slow
 def test_a_density_model_of_lambdas_is_reported_on_two_processes(run: Calib) -> None:
     """Its conditions are not those of the shipped density models, and it cannot be pickled."""
     Path("dens.py").write_text(

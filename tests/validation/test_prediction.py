@@ -94,6 +94,7 @@ def test_bands_contain_an_emulators_error(pull_calibration: Calibration) -> None
     assert alone.predictive.upper[0.9][0] == pytest.approx(found.predictive.upper[0.9][3])
 
 
+@pytest.mark.slow
 def test_rows_left_out_are_predicted_with_an_emulators_error(
     pull_calibration: Calibration,
 ) -> None:
