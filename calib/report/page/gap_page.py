@@ -31,8 +31,9 @@ def begin_page(
     found: Diagnosis, manifest: Mapping[str, Any], *, pool: Pool = HERE
 ) -> Callable[[Path], None]:
     """Ask for the page of a diagnosis; return what waits for it and writes it into a folder."""
-    # Once for all pieces: it takes longer than to hand it over.
-    packed = pickle.dumps(found)
+    # Once for all pieces: it takes longer than to hand it over. Here an effect of a script's own
+    # may be in it, which cannot be pickled.
+    packed = found if pool.here else pickle.dumps(found)
     halves = [pool.submit(_drawn, packed, half) for half in (True, False)]
 
     def write(folder: Path) -> None:
@@ -49,7 +50,7 @@ def begin_page(
     return write
 
 
-def _drawn(packed: bytes, half: bool) -> dict[int, tuple[Plate, bytes]]:
+def _drawn(packed: Diagnosis | bytes, half: bool) -> dict[int, tuple[Plate, bytes]]:
     """Draw one half of the figures; return each by its place, without its canvas and as a file."""
     from dataclasses import replace
 
@@ -57,7 +58,7 @@ def _drawn(packed: bytes, half: bool) -> dict[int, tuple[Plate, bytes]]:
     from calib.report.figures.style import png
     from calib.report.labels import units_of
 
-    found: Diagnosis = pickle.loads(packed)
+    found = _unpacked(packed)
     places = {name: i for i, name in enumerate(GAP_FIGURES) if (i in _HALF) is half}
     with units_of(_headers(found)):
         plates = gap_plates(found, tuple(places))
@@ -65,7 +66,7 @@ def _drawn(packed: bytes, half: bool) -> dict[int, tuple[Plate, bytes]]:
 
 
 def _rendered(
-    packed: bytes,
+    packed: Diagnosis | bytes,
     plates: Sequence[Plate],
     images: Mapping[str, bytes],
     manifest: Mapping[str, Any],
@@ -73,9 +74,14 @@ def _rendered(
     from calib.report.labels import units_of
     from calib.report.page.diagnosis import render_diagnosis
 
-    found: Diagnosis = pickle.loads(packed)
+    found = _unpacked(packed)
     with units_of(_headers(found)):
         return render_diagnosis(found, plates, images, manifest=manifest)
+
+
+def _unpacked(packed: Diagnosis | bytes) -> Diagnosis:
+    found: Diagnosis = pickle.loads(packed) if isinstance(packed, bytes) else packed
+    return found
 
 
 def _headers(found: Diagnosis) -> tuple[str, ...]:
