@@ -149,6 +149,10 @@ def _put(scratch: Path, out: Path) -> None:
     except OSError as error:
         if not out.exists():
             raise
+        if out.is_dir() and not any(out.iterdir()):
+            # A link to an empty folder, or a mount point: neither can be replaced, only filled.
+            shutil.copytree(scratch, out, dirs_exist_ok=True)
+            return
         beside = next(p for i in count(2) if not (p := out.with_name(f"{out.name}-{i}")).exists())
         scratch.replace(beside)
         raise CalibError(
@@ -288,6 +292,12 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
             "the output folder exists and is not empty",
             where=str(out),
             mend="choose another --out, or pass --overwrite to replace it",
+        )
+    if os.path.ismount(out):
+        raise CalibError(
+            "the output folder is a mount point with something in it, which cannot be replaced",
+            where=str(out),
+            mend="choose a new folder inside it as --out, or empty it yourself",
         )
     if not any((out / name).exists() for name in _OURS):
         raise CalibError(

@@ -89,15 +89,12 @@ class Start:
         First guess.
     count : int
         How many of the best guesses, apart from each other, to begin from.
-    skip : int
-        How many of those to leave out, as begun from before.
     """
 
     forward: Forward
     guesses: Array
     noise: Mapping[str, Noise]
     count: int = 1
-    skip: int = 0
 
 
 def truncated_fits(starts: Sequence[Start]) -> list[list[Fit]]:
@@ -107,7 +104,7 @@ def truncated_fits(starts: Sequence[Start]) -> list[list[Fit]]:
     ascents = []
     for start, (problem, psi), raw in zip(starts, asked, residuals_of_all(asked), strict=True):
         costs = problem.costs(psi, raw, problem.sds(start.noise))
-        begun = problem.best(costs, psi, start.count)[start.skip :]
+        begun = problem.best(costs, psi, start.count)
         forward, noise = start.forward, dict(start.noise)
         linear = forward.smooth_slices and not forward.hypothesis.effects and forward.shift is None
         steps = _LINEAR_STEPS if linear else FIRST_STEPS

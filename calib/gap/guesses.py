@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import joined
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
-from calib.gap.odds import Odds
+from calib.gap.odds import Odds, with_prior
 from calib.gap.residuals import Residuals, residuals_of_all
 from calib.inference.even import even_points
 from calib.models.base import Array
@@ -26,7 +26,9 @@ _N_SCREEN = 64
 _N_BEGUN = 5
 _N_THRESHOLDS = 24
 # Guesses at one more effect of a set, and how many of them a fit begins from.
-_N_ADDED, _N_ADDED_BEGUN = 64, 2
+_N_ADDED, _N_STEPPED, _N_ADDED_BEGUN = 64, 4, 2
+# Parts of a Gauss-Newton step that are tried, for where a whole one goes too far.
+_STEPS = (1.0, 0.3, 0.0)
 
 
 @dataclass(frozen=True)
@@ -35,18 +37,44 @@ class Promise:
 
     Parameters
     ----------
-    hypothesis : Hypothesis
-    log_joint : float
-        Log of likelihood times prior at the best guess, the other parameters a step further on.
+    forward : Forward
+    expected : float
+        Log of evidence times prior, by the best guess and one step of the other parameters, if the
+        posterior is as broad as that of the set it was made from.
     starts : ndarray, shape (k, d)
         Guesses, the best first.
     noise : mapping of str to Noise
+    first : int
+        How many of the guesses are the best of a part that the set was made from.
     """
 
-    hypothesis: Hypothesis
-    log_joint: float
+    forward: Forward
+    expected: float
     starts: Array
     noise: Mapping[str, Noise]
+    first: int = 1
+
+    @property
+    def hypothesis(self) -> Hypothesis:
+        """Which causes."""
+        return self.forward.hypothesis
+
+    @property
+    def start(self) -> Start:
+        """Where a fit begins."""
+        return Start(self.forward, self.starts, self.noise, len(self.starts))
+
+    def with_starts_of(self, other: Promise) -> Promise:
+        """Return the better of two promises of a set, with the guesses of both."""
+        one, two = sorted((self, other), key=lambda p: -p.expected)
+        parts = (one.starts[: one.first], two.starts[: two.first],
+                 one.starts[one.first :], two.starts[two.first :])  # fmt: skip
+        return replace(one, starts=np.concatenate(parts), first=one.first + two.first)
+
+    def parted(self) -> tuple[Promise, Promise]:
+        """Part a promise: the best guesses of the parts it was made from, and the others."""
+        first, others = self.starts[: self.first], self.starts[self.first :]
+        return replace(self, starts=first), replace(self, starts=others)
 
 
 class Guesses:
@@ -88,9 +116,7 @@ class Guesses:
         starts = self._spread(forward, start, _N_SCREEN, range(len(hypothesis.effects)))
         return Start(forward, np.concatenate([start[None], starts]), self.noise, _N_BEGUN)
 
-    def begun_jointly(
-        self, hypothesis: Hypothesis, members: Sequence[Fit], count: int, skip: int = 0
-    ) -> Start:
+    def begun_jointly(self, hypothesis: Hypothesis, members: Sequence[Fit], count: int) -> Start:
         """Begin where parts of a hypothesis have led, the effects they lack by their prior."""
         if not members:
             return self.begun(hypothesis)
@@ -102,13 +128,16 @@ class Guesses:
             lacking = [i for i, e in enumerate(hypothesis.effects) if e.name not in known]
             size = _N_SCREEN // len(members) if lacking else 1
             parts.append(self._spread(forward, led, size, lacking))
-        return Start(forward, np.concatenate(parts), self.noise, count, skip)
+        return Start(forward, np.concatenate(parts), self.noise, count)
 
-    def beside(self, kept: Hypothesis, found: Fit, added: Sequence[Hypothesis]) -> list[Promise]:
+    def beside(
+        self, kept: Hypothesis, found: Fit, added: Sequence[Hypothesis], size: int = _N_ADDED
+    ) -> list[Promise]:
         """Guess at sets of what is kept of one that was fitted and one effect more.
 
-        All other parameters take one Gauss-Newton step from each guess: what they can take up is
-        no reason to add an effect.
+        All other parameters take a Gauss-Newton step from each guess, or part of one where a whole
+        one goes too far: what they can take up is no reason to add an effect. What is kept of a
+        larger set is guessed at by itself as well.
 
         Parameters
         ----------
@@ -117,43 +146,57 @@ class Guesses:
         found : Fit
         added : sequence of Hypothesis
             Single effects.
+        size : int
+            How many guesses at the effect that is added are compared.
         """
         forward, start = self._forward(kept)
-        psi = _led(forward, start, found)
-        problem = Residuals(self.data, forward)
+        psi = _led(forward, start, found)[None]
+        problem, ended = Residuals(self.data, forward), Residuals(self.data, found.forward)
         sets = []
         for h in added:
             larger, larger_start = self._forward(joined(kept, h))
             last = [e.name for e in larger.hypothesis.effects].index(h.name)
-            begun = self._spread(larger, _led(larger, larger_start, found), _N_ADDED, [last])
+            begun = self._spread(larger, _led(larger, larger_start, found), size, [last])
             there = Residuals(self.data, larger)
             sets.append((there, there.clip(begun)))
-        asked = [(problem, problem.clip(psi[None])), (problem, problem.around(psi[None])), *sets]
-        raw, moved, *guessed = residuals_of_all(asked)
+        if 1 < len(kept.effects) < len(found.forward.hypothesis.effects):
+            sets.append((problem, problem.clip(psi)))
+        asked = [
+            (ended, found.psi[None]),
+            (problem, problem.clip(psi)),
+            (problem, problem.around(psi)),
+        ]
+        at_end, raw, moved, *guessed = residuals_of_all([*asked, *sets])
         sds = problem.sds(found.noise)
-        slope = problem.jacobian(psi[None], raw, moved)[0] / sds
+        slope = problem.jacobian(psi, raw, moved)[0] / sds
         hessian = slope @ slope.T + np.diag(problem.precision**2 + 1e-6 / problem.width**2)
-        off = (psi - problem.loc) * problem.precision**2
-        promises = []
+        off = (psi[0] - problem.loc) * problem.precision**2
+        stepped = []
         for (there, begun), left in zip(sets, guessed, strict=True):
             gradient = (left / sds) @ slope.T + off
             step = -np.linalg.solve(hessian, gradient.T).T
-            gained = 0.5 * (gradient * step).sum(axis=1)
-            costs = there.costs(begun, left, sds) + gained
-            costs = np.where(np.isfinite(costs), costs, np.inf)
-            best = np.argsort(costs, kind="stable")[:_N_ADDED_BEGUN]
+            costs = there.costs(begun, left, sds) + 0.5 * (gradient * step).sum(axis=1)
+            best = there.best(costs, begun, _N_STEPPED)
             own, here = _places(forward, there.forward)
-            starts = begun[best].copy()
-            starts[:, here] += step[best][:, own]
-            promises.append(
-                Promise(there.forward.hypothesis, -float(costs[best[0]]), starts, found.noise)
-            )
+            starts = np.repeat(begun[best][None], len(_STEPS), axis=0)
+            starts[:, :, here] += np.array(_STEPS)[:, None, None] * step[best][:, own]
+            stepped.append((there, there.clip(starts.reshape(-1, starts.shape[-1]))))
+        cost = float(ended.costs(found.psi[None], at_end, sds)[0])
+        promises = []
+        for (there, starts), left in zip(stepped, residuals_of_all(stepped), strict=True):
+            costs = there.costs(starts, left, sds)
+            best = there.best(costs, starts, _N_ADDED_BEGUN)
+            gained = cost - float(costs[best[0]])
+            expected = self._expected(there.forward.hypothesis, found, gained)
+            promises.append(Promise(there.forward, expected, starts[best], found.noise))
         return promises
 
-    def begun_as_promised(self, promise: Promise) -> Start:
-        """Begin where a promise says."""
-        forward, _ = self._forward(promise.hypothesis)
-        return Start(forward, promise.starts, promise.noise, len(promise.starts))
+    def _expected(self, hypothesis: Hypothesis, found: Fit, gained: float) -> float:
+        """Log of evidence times prior of a set with a density so much higher than one's fitted."""
+        was, odds = found.forward.hypothesis, self.odds
+        share = float(np.log(hypothesis.share / was.share))
+        prior = odds.ln_prior(hypothesis.name) - odds.ln_prior(was.name)
+        return with_prior(found, odds) + gained + prior + share
 
     def _forward(self, hypothesis: Hypothesis) -> tuple[Forward, Array]:
         scale = {o: n.sigma for o, n in self.noise.items()}

@@ -28,8 +28,10 @@ type _Started = tuple[Hypothesis, list[Fit]]
 
 # Effects of which one is in every pair that is tried, and sets from which others are made.
 _N_PAIR_SEEDS, _N_SETS, _MOST_CAUSES = 6, 3, 4
+# Guesses at the second effect of a pair, from either side.
+_N_PAIRED = 32
 # Sets made of others that are fitted at a time, of those that were guessed at.
-_N_FITTED = 8
+_N_FITTED = 12
 # Explanations beside which something unlisted is tried as well.
 _N_LEADING, _N_LEADING_SETS = 7, 3
 # A discrepancy or a pair that is so many nats (prior and all) behind the best hypothesis after a
@@ -38,11 +40,12 @@ _N_LEADING, _N_LEADING_SETS = 7, 3
 _HOPELESS = 15.0
 # One within so many nats is begun from more guesses: a pair has many modes.
 _SEARCHED = 8.0
+# One of which a guess expects so many nats less than the best set has is not fitted at all.
+_UNPROMISING = 40.0
 # An effect that far out in its prior (sds) is fitted with a wider one as well.
 _FAR_OUT = 2.0
 # A hypothesis is in play within so many nats of the best.
 IN_PLAY = 4.0
-_N_BEGUN = 5
 
 
 def sets_and_unlisted(
@@ -66,15 +69,18 @@ def sets_and_unlisted(
     alone = sorted((best[m] for m in best if m != "none"), key=lambda f: -with_prior(f, n))
     others: list[_Started] = [(h, []) for h in unknowns(guesses.data)]
     others += _with_remainders(guesses, alone[:_N_LEADING])
-    pairs = _pairs(single, best)
-    truncated = truncated_fits(
-        [guesses.begun_jointly(h, members, 1) for h, members in others + pairs]
-    )
-    leading = max(_promise(group, n) for group in (*((f,) for f in best.values()), *truncated))
+    alone_best = max(with_prior(f, n) for f in best.values())
+    pairs = _pairs(guesses, single, best, alone_best - _UNPROMISING)
     n_others = len(others)
-    truncated[n_others:] = _begun_again(guesses, pairs, truncated[n_others:], leading)
-    ended = _finished(truncated, leading - _HOPELESS, n)
-    unlisted, sets = (sized(part, leading) for part in (ended[:n_others], ended[n_others:]))
+    truncated = truncated_fits([
+        *(guesses.begun_jointly(h, members, 1) for h, members in others),
+        *(p.parted()[0].start for p in pairs),
+    ])  # fmt: skip
+    listed = max([alone_best, *(_promise(group, n) for group in truncated[n_others:])])
+    leading = max([listed, *(_promise(group, n) for group in truncated[:n_others])])
+    truncated[n_others:] = _begun_again(guesses, pairs, truncated[n_others:], listed)
+    unlisted = sized(_finished(truncated[:n_others], leading - _HOPELESS, n), leading)
+    sets = sized(_finished(truncated[n_others:], listed - _HOPELESS, n), listed)
     # What is unlisted takes up what any listed causes leave: these are compared without it.
     listed = max(with_prior(f, n) for f in (*best.values(), *sets))
     sets += _stepwise(guesses, [best[m] for m in single], usual, sets, listed)
@@ -134,29 +140,31 @@ def _with_remainders(guesses: Guesses, causes: Sequence[Fit]) -> list[_Started]:
     return [(h, [f]) for f in causes for h in with_remainder(guesses.data, f.forward.hypothesis)]
 
 
-def _pairs(single: Sequence[str], best: Mapping[str, Fit]) -> list[_Started]:
-    """Pairs that hold one of the best single effects."""
+def _pairs(
+    guesses: Guesses, single: Sequence[str], best: Mapping[str, Fit], least: float
+) -> list[Promise]:
+    """Guess at pairs that hold one of the best single effects, from either if both are."""
     seeds = sorted(single, key=lambda m: -best[m].log_evidence)[:_N_PAIR_SEEDS]
-    found: list[_Started] = []
-    for i, a in enumerate(single):
-        for b in single[i + 1 :]:
-            one, other = (best[m].forward.hypothesis for m in (a, b))
-            if a in seeds or b in seeds:
-                found.append((joined(one, other), [best[a], best[b]]))
-    return found
+    found: dict[str, Promise] = {}
+    for m in seeds:
+        added = [best[other].forward.hypothesis for other in single if other != m]
+        for p in guesses.beside(best[m].forward.hypothesis, best[m], added, _N_PAIRED):
+            other = found.get(p.hypothesis.name)
+            found[p.hypothesis.name] = p if other is None else other.with_starts_of(p)
+    return [p for p in found.values() if p.expected > least]
 
 
 def _begun_again(
-    guesses: Guesses,
-    pairs: Sequence[_Started],
-    truncated: Sequence[list[Fit]],
-    leading: float,
+    guesses: Guesses, pairs: Sequence[Promise], truncated: Sequence[list[Fit]], leading: float
 ) -> list[list[Fit]]:
     """Begin the pairs that are in play from more guesses."""
-    in_play = [
-        i for i in range(len(pairs)) if _promise(truncated[i], guesses.odds) > leading - _SEARCHED
-    ]
-    more = truncated_fits([guesses.begun_jointly(*pairs[i], _N_BEGUN, skip=1) for i in in_play])
+    others = {
+        i: p.parted()[1]
+        for i, p in enumerate(pairs)
+        if _promise(truncated[i], guesses.odds) > leading - _SEARCHED
+    }
+    in_play = [i for i, p in others.items() if len(p.starts)]
+    more = truncated_fits([others[i].start for i in in_play])
     searched = [list(group) for group in truncated]
     for i, group in zip(in_play, more, strict=True):
         searched[i] += group
@@ -173,22 +181,20 @@ def _stepwise(
     """Sets made of the best pairs by exchange and enlargement, those made of these, and so on."""
     n = guesses.odds
     alone = [f.forward.hypothesis for f in single]
-    searched = {f.forward.hypothesis.name for f in pairs if with_prior(f, n) > listed - _SEARCHED}
+    searched = {f.forward.hypothesis.name for f in pairs}
     grown, made = _leading(pairs, listed - IN_PLAY, n), list[Fit]()
 
     def fitted(promises: Sequence[Promise]) -> list[Fit]:
         return _as_sized(guesses, usual, _fitted(guesses, promises, searched, listed), listed)
 
     while grown:
+        larger = fitted(_enlarged(guesses, grown, alone))
+        listed = max([listed, *(with_prior(f, n) for f in larger)])
+        grown = _leading(larger, listed - IN_PLAY, n)
         changed = fitted(_exchanged(guesses, grown, alone))
         listed = max([listed, *(with_prior(f, n) for f in changed)])
         grown = _leading([*grown, *changed], listed - IN_PLAY, n)
-        larger: list[Fit] = []
-        if len(grown[0].forward.hypothesis.effects) < _MOST_CAUSES:
-            larger = fitted(_enlarged(guesses, grown, alone))
-        made += changed + larger
-        listed = max([listed, *(with_prior(f, n) for f in larger)])
-        grown = _leading(larger, listed - IN_PLAY, n)
+        made += larger + changed
     return made
 
 
@@ -201,7 +207,7 @@ def _leading(sets: Sequence[Fit], least: float, odds: Odds) -> list[Fit]:
 
 
 def _exchanged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis]) -> list[Promise]:
-    """Guess at sets with one effect of some in the place of another."""
+    """Guess at sets with one effect of some in the place of another, or with one less."""
     promises = []
     for found in sets:
         names = {e.name for e in found.forward.hypothesis.effects}
@@ -219,8 +225,9 @@ def _enlarged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis]
     for found in sets:
         kept = found.forward.hypothesis
         names = {e.name for e in kept.effects}
-        added = [h for h in alone if h.name not in names]
-        promises += guesses.beside(kept, found, added)
+        if len(names) < _MOST_CAUSES:
+            added = [h for h in alone if h.name not in names]
+            promises += guesses.beside(kept, found, added)
     return promises
 
 
@@ -229,12 +236,12 @@ def _fitted(
 ) -> list[Fit]:
     """Fit the sets that promise most, each once, and note them as searched."""
     best: dict[str, Promise] = {}
-    for p in sorted(promises, key=lambda p: -p.log_joint):
-        if p.hypothesis.name not in searched:
+    for p in sorted(promises, key=lambda p: -p.expected):
+        if p.hypothesis.name not in searched and p.expected > listed - _UNPROMISING:
             best.setdefault(p.hypothesis.name, p)
     chosen = list(best.values())[:_N_FITTED]
     searched |= {p.hypothesis.name for p in chosen}
-    truncated = truncated_fits([guesses.begun_as_promised(p) for p in chosen])
+    truncated = truncated_fits([p.start for p in chosen])
     return _finished(truncated, listed - _SEARCHED, guesses.odds)
 
 

@@ -90,6 +90,27 @@ def test_an_empty_folder_is_used(tmp_path: Path) -> None:
     assert contents(tmp_path) == {"run", "run/a"}
 
 
+def test_a_link_to_an_empty_folder_is_filled(tmp_path: Path) -> None:
+    """As a mount point is: neither can be replaced, and another process has not written it."""
+    (tmp_path / "elsewhere").mkdir()
+    out = tmp_path / "out"
+    out.symlink_to(tmp_path / "elsewhere")
+    with fresh_folder(out) as folder:
+        (folder / "figures").mkdir()
+        (folder / "figures" / "a.png").write_text("x")
+    assert out.is_symlink()
+    assert contents(tmp_path / "elsewhere") == {"figures", "figures/a.png"}
+    assert {p.name for p in tmp_path.iterdir()} == {"elsewhere", "out"}
+
+
+def test_a_mount_point_with_an_earlier_result_is_refused_before_the_work(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "run.json").write_text("{}")
+    monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == out)
+    assert "is a mount point" in refusal(out, overwrite=True)
+
+
 def test_an_earlier_result_is_replaced_only_on_request(tmp_path: Path) -> None:
     out = tmp_path / "run"
     out.mkdir()

@@ -159,9 +159,8 @@ PULL: Mapping[str, Callable[[Row, Row, float], float]] = {
     * (1.0 - math.exp(-max(r["slip"], 0.0) / p["slip_scale"])),
     "slip_sinkage": lambda p, r, y: y - W * p["pull_loss"] * sunk(r)
     * math.expm1(min(deeper(p, r), 3.0)),
-    "post_peak_softening": lambda p, r, y: y * (
-        1.0 - p["loss"] * (1.0 - math.exp(-max(r["slip"] - p["peak_slip"], 0.0) / p["slip_scale"]))
-    ),
+    "post_peak_softening": lambda p, r, y: y - max(y + W * p["resistance"], 0.0) * p["loss"]
+    * (1.0 - math.exp(-max(r["slip"] - p["peak_slip"], 0.0) / p["slip_scale"])),
     "load_transfer": lambda p, r, y: y * transferred(p, r) ** p["pull_exponent"],
 }  # fmt: skip
 SINKAGE: Mapping[str, Callable[[Row, Row, float], float]] = {

@@ -177,6 +177,31 @@ def test_amounts(view):
     np.testing.assert_allclose(lug, 0.5 * -np.expm1(-view.slip() / 0.2))
 
 
+@pytest.mark.parametrize(
+    ("curvature", "half_way"), [(0.7, 0.1), (1.0, 4.0), (2.5, 2.5), (5.0, 0.3), (7.0, 0.6)]
+)
+def test_a_fit_of_a_drift_begins_with_one_of_about_its_shape_size_and_zero(
+    view, curvature, half_way
+):
+    """From a warm-up no fit gets to a drift from one level to another, whatever its size."""
+    effect = EFFECTS["sensor_drift"]
+    drawn = np.tile(parameters("sensor_drift", {}), (32, 1))
+    true = parameters("sensor_drift", {"drift": -0.4, "curvature": curvature, "half_way": half_way,
+                                       "zero_at": 0.3})  # fmt: skip
+    left = effect.on_output(true, "pull", np.zeros((1, 20)), view)[0]
+    seen = left.copy()
+    seen[3] = np.nan
+    begun = effect.begun(drawn, {"pull": seen}, view)
+    off = effect.on_output(begun, "pull", np.zeros((32, 20)), view) - left
+    assert np.sqrt(np.square(off).mean(axis=1)).min() < 0.1 * np.ptp(left)
+    assert (begun[:, 0] < 0.0).all()
+    # Nothing that is left, or the same in all runs, is as good as no drift.
+    for alike in (0.3, 0.0):
+        begun = effect.begun(drawn, {"pull": np.full(20, alike)}, view)
+        np.testing.assert_allclose(begun[:, 0], 0.0, atol=1e-12)
+        assert ((begun[:, 3] > 0.0) & (begun[:, 3] < 1.0)).all()
+
+
 def test_a_step_is_one_constant_before_a_run_and_another_after_it(view):
     size = {"jump": 0.3, "zero_at": 1.0 / 3.0, "change_point": 9.5 / 19.0, "duration": 1e-9}
     step = apply("sensor_step", size, "pull", view)[0]
@@ -246,12 +271,12 @@ def test_probes_change_what_they_read(name, role, view):
 def test_softening_begins_past_the_peak(view):
     change = apply(
         "post_peak_softening",
-        {"loss": 0.4, "peak_slip": 0.3, "slip_scale": 0.2},
+        {"loss": 0.4, "peak_slip": 0.3, "slip_scale": 0.2, "resistance": 0.1},
         "pull",
         view,
     )[0]
     np.testing.assert_allclose(change[view.slip() <= 0.3], 0.0, atol=1e-12)
-    lost = change / predict("pull", by_role(view))
+    lost = change / (predict("pull", by_role(view)) + 0.1 * view.load_kn)
     assert (np.diff(lost[view.slip() > 0.3]) < 0.0).all()
 
 

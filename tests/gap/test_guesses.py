@@ -12,7 +12,7 @@ from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Start
 from calib.gap.forward import Forward
-from calib.gap.guesses import Guesses, _led
+from calib.gap.guesses import Guesses, _led, _places
 from calib.gap.hypotheses import joined, singles, unknowns
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
@@ -103,13 +103,13 @@ def test_a_set_begins_where_its_parts_have_led_with_what_they_lack_drawn(guesses
     np.testing.assert_array_equal(found, as_any)
 
 
-def test_a_promise_is_the_joint_density_after_one_step_of_all_other_parameters(guesses, alone):
-    """Which take up what they can: Gauss and Newton's step, at the noise of the fit."""
+def test_a_promise_is_what_a_step_of_all_other_parameters_makes_of_the_best_guesses(guesses, alone):
+    """They take up what they can: Gauss and Newton's step or part of it, at the fit's noise."""
     data, kept, added = guesses.data, alone["lug_thrust"], alone["force_offset"]
     found = fit_at(data, kept)
     psi = found.psi.copy()
     psi[found.forward.phi_slices[0]] += 0.2
-    found = replace(found, psi=psi)
+    found = replace(found, psi=psi, log_evidence=12.0)
     (promise,) = guesses.beside(kept, found, [added])
     forward = Forward(data, kept, {o: n.sigma for o, n in guesses.noise.items()}, guesses.lab_mode)
     problem = Residuals(data, forward)
@@ -129,22 +129,50 @@ def test_a_promise_is_the_joint_density_after_one_step_of_all_other_parameters(g
     gradient = raw / sds @ slope.T + (led - problem.loc) * problem.precision**2
     step = -np.linalg.solve(hessian, gradient.T).T
     costs = there.costs(begun, raw, sds) - 0.5 * np.einsum("kd,de,ke->k", step, hessian, step)
-    best = np.argsort(costs)
+    own, here = _places(forward, larger)
+    tried = []
+    for i in there.best(costs, begun, 4):
+        for part in (1.0, 0.3, 0.0):
+            moved = begun[i].copy()
+            moved[here] += part * step[i, own]
+            tried.append((there.clip(moved[None])[0], i))
+    at = np.stack([moved for moved, _ in tried])
+    costs = there.costs(at, there.raw(at), sds)
+    best = [tried[i] for i in np.argsort(costs)]
     assert promise.hypothesis == joined(kept, added)
     assert promise.noise == found.noise
-    assert promise.log_joint == pytest.approx(-costs[best[0]], rel=1e-3)
-    # The starts have the step taken: in the simulators', the size's own drawn.
-    same = larger.n_shared
-    for begin, i in zip(promise.starts, best, strict=False):
-        np.testing.assert_allclose(
-            (begin - begun[i])[:same] / problem.width[:same],
-            step[i, :same] / problem.width[:same], rtol=0.02, atol=2e-3,
-        )  # fmt: skip
-        part = larger.phi_slices[place]
-        np.testing.assert_array_equal(begin[part], begun[i][part])
+    # As much better a density as the one that was fitted has, at a prior of one effect more.
+    was = problem.costs(psi[None], problem.raw(psi[None]), sds)[0]
+    odds = guesses.odds
+    prior = odds.ln_prior(promise.hypothesis.name)
+    assert promise.expected == pytest.approx(12.0 + was - costs.min() + prior, abs=0.05)
+    # It begins at the best of them, and at the best that lies apart.
+    width = there.width
+    np.testing.assert_allclose(promise.starts[0] / width, best[0][0] / width, rtol=0.02, atol=2e-3)
+    apart = (np.abs(promise.starts[0] - promise.starts[1]) / width).max()
+    assert len(promise.starts) == 2
+    assert apart > 0.7
+    # A size keeps what was drawn.
+    part = larger.phi_slices[place]
+    assert all(begin[part] in begun[:, part] for begin in promise.starts)
     # A fit from it begins with all of them, the best first.
-    _, candidates = candidates_of(guesses.begun_as_promised(promise))
+    _, candidates = candidates_of(promise.start)
     np.testing.assert_array_equal(candidates, promise.starts)
+
+
+def test_what_is_kept_of_a_larger_set_is_guessed_at_by_itself(guesses, alone):
+    names = ("force_offset", "lug_thrust", "rut_rebound")
+    found = fit_at(guesses.data, joined(*(alone[n] for n in names)))
+    kept = joined(alone["force_offset"], alone["lug_thrust"])
+    promises = guesses.beside(kept, found, [alone["rate_effect"]])
+    assert [p.hypothesis.name for p in promises] == [
+        "force_offset+lug_thrust+rate_effect", "force_offset+lug_thrust",
+    ]  # fmt: skip
+    assert promises[1].starts.shape[1] == guesses._forward(kept)[0].n_dim
+    # One effect alone is a hypothesis that was fitted already.
+    pair = fit_at(guesses.data, kept)
+    assert len(guesses.beside(alone["lug_thrust"], pair, [alone["rate_effect"]])) == 1
+    assert guesses.beside(alone["lug_thrust"], pair, []) == []
 
 
 def test_what_sets_in_begins_where_the_laboratorys_residuals_show_it_best(guesses):

@@ -67,12 +67,32 @@ def test_sign_and_zeros_hold_for_every_shape_of_an_effect(data, effect, known):
         np.testing.assert_allclose(at, 0.0, atol=1e-12)
 
 
-BOUNDED = [e for e, k in FACTS if k.at_most_all]
+class Bogging(Effect):
+    """Takes a part of the pull that there is."""
+
+    name = "bogging"
+    title = "part of the pull is lost"
+    parameters = ("loss",)
+    form = ("slip",)
+    known = (Known("pull", -1, at_most_all=True),)
+    outputs = ("pull",)
+    priors = """
+model = "bogging"
+
+[parameters.loss]
+dist = "half_normal"
+sd = 0.6
+unit = "1"
+reason = "A test's"
+source = "None"
+"""
+
+    def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        return location - np.maximum(location, 0.0) * phi[:, :1]
 
 
 def test_no_shape_takes_more_of_the_pull_than_there_is(data):
-    assert [e.name for e in BOUNDED] == ["post_peak_softening"]
-    forward, name, psi = drawn(data, BOUNDED[0], "pull", family=True)
+    forward, name, psi = drawn(data, Bogging(), "pull", family=True)
     psi[:, forward.form_slices[name][0]] *= 10.0
     full, plain = forward.field_and_plain(psi, along(data, "slip", SLIPS))
     known = np.isfinite(plain[name]).all(axis=1)
@@ -80,6 +100,23 @@ def test_no_shape_takes_more_of_the_pull_than_there_is(data):
     assert ((full == 0.0) & (plain > 0.0)).any()  # some shapes reach the bound
     assert (full[plain > 0.0] >= 0.0).all()
     np.testing.assert_array_equal(full[plain <= 0.0], plain[plain <= 0.0])
+
+
+def test_strength_that_is_lost_past_the_peak_is_the_gross_thrusts(data):
+    """A wheel that just moves itself pulls less than nothing then, by what resists its motion."""
+    effect = EFFECTS["post_peak_softening"]
+    forward, _, psi = drawn(data, effect, "pull", family=False)
+    part = forward.phi_slices[0]
+    pulls = np.array([-2.0, -0.5, 0.0, 0.7])
+    view = along(data, "slip", np.full(4, 0.5))
+    phi = forward.hypothesis.effect_priors[0].to_natural(psi[:, part])
+    loss, peak, scale, resistance = phi.T[..., None]
+    beyond = -np.expm1(-np.maximum(0.5 - peak, 0.0) / scale)
+    thrust = np.maximum(pulls + resistance * view.load_kn, 0.0)
+    found = effect.on_output(phi, "pull", np.tile(pulls, (DRAWS, 1)), view)
+    np.testing.assert_allclose(found, pulls - thrust * loss * beyond, rtol=1e-12)
+    assert (found[:, 2] < 0.0).mean() > 0.9
+    assert (found[:, 0] == -2.0).mean() > 0.9
 
 
 GROWING = [(e, k) for e, k in FACTS if k.grows_with]

@@ -18,7 +18,7 @@ from calib.gap.case import Case
 from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
-from calib.gap.guesses import Guesses, _led, _places
+from calib.gap.guesses import Guesses, Promise, _led, _places
 from calib.gap.hypotheses import joined, resized, shifts, singles, with_remainder
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.inclusion import inclusion_probability
@@ -85,8 +85,7 @@ def test_what_two_sets_share_begins_where_it_was_led(guesses, alone):
     pair = fitted(guesses, alone["rate_effect"], alone["sensor_drift"])
     (promise,) = guesses.beside(pair.forward.hypothesis, pair, [alone["force_offset"]])
     assert promise.hypothesis.name == "force_offset+rate_effect+sensor_drift"
-    start = guesses.begun_as_promised(promise)
-    forward, candidates = start.forward, start.guesses
+    forward, candidates = promise.start.forward, promise.start.guesses
     # With the new effect at rest and the others where they were, it predicts what the pair did.
     led = _led(forward, candidates[0], pair)
     led[forward.phi_slices[0]] = 0.0
@@ -100,14 +99,14 @@ def test_of_one_effect_more_that_which_acts_promises_most(guesses, alone):
     pair = fitted(guesses, alone["rate_effect"], alone["sensor_drift"])
     promises = _enlarged(guesses, [pair], list(alone.values()))
     assert len(promises) == len(alone) - 2
-    best = max(promises, key=lambda p: p.log_joint)
+    best = max(promises, key=lambda p: p.expected)
     assert best.hypothesis.name == "+".join(CAUSES)
 
 
 def test_an_effect_that_does_not_act_is_exchanged_for_one_that_does(guesses, alone):
     wrong = fitted(guesses, alone["rate_effect"], alone["lug_thrust"])
     promises = _exchanged(guesses, [wrong], list(alone.values()))
-    names = [p.hypothesis.name for p in sorted(promises, key=lambda p: -p.log_joint)]
+    names = [p.hypothesis.name for p in sorted(promises, key=lambda p: -p.expected)]
     assert set(names[0].split("+")) <= set(CAUSES)
     assert "lug_thrust+rate_effect" not in names
 
@@ -207,17 +206,40 @@ def test_the_best_fit_of_each_hypothesis_counts():
     assert _best_of_each(fits) == [fits[2], fits[1], fits[3]]
 
 
-def test_pairs_hold_one_of_the_six_best():
+def test_pairs_hold_one_of_the_six_best_and_are_guessed_at_from_each_that_is():
     names = [f"e{i}" for i in range(9)]
     best = {n: fit_of(named(n), 10.0 - i) for i, n in enumerate(names)}
     for n in names:
         best[n].forward.hypothesis = replace(named(n), effect_priors=(None,))
     mixed = [names[i] for i in (4, 8, 0, 6, 2, 7, 1, 3, 5)]
-    found = _pairs(mixed, best)
+
+    class Guessed(Stub):
+        def beside(self, kept, found, added, size):
+            """Guesses are told by the place of the effect that they were made from."""
+            assert found is best[kept.name]
+            place = float(names.index(kept.name))
+            starts = np.array([[place, 0.0], [place, 1.0]])
+            assert size == 32
+            return [
+                Promise(SimpleNamespace(hypothesis=joined(kept, h)), place, starts, {})
+                for h in added
+            ]
+
+    found = _pairs(Guessed(), mixed, best, -1.0)
     expected = {"+".join(p) for p in combinations(names, 2) if set(p) & set(names[:6])}
-    assert sorted(h.name for h, _ in found) == sorted(expected)
-    for h, members in found:
-        assert {f.forward.hypothesis.name for f in members} == set(h.name.split("+"))
+    assert sorted(p.hypothesis.name for p in found) == sorted(expected)
+    for p in found:
+        # The best guess from either first, that of the side that promises more before the other's.
+        sides = sorted({int(n[1]) for n in p.hypothesis.name.split("+")} & set(range(6)))[::-1]
+        first, others = p.parted()
+        assert first.starts.tolist() == [[float(side), 0.0] for side in sides]
+        assert others.starts.tolist() == [[float(side), 1.0] for side in sides]
+        assert p.expected == sides[0]
+    # Those that promise too little are left out.
+    less = _pairs(Guessed(), mixed, best, 3.5)
+    assert {p.hypothesis.name for p in less} == {
+        p.hypothesis.name for p in found if p.expected > 3.5
+    }
 
 
 def test_sets_are_made_from_the_three_best_of_each_name_that_are_in_play():
@@ -229,18 +251,22 @@ def test_sets_are_made_from_the_three_best_of_each_name_that_are_in_play():
 
 
 class Stub:
-    """Guesses that note what they are asked to begin."""
+    """Guesses that nothing is asked of but their odds."""
 
     def __init__(self, odds=EVEN) -> None:
-        self.odds, self.asked = odds, []
+        self.odds = odds
 
-    def begun_jointly(self, hypothesis, members, count, skip=0):
-        self.asked.append((hypothesis.name, members, count, skip))
-        return [fit_of(hypothesis, 0.5)]
 
-    def begun_as_promised(self, promise):
-        self.asked.append(promise.hypothesis.name)
-        return [fit_of(promise.hypothesis, promise.log_joint)]
+class Promised:
+    """A promise whose start is noted when it is begun from, as one fit."""
+
+    def __init__(self, name: str, expected: float, asked: list[str]) -> None:
+        self.hypothesis, self.expected, self.asked = named(name), expected, asked
+
+    @property
+    def start(self):
+        self.asked.append(self.hypothesis.name)
+        return [fit_of(self.hypothesis, self.expected)]
 
 
 @pytest.fixture
@@ -265,32 +291,40 @@ def test_what_is_hopeless_is_not_fitted_further(at_once):
 
 def test_pairs_in_play_are_begun_again_from_the_guesses_after_the_first(at_once):
     """Those within eight nats of the best."""
-    stub = Stub()
-    pairs = [(named(n), [n]) for n in ("a+b", "a+c", "b+c")]
-    begun = [[fit_of(h, s)] for (h, _), s in zip(pairs, (2.1, 1.9, 9.0), strict=True)]
-    found = _begun_again(stub, pairs, begun, 10.0)
-    assert stub.asked == [("a+b", ["a+b"], 5, 1), ("b+c", ["b+c"], 5, 1)]
-    assert [len(f) for f in found] == [2, 1, 2]
-    assert [len(f) for f in begun] == [1, 1, 1]
+    asked: list[str] = []
+
+    def pair(name: str, others: int):
+        left = Promised(name, 0.5, asked)
+        left.starts = np.zeros((others, 1))
+        return SimpleNamespace(hypothesis=named(name), parted=lambda: (None, left))
+
+    # Of the last all guesses are begun from already.
+    pairs = [pair("a+b", 1), pair("a+c", 1), pair("b+c", 1), pair("c+d", 0)]
+    begun = [[fit_of(p.hypothesis, s)] for p, s in zip(pairs, (2.1, 1.9, 9.0, 9.0), strict=True)]
+    found = _begun_again(Stub(), pairs, begun, 10.0)
+    assert asked == ["a+b", "b+c"]
+    assert [len(f) for f in found] == [2, 1, 2, 1]
+    assert [len(f) for f in begun] == [1, 1, 1, 1]
     assert [f[0] for f in found] == [f[0] for f in begun]
 
 
-def test_the_eight_sets_that_promise_most_are_fitted_once_each(at_once):
-    stub, searched = Stub(), {"s0+t"}
+def test_the_twelve_sets_that_promise_most_are_fitted_once_each(at_once):
+    searched = {"s0+t"}
+    asked: list[str] = []
     promises = [
-        SimpleNamespace(hypothesis=named(f"s{i}+t"), log_joint=j)
-        for i, j in ((0, 99.0), (1, 5.0), (2, 6.0), (1, 7.0), (3, 4.0), (4, 3.0), (5, 2.0),
-                     (6, 1.0), (7, 0.0), (8, -1.0), (9, -2.0))
-    ]  # fmt: skip
-    found = _fitted(stub, promises, searched, 12.5)
-    assert stub.asked == [f"s{i}+t" for i in range(1, 9)]
-    assert searched == {"s0+t", *stub.asked}
+        Promised(f"s{i}+t", j, asked)
+        for i, j in ((0, 99.0), (1, 5.0), (2, 6.0), (1, 7.0), *((i, 7.0 - i) for i in range(3, 20)))
+    ]
+    found = _fitted(Stub(), promises, searched, 12.5)
+    assert asked == [f"s{i}+t" for i in range(1, 13)]
+    assert searched == {"s0+t", *asked}
     # Within eight nats of the best that is listed they are fitted fully.
     assert [with_prior(f, EVEN) for f in found] == pytest.approx(
-        [7.1, 6.1, 4.0, 3.0, 2.0, 1.0, 0.0, -1.0]
+        [7.1, 6.1, *(7.0 - i for i in range(3, 13))]
     )
-    assert _fitted(stub, promises, searched, 12.5) != []
-    assert searched == {f"s{i}+t" for i in range(10)}
+    # One that is expected forty nats behind is not fitted at all.
+    assert len(_fitted(Stub(), promises, searched, 30.5)) == 4
+    assert searched == {f"s{i}+t" for i in range(17)}
 
 
 def test_every_other_effect_takes_ones_place_or_is_added():
@@ -304,6 +338,7 @@ def test_every_other_effect_takes_ones_place_or_is_added():
         ("b", found, "c"), ("b", found, "d"), ("a", found, "c"), ("a", found, "d"),
     ]  # fmt: skip
     assert _enlarged(Noted(), [found], alone) == [("a+b", found, "c"), ("a+b", found, "d")]
+    assert _enlarged(Noted(), [fit_of(joined(*alone), 0.0)], alone) == []
 
 
 def test_sets_grow_step_by_step_up_to_four_causes_as_long_as_they_are_in_play(monkeypatch):
@@ -313,7 +348,7 @@ def test_sets_grow_step_by_step_up_to_four_causes_as_long_as_they_are_in_play(mo
     def enlarged(guesses, grown, alone):
         names = [f.forward.hypothesis.name for f in grown]
         tried.append(names)
-        return [f"{n}+{chr(ord(n[-1]) + 1)}" for n in names]
+        return [f"{n}+{chr(ord(n[-1]) + 1)}" for n in names if n.count("+") < 3]
 
     monkeypatch.setattr(module, "_exchanged", lambda *a: [])
     monkeypatch.setattr(module, "_enlarged", enlarged)
@@ -327,7 +362,7 @@ def test_sets_grow_step_by_step_up_to_four_causes_as_long_as_they_are_in_play(mo
     pairs = [fit_of(named("a+b"), 1.0), fit_of(named("k+l"), -3.5)]
     made = _stepwise(Stub(), [fit_of(named("a"), 0.0)], {}, pairs, 1.0)
     assert [f.forward.hypothesis.name for f in made] == ["a+b+c", "a+b+c+d"]
-    assert tried == [["a+b"], ["a+b+c"]]
+    assert tried == [["a+b"], ["a+b+c"], ["a+b+c+d"]]
     # Four nats behind the best listed no pair is in play.
     tried.clear()
     assert _stepwise(Stub(), [], {}, pairs, 5.5) == []

@@ -19,8 +19,12 @@ EARLY = "zero and span, and an early run once more"
 
 # Part of the campaign over which a step is first taken to happen.
 _WIDE = 0.1
-# Parts of a step at which it is first taken to have been zeroed.
+# Parts of a drift or a step at which it is first taken to have been zeroed.
 _ZEROED = (0.05, 0.95)
+# Curvature and half-way part of drifts: warming up, steady, late, and from one level to another.
+_SHAPES = ((0.8, 0.15), (1.0, 5.0), (3.0, 3.0), (3.0, 0.5), (6.0, 0.25), (6.0, 0.5), (6.0, 0.75))
+# Keeps the size of a drift finite where a guess at its shape has none over the runs.
+_LITTLE = 0.05
 
 
 class _Fault(Effect):
@@ -74,6 +78,17 @@ def _progress(view: View) -> Array:
     return np.clip((view.of("order") - first) / max(last - first, 1.0), 0.0, 1.2)
 
 
+def _grown(curvature: Array, half_way: Array, view: View) -> Array:
+    """Part of a drift that is there at each run, shape (k, n)."""
+    return saturating(np.maximum(_progress(view), 1e-3), curvature, half_way)
+
+
+def _zero_at(before: Array, size: Array) -> Array:
+    """Part of a change at which the gauge was zeroed, by what it read before the change."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.clip(np.nan_to_num(-before / size, nan=0.5), *_ZEROED)
+
+
 class SensorDrift(_Fault):
     """A drift with run order: steady, settling, or from some run on; zeroed at any part of it."""
 
@@ -98,8 +113,24 @@ class SensorDrift(_Fault):
         if output not in self.outputs:
             return location
         drift, curvature, half_way, zero_at = each(phi)
-        u = np.maximum(_progress(view), 1e-3)
-        return np.asarray(location + drift * (saturating(u, curvature, half_way) - zero_at))
+        grown = _grown(curvature, half_way, view)
+        return np.asarray(location + drift * (grown - zero_at))
+
+    def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
+        """Begin with drifts of several shapes, each as large and zeroed where it suits best.
+
+        Between shapes there are modes from which no fit gets away.
+        """
+        residual = left[self.outputs[0]]
+        known = np.isfinite(residual)
+        begun = phi.copy()
+        begun[:, 1:3] = np.resize(_SHAPES, (len(phi), 2))
+        _, curvature, half_way, _ = each(begun)
+        grown, residual = _grown(curvature, half_way, view)[:, known], residual[known]
+        mean = grown.mean(axis=1, keepdims=True)
+        begun[:, 0] = (grown - mean) @ residual / (np.square(grown - mean).sum(axis=1) + _LITTLE)
+        begun[:, 3] = _zero_at(residual.mean() - begun[:, 0] * mean[:, 0], begun[:, 0])
+        return begun
 
     def shape(self, view: View) -> Array | None:
         """Run order."""
@@ -152,9 +183,7 @@ class SensorStep(_Fault):
             part @ residual[known] / (part.sum(axis=1) + 0.5) for part in (1.0 - beyond, beyond)
         )
         begun[:, 0] = after - before
-        with np.errstate(divide="ignore", invalid="ignore"):
-            zero_at = np.nan_to_num(-before / begun[:, 0], nan=0.5)
-        begun[:, 1] = np.clip(zero_at, *_ZEROED)
+        begun[:, 1] = _zero_at(before, begun[:, 0])
         return begun
 
 

@@ -142,31 +142,40 @@ class RutRebound(Effect):
 
 
 class PostPeakSoftening(Effect):
-    """Shear strength falls past its peak: pull (1 - a (1 - exp(-(s - sp)/s1))) beyond slip sp."""
+    """Shear strength falls past its peak: gross thrust H (1 - a (1 - exp(-(s - sp)/s1))).
+
+    The strength drives the gross thrust, of which the motion resistance leaves the pull (Bekker
+    1956; Wong 2008): a wheel that just moves itself has thrust to lose, and pulls less than
+    nothing then.
+    """
 
     name = "post_peak_softening"
     title = "shear strength falls past its peak"
     latex = (
         (
-            r"$P_\mathrm{f} = P\, [1 - \text{loss} \cdot (1 - e^{-(s - \text{peak "
-            r"slip})/\text{slip scale}})]$ for a pull $P > 0$ where the slip $s$ is larger than "
-            r"the peak slip"
+            r"$P_\mathrm{f} = P - H \cdot \text{loss} \cdot (1 - e^{-(s - \text{peak "
+            r"slip})/\text{slip scale}})$ for the pull $P$ where the slip $s$ is larger than the "
+            r"peak slip"
+        ),
+        (
+            r"$H = P + \text{resistance} \cdot W$ is the gross thrust where it is above zero, $W$ "
+            r"the normal load"
         ),
     )
-    parameters = ("loss", "peak_slip", "slip_scale")
+    parameters = ("loss", "peak_slip", "slip_scale", "resistance")
     form = ("slip", "pressure")
-    known = (Known("pull", -1, ("slip",), at_most_all=True),)
+    known = (Known("pull", -1, ("slip",)),)
     outputs = ("pull",)
     covariates = ("slip",)
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
-        """Lower the pull past the peak."""
+        """Lower the thrust past the peak."""
         if output != "pull":
             return location
-        loss, peak_slip, slip_scale = each(phi)
+        loss, peak_slip, slip_scale, resistance = each(phi)
         beyond = np.maximum(view.slip() - peak_slip, 0.0) / slip_scale
-        # A wheel that does not pull has no strength to lose.
-        return np.asarray(location - np.maximum(location, 0.0) * loss * -np.expm1(-beyond))
+        thrust = np.maximum(location + resistance * view.load_kn, 0.0)
+        return np.asarray(location - thrust * loss * -np.expm1(-beyond))
 
 
 class LoadTransfer(Effect):
