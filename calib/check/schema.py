@@ -99,5 +99,5 @@ def read_folder(folder: Path) -> Record:
     raise CalibError(
         f"this is no folder that can be checked ({why})", where=str(folder),
         allowed="a folder written by `calib report`, `calib fit` or `calib compare`",
-        mend="give the folder that --out of one of these named",
+        mend="give such a folder; of a diagnosis `calib diagnose FOLDER/case` makes the same again",
     )  # fmt: skip

@@ -17,8 +17,8 @@ __all__ = ["INTERRUPTED", "STOPPED", "interruptible", "main", "program"]
 
 INTERRUPTED = 130
 STOPPED = (
-    "interrupted; nothing was written. Start the same command again; what a simulator has run "
-    "is kept and not run again"
+    "interrupted; nothing was written. Start the same command again; what simulators of your own "
+    "have run, if there are any, is kept and not run again"
 )
 
 

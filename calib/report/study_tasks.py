@@ -141,7 +141,8 @@ def plan_tasks(
     ------
     CalibError
         If no table has an output, two tables or two models have the same, none has the rows to
-        hold out, a table is too long for a report, or a name is unknown.
+        hold out, a table is too long for a report, a name is unknown, or a model's output is in
+        no table.
     """
     wanted: dict[str, str] = {}
     for name in models:
@@ -188,6 +189,14 @@ def plan_tasks(
             model = wanted.get(OUTPUTS[key]) or choose_model(key, rows)
             tasks[key] = Task(key, model, rows, usable, priors.get(model))
     planned = tuple(tasks[key] for key in OUTPUTS if key in tasks)
+    for column, name in wanted.items():
+        if column not in {OUTPUTS[task.output] for task in planned}:
+            raise CalibError(
+                f"the model {name} is for {column}, which is not reported",
+                where=", ".join(table.source for table in tables),
+                allowed=f"models of {', '.join(task.output for task in planned)}",
+                mend=f"leave it out, or give a file with {column}",
+            )
     if held_out is not None:
         _check_held_out(planned, held_out)
     return planned

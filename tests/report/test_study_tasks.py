@@ -129,6 +129,13 @@ def test_a_model_can_be_chosen_for_its_output() -> None:
     assert "`calib compare bekker modified_bekker FILE`" in str(caught.value)
 
 
+def test_a_model_whose_output_no_file_has_is_refused() -> None:
+    """It was left out without a word."""
+    with pytest.raises(CalibError, match="magic_formula is for drawbar_pull_kn") as caught:
+        plan_tasks([load_he2019("rut_depth")], models=["bekker", "magic_formula"])
+    assert "give a file with drawbar_pull_kn" in str(caught.value)
+
+
 def test_a_prior_file_goes_to_the_model_it_names(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     path.write_text(default_priors("bekker").read_text())
