@@ -26,8 +26,9 @@ from calib.models.base import Array
 __all__ = ["Fit", "Start", "finished", "fit", "full_fits", "truncated_fits"]
 
 _MAX_STEPS = 40
-# Steps of a truncated fit at a discrepancy alone, which predictions are linear in.
-_LINEAR_STEPS = 1
+# Steps of a truncated fit at a discrepancy alone, which predictions are linear in: the noise that a
+# large one leaves is told at the second.
+_LINEAR_STEPS = 2
 # How many nats behind the best of several truncated fits one is given up, and within how many
 # posterior sds of a better one.
 _WORTH, _NEAR = 6.0, 1.5
