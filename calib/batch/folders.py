@@ -51,8 +51,7 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         If `out` exists and may not be replaced, or cannot be written; or if another process wrote
         it while the block ran: then its name ends in a number.
     """
-    out = Path(out)
-    check_folder(out, overwrite=overwrite)
+    out = _replaceable(Path(out), overwrite=overwrite)
     key = out.absolute()
     scratch, held = _claimed.pop(key) if key in _claimed else _scratch(out)
     try:
@@ -88,8 +87,7 @@ def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
     CalibError
         As `fresh_folder` does, or if the folder is claimed already.
     """
-    out = Path(out)
-    check_folder(out, overwrite=overwrite)
+    out = _replaceable(Path(out), overwrite=overwrite)
     with writing(out):
         living = out.parent.is_dir() and any(_is_alive(path) for path, _ in _scratches(out))
     if living:
@@ -107,6 +105,25 @@ def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
             shutil.rmtree(scratch, ignore_errors=True)
             if held is not None:
                 os.close(held)
+
+
+def _replaceable(out: Path, *, overwrite: bool) -> Path:
+    """Check a folder that a result will take the place of; of a link the one that it names."""
+    out = _real(out)
+    check_folder(out, overwrite=overwrite)
+    if os.path.ismount(out):
+        raise CalibError(
+            "the output folder is a mount point, which cannot be replaced",
+            where=str(out),
+            mend="choose a new folder inside it as --out",
+        )
+    return out
+
+
+def _real(out: Path) -> Path:
+    """Return the folder that a link names, which is replaced; the link stays."""
+    with writing(out):  # a name that is too long, a folder that may not be searched
+        return out.resolve() if out.is_symlink() else out
 
 
 def _scratch(out: Path) -> tuple[Path, int | None]:
@@ -149,10 +166,6 @@ def _put(scratch: Path, out: Path) -> None:
     except OSError as error:
         if not out.exists():
             raise
-        if out.is_dir() and not any(out.iterdir()):
-            # A link to an empty folder, or a mount point: neither can be replaced, only filled.
-            shutil.copytree(scratch, out, dirs_exist_ok=True)
-            return
         beside = next(p for i in count(2) if not (p := out.with_name(f"{out.name}-{i}")).exists())
         scratch.replace(beside)
         raise CalibError(
@@ -269,7 +282,8 @@ def _umask() -> int:
 
 def check_folder(out: Path, *, overwrite: bool = False) -> None:
     """Raise a CalibError, before long work, if a folder may not be written, or not replaced."""
-    with writing(out):  # a name that is too long, a folder that may not be searched
+    out = _real(out)
+    with writing(out):
         exists = out.exists()
     if not exists:
         _check_place(out, _above(out))
@@ -292,12 +306,6 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
             "the output folder exists and is not empty",
             where=str(out),
             mend="choose another --out, or pass --overwrite to replace it",
-        )
-    if os.path.ismount(out):
-        raise CalibError(
-            "the output folder is a mount point with something in it, which cannot be replaced",
-            where=str(out),
-            mend="choose a new folder inside it as --out, or empty it yourself",
         )
     if not any((out / name).exists() for name in _OURS):
         raise CalibError(

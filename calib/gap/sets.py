@@ -1,8 +1,9 @@
 """Which explanations of several causes are tried: sets of effects, and what is not listed.
 
-Pairs that hold one of the best single effects come first. The best sets are then changed, one
-effect in the place of another, and enlarged by one, as long as that gives sets in play: a stepwise
-search in both directions, whose result does not depend on where a set came from.
+Pairs that hold one of the best single effects come first. The best sets are then enlarged by one
+effect, and what this makes is changed, one effect in the place of another or one left out, as long
+as that gives sets in play: a stepwise search in both directions, whose result does not depend on
+where a set came from.
 
 Alone an effect may have to be larger than its prior says, to make up for others that act as well.
 Sets are looked for with the priors that their effects had alone, for wide ones miss nothing. Where
@@ -178,7 +179,7 @@ def _stepwise(
     pairs: Sequence[Fit],
     listed: float,
 ) -> list[Fit]:
-    """Sets made of the best pairs by exchange and enlargement, those made of these, and so on."""
+    """Sets made of the best pairs by enlargement and exchange, those made of these, and so on."""
     n = guesses.odds
     alone = [f.forward.hypothesis for f in single]
     searched = {f.forward.hypothesis.name for f in pairs}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.batch.folders import check_folder, fresh_folder
+from calib.batch.folders import check_folder, claimed, fresh_folder
 from calib.errors import CalibError
 
 
@@ -90,25 +90,31 @@ def test_an_empty_folder_is_used(tmp_path: Path) -> None:
     assert contents(tmp_path) == {"run", "run/a"}
 
 
-def test_a_link_to_an_empty_folder_is_filled(tmp_path: Path) -> None:
-    """As a mount point is: neither can be replaced, and another process has not written it."""
-    (tmp_path / "elsewhere").mkdir()
+@pytest.mark.parametrize("earlier", [False, True])
+def test_of_a_link_the_folder_that_it_names_is_written(tmp_path: Path, earlier: bool) -> None:
+    """It was taken for a folder that another process had written meanwhile, or was replaced."""
+    there = tmp_path / "disk" / "elsewhere"
+    there.mkdir(parents=True)
+    if earlier:
+        (there / "run.json").write_text("old")
     out = tmp_path / "out"
-    out.symlink_to(tmp_path / "elsewhere")
-    with fresh_folder(out) as folder:
-        (folder / "figures").mkdir()
-        (folder / "figures" / "a.png").write_text("x")
+    out.symlink_to(there)
+    with fresh_folder(out, overwrite=earlier) as folder:
+        assert folder.parent == there.parent
+        (folder / "run.json").write_text("new")
     assert out.is_symlink()
-    assert contents(tmp_path / "elsewhere") == {"figures", "figures/a.png"}
-    assert {p.name for p in tmp_path.iterdir()} == {"elsewhere", "out"}
+    assert (there / "run.json").read_text() == "new"
+    assert contents(tmp_path) == {"out", "disk", "disk/elsewhere", "disk/elsewhere/run.json"}
 
 
-def test_a_mount_point_with_an_earlier_result_is_refused_before_the_work(tmp_path, monkeypatch):
+def test_a_mount_point_is_refused_before_the_work(tmp_path: Path, monkeypatch) -> None:
+    """What was made could not take its place."""
     out = tmp_path / "out"
     out.mkdir()
-    (out / "run.json").write_text("{}")
     monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == out)
-    assert "is a mount point" in refusal(out, overwrite=True)
+    for kept in (fresh_folder(out), fresh_folder(out, overwrite=True), claimed(out)):
+        with pytest.raises(CalibError, match="is a mount point"), kept:
+            pytest.fail("the work began")
 
 
 def test_an_earlier_result_is_replaced_only_on_request(tmp_path: Path) -> None:
