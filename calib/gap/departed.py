@@ -233,8 +233,8 @@ def _changed(
         if changed is not here:
             change = changed - here
             change *= factor
-            if any(k.at_most_all and k.output == role for k in a.effect.known):
-                np.maximum(change, -np.maximum(here, 0.0), out=change)
+            if any(k.at_most and k.output == role for k in a.effect.known):
+                np.maximum(change, -a.effect.most(a.phi, role, here, a.view), out=change)
             change += here
             location[a.rows] = change
     return location

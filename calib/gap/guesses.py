@@ -25,7 +25,8 @@ __all__ = ["Guesses", "Promise"]
 _N_SCREEN = 64
 _N_BEGUN = 5
 _N_THRESHOLDS = 24
-# Guesses at one more effect of a set, and how many of them a fit begins from.
+# Guesses at one more effect of a set, how many of them all others take a step from, and how many
+# of these a fit begins from.
 _N_ADDED, _N_STEPPED, _N_ADDED_BEGUN = 64, 4, 2
 # Parts of a Gauss-Newton step that are tried, for where a whole one goes too far.
 _STEPS = (1.0, 0.3, 0.0)
@@ -186,7 +187,8 @@ class Guesses:
         for (there, starts), left in zip(stepped, residuals_of_all(stepped), strict=True):
             costs = there.costs(starts, left, sds)
             best = there.best(costs, starts, _N_ADDED_BEGUN)
-            gained = cost - float(costs[best[0]])
+            least = float(costs[best[0]])
+            gained = cost - least if np.isfinite(least) else -np.inf
             expected = self._expected(there.forward.hypothesis, found, gained)
             promises.append(Promise(there.forward, expected, starts[best], found.noise))
         return promises

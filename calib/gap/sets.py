@@ -145,14 +145,17 @@ def _pairs(
     guesses: Guesses, single: Sequence[str], best: Mapping[str, Fit], least: float
 ) -> list[Promise]:
     """Guess at pairs that hold one of the best single effects, from either if both are."""
-    seeds = sorted(single, key=lambda m: -best[m].log_evidence)[:_N_PAIR_SEEDS]
     found: dict[str, Promise] = {}
-    for m in seeds:
+    for m in _pair_seeds(single, best):
         added = [best[other].forward.hypothesis for other in single if other != m]
         for p in guesses.beside(best[m].forward.hypothesis, best[m], added, _N_PAIRED):
             other = found.get(p.hypothesis.name)
             found[p.hypothesis.name] = p if other is None else other.with_starts_of(p)
     return [p for p in found.values() if p.expected > least]
+
+
+def _pair_seeds(single: Sequence[str], best: Mapping[str, Fit]) -> list[str]:
+    return sorted(single, key=lambda m: -best[m].log_evidence)[:_N_PAIR_SEEDS]
 
 
 def _begun_again(
@@ -182,7 +185,7 @@ def _stepwise(
     """Sets made of the best pairs by enlargement and exchange, those made of these, and so on."""
     n = guesses.odds
     alone = [f.forward.hypothesis for f in single]
-    searched = {f.forward.hypothesis.name for f in pairs}
+    searched = {f.forward.hypothesis.name for f in pairs if with_prior(f, n) > listed - _SEARCHED}
     grown, made = _leading(pairs, listed - IN_PLAY, n), list[Fit]()
 
     def fitted(promises: Sequence[Promise]) -> list[Fit]:

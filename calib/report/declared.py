@@ -89,7 +89,7 @@ def known_words(effect: Effect) -> list[str]:
             parts.append(f"is never {'negative' if known.sign > 0 else 'positive'}")
         parts += [f"is nothing {_zero(condition)}" for condition in known.zero_at]
         parts += [f"does not shrink as {_word(c)} grows" for c in known.grows_with]
-        parts += ["takes no more than there is"] * known.at_most_all
+        parts += [f"takes no more than {known.at_most}"] * bool(known.at_most)
         found.append(f"What it adds to the {known.output} {joined(parts)}.")
     return found
 

@@ -195,6 +195,10 @@ def test_a_fit_of_a_drift_begins_with_one_of_about_its_shape_size_and_zero(
     off = effect.on_output(begun, "pull", np.zeros((32, 20)), view) - left
     assert np.sqrt(np.square(off).mean(axis=1)).min() < 0.1 * np.ptp(left)
     assert (begun[:, 0] < 0.0).all()
+    # Its shape may be known: what was drawn of it is among the guesses, as large as suits it.
+    np.testing.assert_array_equal(begun[7:, 1:3], drawn[7:, 1:3])
+    assert (begun[7:, 0] != drawn[7:, 0]).all()
+    np.testing.assert_array_equal(effect.begun(drawn, {"pull": np.full(20, np.nan)}, view), drawn)
     # Nothing that is left, or the same in all runs, is as good as no drift.
     for alike in (0.3, 0.0):
         begun = effect.begun(drawn, {"pull": np.full(20, alike)}, view)

@@ -9,7 +9,7 @@ import pytest
 
 from calib.gap.campaigns import campaigns
 from calib.gap.context import Context
-from calib.gap.effects import EFFECTS
+from calib.gap.effects import EFFECTS, Effect
 from calib.gap.fit import Start
 from calib.gap.forward import Forward
 from calib.gap.guesses import Guesses, _led, _places
@@ -173,6 +173,30 @@ def test_what_is_kept_of_a_larger_set_is_guessed_at_by_itself(guesses, alone):
     pair = fit_at(guesses.data, kept)
     assert len(guesses.beside(alone["lug_thrust"], pair, [alone["rate_effect"]])) == 1
     assert guesses.beside(alone["lug_thrust"], pair, []) == []
+
+
+class Nowhere(Effect):
+    """Has no value at any size."""
+
+    name = "nowhere"
+    parameters = ("size",)
+    outputs = ("pull",)
+    priors = 'model = "nowhere"\n[parameters.size]\ndist = "half_normal"\nsd = 1.0\nunit = "1"\n'
+    priors += 'reason = "A test\'s"\nsource = "None"\n'
+
+    def on_output(self, phi, output, location, view):
+        return np.full_like(location, np.nan)
+
+
+def test_a_set_of_which_no_guess_has_a_density_promises_nothing(guesses, alone):
+    kept = alone["lug_thrust"]
+    (nowhere,) = singles(guesses.data, {"nowhere": Nowhere()})
+    found = fit_at(guesses.data, kept)
+    one, other = guesses.beside(kept, found, [nowhere, alone["force_offset"]])
+    assert one.expected == -np.inf
+    assert np.isfinite(other.expected)
+    for better, worse in ((other, one), (one, other)):
+        assert better.with_starts_of(worse).expected == other.expected
 
 
 def test_what_sets_in_begins_where_the_laboratorys_residuals_show_it_best(guesses):

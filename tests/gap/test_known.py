@@ -74,7 +74,7 @@ class Bogging(Effect):
     title = "part of the pull is lost"
     parameters = ("loss",)
     form = ("slip",)
-    known = (Known("pull", -1, at_most_all=True),)
+    known = (Known("pull", -1, at_most="the pull that there is"),)
     outputs = ("pull",)
     priors = """
 model = "bogging"
@@ -100,6 +100,23 @@ def test_no_shape_takes_more_of_the_pull_than_there_is(data):
     assert ((full == 0.0) & (plain > 0.0)).any()  # some shapes reach the bound
     assert (full[plain > 0.0] >= 0.0).all()
     np.testing.assert_array_equal(full[plain <= 0.0], plain[plain <= 0.0])
+
+
+def test_softening_takes_no_more_than_the_gross_thrust(data):
+    effect = EFFECTS["post_peak_softening"]
+    forward, name, psi = drawn(data, effect, "pull", family=True)
+    resistance = forward.hypothesis.effect_priors[0].to_natural(psi[:, forward.phi_slices[0]])[
+        :, 3:
+    ]
+    psi[:, forward.phi_slices[0].start] *= 3.0
+    view = along(data, "slip", SLIPS)
+    full, plain = forward.field_and_plain(psi, view)
+    rest = -resistance * view.load_kn
+    known = np.isfinite(plain[name]).all(axis=1)
+    full, plain, rest = full[name][known], plain[name][known], rest[known]
+    at_bound = np.isclose(full, rest, rtol=1e-12)
+    assert (at_bound & (plain > rest)).any()  # some take all of it
+    assert (full >= np.minimum(plain, rest) - 1e-12).all()
 
 
 def test_strength_that_is_lost_past_the_peak_is_the_gross_thrusts(data):

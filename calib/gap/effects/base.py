@@ -40,15 +40,16 @@ class Known:
         condition at the laboratory's value.
     grows_with : tuple of str
         Physical roles of conditions with which what the formula adds does not shrink.
-    at_most_all : bool
-        Whether it can take no more of a positive output than there is.
+    at_most : str
+        What it can take no more of an output than, in words, if anything bounds it: `Effect.most`
+        is how much that is.
     """
 
     output: str
     sign: int = 0
     zero_at: tuple[str, ...] = ()
     grows_with: tuple[str, ...] = ()
-    at_most_all: bool = False
+    at_most: str = ""
 
 
 @dataclass(frozen=True)
@@ -232,6 +233,13 @@ class Effect:
         view : View
         """
         return location
+
+    def most(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Return the most that it can take of an output that it bounds, shape (k, n).
+
+        By default all of a positive output. Parameters are those of `on_output`.
+        """
+        return np.maximum(location, 0.0)
 
     def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
         """Return guesses from which a fit may begin better than from draws of the prior.

@@ -112,12 +112,12 @@ def _check_known(effect: Effect, fact: object, conditions: Mapping[str, str], wh
         not isinstance(fact, Known)
         or fact.output not in effect.outputs
         or fact.sign not in (-1, 0, 1)
-        or not isinstance(fact.at_most_all, bool)
+        or not isinstance(fact.at_most, str)
     ):
         raise CalibError(
             f"known has {fact!r}", where=where,
             allowed=f"a tuple of Known(output, sign, ...), output one of "
-            f"{', '.join(effect.outputs)}, sign -1, 0 or 1, at_most_all True or False",
+            f"{', '.join(effect.outputs)}, sign -1, 0 or 1, at_most words",
             mend='write known = (Known("pull", -1, zero_at=("slip",)),), with the comma',
         )  # fmt: skip
     for attribute in ("zero_at", "grows_with"):

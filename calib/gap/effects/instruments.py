@@ -119,12 +119,15 @@ class SensorDrift(_Fault):
     def begun(self, phi: Array, left: Mapping[str, Array], view: View) -> Array:
         """Begin with drifts of several shapes, each as large and zeroed where it suits best.
 
-        Between shapes there are modes from which no fit gets away.
+        Between shapes there are modes from which no fit gets away. Besides these shapes those that
+        were drawn, for a shape may be known.
         """
         residual = left[self.outputs[0]]
         known = np.isfinite(residual)
+        if not known.any():
+            return phi
         begun = phi.copy()
-        begun[:, 1:3] = np.resize(_SHAPES, (len(phi), 2))
+        begun[: len(_SHAPES), 1:3] = _SHAPES[: len(phi)]
         _, curvature, half_way, _ = each(begun)
         grown, residual = _grown(curvature, half_way, view)[:, known], residual[known]
         mean = grown.mean(axis=1, keepdims=True)

@@ -164,17 +164,22 @@ class PostPeakSoftening(Effect):
     )
     parameters = ("loss", "peak_slip", "slip_scale", "resistance")
     form = ("slip", "pressure")
-    known = (Known("pull", -1, ("slip",)),)
+    known = (Known("pull", -1, ("slip",), at_most="the gross thrust"),)
     outputs = ("pull",)
     covariates = ("slip",)
+
+    def most(self, phi: Array, output: str, location: Array, view: View) -> Array:
+        """Return the gross thrust."""
+        resistance = phi[:, 3:]
+        return np.asarray(np.maximum(location + resistance * view.load_kn, 0.0))
 
     def on_output(self, phi: Array, output: str, location: Array, view: View) -> Array:
         """Lower the thrust past the peak."""
         if output != "pull":
             return location
-        loss, peak_slip, slip_scale, resistance = each(phi)
+        loss, peak_slip, slip_scale, _ = each(phi)
         beyond = np.maximum(view.slip() - peak_slip, 0.0) / slip_scale
-        thrust = np.maximum(location + resistance * view.load_kn, 0.0)
+        thrust = self.most(phi, output, location, view)
         return np.asarray(location - thrust * loss * -np.expm1(-beyond))
 
 
