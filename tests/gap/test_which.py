@@ -93,10 +93,11 @@ def test_a_large_gap_is_not_surer_than_shapes_are_known():
     evidence = {"none": -300.0, "a": 0.0, "b": -4.0}
     odds = Odds(2, {})
     assert coarsening(0.0) == 1.0
-    assert coarsening(20.0) == pytest.approx(2.0)
+    assert coarsening(5.0) == pytest.approx(1.16)
+    assert coarsening(7.5) == coarsening(30.0) == pytest.approx(1.36)
     plain, coarse = (probabilities(evidence, odds, coarsening(g)) for g in (0.0, 20.0))
     assert plain["a"] / plain["b"] == pytest.approx(np.exp(4.0))
-    assert coarse["a"] / coarse["b"] == pytest.approx(np.exp(2.0))
+    assert coarse["a"] / coarse["b"] == pytest.approx(np.exp(4.0 / 1.36))
     assert sum(coarse.values()) == pytest.approx(1.0)
 
 

@@ -17,7 +17,7 @@ from calib.gap.effects.dependence import PREFIX
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.inclusion import UNLISTED
-from calib.gap.odds import LEFT, coarsening, probabilities
+from calib.gap.odds import LEFT, MOST_LEFT, coarsening, probabilities
 from calib.gap.placebo import placebos
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
@@ -256,6 +256,7 @@ def render_diagnosis(
         prior=prior_text(found),
         covered=covered_text(found),
         left=f"{100.0 * LEFT:g}",
+        most_left=f"{MOST_LEFT:g}",
         gap=f"{found.ranking.gap:.1f}",
         coarse=f"{coarsening(found.ranking.gap):.2f}",
         before_coarsening=_before_coarsening(found),
