@@ -293,7 +293,7 @@ def test_what_a_listed_effect_leaves_is_unknown():
 def test_prior_and_evidence_give_the_probabilities():
     ranking = ranking_of("lug_thrust")
     assert sum(ranking.prior.values()) == pytest.approx(1.0)
-    coarse = 1.0 + (0.05 * ranking.gap) ** 2
+    coarse = 1.0 + min(0.08 * ranking.gap, 0.6) ** 2
     assert coarse > 1.02
     odds = {
         name: (
