@@ -7,20 +7,25 @@ where a set came from.
 
 Alone an effect may have to be larger than its prior says, to make up for others that act as well.
 Sets are looked for with the priors that their effects had alone, for wide ones miss nothing. Where
-its effects are not as large in a set, their usual priors count, else both do.
+its effects are not as large in a set, their usual priors count, else both do. How promising a set
+is, is told with what usual priors would add: two effects with wide ones are up to ten nats behind.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
+import numpy as np
+
 from calib.gap.fit import Fit, finished, truncated_fits
+from calib.gap.forward import Forward
 from calib.gap.guesses import Guesses, Promise
-from calib.gap.hypotheses import joined, resized, unknowns, with_remainder
+from calib.gap.hypotheses import WIDE, joined, resized, unknowns, with_remainder
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.odds import Odds, with_prior
 from calib.inference.priors import Priors
+from calib.models.base import Array
 
 __all__ = ["IN_PLAY", "far_out", "sets_and_unlisted"]
 
@@ -71,17 +76,19 @@ def sets_and_unlisted(
     others: list[_Started] = [(h, []) for h in unknowns(guesses.data)]
     others += _with_remainders(guesses, alone[:_N_LEADING])
     alone_best = max(with_prior(f, n) for f in best.values())
-    pairs = _pairs(guesses, single, best, alone_best - _UNPROMISING)
+    pairs = _pairs(guesses, usual, single, best, alone_best - _UNPROMISING)
     n_others = len(others)
     truncated = truncated_fits([
         *(guesses.begun_jointly(h, members, 1) for h, members in others),
         *(p.parted()[0].start for p in pairs),
     ])  # fmt: skip
-    listed = max([alone_best, *(_promise(group, n) for group in truncated[n_others:])])
-    leading = max([listed, *(_promise(group, n) for group in truncated[:n_others])])
-    truncated[n_others:] = _begun_again(guesses, pairs, truncated[n_others:], listed)
-    unlisted = sized(_finished(truncated[:n_others], leading - _HOPELESS, n), leading)
-    sets = sized(_finished(truncated[n_others:], listed - _HOPELESS, n), listed)
+    ended_at = [max(with_prior(f, n) for f in group) for group in truncated]
+    listed = max([alone_best, *ended_at[n_others:]])
+    leading = max([listed, *ended_at[:n_others]])
+    promise = partial(_promise, usual, n)
+    truncated[n_others:] = _begun_again(promise, pairs, truncated[n_others:], listed)
+    unlisted = sized(_finished(promise, truncated[:n_others], leading - _HOPELESS), leading)
+    sets = sized(_finished(promise, truncated[n_others:], listed - _HOPELESS), listed)
     # What is unlisted takes up what any listed causes leave: these are compared without it.
     listed = max(with_prior(f, n) for f in (*best.values(), *sets))
     sets += _stepwise(guesses, [best[m] for m in single], usual, sets, listed)
@@ -90,7 +97,7 @@ def sets_and_unlisted(
     top = _leading(sets, leading - _SEARCHED, n)[:_N_LEADING_SETS]
     beside = _with_remainders(guesses, top)
     truncated = truncated_fits([guesses.begun_jointly(h, of, 1) for h, of in beside])
-    ended = sized(_finished(truncated, leading - _HOPELESS, n), leading)
+    ended = sized(_finished(promise, truncated, leading - _HOPELESS), leading)
     everything = _best_of_each([*unlisted, *sets, *ended])
     by_name: dict[str, tuple[Fit, ...]] = {}
     for found in everything:
@@ -109,11 +116,12 @@ def _as_sized(
     guesses: Guesses, usual: Mapping[str, Priors], fits: Sequence[Fit], leading: float
 ) -> list[Fit]:
     """Fits, and those in play once more with the priors that their effects' sizes ask for."""
+    promise = partial(_promise, usual, guesses.odds)
     there = {f.forward.hypothesis for f in fits}
     asked: list[_Started] = []
     for found in fits:
         h = found.forward.hypothesis
-        if not h.effects or with_prior(found, guesses.odds) < leading - _SEARCHED:
+        if not h.effects or promise([found]) < leading - _SEARCHED:
             continue
         large = [
             e.name
@@ -126,7 +134,7 @@ def _as_sized(
                 there.add(other)
                 asked.append((other, [found]))
     truncated = truncated_fits([guesses.begun_jointly(h, of, 1) for h, of in asked])
-    return [*fits, *_finished(truncated, leading - _SEARCHED, guesses.odds)]
+    return [*fits, *_finished(promise, truncated, leading - _SEARCHED)]
 
 
 def _best_of_each(fits: Sequence[Fit]) -> list[Fit]:
@@ -142,8 +150,9 @@ def _with_remainders(guesses: Guesses, causes: Sequence[Fit]) -> list[_Started]:
 
 
 def _pairs(
-    guesses: Guesses, single: Sequence[str], best: Mapping[str, Fit], least: float
-) -> list[Promise]:
+    guesses: Guesses, usual: Mapping[str, Priors], single: Sequence[str], best: Mapping[str, Fit],
+    least: float,
+) -> list[Promise]:  # fmt: skip
     """Guess at pairs that hold one of the best single effects, from either if both are."""
     found: dict[str, Promise] = {}
     for m in _pair_seeds(single, best):
@@ -151,7 +160,7 @@ def _pairs(
         for p in guesses.beside(best[m].forward.hypothesis, best[m], added, _N_PAIRED):
             other = found.get(p.hypothesis.name)
             found[p.hypothesis.name] = p if other is None else other.with_starts_of(p)
-    return [p for p in found.values() if p.expected > least]
+    return [p for p in found.values() if _expected(usual, p) > least]
 
 
 def _pair_seeds(single: Sequence[str], best: Mapping[str, Fit]) -> list[str]:
@@ -159,13 +168,12 @@ def _pair_seeds(single: Sequence[str], best: Mapping[str, Fit]) -> list[str]:
 
 
 def _begun_again(
-    guesses: Guesses, pairs: Sequence[Promise], truncated: Sequence[list[Fit]], leading: float
-) -> list[list[Fit]]:
+    promise: Callable[[Sequence[Fit]], float], pairs: Sequence[Promise],
+    truncated: Sequence[list[Fit]], leading: float,
+) -> list[list[Fit]]:  # fmt: skip
     """Begin the pairs that are in play from more guesses."""
     others = {
-        i: p.parted()[1]
-        for i, p in enumerate(pairs)
-        if _promise(truncated[i], guesses.odds) > leading - _SEARCHED
+        i: p.parted()[1] for i, p in enumerate(pairs) if promise(truncated[i]) > leading - _SEARCHED
     }
     in_play = [i for i, p in others.items() if len(p.starts)]
     more = truncated_fits([others[i].start for i in in_play])
@@ -185,11 +193,12 @@ def _stepwise(
     """Sets made of the best pairs by enlargement and exchange, those made of these, and so on."""
     n = guesses.odds
     alone = [f.forward.hypothesis for f in single]
-    searched = {f.forward.hypothesis.name for f in pairs if with_prior(f, n) > listed - _SEARCHED}
+    promising = [f for f in pairs if _promise(usual, n, [f]) > listed - _SEARCHED]
+    searched = {f.forward.hypothesis.name for f in promising}
     grown, made = _leading(pairs, listed - IN_PLAY, n), list[Fit]()
 
     def fitted(promises: Sequence[Promise]) -> list[Fit]:
-        return _as_sized(guesses, usual, _fitted(guesses, promises, searched, listed), listed)
+        return _as_sized(guesses, usual, _fitted(usual, n, promises, searched, listed), listed)
 
     while grown:
         larger = fitted(_enlarged(guesses, grown, alone))
@@ -236,27 +245,51 @@ def _enlarged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis]
 
 
 def _fitted(
-    guesses: Guesses, promises: Sequence[Promise], searched: set[str], listed: float
-) -> list[Fit]:
+    usual: Mapping[str, Priors], odds: Odds, promises: Sequence[Promise], searched: set[str],
+    listed: float,
+) -> list[Fit]:  # fmt: skip
     """Fit the sets that promise most, each once, and note them as searched."""
     best: dict[str, Promise] = {}
-    for p in sorted(promises, key=lambda p: -p.expected):
-        if p.hypothesis.name not in searched and p.expected > listed - _UNPROMISING:
-            best.setdefault(p.hypothesis.name, p)
+    expected = [_expected(usual, p) for p in promises]
+    for i in np.argsort(expected, kind="stable")[::-1].tolist():
+        name = promises[i].hypothesis.name
+        if name not in searched and expected[i] > listed - _UNPROMISING:
+            best.setdefault(name, promises[i])
     chosen = list(best.values())[:_N_FITTED]
     searched |= {p.hypothesis.name for p in chosen}
     truncated = truncated_fits([p.start for p in chosen])
-    return _finished(truncated, listed - _SEARCHED, guesses.odds)
+    return _finished(partial(_promise, usual, odds), truncated, listed - _SEARCHED)
 
 
-def _finished(truncated: Sequence[Sequence[Fit]], hopeless: float, odds: Odds) -> list[Fit]:
+def _finished(
+    promise: Callable[[Sequence[Fit]], float], truncated: Sequence[Sequence[Fit]], hopeless: float
+) -> list[Fit]:
     """Fit hypotheses fully from their truncated fits, but for those that are hopeless."""
-    worth = [i for i, group in enumerate(truncated) if _promise(group, odds) > hopeless]
+    worth = [i for i, group in enumerate(truncated) if promise(group) > hopeless]
     ended = [max(group, key=lambda f: f.log_evidence) for group in truncated]
     for i, found in zip(worth, finished([truncated[i] for i in worth]), strict=True):
         ended[i] = found
     return ended
 
 
-def _promise(begun: Sequence[Fit], odds: Odds) -> float:
-    return max(with_prior(f, odds) for f in begun)
+def _promise(usual: Mapping[str, Priors], odds: Odds, begun: Sequence[Fit]) -> float:
+    """Log of evidence times prior of a hypothesis, by the priors that suit it best."""
+    return max(with_prior(f, odds) + _as_usual(usual, f.forward, f.psi) for f in begun)
+
+
+def _expected(usual: Mapping[str, Priors], promise: Promise) -> float:
+    """What a promise expects, by the priors that suit it best."""
+    return promise.expected + _as_usual(usual, promise.forward, promise.starts[0])
+
+
+def _as_usual(usual: Mapping[str, Priors], forward: Forward, psi: Array) -> float:
+    """Log of how much more probable parameters are if effects have usual priors where they suit."""
+    gained = 0.0
+    for e, wide, part in zip(
+        forward.hypothesis.effects, forward.hypothesis.effect_priors, forward.phi_slices,
+        strict=True,
+    ):  # fmt: skip
+        if wide != usual[e.name]:
+            denser = usual[e.name].log_prob(psi[None, part]) - wide.log_prob(psi[None, part])
+            gained += max(float(denser[0] - np.log(WIDE)), 0.0)
+    return gained
