@@ -87,8 +87,19 @@ def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
     # Draws of what was integrated out stay those at the noise of the fit: weighted with the factor
     # three of four would be lost.
     sample, ln_factor = density.completed(pool.psi[picked], rng)
-    evidence = total + float(logsumexp(ln_factor)) - np.log(_KEPT)
-    return replace(fit, sample=sample, log_evidence=evidence)
+    return replace(fit, sample=sample, log_evidence=total + _ln_mean(ln_factor))
+
+
+def _ln_mean(ln: Array) -> float:
+    """Log of the mean of exp(ln); by its first two cumulants where few draws carry that mean.
+
+    Of what an unlisted gap of six noise sds changed by averaging over the noise, one draw of 1500
+    carried all: seeds were apart by 4 nats, which two cumulants hold to 0.2.
+    """
+    weight = np.exp(ln - ln.max())
+    if weight.sum() ** 2 >= _ENOUGH * np.square(weight).sum():
+        return float(logsumexp(ln) - np.log(ln.size))
+    return float(ln.mean() + 0.5 * ln.var())
 
 
 class _Pool:

@@ -15,7 +15,7 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
-from calib.gap.refine import refine
+from calib.gap.refine import _ln_mean, refine
 from calib.gap.which import rank
 from calib.he2019.gaps.cases import paper_gaps
 from tests.gap.cases import make_case
@@ -96,3 +96,17 @@ def test_draws_come_from_the_sample():
     found = refine(fitted("slip_zero_shift", {"rut_depth": "modified_bekker"}), 1)
     drawn = found.draws(np.random.default_rng(1), 50)
     assert all((found.sample == row).all(axis=1).any() for row in drawn)
+
+
+def test_a_mean_that_few_draws_carry_is_told_by_two_cumulants():
+    """Of a lognormal both are right; that of the draws is their mean while many carry it."""
+    rng = np.random.default_rng(7)
+    few = rng.normal(-2.0, 4.0, (40, 1500))
+    told = np.array([_ln_mean(ln) for ln in few])
+    assert abs(told.mean() - 6.0) < 0.15
+    assert told.std() < 0.4
+    by_draws = np.log(np.exp(few).mean(axis=1))
+    assert abs(by_draws.mean() - 6.0) > 0.5
+    many = rng.normal(-2.0, 0.7, 1500)
+    assert _ln_mean(many) == pytest.approx(np.log(np.exp(many).mean()))
+    assert _ln_mean(np.zeros(1500)) == 0.0

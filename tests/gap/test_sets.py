@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 from types import SimpleNamespace
 
@@ -19,20 +21,23 @@ from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
 from calib.gap.forward import Forward
 from calib.gap.guesses import Guesses, Promise, _led, _places
-from calib.gap.hypotheses import joined, resized, shifts, singles, with_remainder
+from calib.gap.hypotheses import joined, resized, shifts, singles, wider, with_remainder
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.inclusion import inclusion_probability
 from calib.gap.odds import Odds, with_prior
 from calib.gap.sets import (
     _as_sized,
+    _as_usual,
     _begun_again,
     _best_of_each,
     _enlarged,
     _exchanged,
+    _expected,
     _finished,
     _fitted,
     _leading,
     _pairs,
+    _promise,
     _stepwise,
     far_out,
 )
@@ -180,14 +185,46 @@ EVEN = Odds(1, {})
 def fit_of(hypothesis, score: float):
     """A fit of which evidence times prior has this logarithm."""
     prior = EVEN.ln_prior(hypothesis.name) + np.log(hypothesis.share)
+    parts = [slice(0, 0)] * len(hypothesis.effects)
     return SimpleNamespace(
-        forward=SimpleNamespace(hypothesis=hypothesis), log_evidence=score - float(prior)
-    )
+        forward=SimpleNamespace(hypothesis=hypothesis, phi_slices=parts), psi=np.empty(0),
+        log_evidence=score - float(prior),
+    )  # fmt: skip
 
 
 def named(name: str, **options) -> Hypothesis:
     effects = tuple(SimpleNamespace(name=n) for n in name.split("+"))
-    return Hypothesis(name, effects, **options)
+    return Hypothesis(name, effects, (None,) * len(effects), **options)
+
+
+# Of effects that have no other priors.
+USUAL = defaultdict(lambda: None)
+PROMISE = partial(_promise, USUAL, EVEN)
+
+
+@pytest.mark.parametrize("sds", [0.0, 0.5, 1.7, 5.0])
+@pytest.mark.parametrize("name", ["force_offset", "post_peak_softening"])
+def test_a_set_promises_what_it_has_by_the_priors_that_suit_it(guesses, name, sds):
+    """One in ten effects is several times as large: its wide prior costs density as well."""
+    (single,) = singles(guesses.data, {name: EFFECTS[name]})
+    (other,) = singles(guesses.data, {"lug_thrust": EFFECTS["lug_thrust"]})
+    usual = {h.name: h.effect_priors[0] for h in (single, other)}
+    forward, start = guesses._forward(joined(wider(single), other))
+    part = forward.phi_slices[[e.name for e in forward.hypothesis.effects].index(name)]
+    free = usual[name].free
+    psi = start.copy()
+    psi[part] = [p.loc + sds * p.scale for p in free]
+    widths = [np.log(2.0 if p.log else 4.0) for p in free]
+    less = [0.5 * sds**2 * (1.0 - np.exp(-2.0 * w)) for w in widths]
+    gained = max(sum(widths) - sum(less) + np.log(10.0), 0.0)
+    assert (gained == 0.0) == (sds == 5.0)
+    assert _as_usual(usual, forward, psi) == pytest.approx(gained, abs=1e-6)
+    found = SimpleNamespace(forward=forward, psi=psi, log_evidence=3.0)
+    assert _promise(usual, EVEN, [found]) == pytest.approx(with_prior(found, EVEN) + gained)
+    promise = Promise(forward, 2.0, np.stack([psi, start]), {})
+    assert _expected(usual, promise) == pytest.approx(2.0 + gained)
+    alone, begun = guesses._forward(single)
+    assert _as_usual(usual, alone, begun) == 0.0
 
 
 @pytest.mark.parametrize(("off", "far"), [(1.99, False), (2.01, True)])
@@ -206,6 +243,10 @@ def test_the_best_fit_of_each_hypothesis_counts():
     assert _best_of_each(fits) == [fits[2], fits[1], fits[3]]
 
 
+def forward_of(hypothesis):
+    return fit_of(hypothesis, 0.0).forward
+
+
 def test_pairs_hold_one_of_the_six_best_and_are_guessed_at_from_each_that_is():
     names = [f"e{i}" for i in range(9)]
     best = {n: fit_of(named(n), 10.0 - i) for i, n in enumerate(names)}
@@ -220,12 +261,9 @@ def test_pairs_hold_one_of_the_six_best_and_are_guessed_at_from_each_that_is():
             place = float(names.index(kept.name))
             starts = np.array([[place, 0.0], [place, 1.0]])
             assert size == 32
-            return [
-                Promise(SimpleNamespace(hypothesis=joined(kept, h)), place, starts, {})
-                for h in added
-            ]
+            return [Promise(forward_of(joined(kept, h)), place, starts, {}) for h in added]
 
-    found = _pairs(Guessed(), mixed, best, -1.0)
+    found = _pairs(Guessed(), USUAL, mixed, best, -1.0)
     expected = {"+".join(p) for p in combinations(names, 2) if set(p) & set(names[:6])}
     assert sorted(p.hypothesis.name for p in found) == sorted(expected)
     for p in found:
@@ -236,7 +274,7 @@ def test_pairs_hold_one_of_the_six_best_and_are_guessed_at_from_each_that_is():
         assert others.starts.tolist() == [[float(side), 1.0] for side in sides]
         assert p.expected == sides[0]
     # Those that promise too little are left out.
-    less = _pairs(Guessed(), mixed, best, 3.5)
+    less = _pairs(Guessed(), USUAL, mixed, best, 3.5)
     assert {p.hypothesis.name for p in less} == {
         p.hypothesis.name for p in found if p.expected > 3.5
     }
@@ -262,6 +300,7 @@ class Promised:
 
     def __init__(self, name: str, expected: float, asked: list[str]) -> None:
         self.hypothesis, self.expected, self.asked = named(name), expected, asked
+        self.forward, self.starts = forward_of(self.hypothesis), np.empty((1, 0))
 
     @property
     def start(self):
@@ -276,7 +315,7 @@ def at_once(monkeypatch):
 
     def finished(begun):
         best = [max(group, key=lambda f: f.log_evidence) for group in begun]
-        return [SimpleNamespace(forward=f.forward, log_evidence=f.log_evidence + 0.1) for f in best]
+        return [SimpleNamespace(**{**vars(f), "log_evidence": f.log_evidence + 0.1}) for f in best]
 
     monkeypatch.setattr(module, "finished", finished)
 
@@ -284,7 +323,7 @@ def at_once(monkeypatch):
 def test_what_is_hopeless_is_not_fitted_further(at_once):
     a, b = named("a"), named("b")
     begun = [[fit_of(a, 1.0), fit_of(a, 2.0)], [fit_of(b, 0.5), fit_of(b, 0.4)]]
-    found = _finished(begun, 0.6, EVEN)
+    found = _finished(PROMISE, begun, 0.6)
     assert [with_prior(f, EVEN) for f in found] == pytest.approx([2.1, 0.5])
     assert found[1] is begun[1][0]
 
@@ -301,7 +340,7 @@ def test_pairs_in_play_are_begun_again_from_the_guesses_after_the_first(at_once)
     # Of the last all guesses are begun from already.
     pairs = [pair("a+b", 1), pair("a+c", 1), pair("b+c", 1), pair("c+d", 0)]
     begun = [[fit_of(p.hypothesis, s)] for p, s in zip(pairs, (2.1, 1.9, 9.0, 9.0), strict=True)]
-    found = _begun_again(Stub(), pairs, begun, 10.0)
+    found = _begun_again(PROMISE, pairs, begun, 10.0)
     assert asked == ["a+b", "b+c"]
     assert [len(f) for f in found] == [2, 1, 2, 1]
     assert [len(f) for f in begun] == [1, 1, 1, 1]
@@ -315,7 +354,7 @@ def test_the_twelve_sets_that_promise_most_are_fitted_once_each(at_once):
         Promised(f"s{i}+t", j, asked)
         for i, j in ((0, 99.0), (1, 5.0), (2, 6.0), (1, 7.0), *((i, 7.0 - i) for i in range(3, 20)))
     ]
-    found = _fitted(Stub(), promises, searched, 12.5)
+    found = _fitted(USUAL, EVEN, promises, searched, 12.5)
     assert asked == [f"s{i}+t" for i in range(1, 13)]
     assert searched == {"s0+t", *asked}
     # Within eight nats of the best that is listed they are fitted fully.
@@ -323,7 +362,7 @@ def test_the_twelve_sets_that_promise_most_are_fitted_once_each(at_once):
         [7.1, 6.1, *(7.0 - i for i in range(3, 13))]
     )
     # One that is expected forty nats behind is not fitted at all.
-    assert len(_fitted(Stub(), promises, searched, 30.5)) == 4
+    assert len(_fitted(USUAL, EVEN, promises, searched, 30.5)) == 4
     assert searched == {f"s{i}+t" for i in range(17)}
 
 
@@ -354,16 +393,16 @@ def test_sets_grow_step_by_step_up_to_four_causes_as_long_as_they_are_in_play(mo
     monkeypatch.setattr(module, "_enlarged", enlarged)
     monkeypatch.setattr(
         module, "_fitted",
-        lambda guesses, promises, searched, listed: [
+        lambda usual, odds, promises, searched, listed: [
             fit_of(named(n), float(n.count("+"))) for n in promises
         ],
     )  # fmt: skip
     monkeypatch.setattr(module, "_as_sized", lambda guesses, usual, fits, leading: list(fits))
     pairs = [fit_of(named("a+b"), 1.0), fit_of(named("k+l"), -3.5)]
-    made = _stepwise(Stub(), [fit_of(named("a"), 0.0)], {}, pairs, 1.0)
+    made = _stepwise(Stub(), [fit_of(named("a"), 0.0)], USUAL, pairs, 1.0)
     assert [f.forward.hypothesis.name for f in made] == ["a+b+c", "a+b+c+d"]
     assert tried == [["a+b"], ["a+b+c"], ["a+b+c+d"]]
     # Four nats behind the best listed no pair is in play.
     tried.clear()
-    assert _stepwise(Stub(), [], {}, pairs, 5.5) == []
+    assert _stepwise(Stub(), [], USUAL, pairs, 5.5) == []
     assert tried == []
