@@ -71,7 +71,7 @@ class Context:
         Raises
         ------
         CalibError
-            If it has no such parameter, or one that is positive is said to be zero or less.
+            If it has no such parameter, or the mean is not within the bounds of its prior.
         """
         known = self.sizes.get(single.name)
         if not known:
@@ -101,16 +101,25 @@ def _known(effect: str, priors: Priors, known: Mapping[str, Size]) -> Priors:
     entries = []
     for p in priors.entries:
         size = known.get(p.name)
-        if size is not None and p.log:
+        if size is None:
+            entries.append(p)
+            continue
+        loc, scale = size.mean, size.sd
+        if p.log:
             if size.mean <= 0.0:
                 raise CalibError(
                     f"{effect}: {p.name} is positive", where="[context] sizes",
                     allowed="a mean above zero", mend="correct it",
                 )  # fmt: skip
-            p = replace(p, loc=float(np.log(size.mean)), scale=size.sd / size.mean)
-        elif size is not None:
-            p = replace(p, loc=size.mean, scale=size.sd)
-        entries.append(p)
+            loc, scale = float(np.log(size.mean)), size.sd / size.mean
+        if not p.lower <= loc <= p.upper:
+            low, high = (np.exp(end) if p.log else end for end in (p.lower, p.upper))
+            raise CalibError(
+                f"{effect}: {p.name} cannot be {size.mean:g}", where="[context] sizes",
+                allowed=f"a mean from {low:g} to {high:g}",
+                mend="correct it, or declare an effect of your own with another prior",
+            )  # fmt: skip
+        entries.append(replace(p, loc=loc, scale=scale))
     return Priors(tuple(entries), priors.text, priors.source)
 
 

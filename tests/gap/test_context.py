@@ -161,6 +161,17 @@ def test_what_is_positive_is_not_said_to_be_zero_or_less(mean):
         digging(known={"slip_scale": Size(mean=mean, sd=0.1)})
 
 
+@pytest.mark.parametrize(("mean", "allowed"), [(-1.5, False), (-1.0, True), (7.0, True)])
+def test_a_size_is_within_the_bounds_of_its_prior(mean, allowed):
+    known = {"thrust": Size(mean=mean, sd=0.1)}
+    if allowed:
+        assert digging(known=known).effect_priors[0].entries[0].loc == mean
+        return
+    with pytest.raises(CalibError, match=r"thrust cannot be -1\.5") as refused:
+        digging(known=known)
+    assert refused.value.allowed == "a mean from -1 to inf"
+
+
 def test_what_is_fixed_has_no_size_to_be_known():
     with pytest.raises(CalibError, match="no parameter 'digging'") as refused:
         digging(known={"digging": Size(mean=0.1, sd=0.1)})

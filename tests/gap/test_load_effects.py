@@ -261,6 +261,43 @@ def test_an_effect_adds_nothing_against_its_known_sign(tmp_path, sign, kept, bro
             checked(broken)
 
 
+MOST = (
+    "import numpy as np\n"
+    + CODE.replace("    outputs", '    known = (Known("pull", at_most="the pull"),)\n    outputs')
+    + """
+    def most(self, phi, output, location, view):
+        return np.maximum(location, 0.0)
+"""
+)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("np.maximum(location, 0.0)", "np.zeros(3)", "most for drawbar_pull returned an array of"),
+        ("np.maximum(location, 0.0)", "None", "most for drawbar_pull returned NoneType"),
+        ("np.maximum(location, 0.0)", "location.astype(complex)", "returned an array of complex"),
+        ("np.maximum(location, 0.0)", "-abs(location)", "most returned -"),
+        ("np.maximum(location, 0.0)", "np.nan * location", "most returned nan"),
+        ("np.maximum(location, 0.0)", "view.of('wind')", "does not run: KeyError"),
+        ("return np.maximum(location, 0.0)", "location *= 0.0\n        return location",
+         "most changes the location"),
+        ("most(self, phi, output, location, view)", "most(self, location)", "does not run: Type"),
+        ('"the pull"', '"  "', "at_most words"),
+        ('"the pull"', "True", "at_most words"),
+        ("    def most(", "    most = 3.0\n\n    def other(", "the method most is float"),
+    ],
+)  # fmt: skip
+def test_what_bounds_an_effect_is_tried_as_well(tmp_path, old, new, words):
+    case = make_case("force_offset")
+    assert MOST.count(old) == 1
+    check_effects(load_effects(write(tmp_path, MOST)), case)
+    folder = tmp_path / "broken"
+    folder.mkdir()
+    with pytest.raises(CalibError, match=words):
+        check_effects(load_effects(write(folder, MOST.replace(old, new))), case)
+
+
 def test_an_effect_that_a_case_cannot_show_is_not_tried(tmp_path):
     code = CODE.replace('("pull",)', '("density",)').replace(RETURN, "        raise ValueError\n")
     check_effects(load_effects(write(tmp_path, code)), make_case("force_offset"))

@@ -113,12 +113,14 @@ def _check_known(effect: Effect, fact: object, conditions: Mapping[str, str], wh
         or fact.output not in effect.outputs
         or fact.sign not in (-1, 0, 1)
         or not isinstance(fact.at_most, str)
+        or fact.at_most.isspace()
     ):
         raise CalibError(
             f"known has {fact!r}", where=where,
             allowed=f"a tuple of Known(output, sign, ...), output one of "
             f"{', '.join(effect.outputs)}, sign -1, 0 or 1, at_most words",
-            mend='write known = (Known("pull", -1, zero_at=("slip",)),), with the comma',
+            mend='write known = (Known("pull", -1, zero_at=("slip",)),), with the comma; '
+            'at_most="the pull that there is"',
         )  # fmt: skip
     for attribute in ("zero_at", "grows_with"):
         check_tuple(attribute, getattr(fact, attribute), where)
@@ -135,6 +137,11 @@ def _check_name(name: str, attribute: str, known: Collection[str], where: str) -
 
 
 def _check_attribute(name: str, value: object, where: str) -> None:
+    if name in _METHODS and not callable(value):
+        raise CalibError(
+            f"the method {name} is {_described(value)}", where=where, allowed="a function",
+            mend=f"write def {name}(self, ...)",
+        )  # fmt: skip
     if name.startswith("_") or name in _BASE:
         return
     if callable(value):
@@ -200,6 +207,8 @@ def _changes_output(effect: Effect, phi: Array, o: OutputData, plain: Array, vie
     if not np.isfinite(found[np.isfinite(plain)]).any():
         raise _wrong(f"on_output returned no finite number for {o.name}", where,
                      "numbers wherever the location is one")  # fmt: skip
+    if any(fact.at_most and fact.output == o.role for fact in effect.known):
+        _check_most(effect, phi, o, handed, view)
     sign = next((fact.sign for fact in effect.known if fact.output == o.role), 0)
     added = sign * (found - plain)
     if (added < -_ROUNDING * np.abs(plain)).any():
@@ -208,6 +217,21 @@ def _changes_output(effect: Effect, phi: Array, o: OutputData, plain: Array, vie
             where, f"{'nothing below' if sign > 0 else 'nothing above'} zero, as known says",
         )  # fmt: skip
     return not np.array_equal(found, plain, equal_nan=True)
+
+
+def _check_most(effect: Effect, phi: Array, o: OutputData, plain: Array, view: View) -> None:
+    where = _place(effect)
+    handed = plain.copy()
+    most = _call(effect.most, effect, phi, o.role, handed, view)
+    if not np.array_equal(handed, plain, equal_nan=True):
+        raise CalibError(
+            "most changes the location it is given", where=where, allowed="a new array",
+            mend="write location = location + ... instead of location += ...",
+        )  # fmt: skip
+    _check_numbers(most, (plain.shape,), f"most for {o.name}", where)
+    if not (most[np.isfinite(plain)] >= 0.0).all():
+        raise _wrong(f"most returned {np.min(most):.3g} for {o.name} at some draw of its prior",
+                     where, "numbers from zero on, wherever the location is one")  # fmt: skip
 
 
 def _check_numbers(

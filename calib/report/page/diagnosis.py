@@ -258,6 +258,7 @@ def render_diagnosis(
         left=f"{100.0 * LEFT:g}",
         most_left=f"{MOST_LEFT:g}",
         gap=f"{found.ranking.gap:.1f}",
+        left_here=f"{min(LEFT * found.ranking.gap, MOST_LEFT):.2g}",
         coarse=f"{coarsening(found.ranking.gap):.2f}",
         before_coarsening=_before_coarsening(found),
         relevant=f"{RELEVANT:g}",

@@ -858,8 +858,9 @@ def test_what_the_campaigns_cover_is_said_where_a_correction_is_judged(found, pa
 
 
 def test_a_large_gap_says_how_far_its_probabilities_are_coarsened(found, page):
-    coarse = 1.0 + (0.05 * found.ranking.gap) ** 2
+    left = min(0.08 * found.ranking.gap, 0.6)
+    coarse = 1.0 + left**2
     assert coarse > 1.01
     said = " ".join(page[2].text.split())
     assert f"Of this gap of {found.ranking.gap:.1f} noise sd" in said
-    assert f"the logarithms of all odds are divided by {coarse:.2f}." in said
+    assert f"the logarithms of all odds are divided by 1 + {left:.2g}² = {coarse:.2f}." in said
