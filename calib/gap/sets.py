@@ -1,9 +1,9 @@
 """Which explanations of several causes are tried: sets of effects, and what is not listed.
 
-Pairs that hold one of the best single effects come first. The best sets are then enlarged by one
-effect, and what this makes is changed, one effect in the place of another or one left out, as long
-as that gives sets in play: a stepwise search in both directions, whose result does not depend on
-where a set came from.
+Pairs that hold one of the best single effects come first. The best sets in play of each number of
+causes are then enlarged by one effect and changed, one effect in the place of another or one left
+out, until all that are best have been: a stepwise search in both directions, whose result does not
+depend on where a set came from.
 
 Alone an effect may have to be larger than its prior says, to make up for others that act as well.
 Sets are looked for with the priors that their effects had alone, for wide ones miss nothing. Where
@@ -32,8 +32,9 @@ __all__ = ["IN_PLAY", "far_out", "sets_and_unlisted"]
 # A hypothesis, and fits of parts of it.
 type _Started = tuple[Hypothesis, list[Fit]]
 
-# Effects of which one is in every pair that is tried, and sets from which others are made.
-_N_PAIR_SEEDS, _N_SETS, _MOST_CAUSES = 6, 3, 4
+# Effects of which one is in every pair that is tried, and sets of each number of causes from which
+# others are made.
+_N_PAIR_SEEDS, _N_SETS, _MOST_CAUSES = 6, 2, 4
 # Guesses at the second effect of a pair, from either side.
 _N_PAIRED = 32
 # Sets made of others that are fitted at a time, of those that were guessed at.
@@ -47,7 +48,7 @@ _HOPELESS = 15.0
 # One within so many nats is begun from more guesses: a pair has many modes.
 _SEARCHED = 8.0
 # One of which a guess expects so many nats less than the best set has is not fitted at all.
-_UNPROMISING = 40.0
+_UNPROMISING = 60.0
 # An effect that far out in its prior (sds) is fitted with a wider one as well.
 _FAR_OUT = 2.0
 # A hypothesis is in play within so many nats of the best.
@@ -94,7 +95,7 @@ def sets_and_unlisted(
     sets += _stepwise(guesses, [best[m] for m in single], usual, sets, listed)
     sets = _best_of_each(sets)
     leading = max(leading, *(with_prior(f, n) for f in (*unlisted, *sets)))
-    top = _leading(sets, leading - _SEARCHED, n)[:_N_LEADING_SETS]
+    top = _leading(sets, leading - _SEARCHED, n, _N_LEADING_SETS)
     beside = _with_remainders(guesses, top)
     truncated = truncated_fits([guesses.begun_jointly(h, of, 1) for h, of in beside])
     ended = sized(_finished(promise, truncated, leading - _HOPELESS), leading)
@@ -190,33 +191,38 @@ def _stepwise(
     pairs: Sequence[Fit],
     listed: float,
 ) -> list[Fit]:
-    """Sets made of the best pairs by enlargement and exchange, those made of these, and so on."""
+    """Sets made of the best by enlargement and exchange, until nothing best is left to change."""
     n = guesses.odds
     alone = [f.forward.hypothesis for f in single]
     promising = [f for f in pairs if _promise(usual, n, [f]) > listed - _SEARCHED]
     searched = {f.forward.hypothesis.name for f in promising}
-    grown, made = _leading(pairs, listed - IN_PLAY, n), list[Fit]()
+    known, made_from = list(pairs), set[str]()
+    while True:
+        best = [
+            f
+            for size in range(2, _MOST_CAUSES + 1)
+            for f in _leading(_of_size(known, size), listed - IN_PLAY, n, _N_SETS)
+            if f.forward.hypothesis.name not in made_from
+        ]
+        if not best:
+            return known[len(pairs) :]
+        made_from |= {f.forward.hypothesis.name for f in best}
+        promises = [*_enlarged(guesses, best, alone), *_exchanged(guesses, best, alone)]
+        made = _as_sized(guesses, usual, _fitted(usual, n, promises, searched, listed), listed)
+        listed = max([listed, *(with_prior(f, n) for f in made)])
+        known += made
 
-    def fitted(promises: Sequence[Promise]) -> list[Fit]:
-        return _as_sized(guesses, usual, _fitted(usual, n, promises, searched, listed), listed)
 
-    while grown:
-        larger = fitted(_enlarged(guesses, grown, alone))
-        listed = max([listed, *(with_prior(f, n) for f in larger)])
-        grown = _leading(larger, listed - IN_PLAY, n)
-        changed = fitted(_exchanged(guesses, grown, alone))
-        listed = max([listed, *(with_prior(f, n) for f in changed)])
-        grown = _leading([*grown, *changed], listed - IN_PLAY, n)
-        made += larger + changed
-    return made
+def _of_size(sets: Sequence[Fit], size: int) -> list[Fit]:
+    return [f for f in sets if len(f.forward.hypothesis.effects) == size]
 
 
-def _leading(sets: Sequence[Fit], least: float, odds: Odds) -> list[Fit]:
-    """The best fits of the best sets, those that others are made from."""
+def _leading(sets: Sequence[Fit], least: float, odds: Odds, count: int) -> list[Fit]:
+    """The best fits of the best sets."""
     best: dict[str, Fit] = {}
     for f in sorted(sets, key=lambda f: -with_prior(f, odds)):
         best.setdefault(f.forward.hypothesis.name, f)
-    return [f for f in best.values() if with_prior(f, odds) > least][:_N_SETS]
+    return [f for f in best.values() if with_prior(f, odds) > least][:count]
 
 
 def _exchanged(guesses: Guesses, sets: Sequence[Fit], alone: Sequence[Hypothesis]) -> list[Promise]:

@@ -280,12 +280,12 @@ def test_pairs_hold_one_of_the_six_best_and_are_guessed_at_from_each_that_is():
     }
 
 
-def test_sets_are_made_from_the_three_best_of_each_name_that_are_in_play():
+def test_the_best_fit_of_each_of_the_best_sets_leads():
     fits = [fit_of(named(n), s) for n, s in (("a", 1.0), ("b", 5.0), ("a", 4.0), ("c", 2.0),
             ("d", 3.0), ("e", 0.0))]  # fmt: skip
-    assert _leading(fits, -9.0, EVEN) == [fits[1], fits[2], fits[4]]
-    assert _leading(fits, 3.5, EVEN) == [fits[1], fits[2]]
-    assert _leading(fits, 5.5, EVEN) == []
+    assert _leading(fits, -9.0, EVEN, 3) == [fits[1], fits[2], fits[4]]
+    assert _leading(fits, 3.5, EVEN, 3) == [fits[1], fits[2]]
+    assert _leading(fits, 5.5, EVEN, 3) == []
 
 
 class Stub:
@@ -361,8 +361,8 @@ def test_the_twelve_sets_that_promise_most_are_fitted_once_each(at_once):
     assert [with_prior(f, EVEN) for f in found] == pytest.approx(
         [7.1, 6.1, *(7.0 - i for i in range(3, 13))]
     )
-    # One that is expected forty nats behind is not fitted at all.
-    assert len(_fitted(USUAL, EVEN, promises, searched, 30.5)) == 4
+    # One that is expected sixty nats behind is not fitted at all.
+    assert len(_fitted(USUAL, EVEN, promises, searched, 50.5)) == 4
     assert searched == {f"s{i}+t" for i in range(17)}
 
 
@@ -406,3 +406,26 @@ def test_sets_grow_step_by_step_up_to_four_causes_as_long_as_they_are_in_play(mo
     tried.clear()
     assert _stepwise(Stub(), [], USUAL, pairs, 5.5) == []
     assert tried == []
+
+
+def test_whatever_is_among_the_best_of_its_size_is_changed_once(monkeypatch):
+    """What an exchange finds as well; the third of a size, or what is out of play, never."""
+    scores = {"a+b": 1.0, "a+c": 0.9, "a+d": 0.8, "a+b+c": 3.0, "b+c": 3.5, "b+c+d": 4.0, "k+l": -9}
+    moves = {"a+b": ["a+b+c"], "a+b+c": ["b+c"], "b+c": ["b+c+d"], "a+d": ["nothing"]}
+    changed = []
+
+    def exchanged(guesses, best, alone):
+        names = [f.forward.hypothesis.name for f in best]
+        changed.extend(names)
+        return [made for n in names for made in moves.get(n, [])]
+
+    monkeypatch.setattr(module, "_enlarged", lambda *a: [])
+    monkeypatch.setattr(module, "_exchanged", exchanged)
+    monkeypatch.setattr(
+        module, "_fitted", lambda usual, odds, made, *a: [fit_of(named(n), scores[n]) for n in made]
+    )
+    monkeypatch.setattr(module, "_as_sized", lambda guesses, usual, fits, leading: list(fits))
+    pairs = [fit_of(named(n), scores[n]) for n in ("a+d", "a+b", "k+l", "a+c")]
+    made = _stepwise(Stub(), [], USUAL, pairs, 1.0)
+    assert [f.forward.hypothesis.name for f in made] == ["a+b+c", "b+c", "b+c+d"]
+    assert changed == ["a+b", "a+c", "a+b+c", "b+c", "b+c+d"]
