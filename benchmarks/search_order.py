@@ -32,7 +32,7 @@ from calib.gap.which import rank
 # A search that gives up later and makes more sets of more others.
 WIDER = {
     "_N_PAIR_SEEDS": 99, "_N_SETS": 8, "_N_FITTED": 48, "_HOPELESS": 25.0, "_SEARCHED": 12.0,
-    "_UNPROMISING": 60.0, "IN_PLAY": 6.0,
+    "IN_PLAY": 6.0,
 }  # fmt: skip
 SEARCHES = ("another seed", "listed otherwise", "other pairs first", "several times as wide")
 

@@ -26,7 +26,7 @@ from calib.gap.context import Context
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PAIR_TO_SINGLE, LN_PRIOR, REMAINDER
 
-__all__ = ["LEFT", "MOST_LEFT", "Odds", "coarsening", "probabilities", "with_prior"]
+__all__ = ["LEFT", "MOST_LEFT", "Odds", "coarsening", "left_of", "probabilities", "with_prior"]
 
 # Part of a gap that no formula has the shape of, and the most of that in noise sds. Where true
 # single effects of other mechanics, of 5 to 24 noise sds, were fitted free of noise, 0.1 to 1.4
@@ -37,9 +37,14 @@ __all__ = ["LEFT", "MOST_LEFT", "Odds", "coarsening", "probabilities", "with_pri
 LEFT, MOST_LEFT = 0.08, 0.6
 
 
+def left_of(gap: float) -> float:
+    """Return what no formula has the shape of, in noise sds as the gap's size is."""
+    return min(LEFT * gap, MOST_LEFT)
+
+
 def coarsening(gap: float) -> float:
     """Return the exponent's inverse T for a gap's size in noise sds."""
-    return 1.0 + min(LEFT * gap, MOST_LEFT) ** 2
+    return 1.0 + left_of(gap) ** 2
 
 
 def probabilities(

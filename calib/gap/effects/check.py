@@ -198,11 +198,7 @@ def _changes_output(effect: Effect, phi: Array, o: OutputData, plain: Array, vie
     where = _place(effect)
     handed = plain.copy()
     found = _call(effect.on_output, effect, phi, o.role, handed, view)
-    if not np.array_equal(handed, plain, equal_nan=True):
-        raise CalibError(
-            "on_output changes the location it is given", where=where, allowed="a new array",
-            mend="write location = location + ... instead of location += ...",
-        )  # fmt: skip
+    _check_kept(handed, plain, "on_output", where)
     _check_numbers(found, (plain.shape,), f"on_output for {o.name}", where)
     if not np.isfinite(found[np.isfinite(plain)]).any():
         raise _wrong(f"on_output returned no finite number for {o.name}", where,
@@ -223,15 +219,19 @@ def _check_most(effect: Effect, phi: Array, o: OutputData, plain: Array, view: V
     where = _place(effect)
     handed = plain.copy()
     most = _call(effect.most, effect, phi, o.role, handed, view)
-    if not np.array_equal(handed, plain, equal_nan=True):
-        raise CalibError(
-            "most changes the location it is given", where=where, allowed="a new array",
-            mend="write location = location + ... instead of location += ...",
-        )  # fmt: skip
+    _check_kept(handed, plain, "most", where)
     _check_numbers(most, (plain.shape,), f"most for {o.name}", where)
     if not (most[np.isfinite(plain)] >= 0.0).all():
         raise _wrong(f"most returned {np.min(most):.3g} for {o.name} at some draw of its prior",
                      where, "numbers from zero on, wherever the location is one")  # fmt: skip
+
+
+def _check_kept(handed: Array, plain: Array, method: str, where: str) -> None:
+    if not np.array_equal(handed, plain, equal_nan=True):
+        raise CalibError(
+            f"{method} changes the location it is given", where=where, allowed="a new array",
+            mend="write location = location + ... instead of location += ...",
+        )  # fmt: skip
 
 
 def _check_numbers(

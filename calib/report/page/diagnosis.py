@@ -17,7 +17,7 @@ from calib.gap.effects.dependence import PREFIX
 from calib.gap.fit import Fit
 from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.inclusion import UNLISTED
-from calib.gap.odds import LEFT, MOST_LEFT, coarsening, probabilities
+from calib.gap.odds import LEFT, MOST_LEFT, coarsening, left_of, probabilities
 from calib.gap.placebo import placebos
 from calib.gap.relevance import RELEVANT, RELEVANT_IN_PAIR
 from calib.gap.where import Region
@@ -258,7 +258,7 @@ def render_diagnosis(
         left=f"{100.0 * LEFT:g}",
         most_left=f"{MOST_LEFT:g}",
         gap=f"{found.ranking.gap:.1f}",
-        left_here=f"{min(LEFT * found.ranking.gap, MOST_LEFT):.2g}",
+        left_here=f"{left_of(found.ranking.gap):.2g}",
         coarse=f"{coarsening(found.ranking.gap):.2f}",
         before_coarsening=_before_coarsening(found),
         relevant=f"{RELEVANT:g}",
