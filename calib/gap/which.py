@@ -30,7 +30,7 @@ from calib.gap.odds import Odds, coarsening, probabilities, with_prior
 from calib.gap.refine import PLENTY, refine
 from calib.gap.relevance import gap_size, relevance
 from calib.gap.runs import follows_runs
-from calib.gap.sets import IN_PLAY, far_out, sets_and_unlisted
+from calib.gap.sets import far_out, sets_and_unlisted
 from calib.inference.defined import check_defined
 from calib.inference.random import generator
 from calib.inference.sampling.mode import find_mode
@@ -47,10 +47,12 @@ _IDLE = "it changes nothing that the models of this case predict"
 # while it is in play, times the effective draws of its posterior. Of 938 (33 cases) none gained
 # more than 1.8 nats by its relevance.
 _FAR, _QUICK, _CAREFUL = 32, 96, 1.5
+# A hypothesis is in play within so many nats of the best.
+_IN_PLAY = 4.0
 # Variants of a hypothesis are in play within so many nats of its best; one that is farther behind
 # the best of all than the next of these does not come into play by its relevance, and one farther
 # than the last is not likely, relevant or not.
-_BESIDE, _BEHIND, _FAR_BEHIND = 2.5, IN_PLAY + 3.0, 10.0
+_BESIDE, _BEHIND, _FAR_BEHIND = 2.5, _IN_PLAY + 3.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -224,7 +226,7 @@ def _scored(
 
 def _in_play(scores: Mapping[str, Sequence[float]], odds: Odds) -> set[tuple[str, int]]:
     """Names of hypotheses that are in play, and the places of their variants that are."""
-    least = max(max(values) + odds.ln_prior(name) for name, values in scores.items()) - IN_PLAY
+    least = max(max(values) + odds.ln_prior(name) for name, values in scores.items()) - _IN_PLAY
     return {
         (name, i)
         for name, values in scores.items()
