@@ -6,7 +6,7 @@ says what it finds without it as well.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,13 +14,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.errors import CalibError
-from calib.inference.priors import Priors
+from calib.inference.priors import Prior, Priors
 
 if TYPE_CHECKING:
     from calib.gap.hypothesis import Hypothesis
 
 __all__ = ["Context", "Size", "read_context"]
 
+# A known size that is so many sds (its own and its prior's) off may be in another unit.
+_UNUSUAL = 4.0
 _Number = Annotated[float, Field(ge=-1e15, le=1e15)]
 
 
@@ -85,16 +87,54 @@ class Context:
             )  # fmt: skip
         return replace(single, effect_priors=(_known(single.name, priors, known),))
 
-    def words(self) -> list[str]:
-        """Say what was put in."""
+    def unusual(self, single: Sequence[Hypothesis]) -> list[str]:
+        """Say which sizes are far from what their effects usually have, as in another unit.
+
+        Parameters
+        ----------
+        single : sequence of Hypothesis
+            Effects by themselves, with their usual priors.
+        """
+        said = []
+        for h in single:
+            for p in h.effect_priors[0].free:
+                size = self.sizes.get(h.name, {}).get(p.name)
+                if size is None:
+                    continue
+                loc, scale = _on_its_scale(size, p)
+                apart = abs(loc - p.loc) / float(np.hypot(scale, p.scale))
+                if apart > _UNUSUAL:
+                    low, high = (p.loc + s * p.scale for s in (-1.0, 1.0))
+                    low, high = (float(np.exp(e)) if p.log else e for e in (low, high))
+                    said.append(
+                        f"[context] sizes: {h.name} is said to have {p.name} {size.mean:g} ± "
+                        f"{size.sd:g}{_unit(p.unit)}, {apart:.0f} sds from what is usual "
+                        f"({low:.3g} to {high:.3g}): check its sign and unit, for the diagnosis "
+                        "takes it as it is"
+                    )
+        return said
+
+    def words(self, single: Sequence[Hypothesis] = ()) -> list[str]:
+        """Say what was put in, sizes in the units of the effects that are given."""
+        units = {(h.name, p.name): _unit(p.unit) for h in single for p in h.effect_priors[0].free}
         said = [f"{n.replace('_', ' ')} suspected ({p:g})" for n, p in self.suspected.items()]
         said += [f"{name.replace('_', ' ')} excluded" for name in self.excluded]
         said += [
             f"{name.replace('_', ' ')}: {parameter} {size.mean:g} ± {size.sd:g}"
+            f"{units.get((name, parameter), '')}"
             for name, known in self.sizes.items()
             for parameter, size in known.items()
         ]
         return said
+
+
+def _unit(unit: str) -> str:
+    return "" if unit in {"1", "dimensionless", ""} else f" {unit}"
+
+
+def _on_its_scale(size: Size, p: Prior) -> tuple[float, float]:
+    """Mean and sd, of the logarithm where the prior is of that."""
+    return (float(np.log(size.mean)), size.sd / size.mean) if p.log else (size.mean, size.sd)
 
 
 def _known(effect: str, priors: Priors, known: Mapping[str, Size]) -> Priors:
@@ -104,14 +144,12 @@ def _known(effect: str, priors: Priors, known: Mapping[str, Size]) -> Priors:
         if size is None:
             entries.append(p)
             continue
-        loc, scale = size.mean, size.sd
-        if p.log:
-            if size.mean <= 0.0:
-                raise CalibError(
-                    f"{effect}: {p.name} is positive", where="[context] sizes",
-                    allowed="a mean above zero", mend="correct it",
-                )  # fmt: skip
-            loc, scale = float(np.log(size.mean)), size.sd / size.mean
+        if p.log and size.mean <= 0.0:
+            raise CalibError(
+                f"{effect}: {p.name} is positive", where="[context] sizes",
+                allowed="a mean above zero", mend="correct it",
+            )  # fmt: skip
+        loc, scale = _on_its_scale(size, p)
         if not p.lower <= loc <= p.upper:
             low, high = (np.exp(end) if p.log else end for end in (p.lower, p.upper))
             raise CalibError(

@@ -19,7 +19,7 @@ from calib.gap.corrected import Corrected, conditions_outside
 from calib.gap.declared import new_values
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.effects.check import check_effects
-from calib.gap.hypotheses import inseparable, with_own
+from calib.gap.hypotheses import inseparable, singles, with_own
 from calib.gap.inclusion import UNLISTED, Inclusion, inclusion, inclusion_probability
 from calib.gap.isolate import Isolability
 from calib.gap.mixture import Truth, mixture
@@ -158,9 +158,11 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
     before = corrected.calibrated(target.conditions)
     far = shrink(data, at_target, before, at_target.means)
     causes = inclusion(mixed, ranking)
+    known = with_own(data, effects)
     said += [
         *_beyond(corrected, before),
-        *_confounded(data, causes, with_own(data, effects)),
+        *_confounded(data, causes, known),
+        *case.context.unusual(singles(data, _sized(case.context, known, ranking))),
     ]
     return Diagnosis(
         data,
@@ -183,6 +185,11 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
             *said,
         ),
     )
+
+
+def _sized(context: Context, effects: Mapping[str, Effect], ranking: Ranking) -> dict[str, Effect]:
+    """Effects whose size is known, of those that can be tested."""
+    return {n: effects[n] for n in context.sizes if n not in ranking.not_testable}
 
 
 def screened_ranking(

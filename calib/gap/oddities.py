@@ -8,7 +8,7 @@ import numpy as np
 
 from calib.data import Table
 from calib.data.numbers import plain_number
-from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, role_of
+from calib.data.quantities import OUTPUTS, QUANTITIES, Quantity, columns_of, role_of
 from calib.data.units_check import (
     column_notes,
     lines_of,
@@ -28,12 +28,14 @@ _ODD_RATIO = 4.0
 _FAR_RATIO = 10.0
 # So far apart are fractions of two campaigns of which one may be in percent: 100, give or take 2.
 _PERCENT = 50.0
-# Factors between units that are taken for one another, and how near a ratio has to come.
+# Factors between units that are taken for one another, with one that a quantity has to have, and
+# how near a ratio has to come (sd of a logarithm); conditions are other ones in every campaign, so
+# roughly will do.
 _UNITS = {
-    6.895: "psi and kPa", 10.0: "mm and cm", 25.4: "inches and mm", 4.448: "lbf and N",
-    9.807: "kgf and N", 100.0: "a fraction and percent", 1000.0: "thousandths and wholes",
+    6.895: ("psi and kPa", "psi"), 10.0: ("mm and cm", "cm"), 25.4: ("inches and mm", "inch"),
+    4.448: ("lbf and N", "lbf"), 9.807: ("kgf and N", "kgf"),
+    100.0: ("a fraction and percent", "percent"), 1000.0: ("thousandths and wholes", None),
 }  # fmt: skip
-# (sd of a logarithm); conditions are other ones in every campaign, so roughly will do.
 _NEAR, _ROUGHLY = 0.15, 0.4
 # A covariate that was held in the calibration, to this part, is known well enough to be recognised.
 _HELD = 0.05
@@ -103,9 +105,10 @@ def oddities(lab: Table, field: Table, models: Mapping[str, str]) -> tuple[str, 
             "other causes"
         )
     for output in models:
-        missing = int(np.isnan(field[OUTPUTS[output]]).sum()) if OUTPUTS[output] in field else 0
-        if missing:
-            said.append(f"{missing} of {len(field)} field rows have no {output}")
+        for table, rows in ((lab, "calibration"), (field, "field")):
+            readings = table[OUTPUTS[output]] if OUTPUTS[output] in table else np.empty(0)
+            if missing := int(np.isnan(readings).sum()):
+                said.append(f"{missing} of {len(table)} {rows} rows have no {output}")
     return (*said, *_other_units(lab, field, models))
 
 
@@ -226,15 +229,19 @@ def _compared(lab: Table, field: Table, name: str, near: float = _NEAR) -> str:
 def _typically(lab: Table, field: Table, name: str, near: float = _NEAR) -> str:
     """Say in the field's unit how typical values of a column compare, and which units do so."""
     column = field.column(name)
-    return _times(column.written(lab[name]), column.written(field[name]), near)
+    return _times(column.written(lab[name]), column.written(field[name]), column.quantity, near)
 
 
-def _times(lab: Array, field: Array, near: float = _NEAR) -> str:
-    """Say how the typical values of two columns compare, and which units do so nearly."""
+def _times(lab: Array, field: Array, quantity: Quantity, near: float = _NEAR) -> str:
+    """Say how the typical values of two columns compare, and which of its units do so nearly."""
     low, high = sorted((_typical(lab), _typical(field)))
     factor = high / max(low, 1e-300)
     way = "more" if _typical(field) > _typical(lab) else "less"
-    like = [units for known, units in _UNITS.items() if abs(np.log(factor / known)) < near]
+    like = [
+        words
+        for known, (words, unit) in _UNITS.items()
+        if abs(np.log(factor / known)) < near and unit in (None, *quantity.units.values())
+    ]
     between = f", about the factor between {' or '.join(like)}" if like else ""
     typical = f"typically {plain_number(_typical(field))} against {plain_number(_typical(lab))}"
     return f"{typical}, {plain_number(factor)} times {way}{between}"

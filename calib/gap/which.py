@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import logsumexp
 
-from calib.errors import CalibError
+from calib.errors import CalibError, meant
 from calib.gap.campaigns import Campaigns, OutputData
 from calib.gap.context import Context
 from calib.gap.effects import EFFECTS, Effect
@@ -191,7 +191,9 @@ def _check_names(context: Context, known: set[str]) -> None:
             f"the context speaks of {strange[0]}",
             where="[context] of case.toml",
             allowed=", ".join(sorted(known)) + "; parameter_shift may be suspected",
-            mend="correct the name, or leave it out",
+            mend="leave it out"
+            if strange[0] == "parameter_shift"
+            else meant(strange[0], known, "correct the name, or leave it out"),
         )
 
 

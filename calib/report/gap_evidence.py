@@ -86,11 +86,25 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         remainder_where=_remainder_where(found),
         untested=_untested(found),
         assumed=_assumed(found, ranking.best(best)),
-        put_in="; ".join(case_context.words()),
+        put_in="; ".join(_put_in(found)),
         without=_without(found),
         excluded=case_context.excluded,
         runs=over_runs(found),
     )
+
+
+def _put_in(found: Diagnosis) -> list[str]:
+    """Say what was put in, with units, and what of it cannot be tested."""
+    context, unable = found.data.case.context, found.ranking.not_testable
+    singles = [
+        group[0].forward.hypothesis for n, group in found.ranking.fits.items() if n in context.sizes
+    ]
+    said = context.words(singles)
+    return said + [
+        f"{short_name(n)} cannot be tested here ({unable[n]}), so that nothing follows from it"
+        for n in dict.fromkeys([*context.suspected, *context.sizes])
+        if n in unable
+    ]
 
 
 def _untested(found: Diagnosis) -> list[str]:

@@ -12,6 +12,9 @@ TIE = 0.2
 MOST_TIED = 4
 # What is less probable is not spoken of: shown as a percentage it would be below 5.
 SHOWN = 0.045
+# From here on a cause is said to be possible besides those that act, and a change over the runs to
+# be surer than each of its forms.
+_ALSO = 0.1
 # A change over the runs that nothing listed explains.
 NEITHER = "something that is neither"
 
@@ -91,6 +94,8 @@ class RunsFact:
         Whether it is a change of several outputs at once.
     only : bool
         Whether no other output is measured.
+    surest : float
+        Probability of the surest listed cause that is such a change, whatever acts besides.
     """
 
     outputs: str
@@ -98,6 +103,7 @@ class RunsFact:
     forms: Sequence[tuple[str, float]]
     together: bool = False
     only: bool = False
+    surest: float = 1.0
 
     @property
     def rivals(self) -> list[tuple[str, float]]:
@@ -185,6 +191,17 @@ def causes_text(e: GapEvidence) -> str:
     parts = [
         f"{c.words} acts ({odds_text(c.probability)}) and is {_share(c)} of the gap" for c in named
     ]
+    also = [c for c in e.causes if c.probability >= _ALSO and c not in named]
+    if also and e.acting:
+        listed = joined([f"{c.words} ({odds_text(c.probability)})" for c in also])
+        parts.append(f"besides, or instead, there may be {listed}")
+    runs = e.runs
+    surer = runs is not None and runs.surest < runs.probability - _ALSO
+    if runs is not None and surer and runs.probability >= 0.5 and not runs.together:
+        parts.append(
+            f"that {runs.outputs} changes over the runs, in whichever form, has "
+            f"{odds_text(runs.probability)}"
+        )
     rest = e.remainder
     if rest is not None and rest.probability >= SHOWN:
         where = f", {e.remainder_where}," if e.remainder_where else ""

@@ -32,10 +32,11 @@ def _of(found: Diagnosis, outputs: Sequence[str]) -> RunsFact:
     # Of several outputs at once nothing that is listed changes the reading over the runs.
     kinds = {name: _kind(e) for name, e in _faults(found).items() if list(e.outputs) == roles}
     forms = dict.fromkeys(kinds.values(), 0.0)
-    total = 0.0
+    total, causes = 0.0, dict.fromkeys(kinds, 0.0)
     for name, probability in p.items():
         acting = {kinds[cause] for cause in name.split("+") if cause in kinds}
         total += probability if acting else 0.0
+        causes |= {c: causes[c] + probability for c in name.split("+") if c in kinds}
         # One that is a drift and a step at once is neither by itself.
         both = "a drift and a step at once" if len(acting) > 1 else ""
         for kind in [both] if both else acting:
@@ -46,6 +47,7 @@ def _of(found: Diagnosis, outputs: Sequence[str]) -> RunsFact:
     return RunsFact(
         joined([output_word(o) for o in outputs]), total + unlisted, ranked,
         together=len(outputs) > 1, only=len(found.data.outputs) == 1,
+        surest=max(causes.values(), default=0.0),
     )  # fmt: skip
 
 

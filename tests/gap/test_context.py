@@ -97,6 +97,13 @@ def test_names_that_nobody_knows_are_refused(context):
         diagnose_once(replace(case, context=context), 1)
 
 
+def test_of_a_misspelt_cause_the_one_most_like_it_is_named():
+    case = make_case("force_offset", models=PULL_ONLY)
+    for name, mend in (("sensr_drift", "did you mean sensor_drift"), ("parameter_shift", "leave")):
+        with pytest.raises(CalibError, match=mend):
+            diagnose_once(replace(case, context=Context(excluded=(name,))), 1)
+
+
 def test_a_context_is_read_from_the_case(tmp_path):
     folder = write_case(make_case("force_offset"), tmp_path / "case")
     toml = (folder / "case.toml").read_text()
@@ -153,6 +160,53 @@ def test_what_is_known_of_a_size_replaces_that_and_nothing_else():
 def test_of_other_effects_nothing_is_known():
     single = Hypothesis("rate_effect", effect_priors=(Priors(()),))
     assert Context(sizes=KNOWN).sized(single) is single
+
+
+def known_lugs(**known: Size) -> tuple[Context, Hypothesis]:
+    return Context(sizes={"lug_thrust": known}), digging(known={})
+
+
+@pytest.mark.parametrize(
+    ("name", "mean", "sd", "words"),
+    [
+        # 0.1 ± 0.3 is usual.
+        ("thrust", 1.3, 0.001, ""),
+        ("thrust", 1.4, 0.001, "thrust 1.4 ± 0.001, 4 sds from what is usual (-0.2 to 0.4)"),
+        ("thrust", 1.4, 0.3, ""),
+        ("thrust", 30.0, 5.0, "thrust 30 ± 5, 6 sds from what is usual"),
+        # exp(-1.5 ± 0.4): a fraction that was given in percent.
+        ("slip_scale", 0.22, 0.02, ""),
+        ("slip_scale", 22.0, 2.0, "slip_scale 22 ± 2, 11 sds from what is usual (0.15 to 0.333)"),
+    ],
+)
+def test_a_size_in_another_unit_is_told(name, mean, sd, words):
+    context, single = known_lugs(**{name: Size(mean=mean, sd=sd)})
+    said = context.unusual([single])
+    assert len(said) == bool(words)
+    assert words in "".join(said)
+    assert context.unusual([]) == []
+
+
+def test_sizes_that_were_put_in_have_their_units():
+    context, single = known_lugs(thrust=Size(mean=0.4, sd=0.1))
+    (entry,) = (p for p in single.effect_priors[0].entries if p.name == "thrust")
+    priors = Priors((replace(entry, unit="kN"),), "text", "source")
+    in_kn = replace(single, effect_priors=(priors,))
+    assert context.words([in_kn]) == ["lug thrust: thrust 0.4 ± 0.1 kN"]
+    assert context.words([single]) == context.words() == ["lug thrust: thrust 0.4 ± 0.1"]
+
+
+def test_what_is_put_in_and_cannot_be_tested_is_said_to_change_nothing():
+    case = make_case("force_offset", models=PULL_ONLY)
+    context = Context(
+        suspected={"rut_rebound": 0.9},
+        sizes={"force_offset": {"offset": Size(mean=40.0, sd=5.0)}},
+    )
+    found = diagnose_once(replace(case, context=context), 1, effects=CHOICE)
+    put_in = dict(judge_gap(gap_evidence(found)).facts)["Put in"]
+    assert "offset 40 ± 5 kN" in put_in
+    assert "rut rebound cannot be tested here (" in put_in
+    assert any("force_offset is said to have offset 40 ± 5 kN" in note for note in found.warnings)
 
 
 @pytest.mark.parametrize("mean", [0.0, -0.5])

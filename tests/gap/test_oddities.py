@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.data import table_from_arrays
-from calib.data.quantities import OUTPUTS
+from calib.data.quantities import OUTPUTS, QUANTITIES
 from calib.errors import CalibError
 from calib.gap.campaigns import campaigns
 from calib.gap.diagnose import screened_ranking
@@ -18,6 +18,7 @@ from calib.gap.oddities import _ROUGHLY, _times, identical_rows, oddities
 from tests.gap.cases import MODELS, PULL_ONLY, make_case, table_without
 
 PULL, RUT = OUTPUTS["drawbar_pull"], OUTPUTS["rut_depth"]
+SLIP = QUANTITIES["slip_ratio"]
 NAMES = {
     "ruts in cm": (RUT, 0.1, "mm and cm"),
     "psi as kPa": ("inflation_pressure_psi", 1.0 / 6.895, "psi and kPa"),
@@ -53,6 +54,10 @@ def test_outputs_that_are_not_there_are_told_by_others():
     holed[[2, 5]] = np.nan
     field = replace(case.field, columns={**case.field.columns, RUT: holed})
     assert "2 of 27 field rows have no rut_depth" in said(replace(case, field=field))
+    ruts = np.array(case.lab[RUT])
+    ruts[4] = np.nan
+    lab = replace(case.lab, columns={**case.lab.columns, RUT: ruts})
+    assert f"1 of {len(lab)} calibration rows have no rut_depth" in said(replace(case, lab=lab))
 
 
 @pytest.mark.parametrize("what", sorted(NAMES))
@@ -218,9 +223,16 @@ def test_a_wheel_pulls_no_more_than_it_carries(ratio, odd):
 
 
 @pytest.mark.parametrize(
-    "units", ["psi and kPa", "inches and mm", "lbf and N", "mm and cm", "kgf and N"]
+    ("units", "column", "other"),
+    [
+        ("psi and kPa", "inflation_pressure_psi", "rut_depth_mm"),
+        ("inches and mm", "rut_depth_mm", "drawbar_pull_kn"),
+        ("lbf and N", PULL, "rut_depth_mm"),
+        ("mm and cm", "rut_depth_mm", PULL),
+        ("kgf and N", "normal_load_kn", "cone_index_kpa"),
+    ],
 )
-def test_a_factor_near_that_of_two_units_is_called_so(units):
+def test_a_factor_near_that_of_two_units_of_a_quantity_is_called_so(units, column, other):
     factor = {
         "psi and kPa": 6.895, "inches and mm": 25.4, "lbf and N": 4.448, "mm and cm": 10.0,
         "kgf and N": 9.807,
@@ -228,7 +240,8 @@ def test_a_factor_near_that_of_two_units_is_called_so(units):
     lab = np.full(9, 3.0)
     for off, like in ((1.0, True), (1.12, True), (0.88, True), (1.2, False), (0.8, False)):
         for field in (lab * factor * off, lab / (factor * off)):
-            assert (units in _times(lab, field)) == like
+            assert (units in _times(lab, field, QUANTITIES[column])) == like
+            assert units not in _times(lab, field, QUANTITIES[other])
 
 
 @pytest.mark.parametrize(
@@ -241,8 +254,8 @@ def test_a_ratio_is_near_a_factor_within_an_sd_of_its_logarithm(units, factor):
         for off, like in ((near - 5e-4, True), (near + 5e-4, False)):
             for sign in (1.0, -1.0):
                 field = lab * factor * np.exp(sign * off)
-                assert (units in _times(lab, field, *options)) == like
-    assert "1 times less" in _times(lab, lab)
+                assert (units in _times(lab, field, SLIP, *options)) == like
+    assert "1 times less" in _times(lab, lab, SLIP)
 
 
 PSI = "inflation_pressure_psi"

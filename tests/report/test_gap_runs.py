@@ -63,6 +63,7 @@ def test_all_explanations_with_it_are_added_up_each_once(found):
     })  # fmt: skip
     assert fact.probability == pytest.approx(0.85)
     assert fact.forms[0][0] == "a drift"
+    assert fact.surest == pytest.approx(0.55)
 
 
 def test_of_several_outputs_only_what_is_unlisted_changes_them_together(found):

@@ -168,6 +168,28 @@ def test_of_a_change_over_the_runs_is_said_what_is_sure_of_it(verdict, forms, ki
     assert found.headline.startswith(words)
 
 
+def test_causes_that_may_act_besides_and_what_is_sure_over_the_runs_are_said():
+    """What is as probable as a third is not left to the table below."""
+    causes = [
+        CauseFact("slip_sinkage", "slip sinkage", "deeper", 0.99, 0.9, (0.8, 1.0)),
+        CauseFact("sensor_step", "sensor step", "a jump", 0.6, 0.06, (0.0, 0.2), "its zero"),
+        CauseFact("sensor_drift", "sensor drift", "a drift", 0.34, 0.03, (0.0, 0.2), "its zero"),
+        CauseFact("parameter_shift", "other parameters", "others", 0.31, 0.3, (0.0, 0.9)),
+        CauseFact("gauge", "gauge", "reads wrong", 0.09, 0.1, (0.0, 0.2), "another gauge"),
+    ]
+    runs = replace(over_runs(("a step", 0.6), ("a drift", 0.35)), surest=0.6)
+    e = replace(evidence("effect", slip_sinkage=0.6), causes=causes, runs=runs)
+    text = dict(judge_gap(e).facts)["Causes"]
+    assert "or instead, there may be sensor drift (34 %) and other parameters (31 %)" in text
+    assert "that drawbar pull changes over the runs, in whichever form, has 95 %" in text
+    assert "gauge" not in text
+    told = dict(judge_gap(replace(e, runs=replace(runs, surest=0.93))).facts)["Causes"]
+    assert "in whichever form" not in told
+    # What none of which acts is told by itself already.
+    none = dict(judge_gap(replace(e, causes=causes[2:])).facts)["Causes"]
+    assert "besides" not in none
+
+
 def test_a_sure_form_is_named_whatever_else_may_be():
     sure = CauseFact("sensor_step", "sensor step", "a jump", 0.93, 0.9, (0.8, 1.0), "its zero")
     runs = over_runs(("a step", 0.6), ("a drift and a step at once", 0.33))
