@@ -77,7 +77,8 @@ def read_case(folder: Path) -> Case:
     except OSError as error:
         raise CalibError(
             f"the case cannot be read ({error.strerror})", where=str(path),
-            mend="give a folder with a case.toml in it",
+            mend=f"give its folder: {folder.parent}" if folder.is_file()
+            else "give a folder with a case.toml in it",
         ) from None  # fmt: skip
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None

@@ -34,6 +34,12 @@ def test_a_written_case_is_read_back(tmp_path):
         np.testing.assert_allclose(found.field[name], values, rtol=1e-12)
 
 
+def test_the_file_of_a_case_is_not_its_folder(tmp_path):
+    folder = write_case(make_case("force_offset"), tmp_path / "case")
+    with pytest.raises(CalibError, match=f"give its folder: {re.escape(str(folder))}$"):
+        read_case(folder / "case.toml")
+
+
 def test_units_in_column_names_are_converted(tmp_path):
     folder = write_case(make_case(), tmp_path / "case")
     columns = dict(make_case().field.columns)
