@@ -275,7 +275,7 @@ def read_answer(name: str, entry: dict[str, Any], folder: Path) -> CaseAnswer:
     """
     outputs = tuple(entry["noise_sd"])
     try:
-        diagnosis = json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+        diagnosis = json.loads((folder / "diagnosis.json").read_bytes())
         ranked, verdict = _ranked(diagnosis), str(diagnosis["verdict"])
         located = _localisation(entry, diagnosis)
         path = folder / "fresh_prediction.csv"

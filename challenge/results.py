@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from calib.data.documents import read_toml
 from calib.errors import CalibError
 from challenge.seal import sha256
 
@@ -62,7 +62,7 @@ def check_results(cases_dir: Path, results_dir: Path, names: Sequence[str]) -> t
 def _recorded(path: Path) -> dict[str, Any] | None:
     """Return what a diagnosis says it is of; None where it does not say."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(path.read_bytes())
     except (OSError, ValueError):
         return None
     return found if isinstance(found, dict) else None
@@ -71,7 +71,7 @@ def _recorded(path: Path) -> dict[str, Any] | None:
 def _found(folder: Path) -> dict[str, Any]:
     """Return models and hashes of a case folder, as ``inputs.json`` has them."""
     try:
-        content = tomllib.loads((folder / "case.toml").read_text(encoding="utf-8"))
+        content = read_toml(folder / "case.toml")
     except (OSError, ValueError):
         content = {}
     named = {key: content.get(key) for key in _TABLES}

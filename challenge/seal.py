@@ -113,7 +113,7 @@ def published_hash(cases_dir: Path) -> str:
         If there is none.
     """
     try:
-        manifest = json.loads((cases_dir / MANIFEST_NAME).read_text(encoding="utf-8"))
+        manifest = json.loads((cases_dir / MANIFEST_NAME).read_bytes())
         return str(manifest["key_sha256"])
     except (OSError, ValueError, KeyError, TypeError) as problem:
         raise CalibError(

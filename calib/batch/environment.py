@@ -104,6 +104,17 @@ def sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
+def unix_lines(content: bytes) -> bytes:
+    """Return bytes with the line ends of Unix."""
+    return content.replace(b"\r\n", b"\n")
+
+
+def differs_in_lines(content: bytes, expected: str) -> bool:
+    """Whether bytes have an expected SHA-256 but for line ends, as git's autocrlf changes them."""
+    unix = unix_lines(content)
+    return expected in (sha256(unix), sha256(unix.replace(b"\n", b"\r\n")))
+
+
 @cache
 def code_sha256() -> str:
     """Return the SHA-256 over the source files of this package and the priors shipped with it."""
@@ -136,7 +147,7 @@ def _digest(files: Mapping[str, Path]) -> str:
     digest = hashlib.sha256()
     for name, path in sorted(files.items()):
         # Line ends are the checkout's, not the code's.
-        content = path.read_bytes().replace(b"\r\n", b"\n")
+        content = unix_lines(path.read_bytes())
         digest.update(f"{name}\0{len(content)}\0".encode())
         digest.update(content)
     return digest.hexdigest()

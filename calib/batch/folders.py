@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
+from calib.batch import unfinished
 from calib.errors import CalibError
 
 # Files by which a folder is known to be one of ours, and may be replaced.
@@ -29,6 +30,8 @@ _WRITTEN = (
 # Scratch folders of results to be written by this process: of each its lock.
 _claimed: dict[Path, tuple[Path, int | None]] = {}
 _YOUNG_SECONDS = 60.0
+# In a scratch folder: the result, what other processes finish of it, and room for it.
+_WHOLE, _PARTS, _RESERVED = "whole", "parts", "reserved"
 # A folder with posteriors is of some megabytes; with less than this left it is not begun.
 _ROOM_BYTES = 16_000_000
 # The disk is full, the quota used up, the file system read-only.
@@ -53,17 +56,23 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """
     out = _replaceable(Path(out), overwrite=overwrite)
     key = out.absolute()
-    scratch, held = _claimed.pop(key) if key in _claimed else _scratch(out)
+    was_claimed = key in _claimed
+    scratch, held = _claimed.pop(key) if was_claimed else _scratch(out)
+    whole = scratch / _WHOLE
     try:
-        yield scratch
-        scratch.chmod(0o777 & ~_umask())
+        (scratch / _RESERVED).unlink(missing_ok=True)
+        whole.mkdir()
+        yield whole
         if overwrite and out.exists():
             old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
             out.replace(old / "old")
-            scratch.replace(out)
+            whole.replace(out)
             shutil.rmtree(old)
         else:
-            _put(scratch, out)
+            _put(whole, out)
+        unfinished.saved.append(out)
+        if was_claimed:
+            unfinished.drop()
     except OSError as error:
         # NumPy says of a full disk itself what the system would, without its number.
         if error.errno not in (*NO_ROOM, None):
@@ -80,7 +89,8 @@ def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
     """Keep a folder, which will be written at the end of long work, from other processes.
 
     What can be known before the work is found here: that it may not be written or replaced, that
-    the disk is full, or that another process is about to write it.
+    the disk is full, or that another process is about to write it. Room on the disk is reserved.
+    What the work has finished is rescued (`calib.batch.unfinished`) if it is not written.
 
     Raises
     ------
@@ -96,15 +106,30 @@ def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
             where=str(out),
             mend="wait until it ends, stop it, or choose another --out",
         )
-    _claimed[out.absolute()] = _scratch(out)
+    scratch, held = _claimed[out.absolute()] = _scratch(out)
     try:
-        yield
+        with writing(out):
+            _reserve(scratch / _RESERVED)
+        with unfinished.working(scratch / _PARTS):
+            try:
+                yield
+            finally:
+                unfinished.rescue(out)
     finally:
-        if out.absolute() in _claimed:
-            scratch, held = _claimed.pop(out.absolute())
-            shutil.rmtree(scratch, ignore_errors=True)
-            if held is not None:
-                os.close(held)
+        # Written or not, nothing of it is needed any more.
+        shutil.rmtree(scratch, ignore_errors=True)
+        if _claimed.pop(out.absolute(), None) is not None and held is not None:
+            os.close(held)
+
+
+def _reserve(path: Path) -> None:
+    """Take the room that a result needs, where the system can."""
+    with path.open("wb") as file, contextlib.suppress(AttributeError):
+        try:
+            os.posix_fallocate(file.fileno(), 0, _ROOM_BYTES)
+        except OSError as error:
+            if error.errno in NO_ROOM:
+                raise
 
 
 def _replaceable(out: Path, *, overwrite: bool) -> Path:
@@ -272,12 +297,6 @@ def _check_place(out: Path, parent: Path) -> None:
     left = shutil.disk_usage(parent).free
     if left < _ROOM_BYTES:
         raise _unwritable(out, f"only {left / 1e6:.1f} MB are left on its disk")
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def check_folder(out: Path, *, overwrite: bool = False) -> None:

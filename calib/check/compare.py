@@ -24,6 +24,7 @@ from calib.check.text import GROUP as TEXT
 from calib.check.text import Judged, Judgement, compare_page, own_pictures, parsed, read_text
 from calib.check.tolerances import ORDER_OF_MAGNITUDE, is_drawn
 from calib.check.verify import INPUTS
+from calib.data import documents
 from calib.data.documents import inside
 from calib.errors import FAULTS, CalibError
 from calib.inference.netcdf import read_draws
@@ -114,7 +115,7 @@ def part_of(group: str) -> str:
 
 def read_entries(folder: Path, name: str) -> dict[Place, Any]:
     """Return the entries of a document that are compared; with a run's the summary of its draws."""
-    text = (folder / name).read_text(encoding="utf-8")
+    text = documents.read_text(folder / name)
     if name.endswith(".csv"):
         rows = csv.DictReader(text.splitlines())
         document: Any = [{str(k): _cell(v) for k, v in row.items()} for row in rows]

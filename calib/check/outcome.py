@@ -50,6 +50,7 @@ def claim(group: str, name: str, wrong: str, right: str = "", *, sure: bool = Tr
 
 
 SCHEMA = "calib/check/1"
+LINE_ENDS = "the same but for its line ends"
 # Below this part of what is allowed, the draws are the same ones and rounding differs.
 ROUNDED = 1e-3
 
@@ -102,6 +103,9 @@ class Outcome:
         rest = f"; {unjudged} not judged" if unjudged else ""
         pages = [i.name for i in self.of(Status.UNJUDGED) if i.name.endswith(".html")]
         rest += f", THE PAGE {', '.join(pages)} AMONG THEM" if pages else ""
+        other_ends = sum(item.note == LINE_ENDS for item in self.items)
+        if other_ends:
+            rest += f"; {other_ends} files have other line ends, as git's autocrlf makes them"
         if self.not_converged:
             rest += f"; NOT CONVERGED, not to be used: {', '.join(self.not_converged)}"
         if self.quick:
@@ -109,6 +113,8 @@ class Outcome:
         if not self.of(Status.WITHIN):
             identical = len(self.of(Status.IDENTICAL))
             return f"SAME, bit for bit: {identical} numbers and files{rest}"
+        if len(self.of(Status.WITHIN)) == other_ends:
+            return f"SAME but for line ends{rest}"
         how = "within Monte Carlo error" if self.draws_differ else "up to rounding"
         return f"SAME {how}, not bit for bit{rest}"
 

@@ -18,6 +18,7 @@ from typing import NamedTuple
 from calib.batch.environment import sha256
 from calib.check.numbers import NUMBER, without_numbers
 from calib.check.outcome import Item, Status, claim
+from calib.data.documents import decoded
 from calib.report.compared import FOLDER as COMPARED
 
 GROUP = "page and tables"
@@ -46,7 +47,7 @@ type Judged = Callable[[str], Judgement]
 
 def read_text(path: Path) -> str:
     """Return a text, whatever somebody made of it."""
-    return path.read_text(encoding="utf-8", errors="replace")
+    return decoded(path.read_bytes(), "replace")
 
 
 def verify_images(page: str, folder: Path) -> list[Item]:

@@ -12,12 +12,12 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from calib.batch.environment import sha256
-from calib.check.outcome import Item, Status, claim
+from calib.batch.environment import differs_in_lines, sha256, unix_lines
+from calib.check.outcome import LINE_ENDS, Item, Status, claim
 from calib.check.schema import TaskRecord
 from calib.check.text import GROUP as TEXT
 from calib.check.text import differing_lines, read_text
-from calib.data import Table
+from calib.data import Table, documents
 from calib.data.documents import inside
 from calib.data.labels import KNOWN_DATA, label_of
 from calib.errors import FAULTS
@@ -56,10 +56,12 @@ def _listed(path: Path, own: str, name: str, expected: str) -> Item:
     if not path.is_file():
         return claim(FILES, name, "missing")
     try:
-        found = sha256(path.read_bytes())
+        content = path.read_bytes()
     except OSError as error:
         return claim(FILES, name, f"cannot be read ({error.strerror})")
-    if found != expected:
+    if (found := sha256(content)) != expected:
+        if differs_in_lines(content, expected):
+            return Item(FILES, name, Status.WITHIN, note=LINE_ENDS)
         return Item(FILES, name, Status.DIFFERENT, expected, found, note="changed")
     return Item(FILES, name, Status.IDENTICAL)
 
@@ -79,7 +81,7 @@ def priors(key: str, entry: TaskRecord, folder: Path, *, same_code: bool) -> Ite
     file, shipped = entry.priors.file, default_priors(entry.model)
     if not entry.priors.shipped:
         return claim(INPUTS, file, "", f"priors of the user for {key}")
-    same = (folder / file).read_bytes() == shipped.read_bytes()
+    same = unix_lines((folder / file).read_bytes()) == unix_lines(shipped.read_bytes())
     wrong = "" if same else f"not the {shipped.name} of this version"
     return claim(INPUTS, file, wrong, f"the shipped {shipped.name}", sure=same_code)
 
@@ -111,7 +113,7 @@ def derived(
                 wrong, path = "", folder / name
                 if not path.is_file():
                     wrong = f"missing, though {source} gives it"
-                elif path.read_bytes() != text.encode():
+                elif unix_lines(path.read_bytes()) != text.encode():
                     lines = differing_lines(read_text(path).splitlines(), text.splitlines())
                     wrong = f"it does not follow from {source}: {lines}"
                 found[name] = claim(TEXT, name, wrong, f"it follows from {source}", sure=sure)
@@ -133,7 +135,7 @@ def form(folder: Path) -> list[Item]:
     for path in sorted(folder.rglob("*.json")):
         # What cannot be read is said where its entries are compared.
         with suppress(*FAULTS):
-            text = path.read_text(encoding="utf-8")
+            text = documents.read_text(path)
             indent = 1 if text.startswith("{\n") else None
             if text != f"{json.dumps(json.loads(text), indent=indent)}\n":
                 found.append(claim(TEXT, path.relative_to(folder).as_posix(), wrong))

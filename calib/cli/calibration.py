@@ -153,10 +153,12 @@ def fit(
 ) -> None:
     """Calibrate one model on one file and save the posterior."""
     from dataclasses import asdict
+    from functools import partial
 
     from calib import SamplerSettings, build_problem, calibrate, estimate, save_calibration
     from calib import validate_held_out as validate
     from calib.batch.folders import claimed, fresh_folder
+    from calib.batch.unfinished import keep
     from calib.cli.display import posterior_table, progress_bars, verdict_line
     from calib.cli.simulators import say, say_failed
     from calib.inference.emulation.prepared import prepare
@@ -184,6 +186,7 @@ def fit(
             problem, seed, estimates=(point,), settings=settings,
             progress=lambda done, planned: tell("sampling", done, planned),
         )  # fmt: skip
+        keep("run", partial(save_calibration, calibration))
         preference = noise_preference(
             calibration, settings=settings, workers=workers,
             progress=lambda done, planned: tell("leaving rows out", done, planned),

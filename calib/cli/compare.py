@@ -26,7 +26,10 @@ def compare(
     json: Json = False,
 ) -> None:
     """Say which of several models the same data prefer, and what they cannot tell."""
+    from functools import partial
+
     from calib.batch.folders import claimed, fresh_folder
+    from calib.batch.unfinished import drop, keep
     from calib.cli.display import progress_bars
     from calib.cli.simulators import say
     from calib.inference.emulation.prepared import prepare
@@ -59,9 +62,12 @@ def compare(
             fitted, models, seed, held_out=held, priors=given,
             settings=SamplerSettings(max_steps=max_steps), progress=tell, workers=workers,
         )  # fmt: skip
+    write = partial(write_comparison, found, command=opt.command(), hold_out=hold_out or "")
+    drop()
+    keep("comparison", write)
     good = [say(name, emulation) for name, emulation in emulations.items()]
     with fresh_folder(out, overwrite=overwrite) as folder:
-        written = write_comparison(found, folder, opt.command(), hold_out or "")
+        written = write(folder)
     print(text(written))
     print(out / "index.html")
     finish(0 if found.sound and all(good) else 3, written, folder=str(out))

@@ -41,11 +41,14 @@ def diagnose(
     json: Json = False,
 ) -> None:
     """Find where a calibrated model misses, which effect it lacks, how far adding it gains."""
+    from functools import partial
+
     from calib.batch.folders import claimed, fresh_folder
     from calib.batch.pool import begin_imports, pool
 
     ctx.with_resource(claimed(out, overwrite=overwrite))
     begin_imports(workers, _PAGE)
+    from calib.batch.unfinished import keep
     from calib.cli.display import progress_bars
     from calib.cli.simulators import keep_emulators, prepare_case, say
     from calib.data.quantities import OUTPUTS, QUANTITIES
@@ -84,6 +87,7 @@ def diagnose(
     own_files = [] if effects is None else [effects]
     with pool(workers, _PAGE, own_files) as side:
         found = find(given, seed, effects=considered, pool=side)
+        keep("diagnosis", partial(write_diagnosis, found))
         from calib.report.page.gap_page import begin_page
 
         write_page = begin_page(found, manifest, pool=side)

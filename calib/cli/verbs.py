@@ -6,7 +6,7 @@ import errno
 import sys
 from copy import copy
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated, Any, Never
 
 import typer
 from typer.core import TyperGroup
@@ -37,9 +37,11 @@ class _Verbs(TyperGroup):
     """All verbs: what the user can mend, or stops, ends with a line and no traceback."""
 
     def invoke(self, ctx: Any) -> Any:
+        from calib.batch import unfinished
         from calib.batch.folders import NO_ROOM
         from calib.errors import CalibError
 
+        unfinished.saved.clear()
         try:
             interruptible()
             return super().invoke(ctx)
@@ -48,21 +50,27 @@ class _Verbs(TyperGroup):
                 import traceback
 
                 traceback.print_exc()
-            print(f"calib: {error}", file=sys.stderr)
-            raise typer.Exit(2) from None
+            _end(str(error), 2)
         except OSError as error:
             # Of a disk that fills up while something is written nothing more can be known before.
             if error.errno not in (*NO_ROOM, errno.EACCES, errno.EPERM, None):
                 raise
-            print(
-                f"calib: {error.filename or 'a file'} cannot be written "
-                f"({error.strerror or error}): make room, or change its permissions",
-                file=sys.stderr,
+            _end(
+                f"{error.filename or 'a file'} cannot be written ({error.strerror or error}): "
+                "make room, or change its permissions", 2,
             )  # fmt: skip
-            raise typer.Exit(2) from None
         except KeyboardInterrupt as stop:
-            print(f"calib: {str(stop) or STOPPED}", file=sys.stderr)
-            raise typer.Exit(INTERRUPTED) from None
+            _end(str(stop) or ("interrupted" if unfinished.saved else STOPPED), INTERRUPTED)
+
+
+def _end(why: str, code: int) -> Never:
+    """Say why a command ends, and where what it had finished is, and end it."""
+    from calib.batch import unfinished
+
+    print(f"calib: {why}", file=sys.stderr)
+    for folder in unfinished.saved:
+        print(f"calib: what was finished is in {folder}", file=sys.stderr)
+    raise typer.Exit(code) from None
 
 
 app = typer.Typer(

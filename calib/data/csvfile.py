@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calib.data.documents import decoded
 from calib.errors import CalibError
 
 
@@ -82,16 +83,15 @@ def _read_bytes(source: str) -> bytes:
 
 def _decode(raw: bytes, source: str) -> str:
     mend = "save it again as CSV in UTF-8 (Excel: `CSV UTF-8`)"
-    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-        raise _no_csv("the file is in UTF-16", source, mend)
-    if raw.startswith(b"PK\x03\x04") or b"\x00" in raw:
-        raise _no_csv("this is a binary file, such as a workbook, not text", source, mend)
     try:
-        return raw.decode("utf-8-sig")
+        text = decoded(raw)
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
-        found = f"byte 0x{raw[error.start]:02x} is not UTF-8"
+        found = f"byte 0x{raw[error.start]:02x} is not {error.encoding.upper()}"
         raise _no_csv(found, f"{source}, line {line}", mend) from None
+    if raw.startswith(b"PK\x03\x04") or "\x00" in text:
+        raise _no_csv("this is a binary file, such as a workbook, not text", source, mend)
+    return text
 
 
 def _delimiter(text: str) -> str:

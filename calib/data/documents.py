@@ -1,20 +1,50 @@
-"""JSON documents that somebody else wrote, whatever is in them."""
+"""Texts that somebody else wrote, whatever is in them: how they are encoded, TOML, JSON."""
 
 from __future__ import annotations
 
+import codecs
 import json
+import tomllib
 from pathlib import Path
 from typing import Any
 
 from calib.errors import FAULTS
 
-__all__ = ["inside", "read_json"]
+__all__ = ["decoded", "inside", "read_json", "read_text", "read_toml"]
+
+# By the marks that such texts begin with; UTF-16's is the beginning of UTF-32's.
+_ENCODINGS = {
+    codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
+}  # fmt: skip
+
+
+def decoded(raw: bytes, errors: str = "strict") -> str:
+    """Return a text without its byte-order mark: in UTF-8, unless the mark says otherwise.
+
+    Raises
+    ------
+    UnicodeDecodeError
+        If it is not so encoded, unless `errors`, as of `bytes.decode`, says what to do then.
+    """
+    marked = (name for mark, name in _ENCODINGS.items() if raw.startswith(mark))
+    return raw.decode(next(marked, "utf-8-sig"), errors)
+
+
+def read_text(path: Path) -> str:
+    """Return the text of a file as `decoded` does, with the line ends of Unix."""
+    return decoded(path.read_bytes()).replace("\r\n", "\n")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the content of a TOML file; errors of `read_text` and `tomllib` come out as such."""
+    return tomllib.loads(read_text(path))
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Return a JSON object; empty where the file is missing or damaged."""
     try:
-        return inside(json.loads(path.read_text(encoding="utf-8")))
+        return inside(json.loads(read_text(path)))
     except FAULTS:
         return {}
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.data import Table, read_table
+from calib.data.documents import read_text, read_toml
 from calib.data.quantities import OUTPUTS, output_of
 from calib.errors import CalibError, meant
 from calib.gap.context import Context, read_context
@@ -73,7 +74,7 @@ def read_case(folder: Path) -> Case:
     folder = Path(folder)
     path = folder / "case.toml"
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = read_toml(path)
     except OSError as error:
         raise CalibError(
             f"the case cannot be read ({error.strerror})", where=str(path),
@@ -134,7 +135,7 @@ def _read_priors(
     for output in named:
         path = _inside(folder, output, named)
         try:
-            found[output] = DeclaredPriors(path.name, path.read_text(encoding="utf-8"))
+            found[output] = DeclaredPriors(path.name, read_text(path))
         except (OSError, UnicodeDecodeError) as error:
             raise CalibError(
                 f"the prior file cannot be read ({error})", where=f"{where}, {output}",
@@ -173,7 +174,7 @@ def case_files(folder: Path) -> tuple[dict[str, Any], dict[str, Path]]:
     """
     path = Path(folder) / "case.toml"
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = read_toml(path)
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError):
         content = {}
     named = {key: content.get(key) for key in _FILES}

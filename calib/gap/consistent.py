@@ -51,4 +51,4 @@ def mispredicted(folder: Path) -> str:
 
 
 def _diagnosis(folder: Path) -> Any:
-    return json.loads((folder / "diagnosis.json").read_text(encoding="utf-8"))
+    return json.loads((folder / "diagnosis.json").read_bytes())

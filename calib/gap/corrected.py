@@ -207,7 +207,7 @@ def load_corrected(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> Cor
     """
     path = Path(folder) / "corrected.json"
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_bytes())
         if content["schema"] != SCHEMA:
             raise ValueError
         data = campaigns(read_case(Path(folder) / "case"))

@@ -56,7 +56,7 @@ def recorded_inputs(folder: Path) -> dict[str, Any] | None:
         Of one diagnosis.
     """
     try:
-        found = json.loads((folder / INPUTS).read_text(encoding="utf-8"))
+        found = json.loads((folder / INPUTS).read_bytes())
     except (OSError, ValueError):
         return None
     return found if isinstance(found, dict) else None

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
+from calib.data.documents import read_text
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, campaigns
@@ -104,7 +105,7 @@ def well_specified_case(
         lab_readings[o.name] = back(lab[o.name][0] + lab_sd * rng.standard_normal(lab_sd.size))
         field_readings[o.name] = back(in_field[o.name][0] + sd * rng.standard_normal(sd.size))
     files = {
-        "case.toml": (folder / "case.toml").read_text(encoding="utf-8"),
+        "case.toml": read_text(folder / "case.toml"),
         "lab.csv": _table(case.lab, lab_readings),
         "field.csv": _table(case.field, field_readings),
         "fresh.csv": _table(case.new_conditions, {}),

@@ -68,7 +68,7 @@ def _audit_csv(folder: Path, files: Mapping[str, str]) -> dict[str, str]:
 
     if "audit.json" not in files or not (folder / "audit.json").is_file():
         return {}
-    content = json.loads((folder / "audit.json").read_text(encoding="utf-8"))
+    content = json.loads((folder / "audit.json").read_bytes())
     return {"audit.csv": audit_csv(read_findings(content))}
 
 

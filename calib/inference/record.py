@@ -122,7 +122,7 @@ def read_record[R: Record](kind: type[R], folder: Path) -> R:
             mend=f"give the folder that `{kind.WRITTEN_BY} ... --out` named",
         )  # fmt: skip
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_bytes())
         return kind.model_validate({**content, "document": content})
     except ValidationError as error:
         found = error.errors()

@@ -10,16 +10,19 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
 from calib.batch.pool import Pool
 from calib.batch.threads import one_thread
+from calib.batch.unfinished import keep
 from calib.data import table_from_arrays
 from calib.data.quantities import output_of
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import PointEstimate, estimate, methods_for
+from calib.inference.io import save_calibration
 from calib.inference.prior_files import default_priors
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
@@ -173,6 +176,7 @@ def _work_out(
         settings=settings,
         progress=lambda done, planned: progress(f"{task.output}: sampling", done, planned),
     )
+    keep(task.output, partial(save_calibration, calibration))
     seconds["sample"] = time.perf_counter() - clock
     clock = time.perf_counter()
     if held is not None:

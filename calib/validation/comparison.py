@@ -10,15 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.special import logsumexp
 
+from calib.batch.unfinished import keep
 from calib.data import Table
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
+from calib.inference.io import save_calibration
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
@@ -255,6 +258,7 @@ def _candidate(
         problem, seed, label=name, estimates=(start,), settings=settings,
         progress=lambda done, n: tell(f"{name}: sampling", done, n),
     )  # fmt: skip
+    keep(name, partial(save_calibration, calibration))
     loo = leave_one_out(
         calibration, settings=settings, workers=workers,
         progress=lambda done, n: tell(f"{name}: leaving rows out", done, n),

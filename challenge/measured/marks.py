@@ -65,7 +65,7 @@ def mark(case: MeasuredCase, folder: Path) -> Mark:
     path = folder / "diagnosis.json"
     if not path.exists():
         return Mark(case, FAILED, (), 0.0, FAILED)
-    said = json.loads(path.read_text(encoding="utf-8"))
+    said = json.loads(path.read_bytes())
     inclusion = {name: float(found["probability"]) for name, found in said["inclusion"].items()}
     return Mark(
         case, said["verdict"], tuple(sorted(inclusion.items(), key=lambda item: -item[1])),

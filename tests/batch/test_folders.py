@@ -100,7 +100,7 @@ def test_of_a_link_the_folder_that_it_names_is_written(tmp_path: Path, earlier: 
     out = tmp_path / "out"
     out.symlink_to(there)
     with fresh_folder(out, overwrite=earlier) as folder:
-        assert folder.parent == there.parent
+        assert folder.is_relative_to(there.parent)
         (folder / "run.json").write_text("new")
     assert out.is_symlink()
     assert (there / "run.json").read_text() == "new"
@@ -184,7 +184,13 @@ def test_what_a_killed_run_left_is_removed_by_the_next(tmp_path: Path) -> None:
     with fresh_folder(out) as folder:
         (folder / "a").write_text("x")
     # It might have been a run that had only just begun.
-    assert contents(tmp_path) == {"run", "run/a", left.name, f"{left.name}/half"}
+    assert contents(tmp_path) == {
+        "run",
+        "run/a",
+        left.name,
+        f"{left.name}/whole",
+        f"{left.name}/whole/half",
+    }
     aged(left)
     with fresh_folder(tmp_path / "other") as folder:
         (folder / "a").write_text("x")

@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from calib.batch.campaign.kinds import KINDS, Kind, Section, Task
 from calib.batch.campaign.place import Place
+from calib.data.documents import decoded
 from calib.errors import CalibError
 from calib.inference.random import stream
 
@@ -83,7 +84,7 @@ def read_plan(path: Path) -> Plan:
 def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
     try:
         text = path.read_bytes()
-        return text, tomllib.loads(text.decode("utf-8"))
+        return text, tomllib.loads(decoded(text))
     except OSError as error:
         raise CalibError(
             f"the plan cannot be read ({error.strerror})", where=str(path),

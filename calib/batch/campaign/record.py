@@ -75,7 +75,7 @@ def discard_changed(
 def _difference(record: Mapping[str, Any], path: Path) -> str:
     """Name what differs from the record of a result; empty if nothing does."""
     try:
-        there = json.loads(path.read_text(encoding="utf-8"))
+        there = json.loads(path.read_bytes())
         parts = ("settings", "inputs", "versions")
         for part in parts:
             for key in {**record[part], **there[part]}:

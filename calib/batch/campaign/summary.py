@@ -65,7 +65,7 @@ def summarise(plan: Plan, results: Path) -> Summary:
     for name in plan.tasks:
         path = results / name / NUMBERS
         if path.exists():
-            numbers[name] = json.loads(path.read_text(encoding="utf-8"))
+            numbers[name] = json.loads(path.read_bytes())
     failed = {n: e for n, e in failed_tasks(results).items() if n in plan.tasks}
     return Summary({n: task.kind for n, task in plan.tasks.items()}, numbers, failed)
 

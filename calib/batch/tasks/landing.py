@@ -119,7 +119,7 @@ def landing_ground(folder: Path, kept: Kept[Any, Any]) -> Iterator[Callable[[Fin
 def failed_tasks(folder: Path) -> dict[str, str]:
     """Return the errors of the tasks that failed when they were last tried."""
     path = folder / FAILED
-    found: dict[str, str] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    found: dict[str, str] = json.loads(path.read_bytes()) if path.exists() else {}
     return found
 
 

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from calib.batch.plugins import run_file
+from calib.data.documents import read_text, read_toml
 from calib.errors import CalibError, meant
 from calib.models.simulators.base import Way
 from calib.models.simulators.exchange import check_template
@@ -92,8 +93,7 @@ def read_simulator(path: Path) -> Simulated:
     """
     path = Path(path).resolve()
     try:
-        text = path.read_text(encoding="utf-8")
-        content = tomllib.loads(text)
+        content = read_toml(path)
     except OSError as error:
         raise CalibError(
             f"the simulator file cannot be read ({error.strerror})", where=str(path),
@@ -227,7 +227,7 @@ def _made_of(file: SimulatorFile, path: Path) -> tuple[str, ...]:
 def _template(file: SimulatorFile, path: Path) -> str:
     where = path.parent / file.template
     try:
-        template = where.read_text(encoding="utf-8")
+        template = read_text(where)
     except (OSError, UnicodeDecodeError) as error:
         raise CalibError(
             f"the template cannot be read ({error})", where=f"{path}, template",

@@ -16,6 +16,7 @@ from typing import Any
 from uuid import uuid4
 
 from calib.batch.plugins import USER_MODULE
+from calib.data.documents import decoded
 from calib.errors import CalibError
 from calib.models.simulators.base import Failure, tail
 
@@ -79,7 +80,7 @@ def _text(path: Path, *, whole: bool) -> str:
     with path.open("rb") as printed:
         if not whole:
             printed.seek(max(path.stat().st_size - _END, 0))
-        return printed.read().decode(errors="replace")
+        return decoded(printed.read(), "replace")
 
 
 def call_function(function: Callable[..., Any], arguments: Sequence[Any], limit: float) -> Any:

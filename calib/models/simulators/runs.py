@@ -153,7 +153,7 @@ class RunKeeper:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    found: dict[str, Any] = json.loads(path.read_bytes())
     return found
 
 

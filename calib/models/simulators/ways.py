@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from calib.batch.plugins import declared_in
+from calib.data.documents import read_text
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Printed, Result, no_output, tail
@@ -200,7 +201,7 @@ class CommandWay:
         text = printed
         if self._leaves_file:
             try:
-                text = taken.read_text(encoding="utf-8")
+                text = read_text(taken)
             except (OSError, UnicodeDecodeError):
                 return Failure("unreadable", "it left no readable output file", tail(printed))
         found = output_of_text(text, self.gives, self.patterns)

@@ -10,6 +10,7 @@ from typing import Any
 
 from calib.batch.folders import check_room, write_whole, writing
 from calib.batch.tasks import run_tasks
+from calib.data.documents import read_text
 from calib.errors import CalibError
 from calib.inference.prior_files import DeclaredPriors, prior_file_model
 from calib.inference.sampling.sampler import SamplerSettings
@@ -57,7 +58,7 @@ def run_sbc(
     """
     names = chosen_models(models)
     # As text: replicates may run where the files are not.
-    given = {prior_file_model(p): DeclaredPriors(p.name, p.read_text("utf-8")) for p in priors}
+    given = {prior_file_model(p): DeclaredPriors(p.name, read_text(p)) for p in priors}
     if unused := [model for model in given if model not in names]:
         raise CalibError(
             f"there are priors of {', '.join(unused)}, which is not among the models",
@@ -70,7 +71,7 @@ def run_sbc(
     asked = [*slow] if data is None else names
     designs = {model: design_of(model, data) for model in asked}
     if data is not None:
-        said["data"] = Path(data).read_text("utf-8")
+        said["data"] = read_text(Path(data))
     told = [most_runs(m, found, designs[m], simulations) for m, found in slow.items()]
     _claim(out, {"seed": seed, "settings": asdict(settings), **said})
     if announce is not None:
@@ -100,7 +101,7 @@ def chosen_models(models: Sequence[str] = ()) -> list[str]:
 
 def read_records(out: Path, names: Sequence[str]) -> list[dict[str, Any]]:
     """Return the records of some replicates of a run."""
-    return [json.loads((out / REPLICATES / f"{name}.json").read_text()) for name in names]
+    return [json.loads((out / REPLICATES / f"{name}.json").read_bytes()) for name in names]
 
 
 def _claim(out: Path, run: dict[str, Any]) -> None:
