@@ -7,11 +7,13 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from hashlib import sha256
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from types import ModuleType
 
+from calib.batch.foreign import loading
 from calib.errors import CalibError
 
 # Entry points of packages that register several things.
@@ -23,6 +25,7 @@ _LOADED: set[str] = set()
 _OTHERS: set[str] = set()
 # Worker processes find here what this one has loaded.
 _VARIABLE = "CALIB_MODELS"
+_ORDER = {".toml": 1, ".npz": 2}
 
 
 def run_file(path: Path, what: str) -> ModuleType:
@@ -35,7 +38,8 @@ def run_file(path: Path, what: str) -> ModuleType:
     """
     # `Path.resolve` fails where a link leads to itself.
     path = Path(os.path.realpath(path))
-    name = f"{USER_MODULE}{path.stem}"
+    # Files of one name in two folders are two modules.
+    name = f"{USER_MODULE}{path.stem}_{sha256(str(path).encode()).hexdigest()[:8]}"
     known = sys.modules.get(name)
     if known is not None and known.__file__ == str(path):
         return known
@@ -51,7 +55,8 @@ def run_file(path: Path, what: str) -> ModuleType:
     sys.modules[name] = module
     _OTHERS.add(name)
     try:
-        spec.loader.exec_module(module)
+        with loading(name, path):
+            spec.loader.exec_module(module)
     except CalibError as error:
         sys.modules.pop(name)
         # An effect names its file itself.
@@ -72,16 +77,17 @@ def load_files(paths: Sequence[Path]) -> None:
     """Load files that register things, here and in processes to come.
 
     Python files of quantities, models or effects; simulator files (``.toml``); emulators
-    (``.npz``).
+    (``.npz``). In this order, for each kind may name what those before it register.
 
     Raises
     ------
     CalibError
         If one cannot be run, or what it declares does not hold together.
     """
-    for path in paths:
-        _load(Path(path))
-    new = [str(Path(p).resolve()) for p in paths]
+    ordered = sorted(map(Path, paths), key=lambda path: _ORDER.get(path.suffix, 0))
+    new = [str(path.resolve()) for path in ordered]
+    for path in ordered:
+        _load(path)
     if new:
         known = map(str, loaded_files())
         os.environ[_VARIABLE] = os.pathsep.join(dict.fromkeys([*known, *new]))

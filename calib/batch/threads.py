@@ -1,4 +1,7 @@
-"""One thread of linear algebra, whatever the machine has: several add up in another order."""
+"""The same arithmetic, whatever the machine has and the caller has set.
+
+One thread of linear algebra, for several add up in another order; and no floating-point errors.
+"""
 
 from __future__ import annotations
 
@@ -6,17 +9,29 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Do linear algebra on one thread: the last bits are the same on any number of cores.
 
-    Also a decorator. The matrices are small, so that more threads would not be faster.
+    Also a decorator. The matrices are small, so that more threads would not be faster. Nor does
+    it matter whether the caller has NumPy raise floating-point errors.
     """
-    with _libraries().limit(limits=1, user_api="blas"):
+    with _libraries().limit(limits=1, user_api="blas"), no_floating_point_errors():
         yield
+
+
+def no_floating_point_errors() -> np.errstate:
+    """Have NumPy warn of what it would raise, as it does by default (not of underflow)."""
+    import numpy as np
+
+    usual: Any = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
+    return np.errstate(**{k: usual[k] if v == "raise" else v for k, v in np.geterr().items()})
 
 
 def blas_kernels() -> list[str]:

@@ -34,17 +34,23 @@ def _load(paths: list[Path] | None) -> list[Path] | None:
     return paths
 
 
-def _files(name: str, what: str) -> Any:
-    return typer.Option(name, help=f"{what}; repeatable.", callback=_load, is_eager=True)
+def _files(name: str, what: str, *, first: bool) -> Any:
+    return typer.Option(name, help=f"{what}; repeatable.", callback=_load, is_eager=first)
 
 
 Models = Annotated[
     list[Path] | None,
-    _files("--models", "Python file that registers quantities, models or effects of your own"),
+    _files(
+        "--models",
+        "Python file that registers quantities, models or effects of your own",
+        first=True,
+    ),
 ]
 Simulators = Annotated[
     list[Path] | None,
-    _files("--simulator", "TOML file of a simulator of your own, whose command is run"),
+    _files(
+        "--simulator", "TOML file of a simulator of your own, whose command is run", first=False
+    ),
 ]
 
 

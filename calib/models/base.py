@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.batch.foreign import call
 from calib.errors import CalibError
 from calib.models.latex import text
 
@@ -91,7 +92,7 @@ class _Plain:
                 mend="declare it with a function that predicts its output",
             )
         try:
-            found = np.asarray(self.model.predict(theta, rows), dtype=np.float64)
+            found = np.asarray(call(self.model.predict, theta, rows), dtype=np.float64)
         except CalibError:
             raise
         except (Exception, SystemExit) as error:  # of the user's own code

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from calib.batch.foreign import call
 from calib.batch.plugins import declared_in
 from calib.data.documents import read_text
 from calib.errors import CalibError
@@ -69,7 +70,7 @@ class CallableWay:
         arguments = (theta[None] if self.batched else theta, conditions)
         try:
             if self.limit is None:
-                found = self.function(*arguments)
+                found = call(self.function, *arguments)
             else:
                 found = call_function(self.function, arguments, self.limit)
             if isinstance(found, Failure):
@@ -82,7 +83,7 @@ class CallableWay:
 
     def call(self, theta: Array, conditions: Mapping[str, Array]) -> dict[str, Array]:
         """Call it here and now, and name what it returns."""
-        return self._named(self.function(theta, conditions))
+        return self._named(call(self.function, theta, conditions))
 
     @property
     def _place(self) -> str:
