@@ -6,7 +6,7 @@ import ast
 import os
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, redirect_stdout, suppress
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -33,7 +33,7 @@ def set_apart(*, keep_environment: bool = False) -> Iterator[None]:
     content. Random numbers are left alone: a simulator may scatter, and calib's own
     come from streams of their own.
     """
-    folder, searched, filters = _working_directory(), sys.path[:], warnings.filters[:]
+    folder, searched, filters = _working_directory(), sys.path[:], list(warnings.filters)
     # As the system has it: to decode it would take longer than many a function.
     environment: Any = os.environ._data.copy()  # type: ignore[attr-defined]
     try:
@@ -42,7 +42,7 @@ def set_apart(*, keep_environment: bool = False) -> Iterator[None]:
             stack.enter_context(redirect_stdout(sys.stderr))
             if any(one[0] == "error" for one in filters):
                 stack.enter_context(warnings.catch_warnings())
-                warnings.filters[:] = [one for one in filters if one[0] != "error"]
+                _set_filters([one for one in filters if one[0] != "error"])
                 warnings.simplefilter("ignore", append=True)
             yield
     finally:
@@ -50,12 +50,17 @@ def set_apart(*, keep_environment: bool = False) -> Iterator[None]:
             os.chdir(folder)
         sys.path[:] = searched + [path for path in sys.path if path not in searched]
         if warnings.filters != filters:
-            with warnings.catch_warnings():
-                pass  # has the filters looked at anew
-            warnings.filters[:] = filters
+            _set_filters(filters)
         if not keep_environment and os.environ._data != environment:  # type: ignore[attr-defined]
             os.environ.clear()
             os.environ.update({os.fsdecode(k): os.fsdecode(v) for k, v in environment.items()})
+
+
+def _set_filters(filters: Sequence[Any]) -> None:
+    shown: Any = warnings.filters
+    shown[:] = filters
+    with warnings.catch_warnings():
+        pass  # what was decided by others is forgotten
 
 
 def _working_directory() -> str:

@@ -31,7 +31,8 @@ def no_floating_point_errors() -> np.errstate:
     import numpy as np
 
     usual: Any = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
-    return np.errstate(**{k: usual[k] if v == "raise" else v for k, v in np.geterr().items()})
+    set_here: dict[str, Any] = np.geterr()  # type: ignore[assignment]
+    return np.errstate(**{k: usual[k] if v == "raise" else v for k, v in set_here.items()})
 
 
 def blas_kernels() -> list[str]:

@@ -10,13 +10,17 @@ from typing import Any
 
 from calib.errors import FAULTS
 
-__all__ = ["decoded", "inside", "read_json", "read_text", "read_toml"]
+__all__ = ["MEND_TOML", "decoded", "inside", "read_json", "read_text", "read_toml"]
 
 # By the marks that such texts begin with; UTF-16's is the beginning of UTF-32's.
 _ENCODINGS = {
     codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
     codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
 }  # fmt: skip
+
+
+# Of a file that is not valid TOML.
+MEND_TOML = "correct that line; names with other characters than A-Z a-z 0-9 _ - stand in quotes"
 
 
 def decoded(raw: bytes, errors: str = "strict") -> str:

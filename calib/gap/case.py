@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from calib.data import Table, read_table
-from calib.data.documents import read_text, read_toml
+from calib.data.documents import MEND_TOML, read_text, read_toml
 from calib.data.quantities import OUTPUTS, output_of
 from calib.errors import CalibError, meant
 from calib.gap.context import Context, read_context
@@ -82,7 +82,7 @@ def read_case(folder: Path) -> Case:
             else "give a folder with a case.toml in it",
         ) from None  # fmt: skip
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
+        raise CalibError(f"not valid TOML: {error}", where=str(path), mend=MEND_TOML) from None
     unknown = [key for key in content if key not in _KEYS]
     if unknown:
         raise CalibError(

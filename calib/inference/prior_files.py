@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from calib.batch.plugins import declared_in
-from calib.data.documents import decoded
+from calib.data.documents import MEND_TOML, decoded
 from calib.errors import CalibError, meant
 from calib.inference.noise import USUAL, NoiseChoice
 from calib.inference.prior_entries import (
@@ -145,7 +145,7 @@ def _content(text: str, source: str) -> dict[str, Any]:
         return _parsed(text)
     except tomllib.TOMLDecodeError as error:
         raise CalibError(
-            f"the prior file is not valid TOML: {error}", where=source, mend="correct that line"
+            f"the prior file is not valid TOML: {error}", where=source, mend=MEND_TOML
         ) from None
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from typing import TYPE_CHECKING, Any
 
+from calib.data.documents import MEND_TOML
 from calib.data.quantities import OUTPUTS, QUANTITIES
 from calib.data.units import convert
 from calib.errors import CalibError
@@ -40,6 +41,23 @@ def _quoted(given: str) -> str:
     return f'r"{given}"' if "\\" in given else f'"{given}"'
 
 
+def check_word(name: object, what: str, where: str) -> None:
+    """Check that the name of a model or a parameter will do wherever it stands.
+
+    Raises
+    ------
+    CalibError
+        If it is no word.
+    """
+    if not isinstance(name, str) or not name.isidentifier():
+        raise CalibError(
+            f"{name!r} is no name for a {what}", where=where,
+            allowed="letters of any script, digits and underscores, not beginning with a digit: it "
+            "names columns, variables of netCDF and marks of templates too",
+            mend="give it another name",
+        )  # fmt: skip
+
+
 def check_model(model: Model) -> None:
     """Check a declaration.
 
@@ -50,11 +68,9 @@ def check_model(model: Model) -> None:
         given twice, or the priors are missing, not of the model's parameters, or in another unit.
     """
     where = f"model {model.name!r}"
-    if not model.name.isidentifier():
-        raise CalibError(
-            "the name of a model must be a word", where=where,
-            allowed="letters, digits and underscores", mend="give it another name",
-        )  # fmt: skip
+    check_word(model.name, "model", where)
+    for parameter in model.parameters if not isinstance(model.parameters, str) else ():
+        check_word(parameter, "parameter", where)
     for attribute in ("conditions", "parameters", "latex"):
         check_tuple(attribute, getattr(model, attribute), where)
     for column in (model.output, *model.conditions):
@@ -90,7 +106,7 @@ def check_model(model: Model) -> None:
         given = tomllib.loads(model.priors).get("parameters", {})
     except tomllib.TOMLDecodeError as error:
         raise CalibError(
-            f"its priors are not valid TOML: {error}", where=where, mend="correct that line"
+            f"its priors are not valid TOML: {error}", where=where, mend=MEND_TOML
         ) from None
     apart = sorted(set(names) ^ set(given))
     if apart:

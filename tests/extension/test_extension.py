@@ -214,7 +214,7 @@ def declared(**changes: object) -> calib.Model:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"name": "my model"}, ["must be a word"]),
+        ({"name": "my model"}, ["'my model' is no name for a model"]),
         ({"name": "bekker"}, ["there is a model 'bekker' already"]),
         ({"conditions": ("slip",)}, ["no quantity 'slip'", "slip_ratio"]),
         (

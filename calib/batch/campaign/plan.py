@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from calib.batch.campaign.kinds import KINDS, Kind, Section, Task
 from calib.batch.campaign.place import Place
-from calib.data.documents import decoded
+from calib.data.documents import MEND_TOML, decoded
 from calib.errors import CalibError
 from calib.inference.random import stream
 
@@ -91,7 +91,7 @@ def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
             mend="give the path of a TOML file",
         ) from None  # fmt: skip
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
+        raise CalibError(f"not valid TOML: {error}", where=str(path), mend=MEND_TOML) from None
 
 
 def _tables(found: Any, name: str, path: Path) -> list[Any]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from calib.data.csvfile import open_csv
 from calib.data.headers import parse_header
 from calib.errors import CalibError
 from calib.inference.emulation.judge import held_out, judged
@@ -66,7 +66,7 @@ def read_runs(simulator: Simulator, problem: Problem) -> Training:
     way = simulator.way
     if not isinstance(way, TableWay):
         raise ValueError(f"{simulator.name} is no table")
-    columns = _columns(way.path)
+    columns, lines = _columns(way.path)
     output = next(
         o for o in simulator.outputs if simulator.canonical(o.header) == problem.bound.model.output
     )
@@ -78,6 +78,9 @@ def read_runs(simulator: Simulator, problem: Problem) -> Training:
             allowed=", ".join(needed), mend="add it, or correct its name in the simulator file",
         )  # fmt: skip
     theta = np.stack([columns[name] for name in simulator.parameters], axis=1)
+    _check_doubled(
+        np.stack([columns[name] for name in needed[:-1]], axis=1), needed, lines, way.path
+    )
     x = {
         simulator.canonical(h): _in_canonical(h, columns[n])
         for n, h in simulator.conditions.items()
@@ -86,6 +89,20 @@ def read_runs(simulator: Simulator, problem: Problem) -> Training:
     with np.errstate(all="ignore"):
         y = problem.bound.to_response(y)
     return _by_run(theta, x, y, way.path)
+
+
+def _check_doubled(rows: Array, names: Sequence[str], lines: Sequence[int], path: Path) -> None:
+    """Check that no run has a row of conditions twice."""
+    first: dict[bytes, int] = {}
+    for row, line in zip(rows + 0.0, lines, strict=True):  # 0 and -0 are the same
+        if (earlier := first.setdefault(row.tobytes(), line)) != line:
+            told = ", ".join(f"{n} = {v:g}" for n, v in zip(names, row, strict=False))
+            raise CalibError(
+                f"the row of line {earlier} is there again ({told})", where=f"{path}, line {line}",
+                allowed="each run once at each row of conditions",
+                mend="delete one of the two; of a simulator that scatters a table has one run of "
+                "each parameter vector",
+            )  # fmt: skip
 
 
 def _in_canonical(header: str, values: Array) -> Array:
@@ -103,8 +120,14 @@ def _by_run(theta: Array, x: Mapping[str, Array], y: Array, path: Path) -> Train
         rows.reshape(len(vectors), m, -1), rows[:m], rtol=1e-9, atol=1e-12
     )
     if not same or len(vectors) < _LEAST:
+        counts = np.bincount(of_run.ravel())
+        odd = np.flatnonzero(counts != np.bincount(counts).argmax())[:1]
+        told = "".join(
+            f" (that of {', '.join(f'{v:g}' for v in vectors[i])} has {counts[i]} rows)"
+            for i in odd
+        )
         raise CalibError(
-            f"there are {len(vectors)} runs, not all at the same conditions"
+            f"there are {len(vectors)} runs, not all at the same conditions{told}"
             if not same
             else f"there are {len(vectors)} runs",
             where=str(path),
@@ -115,17 +138,18 @@ def _by_run(theta: Array, x: Mapping[str, Array], y: Array, path: Path) -> Train
     return Training(vectors, y[order].reshape(len(vectors), m), nodes)
 
 
-def _columns(path: Path) -> dict[str, Array]:
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = [row for row in csv.reader(file) if row]
-    names = [cell.strip() for cell in rows[0]] if rows else []
+def _columns(path: Path) -> tuple[dict[str, Array], list[int]]:
+    """Return the columns of numbers, and the line of each row."""
+    file = open_csv(path)
+    read = list(file.rows)
+    lines, rows = [line for line, _ in read], [row for _, row in read]
     found = {}
-    for i, name in enumerate(names):
+    for i, name in enumerate(file.header):
         try:
-            found[name] = np.array([_number(row[i]) for row in rows[1:]])
+            found[name] = np.array([_number(row[i]) for row in rows])
         except (ValueError, IndexError):
             continue  # a label, or a column that is not asked for
-    return found
+    return found, lines
 
 
 def _number(cell: str) -> float:

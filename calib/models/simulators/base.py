@@ -229,6 +229,14 @@ def _parsed(header: str, name: str) -> tuple[str, str]:
     return found.quantity.canonical, found.unit
 
 
+def not_made(why: str, mend: str = "mend that") -> CalibError:
+    """Return what to say of a run that its surroundings have prevented: it is not kept."""
+    return CalibError(
+        f"the run could not be made: {why}",
+        mend=f"{mend}, and call the same command again: the runs that were made are kept",
+    )
+
+
 def no_output(column: str, found: Iterable[str]) -> str:
     """Say that an output was not given, and which were."""
     return f"there is no output {column!r}; it gave {', '.join(map(str, found)) or 'nothing'}"

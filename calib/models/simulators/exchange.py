@@ -15,7 +15,7 @@ from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Result
 
-_MARK = re.compile(r"@([A-Za-z_]\w*)@")
+_MARK = re.compile(r"@([^\W\d]\w*)@")
 
 
 def input_json(parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from calib.batch.plugins import run_file
-from calib.data.documents import read_text, read_toml
+from calib.data.documents import MEND_TOML, read_text, read_toml
 from calib.errors import CalibError, meant
 from calib.models.simulators.base import Way
 from calib.models.simulators.exchange import check_template
@@ -100,7 +100,7 @@ def read_simulator(path: Path) -> Simulated:
             mend="give the path of a TOML file",
         ) from None  # fmt: skip
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CalibError(f"not valid TOML: {error}", where=str(path), mend="correct it") from None
+        raise CalibError(f"not valid TOML: {error}", where=str(path), mend=MEND_TOML) from None
     try:
         file = SimulatorFile.model_validate(content)
     except ValidationError as error:

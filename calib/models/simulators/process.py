@@ -15,16 +15,19 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from calib.batch.folders import check_room
 from calib.batch.plugins import USER_MODULE
 from calib.data.documents import decoded
 from calib.errors import CalibError
-from calib.models.simulators.base import Failure, tail
+from calib.models.simulators.base import Failure, not_made, tail
 
 _PRINTED = ".printed"
 # Of what is printed, so many bytes have more characters than are kept.
 _END = 4096
 # What a program and all that it starts have in their environment.
 _MARK = "CALIB_RUN"
+# Where a program finds, in its environment, the folder of its simulator file.
+HOME = "CALIB_SIMULATOR"
 # How long what was killed is waited for: what hangs in the kernel, on a disk that is gone, may not
 # come to its end.
 _GIVE_UP = 5.0
@@ -32,7 +35,7 @@ _PAUSE = 0.01
 
 
 def run_program(
-    arguments: Sequence[str], folder: Path, limit: float, *, whole: bool = True
+    arguments: Sequence[str], folder: Path, limit: float, *, whole: bool = True, home: str = ""
 ) -> Failure | str:
     """Run a program in a folder and wait for it, so many seconds at the most.
 
@@ -40,12 +43,12 @@ def run_program(
     process group (a session of its own), which is killed when it has come to its end, when the
     limit has passed, and when this process is interrupted: what it started ends with it. On Linux
     so does what has left the group, which is known by a variable of its environment. What the
-    kernel cannot end is left after some seconds.
+    kernel cannot end is left after some seconds. Its `home`, if it has one, is in its environment.
 
     Raises
     ------
     CalibError
-        If it cannot be started.
+        If it cannot be started, or its surroundings and not its input have ended it.
     """
     path = folder / _PRINTED
     mark = f"{_MARK}={uuid4().hex}"
@@ -54,13 +57,12 @@ def run_program(
             child = subprocess.Popen(
                 list(arguments), cwd=folder, stdin=subprocess.DEVNULL, stdout=printed,
                 stderr=subprocess.STDOUT, start_new_session=True,
-                env=os.environ | dict([mark.split("=")]),
+                env=os.environ | dict([mark.split("=")]) | ({HOME: home} if home else {}),
             )  # fmt: skip
         except OSError as error:
-            # No fault of the parameters: nothing is learned from it.
-            raise CalibError(
-                f"{arguments[0]} cannot be started ({error.strerror})",
-                mend="make it a program that can be run here; the runs that were made are kept",
+            why = _script(arguments[:1]) or error.strerror
+            raise not_made(
+                f"{arguments[0]} cannot be started ({why})", "make it a program that runs here"
             ) from None
         try:
             code: int | None = child.wait(limit)
@@ -71,8 +73,61 @@ def run_program(
     if code is None:
         return Failure("time", f"it took longer than {limit:g} s", tail(_text(path, whole=False)))
     if code:
-        return Failure("exit", _ended(code), tail(_text(path, whole=False)))
+        end = tail(_text(path, whole=False))
+        of_shell = code in _NOT_RUN or Path(arguments[0]).stem in _SHELLS
+        why = (_script(arguments) if of_shell else "") or _prevented(code, folder)
+        if why:
+            raise not_made(f"{_ended(code)}: {why}; it printed: {end.strip() or 'nothing'}")
+        return Failure("exit", _ended(code), end)
     return _text(path, whole=whole)
+
+
+# By others than the program: a shell, a scheduler, a system without memory.
+_KILLED = tuple(
+    getattr(signal, name) for name in ("SIGKILL", "SIGTERM", "SIGHUP", "SIGINT", "SIGXFSZ")
+    if hasattr(signal, name)
+)  # fmt: skip
+# How a shell ends, and `env`, where what they are to run is not there or cannot be run.
+_NOT_RUN = (126, 127)
+_SHELLS = ("sh", "bash", "dash", "ksh", "zsh", "env")
+
+
+def _prevented(code: int, folder: Path) -> str:
+    """Return what has prevented a program that ended with a code, if its parameters did not."""
+    # A shell that runs it adds 128 to the signal.
+    if -code in _KILLED or code - 128 in _KILLED:
+        return "something else has ended it; where memory is short, the system does"
+    if code in _NOT_RUN:
+        return f"a program that it starts is not there or cannot be run; {_where(folder)}"
+    try:
+        check_room(folder)
+    except CalibError as error:
+        return error.message
+    return ""
+
+
+def _where(folder: Path) -> str:
+    """Say where a program runs, and how it finds what is its own."""
+    return (
+        f"it runs in {folder}, made for this run alone and removed after it, and finds its own "
+        f"files in the folder that the variable {HOME} names"
+    )
+
+
+def _script(paths: Sequence[str]) -> str:
+    """Say which script is not one for this system, if any, and why."""
+    for path in filter(os.path.isfile, paths):
+        with Path(path).open("rb") as file:
+            head = file.readline(_END)
+        if head.endswith(b"\r\n"):
+            return (
+                f"the lines of {path} end as on Windows (CR LF), and the system takes the CR for a "
+                "part of a name: save it with the line ends of Unix"
+            )
+        words = head.removeprefix(b"#!").split()
+        if head.startswith(b"#!") and words and not os.path.exists(words[0]):  # noqa: PTH110
+            return f"the first line of {path} names {os.fsdecode(words[0])}, which is not there"
+    return ""
 
 
 def _text(path: Path, *, whole: bool) -> str:
@@ -106,7 +161,9 @@ def call_function(function: Callable[..., Any], arguments: Sequence[Any], limit:
         printed = run_program(started, scratch, limit, whole=False)
         if isinstance(printed, Failure):
             return printed
-        found, raised = pickle.loads(taken.read_bytes())
+        found, raised, elsewhere = pickle.loads(taken.read_bytes())
+    if elsewhere:
+        raise not_made(raised)
     return found if raised is None else Failure("error", raised, tail(printed))
 
 

@@ -20,6 +20,8 @@ FIRST = 5
 FROM_THE_START = "it fails from the start, and no more runs were made"
 _MEND: dict[Kind, str] = {
     "time": "give it more time (limit)",
+    "exit": "correct the simulator where it fails: each run is made in a new folder (calib-run-... "
+    "among the temporary files), and finds its own files where the variable CALIB_SIMULATOR says",
     "short": "have it give a number for each row, or ask for one row at a time (rows)",
     "unreadable": "have it give what [outputs] names, as output and patterns say, or correct these",
 }

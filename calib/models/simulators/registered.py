@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from calib.data.documents import MEND_TOML
 from calib.data.headers import parse_header
 from calib.data.registry import Registry
 from calib.errors import CalibError
 from calib.models.base import Array, Conditions, Model
+from calib.models.declared import check_word
 from calib.models.simulators.base import Failure, Output, Simulator
 from calib.models.simulators.refused import FROM_THE_START, fail_alike, without_value
 from calib.models.simulators.runs import Run
@@ -23,6 +26,8 @@ from calib.models.simulators.ways import CallableWay
 
 # So many of the runs that failed are listed, where a sampler asks for thousands.
 _LISTED = 200
+# Keys that TOML has without quotes.
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
 @dataclass(frozen=True)
@@ -292,20 +297,23 @@ def split_tables(priors: str, name: str) -> dict[str, str]:
     except tomllib.TOMLDecodeError as error:
         raise CalibError(
             f"the priors are not valid TOML: {error}", where=f"simulator {name}",
-            mend="correct that line",
+            mend=MEND_TOML,
         ) from None  # fmt: skip
     if not isinstance(known, Mapping) or not known:
         raise CalibError(
             "there are no parameters with priors", where=f"simulator {name}",
             allowed="[parameters.NAME] with dist, unit, reason and source", mend="add them",
         )  # fmt: skip
+    for key in known:
+        check_word(key, "parameter", f"simulator {name}")
     return {key: written(key, table) for key, table in known.items()}
 
 
 def written(name: str, table: Mapping[str, Any]) -> str:
     """Write a table ``[parameters.NAME]``."""
     lines = [f"{key} = {_toml(value)}" for key, value in table.items()]
-    return "\n".join([f"[parameters.{name}]", *lines]) + "\n"
+    key = name if _BARE.fullmatch(name) else _toml(name)
+    return "\n".join([f"[parameters.{key}]", *lines]) + "\n"
 
 
 def _toml(value: Any) -> str:

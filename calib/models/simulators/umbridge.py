@@ -16,7 +16,7 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.models.simulators.base import Failure, Result, tail
+from calib.models.simulators.base import Failure, Result, not_made, tail
 
 
 @dataclass(frozen=True)
@@ -91,31 +91,36 @@ class UmbridgeWay:
     def ask(self, what: str, content: Mapping[str, Any]) -> dict[str, Any] | Failure:
         """Send one request of the protocol; a CalibError if there is no server."""
         body = json.dumps({"name": self.model, **content}).encode()
-        request = urllib.request.Request(
-            f"{self.url.rstrip('/')}/{what}", body, {"Content-Type": "application/json"}
-        )
         try:
+            request = urllib.request.Request(
+                f"{self.url.rstrip('/')}/{what}", body, {"Content-Type": "application/json"}
+            )
             with urllib.request.urlopen(request, timeout=self.limit) as reply:
-                # Python's reader takes the NaN and Infinity that JSON does not have.
-                found = json.loads(reply.read())
+                answer = reply.read()
         except urllib.error.HTTPError as error:
+            if error.code not in _OF_THE_MODEL:
+                raise self._not_there(f"{error.code} {error.reason}") from None
             return Failure("error", f"the server answered {error.code}", tail(_body(error)))
-        except TimeoutError:
-            return Failure("time", f"the server took longer than {self.limit:g} s")
-        except (OSError, HTTPException, ValueError) as error:
-            reason = getattr(error, "reason", error)
-            if isinstance(reason, TimeoutError):
+        except (urllib.error.URLError, ValueError) as error:  # before anything was asked
+            raise self._not_there(getattr(error, "reason", error)) from None
+        except (OSError, HTTPException) as error:
+            if not self._listens():
+                raise self._not_there(error) from None
+            if isinstance(error, TimeoutError):
                 return Failure("time", f"the server took longer than {self.limit:g} s")
-            if isinstance(reason, socket.gaierror) or not self._listens():
-                # No fault of the parameters: nothing is learned from it.
-                raise CalibError(
-                    f"the server at {self.url} is not there ({reason})", allowed="a running server",
-                    mend="start it and call the same command: the runs that were made are kept",
-                ) from None  # fmt: skip
-            return Failure("error", f"the server at {self.url} did not answer: {reason}")
+            return Failure("error", f"the server at {self.url} did not answer: {error}")
+        try:
+            # Python's reader takes the NaN and Infinity that JSON does not have.
+            found = json.loads(answer)
+        except ValueError:
+            said = tail(answer.decode(errors="replace"))
+            return Failure("unreadable", "the server's reply is not JSON", said)
         if not isinstance(found, dict) or "error" in found:
             return Failure("error", "the server reports an error", tail(str(found)))
         return found
+
+    def _not_there(self, why: object) -> CalibError:
+        return not_made(f"the server at {self.url} is not there ({why})", "start it")
 
     def _listens(self) -> bool:
         """Whether something is there to answer: a server that died has no faulty parameters."""
@@ -126,6 +131,11 @@ class UmbridgeWay:
         except (OSError, ValueError):
             return False
         return True
+
+
+# What a server answers of itself with (protocol 1.0): a call that its model will not have, a model
+# that failed. With any other code it was not the model that answered.
+_OF_THE_MODEL = (400, 500)
 
 
 def _body(error: urllib.error.HTTPError) -> str:

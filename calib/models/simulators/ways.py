@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping
@@ -19,7 +20,8 @@ from calib.batch.plugins import declared_in
 from calib.data.documents import read_text
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.models.simulators.base import Failure, Printed, Result, no_output, tail
+from calib.models.simulators.base import Failure, Printed, Result, no_output, not_made, tail
+from calib.models.simulators.child import of_surroundings
 from calib.models.simulators.exchange import filled, input_csv, input_json, output_of_text
 from calib.models.simulators.process import call_function, run_program
 
@@ -79,6 +81,8 @@ class CallableWay:
         except CalibError:
             raise
         except (Exception, SystemExit) as error:
+            if of_surroundings(error):
+                raise not_made(f"{type(error).__name__}: {error}") from error
             return Failure("error", f"{type(error).__name__}: {error}")
 
     def call(self, theta: Array, conditions: Mapping[str, Array]) -> dict[str, Array]:
@@ -165,7 +169,8 @@ class CommandWay:
         if "{" in argument:
             return None
         try:
-            path = (self.folder / argument).resolve()
+            # As it is named: what a link leads to may be another program by its own name.
+            path = Path(os.path.abspath(self.folder / argument))  # noqa: PTH100
             return path if path.is_file() else None
         except (OSError, RuntimeError):  # a text too long for a name, a link to itself
             return None
@@ -193,7 +198,9 @@ class CommandWay:
             given.write_text(self._input(parameters, conditions), encoding="utf-8")
             paths = {"{input}": str(given), "{output}": str(taken)}
             whole = not self._leaves_file
-            printed = run_program(self._arguments(paths), scratch, self.limit, whole=whole)
+            printed = run_program(
+                self._arguments(paths), scratch, self.limit, whole=whole, home=str(self.folder)
+            )
             if isinstance(printed, Failure):
                 return printed
             return self._read(taken, printed)
