@@ -131,13 +131,20 @@ def check_conditions(table: Table, known: Mapping[str, Array]) -> None:
 
 
 def _another_unit(table: Table, name: str, found: str) -> CalibError:
-    header = table.header_of(name)
+    header, quantity = table.header_of(name), QUANTITIES[name]
+    load = ""
+    if (
+        quantity.role == "output" and quantity.kind in _OF_SMALL_WHEELS and quantity.largest
+        and float(np.nanmax(np.abs(table[name]))) < quantity.largest[0]
+        and not any(column in table for column in columns_of("load"))
+    ):  # fmt: skip
+        # Without it, they would be compared with those of a vehicle's wheel.
+        load = ", and add the load of the small wheel that they are of: the column normal_load_kn"
     return CalibError(
         found, where=f"{table.source}, column {header!r}",
-        allowed=f"the unit of the readings in the column name: "
-        f"{', '.join(QUANTITIES[name].units)}",
+        allowed=f"the unit of the readings in the column name: {', '.join(quantity.units)}",
         mend="correct the unit in the column name; if the values are right as they are, say so "
-        f"there: '{header} {CHECKED}'",
+        f"there: '{header} {CHECKED}'{load}",
     )  # fmt: skip
 
 
@@ -148,6 +155,12 @@ def _between(table: Table, name: str, low: float, high: float) -> str:
     return f"{plain_number(ends[0], 4)} to {plain_number(ends[1], 4)} {column.unit_word}".rstrip()
 
 
+def fits_load(pull: float, load: float) -> bool:
+    """Whether a largest pull can be that of a wheel under a load, of one unit."""
+    low, high = _PULL_OVER_LOAD
+    return low * load < pull < high * load
+
+
 def _odd_columns(table: Table) -> Iterator[_Odd]:
     known = [n for n in table if n in QUANTITIES and np.isfinite(table[n]).any()]
     sizes = {name: float(np.nanmax(np.abs(table[name]))) for name in known}
@@ -155,8 +168,7 @@ def _odd_columns(table: Table) -> Iterator[_Odd]:
         max((sizes[c] for c in columns_of(role) if c in sizes), default=0.0)
         for role in ("pull", "load")
     )
-    low, high = _PULL_OVER_LOAD
-    fits = low * load < pull < high * load
+    fits = fits_load(pull, load)
     for name, size in sizes.items():
         quantity = QUANTITIES[name]
         if quantity.largest is None:

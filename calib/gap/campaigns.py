@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
-from calib.data.headers import renamed
+from calib.data.headers import accepted_headers, renamed
 from calib.data.numbers import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, physical_role
+from calib.data.units_check import fits_load
 from calib.errors import CalibError
 from calib.gap.case import Case
 from calib.gap.covariates import Covariates
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 # Fewer field rows cannot tell a gap from noise; a larger ratio is a wrong unit.
 MIN_FIELD_ROWS = 5
 MAX_RATIO = 100.0
+# What effects take for the load where none is recorded, as the shipped priors do.
+_LOAD_KN = 5.0
 
 
 @dataclass(frozen=True)
@@ -155,7 +158,8 @@ def campaigns(case: Case) -> Campaigns:
             "every field row is a row of the calibration, value for value", where=field.source,
             allowed="measurements of another campaign", mend="name the field's own file",
         )  # fmt: skip
-    load = _recorded(lab, "load", _recorded(field, "load", np.array([5.0])))
+    load = _recorded(lab, "load", _recorded(field, "load", np.array([_LOAD_KN])))
+    _check_load(lab, field)
     order = _recorded(field, "order", np.array([0.0, 1.0]))
     view = View(
         conditions=dict(field.columns),
@@ -169,6 +173,22 @@ def campaigns(case: Case) -> Campaigns:
         case.new_conditions.must_have(*needed)
     lab_at = {o.name: noise_conditions_of_lab(o.problem.table, view) for o in outputs}
     return Campaigns(outputs, view, lab_at, case)
+
+
+def _check_load(lab: Table, field: Table) -> None:
+    """Refuse the load that priors of effects assume where the pulls cannot be of it."""
+    pulls = [t[c] for t in (lab, field) for c in columns_of("pull") if c in t]
+    if not pulls or any(c in t for t in (lab, field) for c in columns_of("load")):
+        return
+    largest = float(np.nanmax(np.abs(np.concatenate(pulls))))
+    if not fits_load(largest, _LOAD_KN):
+        raise CalibError(
+            f"there is no column normal_load_kn; a load of {_LOAD_KN:g} kN was assumed, but the "
+            f"largest pull is {plain_number(largest)} kN",
+            where=f"{lab.source}, {field.source}",
+            allowed=", ".join(accepted_headers(QUANTITIES["normal_load_kn"])),
+            mend="add the column normal_load_kn to the calibration or the field",
+        )  # fmt: skip
 
 
 def _output(case: Case, name: str, model: str) -> OutputData:

@@ -19,6 +19,8 @@ from calib.inference.priors import Prior
 # the field comes near them. An sd of 20 on the logarithm is a factor of 5e8 to either side.
 _Number = Annotated[float, Field(strict=True, ge=-1e15, le=1e15)]
 _Positive = Annotated[float, Field(strict=True, gt=1e-15, le=1e15)]
+# Farther out the quantiles of a normal lose their digits.
+_MOST_SDS = 1e4
 _LogSd = Annotated[float, Field(strict=True, gt=1e-6, le=20.0)]
 
 
@@ -136,6 +138,15 @@ def prior_of(name: str, entry: PriorEntry, source: str, references: Mapping[str,
             f"lower bound {lower:g} is not below upper bound {upper:g}",
             where=f"{source}, parameters.{name}",
             mend="give lower < upper",
+        )
+    if max(lower - loc, loc - upper) > _MOST_SDS * scale > 0.0:
+        raise CalibError(
+            f"the bounds lie {max(lower - loc, loc - upper) / scale:.3g} sds from the "
+            f"{'median' if isinstance(entry, _OnLogarithm) else 'mean'}",
+            where=f"{source}, parameters.{name}",
+            allowed=f"bounds within {_MOST_SDS:g} sds, and better those that hold some of the "
+            "distribution",
+            mend="correct the bounds, or the distribution",
         )
     return Prior(
         name, entry.unit, entry.reason, entry.source, text, isinstance(entry, _OnLogarithm), loc,

@@ -15,13 +15,16 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammainc, gammaincinv, gammaln, log_ndtr, ndtr, ndtri
+from scipy.special import gammainc, gammaincinv, gammaln, log_ndtr, ndtr, ndtri, ndtri_exp
 
 from calib.errors import CalibError
 from calib.inference.noise import USUAL, NoiseChoice
 from calib.models.base import Array
 
 type Mask = NDArray[np.bool_]
+
+# Below it a probability has lost digits, or is zero, in double precision; its logarithm is not.
+_LEAST_MASS = 1e-290
 
 
 @dataclass(frozen=True)
@@ -55,6 +58,12 @@ class Prior:
     def fixed(self) -> bool:
         """Whether the parameter is not sampled."""
         return self.scale == 0.0
+
+
+def _in_tail(a: Array, b: Array, u: Array) -> Array:
+    """Quantiles (k, d) of standard normals between bounds (d,) far below zero."""
+    with np.errstate(divide="ignore"):
+        return ndtri_exp(np.logaddexp(np.log1p(-u) + log_ndtr(a), np.log(u) + log_ndtr(b)))
 
 
 @dataclass(frozen=True)
@@ -131,7 +140,10 @@ class Priors:
         a, b, swap = self._bounds
         with np.errstate(invalid="ignore"):
             below, above = ndtr(a), ndtr(b)
-            z = ndtri(below + np.where(swap, 1.0 - u, u) * (above - below))
+            u_left = np.where(swap, 1.0 - u, u)
+            z = ndtri(below + u_left * (above - below))
+            if (tail := above < _LEAST_MASS).any():
+                z[:, tail] = _in_tail(a[tail], b[tail], u_left[:, tail])
             normals = loc + scale * np.where(swap, -z, z)
             uniforms = lower + u * (upper - lower)
             values = np.where(precision > 0.0, normals, uniforms)

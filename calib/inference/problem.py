@@ -33,9 +33,11 @@ from calib.inference.prior_files import (
     relative_columns,
 )
 from calib.inference.priors import Priors
+from calib.inference.scale import check_scale
 from calib.inference.serial import Serial, serial_of
 from calib.inference.uncertain import log_normal
 from calib.models import Array, BoundModel, Conditions, get_model
+from calib.models.simulators.registered import simulated_by
 
 # Mean and variance of each row given others.
 type _Given = Callable[[Serial, Array, Array], tuple[Array, Array]]
@@ -279,7 +281,8 @@ def build_problem(
     ------
     CalibError
         If a column is missing, or as in another unit; if too few rows are there, all of them at one
-        setting of the conditions or with one output; or the priors do not fit the model.
+        setting of the conditions or with one output; if the priors do not fit the model, leave no
+        parameter free, or expect outputs of quite another size.
     """
     model = get_model(model_name)
     table.must_have(*model.conditions, model.output)
@@ -299,15 +302,25 @@ def build_problem(
         bound = model.bind(table.columns)
     except CalibError as error:
         raise error.within(table.source) from None
+    assumed = {name: value for name, value in relative.items() if name not in references}
     notes = tuple(
         f"the data have no column {name}, so priors that are relative to it assume {value:g}; give "
         "it if yours differs"
-        for name, value in relative.items()
-        if name not in references
+        for name, value in assumed.items()
     )
     noise = noise_of(priors.noise, model.select(table.columns), priors.source)
     if model.uncertain is not None:
         noise.must_be_usual(priors.source, f"the emulator {model.name}")
     problem = Problem(bound, table, priors, notes, noise)
     _ = problem.serial  # refused here, not in the middle of an estimation
-    return problem.with_fixed(fixed) if fixed else problem
+    problem = problem.with_fixed(fixed) if fixed else problem
+    if not problem.names:
+        raise CalibError(
+            f"all parameters of {model.name} are held fixed", where=priors.source,
+            allowed="at least one parameter to estimate; sigma, the scale of the noise, will do",
+            mend='give one another distribution than dist = "fixed"',
+        )  # fmt: skip
+    # A simulator's runs cost too much to look at what the priors expect.
+    if model.uncertain is not None or simulated_by(model.name) is None:
+        check_scale(problem, assumed)
+    return problem

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import nullcontext
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from calib.errors import CalibError
 from calib.gap.campaigns import campaigns
 from calib.gap.case import Case
 from calib.gap.oddities import oddities
+from calib.inference.prior_files import DeclaredPriors, default_priors
 from tests.gap.cases import PULL_ONLY, make_case, table_without
 
 
@@ -233,12 +235,46 @@ def test_outputs_are_compared_by_their_typical_size(lab, field, refused):
 def test_outputs_a_hundred_times_apart_are_refused_however_small_they_are(unit, field, refused):
     case = make_case(models=PULL_ONLY)
     lab, there = (
-        replace(t, columns={**t.columns, "drawbar_pull_kn": f * t["drawbar_pull_kn"]})
+        replace(
+            t,
+            columns={
+                **t.columns,
+                "drawbar_pull_kn": f * t["drawbar_pull_kn"],
+                "normal_load_kn": unit * t["normal_load_kn"],
+            },
+        )
         for t, f in ((case.lab, unit), (case.field, unit * field))
     )
     scaled = replace(case, lab=lab, field=there)
     with pytest.raises(CalibError, match="a factor of 100") if refused else nullcontext():
         campaigns(scaled)
+
+
+@pytest.mark.parametrize(("size", "refused"), [(1.0, False), (1e-3, True), (1e3, True)])
+def test_a_load_that_is_assumed_for_effects_and_the_pull_contradicts_is_refused(size, refused):
+    case = make_case(models=PULL_ONLY)
+    own = default_priors(PULL_ONLY["drawbar_pull"]).read_text().replace("relative_to", "#")
+    own = re.sub(
+        r"(median|sd|mean) = ([\d.]+)(?=[^\[]*unit = \"kN)",
+        lambda m: f"{m[1]} = {5.0 * size * float(m[2])}",
+        own.replace("default_reference", "#"),
+    )
+    lab, there = (
+        replace(
+            t,
+            columns={
+                **{name: v for name, v in t.columns.items() if name != "normal_load_kn"},
+                "drawbar_pull_kn": size * t["drawbar_pull_kn"],
+            },
+            header=("slip_ratio", "drawbar_pull_kn (checked)"),
+        )
+        for t in (case.lab, case.field)
+    )
+    priors = {"drawbar_pull": DeclaredPriors("own.toml", own)}
+    with pytest.raises(CalibError) if refused else nullcontext() as caught:
+        campaigns(replace(case, lab=lab, field=there, priors=priors))
+    if refused:
+        assert "add the column normal_load_kn" in str(caught.value)
 
 
 def test_field_rows_that_are_the_calibrations_are_counted():

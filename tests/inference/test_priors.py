@@ -56,6 +56,22 @@ CASES: dict[str, tuple[str, stats.rv_continuous]] = {
         'dist = "normal"\nmean = 0.0\nsd = 1.0\nupper = -9.5',
         stats.truncnorm(-np.inf, -9.5, 0.0, 1.0),
     ),
+    "normal, cut 45 sds above": (
+        'dist = "normal"\nmean = 0.0\nsd = 1.0\nlower = 45.0',
+        stats.truncnorm(45.0, np.inf, 0.0, 1.0),
+    ),
+    "normal, between bounds 50 and 60 sds below": (
+        'dist = "normal"\nmean = 1.0\nsd = 0.1\nlower = -5.0\nupper = -4.0',
+        stats.truncnorm(-60.0, -50.0, 1.0, 0.1),
+    ),
+    "normal, between near bounds 1,000 sds above": (
+        'dist = "normal"\nmean = 0.0\nsd = 1.0\nlower = 1000.0\nupper = 1000.001',
+        stats.truncnorm(1000.0, 1000.001, 0.0, 1.0),
+    ),
+    "lognormal, cut 45 sds above": (
+        'dist = "lognormal"\nmedian = 4.0\nsd_log = 0.7\nlower = 1.9e14',
+        stats.truncnorm(np.log(1.9e14 / 4.0) / 0.7, np.inf, np.log(4), 0.7),
+    ),
     "lognormal": ('dist = "lognormal"\nmedian = 4.0\nsd_log = 0.7', stats.norm(np.log(4), 0.7)),
     "lognormal, cut": (
         'dist = "lognormal"\nmedian = 4.0\nsd_log = 0.7\nlower = 2.0\nupper = 5.0',
@@ -77,6 +93,31 @@ def test_density_quantiles_and_draws_are_scipys(body: str, expected) -> None:
     drawn = priors.sample(np.random.default_rng(5), 4000)[:, 0]
     # At a fixed seed this either holds or not; p would be below 1e-4 by chance in 1 of 1e4 seeds.
     assert stats.kstest(drawn, expected.cdf).pvalue > 1e-4
+
+
+def test_far_in_its_tail_a_normal_is_exponential() -> None:
+    # Beyond c the density of a standard normal falls as exp(-c w - w^2/2).
+    c, u = 1e3, np.array([0.01, 0.5, 0.99])
+    beyond = -np.log1p(-u) / c
+    priors = one(f'dist = "normal"\nmean = 0.0\nsd = 1.0\nlower = {c}')
+    np.testing.assert_allclose(priors.ppf(u[:, None])[:, 0] - c, beyond, rtol=1e-4)
+    t = c + beyond
+    np.testing.assert_allclose(priors.log_prob(t[:, None]), np.log(c) - c * beyond, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        'dist = "normal"\nmean = 0.0\nsd = 1e-9\nlower = 1.0',
+        'dist = "normal"\nmean = 0.0\nsd = 1e-9\nlower = -2.0\nupper = -1.0',
+        'dist = "lognormal"\nmedian = 1.0\nsd_log = 2e-6\nupper = 1e-3',
+        'dist = "half_normal"\nsd = 1e-9\nlower = 1.0',
+    ],
+)
+def test_bounds_beyond_all_probability_are_refused(body: str) -> None:
+    with pytest.raises(CalibError) as caught:
+        one(body)
+    assert "my.toml, parameters.x" in str(caught.value)
 
 
 @BY_CASE

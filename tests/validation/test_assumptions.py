@@ -182,13 +182,16 @@ def test_a_column_that_may_be_left_out_is_asked_after_when_misspelt() -> None:
 def test_residuals_are_not_judged_while_a_column_looks_to_be_in_another_unit() -> None:
     # More than half of the pulls could be kN.
     slip = np.concatenate([np.linspace(1e-4, 5e-3, 18), np.linspace(0.02, 0.5, 12)])
-    pull = 1e3 * np.sin(20.0 * slip)
-    table = table_from_arrays({"slip_ratio": slip, "drawbar_pull_kn": pull}, source="n.csv")
+    pull = 160.0 * np.sin(20.0 * slip)
+    table = table_from_arrays(
+        {"slip_ratio": slip, "drawbar_pull_kn": pull, "normal_load_kn": np.full(30, 5.0)},
+        source="n.csv",
+    )
     problem = build_problem("magic_formula", table)
     t = find_mode(problem.log_prob, problem.priors)
     assert "neighbouring rows are alike" in " | ".join(residual_notes(problem, t))
     unit, withheld = warnings_of(problem, t)
-    assert "about 1000 times too large" in unit
+    assert "the largest drawbar pull is 159.8 kN" in unit
     assert "is not judged while a column looks to be in another unit" in withheld
 
 

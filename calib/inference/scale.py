@@ -1,0 +1,94 @@
+"""Whether data are of a size that priors can say, before any work goes into them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from calib.data.headers import accepted_headers
+from calib.data.numbers import plain_number
+from calib.data.quantities import QUANTITIES
+from calib.errors import CalibError
+from calib.inference.random import generator
+
+if TYPE_CHECKING:
+    from calib.inference.problem import Problem
+
+# Draws of the prior, and the rows that they are looked at in.
+_DRAWS, _ROWS = 2_000, 50
+# Part of the draws on either side that is no evidence against an assumed scale.
+_TAIL = 5e-4
+# An order of magnitude.
+_FAR = 10.0
+
+
+def check_scale(problem: Problem, assumed: Mapping[str, float]) -> None:
+    """Raise a CalibError if the largest output is of a size that the priors exclude.
+
+    Where they rest on an assumed value any size beyond what they admit tells against that. Where
+    they do not, they may be wrong too, which is said after a fit: refused is what is beyond them by
+    an order of magnitude.
+
+    Parameters
+    ----------
+    problem : Problem
+    assumed : mapping of str to float
+        Columns that the priors are relative to and the data lack, with what was assumed.
+    """
+    low, high = _expected(problem)
+    column = problem.table.column(problem.bound.model.output)
+    largest = float(np.abs(problem.observed).max())
+    slack = 1.0 if assumed else _FAR
+    if not np.isfinite([low, high]).all() or low / slack <= largest <= high * slack:
+        return
+    written = [plain_number(float(column.written(x))) for x in (low, high, largest)]
+    unit = f" {column.unit_word}".rstrip()
+    found = (
+        f"the largest {column.quantity.word} is {written[2]}{unit}, and the priors of "
+        f"{problem.bound.model.name} expect {written[0]} to {written[1]}{unit}"
+    )
+    if not assumed:
+        used = [problem.bound.model.output, *problem.bound.model.conditions]
+        raise CalibError(
+            found, where=f"{problem.table.source}, column {column.header!r}",
+            allowed="an output of a size that the priors admit",
+            mend=f"check the units of {', '.join(map(problem.table.header_of, used))}; if they are "
+            "right, pass a prior file of your own that admits it (`calib priors "
+            f"{problem.bound.model.name}` writes one to edit)",
+        )  # fmt: skip
+    taken = ", ".join(_taken(name, value) for name, value in assumed.items())
+    raise CalibError(
+        f"there is no column {', '.join(assumed)}; {taken} was assumed, but {found}",
+        where=problem.table.source,
+        allowed="; ".join(", ".join(accepted_headers(QUANTITIES[name])) for name in assumed),
+        mend=f"add the column {', '.join(assumed)}; if its values are not known, pass a prior file "
+        "whose entries are not relative to it",
+    )
+
+
+def _taken(name: str, value: float) -> str:
+    quantity = QUANTITIES[name]
+    return f"{quantity.word} {value:g} {quantity.unit.replace('**', '')}".removesuffix(
+        " dimensionless"
+    )
+
+
+def _expected(problem: Problem) -> tuple[float, float]:
+    """Return between which values the priors expect the largest size of the output."""
+    table = problem.table
+    # The row of the largest output among them, which is what is compared.
+    rows = np.linspace(0, len(table) - 1, min(len(table), _ROWS)).astype(np.int64)
+    rows[0] = int(np.argmax(np.abs(problem.observed)))
+    some = problem.with_table(table.take(np.unique(rows)))
+    rng = generator(0, "scale of the priors")
+    natural = some.theta(some.priors.sample(rng, _DRAWS))
+    drawn = some.draw_location(natural, some.conditions, rng) + some.draw_noise(natural, rng)
+    with np.errstate(all="ignore"):
+        sizes = np.abs(some.bound.from_response(drawn)).max(axis=1)
+    sizes = sizes[np.isfinite(sizes)]
+    if sizes.size < _DRAWS / 2:
+        return np.nan, np.nan
+    low, high = np.quantile(sizes, [_TAIL, 1.0 - _TAIL])
+    return float(low), float(high)
