@@ -7,6 +7,7 @@ are single cells looked at, to say what is wrong with them.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -23,12 +24,18 @@ MAX_SHOWN = 5
 _MISSING = frozenset({"", "nan", "na", "n/a", "null", "none"})
 # Squares and cubes of larger numbers leave the range of double precision.
 _LARGEST = 1e100
+_THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
 _MINUS = "\N{MINUS SIGN}"
 # What instruments and databases write where there is no value; of the positive ones from 9999 on.
 _NINES = [10.0**d - 1.0 + more for d in range(2, 7) for more in (0.0, 0.9, 0.99)]
 _CODES = np.array([
     *(-x for x in _NINES), *(x for x in _NINES if x >= 9999.0), -999.25, -32768.0,
 ])  # fmt: skip
+# The driven wheel's slip of SAE J670 has no upper bound.
+_OTHER_SLIP = (
+    "slip is s = 1 - v/(ωr) here, at most 1: if it was recorded as κ = ωr/v - 1, convert every "
+    "row, s = κ/(1 + κ)"
+)
 
 
 @dataclass(frozen=True, order=True)
@@ -90,20 +97,30 @@ class Problems:
 class Decimals:
     """The first decimal comma and the first decimal point of a file, as (line, column, cell).
 
-    A file that has both could mean 1,234 either way, so it is refused.
+    A file that has both could mean 1,234 either way, so it is refused; so is one whose commas are
+    all such that they may separate thousands.
     """
 
     comma: tuple[int, str, str] | None = None
     point: tuple[int, str, str] | None = None
+    certain: bool = False
 
     def complain(self, problems: Problems) -> None:
-        """Note a problem if the file has both."""
+        """Note a problem if the file has both, or commas that can be either."""
         if self.comma and self.point:
             line, column, cell = self.comma
             other = f"{self.point[2]!r} in line {self.point[0]}, column {self.point[1]!r}"
             problems.add(
                 line, column, f"{cell!r} has a decimal comma, but {other} has a decimal point",
                 "one decimal sign in the whole file",
+                "write every number with a decimal point, without thousands separators",
+            )  # fmt: skip
+        elif self.comma and not self.certain:
+            line, column, cell = self.comma
+            problems.add(
+                line, column, f"{cell!r} may be {cell.replace(',', '')} or "
+                f"{cell.replace(',', '.')}, and no comma of the file tells which",
+                "numbers of one reading",
                 "write every number with a decimal point, without thousands separators",
             )  # fmt: skip
 
@@ -176,6 +193,7 @@ class CellReader:
                     "1234 or 0.5 (decimal commas are read where semicolons separate the cells)",
                 )
             self.decimals.comma = self.decimals.comma or (line, self.column.header, cell)
+            self.decimals.certain |= _THOUSANDS.fullmatch(text) is None
             text = text.replace(",", ".")
         try:
             if "_" in text:
@@ -218,7 +236,7 @@ def check_values(
     bad = np.flatnonzero(~fine)
     for i in bad[:MAX_SHOWN].tolist():
         cell = cells[i] if len(cells) else f"{values[i]:g}"
-        found, mend = _complaint(column, float(values[i]), cell)
+        found, mend = _complaint(column, float(values[i]), cell, values)
         problems.add(int(lines[i]), column.header, found, column.allowed, mend)
     problems.total += max(0, bad.size - MAX_SHOWN)
     return canonical
@@ -262,8 +280,8 @@ def _mend_code(column: Column, missing_ok: bool) -> str:
     return f"{cell}; if it is a reading, say so in the column name: '{column.header} {CHECKED}'"
 
 
-def _complaint(column: Column, value: float, cell: str) -> tuple[str, str]:
-    """Say what is wrong with a value and how to mend it."""
+def _complaint(column: Column, value: float, cell: str, values: Array) -> tuple[str, str]:
+    """Say what is wrong with a value, one of a column's, and how to mend it."""
     if not math.isfinite(value):
         what = f"{cell.strip()!r} is not a finite number" if cell.strip() else "an empty cell"
         return (
@@ -277,10 +295,17 @@ def _complaint(column: Column, value: float, cell: str) -> tuple[str, str]:
     if abs(value) > _LARGEST:
         return f"{cell.strip()!r} is too large for a reading", quantity.mend
     what = f"{cell.strip()!r} is outside the range of {quantity.stem}"
-    in_percent = "percent" in quantity.units and column.unit == "dimensionless"
-    if in_percent and 1.0 < abs(value) <= 100.0:
-        return what, f"did you mean {quantity.stem}_percent? Then rename the column"
-    return what, quantity.mend
+    mend = quantity.mend
+    if quantity.kind == "slip" and value > 0.0:
+        mend = _OTHER_SLIP
+    if "percent" in quantity.units and column.unit == "dimensionless" and abs(value) <= 100.0:
+        # Renamed for the sake of a few, the others would be a hundredth of what they are.
+        name = f"{quantity.stem}_percent"
+        if float(np.nanmedian(np.abs(values))) > 1.0:
+            mend = f"did you mean {name}? Then rename the column; otherwise: {mend}"
+        else:
+            mend += f"; or if all values are percent, rename the column {name}"
+    return what, mend
 
 
 def label_codes(

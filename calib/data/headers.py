@@ -27,6 +27,9 @@ _QUALIFIERS = frozenset({
     "level", "class", "method", "sensor", "channel", "time", "date",
 })  # fmt: skip
 
+# What tells repeats of a reading apart that stand side by side.
+_REPEAT = re.compile(r"(rep|repeat|replicate|run|test|trial|no)?\d*")
+
 # What a user puts behind a header whose values are to be believed as they are.
 CHECKED = "(checked)"
 
@@ -79,8 +82,9 @@ def accepted_headers(quantity: Quantity) -> tuple[str, ...]:
 
 
 def _normal(header: str) -> str:
-    """Bring a header to lower case words joined by underscores."""
-    text = header.lower().replace("%", " percent ").replace("³", "3").replace("²", "2")
+    """Bring a header to lower case words joined by underscores, without `CHECKED`."""
+    text = header.lower().rstrip().removesuffix(CHECKED)
+    text = text.replace("%", " percent ").replace("³", "3").replace("²", "2")
     return re.sub(r"[\s_\-/()\[\]{},.:·]+", "_", re.sub(r"\^|\*\*", "", text)).strip("_")
 
 
@@ -106,20 +110,37 @@ def parse_header(header: str, *, where: str = "", position: int = 0) -> Column |
     CalibError
         If a quantity is named without its unit, or with an unknown or an unfitting one.
     """
-    name = _normal(re.sub(rf"{re.escape(CHECKED)}\s*$", "", header, flags=re.IGNORECASE))
+    name = _normal(header)
+    named = _named(name)
+    if named is None:
+        return None
+    quantity, suffix = named
+    unit = quantity.units.get(suffix) if suffix else quantity.bare_unit
+    if unit is not None:
+        return Column(header, quantity, unit, position)
+    if suffix and _is_about(suffix, quantity) and not _is_repeat(suffix, quantity):
+        return None
+    raise _unit_error(header, quantity, suffix, where)
+
+
+def names_quantity(header: str) -> bool:
+    """Whether a column name begins with a quantity, whatever its unit."""
+    return _named(_normal(header)) is not None
+
+
+def _named(name: str) -> tuple[Quantity, str] | None:
+    """Return the quantity that a normal name begins with, and what follows."""
     for stem, quantity in _stems():
-        if name == stem:
-            if quantity.bare_unit is None:
-                raise _unit_error(header, quantity, "", where)
-            return Column(header, quantity, quantity.bare_unit, position)
-        if name.startswith(f"{stem}_") and quantity.units:
-            suffix = name[len(stem) + 1 :]
-            if suffix in quantity.units:
-                return Column(header, quantity, quantity.units[suffix], position)
-            if _is_about(suffix, quantity):
-                return None
-            raise _unit_error(header, quantity, suffix, where)
+        if name == stem or (name.startswith(f"{stem}_") and quantity.units):
+            return quantity, name[len(stem) + 1 :]
     return None
+
+
+def _is_repeat(suffix: str, quantity: Quantity) -> bool:
+    """Whether a suffix is a unit and the number of a repeat (``1_n``, ``n_run_2``)."""
+    words = suffix.split("_")
+    rest = "_".join(word for word in words if not _REPEAT.fullmatch(word))
+    return rest != suffix and (rest in quantity.units or not rest)
 
 
 def _is_about(suffix: str, quantity: Quantity) -> bool:
@@ -141,13 +162,16 @@ def _unit_error(header: str, quantity: Quantity, suffix: str, where: str) -> Cal
     else:
         found = f"{suffix!r} is not a known unit of {quantity.stem}"
     near = difflib.get_close_matches(suffix, quantity.units, n=1, cutoff=0.5)
-    name = f"{quantity.stem}_{near[0]}" if near else quantity.canonical
-    hint = "did you mean" if near else "rename the column, for example"
+    if near:
+        mend = f"did you mean {quantity.stem}_{near[0]}?"
+    else:
+        mend = f"rename the column, for example {quantity.canonical}, with the unit of its readings"
+    mend += "; what is in no such unit must be converted first" * bool(suffix)
     return CalibError(
         found,
         where=_at(where, header),
         allowed=", ".join(accepted_headers(quantity)),
-        mend=f"{hint} {name}{'?' if near else ''}",
+        mend=mend,
     )
 
 
@@ -165,6 +189,7 @@ def match_headers(
         one that is missing.
     """
     found: dict[str, Column] = {}
+    given: dict[str, list[tuple[int, str]]] = {}
     ignored: list[str] = []
     errors: dict[str, CalibError] = {}
     for position, header in enumerate(headers):
@@ -172,24 +197,39 @@ def match_headers(
             column = parse_header(header, position=position)
         except CalibError as error:
             errors[header] = error
+            quantity, suffix = _named(_normal(header)) or (None, "")
+            if quantity and _is_repeat(suffix, quantity):
+                given.setdefault(quantity.canonical, []).append((position, header))
             continue
         if column is None:
             ignored.append(header)
             continue
-        first = found.setdefault(column.quantity.canonical, column)
-        if first is not column:
-            raise CalibError(
-                f"columns {first.position + 1} ({first.header!r}) and {position + 1} "
-                f"({header!r}) both give {column.quantity.stem}",
-                where=_at(where, header),
-                allowed="one column per quantity",
-                mend="delete or rename one of the two",
-            )
+        given.setdefault(column.quantity.canonical, []).append((position, header))
+        found.setdefault(column.quantity.canonical, column)
+    if any(len(columns) > 1 for columns in given.values()):
+        raise _side_by_side(given, where)
     if errors:
         raise _together(errors, where)
     if missing := [name for name in required if name not in found]:
         raise missing_columns(missing, headers, ignored, where)
     return tuple(found.values()), tuple(ignored)
+
+
+def _side_by_side(given: Mapping[str, list[tuple[int, str]]], where: str) -> CalibError:
+    """Return the error of quantities that several columns give, (position, header) each."""
+    said, header = [], ""
+    for name, columns in given.items():
+        if len(columns) > 1:
+            *most, last = [f"{position + 1} ({column!r})" for position, column in columns]
+            header = columns[-1][1]
+            both = "both" if len(columns) == 2 else "all"
+            said.append(f"columns {', '.join(most)} and {last} {both} give {QUANTITIES[name].stem}")
+    return CalibError(
+        "; ".join(said), where=_at(where, header), allowed="one column per quantity",
+        mend="of one reading in several units, delete or rename one; of repeats side by side, "
+        "write each reading in a row of its own, below one another, with the conditions of its "
+        "row copied and the number of the repeat in a column 'repeat'",
+    )  # fmt: skip
 
 
 def _together(errors: Mapping[str, CalibError], where: str) -> CalibError:
@@ -214,13 +254,19 @@ def missing_columns(
     """
     wanted = [QUANTITIES[name] for name in dict.fromkeys(names)]
     added = ", ".join(f"{q.canonical} ({q.description})" for q in wanted)
+    derived = "".join(
+        f"; {header!r} is read as derived from the {of[0].word}, unless it is renamed to the "
+        "quantity and its unit alone"
+        for header in ignored
+        if (of := _named(_normal(header))) and of[0] in wanted
+    )
     return CalibError(
         f"there is no column for {', '.join(q.stem for q in wanted)}; "
         f"found {', '.join(map(repr, headers))}",
         where=_at(where, names[0]) if len(wanted) == 1 else where,
         allowed="; ".join(", ".join(accepted_headers(q)) for q in wanted),
         mend=f"{renamed(ignored, names)}add the {'column' if len(wanted) == 1 else 'columns'} "
-        f"{added}",
+        f"{added}{derived}",
     )
 
 
@@ -256,6 +302,10 @@ def columns_meant(
 
 def _guess(header: str, known: Mapping[str, Quantity], cutoff: float, shortened: bool) -> str:
     name = _normal(header)
+    named = _named(name)
+    if named is not None and _is_about(named[1], named[0]):
+        # Renamed, an uncertainty or a limit would be taken for the reading.
+        return ""
     near = difflib.get_close_matches(name, known, n=1, cutoff=cutoff)
     if shortened and not near:
         # A unit alone ("kn") is the end of a name too, but no word of it.

@@ -5,8 +5,9 @@ from __future__ import annotations
 import hashlib
 import logging
 import os
+import re
 from collections.abc import Collection, Mapping, Sequence
-from itertools import batched
+from itertools import batched, islice
 from typing import Any
 
 import numpy as np
@@ -21,12 +22,15 @@ from calib.data.cells import (
     label_codes,
 )
 from calib.data.csvfile import CsvFile, open_csv
-from calib.data.headers import Column, match_headers
+from calib.data.headers import Column, match_headers, names_quantity
 from calib.data.quantities import OUTPUTS, QUANTITIES
 from calib.data.table import MAX_TEXT_ROWS, Table
 from calib.errors import CalibError
 
 _BATCH = 65_536
+_WITH_COMMA = re.compile(r"\s*[-+]?\d*,\d+(e[-+]?\d+)?\s*", re.IGNORECASE)
+# An instrument's lines before the column names are fewer.
+_PREAMBLE = 100
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +67,11 @@ def read_table(
     """
     file = open_csv(path)
     where = f"{file.source}, line {file.header_line}"
-    columns, ignored = match_headers(file.header, where=where, required=required)
+    try:
+        columns, ignored = match_headers(file.header, where=where, required=required)
+    except CalibError:
+        _check_first_line(open_csv(path), where)
+        raise
     problems = Problems(file.source)
     parts = _Parts(columns, file, problems, _wants(required), allow_missing)
     for batch in batched(file.rows, _BATCH):
@@ -80,6 +88,21 @@ def read_table(
         values, file.source, np.array(parts.lines), file.header, tuple(parts.text), file.sha256,
         label, ignored,
     )  # fmt: skip
+
+
+def _check_first_line(file: CsvFile, where: str) -> None:
+    """Refuse a file whose column names stand below other lines."""
+    first = sum(map(names_quantity, file.header))
+    for line, row in islice(file.rows, _PREAMBLE):
+        # What separates the cells was told by the first line.
+        cells = re.split("[,;\t]", ",".join(row))
+        if sum(map(names_quantity, cells)) > first:
+            raise CalibError(
+                f"the first line, {', '.join(file.header)!r}, names fewer quantities than line "
+                f"{line}",
+                where=where, allowed="the line of column names first, then one line per row",
+                mend=f"delete what stands above line {line}",
+            )  # fmt: skip
 
 
 def _wants(required: Sequence[str]) -> frozenset[str]:
@@ -143,6 +166,8 @@ class _Parts:
     def finish(self) -> dict[str, NDArray[np.float64]]:
         if self._decimals:
             self._decimals.complain(self._problems)
+            if self._decimals.comma:
+                self._write_points()
         done = {n: np.concatenate(p) if p else np.empty(0) for n, p in self._numbers.items()}
         for name, values in done.items():
             if name in self._used:
@@ -156,6 +181,17 @@ class _Parts:
                 missing_ok=name in self._missing,
             )  # fmt: skip
         return {name: done[name] for name in self._columns}
+
+    def _write_points(self) -> None:
+        """Give numbers, of columns that are not used too, the decimal sign of what is written."""
+        labels = {self._columns[name].position for name in self._labels}
+        self.text = [
+            tuple(
+                cell.replace(",", ".") if i not in labels and _WITH_COMMA.fullmatch(cell) else cell
+                for i, cell in enumerate(row)
+            )
+            for row in self.text
+        ]
 
 
 def read_for_model(path: str | os.PathLike[str], used: Sequence[str]) -> Table:

@@ -32,7 +32,8 @@ class Table:
     header : tuple of str
         Column names as in the file.
     text : tuple of tuple of str
-        Cells as in the file, row by row; empty for more than 10,000 rows, to save memory.
+        Cells as in the file, numbers with a decimal point, row by row; empty for more than 10,000
+        rows, to save memory.
     sha256 : str
         Of the bytes of the file, or of the canonical columns. A subset keeps that of the whole.
     label : str

@@ -261,7 +261,7 @@ def test_several_bad_cells_come_in_one_message(my_csv: Write) -> None:
     assert lines[4].startswith("  line 5: the row has 1 cells")
     assert lines[5].strip() == "to mend:"
     assert lines[6].startswith("    - write one plain number")
-    assert lines[7].startswith("    - did you mean slip_percent?")
+    assert lines[7].startswith("    - slip is s = 1 - v/(ωr) here")
 
 
 @pytest.mark.parametrize("cell", ["x", "-1"])
@@ -546,3 +546,84 @@ def test_columns_are_written_in_the_units_of_their_file(my_csv: Write, tmp_path:
     assert (tmp_path / "again.csv").read_text() == (
         "Slip (%),Drawbar pull [lbf],rut_depth_mm\n0.7,2851.464474674471,12.5\n5.3,12.0,\n"
     )
+
+
+# Advice that does not mislead
+
+
+@pytest.mark.parametrize("unit", ["ratio", "percent"])
+def test_slip_above_one_names_both_definitions(my_csv: Write, unit: str) -> None:
+    factor = 1.0 if unit == "ratio" else 100.0
+    rows = "".join(f"{factor * s},1\n" for s in (0.0, 0.2, 0.5, 0.99, 3.0, 8.9))
+    message = refusal(my_csv(f"slip_{unit},drawbar_pull_kn\n{rows}"))
+    assert "s = 1 - v/(ωr)" in message
+    assert "κ = ωr/v - 1" in message
+    assert "s = κ/(1 + κ)" in message
+    assert "did you mean" not in message
+    assert "delete" not in message
+
+
+def test_slip_that_is_percent_on_the_whole_is_told_so(my_csv: Write) -> None:
+    message = refusal(my_csv("slip_ratio,drawbar_pull_kn\n0.5,1\n5,2\n20,3\n60,4\n"))
+    assert "did you mean slip_percent?" in message
+    assert "s = κ/(1 + κ)" in message
+
+
+def test_one_value_above_the_range_does_not_make_percent_of_the_others(my_csv: Write) -> None:
+    cells = "0.1\n0.12\n0.15\n12.0\n"
+    message = refusal(my_csv(f"gravimetric_water_content\n{cells}"))
+    assert "if all values are percent" in message
+    assert "did you mean" not in message
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Slip [%],Drawbar pull 1 [N],Drawbar pull 2 [N],Drawbar pull 3 [N]",
+        "slip_percent,drawbar_pull_n,drawbar_pull_n.1,drawbar_pull_n.2",
+        "slip_percent,drawbar_pull_n_run1,drawbar_pull_n_run2,drawbar_pull_n (checked)",
+        "Slip [%],Drawbar pull rep 1 [N],Drawbar pull rep 2 [N],Drawbar pull rep 3 [N] (checked)",
+        "slip_percent,drawbar_pull_n,drawbar_pull_n,drawbar_pull_kn",
+    ],
+)
+def test_repeats_side_by_side_belong_below_one_another(my_csv: Write, header: str) -> None:
+    message = refusal(my_csv(f"{header}\n1,2,3,4\n"))
+    assert "all give drawbar_pull" in message
+    assert "a row of its own" in message
+    assert "a column 'repeat'" in message
+
+
+@pytest.mark.parametrize(
+    "header", ["drawbar_pull_sd_kn", "drawbar_pull_kn_lower", "Drawbar pull max [kN]"]
+)
+def test_a_derived_column_is_not_taken_for_the_reading(my_csv: Write, header: str) -> None:
+    message = refusal(my_csv(f"{header}\n1\n"), required=["drawbar_pull_kn"])
+    assert "did you mean" not in message
+    assert f"{header!r} is read as derived from the drawbar pull" in message
+
+
+def test_another_unit_is_to_be_converted(my_csv: Write) -> None:
+    message = refusal(my_csv("cone_index_n_m2\n1\n"))
+    assert "what is in no such unit must be converted first" in message
+
+
+def test_lines_above_the_column_names_are_told_and_may_be_deleted(my_csv: Write) -> None:
+    table = "Slip [%];Drawbar pull [N]\n10;5\n20;7\n"
+    path = my_csv(f"Testbed: NPTM\nLoad cell: 5 kN\n\n{table}")
+    message = refusal(path, required=["slip_ratio"])
+    assert "delete what stands above line 4" in message
+    np.testing.assert_allclose(read_table(my_csv(table))["slip_ratio"], [0.1, 0.2])
+
+
+@pytest.mark.parametrize("cells", ["1,234;0,1", "12,5;0,1", "0,250;0,100"])
+def test_commas_that_are_decimal_signs_are_read(my_csv: Write, cells: str) -> None:
+    table = read_table(my_csv(f"normal_load_kn;slip_ratio\n{cells}\n"))
+    expected = [float(c.replace(",", ".")) for c in cells.split(";")]
+    assert table["normal_load_kn"][0] == expected[0]
+    # What is written beside predictions has the sign of these.
+    assert table.text[0][0] == cells.split(";")[0].replace(",", ".")
+
+
+def test_commas_that_may_separate_thousands_are_refused(my_csv: Write) -> None:
+    message = refusal(my_csv("normal_load_n;slip_percent\n1,234;10\n2,500;20\n"))
+    assert "'1,234' may be 1234 or 1.234" in message

@@ -45,7 +45,7 @@ def test_an_assumed_load_that_may_be_right_is_noted() -> None:
 def test_any_column_that_priors_are_relative_to_may_be_the_missing_one() -> None:
     text = default_priors("bekker").read_text()
     text = text.replace(
-        'median = 25.0', 'median = 0.1\nrelative_to = "tyre_width_m"\ndefault_reference = 250.0'
+        "median = 25.0", 'median = 0.1\nrelative_to = "tyre_width_m"\ndefault_reference = 250.0'
     )
     assert "tyre_width_m" in text
     own = DeclaredPriors("own.toml", text)
