@@ -72,6 +72,8 @@ def read_table(
     except CalibError:
         _check_first_line(open_csv(path), where)
         raise
+    if not columns:
+        _check_first_line(open_csv(path), where)
     problems = Problems(file.source)
     parts = _Parts(columns, file, problems, _wants(required), allow_missing)
     for batch in batched(file.rows, _BATCH):
@@ -92,17 +94,19 @@ def read_table(
 
 def _check_first_line(file: CsvFile, where: str) -> None:
     """Refuse a file whose column names stand below other lines."""
-    first = sum(map(names_quantity, file.header))
-    for line, row in islice(file.rows, _PREAMBLE):
-        # What separates the cells was told by the first line.
-        cells = re.split("[,;\t]", ",".join(row))
-        if sum(map(names_quantity, cells)) > first:
-            raise CalibError(
-                f"the first line, {', '.join(file.header)!r}, names fewer quantities than line "
-                f"{line}",
-                where=where, allowed="the line of column names first, then one line per row",
-                mend=f"delete what stands above line {line}",
-            )  # fmt: skip
+    first = ",".join(file.header)
+    # What separates the cells was told by the first line.
+    named = {
+        line: sum(map(names_quantity, re.split("[,;\t]", ",".join(row))))
+        for line, row in islice(file.rows, _PREAMBLE)
+    }
+    line = max(named, key=named.__getitem__, default=0)
+    if line and named[line] > sum(map(names_quantity, file.header)):
+        raise CalibError(
+            f"the first line, {first!r}, names fewer quantities than line {line}", where=where,
+            allowed="the line of column names first, then one line per row",
+            mend=f"delete what stands above line {line}",
+        )  # fmt: skip
 
 
 def _wants(required: Sequence[str]) -> frozenset[str]:
