@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +33,7 @@ from calib.gap.screening import (
     without_outputs,
 )
 from calib.gap.shrink import NewPrediction, Shrink, predict_new, shrink
-from calib.gap.where import Region, RowGap, regions, row_gaps
+from calib.gap.where import Region, RowGap, regions, row_gaps, unused_rows
 from calib.gap.which import Lab, Ranking, calibrate_lab, rank
 from calib.inference.random import generator
 from calib.models.base import Array
@@ -81,6 +81,8 @@ class Diagnosis:
         ``unknown`` (something unlisted) among them. None without a context.
     warnings : tuple of str
         What a reader must know: of the input, what was set aside, what is extrapolated.
+    unused : mapping of str to (mapping of int to str)
+        Field rows that an output was not judged by, by output and row, with the reason.
     """
 
     data: Campaigns
@@ -97,6 +99,7 @@ class Diagnosis:
     inclusion: Inclusion
     without_context: Mapping[str, float] | None = None
     warnings: tuple[str, ...] = ()
+    unused: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
 
     def __repr__(self) -> str:
         """Name the case, the verdict and the most probable hypotheses."""
@@ -184,6 +187,7 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
             *new_values(case.covariates, case.lab, case.field),
             *said,
         ),
+        unused_rows(data, case.field),
     )
 
 

@@ -16,7 +16,7 @@ from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
 from calib.gap.inclusion import Included
-from calib.gap.where import Region
+from calib.gap.where import Region, row_gaps
 from calib.models.base import Array
 
 __all__ = ["SCHEMA", "answer", "document", "write_diagnosis"]
@@ -46,17 +46,7 @@ def document(found: Diagnosis) -> dict[str, Any]:
             ],
         },
         "not_testable": [{"name": n, "reason": r} for n, r in ranking.not_testable.items()],
-        "where": [
-            {
-                "output": g.output,
-                "row": int(row),
-                "gap": float(gap),
-                "gap_sd": float(sd),
-                "probability": float(p),
-            }
-            for g in found.gaps
-            for row, gap, sd, p in zip(g.rows, g.gap, g.sd, g.probability, strict=True)
-        ],
+        "where": _rows(found),
         "regions": [
             {
                 "output": r.output,
@@ -88,6 +78,26 @@ def document(found: Diagnosis) -> dict[str, Any]:
             for m in found.next_measurements
         ],
     }
+
+
+def _rows(found: Diagnosis) -> list[dict[str, Any]]:
+    """Return an entry for every field row and output; rows that were not judged by say why."""
+    unused = {name: np.array([*rows], np.int64) for name, rows in found.unused.items()}
+    others = row_gaps(found.data, found.truth, unused) if unused else ()
+    said = {
+        (g.output, int(row)): {"gap": float(gap), "gap_sd": float(sd), "probability": float(p)}
+        for g in (*found.gaps, *others)
+        for row, gap, sd, p in zip(g.rows, g.gap, g.sd, g.probability, strict=True)
+    }
+    place = {name: i for i, name in enumerate(found.data.names)}
+    rows = []
+    for output, row in sorted(said, key=lambda at: (place[at[0]], at[1])):
+        why = found.unused.get(output, {}).get(row)
+        rows.append(
+            {"output": output, "row": row, **said[output, row]}
+            | ({} if why is None else {"used": False, "reason": why})
+        )
+    return rows
 
 
 def answer(told: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,13 +9,14 @@ from itertools import groupby
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.data.quantities import columns_of
+from calib.data import Table
+from calib.data.quantities import OUTPUTS, columns_of
 from calib.gap.campaigns import Campaigns
 from calib.gap.covariates import other_conditions
 from calib.gap.mixture import Truth
 from calib.models.base import Array
 
-__all__ = ["Region", "RowGap", "conditions_to_search", "regions", "row_gaps"]
+__all__ = ["Region", "RowGap", "conditions_to_search", "regions", "row_gaps", "unused_rows"]
 
 # Physical roles of the conditions, in the order in which a reader looks for a cause; others follow.
 _ROLES = (
@@ -25,6 +26,10 @@ _ROLES = (
 # The fewest rows of a region: this part of an output's rows, and two.
 _FEWEST_PART, _FEWEST = 1 / 12, 2
 _MOST = 3
+# Why a row was not judged by.
+_NO_READING = "there is no reading"
+_SET_ASIDE = "the reading was set aside as an outlier or as no reading at all"
+_MOVED = "the conditions were set aside as a mistake; the gap is where they typically are"
 
 
 @dataclass(frozen=True)
@@ -83,17 +88,45 @@ def conditions_to_search(data: Campaigns) -> list[str]:
     return [*known, *data.case.covariates]
 
 
-def row_gaps(data: Campaigns, truth: Truth) -> tuple[RowGap, ...]:
-    """Gap at every field row that has the output."""
+def row_gaps(
+    data: Campaigns, truth: Truth, of: Mapping[str, NDArray[np.int64]] | None = None
+) -> tuple[RowGap, ...]:
+    """Gap at every field row that has the output, or at other rows of each output."""
     found = []
     for o in data.outputs:
-        gap = (truth.truth[o.name] - truth.simulator[o.name])[:, o.rows]
-        noise = truth.noise[o.name][:, o.rows]
+        rows = o.rows if of is None else of[o.name]
+        gap = (truth.truth[o.name] - truth.simulator[o.name])[:, rows]
+        noise = truth.noise[o.name][:, rows]
         mean = truth.mean(gap)
         sd = np.sqrt(np.maximum(truth.mean(np.square(gap)) - mean**2, 0.0))
         probability = truth.mean((np.abs(gap) > noise).astype(np.float64))
-        found.append(RowGap(o.name, o.rows, mean, sd, np.clip(probability, 0.0, 1.0)))
+        found.append(RowGap(o.name, rows, mean, sd, np.clip(probability, 0.0, 1.0)))
     return tuple(found)
+
+
+def unused_rows(data: Campaigns, field: Table) -> dict[str, dict[int, str]]:
+    """Return the field rows that an output was not judged by, with the reason.
+
+    Parameters
+    ----------
+    data : Campaigns
+        Without what was set aside.
+    field : Table
+        The campaign as it was read.
+    """
+    kept = data.case.field
+    moved = np.any(
+        [kept[n] != values for n, values in field.columns.items() if n not in OUTPUTS.values()],
+        axis=0,
+    )
+    found: dict[str, dict[int, str]] = {}
+    for o in data.outputs:
+        read = np.isfinite(field[OUTPUTS[o.name]])
+        found[o.name] = {
+            int(row): _NO_READING if not read[row] else _MOVED if moved[row] else _SET_ASIDE
+            for row in np.setdiff1d(np.arange(len(field)), o.rows)
+        }
+    return found
 
 
 def regions(data: Campaigns, truth: Truth, gaps: tuple[RowGap, ...]) -> tuple[Region, ...]:

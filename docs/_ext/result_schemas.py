@@ -78,6 +78,8 @@ class _Row(_Exactly):
     gap: float
     gap_sd: float
     probability: Probability
+    used: Literal[False] | None = None
+    reason: str | None = None
 
 
 class _Region(_Somewhere):

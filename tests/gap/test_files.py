@@ -20,7 +20,14 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.next_measurement import NextMeasurement
 from calib.gap.where import Region
 from calib.inference.priors import Prior, Priors
-from tests.gap.cases import CHOICE, diagnosis_of, make_case, pull_diagnosis, write_case
+from tests.gap.cases import (
+    CHOICE,
+    PULL_ONLY,
+    diagnosis_of,
+    make_case,
+    pull_diagnosis,
+    write_case,
+)
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +98,27 @@ def test_one_entry_for_each_row_and_output(written):
     assert len(where) == 2 * 27
     for output in ("drawbar_pull", "rut_depth"):
         assert [w["row"] for w in where if w["output"] == output] == list(range(27))
+
+
+def test_rows_that_were_not_judged_by_have_an_entry_that_says_why():
+    case = make_case("force_offset", models=PULL_ONLY)
+    slip, pull = (np.array(case.field[n]) for n in ("slip_ratio", "drawbar_pull_kn"))
+    slip[2], pull[4], pull[7] = -1.0, np.nan, 900.0
+    spoilt = {**case.field.columns, "slip_ratio": slip, "drawbar_pull_kn": pull}
+    few = {"force_offset": EFFECTS["force_offset"]}
+    found = diagnose(replace(case, field=replace(case.field, columns=spoilt)), effects=few)
+    where = document(found)["where"]
+    assert [w["row"] for w in where] == list(range(27))
+    unused = {w["row"]: w["reason"] for w in where if "used" in w}
+    assert not any(w["used"] for w in where if w["row"] in unused)
+    assert list(unused) == [2, 4, 7]
+    assert "conditions" in unused[2]
+    assert unused[4] == "there is no reading"
+    assert "reading was set aside" in unused[7]
+    # An offset is the same at every row, read or not.
+    gaps = np.array([w["gap"] for w in where])
+    np.testing.assert_allclose(gaps, gaps[0], atol=2.0 * where[0]["gap_sd"])
+    assert all(w["gap_sd"] > 0.0 and w["probability"] > 0.9 for w in where)
 
 
 def test_parameters_of_a_pair_carry_their_effects_name(written):
