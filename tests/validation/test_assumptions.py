@@ -184,7 +184,7 @@ def test_residuals_are_not_judged_while_a_column_looks_to_be_in_another_unit() -
     slip = np.concatenate([np.linspace(1e-4, 5e-3, 18), np.linspace(0.02, 0.5, 12)])
     pull = 160.0 * np.sin(20.0 * slip)
     table = table_from_arrays(
-        {"slip_ratio": slip, "drawbar_pull_kn": pull, "normal_load_kn": np.full(30, 5.0)},
+        {"slip_ratio": slip, "drawbar_pull_kn": pull, "normal_load_kn": np.full(30, 20.0)},
         source="n.csv",
     )
     problem = build_problem("magic_formula", table)
