@@ -63,7 +63,8 @@ class Prior:
 def _in_tail(a: Array, b: Array, u: Array) -> Array:
     """Quantiles (k, d) of standard normals between bounds (d,) far below zero."""
     with np.errstate(divide="ignore"):
-        return ndtri_exp(np.logaddexp(np.log1p(-u) + log_ndtr(a), np.log(u) + log_ndtr(b)))
+        log_mass = np.logaddexp(np.log1p(-u) + log_ndtr(a), np.log(u) + log_ndtr(b))
+    return np.asarray(ndtri_exp(log_mass), dtype=np.float64)
 
 
 @dataclass(frozen=True)

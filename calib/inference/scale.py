@@ -49,8 +49,8 @@ def check_scale(problem: Problem, assumed: Mapping[str, float]) -> None:
     written = [plain_number(float(column.written(x))) for x in (low, high, size)]
     unit = f" {column.unit_word}".rstrip()
     found = (
-        f"nine tenths of {column.quantity.word} are at most {written[2]}{unit} in size, and the "
-        f"priors of {problem.bound.model.name} expect {written[0]} to {written[1]}{unit}"
+        f"nine tenths of the {column.quantity.word}s are at most {written[2]}{unit} in size, and "
+        f"the priors of {problem.bound.model.name} expect {written[0]} to {written[1]}{unit}"
     )
     if not assumed:
         used = [problem.bound.model.output, *problem.bound.model.conditions]
