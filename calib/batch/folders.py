@@ -54,10 +54,11 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         If `out` exists and may not be replaced, or cannot be written; or if another process wrote
         it while the block ran: then its name ends in a number.
     """
-    out = _replaceable(Path(out), overwrite=overwrite)
-    key = out.absolute()
-    was_claimed = key in _claimed
-    scratch, held = _claimed.pop(key) if was_claimed else _scratch(out)
+    out = _real(Path(out))
+    claim = _claimed.pop(out.absolute(), None)
+    if claim is None:
+        out = _replaceable(out, overwrite=overwrite)
+    scratch, held = claim or _scratch(out)
     whole = scratch / _WHOLE
     try:
         (scratch / _RESERVED).unlink(missing_ok=True)
@@ -71,7 +72,7 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         else:
             _put(whole, out)
         unfinished.saved.append(out)
-        if was_claimed:
+        if claim is not None:
             unfinished.drop()
     except OSError as error:
         # NumPy says of a full disk itself what the system would, without its number.

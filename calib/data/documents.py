@@ -6,7 +6,7 @@ import codecs
 import json
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from calib.errors import FAULTS
 
@@ -35,7 +35,11 @@ def decoded(raw: bytes, errors: str = "strict") -> str:
     return raw.decode(next(marked, "utf-8-sig"), errors)
 
 
-def read_text(path: Path) -> str:
+class _Readable(Protocol):
+    def read_bytes(self) -> bytes: ...
+
+
+def read_text(path: _Readable) -> str:
     """Return the text of a file as `decoded` does, with the line ends of Unix."""
     return decoded(path.read_bytes()).replace("\r\n", "\n")
 

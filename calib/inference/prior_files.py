@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from calib.batch.plugins import declared_in
-from calib.data.documents import MEND_TOML, decoded
+from calib.data.documents import MEND_TOML, read_text
 from calib.errors import CalibError, meant
 from calib.inference.noise import USUAL, NoiseChoice
 from calib.inference.prior_entries import (
@@ -131,7 +131,7 @@ def read_priors(
 
 def _text(path: PriorFile) -> str:
     try:
-        return decoded(path.read_bytes())
+        return read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise CalibError(
             f"the prior file cannot be read ({error})",

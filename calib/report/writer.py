@@ -12,6 +12,7 @@ from calib.batch.environment import Environment, sha256
 from calib.batch.folders import fresh_folder
 from calib.batch.pool import HERE, Later, Pool
 from calib.data import Table, write_table
+from calib.data.documents import read_text
 from calib.inference.estimators import GeneticSettings
 from calib.inference.io import groups_of
 from calib.inference.netcdf import write_netcdf
@@ -203,7 +204,7 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
         prior_path = task.prior_path or default_priors(task.model)
         write_table(folder / "data" / f"{key}.csv", task.table.to_write(task.table.columns))
         data = (folder / "data" / f"{key}.csv").read_bytes()
-        priors = prior_path.read_bytes()
+        priors = read_text(prior_path).encode()
         (folder / "priors" / f"{key}.toml").write_bytes(priors)
         emulator = emulator_of(get_model(task.model))
         if emulator is not None:

@@ -1,0 +1,888 @@
+"""Whatever surrounds it: terminals, disks, servers, encodings, and code of a user's own."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import urllib.error
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+import calib
+from calib.batch import unfinished
+from calib.batch.folders import claimed, fresh_folder
+from calib.batch.foreign import call, set_apart
+from calib.batch.plugins import run_file
+from calib.batch.pool import pool
+from calib.cli import _readable
+from calib.cli.verbs import app
+from calib.data.documents import decoded, read_json
+from calib.data.quantities import QUANTITIES
+from calib.errors import CalibError
+from calib.inference.prior_files import default_priors, read_priors
+from calib.models import MODELS, example_csv
+from calib.models.simulators.base import Failure, Output, Simulator
+from calib.models.simulators.child import of_surroundings
+from calib.models.simulators.exchange import output_of_text
+from calib.models.simulators.files import read_simulator
+from calib.models.simulators.process import run_program
+from calib.models.simulators.registered import SIMULATED
+from calib.models.simulators.runs import RunKeeper
+from calib.models.simulators.umbridge import UmbridgeWay
+from calib.models.simulators.ways import CallableWay, CommandWay
+from tests.abuse.test_writing import mounted
+from tests.gap.cases import make_case, write_case
+from tests.models.simulators.examples import PRIORS, lab, write_program
+from tests.registered import forgotten
+
+PROGRAM = [sys.executable, "-c", "from calib.cli import program; program()"]
+FIT = ["fit", "ruts.csv", "--model", "bekker", "--max-steps", "400", "--out", "run"]
+THETA = np.array([0.6, 0.08])
+X = {"slip_ratio": np.array([0.1, 0.2]), "normal_load_kn": np.array([4.0, 5.0])}
+
+
+@pytest.fixture(autouse=True)
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", sys.path[:])
+    monkeypatch.setenv("CALIB_MODELS", "")
+    Path("ruts.csv").write_text(example_csv("bekker"), encoding="utf-8")
+    Path("slip.csv").write_text(example_csv("modified_bekker"), encoding="utf-8")
+    modules = set(sys.modules)
+    with forgotten(MODELS, SIMULATED, QUANTITIES):
+        yield tmp_path
+    for name in set(sys.modules) - modules:
+        if name.startswith(("calib_user_", "soil", "helper")):
+            sys.modules.pop(name)
+
+
+def run(*words: str) -> Result:
+    return CliRunner().invoke(app, words)
+
+
+def shell(command: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    path = os.pathsep.join(p for p in sys.path if p)
+    words = command.replace("calib", f"{sys.executable} -c '{PROGRAM[2]}'", 1)
+    return subprocess.run(
+        ["bash", "-o", "pipefail", "-c", words], capture_output=True, text=True, check=False,
+        env=os.environ | {"PYTHONPATH": path} | environment, errors="replace", timeout=120,
+    )  # fmt: skip
+
+
+# Terminals
+
+
+@pytest.mark.parametrize(
+    ("text", "plain"),
+    [
+        ("θ = 3", "theta = 3"), ("(0.1 ± 1.2)×10⁷", "(0.1 +- 1.2)x10^7"), ("10⁻⁷ m²", "10^-7 m^2"),  # noqa: RUF001
+        ("µm", "mum"), ("Prüfer – ∑", "Prufer - \\u2211"), ("中", "\\u4e2d"), ("\udcff", "\\udcff"),  # noqa: RUF001
+        ("k_φ ≤ 2 → ΔF", "k_phi <= 2 -> deltaF"),
+    ],
+)  # fmt: skip
+def test_what_an_encoding_lacks_is_written_otherwise(text: str, plain: str) -> None:
+    import codecs
+
+    codecs.register_error("calib.readable", _readable)
+    assert text.encode("ascii", "calib.readable").decode("ascii") == plain
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1", "cp437", "utf-8"])
+def test_a_limited_terminal_costs_nothing(encoding: str) -> None:
+    done = shell(f"calib {' '.join(FIT)} --overwrite", PYTHONIOENCODING=encoding)
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+    assert "run folder: run" in done.stdout
+    assert ("10^7" if encoding in ("ascii", "latin-1", "cp437") else "10⁷") in done.stdout
+    # Files are in UTF-8 whatever the terminal is.
+    assert json.loads(Path("run/run.json").read_bytes())["model"] == "bekker"
+    said = shell("calib models bekker", PYTHONIOENCODING=encoding)
+    assert (said.returncode, "Traceback" in said.stderr) == (0, False)
+
+
+def test_of_a_locale_without_utf8_files_are_in_it_all_the_same() -> None:
+    plain = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
+    out = "report ruts.csv --model bekker --max-steps 400 --workers 1 --out rep"
+    done = shell(f"calib {out}", **plain)
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+    assert "²" in Path("rep/index.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device")
+@pytest.mark.parametrize("to", [">/dev/full", "2>/dev/full"])
+def test_where_printing_fails_files_are_written_and_the_exit_code_says_it(to: str) -> None:
+    done = shell(f"calib {' '.join(FIT)} {to}")
+    assert done.returncode == 2
+    assert "Traceback" not in done.stderr
+    assert calib.load_calibration(Path("run")).problem.bound.model.name == "bekker"
+    if to == ">/dev/full":
+        assert (
+            "what was printed is lost (No space left on device); files are written" in done.stderr
+        )
+
+
+def test_a_reader_that_leaves_changes_no_exit_code() -> None:
+    """Of a run that did not converge, 3; the whole folder is written."""
+    words = " ".join(FIT).replace("400", "100")
+    alone = shell(f"calib {words} --overwrite")
+    left = shell(f"calib {words} --overwrite | true")
+    assert (left.returncode, "Traceback" in left.stderr) == (alone.returncode, False)
+    calib.load_calibration(Path("run"))
+
+
+# What is finished before its command is
+
+
+def interrupt(*_: object, **__: object) -> Any:
+    raise KeyboardInterrupt
+
+
+def fail(*_: object, **__: object) -> Any:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize(
+    ("words", "stage", "kept"),
+    [
+        (FIT, "calib.validation.noise_preference.noise_preference", "run-unfinished/run"),
+        (FIT, "calib.inference.io.write_table", ""),
+        (
+            ["report", "ruts.csv", "--model", "bekker", "--max-steps", "400", "--workers", "1",
+             "--out", "run"],
+            "calib.report.study.prior_sensitivity", "run-unfinished/rut_depth",
+        ),
+        (
+            ["compare", "bekker", "modified_bekker", "slip.csv", "--max-steps", "400", "--workers",
+             "1", "--out", "run"],
+            "calib.validation.comparison.leave_one_out", "run-unfinished/bekker",
+        ),
+    ],
+)  # fmt: skip
+def test_an_interruption_loses_no_posterior(words: list[str], stage: str, kept: str) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stage, interrupt)
+        done = run(*words)
+    assert done.exit_code == 130, done.output
+    assert not Path("run").exists()
+    if not kept:  # the very writing of it was interrupted, and that again
+        assert not Path("run-unfinished").exists()
+        return
+    assert "calib: what was finished is in run-unfinished" in done.stderr
+    found = calib.load_calibration(Path(kept))
+    assert run("predict", kept, "--at", "ruts.csv").exit_code in (0, 3)
+    assert np.isfinite(found.draws.t).all()
+
+
+def test_an_interrupted_diagnosis_that_was_made_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    write_case(make_case("force_offset", n_lab=15, n_field=12), Path("case"))
+    monkeypatch.setattr("calib.report.page.gap_page.begin_page", interrupt)
+    done = run("diagnose", "case", "--workers", "1", "--out", "found")
+    assert (done.exit_code, "what was finished is in found-unfinished" in done.stderr) == (
+        130,
+        True,
+    )
+    assert read_json(Path("found-unfinished/diagnosis/diagnosis.json"))["verdict"]
+
+
+def test_a_disk_that_is_full_at_the_end_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    usual, asked = calib.inference.io.write_netcdf, list[Path]()
+
+    def once(groups: Any, path: Path) -> None:
+        asked.append(path)
+        if len(asked) == 1:
+            fail()
+        usual(groups, path)
+
+    monkeypatch.setattr("calib.inference.io.write_netcdf", once)
+    done = run(*FIT)
+    assert done.exit_code == 2
+    assert "cannot be written (No space left on device)" in done.stderr
+    assert "calib: what was finished is in run-unfinished" in done.stderr
+    assert calib.load_calibration(Path("run-unfinished/run")).seed == 2019
+
+
+def test_another_process_leaves_what_it_finished(tmp_path: Path) -> None:
+    with suppress(KeyboardInterrupt), claimed(tmp_path / "out"), pool(2, modules=()) as side:
+        assert side.submit(keeps, "there").result() == "kept"
+        unfinished.keep("here", write_here)
+        raise KeyboardInterrupt
+    found = {p.relative_to(tmp_path).as_posix() for p in tmp_path.rglob("word")}
+    assert found == {"out-unfinished/there/word", "out-unfinished/here/word"}
+    assert not list(tmp_path.glob(".out-*"))
+
+
+def write_here(folder: Path) -> None:
+    (folder / "word").write_text("kept")
+
+
+def keeps(name: str) -> str:
+    unfinished.keep(name, write_here)
+    return "kept"
+
+
+def test_of_what_was_written_nothing_is_kept_besides(tmp_path: Path) -> None:
+    with claimed(tmp_path / "out"):
+        unfinished.keep("part", write_here)
+        with fresh_folder(tmp_path / "out") as folder:
+            write_here(folder)
+    assert {p.name for p in tmp_path.rglob("*")} >= {"out", "word"}
+    assert not list(tmp_path.glob("*unfinished*")) + list(tmp_path.glob(".out-*"))
+
+
+def test_where_no_place_is_left_beside_it_is_among_temporary_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = tmp_path / "tmp"
+    other.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(other))
+    with mounted(tmp_path / "stick", "size=20m") as stick:
+
+        def large(folder: Path) -> None:
+            (folder / "posterior").write_bytes(bytes(30_000_000))
+
+        with suppress(KeyboardInterrupt), claimed(stick / "out"):
+            unfinished.keep("run", large)
+            raise KeyboardInterrupt
+        assert list(stick.iterdir()) == []
+    assert (other / "out-unfinished" / "run" / "posterior").stat().st_size == 30_000_000
+
+
+def test_a_disk_that_others_fill_meanwhile_has_room_reserved(tmp_path: Path) -> None:
+    with mounted(tmp_path / "stick", "size=20m") as stick:
+        with claimed(stick / "out"):
+            with pytest.raises(OSError, match="No space"), (stick / "photos").open("wb") as file:
+                file.write(bytes(20_000_000))
+            with fresh_folder(stick / "out") as folder:
+                (folder / "posterior.nc").write_bytes(bytes(10_000_000))
+        assert (stick / "out" / "posterior.nc").stat().st_size == 10_000_000
+
+
+def test_a_limit_of_file_sizes_is_found_before_the_work() -> None:
+    done = subprocess.run(
+        [*PROGRAM, *FIT], capture_output=True, text=True, check=False,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000)),
+    )  # fmt: skip
+    assert done.returncode == 2
+    assert "the output cannot be written (File too large)" in done.stderr
+    assert "sampling" not in done.stderr
+
+
+# What surroundings do to a run
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        MemoryError(), ConnectionRefusedError(), socket.gaierror(-2, "unknown"), TimeoutError(),
+        OSError(errno.ENOSPC, "full"), OSError(errno.EMFILE, "files"), BrokenPipeError(),
+        urllib.error.URLError(ConnectionResetError()), OSError(errno.EHOSTUNREACH, "no route"),
+    ],
+)  # fmt: skip
+def test_errors_of_the_surroundings_are_known(error: Exception) -> None:
+    def wrapped() -> None:
+        try:
+            raise error.reason if isinstance(error, urllib.error.URLError) else error
+        except Exception as first:
+            raise RuntimeError("the solver has no licence") from first
+
+    with pytest.raises(RuntimeError) as caught:
+        wrapped()
+    assert of_surroundings(caught.value)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [ValueError("no root"), FileNotFoundError(errno.ENOENT, "out.dat"), ZeroDivisionError()],
+)
+def test_errors_of_a_simulator_are_its_own(error: Exception) -> None:
+    assert not of_surroundings(error)
+
+
+def out_of_memory(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+    raise MemoryError("no memory")
+
+
+def in_python(function: Callable[..., Any], limit: float | None = None, **more: Any) -> Simulator:
+    return Simulator(
+        "wheel", CallableWay(function, ("pull",), limit=limit), ("mu", "s0"), PRIORS,
+        {"s": "slip_percent", "w": "normal_load_kn"}, (Output("drawbar_pull_n", "pull", ""),),
+        **more,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("limit", [None, 60.0])
+def test_a_lack_of_memory_is_no_failed_run(limit: float | None, tmp_path: Path) -> None:
+    keeper = RunKeeper(in_python(out_of_memory, limit), tmp_path / "runs")
+    with pytest.raises(CalibError, match=r"could not be made: .*MemoryError: no memory"):
+        keeper.runs(THETA[None], X)
+    assert kept(tmp_path / "runs") == []
+
+
+def kept(folder: Path) -> list[str]:
+    return [p.name for p in folder.glob("*/*.json") if p.name != "failed.json"]
+
+
+@pytest.mark.parametrize(
+    ("code", "word"),
+    [
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "SIGKILL: something else"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGTERM)", "SIGTERM: something else"),
+        ("raise SystemExit(137)", "exit code 137: something else"),
+        ("raise SystemExit(127)", "CALIB_SIMULATOR"),
+    ],
+)
+def test_what_ends_a_program_from_outside_is_no_failed_run(
+    code: str, word: str, tmp_path: Path
+) -> None:
+    with pytest.raises(CalibError, match="could not be made") as caught:
+        run_program([sys.executable, "-c", code], tmp_path, 20.0)
+    assert word in str(caught.value)
+
+
+def test_a_disk_without_room_is_no_failed_run(tmp_path: Path) -> None:
+    with (
+        mounted(tmp_path / "stick", "size=1m") as stick,
+        pytest.raises(CalibError, match="MB are left on its disk"),
+    ):
+        run_program([sys.executable, "-c", "raise SystemExit(1)"], stick, 20.0)
+
+
+class _Server(BaseHTTPRequestHandler):
+    code = 200
+
+    def do_POST(self) -> None:
+        self.rfile.read(int(self.headers["Content-Length"]))
+        self.send_response(self.code)
+        self.end_headers()
+        self.wfile.write(b'{"output": [[1.0]]}')
+
+    def log_message(self, *args: object) -> None:
+        """Print nothing."""
+
+
+@contextmanager
+def serving(port: int, code: int = 200) -> Iterator[None]:
+    server = HTTPServer(("127.0.0.1", port), type("Server", (_Server,), {"code": code}))
+    thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def remote(url: str) -> Simulator:
+    return Simulator(
+        "wheel", UmbridgeWay(url, "forward", ("pull",), limit=5.0), ("mu", "s0"), PRIORS,
+        {"s": "slip_percent", "w": "normal_load_kn"}, (Output("drawbar_pull_n", "pull", ""),),
+    )  # fmt: skip
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return int(server.getsockname()[1])
+
+
+def test_a_server_that_is_started_later_answers_the_same_command(tmp_path: Path) -> None:
+    port, folder = free_port(), tmp_path / "runs"
+    keeper = RunKeeper(remote(f"http://127.0.0.1:{port}"), folder)
+    with pytest.raises(CalibError, match=r"is not there .*refused"):
+        keeper.runs(THETA[None], X)
+    with serving(port, 503), pytest.raises(CalibError, match=r"is not there \(503"):
+        keeper.runs(THETA[None], X)
+    assert kept(folder) == []
+    with serving(port):
+        (found,) = keeper.runs(THETA[None], X)
+    np.testing.assert_allclose(found.outputs["drawbar_pull_kn"], [0.001, 0.001])
+    with serving(free_port(), 500):
+        assert len(kept(folder)) == 1
+
+
+@pytest.mark.parametrize(
+    "why", [TimeoutError("timed out"), socket.gaierror(-2, "Name or service not known")]
+)
+def test_a_connection_that_is_not_made_is_no_failed_run(
+    why: Exception, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def unreachable(*_: object, **__: object) -> Any:
+        raise urllib.error.URLError(why)
+
+    monkeypatch.setattr("urllib.request.urlopen", unreachable)
+    with pytest.raises(CalibError, match="is not there"):
+        remote("http://far.example").run(THETA, X)
+    with pytest.raises(CalibError, match="is not there"):
+        remote("far:away").run(THETA, X)
+
+
+# Code of a user's own
+
+
+def meddles(folder: Path) -> Callable[..., Any]:
+    def pull(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        os.chdir(folder)
+        os.environ["TMPDIR"] = "/nowhere"
+        os.environ.pop("HOME", None)
+        sys.path.insert(0, "/nowhere")
+        np.seterr(all="raise")
+        warnings.simplefilter("error")
+        print("1,2,3")
+        return 1000.0 * theta[:, :1] * x["w"] * (1.0 - np.exp(-x["s"] / 100.0 / theta[:, 1:2]))
+
+    return pull
+
+
+def test_what_code_of_ones_own_changes_is_put_back(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    before = Path.cwd(), os.environ.copy(), sys.path[:], np.geterr(), warnings.filters[:]
+    simulator = in_python(meddles(tmp_path / "elsewhere"))
+    first, second = (simulator.run(THETA, X) for _ in range(2))
+    assert not isinstance(first, Failure)
+    assert not isinstance(second, Failure)
+    np.testing.assert_array_equal(first["drawbar_pull_kn"], second["drawbar_pull_kn"])
+    now = Path.cwd(), os.environ.copy(), sys.path[:-1], np.geterr(), warnings.filters[:]
+    assert now == before
+    assert sys.path[-1] == "/nowhere"
+    # The output may be a file's content.
+    said = capsys.readouterr()
+    assert (said.out, said.err) == ("", "1,2,3\n1,2,3\n")
+
+
+def test_random_numbers_are_left_to_a_simulator_that_scatters() -> None:
+    np.random.seed(1)  # noqa: NPY002
+    random.seed(1)
+    assert call(np.random.rand) != call(np.random.rand)
+    assert call(random.random) != call(random.random)
+
+
+def test_of_a_folder_that_was_removed_there_is_no_way_back(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    os.chdir(gone)
+    with set_apart():
+        shutil.rmtree(gone)
+        os.chdir(tmp_path)
+    assert Path.cwd() == tmp_path
+
+
+OWN = """
+import os
+import numpy as np
+from calib import Model, register
+np.seterr(all="raise")
+import warnings
+warnings.simplefilter("error")
+os.makedirs("/tmp", exist_ok=True)
+os.chdir(os.path.dirname(__file__))
+def predict(theta, conditions):
+    os.chdir("/")
+    p = conditions["average_ground_pressure_kpa"]
+    # Underflows, overflows and divides by zero, none of which the result depends on.
+    np.exp(-800.0 * np.ones(1)), np.exp(800.0 * np.ones(1)), np.ones(1) / np.zeros(1)
+    return theta[:, :1] * (p / 100.0) ** theta[:, 1:]
+register(Model(
+    name="own_rut", title="A rut", output="rut_depth_mm", parameters=("z", "m"),
+    conditions=("average_ground_pressure_kpa",), predict=predict, priors='''
+model = "own_rut"
+[parameters.z]
+dist = "lognormal"
+median = 20.0
+sd_log = 0.5
+unit = "1"
+reason = "r"
+source = "s"
+[parameters.m]
+dist = "normal"
+mean = 0.5
+sd = 0.2
+unit = "1"
+reason = "r"
+source = "s"
+[parameters.sigma]
+dist = "half_normal"
+sd = 2.0
+unit = "mm"
+reason = "r"
+source = "s"
+''',
+))
+"""
+
+
+def test_a_models_file_moves_no_results_and_raises_no_errors(tmp_path: Path) -> None:
+    (tmp_path / "models").mkdir()
+    Path("models/own.py").write_text(OWN)
+    Path("models/plain.py").write_text(
+        OWN.replace("own_rut", "plain_rut").replace("np.seterr", "# ").replace("os.chdir", "str")
+        .replace("warnings.simplefilter", "str").replace("np.exp(-800", "# ")
+    )  # fmt: skip
+    posteriors = []
+    for name in ("own", "plain"):
+        words = [*FIT[:3], f"{name}_rut", *FIT[4:6], "--models", f"models/{name}.py", "--out", name]
+        done = run(*words)
+        assert done.exit_code == 0, (done.output, done.exception)
+        assert Path.cwd() == tmp_path
+        posteriors.append(read_json(tmp_path / name / "run.json")["mode"])
+        found = run("predict", name, "--at", "ruts.csv", "--out", f"{name}.csv")
+        assert found.exit_code == 0, found.output
+    assert posteriors[0] == posteriors[1]
+    assert Path("own.csv").read_bytes() == Path("plain.csv").read_bytes()
+    assert np.geterr()["under"] == "ignore"
+
+
+@pytest.fixture
+def raising() -> Iterator[None]:
+    with np.errstate(all="raise"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        yield
+
+
+def numbers() -> dict[str, Any]:
+    """Return what the main steps find."""
+    table = calib.read_table("ruts.csv")
+    problem = calib.build_problem("bekker", table)
+    settings = calib.SamplerSettings(max_steps=400)
+    found = calib.calibrate(problem, 1, settings=settings)
+    ahead = calib.predict(found, table)
+    rows = calib.read_table("slip.csv")
+    between = calib.compare(rows, ["bekker", "modified_bekker"], 1, settings=settings)
+    which = calib.diagnose("case", 1)
+    return {
+        "mean": found.summary["n"].mean, "ahead": ahead.predictive.median.tolist(),
+        "loo": calib.leave_one_out(found).elpd, "weights": dict(between.weights),
+        "probability": dict(which.ranking.probability),
+        "estimate": [
+            calib.estimate(problem, m, np.random.default_rng(1)).cost
+            for m in ("least_squares", "genetic", "differential_evolution")
+        ],
+    }  # fmt: skip
+
+
+def test_errors_that_a_caller_asks_numpy_for_change_nothing() -> None:
+    write_case(make_case("force_offset", n_lab=15, n_field=12), Path("case"))
+    usual = numbers()
+    with np.errstate(all="raise"), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert numbers() == usual
+
+
+@pytest.mark.parametrize("words", [
+    FIT, ["models", "bekker"],
+    ["report", "ruts.csv", "--model", "bekker", "--max-steps", "400", "--workers", "1"],
+    ["sbc", "--model", "bekker", "--simulations", "10", "--workers", "1", "--out", "ranks"],
+])  # fmt: skip
+def test_nor_do_they_reach_the_verbs(words: list[str], raising: None) -> None:
+    done = run(*words)
+    assert done.exit_code == 0, (done.output, done.exception)
+
+
+HELPER = "def factor():\n    return {}\n"
+WITH_HELPER = """
+import helper_soil
+def pull(theta, x):
+    import helper_later
+    return helper_soil.factor() * helper_later.factor() * theta[:, :1] * x["w"]
+"""
+
+
+def write_helped(folder: Path, factor: float, **keys: str) -> Path:
+    folder.mkdir()
+    path = write_program(folder, **{"run": "", "python": '"sim.py:pull"'} | keys)
+    (folder / "sim.py").write_text(WITH_HELPER)
+    (folder / "helper_soil.py").write_text(HELPER.format(factor))
+    (folder / "helper_later.py").write_text(HELPER.format(2.0))
+    return path
+
+
+def pulled(path: Path) -> float:
+    found = read_simulator(path).simulator.run(THETA, X)
+    assert not isinstance(found, Failure), found
+    return float(found["drawbar_pull_kn"][0])
+
+
+@pytest.mark.parametrize("limit", ["", "60.0"])
+def test_a_simulator_imports_what_lies_beside_it(limit: str, tmp_path: Path) -> None:
+    path = write_helped(tmp_path / "a", 3.0, limit=limit)
+    assert pulled(path) == pytest.approx(3.0 * 2.0 * 0.6 * 4.0 / 1000.0)
+    # In another process too.
+    with pool(2, modules=(), files=[path]) as side:
+        assert side.submit(pulled, path).result() == pulled(path)
+
+
+def test_two_helpers_of_one_name_are_refused_not_mixed_up(tmp_path: Path) -> None:
+    pulled(write_helped(tmp_path / "a", 3.0))
+    with pytest.raises(CalibError, match=r"imports helper_\w+, .* and elsewhere too"):
+        pulled(write_helped(tmp_path / "b", 5.0))
+
+
+def test_nor_is_a_helper_with_the_name_of_a_library(tmp_path: Path) -> None:
+    (tmp_path / "corner.py").write_text("x = 1\n")
+    (tmp_path / "own.py").write_text("import corner\n")
+    with pytest.raises(CalibError, match=r"imports corner, which is corner\.py beside it"):
+        run_file(tmp_path / "own.py", "models")
+
+
+def test_two_files_of_one_name_are_two(tmp_path: Path) -> None:
+    found = []
+    for name, value in (("a", 1), ("b", 2)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "soil_own.py").write_text(f"VALUE = {value}\n")
+        found.append(run_file(tmp_path / name / "soil_own.py", "models"))
+    assert [module.VALUE for module in found] == [1, 2]
+    assert [sys.modules[module.__name__] for module in found] == found
+
+
+def test_a_file_finds_what_it_looked_for_where_it_went(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "table.txt").write_text("7")
+    (tmp_path / "a" / "own.py").write_text(
+        "import os\nos.chdir(os.path.dirname(__file__))\n"
+        "def read():\n    return open('table.txt').read()\n"
+    )
+    module = run_file(tmp_path / "a" / "own.py", "models")
+    assert Path.cwd() == tmp_path
+    assert call(module.read) == "7"
+
+
+def test_files_may_be_named_in_any_order(tmp_path: Path) -> None:
+    Path("quantity.py").write_text(
+        "from calib import Quantity, register\n"
+        "register(Quantity('paddle_depth', 'paddle_depth_mm', 'length', 'mm', 'condition', 'D'))\n"
+    )
+    text = write_program(tmp_path).read_text().replace("slip_percent", "paddle_depth_mm")
+    Path("wheel.toml").write_text(text)
+    files = [["--simulator", "wheel.toml"], ["--models", "quantity.py"]]
+    for order in (files, files[::-1]):
+        done = run("models", "wheel", *order[0], *order[1])
+        assert done.exit_code == 0, done.output
+        assert "paddle_depth_mm" in done.output
+
+
+# Programs and their paths
+
+
+def test_a_program_is_run_by_the_path_that_names_it(tmp_path: Path) -> None:
+    """An environment's Python is a link to that without its packages."""
+    (tmp_path / "real").write_text(
+        "#!/bin/sh\necho '{\"pull\": [1, 2]}'; echo $0 > $CALIB_SIMULATOR/ran\n"
+    )
+    (tmp_path / "real").chmod(0o755)
+    (tmp_path / "linked").symlink_to("real")
+    way = CommandWay(("./linked",), tmp_path)
+    found = way.run({"mu": 1.0}, {"w": np.ones(2)})
+    assert not isinstance(found, Failure), found
+    assert (tmp_path / "ran").read_text().strip() == str(tmp_path / "linked")
+    assert way.program == str(tmp_path / "linked")
+
+
+@pytest.mark.parametrize(
+    ("script", "arguments", "word"),
+    [
+        ("#!/bin/sh\r\necho 1\r\n", ["./run"], "end as on Windows (CR LF)"),
+        ("#!/usr/bin/env sh\r\necho 1\r\n", ["./run"], "end as on Windows (CR LF)"),
+        ("P=sh\r\nexec $P -c true\r\n", ["sh", "./run"], "end as on Windows (CR LF)"),
+        ("#!/nowhere/python\nprint(1)\n", ["./run"], "names /nowhere/python, which is not there"),
+    ],
+)
+def test_a_script_that_is_none_here_is_told_why(
+    script: str, arguments: list[str], word: str, tmp_path: Path
+) -> None:
+    (tmp_path / "run").write_bytes(script.encode())
+    (tmp_path / "run").chmod(0o755)
+    with pytest.raises(CalibError) as caught:
+        CommandWay(tuple(arguments), tmp_path).run({"mu": 1.0}, {"w": np.ones(2)})
+    assert word in str(caught.value)
+
+
+def test_a_program_that_starts_another_is_told_where_it_runs(tmp_path: Path) -> None:
+    (tmp_path / "run").write_text("#!/bin/sh\n./other\n")
+    (tmp_path / "other").write_text("#!/bin/sh\necho '{\"pull\": [1, 2]}'\n")
+    for name in ("run", "other"):
+        (tmp_path / name).chmod(0o755)
+    way = CommandWay(("./run",), tmp_path)
+    with pytest.raises(CalibError, match=r"runs in \S*calib-run-\w+, .* CALIB_SIMULATOR"):
+        way.run({"mu": 1.0}, {"w": np.ones(2)})
+    (tmp_path / "run").write_text("#!/bin/sh\n$CALIB_SIMULATOR/other\n")
+    found = way.run({"mu": 1.0}, {"w": np.ones(2)})
+    assert not isinstance(found, Failure)
+    assert found["pull"].tolist() == [1.0, 2.0]
+
+
+# Texts
+
+WRITTEN: dict[str, Callable[[str], bytes]] = {
+    "mark": lambda text: text.encode("utf-8-sig"),
+    "windows": lambda text: text.replace("\n", "\r\n").encode("utf-8-sig"),
+    "utf-16": lambda text: text.encode("utf-16"),
+    "utf-16 of another machine": lambda text: b"\xfe\xff" + text.encode("utf-16-be"),
+    "utf-32": lambda text: text.encode("utf-32"),
+}
+
+
+@pytest.mark.parametrize("how", WRITTEN)
+def test_texts_are_read_however_they_were_saved(how: str, tmp_path: Path) -> None:
+    write = WRITTEN[how]
+    assert decoded(write("θ\n")).replace("\r", "") == "θ\n"
+    Path("r.csv").write_bytes(write(example_csv("bekker")))
+    assert len(calib.read_table("r.csv")) == len(calib.read_table("ruts.csv"))
+    Path("p.toml").write_bytes(write(default_priors("bekker").read_text(encoding="utf-8")))
+    names = (*MODELS["bekker"].parameters, "sigma")
+    assert read_priors(Path("p.toml"), "bekker", names, {}).names == names
+    for text, kind in (('{"pull": [1, null]}', "json"), ("pull,note\n1,a\nnan,b\n", "csv")):
+        found = output_of_text(decoded(write(text)), kind, {})
+        assert not isinstance(found, Failure)
+        np.testing.assert_array_equal(found["pull"], [1.0, np.nan])
+    file = write_program(tmp_path, input='"template"', template='"in.txt"')
+    file.write_bytes(write(file.read_text()))
+    Path("in.txt").write_bytes(write("@mu@ @s0@ @s@ @w@\n"))
+    way = read_simulator(file).simulator.way
+    assert isinstance(way, CommandWay)
+    assert way.template == "@mu@ @s0@ @s@ @w@\n"
+    write_case(make_case("force_offset", n_lab=15, n_field=12), Path("case"))
+    for path in Path("case").glob("*.*"):
+        path.write_bytes(write(path.read_text(encoding="utf-8")))
+    assert len(calib.read_case(Path("case")).lab) == 15
+    Path("plan.toml").write_bytes(
+        write('[[fit]]\nname = "a"\ndata = ["ruts.csv"]\nmodels = ["bekker"]\n')
+    )
+    assert len(calib.read_plan(Path("plan.toml")).tasks) == 1
+
+
+@pytest.mark.parametrize("how", ["mark", "utf-16"])
+@pytest.mark.parametrize("printed", [True, False])
+def test_of_a_program_too(how: str, printed: bool, tmp_path: Path) -> None:
+    content = WRITTEN[how]("pull,n\n1,1\n2,2\n")
+    to = "sys.stdout.buffer" if printed else "open(sys.argv[1], 'wb')"
+    arguments = [sys.executable, "-c", f"import sys; {to}.write({content!r})"]
+    way = CommandWay((*arguments, *([] if printed else ["{output}"])), tmp_path, gives="csv")
+    found = way.run({"mu": 1.0}, {"w": np.ones(2)})
+    assert not isinstance(found, Failure), found
+    assert found["pull"].tolist() == [1.0, 2.0]
+
+
+def test_names_are_allowed_in_any_script(tmp_path: Path) -> None:
+    path = write_program(tmp_path)
+    text = path.read_text()
+    path.write_text(text.replace("parameters.mu", 'parameters."θ"'), encoding="utf-8")
+    found = read_simulator(path)
+    assert found.simulator.parameters == ("θ", "s0")
+    found.register()
+    assert calib.MODELS["wheel"].parameters == ("θ", "s0")
+    path.write_text(text.replace("parameters.mu", 'parameters."mu b"'))
+    with pytest.raises(CalibError, match="'mu b' is no name for a parameter") as caught:
+        read_simulator(path)
+    assert "letters of any script, digits and underscores" in str(caught.value)
+    path.write_text(text.replace("parameters.mu", "parameters.θ"), encoding="utf-8")
+    with pytest.raises(CalibError, match="stand in quotes"):
+        read_simulator(path)
+
+
+# Folders that went through version control
+
+
+def to_windows(folder: Path) -> None:
+    """As git's autocrlf does with what it takes for text."""
+    for path in folder.rglob("*"):
+        if path.is_file() and b"\0" not in (content := path.read_bytes()):
+            path.write_bytes(content.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n"))
+
+
+def test_other_line_ends_are_no_difference_and_are_told() -> None:
+    assert run(*FIT).exit_code == 0
+    to_windows(Path("run"))
+    done = run("check", "run", "--workers", "1")
+    assert done.exit_code == 0, done.output
+    assert "SAME but for line ends" in done.output
+    assert "2 files have other line ends, as git's autocrlf makes them" in done.output
+    assert run("predict", "run", "--at", "ruts.csv").exit_code == 0
+    data = Path("run/data.csv")
+    data.write_bytes(data.read_bytes().replace(b"60", b"61", 1))
+    changed = run("check", "run", "--workers", "1")
+    assert (changed.exit_code, "data.csv" in changed.output) == (1, True)
+
+
+def test_of_a_report_too() -> None:
+    words = ["report", "ruts.csv", "--model", "bekker", "--max-steps", "400", "--workers", "1"]
+    assert run(*words, "--out", "rep").exit_code == 0
+    to_windows(Path("rep"))
+    done = run("check", "rep", "--workers", "1")
+    assert done.exit_code == 0, done.output
+    assert done.stdout.startswith("SAME")
+    assert "other line ends" in done.output
+
+
+def test_a_run_that_is_doubled_in_a_table_is_named(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    columns = lab(rng)
+    rows = [
+        (mu, s0, 100.0 * s, w, 1000.0 * mu * w * (1.0 - np.exp(-s / s0)))
+        for mu, s0 in rng.uniform([0.3, 0.05], [0.8, 0.2], (10, 2))
+        for s, w in zip(columns["slip_ratio"], columns["normal_load_kn"], strict=True)
+    ]
+    np.savetxt("lab.csv", np.stack(list(columns.values()), axis=1), delimiter=",",
+               header=",".join(columns), comments="")  # fmt: skip
+    doubled = [rows[40]], "line 182: the row of line 42 is there again (mu = "
+    short = [(0.5, 0.1, *rows[0][2:])], "(that of 0.5, 0.1 has 1 rows)"
+    for name, (extra, word) in {"doubled": doubled, "short": short}.items():
+        np.savetxt("runs.csv", [*rows, *extra], delimiter=",", header="mu,s0,s,w,pull", comments="")
+        path = write_program(tmp_path, run="", table='"runs.csv"', name=f'"{name}"')
+        done = run("fit", "lab.csv", "--model", name, "--simulator", str(path))
+        assert (done.exit_code, word in done.output) == (2, True), done.output
+
+
+def test_an_interruption_says_what_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the folder is written, while its numbers are printed."""
+    monkeypatch.setattr("calib.cli.display.posterior_table", interrupt)
+    done = run(*FIT)
+    assert done.exit_code == 130
+    assert "nothing was written" not in done.stderr
+    assert "calib: what was finished is in run" in done.stderr
+    calib.load_calibration(Path("run"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_whenever_it_is_stopped_folders_are_whole(number: int) -> None:
+    words = ["compare", "bekker", "modified_bekker", "slip.csv", "--max-steps", "400", "--workers",
+             "1", "--out", "both"]  # fmt: skip
+    rng = np.random.default_rng(number)
+    for _ in range(8):
+        with subprocess.Popen(
+            [*PROGRAM, *words], stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+            env=os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+        ) as process:  # fmt: skip
+            try:
+                process.wait(rng.uniform(0.5, 6.0))
+            except subprocess.TimeoutExpired:
+                process.send_signal(number)
+            _, said = process.communicate(timeout=60)
+        assert process.returncode in (0, 3, 130, -number)
+        assert "Traceback" not in said
+        for folder in Path().glob("both-unfinished/*"):
+            if (folder / "run.json").exists():
+                calib.load_calibration(folder)
+        if Path("both").exists():
+            assert json.loads(Path("both/comparison.json").read_bytes())["models"]
+        assert not list(Path().glob(".both-*"))
+        for left in Path().glob("both*"):
+            shutil.rmtree(left)
