@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 
 from calib.batch.foreign import loading
+from calib.batch.sources import content_of, own_files
 from calib.errors import CalibError
 
 # Entry points of packages that register several things.
@@ -21,6 +22,8 @@ PLUGINS = "terracalib.plugins"
 # What the names of modules begin with that were loaded by their paths.
 USER_MODULE = "calib_user_"
 _LOADED: set[str] = set()
+# What was in the files of these modules when they were run.
+_CONTENT: dict[str, str] = {}
 # Code that is not calib's own, which may leave threads and files open.
 _OTHERS: set[str] = set()
 # Worker processes find here what this one has loaded.
@@ -29,7 +32,9 @@ _ORDER = {".toml": 1, ".npz": 2}
 
 
 def run_file(path: Path, what: str) -> ModuleType:
-    """Run a Python file as a module of its own; one that has been run is not run again.
+    """Run a Python file as a module of its own, once, and again when it has changed.
+
+    What it imports from its own folder is of it.
 
     Raises
     ------
@@ -42,7 +47,9 @@ def run_file(path: Path, what: str) -> ModuleType:
     name = f"{USER_MODULE}{path.stem}_{sha256(str(path).encode()).hexdigest()[:8]}"
     known = sys.modules.get(name)
     if known is not None and known.__file__ == str(path):
-        return known
+        if _CONTENT.get(name) == content_of(path):
+            return known
+        _forget(path)
     spec = importlib.util.spec_from_file_location(name, path)
     # `Path.is_file` fails where a name is too long for one.
     if not os.path.isfile(path) or spec is None or spec.loader is None:  # noqa: PTH113
@@ -54,6 +61,7 @@ def run_file(path: Path, what: str) -> ModuleType:
     # Known by its name, so that what it defines can be handed to other processes.
     sys.modules[name] = module
     _OTHERS.add(name)
+    _CONTENT[name] = content_of(path)
     try:
         with loading(name, path):
             spec.loader.exec_module(module)
@@ -71,6 +79,17 @@ def run_file(path: Path, what: str) -> ModuleType:
             f"the file does not run: {type(error).__name__}: {error}", where=at, mend="correct it"
         ) from error
     return module
+
+
+def _forget(path: Path) -> None:
+    """Have modules of a file's own folder run anew when they are imported next."""
+    files = own_files(path)
+    for name, module in list(sys.modules.items()):
+        if getattr(module, "__file__", None) in map(str, files):
+            del sys.modules[name]
+    for file in files:
+        # Compiled code is told from that of another text by the size and the second alone.
+        Path(importlib.util.cache_from_source(str(file))).unlink(missing_ok=True)
 
 
 def load_files(paths: Sequence[Path]) -> None:

@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.batch.foreign import call
+from calib.data.quantities import QUANTITIES
+from calib.data.values import real_array
 from calib.errors import CalibError
 from calib.models.latex import text
 
@@ -91,8 +93,10 @@ class _Plain:
                 allowed="predict(theta (k, d), conditions) -> (k, n)",
                 mend="declare it with a function that predicts its output",
             )
+        # Copies: what a function does to what it is handed is seen by no other call.
+        handed = theta.copy(), {name: v.copy() for name, v in rows.items()}
         try:
-            found = np.asarray(call(self.model.predict, theta, rows), dtype=np.float64)
+            given = call(self.model.predict, *handed)
         except CalibError:
             raise
         except (Exception, SystemExit) as error:  # of the user's own code
@@ -104,6 +108,10 @@ class _Plain:
                 f"theta (k, {len(self.model.parameters)})",
                 mend="correct the function",
             ) from error
+        try:
+            found = real_array(given, QUANTITIES[self.model.output].unit)
+        except CalibError as error:
+            raise error.within(f"predict of the model {self.model.name}") from None
         n = n or next(iter(rows.values())).size
         if found.shape != (theta.shape[0], n):
             raise CalibError(
@@ -111,7 +119,7 @@ class _Plain:
                 allowed=f"(vectors, rows) = ({theta.shape[0]}, {n})",
                 mend="theta[:, :1] is the first parameter as a column, (vectors, 1)",
             )
-        return np.log(found) if self.model.response == "log" else found.copy()
+        return np.log(found) if self.model.response == "log" else found
 
 
 @dataclass(frozen=True)

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from calib.data.csvfile import open_csv
 from calib.data.headers import parse_header
+from calib.data.values import real_array
 from calib.errors import CalibError
 from calib.inference.emulation.judge import held_out, judged
 from calib.inference.emulation.settings import Emulation, EmulationSettings
@@ -19,6 +21,7 @@ from calib.inference.trial import check_scale
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Simulator
 from calib.models.simulators.emulator import Training
+from calib.models.simulators.exchange import columns_of
 from calib.models.simulators.runs import Run, RunKeeper
 from calib.models.simulators.ways import TableWay
 
@@ -66,17 +69,19 @@ def read_runs(simulator: Simulator, problem: Problem) -> Training:
     way = simulator.way
     if not isinstance(way, TableWay):
         raise ValueError(f"{simulator.name} is no table")
-    columns, lines = _columns(way.path)
+    found, lines = _columns(way.path)
     output = next(
         o for o in simulator.outputs if simulator.canonical(o.header) == problem.bound.model.output
     )
     needed = (*simulator.parameters, *simulator.conditions, output.column)
-    missing = [name for name in needed if name not in columns]
+    missing = [name for name in needed if name not in found]
     if missing:
         raise CalibError(
             f"the table of runs has no column {', '.join(missing)}", where=str(way.path),
             allowed=", ".join(needed), mend="add it, or correct its name in the simulator file",
         )  # fmt: skip
+    columns = {name: _numbers(found, name, way.path) for name in needed}
+    _check_finite(columns, needed[:-1], lines, way.path)
     theta = np.stack([columns[name] for name in simulator.parameters], axis=1)
     _check_doubled(
         np.stack([columns[name] for name in needed[:-1]], axis=1), needed, lines, way.path
@@ -138,19 +143,36 @@ def _by_run(theta: Array, x: Mapping[str, Array], y: Array, path: Path) -> Train
     return Training(vectors, y[order].reshape(len(vectors), m), nodes)
 
 
-def _columns(path: Path) -> tuple[dict[str, Array], list[int]]:
-    """Return the columns of numbers, and the line of each row."""
+def _columns(path: Path) -> tuple[dict[str, Any], list[int]]:
+    """Return the columns, and the line of each row."""
     file = open_csv(path)
     read = list(file.rows)
     lines, rows = [line for line, _ in read], [row for _, row in read]
-    found = {}
-    for i, name in enumerate(file.header):
-        try:
-            found[name] = np.array([_number(row[i]) for row in rows])
-        except (ValueError, IndexError):
-            continue  # a label, or a column that is not asked for
-    return found, lines
+    try:
+        return columns_of(file.header, rows), lines
+    except ValueError as error:
+        raise CalibError(
+            f"the table of runs cannot be read: {error}", where=str(path),
+            allowed="CSV with a header, and a cell for each column in each row; decimal points",
+            mend="correct it",
+        ) from None  # fmt: skip
 
 
-def _number(cell: str) -> float:
-    return float(cell) if cell.strip() else float("nan")
+def _numbers(columns: Mapping[str, Any], name: str, path: Path) -> Array:
+    try:
+        return real_array(columns[name])
+    except CalibError as error:
+        raise error.within(f"{path}, column {name}") from None
+
+
+def _check_finite(
+    columns: Mapping[str, Array], names: Sequence[str], lines: Sequence[int], path: Path
+) -> None:
+    for name in names:
+        bad = np.flatnonzero(~np.isfinite(columns[name]))
+        if bad.size:
+            raise CalibError(
+                "there is no number", where=f"{path}, line {lines[bad[0]]}, column {name}",
+                allowed="a number for each parameter and condition; outputs may be missing",
+                mend="add it, or leave the run out",
+            )  # fmt: skip

@@ -10,18 +10,21 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from calib.data.headers import parse_header
 from calib.data.quantities import QUANTITIES
 from calib.data.units import convert
+from calib.data.values import real_array
 from calib.errors import CalibError
 from calib.models.base import Array
 
 type Kind = Literal["time", "exit", "nan", "short", "unreadable", "error"]
 type Values = Mapping[str, Array]
+# Outputs by the simulator's own names as it gave them, which may be anything.
+type Found = Mapping[str, Any]
 
 # Of what a failed run printed, so many characters are kept.
 _TAIL = 600
@@ -51,12 +54,13 @@ class Failure:
 
 
 type Result = Values | Failure
+type Given = Found | Failure
 
 
-class Printed(dict[str, Array]):
+class Printed(dict[str, Any]):
     """Outputs of a run that printed something besides, for the message if they will not do."""
 
-    def __init__(self, outputs: Values, printed: str) -> None:
+    def __init__(self, outputs: Found, printed: str) -> None:
         super().__init__(outputs)
         self.printed = printed
 
@@ -76,8 +80,8 @@ class Way(Protocol):
     def runs(self) -> bool:
         """Whether new runs can be made at all."""
 
-    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
-        """Return the outputs by the simulator's own names, (n,) each, or why there are none."""
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
+        """Return the outputs by the simulator's own names, n values each, or why there are none."""
 
 
 @dataclass(frozen=True)
@@ -176,12 +180,12 @@ class Simulator:
         canonical column, in canonical units.
         """
         parameters = dict(zip(self.parameters, map(float, theta), strict=True))
-        asked = self.asked(conditions)
-        n = next(iter(asked.values())).size
+        n = next(iter(conditions.values())).size
         found: Result = Failure("error", "it was not run")
         try:
             for _ in range(1 + self.retries):
-                found = self._once(parameters, asked, n)
+                # What one try does to what it is handed is seen by no other.
+                found = self._once(dict(parameters), self.asked(conditions), n)
                 if not isinstance(found, Failure):
                     return found
         except CalibError as error:
@@ -196,11 +200,15 @@ class Simulator:
             found[name] = convert(conditions[column], QUANTITIES[column].unit, unit)
         return found
 
-    def converted(self, found: Values, output: str) -> Array:
+    def converted(self, found: Found, output: str) -> Array:
         """Return an output, by its canonical column, in its canonical unit."""
         own = next(o for o in self.outputs if self.canonical(o.header) == output)
         unit = _parsed(own.header, self.name)[1]
-        return convert(found[own.column], unit, QUANTITIES[output].unit)
+        try:
+            values = real_array(found[own.column], unit)
+        except CalibError as error:
+            raise error.within(own.column) from None
+        return convert(values, unit, QUANTITIES[output].unit)
 
     def _once(
         self, parameters: Mapping[str, float], conditions: Mapping[str, Array], n: int
@@ -210,10 +218,10 @@ class Simulator:
             return found
         canonical: dict[str, Array] = {}
         for output in self.outputs:
-            values = checked(found, output.column, n)
+            column, unit = _parsed(output.header, self.name)
+            values = checked(found, output.column, n, unit)
             if isinstance(values, Failure):
                 return values
-            column, unit = _parsed(output.header, self.name)
             canonical[column] = convert(values, unit, QUANTITIES[column].unit)
         return canonical
 
@@ -242,15 +250,22 @@ def no_output(column: str, found: Iterable[str]) -> str:
     return f"there is no output {column!r}; it gave {', '.join(map(str, found)) or 'nothing'}"
 
 
-def checked(found: Values, column: str, n: int) -> Array | Failure:
-    """Return one output as n numbers, or why it is not that."""
+def checked(found: Found, column: str, n: int, unit: str) -> Array | Failure:
+    """Return one output as n numbers in a unit, or why it is not that."""
     printed = found.printed if isinstance(found, Printed) else ""
     if column not in found:
         return Failure("unreadable", no_output(column, found), printed)
-    values = np.asarray(found[column], dtype=np.float64).ravel()
+    try:
+        values = real_array(found[column], unit)
+    except CalibError as error:
+        return Failure("unreadable", f"{column}: {error.message}", printed)
     if values.size != n:
         what = f"{column} has {values.size} values for {n} rows of conditions"
         return Failure("short", what, printed)
+    if max(values.shape, default=1) != n:
+        what = f"{column} has the shape {values.shape} for {n} rows of conditions"
+        return Failure("short", what, printed)
+    values = values.ravel()
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
         what = f"{column} is not finite in {bad.size} of {n} rows, first {bad[0]}"

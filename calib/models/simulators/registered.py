@@ -142,7 +142,7 @@ class Direct:
         if isinstance(way, CallableWay) and self._at_once:
             asked = self.simulator.asked(conditions)
             try:
-                return self.simulator.converted(way.call(theta, asked), self.output)
+                return self.simulator.converted(way.call(theta.copy(), asked), self.output)
             except CalibError as error:
                 raise error.within(self.simulator.place()) from None
         empty = np.full(next(iter(conditions.values())).shape[-1], np.nan)

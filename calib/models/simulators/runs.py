@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,8 @@ from calib.batch.tasks import read_seconds, run_tasks
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Result, Simulator
+
+_log = logging.getLogger(__name__)
 
 type Progress = Callable[[int, int], None]
 
@@ -114,6 +118,7 @@ class RunKeeper:
 
     def _on_disk(self, items: Mapping[str, _Item]) -> Mapping[str, Mapping[str, Any]]:
         folder = Path(self.folder or ".") / self.simulator.digest[:16]
+        _say_unshared(self.simulator.name, getattr(self.simulator.way, "unshared", ""))
         with writing(folder):
             self._forget_failures(folder, items)
         if self.workers > 1 and not self.seconds:
@@ -152,6 +157,16 @@ class RunKeeper:
         return self.workers if self.seconds * count > _WORTH_SECONDS else 1
 
 
+@cache
+def _say_unshared(name: str, why: str) -> None:
+    if why:
+        _log.warning(
+            "simulator %s: it cannot be told what its function is (%s), so that its runs are kept "
+            "but not taken another time; a function that holds no open files, locks or connections "
+            "can be told from others", name, why,
+        )  # fmt: skip
+
+
 def _read(path: Path) -> dict[str, Any]:
     found: dict[str, Any] = json.loads(path.read_bytes())
     return found
@@ -168,7 +183,9 @@ def _carry_out(item: _Item) -> dict[str, Any]:
     """Make one run and describe it for JSON."""
     found: Result = item.simulator.run(item.theta, item.conditions)
     described: dict[str, Any] = {
-        "parameters": dict(zip(item.simulator.parameters, map(float, item.theta), strict=True))
+        "simulator": item.simulator.name,
+        "parameters": dict(zip(item.simulator.parameters, map(float, item.theta), strict=True)),
+        "conditions": {name: values.tolist() for name, values in item.conditions.items()},
     }
     if isinstance(found, Failure):
         granted = [item.simulator.limit, item.simulator.retries]

@@ -12,11 +12,9 @@ from http.client import HTTPException
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
-import numpy as np
-
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.models.simulators.base import Failure, Result, not_made, tail
+from calib.models.simulators.base import Failure, Given, Printed, not_made, tail
 
 
 @dataclass(frozen=True)
@@ -59,7 +57,7 @@ class UmbridgeWay:
         """Always."""
         return True
 
-    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Call the server."""
         theta = list(parameters.values())
         lists = {name: values.tolist() for name, values in conditions.items()}
@@ -71,7 +69,7 @@ class UmbridgeWay:
                 calls.append(self.ask("Evaluate", {"input": [[*theta, *row]], "config": {}}))
                 if isinstance(calls[-1], Failure):
                     break
-        outputs: dict[str, list[float]] = {name: [] for name in self.columns}
+        outputs: dict[str, list[Any]] = {name: [] for name in self.columns}
         for reply in calls:
             if isinstance(reply, Failure):
                 return reply
@@ -80,13 +78,12 @@ class UmbridgeWay:
                 given = len(vectors) if isinstance(vectors, list) else 0
                 what = f"the reply has {given} output vectors for {', '.join(self.columns)}"
                 return Failure("unreadable", what, tail(str(reply)))
-            try:
-                for name, values in zip(self.columns, vectors, strict=True):
-                    outputs[name] += [np.nan if v is None else float(v) for v in values]
-            except (TypeError, ValueError) as error:
-                what = f"the reply is not of output vectors of numbers: {error}"
+            if not all(isinstance(values, list) for values in vectors):
+                what = "the reply is not of output vectors of numbers"
                 return Failure("unreadable", what, tail(str(reply)))
-        return {name: np.array(values) for name, values in outputs.items()}
+            for name, values in zip(self.columns, vectors, strict=True):
+                outputs[name].append(values)
+        return Printed(outputs, tail(str(calls[-1])))
 
     def ask(self, what: str, content: Mapping[str, Any]) -> dict[str, Any] | Failure:
         """Send one request of the protocol; a CalibError if there is no server."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import inspect
 import json
 import os
 import shutil
@@ -12,15 +10,17 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
+from uuid import uuid4
 
 import numpy as np
 
 from calib.batch.foreign import call
 from calib.batch.plugins import declared_in
+from calib.batch.sources import content_of, fingerprint
 from calib.data.documents import read_text
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.models.simulators.base import Failure, Printed, Result, no_output, not_made, tail
+from calib.models.simulators.base import Failure, Given, Printed, no_output, not_made, tail
 from calib.models.simulators.child import of_surroundings
 from calib.models.simulators.exchange import filled, input_csv, input_json, output_of_text
 from calib.models.simulators.process import call_function, run_program
@@ -40,21 +40,30 @@ class CallableWay:
         The outputs.
     limit : float, optional
         Seconds for a run, which is then made in a process of its own; without one, in this.
+
+    Attributes
+    ----------
+    identity : str
+        What the function was when this was made: what it counts or remembers changes as it runs.
+    unshared : str
+        Why it cannot be told from others, so that its runs are not shared; empty if it can.
     """
 
     function: Callable[[Array, Mapping[str, Array]], Any]
     columns: tuple[str, ...]
     batched: bool = True
     limit: float | None = None
+    identity: str = field(init=False, repr=False, compare=False)
+    unshared: str = field(init=False, repr=False, compare=False)
 
-    @property
-    def identity(self) -> str:
-        """The function's name and source."""
+    def __post_init__(self) -> None:
+        unshared = ""
         try:
-            source = inspect.getsource(self.function)
-        except (OSError, TypeError):
-            source = repr(self.function)
-        return f"callable {getattr(self.function, '__qualname__', '')} {self.batched}\n{source}"
+            what = fingerprint(self.function)
+        except ValueError as error:
+            what, unshared = uuid4().hex, str(error)
+        object.__setattr__(self, "identity", f"callable {self.batched} {what}")
+        object.__setattr__(self, "unshared", unshared)
 
     @property
     def key(self) -> str:
@@ -66,7 +75,7 @@ class CallableWay:
         """Always."""
         return True
 
-    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Call it for one parameter vector."""
         theta = np.array(list(parameters.values()))
         arguments = (theta[None] if self.batched else theta, conditions)
@@ -75,9 +84,7 @@ class CallableWay:
                 found = call(self.function, *arguments)
             else:
                 found = call_function(self.function, arguments, self.limit)
-            if isinstance(found, Failure):
-                return found
-            return {name: values.ravel() for name, values in self._named(found).items()}
+            return found if isinstance(found, Failure) else self._named(found)
         except CalibError:
             raise
         except (Exception, SystemExit) as error:
@@ -85,7 +92,7 @@ class CallableWay:
                 raise not_made(f"{type(error).__name__}: {error}") from error
             return Failure("error", f"{type(error).__name__}: {error}")
 
-    def call(self, theta: Array, conditions: Mapping[str, Array]) -> dict[str, Array]:
+    def call(self, theta: Array, conditions: Mapping[str, Array]) -> Mapping[str, Any]:
         """Call it here and now, and name what it returns."""
         return self._named(call(self.function, theta, conditions))
 
@@ -95,7 +102,9 @@ class CallableWay:
         called = getattr(self.function, "__qualname__", repr(self.function))
         return ", ".join(filter(None, (declared_in(self.function), f"function {called}")))
 
-    def _named(self, found: Any) -> dict[str, Array]:
+    def _named(self, found: Any) -> Mapping[str, Any]:
+        if hasattr(found, "columns") and not hasattr(found, "dims"):  # a table, not an array
+            found = {str(column): found[column] for column in found.columns}
         if not isinstance(found, Mapping):
             found = dict.fromkeys(self.columns[:1], found)
         missing = [column for column in self.columns if column not in found]
@@ -107,7 +116,7 @@ class CallableWay:
                 allowed=", ".join(self.columns),
                 mend="return a mapping with these names, or rename the outputs declared",
             )
-        return {name: np.asarray(v, dtype=np.float64) for name, v in found.items()}
+        return found
 
 
 @dataclass(frozen=True)
@@ -142,9 +151,9 @@ class CommandWay:
 
     @property
     def identity(self) -> str:
-        """The command, the formats, and the content of the files that it names."""
+        """The command, the formats, and what is in the files that it names and they import."""
         named = [self._found(a) for a in self.arguments]
-        files = [hashlib.sha256(p.read_bytes()).hexdigest() if p else "" for p in named]
+        files = [content_of(p) if p else "" for p in named]
         what = [self.arguments, files, self.takes, self.template, self.gives]
         return json.dumps(["command", *what, dict(self.patterns), self.each_row])
 
@@ -175,7 +184,7 @@ class CommandWay:
         except (OSError, RuntimeError):  # a text too long for a name, a link to itself
             return None
 
-    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Run it once, or once for each row."""
         if not self.each_row:
             return self._one(parameters, conditions)
@@ -186,7 +195,7 @@ class CommandWay:
                 return Failure(one.kind, f"row {i} of the conditions: {one.reason}", one.printed)
             found.append(one)
         common = set(found[0]).intersection(*found)
-        outputs = {name: np.concatenate([one[name] for one in found]) for name in common}
+        outputs = {name: [one[name] for one in found] for name in common}
         return Printed(outputs, found[-1].printed)
 
     def _one(
@@ -271,6 +280,6 @@ class TableWay:
         """Never."""
         return False
 
-    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Result:
+    def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Refuse: there is nothing to carry out."""
         return Failure("error", "there are the runs of the table and no others")
