@@ -84,8 +84,9 @@ def run_file(path: Path, what: str) -> ModuleType:
 def _forget(path: Path) -> None:
     """Have modules of a file's own folder run anew when they are imported next."""
     files = own_files(path)
+    names = [str(file) for file in files]
     for name, module in list(sys.modules.items()):
-        if getattr(module, "__file__", None) in map(str, files):
+        if getattr(module, "__file__", None) in names:
             del sys.modules[name]
     for file in files:
         # Compiled code is told from that of another text by the size and the second alone.

@@ -116,7 +116,7 @@ def _named(root: Path, parts: list[str]) -> Iterator[Path]:
         yield from (file.resolve() for file in there if file.is_file())
 
 
-class _Fingerprint(pickle._Pickler):  # type: ignore[name-defined,misc]
+class _Fingerprint(pickle._Pickler):
     """Pickles into a hash: functions and classes by what they are, not by their names.
 
     It is the pickler in Python, as that in C asks nobody about sets, whose order is the process's.
@@ -144,7 +144,9 @@ class _Fingerprint(pickle._Pickler):  # type: ignore[name-defined,misc]
         if isinstance(value, ModuleType):
             self._note(getattr(value, "__file__", None))
             return repr, (value.__name__,)
-        return repr, ((self._of_class if isinstance(value, type) else self._of_function)(value),)
+        if isinstance(value, type):
+            return repr, (self._of_class(value),)
+        return repr, (self._of_function(value),)
 
     def _of_class(self, value: type) -> tuple[Any, ...]:
         module = sys.modules.get(value.__module__)

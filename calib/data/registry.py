@@ -2,11 +2,52 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import FunctionType
 from typing import Protocol
 
-from calib.batch.plugins import PLUGINS, load_installed
+from calib.batch.plugins import PLUGINS, declared_in, load_installed
+from calib.batch.sources import fingerprint
 from calib.errors import CalibError
+
+
+def run_again(known: Sequence[FunctionType], new: Sequence[FunctionType]) -> bool:
+    """Whether functions of a user's own are others of the same code, run again.
+
+    In a notebook what was declared may be declared anew; in a file only where all of it is run
+    again, for there one name may have been given to two things.
+    """
+    places = [[(declared_in(f), f.__qualname__) for f in functions] for functions in (known, new)]
+    if not new or places[0] != places[1]:
+        return False
+    return _interactive() or all(
+        a.__globals__ is not b.__globals__ for a, b in zip(known, new, strict=True)
+    )
+
+
+def _functions(declared: object) -> list[FunctionType]:
+    found = vars(declared).values()
+    return [v for v in found if isinstance(v, FunctionType) and declared_in(v)]
+
+
+def _says_the_same(known: object, new: object) -> bool:
+    """Whether two declarations are equal, their functions by what they do."""
+    if not (_functions(new) or _interactive()):
+        return False
+    # What a model is evaluated by holds the model itself.
+    told = [
+        {k: v for k, v in vars(d).items() if getattr(v, "model", None) is not d}
+        for d in (known, new)
+    ]
+    try:
+        return type(known) is type(new) and fingerprint(told[0]) == fingerprint(told[1])
+    except ValueError:
+        return False
+
+
+def _interactive() -> bool:
+    return not hasattr(sys.modules["__main__"], "__file__")
 
 
 class _Declared(Protocol):
@@ -42,16 +83,27 @@ class Registry[T](Mapping[str, T]):
         for one in declared:
             self.add(one)
 
-    def add(self, declared: T) -> None:
-        """Add a declaration; a CalibError if another one has its name."""
-        name = self._key(declared)
+    def add(self, *declared: T) -> None:
+        """Add declarations, all or none; a CalibError if another one has the name of one.
+
+        One that says the same as before is not added again. Where the code that declared it is run
+        again, as a cell of a notebook is, the new one takes its place.
+        """
+        new: dict[str, T] = {}
+        for one in declared:
+            name = self._key(one)
+            known = self._known.get(name, new.get(name))
+            if known is None or run_again(_functions(known), _functions(one)):
+                new[name] = one
+            elif known is not one and not _says_the_same(known, one):
+                raise CalibError(
+                    f"there is a {self._what} {name!r} already",
+                    allowed=f"a name other than {', '.join(self._known)}",
+                    mend=f"give the new {self._what} another name; if it is to take the place of "
+                    "the other, start Python again",
+                )
+        self._known |= new
         self.version += 1
-        if self._known.setdefault(name, declared) is not declared:
-            raise CalibError(
-                f"there is a {self._what} {name!r} already",
-                allowed=f"a name other than {', '.join(self._known)}",
-                mend=f"give the new {self._what} another name",
-            )
 
     def discard(self, name: str) -> None:
         """Forget a declaration, if there is one of this name."""

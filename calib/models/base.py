@@ -313,7 +313,7 @@ class Model:
         Raises
         ------
         CalibError
-            If its declaration does not hold together, or the name is taken.
+            If its declaration does not hold together, or another model has its name.
         """
         from calib.models import MODELS
         from calib.models.declared import check_model

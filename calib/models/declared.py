@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 
 from calib.data.documents import MEND_TOML
@@ -14,6 +15,8 @@ if TYPE_CHECKING:
     from calib.models.base import Model
 
 _ONE = "dimensionless"
+# Those of variables in `calib.inference.netcdf`.
+DIMENSIONS = dict.fromkeys(("chain", "draw", "row"), "a dimension of the files of draws")
 
 
 def check_tuple(attribute: str, given: object, where: str) -> None:
@@ -58,6 +61,36 @@ def check_word(name: object, what: str, where: str) -> None:
         )  # fmt: skip
 
 
+def check_names(taken: Mapping[str, str], given: Mapping[str, Iterable[str]], where: str) -> None:
+    """Check that each name is that of one thing: files know things by their names.
+
+    Parameters
+    ----------
+    taken : mapping of str to str
+        Names that are those of something else, and what that is.
+    given : mapping of str to iterable of str
+        Names by what they are those of.
+
+    Raises
+    ------
+    CalibError
+        If a name is there twice.
+    """
+    known = dict(taken)
+    for what, names in given.items():
+        for name in names:
+            if name in known:
+                twice = known[name] == f"the {what} {name}"
+                raise CalibError(
+                    f"the {what} {name} is there twice" if twice
+                    else f"the {what} {name} has the name of {known[name]}",
+                    where=where, allowed="a name for each parameter, condition and output that "
+                    f"nothing else has: not {', '.join(taken)}",
+                    mend="rename one of them",
+                )  # fmt: skip
+            known[name] = f"the {what} {name}"
+
+
 def check_model(model: Model) -> None:
     """Check a declaration.
 
@@ -90,12 +123,12 @@ def check_model(model: Model) -> None:
             mend="name at least one of each",
         )  # fmt: skip
     names = (*model.parameters, "sigma")
-    twice = sorted({n for n in names if names.count(n) > 1})
-    if twice:
-        raise CalibError(
-            f"the parameter {twice[0]} is there twice", where=where,
-            allowed="each name once; sigma is the noise's", mend="rename one of them",
-        )  # fmt: skip
+    derived = [name for name in model.reported if name not in model.parameters]
+    check_names(
+        DIMENSIONS | {"sigma": "the noise"},
+        {"parameter": names[:-1], "published parameter": derived, "condition": model.conditions,
+         "output": [model.output]}, where,
+    )  # fmt: skip
     if not model.priors:
         raise CalibError(
             "the model has no priors", where=where,

@@ -19,6 +19,7 @@ from calib.inference.emulation.tabulated import emulate_table
 from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
 from calib.models import get_model
+from calib.models.simulators.base import FAILED
 from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.emulator.files import save_emulator
 from calib.models.simulators.emulator.model import emulator_of
@@ -209,7 +210,7 @@ def write_failed(failed: Sequence[Run], parameters: Sequence[str], path: Path) -
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*parameters, "kind", "reason", "printed"])
+        writer.writerow([*parameters, *FAILED])
         for run in failed:
             if run.failure is not None:
                 what = run.failure.kind, run.failure.reason, run.failure.printed.strip()

@@ -26,6 +26,8 @@ type Values = Mapping[str, Array]
 # Outputs by the simulator's own names as it gave them, which may be anything.
 type Found = Mapping[str, Any]
 
+# Columns of the list of failed runs beside those of their parameters.
+FAILED = ("kind", "reason", "printed")
 # Of what a failed run printed, so many characters are kept.
 _TAIL = 600
 # The key of a simulator file that a failed run has to do with, if not the one that says how it is
@@ -171,7 +173,7 @@ class Simulator:
     @property
     def takes(self) -> tuple[str, ...]:
         """Canonical columns of its conditions."""
-        return tuple(self.canonical(header) for header in self.conditions.values())
+        return tuple(dict.fromkeys(map(self.canonical, self.conditions.values())))
 
     def run(self, theta: Array, conditions: Mapping[str, Array]) -> Result:
         """Carry out one run, tried again where it fails.

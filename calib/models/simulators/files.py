@@ -75,11 +75,8 @@ class SimulatorFile(BaseModel):
 def register_file(path: Path) -> Simulated:
     """Read a simulator file (see `read_simulator`) and make its models known, once."""
     found = read_simulator(path)
-    known = SIMULATED.get(found.name)
-    if known is not None and known.simulator.digest == found.simulator.digest:
-        return known
     found.register()
-    return found
+    return SIMULATED[found.name]
 
 
 def read_simulator(path: Path) -> Simulated:

@@ -9,17 +9,19 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
 
 from calib.data.documents import MEND_TOML
 from calib.data.headers import parse_header
-from calib.data.registry import Registry
+from calib.data.registry import Registry, run_again
 from calib.errors import CalibError
+from calib.models import MODELS
 from calib.models.base import Array, Conditions, Model
-from calib.models.declared import check_word
-from calib.models.simulators.base import Failure, Output, Simulator
+from calib.models.declared import DIMENSIONS, check_model, check_names, check_word
+from calib.models.simulators.base import FAILED, Failure, Output, Simulator
 from calib.models.simulators.refused import FROM_THE_START, fail_alike, without_value
 from calib.models.simulators.runs import Run
 from calib.models.simulators.ways import CallableWay
@@ -57,16 +59,35 @@ class Simulated:
         return tuple(model.name for model in models_of(self.simulator))
 
     def register(self) -> None:
-        """Make the simulator and its models known.
+        """Make the simulator and its models known; nothing is done where they are already.
 
         Raises
         ------
         CalibError
-            If a declaration does not hold together, or a name is taken.
+            If a declaration does not hold together, or something else has its name.
         """
-        for model in models_of(self.simulator):
-            model.register()
+        models, known = models_of(self.simulator), SIMULATED.get(self.name)
+        for model in models:
+            check_model(model)
+        if known is not None:
+            if self._content == known._content:
+                return
+            if run_again(known._functions, self._functions):
+                SIMULATED.discard(self.name)
+                for name in known.models:
+                    MODELS.discard(name)
+        MODELS.add(*models)
         SIMULATED.add(self)
+
+    @property
+    def _content(self) -> tuple[object, ...]:
+        told = {k: v for k, v in vars(self.simulator).items() if k != "way"}
+        return self.simulator.digest, told, self.folder, self.budget
+
+    @property
+    def _functions(self) -> list[FunctionType]:
+        found = getattr(self.simulator.way, "function", None)
+        return [found] if isinstance(found, FunctionType) else []
 
 
 SIMULATED: Registry[Simulated] = Registry("simulator", lambda one: one.name)
@@ -276,6 +297,11 @@ def declare(
         for own, header in outputs.items()
     )
     parameters = tuple(t for t in tables if t not in sigmas.values())
+    check_names(
+        {"sigma": "the noise"} | {f"sigma_{own}": f"the noise of {own}" for own in outputs},
+        {"parameter": parameters, "condition": conditions, "output": outputs},
+        f"simulator {name}",
+    )
     text = "\n".join(tables[t] for t in parameters)
     simulator = Simulator(name, way, parameters, text, conditions, declared, **details)
     for key, table in (("conditions", conditions), ("outputs", outputs)):
@@ -287,6 +313,12 @@ def declare(
                     error.message, where=f"simulator {name}, {key}.{own}", allowed=error.allowed,
                     mend=error.mend,
                 ) from None  # fmt: skip
+    check_names(
+        DIMENSIONS | dict.fromkeys(FAILED, "a column of the list of failed runs"),
+        {"parameter": parameters, "column of a condition": simulator.takes,
+         "column of an output": [simulator.canonical(header) for header in outputs.values()]},
+        f"simulator {name}",
+    )  # fmt: skip
     return Simulated(simulator, folder, budget)
 
 

@@ -103,20 +103,21 @@ class CallableWay:
         return ", ".join(filter(None, (declared_in(self.function), f"function {called}")))
 
     def _named(self, found: Any) -> Mapping[str, Any]:
-        if hasattr(found, "columns") and not hasattr(found, "dims"):  # a table, not an array
-            found = {str(column): found[column] for column in found.columns}
-        if not isinstance(found, Mapping):
-            found = dict.fromkeys(self.columns[:1], found)
-        missing = [column for column in self.columns if column not in found]
+        named: Mapping[str, Any] = dict.fromkeys(self.columns[:1], found)
+        if isinstance(found, Mapping):
+            named = found
+        elif hasattr(found, "columns") and not hasattr(found, "dims"):  # a table, not an array
+            named = {str(column): found[column] for column in found.columns}
+        missing = [column for column in self.columns if column not in named]
         if missing:
             # No fault of the parameters: the next run would not give it either.
             raise CalibError(
-                no_output(missing[0], found),
+                no_output(missing[0], named),
                 where=self._place,
                 allowed=", ".join(self.columns),
                 mend="return a mapping with these names, or rename the outputs declared",
             )
-        return found
+        return named
 
 
 @dataclass(frozen=True)

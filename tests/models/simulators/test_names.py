@@ -1,0 +1,115 @@
+"""A name is that of one thing, or is refused before any work, with file and key."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import calib
+from calib.errors import CalibError
+from calib.models import MODELS
+from calib.models.simulators.files import read_simulator
+from calib.models.simulators.registered import SIMULATED
+from tests.models.simulators.examples import PRIORS, pull, write_program
+from tests.registered import forgotten
+
+
+@pytest.fixture(autouse=True)
+def as_before() -> Iterator[None]:
+    """Forget what a test registers."""
+    with forgotten(MODELS, SIMULATED):
+        yield
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("[parameters.mu]", "[parameters.s]", "the condition s has the name of the parameter s"),
+        ("[parameters.mu]", "[parameters.pull]", "the output pull has the name of the parameter"),
+        ("s = ", "pull = ", "the output pull has the name of the condition pull"),
+        ("s = ", "sigma = ", "the condition sigma has the name of the noise"),
+        ("[parameters.mu]", "[parameters.sigma_pull]", "has the name of the noise of pull"),
+        ("[parameters.mu]", "[parameters.chain]", "a dimension of the files of draws"),
+        ("[parameters.mu]", "[parameters.draw]", "a dimension of the files of draws"),
+        ("[parameters.mu]", "[parameters.row]", "a dimension of the files of draws"),
+        ("[parameters.mu]", "[parameters.kind]", "a column of the list of failed runs"),
+        ("[parameters.mu]", "[parameters.slip_ratio]", "has the name of the parameter slip_ratio"),
+        ("[parameters.mu]", "[parameters.drawbar_pull_kn]", "the name of the parameter drawbar"),
+        ('"normal_load_kn"', '"drawbar_pull_lbf"', "the name of the column of a condition drawbar"),
+    ],
+)
+def test_two_things_of_one_name_are_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
+    file = write_program(tmp_path)
+    text = file.read_text()
+    assert text.count(old) == 1
+    file.write_text(text.replace(old, new))
+    with pytest.raises(CalibError, match=words) as refused:
+        read_simulator(file)
+    for word in ("wheel.toml, simulator wheel", "to mend: rename"):
+        assert word in str(refused.value)
+
+
+def test_a_quantity_that_two_outputs_give_is_refused() -> None:
+    noise = PRIORS[PRIORS.index("[parameters.sigma]") :]
+    priors = PRIORS.replace(noise, "") + "".join(
+        noise.replace(".sigma]", f".sigma_{name}]") for name in ("front", "rear")
+    )
+    with pytest.raises(CalibError, match="column of an output drawbar_pull_kn is there twice"):
+        calib.from_callable(
+            pull, parameters=priors, conditions=["slip_ratio", "normal_load_kn"],
+            output={"front": "drawbar_pull_n", "rear": "drawbar_pull_kn"},
+        )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["chain", "draw", "row", "sigma", "slip_ratio", "drawbar_pull_kn"])
+@pytest.mark.parametrize("reported", [True, False])
+def test_a_parameter_of_a_model_has_a_name_of_its_own(name: str, reported: bool) -> None:
+    if name == "sigma" and not reported:
+        pytest.skip("the priors have the same table twice, which is no TOML")
+    own = "mu" if reported else name
+    model = calib.Model(
+        name="wheel", title="", output="drawbar_pull_kn", conditions=("slip_ratio",),
+        parameters=(own, "s0"), predict=pull, priors=PRIORS.replace(".mu]", f".{own}]"),
+        reported={name: "1"} if reported else {},
+    )  # fmt: skip
+    with pytest.raises(CalibError, match=rf"{name} has the name of|{name} is there twice"):
+        calib.register(model)
+    assert "wheel" not in MODELS
+
+
+def test_a_model_of_a_file_is_refused_with_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "import calib\nfrom tests.models.simulators.examples import PRIORS, pull\n"
+        "calib.register(calib.Model(name='wheel', title='', output='drawbar_pull_kn',\n"
+        "    conditions=('slip_ratio',), parameters=('chain', 's0'), predict=pull,\n"
+        "    priors=PRIORS.replace('.mu]', '.chain]')))\n"
+    )
+    from calib.batch.plugins import load_files
+
+    with pytest.raises(CalibError, match="chain has the name of a dimension") as refused:
+        load_files([path])
+    assert "mine.py" in str(refused.value)
+
+
+def test_registering_is_all_or_nothing() -> None:
+    """Of two outputs the second model's name is taken."""
+    noise = PRIORS[PRIORS.index("[parameters.sigma]") :]
+    priors = PRIORS.replace(noise, "") + "".join(
+        noise.replace(".sigma]", f".sigma_{name}]") for name in ("pull", "rut")
+    )
+    given = {"parameters": PRIORS, "conditions": ["slip_ratio", "normal_load_kn"]}
+    calib.register(calib.from_callable(
+        pull, output="drawbar_pull_kn", name="both_rut_depth", **given,  # type: ignore[arg-type]
+    ))  # fmt: skip
+    priors = priors.replace('"kN"', '"1"').replace('"1"', '"kN"', 3).replace('"kN"', '"1"', 2)
+    both = calib.from_callable(
+        pull, output={"pull": "drawbar_pull_kn", "rut": "rut_depth_mm"}, name="both",
+        **given | {"parameters": priors},  # type: ignore[arg-type]
+    )  # fmt: skip
+    with pytest.raises(CalibError, match="'both_rut_depth' already"):
+        calib.register(both)
+    assert "both_drawbar_pull" not in MODELS
+    assert "both" not in SIMULATED
