@@ -139,7 +139,9 @@ def _cell(text: Any) -> Any:
 def _compared(file: str, first: str = "", *more: str) -> bool:
     if file == MANIFEST and first == "tasks":
         return more[-1] not in _OF_FILES
-    return file not in (MANIFEST, RUN, COMPARISON) or first not in _OWN
+    # A run's verdict is on rows that were held out as well, which it does not keep.
+    own = (*_OWN, "verdict") if file == RUN else _OWN
+    return file not in (MANIFEST, RUN, COMPARISON) or first not in own
 
 
 def count_drawn(made: Path) -> int:

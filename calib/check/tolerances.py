@@ -115,7 +115,8 @@ TABLE: tuple[tuple[str, Tolerance], ...] = (
     # What is read off differences of models is held against their rows (check_comparison); of two
     # models much alike either may take all the weight.
     (f"({_M}/(validation/(refitted|refits_not_converged)|noise/against_normal/preferred)(|/*)|"
-     f"comparison.json/verdict|{_COMPARED}/(weight|told_apart|refitted_rows|refits_not_converged)|"
+     f"comparison.json/verdict|{_COMPARED}/verdict/*|"
+     f"{_COMPARED}/(weight|told_apart|refitted_rows|refits_not_converged)|"
      f"{_FOUND}/(regions|next_measurement|remainder/where)*|audit.json/findings/genetic_joint/"
      "found*)", _EITHER),
     # Gaps: of 1200 draws, with seven Monte Carlo errors of a difference (of an end of a 90 % band

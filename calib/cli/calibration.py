@@ -56,7 +56,7 @@ def report(
     from dataclasses import replace
 
     from calib import SamplerSettings, read_table
-    from calib.cli.display import progress_bars
+    from calib.cli.display import progress_bars, tell_compared, tell_verdict
     from calib.cli.simulators import say
     from calib.data.labels import labelled
     from calib.data.quantities import OUTPUTS
@@ -64,6 +64,7 @@ def report(
     from calib.inference.prior_files import prior_file_model
     from calib.report.sections import EmulatorSection, work_out
     from calib.report.study_tasks import HoldOut, fitted_rows, plan_tasks
+    from calib.report.verdict import judge_evidence
     from calib.report.writer import write_report
 
     if files:
@@ -118,22 +119,26 @@ def report(
             overwrite=overwrite, posteriors=posteriors, pdf=pdf, drawn=found.drawn, progress=tell,
             pool=side,
         )  # fmt: skip
+    verdicts = {}
     for key, result in study.successes.items():
         ninety = result.validation.scores.coverage[0.9]
         state = "converged" if result.calibration.converged else "NOT CONVERGED"
+        fails = made.get(result.task.model, {}).get("reasons", ())
+        verdicts[key] = judge_evidence(replace(result.evidence, emulator_fails=fails))
         print(f"{key}: {state}; 90 % band covers {ninety.hits} of {ninety.n} rows not fitted")
-        for warning in result.warnings:
-            print(f"warning: {warning}", file=sys.stderr)
+        tell_verdict(verdicts[key], f"{key}: ")
     for key, failure in study.failures.items():
         print(f"{key}: FAILED: {failure.error}", file=sys.stderr)
     print(page)
     converged = all(r.calibration.converged for r in study.successes.values())
     for section in found.found:
         if section.name == "comparison":
+            tell_compared(section.record())
             print(section.record()["verdict"])
             converged &= bool(section.record()["converged"])
     code = 1 if study.failures else 0 if converged and all(good) else 3
-    finish(code, out / "summary.json", folder=str(out))
+    told = {key: found.document() for key, found in verdicts.items()}
+    finish(code, out / "summary.json", folder=str(out), verdicts=told)
 
 
 def fit(
@@ -156,19 +161,18 @@ def fit(
     from functools import partial
 
     from calib import SamplerSettings, build_problem, calibrate, estimate, save_calibration
-    from calib import validate_held_out as validate
     from calib.batch.folders import claimed, fresh_folder
     from calib.batch.unfinished import keep
-    from calib.cli.display import posterior_table, progress_bars, verdict_line
+    from calib.cli.display import posterior_table, progress_bars, tell_verdict, verdict_line
     from calib.cli.simulators import say, say_failed
     from calib.inference.emulation.prepared import prepare
     from calib.inference.random import generator
     from calib.models import get_model
     from calib.report.numbers import format_number
     from calib.report.study_tasks import HoldOut, read_and_split
-    from calib.report.verdict import prior_conflict
-    from calib.validation.assumptions import warnings_of
+    from calib.report.verdict import keep_verdict, validated, verdict
     from calib.validation.noise_preference import noise_preference
+    from calib.validation.validate import PARETO_K_MAX
 
     chosen = get_model(model)
     ctx.with_resource(claimed(out, overwrite=overwrite))
@@ -199,28 +203,33 @@ def fit(
     say_failed(model)
     if preference is not None:
         print(preference.sentence)
-    mode, draws = calibration.draws.mode, calibration.draws.flat
-    told = (*warnings_of(problem, mode, draws), *prior_conflict(calibration))
+    fails = () if emulation is None else emulation.reasons
+    validation = validated(calibration, held)
+    judged = verdict(calibration, validation, emulator_fails=fails, held_out=str(kept or ""))
+    keep_verdict(judged, out)
     for note in problem.notes:
         print(f"note: {note}", file=sys.stderr)
-    for warning in told:
-        print(f"warning: {warning}", file=sys.stderr)
     found: dict[str, Any] = {
-        "folder": str(out), "notes": list(problem.notes), "warnings": list(told),
+        "folder": str(out), "notes": list(problem.notes), "warnings": list(judged.warnings),
         "posterior": {name: asdict(s) for name, s in calibration.summary.items()},
     }  # fmt: skip
     if preference is not None:
         found["preference"] = asdict(preference)
-    if held is not None:
-        scores = validate(calibration, held).scores
+    if validation is not None:
+        scores = validation.scores
         ninety = scores.coverage[0.9]
+        k = validation.pareto_k
+        rough = 0 if k is None else int((k > PARETO_K_MAX).sum())
         print(
-            f"held out ({kept}): 90 % band covers {ninety.hits} of {ninety.n}, "
-            f"RMSE {format_number(scores.rmse)}, CRPS {format_number(scores.crps)}"
+            f"{'left out one by one' if held is None else f'held out ({kept})'}: 90 % band covers "
+            f"{ninety.hits} of {ninety.n}, RMSE {format_number(scores.rmse)}, "
+            f"CRPS {format_number(scores.crps)}"
+            + (f" ({rough} of them roughly: `calib report` fits without each)" if rough else "")
         )
-        found["held_out"] = {
-            "what": str(kept), "rows": ninety.n, "covered_90": ninety.hits,
-            "rmse": scores.rmse, "crps": scores.crps,
+        found["left_out" if held is None else "held_out"] = {
+            "rows": ninety.n, "covered_90": ninety.hits, "rmse": scores.rmse, "crps": scores.crps,
+            **({} if held is None else {"what": str(kept)}),
         }  # fmt: skip
+    tell_verdict(judged)
     print(f"run folder: {out}")
     finish(0 if calibration.converged and good else 3, out / "run.json", **found)

@@ -30,7 +30,7 @@ def compare(
 
     from calib.batch.folders import claimed, fresh_folder
     from calib.batch.unfinished import drop, keep
-    from calib.cli.display import progress_bars
+    from calib.cli.display import progress_bars, tell_compared
     from calib.cli.simulators import say
     from calib.inference.emulation.prepared import prepare
     from calib.inference.prior_files import prior_file_model
@@ -62,12 +62,17 @@ def compare(
             fitted, models, seed, held_out=held, priors=given,
             settings=SamplerSettings(max_steps=max_steps), progress=tell, workers=workers,
         )  # fmt: skip
-    write = partial(write_comparison, found, command=opt.command(), hold_out=hold_out or "")
+    fails = {name: e.reasons for name, e in emulations.items() if e is not None}
+    write = partial(
+        write_comparison, found, command=opt.command(), hold_out=hold_out or "",
+        emulator_fails=fails,
+    )  # fmt: skip
     drop()
     keep("comparison", write)
     good = [say(name, emulation) for name, emulation in emulations.items()]
     with fresh_folder(out, overwrite=overwrite) as folder:
         written = write(folder)
+    tell_compared(written)
     print(text(written))
     print(out / "index.html")
     finish(0 if found.sound and all(good) else 3, written, folder=str(out))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from calib.report.numbers import centre_text, interval_text
 
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from calib.inference.calibration import Calibration
+    from calib.report.verdict import Verdict
 
 _log = logging.getLogger("calib")
 
@@ -93,20 +94,39 @@ def posterior_table(calibration: Calibration) -> None:
     from rich.console import Console
     from rich.table import Table as RichTable
 
+    from calib.validation.assumptions import parameter_remarks
+
     model = calibration.problem.bound.model
     table = RichTable(title=f"{model.name}: posterior of {len(calibration.problem.table)} rows")
     words, numbers = ("parameter", "unit"), ("mean ± sd or median", "95 % HDI", "ESS bulk/tail")
     for heading in (*words, *numbers, "R-hat", "remark"):
         table.add_column(heading, justify="left" if heading in (*words, "remark") else "right")
+    remarks = parameter_remarks(calibration)
     for s in calibration.summary.values():
         table.add_row(
             s.name, s.unit, centre_text(s),
             interval_text(s), f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}",
-            f"{s.rhat:.3f}", "set by the prior" if s.sd_ratio > 0.9 else "",
+            f"{s.rhat:.3f}", remarks.get(s.name, ""),
         )  # fmt: skip
     # A pipe has no width of its own: wide enough for whole rows.
     width = None if sys.stdout.isatty() else 120
     Console(width=width).print(table)
+
+
+def tell_verdict(found: Verdict, of: str = "") -> None:
+    """Print a verdict, the warnings behind it first."""
+    for warning in found.warnings:
+        print(f"warning: {of}{warning}", file=sys.stderr)
+    for line in found.lines:
+        print(f"{of}{line}")
+
+
+def tell_compared(found: Mapping[str, Any]) -> None:
+    """Print the verdict on each model of a comparison, as `comparison.json` has it."""
+    from calib.report.verdict import Verdict
+
+    for name, model in found["models"].items():
+        tell_verdict(Verdict.of(model["verdict"]), f"{name}: ")
 
 
 def verdict_line(calibration: Calibration) -> str:

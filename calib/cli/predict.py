@@ -50,6 +50,7 @@ def predict(
     from calib.data import read_for_model
     from calib.data.units_check import beyond_notes, check_conditions
     from calib.models.simulators.emulator.model import emulator_of
+    from calib.report.comparison import load_stack, verdicts_of
     from calib.validation.prediction import MIN_DEFINED, predict_stacked, prediction_columns
     from calib.validation.prediction import predict as predict_at
 
@@ -65,8 +66,6 @@ def predict(
             mend="correct its name, or leave --effects and --without out",
         )  # fmt: skip
     if (run / "comparison.json").exists():
-        from calib.report.comparison import load_stack
-
         found, parts = load_stack(run)
         converged = bool(found["converged"])
     else:
@@ -75,10 +74,20 @@ def predict(
     if not converged:
         print("calib: this calibration did not converge; its bands are not to be used",
               file=sys.stderr)  # fmt: skip
+    kept = verdicts_of(run)
+    names = [c.problem.bound.model.name if len(parts) > 1 else "" for _, c in parts]
     used = dict.fromkeys(n for _, c in parts for n in c.problem.bound.model.conditions)
     table = read_for_model(at, tuple(used))
     known = {n: v for _, c in parts for n, v in c.problem.conditions.items()}
     check_conditions(table, known)
+    doubts = list(dict.fromkeys(
+        f"{name}: {doubt}" if name else doubt
+        for name, (_, c) in zip(names, parts, strict=True)
+        if (found_of := kept.get(name or c.problem.bound.model.name, kept.get(""))) is not None
+        for doubt in found_of.for_rows(table.columns)
+    ))  # fmt: skip
+    for doubt in doubts:
+        print(f"calib: {doubt}", file=sys.stderr)
     prediction = (
         predict_at(parts[0][1], table) if len(parts) == 1 else predict_stacked(parts, table)
     )
@@ -100,7 +109,9 @@ def predict(
         )  # fmt: skip
         print(f"calib: no value (nan) at {undefined} of {len(table)} rows{why}", file=sys.stderr)
     _give(columns, out)
-    finish(0 if converged else 3, {"columns": _lists(columns)}, outside=outside)
+    finish(
+        0 if converged else 3, {"columns": _lists(columns)}, outside=outside, doubts=doubts
+    )  # fmt: skip
 
 
 def _must_be_ours(out: Path, at: Path, overwrite: bool) -> None:

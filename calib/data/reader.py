@@ -6,7 +6,7 @@ import hashlib
 import logging
 import os
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import batched, islice
 from typing import Any
 
@@ -88,7 +88,7 @@ def read_table(
     _log.debug("%s: %d rows of %s", file.source, len(parts.lines), ", ".join(values))
     return Table(
         values, file.source, np.array(parts.lines), file.header, tuple(parts.text), file.sha256,
-        label, ignored,
+        label, ignored, _cells(file.header, parts.text, ignored),
     )  # fmt: skip
 
 
@@ -256,7 +256,18 @@ def table_from_arrays(
             check_codes(column, done[name], rows, problems, missing_ok=missing_ok)
     problems.raise_any()
     text = _texts(arrays, n) if n <= MAX_TEXT_ROWS else ()
-    return Table(done, source, rows, tuple(arrays), text, _sha256(done), label, ignored)
+    return Table(
+        done, source, rows, tuple(arrays), text, _sha256(done), label, ignored,
+        _cells(tuple(arrays), text, ignored),
+    )  # fmt: skip
+
+
+def _cells(
+    header: Sequence[str], text: Sequence[Sequence[str]], names: Iterable[str]
+) -> dict[str, tuple[str, ...]]:
+    """Return the cells of some columns."""
+    at = {name: header.index(name) for name in names if text}
+    return {name: tuple(row[i] for row in text) for name, i in at.items()}
 
 
 def _common_length(arrays: Mapping[str, NDArray[Any]], source: str) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 
@@ -40,6 +40,8 @@ class Table:
         What to call the data wherever they are shown, such as ``"reconstructed"``.
     ignored : tuple of str
         Column names that name no known quantity.
+    extra : mapping of str to tuple of str
+        The cells of these; empty where `text` is.
     """
 
     columns: Mapping[str, NDArray[np.float64]]
@@ -50,6 +52,7 @@ class Table:
     sha256: str
     label: str = ""
     ignored: tuple[str, ...] = ()
+    extra: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         frozen = {name: np.array(values, dtype=np.float64) for name, values in self.columns.items()}
@@ -63,7 +66,7 @@ class Table:
         # A mapping proxy does not pickle, and worker processes are handed tables.
         return Table, (
             dict(self.columns), self.source, self.lines, self.header, self.text, self.sha256,
-            self.label, self.ignored,
+            self.label, self.ignored, self.extra,
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -112,6 +115,10 @@ class Table:
         sure = {name for name, column in self._headers.items() if column.checked}
         return {f"{n} {CHECKED}" if n in sure else n: v for n, v in columns.items()}
 
+    def whole(self) -> dict[str, NDArray[np.float64] | tuple[str, ...]]:
+        """Return all columns under the headers to write them with, those of no known name too."""
+        return {**self.to_write(self.columns), **self.extra}
+
     def as_in_file(self, columns: Mapping[str, ArrayLike]) -> dict[str, ArrayLike]:
         """Return columns of this table, by canonical name, with its file's headers and units.
 
@@ -141,6 +148,7 @@ class Table:
             columns={name: values[index] for name, values in self.columns.items()},
             lines=self.lines[index],
             text=tuple(self.text[i] for i in index) if self.text else (),
+            extra={name: tuple(cells[i] for i in index) for name, cells in self.extra.items()},
         )
 
 

@@ -190,7 +190,10 @@ def save_calibration(
     problem = calibration.problem
     write_netcdf(groups_of(calibration), folder / "posterior.nc")
     (folder / "priors.toml").write_text(problem.priors.text, encoding="utf-8")
-    write_table(folder / "data.csv", problem.table.to_write(problem.table.columns))
+    write_table(
+        folder / "data.csv",
+        {**problem.table.to_write(problem.table.columns), **problem.table.extra},
+    )
     hashed = [*_HASHED]
     emulator = emulator_of(problem.bound.model)
     if emulator is not None:

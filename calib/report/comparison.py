@@ -27,6 +27,7 @@ from calib.report.figures.style import BLACK, BLUE, legend_below, panels, png_by
 from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
 from calib.report.page.template import data_uri, template
+from calib.report.verdict import Verdict, keep_verdict, kept_verdict, verdict
 from calib.report.writer import file_hashes, own_names
 from calib.validation.comparison import Candidate, Comparison, difference, sentence
 from calib.validation.prediction import N_DRAWS
@@ -186,11 +187,17 @@ class ComparisonRecord(Record):
         )
 
 
-def document(comparison: Comparison, hold_out: str = "") -> dict[str, Any]:
+def document(
+    comparison: Comparison,
+    hold_out: str = "",
+    emulator_fails: Mapping[str, Sequence[str]] | None = None,
+) -> dict[str, Any]:
     """Return every number of a comparison as plain dictionaries.
 
-    What was held out is said in words. Differences are from the first model.
+    What was held out is said in words, and by model why its emulator is not good enough.
+    Differences are from the first model.
     """
+    fails = emulator_fails or {}
     candidates = {c.model: c for c in comparison.candidates}
     first = comparison.candidates[0].calibration.problem.table
     stated = stated_of_rows(
@@ -204,7 +211,20 @@ def document(comparison: Comparison, hold_out: str = "") -> dict[str, Any]:
         "held_out": hold_out,
         "converged": comparison.sound,
         **stated,
-        "models": {name: {**m, **_model(candidates[name])} for name, m in stated["models"].items()},
+        "models": {
+            name: {
+                **m,
+                **_model(candidates[name]),
+                "verdict": verdict(
+                    c.calibration,
+                    c.loo if c.held is None else c.held,
+                    emulator_fails=fails.get(name, ()),
+                    held_out=hold_out,
+                ).document(),
+            }
+            for name, m in stated["models"].items()
+            for c in [candidates[name]]
+        },
     }
 
 
@@ -266,6 +286,7 @@ def write_comparison(
     hold_out: str = "",
     *,
     environment: Environment | None = None,
+    emulator_fails: Mapping[str, Sequence[str]] | None = None,
 ) -> dict[str, Any]:
     """Write a comparison into an empty folder and return what `comparison.json` holds.
 
@@ -274,7 +295,7 @@ def write_comparison(
     here = environment or Environment.here()
     first = comparison.candidates[0]
     found = {
-        **document(comparison, hold_out),
+        **document(comparison, hold_out, emulator_fails),
         "command": list(command),
         "settings": json.loads(json.dumps(asdict(first.calibration.settings))),
         **here.document(),
@@ -291,9 +312,17 @@ def write_comparison(
         run = folder / "runs" / c.model
         run.mkdir(parents=True)
         save_calibration(c.calibration, run, environment=here)
+        keep_verdict(Verdict.of(found["models"][c.model]["verdict"]), run)
     found["files"] = file_hashes(folder)
     (folder / FILE).write_text(json.dumps(found, indent=1, allow_nan=False) + "\n")
     return found
+
+
+def verdicts_of(folder: Path) -> dict[str, Verdict | None]:
+    """Return the verdicts kept in a run or comparison folder, of the latter by model."""
+    if not (folder / FILE).exists():
+        return {"": kept_verdict(folder)}
+    return {path.name: kept_verdict(path) for path in sorted((folder / "runs").iterdir())}
 
 
 def load_stack(folder: Path) -> tuple[dict[str, Any], list[tuple[float, Calibration]]]:

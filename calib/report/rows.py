@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.data.quantities import columns_of, role_of
 from calib.data.table import Table
+from calib.inference.calibration import Calibration
 from calib.models.base import Array
 from calib.report.labels import Axis, axis_of
-from calib.report.study import OutputResult
 from calib.validation.residuals import sign_changes
+from calib.validation.validate import Validation
 
 MAX_PANELS = 6
 _GRID = 100
+
+
+class Result(Protocol):
+    """A calibration, and what it was validated on if anything."""
+
+    @property
+    def calibration(self) -> Calibration:
+        """What was calibrated."""
+
+    @property
+    def validation(self) -> Validation | None:
+        """How it did on rows that were not fitted, if there were any."""
 
 
 @dataclass(frozen=True)
@@ -38,35 +52,37 @@ class Group:
         return int(self.fitted.sum() + self.held_out.sum())
 
 
-def held_table(result: OutputResult) -> Table | None:
+def held_table(result: Result) -> Table | None:
     """Return the rows that were held out, if any were."""
-    return result.validation.table if result.validation.method == "held_out" else None
+    v = result.validation
+    return v.table if v is not None and v.method == "held_out" else None
 
 
-def data_word(result: OutputResult) -> str:
+def data_word(result: Result) -> str:
     """What to call the data: their label where they have one."""
-    label = result.task.table.label
+    label = result.calibration.problem.table.label
     return f"{label} data" if label else "data"
 
 
-def x_column(result: OutputResult) -> str:
+def x_column(result: Result) -> str:
     """The condition along which predictions are drawn."""
     conditions = result.calibration.problem.bound.model.conditions
     return next((name for name in conditions if role_of(name) == "slip"), conditions[0])
 
 
-def group_column(result: OutputResult) -> str | None:
+def group_column(result: Result) -> str | None:
     """The column that tells panels apart: inflation pressure where the data have it."""
     conditions = result.calibration.problem.bound.model.conditions
-    table = result.task.table
-    pressure = next((name for name in columns_of("pressure") if name in table), None)
-    if pressure and np.unique(table[pressure]).size > 1 and len(conditions) > 1:
+    tables = [t for t in (result.calibration.problem.table, held_table(result)) if t is not None]
+    pressure = next((n for n in columns_of("pressure") if all(n in t for t in tables)), None)
+    values = np.concatenate([t[pressure] for t in tables]) if pressure else np.zeros(0)
+    if pressure and np.unique(values).size > 1 and len(conditions) > 1:
         return pressure
     second = [name for name in conditions if name != x_column(result)]
     return second[0] if second else None
 
 
-def groups(result: OutputResult, *, most: bool = True) -> list[Group]:
+def groups(result: Result, *, most: bool = True) -> list[Group]:
     """Split the rows into at most six panels: those held out and the most populated others.
 
     More distinct values than twice that are pooled into thirds of the rows. Without `most` it does
@@ -92,7 +108,7 @@ def groups(result: OutputResult, *, most: bool = True) -> list[Group]:
     return _kept(found) if most else found
 
 
-def signs_along(result: OutputResult, residual: Array) -> tuple[int, int]:
+def signs_along(result: Result, residual: Array) -> tuple[int, int]:
     """Count sign changes of the calibrated rows' residuals along x in each group; see there."""
     x = result.calibration.problem.table[x_column(result)]
     return sign_changes(x, residual, (g.fitted for g in groups(result, most=False)))
@@ -130,7 +146,7 @@ def _bins(values: Array) -> list[tuple[float, float, float]]:
     return [(float(p[0]), float(p[-1]), float(np.median(p))) for p in parts]
 
 
-def grid(result: OutputResult, group: Group) -> dict[str, Array]:
+def grid(result: Result, group: Group) -> dict[str, Array]:
     """Conditions along the x axis of a panel, the others at the panel's middle."""
     problem = result.calibration.problem
     held = held_table(result)

@@ -9,16 +9,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 
 import numpy as np
 
 from calib.batch.pool import Pool
 from calib.batch.threads import one_thread
 from calib.batch.unfinished import keep
-from calib.data import table_from_arrays
-from calib.data.quantities import output_of
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import PointEstimate, estimate, methods_for
@@ -30,13 +28,11 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.base import Array
 from calib.report.study_tasks import Task, fitted_rows
-from calib.validation.assumptions import warnings_of
+from calib.report.verdict import Evidence, gather
 from calib.validation.noise_preference import NoisePreference, noise_preference
-from calib.validation.prediction import predictive_draws
+from calib.validation.prediction import predictive_draws, prior_predictive
 from calib.validation.sensitivity import Sensitivity, prior_sensitivity
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
-
-N_PRIOR_PREDICTIVE = 1000
 
 type Progress = Callable[[str, int, int], None]
 
@@ -57,8 +53,6 @@ class OutputResult:
         Of each step of the work.
     preference : NoisePreference, optional
         Of the noise that the prior file asks for over the usual one.
-    warnings : tuple of str
-        Where the rows are not as the likelihood has them.
     """
 
     task: Task
@@ -71,7 +65,11 @@ class OutputResult:
     seconds: Mapping[str, float] = field(default_factory=dict)
     sensitivity: Mapping[str, Sensitivity] = field(default_factory=dict)
     preference: NoisePreference | None = None
-    warnings: tuple[str, ...] = ()
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """What its verdict is made from."""
+        return gather(self)
 
 
 @dataclass(frozen=True)
@@ -207,25 +205,6 @@ def _work_out(
         seconds,
         prior_sensitivity(calibration),
         preference,
-        warnings_of(problem, calibration.draws.mode, calibration.draws.flat),
-    )
-
-
-def judged(calibration: Calibration, validation: Validation) -> OutputResult:
-    """Return a calibration and its validation as a study has them, without point estimates."""
-    problem = calibration.problem
-    table, model = problem.table, problem.bound.model
-    if validation.method == "held_out":
-        shared = [c for c in table if c in validation.table]
-        both = {c: np.append(table[c], validation.table[c]) for c in shared}
-        table = replace(table_from_arrays(both), label=table.label)
-    output = output_of(model.output)
-    _, replicated = predictive_draws(
-        calibration, problem.conditions, generator(calibration.seed, output, "replicate")
-    )
-    prior = prior_predictive(problem, generator(calibration.seed, output, "prior"))
-    return OutputResult(
-        Task(output, model.name, table), calibration, validation, (), {}, prior, replicated
     )
 
 
@@ -275,10 +254,3 @@ def _each_alone(task: Task, seed: int) -> dict[float, tuple[PointEstimate, ...]]
             problem = build_problem(alone.model, rows, fixed=alone.fixed)
             found[float(value)] = _all_methods(problem, seed, (task.output, f"{value:g}"))
     return found
-
-
-def prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
-    """Return measurements that the priors expect at the calibrated rows, shape (draws, n)."""
-    natural = problem.theta(problem.priors.sample(rng, N_PRIOR_PREDICTIVE))
-    location = problem.draw_location(natural, problem.conditions, rng)
-    return problem.bound.from_response(location + problem.draw_noise(natural, rng))

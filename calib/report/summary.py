@@ -14,6 +14,7 @@ from calib.inference.noise import Noise
 from calib.models.base import Array
 from calib.report.numbers import finite
 from calib.report.study import OutputResult, Study
+from calib.report.verdict import judge_evidence
 from calib.validation.noise_preference import NoisePreference
 from calib.validation.scores import Scores
 from calib.validation.sensitivity import CONTRACTION_MIN, SENSITIVITY_MIN
@@ -57,7 +58,7 @@ def _output(result: OutputResult) -> dict[str, Any]:
         },
         "references": dict(problem.bound.references),
         **_noise(problem.noise, result.preference),
-        **({"warnings": list(result.warnings)} if result.warnings else {}),
+        **_verdict(result),
         **summarise_estimates(result.estimates, result.by_pressure),
         "priors": {
             p.name: {"unit": p.unit, "distribution": p.text, **_picked(p, "reason", "source")}
@@ -68,6 +69,12 @@ def _output(result: OutputResult) -> dict[str, Any]:
         "validation": _validation(result),
         "sampling": _sampling(result.calibration),
     }
+
+
+def _verdict(result: OutputResult) -> dict[str, Any]:
+    """What the rows, the prior and the validation say of the assumptions."""
+    said = judge_evidence(result.evidence).warnings
+    return {"warnings": list(said)} if said else {}
 
 
 def _noise(noise: Noise, preference: NoisePreference | None) -> dict[str, Any]:

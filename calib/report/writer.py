@@ -202,7 +202,7 @@ def _copy_inputs(study: Study, folder: Path) -> dict[str, dict[str, Any]]:
     for key, result in study.results.items():
         task = result.task
         prior_path = task.prior_path or default_priors(task.model)
-        write_table(folder / "data" / f"{key}.csv", task.table.to_write(task.table.columns))
+        write_table(folder / "data" / f"{key}.csv", task.table.whole())
         data = (folder / "data" / f"{key}.csv").read_bytes()
         priors = read_text(prior_path).encode()
         (folder / "priors" / f"{key}.toml").write_bytes(priors)

@@ -1,19 +1,25 @@
-"""What a calibration assumes of its rows, tested: a warning for each assumption that fails.
+"""What a calibration assumes of its rows and priors, tested: a remark for each that fails.
 
-The likelihood takes rows as independent, and scattered as it says. Each test has the chance
-`LEVEL` of a false alarm on rows that are so; what depends on a file's contents alone has none, or
-one that is stated. `docs/statistics/likelihood.md` lists them.
+The likelihood takes rows as independent, and scattered as it says, about what the conditions of the
+model explain. The tests that have a probability are one family: on rows that are so, `LEVEL` is the
+chance that any of them fails. `docs/statistics/likelihood.md` lists them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from calib.data import Table
-from calib.data.quantities import QUANTITIES
+from calib.data.numbers import plain_number
+from calib.data.quantities import OUTPUTS, QUANTITIES
 from calib.data.units_check import (
     column_notes,
     lines_of,
@@ -22,40 +28,117 @@ from calib.data.units_check import (
     unit_notes,
     word_of,
 )
+from calib.errors import CalibError
+from calib.inference.calibration import Calibration
+from calib.inference.diagnostics import distances
+from calib.inference.estimators import PointEstimate, estimate
 from calib.inference.problem import Problem
+from calib.inference.random import generator
 from calib.models.base import Array
 from calib.validation.outliers import linear, outlying_notes
+from calib.validation.roles import PRIOR_SET
 
-# Chance that a test of residuals warns of rows that are as the likelihood says.
-LEVEL = 1e-3
+# Chance that any test of a family fails on rows and priors that are as assumed.
+LEVEL = 0.05
 # Chance that readings agree to the last digit, from which equal rows are taken for copies.
 _COPIED = 0.01
 _FEWEST, _FEWEST_FOR_TAILS = 8, 20
+# Rows of a group whose scatter or mean is compared, at least.
+_FEWEST_IN_GROUP = 5
 # Draws that are looked at for an edge of where the model has a value, and what part beyond it is.
 _PROBES, _MANY = 100, 0.2
+# Estimates so many posterior sds off, which the likelihood finds better too, contradict the prior.
+FAR_SDS = 3.0
+# A posterior that falls from a bound has at least a tenth of its mass within a quarter of an sd of
+# it: a half-normal has 0.12, a uniform one 0.07.
+_BESIDE, _HEAPED = 0.25, 0.1
 _UNIT_FIRST = (
     "whether neighbouring rows are alike, the scatter even and its tails light is not judged while "
     "a column looks to be in another unit"
 )
 
 
-def warnings_of(problem: Problem, t: Array, draws: Array | None = None) -> tuple[str, ...]:
-    """Say what a reader should mend, or know, before believing a calibration's width.
+class Range(NamedTuple):
+    """Values of a condition, canonical name and unit, ends included."""
 
-    `t` (d,) are internal coordinates of a fit to all rows, for instance the posterior's mode, and
-    `draws` (k, d) those of the posterior. Of a column in another unit the priors make a misfit,
-    whose residuals say nothing of the rows.
+    column: str
+    low: float
+    high: float
+
+    def holds(self, conditions: Mapping[str, Array]) -> bool:
+        """Whether any row of some conditions is inside; of a condition that is not there, yes."""
+        values = conditions.get(self.column)
+        return values is None or bool(((values >= self.low) & (values <= self.high)).any())
+
+
+@dataclass(frozen=True)
+class Remark:
+    """A fact that a reader should know before believing a calibration.
+
+    Parameters
+    ----------
+    text : str
+        The fact with its numbers.
+    title : str
+        Which assumption fails, in two or three words; empty where none does.
+    shifts : bool
+        Whether the median is off with it, not only the width of the bands.
+    where : tuple of Range
+        The rows it concerns: those in any of them, all if there is none.
     """
-    scatter = float(problem.theta(t[None])[0, -1])
-    off = any(column_notes(problem.table))
+
+    text: str
+    title: str = ""
+    shifts: bool = False
+    where: tuple[Range, ...] = ()
+
+    def concerns(self, conditions: Mapping[str, Array]) -> bool:
+        """Whether it concerns any row of some conditions."""
+        return not self.where or any(part.holds(conditions) for part in self.where)
+
+
+class Check(NamedTuple):
+    """The probability of so much or more were an assumption right, and what to say if it is not."""
+
+    p: float
+    remark: Remark
+
+
+def failed(tests: Sequence[Check], level: float = LEVEL) -> tuple[Remark, ...]:
+    """Return what the tests say that fail together, in their order, by Holm's (1979) procedure."""
+    ranked = sorted((t.p, i) for i, t in enumerate(tests))
+    fails: set[int] = set()
+    for rank, (p, i) in enumerate(ranked):
+        if not p < level / (len(tests) - rank):
+            break
+        fails.add(i)
+    return tuple(t.remark for i, t in enumerate(tests) if i in fails)
+
+
+def checks_of(calibration: Calibration) -> tuple[Check, ...]:
+    """Test a calibration's prior and, unless a column is in another unit, its residuals.
+
+    Of such a column the priors make a misfit, whose residuals say nothing of the rows.
+    """
+    problem = calibration.problem
+    residuals = () if any(column_notes(problem.table)) else residual_checks(
+        problem, calibration.draws.mode
+    )  # fmt: skip
+    return (*_contradicted(calibration), *residuals)
+
+
+def remarks_of(calibration: Calibration) -> tuple[Remark, ...]:
+    """Say what a reader should mend, or know, that does not take one of the family of tests."""
+    problem, t = calibration.problem, calibration.draws.mode
+    outlying = (Remark(note, "Rows far off", True) for note in outlying_notes(problem, t))
     return (
-        *outlying_notes(problem, t), *file_notes(problem, scatter),
-        *((_UNIT_FIRST,) if off else residual_notes(problem, t)),
-        *(() if draws is None else _cut_off(problem, draws)),
+        *outlying, *file_remarks(problem, float(problem.theta(t[None])[0, -1])),
+        *((Remark(_UNIT_FIRST),) if any(column_notes(problem.table)) else ()),
+        *_pressed(calibration), *_cut_off(problem, calibration.draws.flat),
     )  # fmt: skip
 
 
-def _cut_off(problem: Problem, draws: Array) -> Iterable[str]:
+def _cut_off(problem: Problem, draws: Array) -> Iterable[Remark]:
     """A posterior that ends where the model has no value, and not where the data end it.
 
     Draws twice as far from their mean as they are lie beyond such an edge: a fifth of them if it is
@@ -76,29 +159,165 @@ def _cut_off(problem: Problem, draws: Array) -> Iterable[str]:
         # Of what the data hardly tell, an edge of the model is as much assumed as the prior is.
         return
     at = f"{'large' if away[i] > 0.0 else 'small'} {problem.priors.free[i].name}"
-    yield (
+    yield Remark(
         f"{problem.bound.model.name}: the posterior ends where the model has no value, at {at} "
         "above all: it is cut off there, not where the data end it; mend the model there, or "
-        "exclude such values by the bounds of the priors"
-    )
+        "exclude such values by the bounds of the priors",
+        "Posterior cut off", shifts=True,
+    )  # fmt: skip
 
 
-def file_notes(problem: Problem, scatter: float) -> tuple[str, ...]:
+def parameter_remarks(calibration: Calibration) -> dict[str, str]:
+    """Say of each parameter of a summary what a table has room for; nothing of most."""
+    found = {n: "set by the prior" for n, s in calibration.summary.items() if s.sd_ratio > 0.9}
+    best = _least_squares(calibration)
+    for name, sds in _far_off(calibration, best).items():
+        assert best is not None
+        found[name] = f"{plain_number(_estimated(calibration, best, name))} by least squares"
+        found[name] += f", {abs(sds):.0f} sds off"
+    for name, bound in _bounds_pressed(calibration).items():
+        found[name] = f"pressed against its bound {plain_number(bound)}"
+    return found
+
+
+def _bounds_pressed(calibration: Calibration) -> dict[str, float]:
+    """Bounds, in natural values, that posteriors heap up at and the priors by themselves do not."""
+    flat, found = calibration.draws.flat, {}
+    for j, prior in enumerate(calibration.problem.priors.free):
+        if calibration.summary[prior.name].sd_ratio > PRIOR_SET:
+            continue
+        for bound in (prior.lower, prior.upper):
+            beside = np.abs(flat[:, j] - bound) < _BESIDE * flat[:, j].std()
+            if np.isfinite(bound) and bound != prior.loc and beside.mean() > _HEAPED:
+                found[prior.name] = float(np.exp(bound) if prior.log else bound)
+    return found
+
+
+def _pressed(calibration: Calibration) -> Iterable[Remark]:
+    for name, bound in _bounds_pressed(calibration).items():
+        yield Remark(
+            f"the posterior of {name} is pressed against {plain_number(bound)}, where its prior "
+            f"ends: values beyond are excluded by the prior, not by the data"
+            f"{_beyond(calibration, name)}; widen it (`calib priors`) unless they are impossible",
+            "Posterior at a bound", shifts=True,
+        )  # fmt: skip
+
+
+def _beyond(calibration: Calibration, name: str) -> str:
+    """Say what least squares give without the bounds of a parameter, where they are soon found."""
+    problem = calibration.problem
+    model = problem.bound.model
+    if model.slow or model.uncertain is not None or name not in model.parameters:
+        return ""
+    entries = tuple(
+        replace(
+            p, lower=-np.inf, upper=np.inf,
+            scale=p.scale if np.isfinite(p.scale) else p.upper - p.lower,
+        ) if p.name == name else p
+        for p in problem.priors.entries
+    )  # fmt: skip
+    free = replace(problem, priors=replace(problem.priors, entries=entries))
+    with suppress(CalibError):
+        best = estimate(free, "least_squares", generator(calibration.seed, name, "without bounds"))
+        sampled = dict(zip(model.parameters, best.theta, strict=True))
+        found = {name: float(sampled[name]), **best.reported}
+        said = [f"{n} = {plain_number(v)}" for n, v in found.items()]
+        return f" (without its bounds least squares give {', '.join(said)})"
+    return ""
+
+
+def _least_squares(calibration: Calibration) -> PointEstimate | None:
+    """The estimate that seeded the sampler, unless it is on a bound, where others mean nothing."""
+    finite = [e for e in calibration.estimates if np.isfinite(e.rmse)]
+    best = min(finite, key=lambda e: e.rmse, default=None)
+    if best is None:
+        return None
+    known = dict(zip(calibration.problem.bound.model.parameters, best.theta, strict=True))
+    for prior in calibration.problem.priors.free:
+        ends = np.array([prior.lower, prior.upper])
+        ends = np.exp(ends) if prior.log else ends
+        if prior.name in known and np.isclose(known[prior.name], ends, atol=1e-6).any():
+            return None
+    return best
+
+
+def _estimated(calibration: Calibration, best: PointEstimate, name: str) -> float:
+    sampled = dict(zip(calibration.problem.bound.model.parameters, best.theta, strict=True))
+    return float({**sampled, **best.reported}[name])
+
+
+def _far_off(calibration: Calibration, best: PointEstimate | None) -> dict[str, float]:
+    """Parameters of the model whose estimate is far off, the farthest first, with how many sds."""
+    if best is None:
+        return {}
+    model, found = calibration.problem.bound.model, {}
+    for name, draws in calibration.parameters.items():
+        if name in model.parameters or name in model.reported:
+            s = calibration.summary[name]
+            value = np.array([_estimated(calibration, best, name)])
+            sds = distances(draws.ravel(), value, (s.hdi_lower, s.hdi_upper))[0]
+            found[name] = float(np.nan_to_num(sds[0], nan=0.0))
+    far = sorted(found, key=lambda name: -abs(found[name]))
+    return {name: found[name] for name in far if abs(found[name]) > FAR_SDS}
+
+
+def _contradicted(calibration: Calibration) -> Iterable[Check]:
+    """Whether least squares, which know no prior, fit better than chance has it than the mode.
+
+    By an F test of the sums of squares, which is too rarely significant where a prior that is
+    right takes the place of data.
+    """
+    problem, best = calibration.problem, _least_squares(calibration)
+    names = set(problem.bound.model.parameters)
+    free = sum(prior.name in names for prior in problem.priors.free)
+    left = problem.response.size - free
+    if best is None or left < 2:
+        return
+    mode = problem.theta(calibration.draws.mode[None])
+    natural = np.concatenate([mode, problem.completed(best.theta, mode[0, -1])[None]])
+    raw = problem.residuals(natural) / problem.noise.scale(mode, problem.conditions)
+    with_prior, without = np.square(raw).sum(axis=1)
+    far = _far_off(calibration, best)
+    if not far or not np.isfinite(without):
+        return
+    gain = max(with_prior - without, 0.0) / free
+    ratio = gain / max(without / left, 1e-12 * with_prior / left)
+    said = [
+        f"{name} = {plain_number(_estimated(calibration, best, name))} where the posterior has "
+        f"{plain_number(calibration.summary[name].mean)} ± "
+        f"{plain_number(calibration.summary[name].sd)} ({abs(sds):.0f} posterior sds away)"
+        for name, sds in [*far.items()][:2]
+    ]
+    yield Check(
+        float(scipy.stats.f.sf(ratio, free, left)),
+        Remark(
+            f"the data contradict the prior: least squares, which know no prior, give "
+            f"{' and '.join(said)} and leave {plain_number(100.0 * without / with_prior)} % of the "
+            "squared residuals; widen the prior (`calib priors`), or look for what is wrong with "
+            "the data",
+            "Prior contradicted", shifts=True,
+        ),
+    )  # fmt: skip
+
+
+def file_remarks(problem: Problem, scatter: float) -> tuple[Remark, ...]:
     """Say what is odd in the rows themselves: units, names, copies, conditions that do not vary.
 
     `scatter` is the sd of a reading about the prediction, on the scale of the response.
     """
-    found = [*column_notes(problem.table), *spelling_notes(problem.table)]
+    found = [Remark(note, "Unit in doubt", True) for note in column_notes(problem.table)]
+    found += map(Remark, spelling_notes(problem.table))
     for name, values in problem.conditions.items():
         quantity = QUANTITIES[name]
         if np.unique(values).size == 1:
-            found.append(
+            found.append(Remark(
                 f"{source_of(problem.table)}: {word_of(problem.table, quantity)} is the same in "
                 "all rows; what depends on it comes from the prior, and predictions elsewhere "
                 "with it"
-            )
-        found += unit_notes(problem.table, quantity, values)
-    return (*found, *_few_settings(problem), *_copies(problem, scatter))
+            ))  # fmt: skip
+        notes = unit_notes(problem.table, quantity, values)
+        found += [Remark(note, "Unit in doubt", True) for note in notes]
+    return (*found, *map(Remark, _few_settings(problem)), *_copies(problem, scatter))
 
 
 def _few_settings(problem: Problem) -> Iterable[str]:
@@ -114,7 +333,7 @@ def _few_settings(problem: Problem) -> Iterable[str]:
         )
 
 
-def _copies(problem: Problem, scatter: float) -> Iterable[str]:
+def _copies(problem: Problem, scatter: float) -> Iterable[Remark]:
     """Rows that repeat another one exactly, unless the readings are so coarse that some would."""
     table = problem.table
     at = np.stack([*problem.conditions.values()], axis=1)
@@ -130,10 +349,11 @@ def _copies(problem: Problem, scatter: float) -> Iterable[str]:
     agree = _last_digit(problem) / (2.0 * np.sqrt(np.pi) * max(scatter, 1e-300))
     if scipy.stats.poisson.sf(int(copied.sum()) - 1, pairs * min(agree, 1.0)) > _COPIED:
         return
-    yield (
+    yield Remark(
         f"{source_of(table)}, {lines_of(table, copied)}: {_rows(int(copied.sum()))} another one "
         "exactly; a copy counts as a measurement and narrows every width: delete it, unless it was "
-        "measured"
+        "measured",
+        "Copied rows",
     )
 
 
@@ -148,8 +368,8 @@ def _last_digit(problem: Problem) -> float:
     return 0.0
 
 
-def residual_notes(problem: Problem, t: Array) -> tuple[str, ...]:
-    """Say where the residuals at a fit, `t` (d,), are not as the likelihood has them.
+def residual_checks(problem: Problem, t: Array) -> tuple[Check, ...]:
+    """Test whether the residuals at a fit, `t` (d,), are as the likelihood has them.
 
     Residuals are those of the model made linear at the fit, over the noise's scale there (Student's
     as normal scores), so that the moments of linear least squares hold. Of noise that is correlated
@@ -167,15 +387,84 @@ def residual_notes(problem: Problem, t: Array) -> tuple[str, ...]:
         mean, variance = problem.serial.before(score[None], problem.noise.own("rho", natural))
         score, leverage = ((score - mean) / np.sqrt(variance))[0], np.zeros_like(score)
     judged = leverage < 1.0 - 1e-9
-    studentised = np.where(judged, score / np.sqrt(np.where(judged, 1.0 - leverage, 1.0)), 0.0)
+    studentised = np.where(judged, score / np.sqrt(np.where(judged, 1.0 - leverage, 1.0)), np.nan)
     return (
+        *_unexplained(problem, studentised),
         *(() if problem.serial is not None else _autocorrelated(problem.table, score, design)),
-        *_uneven(problem, studentised[judged], judged),
-        *_heavy_tailed(problem, studentised[judged]),
-    )
+        *_uneven(problem, studentised), *_heavy_tailed(problem, studentised[judged]),
+    )  # fmt: skip
 
 
-def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[str]:
+def _unexplained(problem: Problem, residual: Array) -> Iterable[Check]:
+    """Whether residuals (n,) differ with a column that is not used.
+
+    Numbers by Spearman's rank correlation, and groups (of a category, of a number with few values,
+    of quarters of the rows otherwise) by Kruskal and Wallis's (1952) test.
+    """
+    for header, cells in _unused(problem).items():
+        numbers = _numbers(cells)
+        there = np.isfinite(residual) & (np.isfinite(numbers) | np.isnan(numbers).all())
+        if there.sum() < _FEWEST:
+            continue
+        found = []
+        score, x = residual[there], numbers[there]
+        category = bool(np.isnan(x).all())
+        names = cells[there] if category else np.array([plain_number(v) for v in x])
+        if not category and np.unique(x).size > 1:
+            found.append(scipy.stats.spearmanr(score, x).pvalue)
+        levels, group, count = np.unique(names, return_inverse=True, return_counts=True)
+        if not category and count.min() < _FEWEST_IN_GROUP:
+            edges = np.quantile(x, [0.25, 0.5, 0.75])
+            group = np.searchsorted(edges, x)
+            named = [(x[group == i].min(), x[group == i].max()) for i in np.unique(group)]
+            levels = np.array([f"{plain_number(a)} to {plain_number(b)}" for a, b in named])
+            group = np.unique(group, return_inverse=True)[1]
+            count = np.bincount(group)
+        # A category of one row each, as a remark, is none.
+        large = np.flatnonzero(count >= (2 if category else _FEWEST_IN_GROUP))
+        parts = [score[group == i] for i in large]
+        if len(parts) > 1 and sum(map(len, parts)) >= _FEWEST:
+            found.append(scipy.stats.kruskal(*parts).pvalue)
+        if not found or len(parts) < 2:
+            continue
+        means = [float(part.mean()) for part in parts]
+        low, high = int(np.argmin(means)), int(np.argmax(means))
+        p = min(1.0, len(found) * float(min(found)))
+        said = [
+            f"{means[i]:+.1f} noise sds where it is {levels[large[i]]} ({len(parts[i])} rows)"
+            for i in (high, low)
+        ]
+        yield Check(p, Remark(
+            f"{source_of(problem.table)}: the residuals differ with {header!r}, a column that is "
+            f"not used: on average {' and '.join(said)} (p = {plain_number(p, 2)}); fit each of "
+            "its values by itself, or choose a model that has it as a condition",
+            "A column explains the residuals", shifts=True,
+        ))  # fmt: skip
+
+
+def _unused(problem: Problem) -> dict[str, NDArray[np.str_] | Array]:
+    """Columns of the file that neither the model nor the noise uses, other outputs left out."""
+    table, choice = problem.table, problem.noise.choice
+    own = {*problem.conditions, *OUTPUTS.values(), problem.bound.model.output}
+    own |= {name for name in table if name in QUANTITIES
+            and QUANTITIES[name].stem in (choice.depends_on, choice.correlated_along)}  # fmt: skip
+    known = {table.header_of(n): values for n, values in table.columns.items() if n not in own}
+    # Tables that others put together may keep the cells of the rows they came from.
+    extra = {h: np.array(cells) for h, cells in table.extra.items() if len(cells) == len(table)}
+    return {**known, **extra}
+
+
+def _numbers(cells: NDArray[np.str_] | Array) -> Array:
+    """Cells as numbers, NaN where one is empty; all NaN where any is text."""
+    if cells.dtype.kind == "f":
+        return np.asarray(cells, dtype=float)
+    try:
+        return np.array([float(c.strip().replace(",", ".") or "nan") for c in cells])
+    except ValueError:
+        return np.full(cells.size, np.nan)
+
+
+def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[Check]:
     """Durbin and Watson's (1951) test in the order of the file, by their beta approximation."""
     n = residual.size
     d = float(np.square(np.diff(residual)).sum() / np.square(residual).sum())
@@ -183,16 +472,15 @@ def _autocorrelated(table: Table, residual: Array, design: Array) -> Iterable[st
     # On (0, 4) as d is.
     x, v = mean / 4.0, variance / 16.0
     size = x * (1.0 - x) / v - 1.0
-    if not scipy.stats.beta.cdf(d / 4.0, x * size, (1.0 - x) * size) < LEVEL:
-        return
     r = float(np.clip(1.0 - d / mean, 0.0, 0.99))
-    yield (
+    yield Check(float(scipy.stats.beta.cdf(d / 4.0, x * size, (1.0 - x) * size)), Remark(
         f"{source_of(table)}: residuals of neighbouring rows are alike (correlation {r:.2f}), as "
         "in rows of one continuous run, or where the curve misses a pattern; the rows are worth "
         f"about {max(1.0, n * (1.0 - r) / (1.0 + r)):.0f} independent ones, not {n}, so that "
         'widths are too narrow: correlated_along = "run_order" (a column) under [likelihood] in '
-        "the prior file widens them; or thin the rows, or look at the residuals"
-    )
+        "the prior file widens them; or thin the rows, or look at the residuals",
+        "Rows depend on each other",
+    ))  # fmt: skip
 
 
 def durbin_watson_moments(design: Array) -> tuple[float, float]:
@@ -221,32 +509,57 @@ def _second_difference(x: Array) -> Array:
     return out
 
 
-def _uneven(problem: Problem, residual: Array, judged: np.ndarray) -> Iterable[str]:
-    """Spearman's rank correlation of the residuals' sizes with each condition that varies."""
-    varying = {k: v[judged] for k, v in problem.conditions.items() if np.ptp(v[judged]) > 0.0}
-    for name, values in varying.items():
-        found = scipy.stats.spearmanr(np.abs(residual), values)
-        if found.pvalue < LEVEL / len(varying):
-            word, stem = word_of(problem.table, QUANTITIES[name]), QUANTITIES[name].stem
-            grows = "grows" if found.statistic > 0.0 else "falls"
-            yield (
-                f"{source_of(problem.table)}: the scatter {grows} with {word} (rank correlation "
-                f"{found.statistic:.2f}); one sigma is too wide at one end and too narrow at the "
-                f'other: noise_depends_on = "{stem}" in the prior file lets it change'
-            )
+def _uneven(problem: Problem, residual: Array) -> Iterable[Check]:
+    """Whether the scatter of residuals (n,) differs with a condition.
+
+    By Levene's test, in Brown and Forsythe's form, where every value has its group of rows;
+    otherwise by Spearman's rank correlation with their sizes.
+    """
+    there = np.isfinite(residual)
+    for name, every in problem.conditions.items():
+        score, values = residual[there], every[there]
+        levels, group, count = np.unique(values, return_inverse=True, return_counts=True)
+        if levels.size < 2 or name == problem.noise.column:
+            continue
+        word, stem = word_of(problem.table, QUANTITIES[name]), QUANTITIES[name].stem
+        remedy = f'noise_depends_on = "{stem}" in the prior file lets it change'
+        remark = partial(Remark, title="Scatter is uneven")
+        if count.min() >= _FEWEST_IN_GROUP:
+            parts = [score[group == i] for i in range(levels.size)]
+            sd = np.array([part.std(ddof=1) for part in parts])
+            wide, tight = int(np.argmax(sd)), int(np.argmin(sd))
+            column, p = problem.table.column(name), float(scipy.stats.levene(*parts).pvalue)
+            at = [
+                f"{plain_number(float(column.written(levels[i])), 4)} {column.unit_word}".rstrip()
+                for i in (wide, tight)
+            ]
+            yield Check(p, remark(
+                f"{source_of(problem.table)}: the scatter differs with {word}: one sigma is too "
+                f"narrow at {at[0]}, where the residuals have an sd of {sd[wide]:.2f} sigma, and "
+                f"too wide at {at[1]} ({sd[tight]:.2f} sigma; p = {plain_number(p, 2)}): {remedy}",
+                where=tuple(Range(name, float(levels[i]), float(levels[i])) for i in (wide, tight)),
+            ))  # fmt: skip
+            continue
+        found = scipy.stats.spearmanr(np.abs(score), values)
+        grows = "grows" if found.statistic > 0.0 else "falls"
+        yield Check(float(found.pvalue), remark(
+            f"{source_of(problem.table)}: the scatter {grows} with {word} (rank correlation "
+            f"{found.statistic:.2f}); one sigma is too wide at one end and too narrow at the "
+            f"other: {remedy}",
+        ))  # fmt: skip
 
 
-def _heavy_tailed(problem: Problem, residual: Array) -> Iterable[str]:
+def _heavy_tailed(problem: Problem, residual: Array) -> Iterable[Check]:
     """Anscombe and Glynn's (1983) test of the kurtosis, one-sided."""
     if residual.size < _FEWEST_FOR_TAILS or problem.noise.student:
         return
-    if scipy.stats.kurtosistest(residual, alternative="greater").pvalue < LEVEL:
-        yield (
-            f"{source_of(problem.table)}: the residuals have heavier tails than normal noise "
-            f"(excess kurtosis {scipy.stats.kurtosis(residual):.1f}); single readings then weigh "
-            "too much: correct those that are wrong, or write "
-            'family = "student_t" in the prior file'
-        )
+    p = float(scipy.stats.kurtosistest(residual, alternative="greater").pvalue)
+    yield Check(p, Remark(
+        f"{source_of(problem.table)}: the residuals have heavier tails than normal noise "
+        f"(excess kurtosis {scipy.stats.kurtosis(residual):.1f}); single readings then weigh "
+        'too much: correct those that are wrong, or write family = "student_t" in the prior file',
+        "Heavy tails",
+    ))  # fmt: skip
 
 
 def _rows(n: int) -> str:

@@ -20,12 +20,14 @@ from calib.validation.scores import LEVELS
 
 if TYPE_CHECKING:
     from calib.inference.calibration import Calibration
+    from calib.inference.problem import Problem
 
 N_DRAWS = 4000
 MIN_DEFINED = 0.95
 _ROWS_AT_ONCE = 2000
 _NOISE_REPEATS = 4
 _N_SMOOTH = 1000
+_N_PRIOR_PREDICTIVE = 1000
 
 
 @dataclass(frozen=True)
@@ -78,6 +80,13 @@ def predictive_draws(
     noise = problem.noise.draw(natural, conditions, rng, location.shape[1])
     from_response = problem.bound.from_response
     return from_response(location), from_response(location + noise)
+
+
+def prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
+    """Return measurements that the priors expect at the calibrated rows, shape (draws, n)."""
+    natural = problem.theta(problem.priors.sample(rng, _N_PRIOR_PREDICTIVE))
+    location = problem.draw_location(natural, problem.conditions, rng)
+    return problem.bound.from_response(location + problem.draw_noise(natural, rng))
 
 
 def predict_stacked(parts: Sequence[tuple[float, Calibration]], table: Table) -> Prediction:

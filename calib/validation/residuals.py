@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from numpy.typing import NDArray
 from scipy.special import betaincinv, ndtri
 
@@ -15,8 +14,6 @@ from calib.inference.problem import Problem
 from calib.models.base import Array
 
 _N_DRAWS = 1000
-# Rows of a group whose spread is compared, at least.
-_FEWEST = 5
 
 
 @dataclass(frozen=True)
@@ -62,22 +59,3 @@ def normal_order(n: int) -> tuple[Array, Array, Array]:
     low, high = (betaincinv(i, n + 1.0 - i, p) for p in (0.025, 0.975))
     middle, low, high = ndtri(np.stack([(i - 0.375) / (n + 0.25), low, high]))
     return middle, low, high
-
-
-def normality_p(residual: Array) -> float:
-    """Shapiro and Wilk's p value of residuals (n,); NaN of fewer than three."""
-    return float(scipy.stats.shapiro(residual).pvalue) if residual.size >= 3 else float("nan")
-
-
-def spreads(
-    problem: Problem, predicted: Array, groups: Iterable[NDArray[np.bool_]]
-) -> tuple[Array, float]:
-    """Compare the scatter of a problem's rows about predictions (n,) between groups of them.
-
-    Sds on the scale of the response, NaN of fewer than five rows, and Levene's p; NaN of one group.
-    """
-    raw = problem.response - problem.bound.to_response(predicted)
-    found = [raw[rows] for rows in groups]
-    judged = [r for r in found if r.size >= _FEWEST]
-    p = float(scipy.stats.levene(*judged).pvalue) if len(judged) > 1 else float("nan")
-    return np.array([r.std(ddof=1) if r.size >= _FEWEST else np.nan for r in found]), p

@@ -107,6 +107,7 @@ def leave_one_out(
     settings: SamplerSettings | None = None,
     progress: Progress | None = None,
     workers: int = 1,
+    refit: bool = True,
 ) -> Validation:
     """Leave every row out in turn: by smoothed importance sampling, or by fitting again.
 
@@ -120,6 +121,9 @@ def leave_one_out(
     workers : int
         Processes for the refits, as for `calib.batch.tasks.completed`; the numbers do not depend
         on it.
+    refit : bool
+        Whether to fit again where importance sampling cannot be trusted; its smoothed weights are
+        used otherwise, which makes too little of the rows that matter most.
 
     References
     ----------
@@ -133,7 +137,7 @@ def leave_one_out(
     n = problem.response.size
     drawn = np.empty((N_DRAWS, n))
     elpd = np.empty(n)
-    too_large = [int(i) for i in np.flatnonzero(~(k <= PARETO_K_MAX))]
+    too_large = [int(i) for i in np.flatnonzero(~(k <= PARETO_K_MAX))] if refit else []
     refits = _refits(calibration, too_large, settings, progress, workers)
     for i in range(n):
         row = problem.table.take(np.arange(n) == i)

@@ -20,7 +20,8 @@ from calib.inference.estimators import estimate
 from calib.inference.prior_files import default_priors
 from calib.inference.problem import build_problem
 from calib.models import get_model
-from calib.validation.assumptions import file_notes, warnings_of
+from calib.report.verdict import verdict
+from calib.validation.assumptions import file_remarks
 
 MODEL = "modified_bekker"
 TRUTH = {"z_ref": 20.0, "n0": 1.0, "n1": 1.0}
@@ -70,7 +71,7 @@ def _table(slip: np.ndarray, pressure: np.ndarray, rut: np.ndarray):
 
 
 def warned(calibration: Calibration) -> str:
-    return " | ".join(warnings_of(calibration.problem, calibration.draws.mode))
+    return " | ".join(verdict(calibration).warnings)
 
 
 def holds(calibration: Calibration) -> bool:
@@ -223,7 +224,7 @@ def test_fewer_settings_than_parameters_are_told() -> None:
     pull = 1.5 * np.sin(10.0 * slip) + 0.03 * np.random.default_rng(3).standard_normal(30)
     columns = {"Slip (%)": 100.0 * slip, "drawbar_pull_kn": pull}
     problem = build_problem("magic_formula", table_from_arrays(columns, source="few.csv"))
-    said = " | ".join(file_notes(problem, 0.03))
+    said = " | ".join(remark.text for remark in file_remarks(problem, 0.03))
     assert "few.csv: the rows are at 3 different settings of the conditions" in said
     assert "about 6 parameters" in said
 

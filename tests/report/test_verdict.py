@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -10,7 +11,8 @@ import numpy as np
 import pytest
 
 import calib
-from calib.report.verdict import Evidence, Level, Where, gather, judge_evidence, prior_conflict
+from calib.report.verdict import Evidence, Level, Verdict, Where, gather, judge_evidence
+from calib.validation.assumptions import Check, Range, Remark
 from calib.validation.joint import binomial_p
 
 FINE = Evidence(
@@ -113,11 +115,11 @@ def test_priors_expect_at_least_half_of_the_points(hits, rule):
 
 
 def test_data_that_the_priors_did_not_expect():
-    doubt = judge_evidence(
+    (said,) = judge_evidence(
         replace(FINE, **RULES["unexpected"], suspects="the load", notes=("5 kN is assumed",))
-    ).doubt
-    assert "did not expect these data (2 of 20 points" in doubt
-    assert "check the load; 5 kN is assumed" in doubt
+    ).fails
+    assert "did not expect these data (2 of 20 points" in said
+    assert "check the load; 5 kN is assumed" in said
 
 
 def test_units_off_by_a_thousand_conflict_with_the_priors(drawbar):
@@ -130,23 +132,61 @@ def test_units_off_by_a_thousand_conflict_with_the_priors(drawbar):
     )
     assert (evidence.prior_hits, evidence.prior_n) == (0, 28)
     assert evidence.notes == ("5 kN is assumed",)
-    assert "normal load" in judge_evidence(evidence).doubt
+    assert any("normal load" in said for said in judge_evidence(evidence).fails)
 
 
-def test_a_fit_says_of_a_wrong_sign_what_the_card_does(drawbar):
-    """And says nothing where the priors expect the data."""
-    assert prior_conflict(drawbar.calibration) == ()
+def test_a_wrong_sign_is_said(drawbar):
     problem = drawbar.calibration.problem
     columns = dict(problem.table.columns)
     pull = problem.bound.model.output
     table = calib.table_from_arrays({**columns, pull: -columns[pull]})
     turned = calib.build_problem(problem.bound.model.name, table)
     calibration = replace(drawbar.calibration, problem=turned)
-    (said,) = prior_conflict(calibration)
-    inside = int(said.split("disagree: ")[1].split()[0])
-    assert inside < 14
-    assert f"{inside} of 28 points" in said
+    found = calib.verdict(calibration)
+    assert found.level is Level.CARE
+    (said,) = (r.text for r in found.remarks if r.title == "Data and priors disagree")
+    assert int(said.split("data (")[1].split(" of 28 points")[0]) < 14
     assert "the normal load" in said
+
+
+@pytest.mark.parametrize("rule", RULES)
+def test_a_verdict_is_the_same_when_it_is_read_again(rule):
+    found = judge_evidence(replace(
+        FINE, **RULES[rule], parabolic_in="inflation_pressure_psi", fitted_at=(18.0, 42.0)
+    ))  # fmt: skip
+    assert Verdict.of(json.loads(json.dumps(found.document(), allow_nan=False))) == found
+
+
+@pytest.mark.parametrize(
+    ("psi", "told"), [(18.0, False), (30.0, True), (42.0, False), (50.0, True)]
+)
+def test_a_doubt_is_told_of_the_rows_that_it_concerns(psi, told):
+    evidence = replace(
+        FINE, **RULES["extrapolated"], unseen_at=Where.BETWEEN,
+        parabolic_in="inflation_pressure_psi", fitted_at=(18.0, 42.0),
+    )  # fmt: skip
+    rows = {"inflation_pressure_psi": np.array([float(psi)])}
+    assert bool(judge_evidence(evidence).for_rows(rows)) is told
+    held = replace(judge_evidence(evidence), held_out="14 rows (inflation_pressure_psi = 30)")
+    first = held.for_rows(rows)[0]
+    assert "14 rows (inflation_pressure_psi = 30) were held out of this fit" in first
+    assert "fit again without --hold-out" in first
+
+
+def test_what_fails_at_one_pressure_is_told_there_alone():
+    range_ = Range("inflation_pressure_psi", 18.0, 18.0)
+    remark = Remark("one sigma is too narrow at 18 psi", "Scatter is uneven", where=(range_,))
+    evidence = replace(FINE, checks=(Check(0.0024, remark),))
+    found = judge_evidence(evidence)
+    assert (found.rule, found.level, found.fails) == ("assumption", Level.CARE, (remark.text,))
+    assert remark.text in found.for_rows({"inflation_pressure_psi": np.array([18.0, 30.0])})
+    assert remark.text not in found.for_rows({"inflation_pressure_psi": np.array([42.0])})
+
+
+def test_without_unseen_rows_nothing_is_green(drawbar):
+    evidence = replace(FINE, n=0, rmse=float("nan"))
+    assert judge_evidence(evidence).rule == "not validated"
+    assert calib.verdict(drawbar.calibration).level is Level.CARE
 
 
 def test_parameters_set_by_the_prior_are_named_even_where_all_is_fine():
@@ -169,8 +209,14 @@ def test_evidence_of_the_held_out_pressure(drawbar):
     assert evidence.unseen_at is Where.BETWEEN
     assert evidence.prior_hits >= 14
     verdict = judge_evidence(evidence)
-    assert verdict.rule == "extrapolated"
-    assert verdict.trust == "the curves at 18 and 42 psi for slip 2 to 72 %"
+    # What fails comes before what the prior sets, which is doubted all the same.
+    assert verdict.headline == "Scatter is uneven"
+    assert "one sigma is too narrow at 18 psi" in verdict.fails[0]
+    assert verdict.trust == "the median at 18 and 42 psi for slip 2 to 72 %"
+    assert "two pressures do not determine a quadratic" in verdict.doubt
+    even = judge_evidence(replace(evidence, checks=()))
+    assert even.rule == "extrapolated"
+    assert even.trust == "the curves at 18 and 42 psi for slip 2 to 72 %"
 
 
 @pytest.mark.parametrize(

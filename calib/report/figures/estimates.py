@@ -28,6 +28,7 @@ from calib.report.figures.style import (
 from calib.report.labels import NO_UNIT, joined, parameter_label, plain, short, symbol
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
+from calib.validation.assumptions import FAR_SDS
 
 _KNOWN = (
     "geometric", "genetic", "differential_evolution", "least_squares", "published_regression",
@@ -121,11 +122,11 @@ def _caption(result: OutputResult, names: Sequence[str], reference: Reference) -
     off = {n: float(_distances(result, n, [best.reported[n]])[0][0]) for n in names}
     far = max(names, key=lambda n: abs(off[n]))
     distance = abs(off[far])
-    how = f"within {short(distance)}" if distance < 100.0 else "up to more than 100"
+    how = f"{short(distance)}" if distance < 100.0 else "more than 100"
     text = (
-        f"The lowest cost, {short(best.cost, 3)}, was found by "
-        f"{method_name(best.method)}; its estimates lie "
-        f"{how} posterior sds of the posterior mean ({plain(far)} is farthest)."
+        f"The lowest cost, {short(best.cost, 3)}, was found by {method_name(best.method)}; of its "
+        f"estimates {plain(far)} is farthest from the posterior mean, by {how} posterior sds"
+        + (": the prior sets it, or is contradicted." if distance > FAR_SDS else ".")
     )
     name = result.calibration.problem.bound.model.name
     printed = reference.parameters(name)

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from calib.data.quantities import role_of
 from calib.models.base import Array
 from calib.report.figures.density import cone_and_water, draw_predicted_observed
 from calib.report.figures.plate import Plate
@@ -24,13 +23,12 @@ from calib.report.figures.style import (
     note,
     panels,
 )
-from calib.report.labels import MINUS, NO_UNIT, axis_of, joined, percent, plain, short, unit_plain
+from calib.report.labels import MINUS, NO_UNIT, axis_of, percent, plain, short, unit_plain
 from calib.report.numbers import centre_text
 from calib.report.reference import NOTHING, Reference
 from calib.report.rows import (
     Group,
     data_word,
-    group_column,
     groups,
     held_table,
     signs_along,
@@ -41,8 +39,6 @@ from calib.validation.joint import effective_rows, ks_distance, pit_half_width
 from calib.validation.residuals import (
     Standardised,
     normal_order,
-    normality_p,
-    spreads,
     standardise,
 )
 from calib.validation.validate import PARETO_K_MAX
@@ -153,14 +149,11 @@ def _residuals_caption(
     result: OutputResult, fitted: Standardised, held: Standardised | None
 ) -> str:
     n, large = fitted.residual.size, int((np.abs(fitted.residual) > 2.0).sum())
-    p = normality_p(fitted.residual)
     runs, pairs = signs_along(result, fitted.residual)
     beyond = "As normal scores, b" if result.calibration.problem.noise.student else "B"
     text = (
         f"{beyond}eyond 2 noise sds lie {large} of {n} residuals ({short(0.046 * n)} expected); "
-        "they "
-        f"{'are compatible with' if p > 0.05 else 'depart from'} a normal law (Shapiro-Wilk p = "
-        f"{short(p)}) and change sign {runs} times along {axis_of(x_column(result)).name.lower()} "
+        f"they change sign {runs} times along {axis_of(x_column(result)).name.lower()} "
         f"where independent ones would do so about {0.5 * pairs:.0f} times."
     )
     sigma = result.calibration.summary.get("sigma")
@@ -171,36 +164,11 @@ def _residuals_caption(
         what = "The noise scale" if noise.student else "One noise sd"
         where = f" at the mean {axis_of(noise.column).name.lower()}" if noise.column else ""
         text += f" {what} {plain('sigma')}{where} is {centre_text(sigma)}{unit}{scale}."
-    text += _spread_words(result, fitted)
     if held is not None:
         mean = float(held.residual.mean())
         side = "above" if mean > 0.0 else "below"
         text += f" Held-out rows (open) lie {short(abs(mean))} noise sds {side} their prediction."
     return text
-
-
-def _spread_words(result: OutputResult, fitted: Standardised) -> str:
-    """Say whether the noise differs between pressures; empty where too few rows would tell."""
-    problem = result.calibration.problem
-    if role_of(group_column(result) or "") != "pressure" or problem.noise.column:
-        return ""
-    found = groups(result, most=False)
-    sd, p = spreads(problem, fitted.predicted, (g.fitted for g in found))
-    if np.isnan(p):
-        return ""
-    if not p < _SIGNIFICANT:
-        return f" Their spread does not tell the pressures apart (Levene p = {short(p)})."
-    model = problem.bound.model
-    axis = axis_of(model.output)
-    unit, factor = ("of ln output", 1.0) if model.response == "log" else (axis.unit, axis.factor)
-    named = zip((factor * sd).tolist(), (g.title for g in found), strict=True)
-    sds = sorted(((s, title) for s, title in named if s > 0.0), reverse=True)
-    listed = joined([f"{short(sd)} {unit} at {title}" for sd, title in sds])
-    return (
-        f" Their sd differs between pressures: {listed} (Levene p = {short(p)}); one "
-        f"{plain('sigma')} for all makes the bands too narrow at {sds[0][1]} and too wide at "
-        f"{sds[-1][1]}."
-    )
 
 
 def validation_plate(result: OutputResult, *, reference: Reference = NOTHING) -> Plate:

@@ -37,7 +37,7 @@ from calib.report.reference import reference_of
 from calib.report.rows import held_table, x_column
 from calib.report.sections import Document, Written, emulation_words
 from calib.report.study import Failure, OutputResult, Study
-from calib.report.verdict import Evidence, Level, gather, judge_evidence
+from calib.report.verdict import Evidence, Level, judge_evidence
 
 
 def validation_facts(result: OutputResult, effective: float, low_p: float) -> list[list[str]]:
@@ -176,7 +176,7 @@ def section(
     """
     calibration = result.calibration
     problem = calibration.problem
-    evidence = replace(gather(result), emulator_fails=(emulation or {}).get("reasons", ()))
+    evidence = replace(result.evidence, emulator_fails=(emulation or {}).get("reasons", ()))
     verdict = judge_evidence(evidence)
     reference = reference_of(problem.table.label)
     names = [*problem.bound.model.reported, *(p.name for p in problem.priors.entries)]
@@ -189,6 +189,7 @@ def section(
         "level": str(verdict.level.value),
         "mark": MARKS[verdict.level],
         "headline": verdict.headline,
+        "fails": [prose(text, names) for text in verdict.fails],
         "trust": prose(verdict.trust, names),
         "doubt": prose(verdict.doubt, names),
         "label": problem.table.label,
@@ -198,7 +199,7 @@ def section(
         "parametrisation": prose(parametrisation(bound), names),
         "data": _data_facts(result),
         "assumed": [prose(note, names) for note in evidence.notes],
-        "warnings": [prose(warning, names) for warning in result.warnings],
+        "warnings": [prose(r.text, names) for r in verdict.remarks if not r.title],
         "priors": prior_rows(result),
         "prior_source": PurePath(problem.priors.source).name,
         "estimates": estimates_grid(result, reference=reference),

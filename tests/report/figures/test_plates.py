@@ -27,6 +27,7 @@ from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.labels import axis_of, units_of
 from calib.report.reference import NOTHING
 from calib.report.rows import groups, signs_along
+from calib.report.verdict import judge_evidence
 from calib.validation.residuals import standardise
 from calib.validation.roles import BOTH, DATA, MOVED, PRIOR, role_of
 
@@ -256,20 +257,16 @@ def with_residuals(drawbar, high, low):
     return replace(drawbar, calibration=replace(drawbar.calibration, problem=told))
 
 
-def test_residuals_say_where_one_sigma_does_not_fit(drawbar):
-    caption = residuals_plate(with_residuals(drawbar, 0.2, 0.02)).caption
-    sds = re.search(r"([\d.]+) kN at 18 psi and ([\d.]+) kN at 42 psi", caption).groups()
-    assert float(sds[0]) == pytest.approx(0.2, rel=0.5)
-    assert float(sds[1]) == pytest.approx(0.02, rel=0.5)
-    assert "too narrow at 18 psi and too wide at 42 psi" in caption
-    same = residuals_plate(with_residuals(drawbar, 0.05, 0.05)).caption
-    assert "does not tell the pressures apart" in same
-    assert "too narrow" not in same
-
-
-def test_spread_is_compared_between_pressures_only(plate, density):
-    for result in (plate, density):
-        assert "Levene" not in residuals_plate(result).caption
+def test_scatter_that_differs_between_pressures_is_the_verdicts_first_line(drawbar):
+    found = judge_evidence(with_residuals(drawbar, 0.2, 0.02).evidence)
+    (uneven,) = (remark for remark in found.remarks if remark.title == "Scatter is uneven")
+    assert "too narrow at 18 psi" in uneven.text
+    assert "too wide at 42 psi" in uneven.text
+    assert found.headline == "Scatter is uneven"
+    assert found.trust.startswith("the median, to ")
+    assert [round(part.low) for part in uneven.where] == [18, 42]
+    same = judge_evidence(with_residuals(drawbar, 0.05, 0.05).evidence)
+    assert not any("too narrow" in text for text in same.fails)
 
 
 def test_by_pressure_says_which_pressures_were_calibrated(drawn):

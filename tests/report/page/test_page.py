@@ -34,7 +34,6 @@ from calib.report.page.template import (
 )
 from calib.report.sections import Written
 from calib.report.study import Failure, Study
-from calib.validation.assumptions import warnings_of
 
 PNG = b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x00\x00\x00\x02\x00\x00\x00\x03\x08\x06\x00\x00\x00rest"
 MANIFEST = {
@@ -213,9 +212,13 @@ def test_readings_far_off_are_named(rut):
     columns = dict(table.columns) | {"rut_depth_mm": table["rut_depth_mm"].copy()}
     columns["rut_depth_mm"][4] *= 30.0
     problem = rut.calibration.problem.with_table(replace(table, columns=columns))
-    told = replace(rut, warnings=warnings_of(problem, rut.calibration.draws.mode))
-    assert f"line {table.lines[4]}: " in page({"rut_depth": told})[1].text
-    assert "Warning:" not in page({"rut_depth": rut})[1].text
+    told = replace(rut, calibration=replace(rut.calibration, problem=problem))
+    said = page({"rut_depth": told})[1].text
+    assert f"line {table.lines[4]}: " in said
+    # First of all on its card.
+    assert said.index(f"line {table.lines[4]}: ") < said.index("Trust:")
+    assert "Rows far off" in said
+    assert "Rows far off" not in page({"rut_depth": rut})[1].text
 
 
 def test_repeats_that_stay_in_are_named(plate):

@@ -38,7 +38,7 @@ from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.models.simulators.registered import slow_simulator
 from calib.report.study_tasks import HoldOut, read_and_split
-from calib.validation.assumptions import warnings_of
+from calib.report.verdict import Verdict, keep_verdict, verdict
 from calib.validation.validate import validate_held_out
 
 SHIPPED, NOTHING = "shipped", "nothing"
@@ -118,16 +118,20 @@ class Fit(Kind[FitSection, FitItem]):
         point = estimate(problem, "least_squares", generator(seed, model, "least_squares"))
         calibration = calibrate(problem, seed, estimates=(point,), settings=settings)
         numbers = _numbers(calibration)
-        files = dict(_run_folder(calibration)) if posterior else {}
+        validation = None if held is None else validate_held_out(calibration, held)
+        fails = () if emulation is None else emulation.numbers.get("reasons", ())
+        judged = verdict(calibration, validation, emulator_fails=fails)
+        numbers["verdict"] = judged.headline
+        files = dict(_run_folder(calibration, judged)) if posterior else {}
         if emulation is not None:
             # A posterior under an emulator that is too far off is not to be used either.
             numbers["converged"] = numbers["converged"] and emulation.passed
             numbers["emulator"] = emulation.numbers
             files[EMULATION] = emulation_file([emulation])
-        if warnings := warnings_of(problem, calibration.draws.mode, calibration.draws.flat):
-            numbers["warnings"] = " | ".join(warnings)
-        if held is not None:
-            scores = validate_held_out(calibration, held).scores
+        if judged.warnings:
+            numbers["warnings"] = " | ".join(judged.warnings)
+        if validation is not None:
+            scores = validation.scores
             numbers["held_out"] = {
                 "rows": scores.n, "rmse": scores.rmse,
                 "crps": scores.crps if isfinite(scores.crps) else None,
@@ -190,9 +194,10 @@ def _numbers(calibration: Calibration) -> dict[str, Any]:
 _SHOWN = ("unit", "mean", "sd", "median", "hdi_lower", "hdi_upper", "sd_ratio")
 
 
-def _run_folder(calibration: Calibration) -> Mapping[str, str | bytes]:
+def _run_folder(calibration: Calibration, judged: Verdict) -> Mapping[str, str | bytes]:
     # How long it took stands elsewhere: without it, equal posteriors are equal files.
     calibration = replace(calibration, draws=replace(calibration.draws, seconds=0.0))
     with TemporaryDirectory() as scratch:
         save_calibration(calibration, Path(scratch))
+        keep_verdict(judged, Path(scratch))
         return {f"run/{name}": data for name, data in read_folder(Path(scratch)).items()}
