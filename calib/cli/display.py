@@ -106,7 +106,7 @@ def posterior_table(calibration: Calibration) -> None:
         table.add_row(
             s.name, s.unit, centre_text(s),
             interval_text(s), f"{s.ess_bulk:.0f}/{s.ess_tail:.0f}",
-            f"{s.rhat:.3f}", remarks.get(s.name, ""),
+            f"{s.rhat:.3f}", remarks[s.name],
         )  # fmt: skip
     # A pipe has no width of its own: wide enough for whole rows.
     width = None if sys.stdout.isatty() else 120

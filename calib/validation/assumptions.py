@@ -31,7 +31,8 @@ from calib.data.units_check import (
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import distances
-from calib.inference.estimators import PointEstimate, estimate
+from calib.inference.estimators import PointEstimate
+from calib.inference.estimators.least_squares import estimate_least_squares
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
@@ -169,14 +170,17 @@ def _cut_off(problem: Problem, draws: Array) -> Iterable[Remark]:
 
 def parameter_remarks(calibration: Calibration) -> dict[str, str]:
     """Say of each parameter of a summary what a table has room for; nothing of most."""
-    found = {n: "set by the prior" for n, s in calibration.summary.items() if s.sd_ratio > 0.9}
-    best = _least_squares(calibration)
-    for name, sds in _far_off(calibration, best).items():
-        assert best is not None
-        found[name] = f"{plain_number(_estimated(calibration, best, name))} by least squares"
-        found[name] += f", {abs(sds):.0f} sds off"
-    for name, bound in _bounds_pressed(calibration).items():
-        found[name] = f"pressed against its bound {plain_number(bound)}"
+    best, pressed = _least_squares(calibration), _bounds_pressed(calibration)
+    far = {} if best is None else _far_off(calibration, best)
+    found = {}
+    for name, s in calibration.summary.items():
+        said = ["set by the prior"] * (s.sd_ratio > 0.9)
+        if name in pressed:
+            said.append(f"pressed against its bound {plain_number(pressed[name])}")
+        if best is not None and name in far:
+            value = plain_number(_estimated(calibration, best, name))
+            said.append(f"{value} by least squares, {abs(far[name]):.0f} sds off")
+        found[name] = "; ".join(said)
     return found
 
 
@@ -218,7 +222,7 @@ def _beyond(calibration: Calibration, name: str) -> str:
     )  # fmt: skip
     free = replace(problem, priors=replace(problem.priors, entries=entries))
     with suppress(CalibError):
-        best = estimate(free, "least_squares", generator(calibration.seed, name, "without bounds"))
+        best = estimate_least_squares(free, generator(calibration.seed, name, "without bounds"))
         sampled = dict(zip(model.parameters, best.theta, strict=True))
         found = {name: float(sampled[name]), **best.reported}
         said = [f"{n} = {plain_number(v)}" for n, v in found.items()]
@@ -246,10 +250,8 @@ def _estimated(calibration: Calibration, best: PointEstimate, name: str) -> floa
     return float({**sampled, **best.reported}[name])
 
 
-def _far_off(calibration: Calibration, best: PointEstimate | None) -> dict[str, float]:
+def _far_off(calibration: Calibration, best: PointEstimate) -> dict[str, float]:
     """Parameters of the model whose estimate is far off, the farthest first, with how many sds."""
-    if best is None:
-        return {}
     model, found = calibration.problem.bound.model, {}
     for name, draws in calibration.parameters.items():
         if name in model.parameters or name in model.reported:

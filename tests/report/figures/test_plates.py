@@ -263,7 +263,7 @@ def test_scatter_that_differs_between_pressures_is_the_verdicts_first_line(drawb
     assert "too narrow at 18 psi" in uneven.text
     assert "too wide at 42 psi" in uneven.text
     assert found.headline == "Scatter is uneven"
-    assert found.trust.startswith("the median, to ")
+    assert found.trust.startswith("the median at 18 and 42 psi")
     assert [round(part.low) for part in uneven.where] == [18, 42]
     same = judge_evidence(with_residuals(drawbar, 0.05, 0.05).evidence)
     assert not any("too narrow" in text for text in same.fails)

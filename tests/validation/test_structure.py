@@ -1,0 +1,154 @@
+"""What the data say against the prior, and columns that the model leaves out: right values."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calib.data import table_from_arrays
+from calib.inference.calibration import Calibration, calibrate
+from calib.inference.estimators.least_squares import estimate_least_squares
+from calib.inference.priors import Prior
+from calib.inference.problem import Problem
+from calib.validation.assumptions import (
+    LEVEL,
+    checks_of,
+    failed,
+    parameter_remarks,
+    remarks_of,
+    residual_checks,
+)
+from tests.custom_problems import normal, problem_of
+from tests.validation.test_outliers import fitted_line, line_problem
+
+SLIP = np.linspace(0.0, 1.0, 40)
+NOISE = 0.1 * np.random.default_rng(3).standard_normal(40)
+
+
+def fitted(slope: Prior, pull: np.ndarray) -> Calibration:
+    priors = [normal("a", 0.0, 10.0), slope, normal("sigma", np.log(0.1), 1.0, log=True)]
+    problem = problem_of(lambda a, b, s: a + b * s, priors, SLIP, pull)
+    point = estimate_least_squares(problem, np.random.default_rng(1))
+    return calibrate(problem, 1, estimates=(point,))
+
+
+def test_a_prior_that_the_data_contradict_is_named_with_its_numbers() -> None:
+    """The slope is 2; its prior has 0 +- 0.05, so that the posterior lies between."""
+    pull = 1.0 + 2.0 * SLIP + NOISE
+    found = fitted(normal("b", 0.0, 0.05), pull)
+    (check,) = (c for c in checks_of(found) if c.remark.title == "Prior contradicted")
+    line = np.polyfit(SLIP, pull, 1)
+    assert f"b = {line[0]:.3g}" in check.remark.text
+    # The F test of the sums of squares at the mode and of least squares.
+    problem = found.problem
+    at_mode = np.square(problem.residuals(problem.theta(found.draws.mode[None]))).sum()
+    least = np.square(pull - np.polyval(line, SLIP)).sum()
+    p = stats.f.sf((at_mode - least) / 2.0 / (least / 38.0), 2, 38)
+    assert check.p == pytest.approx(p, rel=1e-6)
+    assert p < 1e-6
+    assert "by least squares" in parameter_remarks(found)["b"]
+
+
+@pytest.mark.parametrize("sd", [0.1, 1.0, 100.0])
+def test_a_prior_that_is_right_is_left_alone(sd: float) -> None:
+    found = fitted(normal("b", 2.05, sd), 1.0 + 2.0 * SLIP + NOISE)
+    assert not any(c.remark.title == "Prior contradicted" for c in checks_of(found))
+
+
+def test_weak_data_do_not_contradict_a_sharp_prior_that_is_right() -> None:
+    """Least squares are many posterior sds off then: the posterior is as narrow as the prior."""
+    rng, alarms = np.random.default_rng(4), 0
+    for _ in range(20):
+        pull = 1.0 + 2.0 * SLIP + rng.standard_normal(40)
+        found = fitted(normal("b", 2.0, 0.01), pull)
+        alarms += "Prior contradicted" in {r.title for r in failed(checks_of(found))}
+    assert stats.binom.sf(alarms - 1, 20, LEVEL) > 1e-3
+
+
+@pytest.mark.parametrize(("slope", "bound"), [(-1.0, 0.0), (3.0, 1.0), (0.5, None)])
+def test_a_posterior_pressed_against_a_bound_is_said(slope: float, bound: float | None) -> None:
+    uniform = Prior("b", "1", "a test", "nobody", "uniform", False, 0.5, np.inf, 0.0, 1.0)
+    pull = 1.0 + slope * SLIP + NOISE
+    found = fitted(uniform, pull)
+    said = [r.text for r in remarks_of(found) if r.title == "Posterior at a bound"]
+    if bound is None:
+        assert said == []
+        return
+    assert f"the posterior of b is pressed against {bound:g}" in said[0]
+    assert f"least squares give b = {np.polyfit(SLIP, pull, 1)[0]:.3g}" in said[0].replace(
+        "\u2212", "-"
+    )
+    assert parameter_remarks(found)["b"] == f"pressed against its bound {bound:g}"
+
+
+def test_a_half_normal_prior_may_be_heaped_up_at_zero() -> None:
+    """Zero is then what the prior itself holds for most probable."""
+    half = Prior("b", "1", "a test", "nobody", "half-normal", False, 0.0, 1.0, 0.0)
+    found = fitted(half, 1.0 + NOISE)
+    assert not [r for r in remarks_of(found) if r.title == "Posterior at a bound"]
+
+
+def with_column(problem: Problem, header: str, values: object) -> Problem:
+    table = problem.table
+    columns = {**table.columns, header: values}
+    return problem.with_table(table_from_arrays(columns, source="my.csv"))
+
+
+def told(header: str, values: np.ndarray, effect: np.ndarray, seed: int = 5) -> list[str]:
+    pull = 1.0 + 2.0 * SLIP + effect + 0.1 * np.random.default_rng(seed).standard_normal(40)
+    problem = with_column(line_problem(SLIP, pull), header, values)
+    found = failed(residual_checks(problem, fitted_line(SLIP, pull)))
+    return [r.text for r in found if r.title == "A column explains the residuals"]
+
+
+BIN = np.tile(["A", "B"], 20)
+DAY = np.tile([1.0, 2.0, 3.0, 4.0], 10)
+HEAT = np.random.default_rng(6).random(40)
+
+
+@pytest.mark.parametrize(("header", "values", "effect", "where"), [
+    ("soil bin", BIN, 0.2 * (BIN == "A"), "where it is A (20 rows)"),
+    ("day", DAY, 0.4 * (DAY == 3.0), "where it is 3 (10 rows)"),
+    ("heat", HEAT, HEAT, "where it is 0."),
+    ("heat", HEAT, 8.0 * (HEAT - 0.5) ** 2, "where it is 0."),
+    ("cone_index_kpa", 400.0 + 200.0 * HEAT, HEAT, "a column that is not used"),
+])  # fmt: skip
+def test_a_column_that_explains_the_residuals_is_named(
+    header: str, values: np.ndarray, effect: np.ndarray, where: str
+) -> None:
+    """A category, a number of few values, a trend, a bow, and a quantity that is known."""
+    (said,) = told(header, values, effect)
+    assert f"differ with {header!r}" in said
+    assert where in said
+
+
+@pytest.mark.parametrize(("header", "values"), [
+    ("remark", np.array([f"row {i}" for i in range(40)])),
+    ("site", np.full(40, "north")),
+    ("rut_depth_mm", 10.0 + 10.0 * HEAT),
+])  # fmt: skip
+def test_remarks_constants_and_other_outputs_explain_nothing(
+    header: str, values: np.ndarray
+) -> None:
+    assert told(header, values, HEAT) == []
+
+
+def test_columns_that_mean_nothing_alarm_no_more_often_than_is_said() -> None:
+    rng, alarms, trials = np.random.default_rng(7), 0, 300
+    for _ in range(trials):
+        pull = 1.0 + 2.0 * SLIP + 0.1 * rng.standard_normal(40)
+        problem = line_problem(SLIP, pull)
+        extra = {"bin": rng.choice(["A", "B", "C"], 40), "heat": rng.random(40)}
+        table = table_from_arrays({**problem.table.columns, **extra}, source="my.csv")
+        alarms += bool(failed(residual_checks(problem.with_table(table), fitted_line(SLIP, pull))))
+    assert stats.binom.sf(alarms - 1, trials, LEVEL) > 1e-3
+
+
+def test_part_of_a_table_keeps_its_other_columns() -> None:
+    table = with_column(line_problem(SLIP, SLIP), "soil bin", BIN).table
+    assert table.extra == {"soil bin": tuple(BIN)}
+    assert table.take(BIN == "B").extra == {"soil bin": ("B",) * 20}
+    assert replace(table, extra={}).ignored == ("soil bin",)
