@@ -6,6 +6,7 @@ import ast
 import dis
 import functools
 import hashlib
+import os
 import pickle
 import re
 import sys
@@ -19,6 +20,11 @@ from typing import Any
 import numpy as np
 
 _DOTTED = re.compile(r"[^\W\d]\w*(?:\.\w+)*")
+_PATH = re.compile(r"[\w.+-]+(?:/[\w.+-]+)*")
+# Beside what has no ending and may be executed.
+_PROGRAMS = {
+    ".exe", ".jl", ".js", ".lua", ".m", ".pl", ".py", ".r", ".rb", ".sh", ".so", ".tcl",
+}  # fmt: skip
 _PLAIN = (int, float, complex, str, bytes, type(None), np.ndarray, np.generic)
 # Python, installed packages and this one: their files are taken alone, without what they import.
 _INSTALLED = (
@@ -30,20 +36,23 @@ _INSTALLED = (
 def own_files(path: Path) -> tuple[Path, ...]:
     """Return a program's file and what it imports from its own folder or package, and so on.
 
-    Imports are read from the text of Python files, wherever they stand; a text that names a module
-    counts as well, for it may be imported by its name.
+    Of Python files that is what they import, wherever it stands in them; of these and of scripts
+    of a shell it is also the programs beside them that they name.
     """
     path = path.resolve()
     folder = _own_folder(path)
     found, left = {path}, [path]
     while left:
         this = left.pop()
-        around = {path.parent, this.parent, folder.parent}
-        for name, up in _imports(this):
+        imports, texts = _read(this)
+        named = {file for text in texts for file in _programs(this.parent, text)}
+        for name, up in imports:
+            around = {path.parent, this.parent, folder.parent}
             for root in {this.parents[up - 1]} if up else around:
-                new = {p for p in _named(root, name.split(".")) if p.is_relative_to(folder)} - found
-                found |= new
-                left += new
+                named.update(_modules(root, name.split(".")))
+        new = {file for file in named - found if file.is_relative_to(folder)}
+        found |= new
+        left += new
     return (path, *sorted(found - {path}))
 
 
@@ -88,32 +97,48 @@ def _own_folder(path: Path) -> Path:
     return folder
 
 
-def _imports(path: Path) -> Iterator[tuple[str, int]]:
-    """Yield the names that a Python file may import, and how many folders up each begins."""
+def _read(path: Path) -> tuple[list[tuple[str, int]], list[str]]:
+    """Return what a file may import, as names and how many folders up they begin, and its texts."""
     try:
         content = path.read_bytes()
-        shebang = content[:200].split(b"\n", 1)[0]
-        if path.suffix not in (".py", ".pyw") and not re.match(rb"#!.*python", shebang):
-            return
+        shebang = content.split(b"\n", 1)[0] if content[:2] == b"#!" else b""
+        if path.suffix not in (".py", ".pyw") and b"python" not in shebang:
+            return [], [content.decode(errors="replace")] if shebang or path.suffix == ".sh" else []
         nodes = list(ast.walk(ast.parse(content)))
     except (OSError, SyntaxError, ValueError, RecursionError):
-        return
+        return [], []
+    imports, texts = [], []
     for node in nodes:
         if isinstance(node, ast.Import):
-            yield from ((alias.name, 0) for alias in node.names)
+            imports += [(alias.name, 0) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = f"{node.module}." if node.module else ""
-            yield from ((f"{base}{alias.name}", node.level) for alias in node.names)
-        elif isinstance(node, ast.Constant) and _DOTTED.fullmatch(str(node.value)):
-            yield str(node.value), 0
+            imports += [(f"{base}{alias.name}", node.level) for alias in node.names]
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            texts.append(node.value)
+            # It may be imported by its name.
+            imports += [(node.value, 0)] if _DOTTED.fullmatch(node.value) else []
+    return imports, texts
 
 
-def _named(root: Path, parts: list[str]) -> Iterator[Path]:
+def _modules(root: Path, parts: list[str]) -> Iterator[Path]:
     """Yield the files of a dotted name below a folder, those of the packages on the way too."""
     for i, part in enumerate(parts):
         at = root.joinpath(*parts[:i])
         there = (*(at / f"{part}{suffix}" for suffix in all_suffixes()), at / part / "__init__.py")
         yield from (file.resolve() for file in there if file.is_file())
+
+
+def _programs(folder: Path, text: str) -> Iterator[Path]:
+    """Yield the programs below a folder that a text names, as a path or the end of one."""
+    for path in set(_PATH.findall(text)):
+        parts = path.split("/")
+        for i in range(len(parts)):
+            file = folder.joinpath(*parts[i:])
+            written = file.suffix.lower() in _PROGRAMS
+            built = not file.suffix and os.access(file, os.X_OK)
+            if (written or built) and file.is_file():
+                yield file.resolve()
 
 
 class _Fingerprint(pickle._Pickler):

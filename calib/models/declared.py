@@ -5,6 +5,7 @@ from __future__ import annotations
 import tomllib
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
+from unicodedata import normalize
 
 from calib.data.documents import MEND_TOML
 from calib.data.quantities import OUTPUTS, QUANTITIES
@@ -61,34 +62,36 @@ def check_word(name: object, what: str, where: str) -> None:
         )  # fmt: skip
 
 
-def check_names(taken: Mapping[str, str], given: Mapping[str, Iterable[str]], where: str) -> None:
+def check_names(
+    taken: Mapping[str, str], given: Iterable[tuple[str, str, str]], where: str
+) -> None:
     """Check that each name is that of one thing: files know things by their names.
 
     Parameters
     ----------
     taken : mapping of str to str
         Names that are those of something else, and what that is.
-    given : mapping of str to iterable of str
-        Names by what they are those of.
+    given : iterable of (str, str, str)
+        Names, what each is the name of, and the key that says so.
 
     Raises
     ------
     CalibError
         If a name is there twice.
     """
-    known = dict(taken)
-    for what, names in given.items():
-        for name in names:
-            if name in known:
-                twice = known[name] == f"the {what} {name}"
-                raise CalibError(
-                    f"the {what} {name} is there twice" if twice
-                    else f"the {what} {name} has the name of {known[name]}",
-                    where=where, allowed="a name for each parameter, condition and output that "
-                    f"nothing else has: not {', '.join(taken)}",
-                    mend="rename one of them",
-                )  # fmt: skip
-            known[name] = f"the {what} {name}"
+    # Letters that look alike and are written in two ways are the same.
+    known = {normalize("NFKC", name): what for name, what in taken.items()}
+    for name, what, key in given:
+        other = known.get(normalize("NFKC", name))
+        if other is not None:
+            raise CalibError(
+                f"{what} is there twice" if other == what else f"{what} has the name of {other}",
+                where=f"{where}, {key}",
+                allowed="a name for each parameter, condition and output that nothing else has: "
+                f"not {', '.join(taken)}",
+                mend="rename one of them",
+            )  # fmt: skip
+        known[normalize("NFKC", name)] = what
 
 
 def check_model(model: Model) -> None:
@@ -124,11 +127,11 @@ def check_model(model: Model) -> None:
         )  # fmt: skip
     names = (*model.parameters, "sigma")
     derived = [name for name in model.reported if name not in model.parameters]
-    check_names(
-        DIMENSIONS | {"sigma": "the noise"},
-        {"parameter": names[:-1], "published parameter": derived, "condition": model.conditions,
-         "output": [model.output]}, where,
-    )  # fmt: skip
+    given = [(name, f"the parameter {name}", "parameters") for name in model.parameters]
+    given += [(name, f"the published parameter {name}", "reported") for name in derived]
+    given += [(name, f"the condition {name}", "conditions") for name in model.conditions]
+    given += [(model.output, f"the output {model.output}", "output")]
+    check_names(DIMENSIONS | {"sigma": "the noise"}, given, where)
     if not model.priors:
         raise CalibError(
             "the model has no priors", where=where,

@@ -297,28 +297,31 @@ def declare(
         for own, header in outputs.items()
     )
     parameters = tuple(t for t in tables if t not in sigmas.values())
-    check_names(
-        {"sigma": "the noise"} | {f"sigma_{own}": f"the noise of {own}" for own in outputs},
-        {"parameter": parameters, "condition": conditions, "output": outputs},
-        f"simulator {name}",
-    )
+    where = f"simulator {name}"
+    given = [(p, f"the parameter {p}", f"parameters.{p}") for p in parameters]
+    for key, table in (("conditions", conditions), ("outputs", outputs)):
+        given += [(own, f"the {key[:-1]} {own}", f"{key}.{own}") for own in table]
+    noise = {"sigma": "the noise"} | {f"sigma_{own}": f"the noise of {own}" for own in outputs}
+    check_names(noise, given, where)
     text = "\n".join(tables[t] for t in parameters)
     simulator = Simulator(name, way, parameters, text, conditions, declared, **details)
+    given = given[: len(parameters)]
     for key, table in (("conditions", conditions), ("outputs", outputs)):
+        known = set()
         for own, header in table.items():
             try:
-                simulator.canonical(header)
+                column = simulator.canonical(header)
             except CalibError as error:
                 raise CalibError(
-                    error.message, where=f"simulator {name}, {key}.{own}", allowed=error.allowed,
+                    error.message, where=f"{where}, {key}.{own}", allowed=error.allowed,
                     mend=error.mend,
                 ) from None  # fmt: skip
-    check_names(
-        DIMENSIONS | dict.fromkeys(FAILED, "a column of the list of failed runs"),
-        {"parameter": parameters, "column of a condition": simulator.takes,
-         "column of an output": [simulator.canonical(header) for header in outputs.values()]},
-        f"simulator {name}",
-    )  # fmt: skip
+            # A program may take a condition in two units.
+            if key == "outputs" or column not in known:
+                given.append((column, f"the column {column} of {key}.{own}", f"{key}.{own}"))
+            known.add(column)
+    reserved = dict.fromkeys(FAILED, "a column of the list of failed runs")
+    check_names(DIMENSIONS | reserved, given, where)
     return Simulated(simulator, folder, budget)
 
 

@@ -216,6 +216,29 @@ def test_modules_beside_a_script_are_of_the_program(tmp_path: Path, name: str) -
     assert read_simulator(file).simulator.digest == after
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '#!/bin/sh\nexec python "$CALIB_SIMULATOR/inner/solve.py" "$1"\n',
+        "#!/usr/bin/env python3\nimport subprocess\nsubprocess.run(['./solver', '-q'])\n",
+    ],
+)
+def test_programs_that_a_script_names_are_of_it(tmp_path: Path, text: str) -> None:
+    (tmp_path / "inner").mkdir()
+    for name in ("solver", "inner/solve.py", "start"):
+        (tmp_path / name).write_text(text if name == "start" else "1\n")
+        (tmp_path / name).chmod(0o755)
+    file = write_program(tmp_path, run='"./start {input} {output}"')
+    before = read_simulator(file).simulator.digest
+    for name in ("solver", "inner/solve.py"):
+        (tmp_path / name).write_text("2\n")
+    after = read_simulator(file).simulator.digest
+    assert after != before
+    # What it leaves beside itself is not it.
+    (tmp_path / "out.csv").write_text("pull\n1\n")
+    assert read_simulator(file).simulator.digest == after
+
+
 def test_a_run_on_disk_says_what_it_is_of(tmp_path: Path) -> None:
     made(closure(1.0), tmp_path)
     (path,) = tmp_path.rglob("*-0.json")
