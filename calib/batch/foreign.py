@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import os
 import sys
 import warnings
@@ -12,6 +11,7 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import Any
 
+from calib.batch.sources import own_files
 from calib.batch.threads import no_floating_point_errors
 from calib.errors import CalibError
 
@@ -94,31 +94,10 @@ def loading(module: str, path: Path) -> Iterator[None]:
 
 def beside(path: Path) -> dict[str, Path]:
     """Return the modules in a file's folder that it imports, or that these import, by name."""
-    found: dict[str, Path] = {}
-    todo = [path]
-    while todo:
-        try:
-            tree = ast.parse(todo.pop().read_bytes())
-        except (OSError, SyntaxError, ValueError):
-            continue  # for whoever imports it
-        for name in _imported(tree) - set(found):
-            for file in (path.parent / f"{name}.py", path.parent / name / "__init__.py"):
-                if file.is_file() and file != path:
-                    found[name] = file
-                    todo += [file] if file.stem == name else file.parent.rglob("*.py")
-                    break
-    return found
-
-
-def _imported(tree: ast.Module) -> set[str]:
-    """Return the first parts of the names that a text imports."""
-    names: set[str] = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            names |= {alias.name.partition(".")[0] for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            names.add(node.module.partition(".")[0])
-    return names
+    files = own_files(path, named=False)[1:]
+    packages = {f.parent.name: f for f in files if f.name == "__init__.py"}
+    found = {f.stem: f for f in files if f.parent == path.parent and f.suffix == ".py"} | packages
+    return {n: f for n, f in found.items() if path.parent in (f.parent, f.parent.parent)}
 
 
 def _check_beside(path: Path) -> None:

@@ -33,11 +33,11 @@ _INSTALLED = (
 )
 
 
-def own_files(path: Path) -> tuple[Path, ...]:
+def own_files(path: Path, *, named: bool = True) -> tuple[Path, ...]:
     """Return a program's file and what it imports from its own folder or package, and so on.
 
-    Of Python files that is what they import, wherever it stands in them; of these and of scripts
-    of a shell it is also the programs beside them that they name.
+    Of Python files that is what they import, wherever it stands in them. What is only `named` in
+    these and in scripts of a shell counts as well: modules, and programs beside them.
     """
     path = path.resolve()
     folder = _own_folder(path)
@@ -45,12 +45,15 @@ def own_files(path: Path) -> tuple[Path, ...]:
     while left:
         this = left.pop()
         imports, texts = _read(this)
-        named = {file for text in texts for file in _programs(this.parent, text)}
+        new = set()
+        for text in texts if named else ():
+            new.update(_programs(this.parent, text))
+            imports += [(text, 0)] if _DOTTED.fullmatch(text) else []
         for name, up in imports:
             around = {path.parent, this.parent, folder.parent}
             for root in {this.parents[up - 1]} if up else around:
-                named.update(_modules(root, name.split(".")))
-        new = {file for file in named - found if file.is_relative_to(folder)}
+                new.update(_modules(root, name.split(".")))
+        new = {file for file in new - found if file.is_relative_to(folder)}
         found |= new
         left += new
     return (path, *sorted(found - {path}))
@@ -116,8 +119,6 @@ def _read(path: Path) -> tuple[list[tuple[str, int]], list[str]]:
             imports += [(f"{base}{alias.name}", node.level) for alias in node.names]
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             texts.append(node.value)
-            # It may be imported by its name.
-            imports += [(node.value, 0)] if _DOTTED.fullmatch(node.value) else []
     return imports, texts
 
 

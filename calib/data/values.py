@@ -105,6 +105,9 @@ def _of_array(found: np.ndarray[Any, Any], unit: str) -> Array:
 
 
 def _of_parts(found: Sequence[Any], unit: str) -> Array:
+    if {type(part) for part in found} <= {float, int}:
+        with suppress(OverflowError):
+            return np.array(found, dtype=np.float64)
     parts = [_real(part, unit) for part in found]
     shapes = {part.shape for part in parts}
     if len(shapes) > 1:
