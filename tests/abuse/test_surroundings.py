@@ -335,6 +335,22 @@ def test_a_lack_of_memory_is_no_failed_run(limit: float | None, tmp_path: Path) 
     assert kept(tmp_path / "runs") == []
 
 
+def test_surroundings_that_stay_away_are_not_tried_for_ever(tmp_path: Path) -> None:
+    tried: list[float] = []
+
+    def refused(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        tried.append(theta[0, 0])
+        if len(tried) == 3:
+            return np.ones((1, x["w"].size))
+        raise ConnectionRefusedError
+
+    keeper = RunKeeper(in_python(refused), tmp_path / "runs")
+    with pytest.raises(CalibError, match="7 of 50 runs could not be made"):
+        keeper.runs(np.linspace(THETA, 2.0 * THETA, 50), X)
+    # Two, one that was made, and five in a row.
+    assert (len(tried), len(kept(tmp_path / "runs"))) == (8, 1)
+
+
 def kept(folder: Path) -> list[str]:
     return [p.name for p in folder.glob("*/*.json") if p.name != "failed.json"]
 
@@ -876,8 +892,8 @@ def test_whenever_it_is_stopped_folders_are_whole(number: int) -> None:
             except subprocess.TimeoutExpired:
                 process.send_signal(number)
             _, said = process.communicate(timeout=60)
-        assert process.returncode in (0, 3, 130, -number)
-        assert "Traceback" not in said
+        assert process.returncode in (0, 3, 130, -number), said
+        assert "Traceback" not in said, said
         for folder in Path().glob("both-unfinished/*"):
             if (folder / "run.json").exists():
                 calib.load_calibration(folder)

@@ -48,6 +48,7 @@ def run_tasks[I, R](
     progress: Progress | None = None,
     announce: Callable[[str], None] | None = None,
     kept: Kept[R, Any] = JSON_FILES,
+    give_up: int | None = None,
 ) -> Outcome:
     """Do every task whose result is not there; each gives one JSON file.
 
@@ -73,6 +74,8 @@ def run_tasks[I, R](
         Called with one line that says where the tasks are done.
     kept : Kept
         How results are kept, if not as JSON.
+    give_up : int, optional
+        After so many failures with nothing done between them no more tasks are done.
 
     Returns
     -------
@@ -106,13 +109,18 @@ def run_tasks[I, R](
         ) as coming,
     ):  # fmt: skip
         tell(len(found), len(items))
+        in_a_row = 0
         try:
             for task in coming:
                 if task.error is None:
                     land(task)
                     found.add(task.name)
+                    in_a_row = 0
                 else:
                     failed[task.name] = task.error
+                    in_a_row += 1
+                    if in_a_row == give_up:
+                        break
                 tell(len(found) + len(failed), len(items))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(

@@ -117,6 +117,8 @@ class RunKeeper:
         return self._memory
 
     def _on_disk(self, items: Mapping[str, _Item]) -> Mapping[str, Mapping[str, Any]]:
+        from calib.models.simulators.refused import FIRST  # which imports this
+
         folder = Path(self.folder or ".") / self.simulator.digest[:16]
         _say_unshared(self.simulator.name, getattr(self.simulator.way, "unshared", ""))
         with writing(folder):
@@ -130,7 +132,7 @@ class RunKeeper:
                 self.made, self.kept = self.made + 1, self.kept - 1
         outcome = run_tasks(
             _carry_out, items, folder, workers=self._workers(len(items)),
-            scheduler=self.scheduler, progress=self.progress,
+            scheduler=self.scheduler, progress=self.progress, give_up=FIRST,
         )  # fmt: skip
         new = [s for n, s in outcome.seconds.items() if n not in outcome.resumed]
         self.seconds = float(np.median(new)) if new else self.seconds
