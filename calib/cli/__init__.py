@@ -16,11 +16,12 @@ from functools import partial
 from threading import Timer
 from typing import Any
 
-__all__ = ["INTERRUPTED", "STOPPED", "interruptible", "main", "program"]
+__all__ = ["INTERRUPTED", "STOPPED", "interruptible", "main", "program", "was_interrupted"]
 
 INTERRUPTED = 130
 # What was printed could not be written, although files were.
 LOST = 2
+_came: list[bool] = []
 STOPPED = (
     "interrupted; nothing was written. Start the same command again; what simulators of your own "
     "have run, if there are any, is kept and not run again"
@@ -40,10 +41,12 @@ def main() -> None:
     from calib.cli.verbs import command
 
     # A polite kill cleans up as an interrupt does.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    signal.signal(signal.SIGTERM, _interrupt)
     # So does a terminal that is closed.
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
-        signal.signal(signal.SIGHUP, signal.default_int_handler)
+        signal.signal(signal.SIGHUP, _interrupt)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     usual = sys.unraisablehook
     sys.unraisablehook = partial(_interrupt_again, usual)
     before, outputs = (sys.stdout, sys.stderr), _lasting_outputs()
@@ -182,7 +185,17 @@ def _open_what_is_closed() -> None:
 def interruptible() -> None:
     """Make Ctrl-C an exception, which cleans up: from here on there may be something to."""
     if signal.getsignal(signal.SIGINT) is _stop:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGINT, _interrupt)
+
+
+def _interrupt(*_: object) -> None:
+    _came.append(True)
+    raise KeyboardInterrupt
+
+
+def was_interrupted() -> bool:
+    """Whether an interruption came, whatever the code that it came in has made of it."""
+    return bool(_came)
 
 
 def _stop(*_: object) -> None:

@@ -27,6 +27,7 @@ from calib.cli import (
     interruptible,
     predict,
     sbc,
+    was_interrupted,
 )
 from calib.cli.examples import add_examples
 
@@ -45,22 +46,33 @@ class _Verbs(TyperGroup):
         try:
             interruptible()
             return super().invoke(ctx)
-        except CalibError as error:
-            if ctx.params["verbose"]:
-                import traceback
+        except KeyboardInterrupt as stop:
+            _end(str(stop) or _stopped(), INTERRUPTED)
+        except typer.Exit:
+            raise
+        except Exception as error:
+            if was_interrupted():  # in code that has made another error of it
+                _end(_stopped(), INTERRUPTED)
+            if isinstance(error, CalibError):
+                if ctx.params["verbose"]:
+                    import traceback
 
-                traceback.print_exc()
-            _end(str(error), 2)
-        except OSError as error:
+                    traceback.print_exc()
+                _end(str(error), 2)
             # Of a disk that fills up while something is written nothing more can be known before.
-            if error.errno not in (*NO_ROOM, errno.EACCES, errno.EPERM, None):
+            known = (*NO_ROOM, errno.EACCES, errno.EPERM, None)
+            if not isinstance(error, OSError) or error.errno not in known:
                 raise
             _end(
                 f"{error.filename or 'a file'} cannot be written ({error.strerror or error}): "
                 "make room, or change its permissions", 2,
             )  # fmt: skip
-        except KeyboardInterrupt as stop:
-            _end(str(stop) or ("interrupted" if unfinished.saved else STOPPED), INTERRUPTED)
+
+
+def _stopped() -> str:
+    from calib.batch import unfinished
+
+    return "interrupted" if unfinished.saved else STOPPED
 
 
 def _end(why: str, code: int) -> Never:
