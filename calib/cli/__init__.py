@@ -184,6 +184,7 @@ def _open_what_is_closed() -> None:
 
 def interruptible() -> None:
     """Make Ctrl-C an exception, which cleans up: from here on there may be something to."""
+    _came.clear()
     if signal.getsignal(signal.SIGINT) is _stop:
         signal.signal(signal.SIGINT, _interrupt)
 
