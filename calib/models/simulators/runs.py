@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -104,7 +105,8 @@ class RunKeeper:
             name: _Item(self.simulator, theta, conditions)
             for name, theta in zip(names, thetas, strict=True)
         }
-        found = self._in_memory(items) if self.folder is None else self._on_disk(items)
+        with getattr(self.simulator.way, "watched", nullcontext)():
+            found = self._in_memory(items) if self.folder is None else self._on_disk(items)
         return [_run(found[name], t) for name, t in zip(names, thetas, strict=True)]
 
     def _in_memory(self, items: Mapping[str, _Item]) -> Mapping[str, Mapping[str, Any]]:

@@ -6,7 +6,8 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -44,7 +45,8 @@ class CallableWay:
     Attributes
     ----------
     identity : str
-        What the function was when this was made: what it counts or remembers changes as it runs.
+        What the function was when this was made, or as others have changed it since; what it
+        counts or remembers itself as it runs is no part of it.
     unshared : str
         Why it cannot be told from others, so that its runs are not shared; empty if it can.
     """
@@ -55,15 +57,33 @@ class CallableWay:
     limit: float | None = None
     identity: str = field(init=False, repr=False, compare=False)
     unshared: str = field(init=False, repr=False, compare=False)
+    _left: str = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        unshared = ""
+        object.__setattr__(self, "unshared", "")
         try:
             what = fingerprint(self.function)
         except ValueError as error:
-            what, unshared = uuid4().hex, str(error)
+            what = uuid4().hex
+            object.__setattr__(self, "unshared", str(error))
+        self._is(what)
+
+    def _is(self, what: str) -> None:
         object.__setattr__(self, "identity", f"callable {self.batched} {what}")
-        object.__setattr__(self, "unshared", unshared)
+        object.__setattr__(self, "_left", what)
+
+    @contextmanager
+    def watched(self) -> Iterator[None]:
+        """Have what was changed between such blocks, not within, make another simulator of it."""
+        if self.unshared:
+            yield
+            return
+        with suppress(ValueError):
+            if (now := fingerprint(self.function)) != self._left:
+                self._is(now)
+        yield
+        with suppress(ValueError):
+            object.__setattr__(self, "_left", fingerprint(self.function))
 
     @property
     def key(self) -> str:

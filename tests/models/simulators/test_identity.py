@@ -144,6 +144,18 @@ def test_what_a_function_counts_is_no_part_of_it(tmp_path: Path) -> None:
     assert len(calls) == 1
 
 
+def test_what_others_change_of_an_object_makes_another_of_it(tmp_path: Path) -> None:
+    wheel = Wheel(1.0)
+    keeper = RunKeeper(simulator(CallableWay(wheel, ("pull",))), tmp_path)
+    for scale, made in ((1.0, 1), (1.0, 1), (2.0, 2), (1.0, 2)):
+        wheel.scale = scale
+        (run,) = keeper.runs(THETA[None], X)
+        assert keeper.made == made
+        np.testing.assert_allclose(
+            run.outputs["drawbar_pull_kn"], scale * 0.6 * X["normal_load_kn"] / 1e3
+        )
+
+
 def test_runs_of_what_cannot_be_told_are_not_shared_and_it_is_said(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
