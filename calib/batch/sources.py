@@ -45,7 +45,7 @@ def own_files(path: Path, *, named: bool = True) -> tuple[Path, ...]:
     while left:
         this = left.pop()
         imports, texts = _read(this)
-        new = set()
+        new: set[Path] = set()
         for text in texts if named else ():
             new.update(_programs(this.parent, text))
             imports += [(text, 0)] if _DOTTED.fullmatch(text) else []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from types import FunctionType
 from typing import Protocol
 
@@ -47,7 +48,8 @@ def _says_the_same(known: object, new: object) -> bool:
 
 
 def _interactive() -> bool:
-    return not hasattr(sys.modules["__main__"], "__file__")
+    # In a notebook, or where Python reads what is typed, the program is no file.
+    return not Path(getattr(sys.modules["__main__"], "__file__", "")).is_file()
 
 
 class _Declared(Protocol):
