@@ -56,7 +56,9 @@ Simulators = Annotated[
 
 def command() -> list[str]:
     """Return the command line without the folder the program was started from."""
-    return ["calib", *sys.argv[1:]]
+    from calib.data.documents import writable
+
+    return ["calib", *map(writable, sys.argv[1:])]
 
 
 def announce(line: str) -> None:

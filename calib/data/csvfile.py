@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.data.documents import decoded
+from calib.data.documents import decoded, writable
 from calib.errors import CalibError
 
 
@@ -51,6 +51,7 @@ def open_csv(path: str | os.PathLike[str]) -> CsvFile:
     """
     source = os.fspath(path)
     raw = _read_bytes(source)
+    source = writable(source)
     text = _decode(raw, source)
     delimiter = _delimiter(text)
     rows = _rows(text, delimiter, source)

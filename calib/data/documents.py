@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from calib.errors import FAULTS
 
-__all__ = ["MEND_TOML", "decoded", "inside", "read_json", "read_text", "read_toml"]
+__all__ = ["MEND_TOML", "decoded", "inside", "read_json", "read_text", "read_toml", "writable"]
 
 # By the marks that such texts begin with; UTF-16's is the beginning of UTF-32's.
 _ENCODINGS = {
@@ -33,6 +33,11 @@ def decoded(raw: bytes, errors: str = "strict") -> str:
     """
     marked = (name for mark, name in _ENCODINGS.items() if raw.startswith(mark))
     return raw.decode(next(marked, "utf-8-sig"), errors)
+
+
+def writable(name: str) -> str:
+    """Return a name of a file that may be in no encoding as one that a text can hold."""
+    return name.encode("utf-8", "backslashreplace").decode()
 
 
 class _Readable(Protocol):

@@ -795,6 +795,16 @@ def test_of_a_program_too(how: str, printed: bool, tmp_path: Path) -> None:
     assert found["pull"].tolist() == [1.0, 2.0]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="names of files are text")
+def test_a_file_whose_name_is_in_no_encoding_is_reported(tmp_path: Path) -> None:
+    name = os.fsdecode(b"r\xff.csv")
+    shutil.copy("ruts.csv", name)
+    words = ["report", name, "--model", "bekker", "--max-steps", "400", "--workers", "1"]
+    done = shell(f"calib {' '.join(words)} --out rep")
+    assert (done.returncode, "Traceback" in done.stderr) == (0, False), done.stderr
+    assert "r\\udcff.csv" in Path("rep/index.html").read_text(encoding="utf-8")
+
+
 def test_names_are_allowed_in_any_script(tmp_path: Path) -> None:
     path = write_program(tmp_path)
     text = path.read_text()
