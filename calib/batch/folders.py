@@ -29,6 +29,8 @@ _WRITTEN = (
 
 # Scratch folders of results to be written by this process: of each its lock.
 _claimed: dict[Path, tuple[Path, int | None]] = {}
+# Where the work began for which a folder is claimed: code of a user's own may have gone elsewhere.
+_began_in: list[Path] = []
 _YOUNG_SECONDS = 60.0
 # In a scratch folder: the result, what other processes finish of it, and room for it.
 _WHOLE, _PARTS, _RESERVED = "whole", "parts", "reserved"
@@ -54,6 +56,8 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
         If `out` exists and may not be replaced, or cannot be written; or if another process wrote
         it while the block ran: then its name ends in a number.
     """
+    if _began_in:
+        os.chdir(_began_in[-1])
     out = _real(Path(out))
     claim = _claimed.pop(out.absolute(), None)
     if claim is None:
@@ -112,9 +116,11 @@ def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
         with writing(out):
             _reserve(scratch / _RESERVED)
         with unfinished.working(scratch / _PARTS):
+            _began_in.append(Path.cwd())
             try:
                 yield
             finally:
+                os.chdir(_began_in.pop())
                 unfinished.rescue(out)
     finally:
         # Written or not, nothing of it is needed any more.

@@ -245,6 +245,21 @@ def test_of_what_was_written_nothing_is_kept_besides(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("*unfinished*")) + list(tmp_path.glob(".out-*"))
 
 
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_result_is_written_where_it_was_claimed(fails: bool, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    with suppress(KeyboardInterrupt), claimed(Path("out")):
+        unfinished.keep("part", write_here)
+        os.chdir("elsewhere")
+        if fails:
+            raise KeyboardInterrupt
+        with fresh_folder(Path("out")) as folder:
+            write_here(folder)
+    assert Path.cwd() == tmp_path
+    (found,) = tmp_path.rglob("word")
+    assert found.relative_to(tmp_path).parts[0] == ("out-unfinished" if fails else "out")
+
+
 def test_where_no_place_is_left_beside_it_is_among_temporary_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
