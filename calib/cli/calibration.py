@@ -58,7 +58,6 @@ def report(
     from calib import SamplerSettings, read_table
     from calib.cli.display import progress_bars, tell_compared, tell_verdict
     from calib.cli.simulators import say
-    from calib.data.labels import labelled
     from calib.data.quantities import OUTPUTS
     from calib.inference.emulation.prepared import prepare
     from calib.inference.prior_files import prior_file_model
@@ -69,7 +68,7 @@ def report(
 
     if files:
         tasks = plan_tasks(
-            [labelled(read_table(f, allow_missing=tuple(OUTPUTS.values()))) for f in files],
+            [read_table(f, allow_missing=tuple(OUTPUTS.values())) for f in files],
             None if hold_out is None else HoldOut.parse(hold_out),
             models=model or (),
             prior_paths=priors or (),

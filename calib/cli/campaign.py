@@ -32,6 +32,7 @@ def campaign(
     """Run many fits, diagnoses, challenge cases or SBC replicates as tasks; run again to resume."""
     from calib.batch.campaign import read_plan, run_campaign
     from calib.cli.display import progress_bars
+    from calib.data.labels import SEEN
 
     planned = read_plan(plan)
     if only_list:
@@ -43,6 +44,9 @@ def campaign(
             planned, out, workers=workers, scheduler=scheduler, overwrite=overwrite,
             progress=lambda done, n: tell("tasks", done, n), announce=opt.announce,
         )  # fmt: skip
+    # Tasks of another process, or of before, have read them.
+    labels = (numbers.get("data_label", "") for numbers in summary.numbers.values())
+    SEEN.update(dict.fromkeys(filter(None, labels)))
     for name, error in summary.failed.items():
         print(f"calib: {name} failed: {error}", file=sys.stderr)
     counts = summary.counts

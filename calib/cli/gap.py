@@ -60,6 +60,7 @@ def diagnose(
     from calib.gap.files import write_diagnosis
     from calib.gap.provenance import INPUTS, inputs_record
     from calib.report.gap_evidence import gap_verdict
+    from calib.report.gap_facts import track_record_text
     from calib.report.numbers import format_number
 
     if case is not None and run is None and field is None:
@@ -104,6 +105,7 @@ def diagnose(
         p = found.ranking.probability[name]
         text = ">0.999" if p >= 0.9995 else "<0.001" if p < 0.0005 else f"{p:.3f}"
         print(f"  {text:>6}  {name}")
+    print(track_record_text(found.ranking.probability[found.ranking.order[0]]))
     for output, s in found.shrink.items():
         low, high = s.interval
         unit = QUANTITIES[OUTPUTS[output]].unit.replace("**", "").replace("*", " ")

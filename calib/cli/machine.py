@@ -45,8 +45,11 @@ def finish(code: int, found: Mapping[str, Any] | Path, **more: Any) -> None:
     null.
     """
     if isinstance(sys.stdout, _Aside):
+        from calib.data.labels import SEEN
+
         document = found if isinstance(found, Mapping) else json.loads(found.read_bytes())
-        whole = finite({"exit_code": code, **more, **document})
+        data = {"data_label": ", ".join(SEEN)} if SEEN else {}
+        whole = finite({"exit_code": code, **more, **data, **document})
         sys.stdout.output.write(json.dumps(whole, indent=1, allow_nan=False) + "\n")
     if code:
         raise typer.Exit(code)

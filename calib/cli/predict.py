@@ -17,6 +17,8 @@ from calib.errors import CalibError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from calib.data import Table
+
 # By which a file is known for a prediction: of a run, of one that did not converge, of a diagnosis.
 _LAST_COLUMNS = ("outside_calibrated_range", "converged", "_after_upper")
 
@@ -108,6 +110,7 @@ def predict(
             "again" if emulated else ": the model has none there for much of the posterior"
         )  # fmt: skip
         print(f"calib: no value (nan) at {undefined} of {len(table)} rows{why}", file=sys.stderr)
+    _label(columns, *(c.problem.table for _, c in parts))
     _give(columns, out)
     finish(
         0 if converged else 3, {"columns": _lists(columns)}, outside=outside, doubts=doubts
@@ -164,17 +167,31 @@ def _predict_corrected(
     if beyond:
         told = ", ".join(f"{name} in {count} rows" for name, count in beyond.items())
         print(f"calib: outside what the campaigns covered: {told}", file=sys.stderr)
+    _label(columns, corrected.data.case.lab, corrected.data.case.field)
     _give(columns, out)
     finish(0, {"columns": _lists(columns)}, outside=beyond)
+
+
+def _label(columns: dict[str, Any], *tables: Table) -> None:
+    """Say in a column what the data of a calibration must be called, if anything."""
+    from calib.data.labels import common_label
+
+    if label := common_label(*tables):
+        # The last column stays last: by it a prediction is known.
+        name, last = columns.popitem()
+        columns |= {"data_label": [label] * len(last), name: last}
 
 
 def _give(columns: Mapping[str, Any], out: Path | None) -> None:
     """Write columns to a file, or print them."""
     from calib.data import write_table
+    from calib.data.labels import SEEN
 
     if out is not None:
         write_table(out, {name: [_cell(c, "") for c in column] for name, column in columns.items()})
-        print(f"{len(next(iter(columns.values())))} rows written to {out}")
+        n, label = len(next(iter(columns.values()))), columns.get("data_label", [""])[0]
+        print(f"{n} rows written to {out}{f', of {label} data' if label else ''}")
+        SEEN.clear()
         return
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(columns)

@@ -43,12 +43,17 @@ class _Verbs(TyperGroup):
         from calib.errors import CalibError
 
         unfinished.saved.clear()
+        _seen().clear()
         try:
             interruptible()
-            return super().invoke(ctx)
+            found = super().invoke(ctx)
+            _tell_data()
+            return found
         except KeyboardInterrupt as stop:
             _end(str(stop) or _stopped(), INTERRUPTED)
         except typer.Exit:
+            # It did not converge, or a check found something.
+            _tell_data()
             raise
         except Exception as error:
             if was_interrupted():  # in code that has made another error of it
@@ -73,6 +78,20 @@ def _stopped() -> str:
     from calib.batch import unfinished
 
     return "interrupted" if unfinished.saved else STOPPED
+
+
+def _tell_data() -> None:
+    """Say of which known data a command has read: no others tell it that these are no others."""
+    for label in _seen():
+        from calib.data.labels import said_of
+
+        print(f"calib: {label} data: {said_of(label)}", file=sys.stderr)
+
+
+def _seen() -> dict[str, None]:
+    """Labels of the data that were read; nothing is imported where none were."""
+    seen: dict[str, None] = getattr(sys.modules.get("calib.data.labels"), "SEEN", {})
+    return seen
 
 
 def _end(why: str, code: int) -> Never:

@@ -162,17 +162,38 @@ def _unit_error(header: str, quantity: Quantity, suffix: str, where: str) -> Cal
     else:
         found = f"{suffix!r} is not a known unit of {quantity.stem}"
     near = difflib.get_close_matches(suffix, quantity.units, n=1, cutoff=0.5)
-    if near:
+    factor = _foreign_unit(header, suffix, quantity) if suffix else 0.0
+    if factor:
+        mend = f"multiply the readings by {factor:g}, and name the column {quantity.canonical}"
+    elif near:
         mend = f"did you mean {quantity.stem}_{near[0]}?"
     else:
         mend = f"rename the column, for example {quantity.canonical}, with the unit of its readings"
-    mend += "; what is in no such unit must be converted first" * bool(suffix)
+    if suffix and not factor:
+        mend += "; what is in no such unit must be converted first"
     return CalibError(
         found,
         where=_at(where, header),
         allowed=", ".join(accepted_headers(quantity)),
         mend=mend,
     )
+
+
+def _foreign_unit(header: str, suffix: str, quantity: Quantity) -> float:
+    """Return how many canonical units one of a unit is that headers do not know; 0 if it is none.
+
+    It is another unit, not a known one misspelt: renamed, the readings would be in the wrong one.
+    """
+    bracketed = re.search(r"[\[(]([^\])]+)[\])]", header)
+    # Units as pint spells them: suffixes are lower case.
+    spelt = {name: unit for units in UNITS.values() for name, unit in units.items()}
+    text = "/".join(spelt.get(word, word) for word in suffix.split("_"))
+    text = bracketed[1] if bracketed else text
+    text = text.replace("²", "2").replace("³", "3").replace("^", "")
+    try:
+        return float(convert(1.0, re.sub(r"([A-Za-z])(\d)", r"\1**\2", text), quantity.unit))
+    except (CalibError, ValueError):
+        return 0.0
 
 
 def match_headers(

@@ -23,6 +23,7 @@ from calib.data.cells import (
 )
 from calib.data.csvfile import CsvFile, open_csv
 from calib.data.headers import Column, match_headers, names_quantity
+from calib.data.labels import labelled
 from calib.data.quantities import OUTPUTS, QUANTITIES
 from calib.data.table import MAX_TEXT_ROWS, Table
 from calib.errors import CalibError
@@ -86,9 +87,11 @@ def read_table(
             allowed="at least one row below the column names", mend="add the measurements",
         )  # fmt: skip
     _log.debug("%s: %d rows of %s", file.source, len(parts.lines), ", ".join(values))
-    return Table(
-        values, file.source, np.array(parts.lines), file.header, tuple(parts.text), file.sha256,
-        label, ignored, _cells(file.header, parts.text, ignored),
+    return labelled(
+        Table(
+            values, file.source, np.array(parts.lines), file.header, tuple(parts.text),
+            file.sha256, label, ignored, _cells(file.header, parts.text, ignored),
+        )
     )  # fmt: skip
 
 
@@ -256,9 +259,11 @@ def table_from_arrays(
             check_codes(column, done[name], rows, problems, missing_ok=missing_ok)
     problems.raise_any()
     text = _texts(arrays, n) if n <= MAX_TEXT_ROWS else ()
-    return Table(
-        done, source, rows, tuple(arrays), text, _sha256(done), label, ignored,
-        _cells(tuple(arrays), text, ignored),
+    return labelled(
+        Table(
+            done, source, rows, tuple(arrays), text, _sha256(done), label, ignored,
+            _cells(tuple(arrays), text, ignored),
+        )
     )  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from calib.data import Table, read_table
 from calib.data.documents import MEND_TOML, read_text, read_toml
+from calib.data.labels import common_label
 from calib.data.quantities import OUTPUTS, output_of
 from calib.errors import CalibError, meant
 from calib.gap.context import Context, read_context
@@ -56,6 +57,11 @@ class Case:
     context: Context = dataclasses.field(default_factory=Context)
     priors: Mapping[str, DeclaredPriors] = dataclasses.field(default_factory=dict)
     covariates: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+
+    @property
+    def label(self) -> str:
+        """What its data must be called wherever something of them is shown; usually nothing."""
+        return common_label(self.lab, self.field)
 
 
 def read_case(folder: Path) -> Case:

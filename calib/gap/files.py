@@ -16,6 +16,7 @@ from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.fit import Fit
 from calib.gap.inclusion import Included
+from calib.gap.track_record import BENCH, track_record
 from calib.gap.where import Region, row_gaps
 from calib.models.base import Array
 
@@ -29,6 +30,7 @@ def document(found: Diagnosis) -> dict[str, Any]:
     ranking = found.ranking
     return {
         "schema": SCHEMA,
+        **({"data_label": found.data.case.label} if found.data.case.label else {}),
         "verdict": found.verdict,
         "effects": [
             {
@@ -38,6 +40,7 @@ def document(found: Diagnosis) -> dict[str, Any]:
             }
             for name in ranking.order
         ],
+        "track_record": _track_record(ranking.probability[ranking.order[0]]),
         "inclusion": {name: _included(c) for name, c in found.inclusion.causes.items()},
         "remainder": {
             **_included(found.inclusion.remainder),
@@ -77,6 +80,19 @@ def document(found: Diagnosis) -> dict[str, Any]:
             }
             for m in found.next_measurements
         ],
+    }
+
+
+def _track_record(probability: float) -> dict[str, Any]:
+    """Return how often first explanations that were as probable were right."""
+    r = track_record(probability)
+    return {
+        "stated": [r.low, r.high],
+        "cases": r.cases,
+        "right": r.right,
+        "share": r.share,
+        "interval": list(r.interval),
+        "of": BENCH,
     }
 
 
@@ -166,4 +182,6 @@ def write_diagnosis(found: Diagnosis, folder: Path) -> None:
         columns[f"{column}_after"] = prediction.after
         columns[f"{column}_after_lower"] = prediction.lower
         columns[f"{column}_after_upper"] = prediction.upper
+    if found.data.case.label:
+        columns["data_label"] = [found.data.case.label] * len(new)
     write_table(folder / "fresh_prediction.csv", columns)

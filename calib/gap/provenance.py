@@ -36,6 +36,8 @@ def inputs_record(case: Case, seed: int, effects: Mapping[str, bytes] | None = N
         "models": dict(case.models),
         "sha256": {key: table.sha256 for key, table in tables.items() if table is not None},
     }
+    if case.label:
+        content["data_label"] = case.label
     if case.context:
         content["context"] = case.context.words()
     if case.covariates:

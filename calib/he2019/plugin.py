@@ -12,7 +12,6 @@ from typing import Any
 
 from calib.data.labels import KnownData
 from calib.data.registry import register
-from calib.data.table import Table
 from calib.inference.estimators import Method
 from calib.report.reference import REFERENCES
 from calib.report.sections import Section, SectionKind
@@ -28,11 +27,6 @@ def _later(module: str, name: str) -> Callable[..., Any]:
         return getattr(import_module(f"calib.he2019.{module}"), name)(*args, **kwargs)
 
     return call
-
-
-def _holds(table: Table) -> bool:
-    held: bool = _later("datasets.embedded", "holds")(table)
-    return held
 
 
 def _gaps_again(record: Any) -> Section:
@@ -88,7 +82,14 @@ class Plugin:
                 "the embedded data",
                 "The data are reconstructed from published results [@He_2019]; they are not "
                 "measurements.",
-                _holds,
+                _later("datasets.embedded", "holds"),
+            ),
+            KnownData(
+                f"partly {_LABEL}",
+                "the embedded data and others",
+                "Some of the data are reconstructed from published results [@He_2019]; they are "
+                "not measurements.",
+                _later("datasets.embedded", "holds_some"),
             ),
             Method(
                 "geometric", _later("estimators.geometric", "estimate_geometric"),

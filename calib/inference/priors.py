@@ -62,7 +62,7 @@ class Prior:
 
 def _in_tail(a: Array, b: Array, u: Array) -> Array:
     """Quantiles (k, d) of standard normals between bounds (d,) far below zero."""
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", under="ignore"):
         log_mass = np.logaddexp(np.log1p(-u) + log_ndtr(a), np.log(u) + log_ndtr(b))
     return np.asarray(ndtri_exp(log_mass), dtype=np.float64)
 

@@ -84,9 +84,9 @@ def _expected(problem: Problem) -> tuple[float, float]:
     rows = np.linspace(0, len(table) - 1, min(len(table), _ROWS)).astype(np.int64)
     some = problem.with_table(table.take(rows))
     rng = generator(0, "scale of the priors")
-    natural = some.theta(some.priors.sample(rng, _DRAWS))
-    drawn = some.draw_location(natural, some.conditions, rng) + some.draw_noise(natural, rng)
     with np.errstate(all="ignore"):
+        natural = some.theta(some.priors.sample(rng, _DRAWS))
+        drawn = some.draw_location(natural, some.conditions, rng) + some.draw_noise(natural, rng)
         sizes = np.quantile(np.abs(some.bound.from_response(drawn)), _SIZE, axis=1)
     sizes = sizes[np.isfinite(sizes)]
     if sizes.size < _DRAWS / 2:

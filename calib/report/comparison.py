@@ -23,6 +23,7 @@ from calib.inference.io import load_calibration, save_calibration
 from calib.inference.record import Entry, File, Hash, KnownModel, Record, read_record
 from calib.models import get_model
 from calib.models.base import Array
+from calib.report.figures.plate import mark
 from calib.report.figures.style import BLACK, BLUE, legend_below, panels, png_bytes, style
 from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
@@ -146,6 +147,7 @@ def page(found: Mapping[str, Any], image: bytes) -> str:
     models = [get_model(name) for name in found["models"]]
     return template("comparison.html.j2").render(
         found=found,
+        data_label=found.get("data_label", ""),
         head=head,
         rows=body,
         image=data_uri(image),
@@ -209,6 +211,7 @@ def document(
         "seed": comparison.seed,
         **own_names(first),
         "held_out": hold_out,
+        **({"data_label": first.label} if first.label else {}),
         "converged": comparison.sound,
         **stated,
         "models": {
@@ -301,7 +304,9 @@ def write_comparison(
         **here.document(),
     }
     with units_of(first.calibration.problem.table.header):
-        image = png_bytes(comparison_figure(comparison))
+        figure = comparison_figure(comparison)
+        mark(figure, first.calibration.problem.table.label)
+        image = png_bytes(figure)
     (folder / "figures").mkdir()
     (folder / FIGURE).write_bytes(image)
     (folder / PAGE).write_text(page(found, image), encoding="utf-8")

@@ -39,10 +39,12 @@ def begin_figures(study: Study, pool: Pool, *, pdf: bool = False) -> dict[str, L
 def _drawn(key: str, result: OutputResult, pdf: bool) -> Drawn:
     # Late: where the figures are drawn, which as a rule is another process.
     from calib.report.figures.collect import plates
+    from calib.report.figures.plate import marked
     from calib.report.figures.style import pdf_bytes, png_bytes
 
     with units_of(result.task.table.header):
-        drawn = plates(result, reference_of(result.task.table.label))
+        label = result.task.table.label
+        drawn = marked(plates(result, reference_of(label)), label)
     figures = {f"{key}_{p.name}": p.figure for p in drawn if p.figure is not None}
     return Drawn(
         tuple(replace(plate, figure=None) for plate in drawn),

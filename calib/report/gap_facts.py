@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from calib.gap.track_record import BENCH, track_record
 from calib.report.labels import MINUS, joined, odds_text, percent_range
 
 # Hypotheses within this factor of the best are read as a tie with it.
@@ -217,6 +218,16 @@ def causes_text(e: GapEvidence) -> str:
 
 def _share(c: CauseFact) -> str:
     return f"{_per_cent(c.share)} % ({percent_range(c.interval)})"
+
+
+def track_record_text(probability: float) -> str:
+    """Say how often first explanations that were as probable were right."""
+    r = track_record(probability)
+    ends = f"{r.low:g} or more" if r.high == 1.0 else f"{r.low:g} to {r.high:g}"
+    return (
+        f"Of {r.cases:,} blind cases whose first explanation was stated at {ends}, {r.share:.2f} "
+        f"(95 % interval {r.interval[0]:.2f} to {r.interval[1]:.2f}) were right: {BENCH}"
+    )
 
 
 def which_text(e: GapEvidence) -> str:

@@ -10,7 +10,6 @@ import numpy as np
 
 from calib.data import Table, hold_out, read_for_model
 from calib.data.headers import parse_header, renamed
-from calib.data.labels import labelled
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.inference.prior_files import prior_file_model
@@ -70,7 +69,7 @@ def read_and_split(
     path: Path, columns: Sequence[str], kept: HoldOut | None
 ) -> tuple[Table, Table | None]:
     """Read a file, of which some columns are used; return the rows to fit and those held out."""
-    table = labelled(read_for_model(path, columns))
+    table = read_for_model(path, columns)
     return kept.split(table) if kept else (table, None)
 
 

@@ -72,6 +72,15 @@ class _NotTestable(_Exactly):
     reason: str
 
 
+class _TrackRecord(_Exactly):
+    stated: Interval
+    cases: Count
+    right: Count
+    share: Probability
+    interval: Interval
+    of: str
+
+
 class _Row(_Exactly):
     output: str
     row: Count
@@ -105,8 +114,10 @@ class Diagnosis(_Exactly):
     """`diagnosis.json` of a diagnosis folder."""
 
     schema_: Literal["calib/diagnosis/1"] = Field(alias="schema")
+    data_label: str | None = None
     verdict: Literal["effect", "none", "unknown", "ambiguous"]
     effects: list[_Hypothesis]
+    track_record: _TrackRecord | None = None  # not in files of before
     inclusion: dict[str, _Cause]
     remainder: _Remainder
     not_testable: list[_NotTestable]

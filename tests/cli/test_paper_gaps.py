@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import inspect
 import json
 import re
@@ -157,3 +158,36 @@ def test_effects_are_of_a_diagnosis_alone(calib: Calib) -> None:  # noqa: F811
     for option in (("--effects", "mine.py"), ("--without", "force_offset")):
         told = calib("predict", "run", "--at", "ruts.csv", *option)
         assert_refused(told, ["there is no diagnosis, which alone has effects", "run"])
+
+
+def test_what_comes_of_reconstructed_data_says_so(calib: Calib) -> None:  # noqa: F811
+    said = "The data are reconstructed from published results; they are not measurements."
+    assert calib("data", "he2019-gaps", "--out", "gaps").code == 0
+    # A copy under another name is what it is.
+    Path("gaps/nominal_slip").rename("mine")
+    ran = calib("diagnose", "mine", "--out", "found", "--workers", 1)
+    assert said in ran.err
+    assert said in Path("found/index.html").read_text()
+    assert json.loads(Path("found/diagnosis.json").read_text())["data_label"] == "reconstructed"
+    predicted = calib("predict", "found", "--at", "mine/fresh.csv", "--out", "p.csv")
+    assert predicted.out.startswith("7 rows written to p.csv, of reconstructed data")
+    assert said in calib("predict", "found", "--at", "mine/fresh.csv").err
+    for file in ("p.csv", "found/fresh_prediction.csv"):
+        with Path(file).open(newline="") as text:
+            assert {row["data_label"] for row in csv.DictReader(text)} == {"reconstructed"}
+    rut = "mine.csv"
+    Path("gaps/plain_bekker/lab.csv").rename(rut)
+    fitted = calib("fit", rut, "--model", "bekker", "--out", "fit", "--json")
+    assert said in fitted.err
+    assert json.loads(fitted.out)["data_label"] == "reconstructed"
+    compared = calib("compare", "bekker", "modified_bekker", rut, "--out", "both")
+    assert said in compared.err
+    assert said in Path("both/index.html").read_text()
+    assert json.loads(Path("both/comparison.json").read_text())["data_label"] == "reconstructed"
+    assert said in calib("check", "fit").err
+
+
+def test_data_of_ones_own_are_called_nothing(calib: Calib) -> None:  # noqa: F811
+    template = calib("template", "bekker", "--out", "own.csv")
+    assert template.code == 0
+    assert "reconstructed" not in calib("fit", "own.csv", "--model", "bekker", "--out", "fit").err

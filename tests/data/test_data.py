@@ -602,9 +602,17 @@ def test_a_derived_column_is_not_taken_for_the_reading(my_csv: Write, header: st
     assert f"{header!r} is read as derived from the drawbar pull" in message
 
 
-def test_another_unit_is_to_be_converted(my_csv: Write) -> None:
-    message = refusal(my_csv("cone_index_n_m2\n1\n"))
-    assert "what is in no such unit must be converted first" in message
+@pytest.mark.parametrize(
+    ("header", "factor"),
+    [("cone_index_n_m2", "0.001"), ("Cone index [MN/m²]", "1000"), ("rut depth [µm]", "0.001")],
+)
+def test_a_unit_that_headers_do_not_know_is_to_be_converted(
+    my_csv: Write, header: str, factor: str
+) -> None:
+    message = refusal(my_csv(f"{header}\n1\n"))
+    assert f"multiply the readings by {factor}, and name the column" in message
+    assert "did you mean" not in message
+    assert "must be converted first" in refusal(my_csv("cone_index_stone\n1\n"))
 
 
 def test_lines_above_the_column_names_are_told_and_may_be_deleted(my_csv: Write) -> None:

@@ -12,8 +12,8 @@ import pytest
 
 import calib.report.study as study_module
 from calib.batch.environment import sha256
-from calib.data import read_table
-from calib.data.labels import labelled
+from calib.data import read_table, table_from_arrays, write_table
+from calib.data.labels import label_of
 from calib.he2019.datasets import embedded
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import PUBLISHED
@@ -297,7 +297,31 @@ def test_failures_and_tasks_are_plain_records() -> None:
 def test_the_embedded_data_are_recognised_in_a_file(tmp_path: Path) -> None:
     for path in embedded.write(tmp_path):
         read = read_table(path)
-        assert labelled(read).label == "reconstructed"
-        assert labelled(read.take([3, 1])).label == "reconstructed"
+        assert read.label == "reconstructed"
+        assert label_of(read.take([3, 1])) == "reconstructed"
+        # Where a condition was changed, as a slip whose zero is another, the reading tells.
         path.write_text(path.read_text().replace("0.0", "0.1", 1))
-        assert labelled(read_table(path)).label == ""
+        assert read_table(path).label == "reconstructed"
+        *rows, last = path.read_text().splitlines()
+        path.write_text("\n".join([*rows, last.rpartition(",")[0] + ",1.23"]))
+        assert read_table(path).label == "partly reconstructed"
+
+
+def test_embedded_data_are_recognised_in_other_units_and_rounded(tmp_path: Path) -> None:
+    pull = load_he2019("drawbar_pull")
+    for name, values in (
+        ("Drawbar pull [N]", 1e3 * pull["drawbar_pull_kn"]),
+        ("drawbar_pull_kn", np.array([float(f"{v:.4g}") for v in pull["drawbar_pull_kn"]])),
+    ):
+        path = tmp_path / "renamed.csv"
+        kept = {n: pull[n] for n in ("inflation_pressure_psi", "slip_ratio")}
+        write_table(path, {**kept, name: values})
+        assert read_table(path).label == "reconstructed"
+
+
+def test_other_readings_at_the_same_conditions_are_no_embedded_data() -> None:
+    pull = load_he2019("drawbar_pull")
+    noise = 0.03 * np.random.default_rng(1).standard_normal(len(pull))
+    table = {n: pull[n] for n in ("inflation_pressure_psi", "slip_ratio")}
+    own = table_from_arrays({**table, "drawbar_pull_kn": pull["drawbar_pull_kn"] + noise})
+    assert own.label == ""

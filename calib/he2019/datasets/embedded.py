@@ -12,12 +12,13 @@ doi:10.1016/j.jterra.2019.07.003; the published figures are in `calib.he2019.dat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.batch.folders import write_whole
 from calib.data import Table, table_from_arrays
@@ -26,6 +27,10 @@ from calib.he2019.datasets import density, drawbar, rut
 from calib.he2019.datasets.reconstruct import Array
 
 LABEL = "reconstructed"
+# Relative differences of what was written with all digits, and with four of them.
+_EXACT, _ROUNDED = 1e-9, 5e-4
+# One reading may be the same by chance.
+_CHANCE = 2
 
 # Decimals of every column; they carry the printed digits through the files.
 _DECIMALS: Mapping[str, int] = MappingProxyType(
@@ -87,18 +92,31 @@ def _csv(table: Mapping[str, Array]) -> str:
 
 
 def holds(table: Table) -> bool:
-    """Whether all rows of a table are rows of the embedded data."""
-    return any(_within(table, known) for known in tables().values())
+    """Whether all readings of an output are those of the embedded data.
+
+    To all digits a reading tells by itself, whatever was done with the conditions; to four digits
+    beside its own conditions.
+    """
+    return any(same.all() for same in _same(table))
 
 
-def _within(table: Table, known: Mapping[str, Array]) -> bool:
-    names = list(known)
-    if len(table) > len(known[names[0]]) or any(name not in table for name in names):
-        return False
-    rows = np.column_stack([table[name] for name in names])
-    embedded = np.column_stack([known[name] for name in names])
-    same = np.isclose(rows[:, None], embedded[None], rtol=1e-9, atol=1e-12).all(axis=2)
-    return bool(same.any(axis=1).all())
+def holds_some(table: Table) -> bool:
+    """Whether at least two readings are those of the embedded data."""
+    return any(same.sum() >= _CHANCE for same in _same(table))
+
+
+def _same(table: Table) -> Iterator[NDArray[np.bool_]]:
+    """Return which readings are the embedded ones, for every output that a table has."""
+    for known in tables().values():
+        output = list(known)[-1]
+        there = np.isfinite(table[output]) if output in table else np.zeros(0, dtype=np.bool_)
+        if not there.any():
+            continue
+        off = np.abs(table[output][there, None] / known[output] - 1.0)
+        rounded = off <= _ROUNDED
+        for name in set(known) & set(table) - {output, "slip_ratio", "nominal_slip_ratio"}:
+            rounded &= np.isclose(table[name][there, None], known[name], rtol=_ROUNDED, atol=0.0)
+        yield ((off <= _EXACT) | rounded).any(axis=1)
 
 
 def write(out_dir: Path) -> list[Path]:

@@ -12,7 +12,7 @@ from calib.gap.diagnose import NAMED, Diagnosis
 from calib.gap.placebo import Placebo, placebos
 from calib.report.figures.gap_design import isolability_plate
 from calib.report.figures.gap_where import conditions_plate, how_far_plate, where_plate
-from calib.report.figures.plate import Plate, draw_all
+from calib.report.figures.plate import Plate, draw_all, marked
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -256,4 +256,5 @@ def gap_plates(found: Diagnosis, names: Sequence[str] = GAP_FIGURES) -> list[Pla
     list of Plate
         In reading order. A figure that failed has ``figure=None`` and a caption saying why.
     """
-    return draw_all({name: partial(_DRAWINGS[name], found) for name in names})
+    plates = draw_all({name: partial(_DRAWINGS[name], found) for name in names})
+    return marked(plates, found.data.case.label)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Plate", "draw_all"]
+__all__ = ["Plate", "draw_all", "mark", "marked"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +42,24 @@ def draw_all(drawings: Mapping[str, Callable[[], Plate | None]]) -> list[Plate]:
     with style():
         drawn = [_attempt(name, draw) for name, draw in drawings.items()]
     return [plate for plate in drawn if plate is not None]
+
+
+def mark(figure: Figure, label: str) -> None:
+    """Write on a figure what its data are, if they have a label."""
+    if label:
+        figure.text(
+            0.995, 0.005, f"{label.capitalize()} data", ha="right", va="bottom", fontsize=7,
+            color="0.35",
+        )  # fmt: skip
+
+
+def marked(plates: Sequence[Plate], label: str) -> list[Plate]:
+    """Return plates that say what their data are, in the figure and below it."""
+    for plate in plates:
+        if plate.figure is not None:
+            mark(plate.figure, label)
+    said = f" {label.capitalize()} data." if label else ""
+    return [replace(plate, caption=f"{plate.caption}{said}") for plate in plates]
 
 
 def _attempt(name: str, draw: Callable[[], Plate | None]) -> Plate | None:

@@ -30,7 +30,7 @@ from calib.report.gap_evidence import (
     region_words,
     shrink_facts,
 )
-from calib.report.gap_facts import TIE, GapEvidence
+from calib.report.gap_facts import TIE, GapEvidence, track_record_text
 from calib.report.gap_rows import (
     output_axis,
     output_word,
@@ -248,6 +248,8 @@ def render_diagnosis(
         verdict=verdict,
         mark=TONE_MARKS[verdict.tone],
         probability=round(100.0 * found.ranking.probability[found.ranking.order[0]]),
+        data_label=case.label,
+        track_record=track_record_text(found.ranking.probability[found.ranking.order[0]]),
         figures={p.name: picture(p, images.get(f"{p.name}.png", b""), p.caption) for p in plates},
         facts=_case_facts(found),
         warnings=found.warnings,

@@ -13,6 +13,7 @@ from typing import Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup, escape
 
+from calib.data.labels import said_of
 from calib.inference.problem import Problem
 from calib.models import BoundModel
 from calib.models.latex import html
@@ -44,6 +45,7 @@ _FILTERS: dict[str, Callable[..., str]] = {
     "unbroken": unbroken,
     "basename": lambda path: PurePosixPath(path).name,
     "joined": joined,
+    "said_of": said_of,
     "percent": percent,
     "short": short,
     "value": format_value,

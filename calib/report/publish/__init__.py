@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from calib.report.publish.markup import bibliography, bibtex, cited, to_latex, to_text
@@ -73,7 +73,7 @@ def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publ
         return Publication({}, (), ())
     version = str(manifest["versions"]["terracalib"])
     paragraphs = methods(manifest, found)
-    tables = _latex_tables(found, manifest["settings"]["gate"])
+    tables = [_labelled(t, found) for t in _latex_tables(found, manifest["settings"]["gate"])]
     said = [sentence for _, sentences in paragraphs for sentence in sentences]
     keys = cited([*said, *(t.caption for t in tables)])
     references = bibliography(cited(said), version)
@@ -89,7 +89,25 @@ def publication(manifest: Mapping[str, Any], summary: Mapping[str, Any]) -> Publ
     )
 
 
+def _labelled(table: LatexTable, found: Sequence[Output]) -> LatexTable:
+    """Say of a table what its data must be called, unless its caption does."""
+    label = ", ".join(dict.fromkeys(o.label for o in found if o.label))
+    if label in table.caption:
+        return table
+    return replace(table, caption=f"{table.caption} {label.capitalize()} data.")
+
+
 def _csv_tables(found: Sequence[Output]) -> dict[str, list[Row]]:
+    labels = {o.key: o.label for o in found}
+    return {
+        name: [{**row, "data_label": labels[row["output"]]} for row in rows]
+        if any(labels.values())
+        else rows
+        for name, rows in _rows(found).items()
+    }
+
+
+def _rows(found: Sequence[Output]) -> dict[str, list[Row]]:
     return {
         "posterior": posterior_csv(found),
         "estimates": estimates_csv(found),

@@ -23,6 +23,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.files import document, write_diagnosis
 from calib.gap.inclusion import Included, Inclusion, inclusion_probability
 from calib.gap.next_measurement import NextMeasurement
+from calib.gap.track_record import track_record
 from calib.inference.priors import Prior
 from calib.report.gap_evidence import covered_text, gap_evidence
 from calib.report.gap_facts import (
@@ -34,6 +35,7 @@ from calib.report.gap_facts import (
     RunsFact,
     ShrinkFact,
     WhereFact,
+    track_record_text,
 )
 from calib.report.gap_rows import shrink_place
 from calib.report.gap_sizes import size_sentences
@@ -328,6 +330,15 @@ def test_nothing_to_show_is_said():
     assert facts["How far"] == "No output has a gap that could shrink"
 
 
+@pytest.mark.parametrize(("probability", "stated"), [(0.97, "0.9 or more"), (0.62, "0.6 to 0.7")])
+def test_a_probability_has_its_track_record(probability, stated):
+    text = track_record_text(probability)
+    record = track_record(probability)
+    assert text.startswith(f"Of {record.cases:,} blind cases whose first explanation was stated at")
+    assert f" {stated}, {record.right / record.cases:.2f} (95 % interval" in text
+    assert "simulated campaigns of calib's own bench" in text
+
+
 def test_a_null_says_what_would_have_been_seen():
     facts = dict(judge_gap(evidence("none", none=0.97)).facts)
     assert "0.7 noise sd" in facts["Which"]
@@ -393,6 +404,10 @@ def page(found, tmp_path_factory):
     reader = Reader()
     reader.feed(html)
     return folder, html, reader
+
+
+def test_the_verdict_has_the_track_record_beside_it(page):
+    assert "blind cases whose first explanation was stated at" in page[1]
 
 
 def test_it_is_well_formed_and_makes_no_request(page):

@@ -104,6 +104,8 @@ class Diagnose(Kind[DiagnoseSection, DiagnosisItem]):
             files: dict[str, str | bytes] = {**written(found, effects)}
             files |= _page(found, seed) if page else {}
         numbers = diagnosis_numbers(found)
+        if case.label:
+            numbers["data_label"] = case.label
         if emulated:
             # A verdict under an emulator that is too far off is not to be used.
             numbers |= {} if all(e.passed for e in emulated) else {"converged": False}

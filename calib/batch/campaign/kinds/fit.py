@@ -130,6 +130,8 @@ class Fit(Kind[FitSection, FitItem]):
             files[EMULATION] = emulation_file([emulation])
         if judged.warnings:
             numbers["warnings"] = " | ".join(judged.warnings)
+        if problem.table.label:
+            numbers["data_label"] = problem.table.label
         if validation is not None:
             scores = validation.scores
             numbers["held_out"] = {
