@@ -185,13 +185,10 @@ def _label(columns: dict[str, Any], *tables: Table) -> None:
 def _give(columns: Mapping[str, Any], out: Path | None) -> None:
     """Write columns to a file, or print them."""
     from calib.data import write_table
-    from calib.data.labels import SEEN
 
     if out is not None:
         write_table(out, {name: [_cell(c, "") for c in column] for name, column in columns.items()})
-        n, label = len(next(iter(columns.values()))), columns.get("data_label", [""])[0]
-        print(f"{n} rows written to {out}{f', of {label} data' if label else ''}")
-        SEEN.clear()
+        print(f"{len(next(iter(columns.values())))} rows written to {out}")
         return
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(columns)

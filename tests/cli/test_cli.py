@@ -92,7 +92,12 @@ def test_fit_predict_and_read_the_numbers(calib: Calib, he2019: Path, tmp_path: 
     assert len(rows) == 4
     assert "1 row lies outside the calibrated range" in printed.err
     assert [row[-1] for row in rows] == ["", "", "", "slip_ratio"]
-    number = {name: [float(row[i]) for row in rows] for i, name in enumerate(header[:-1])}
+    assert [row[header.index("data_label")] for row in rows] == ["reconstructed"] * 4
+    number = {
+        name: [float(row[i]) for row in rows]
+        for i, name in enumerate(header[:-1])
+        if name != "data_label"
+    }
     # Within 10 % of Eq 21 at Table 6: the likelihood differs from the published regression.
     published = [1000 * (140 / 3.306e5) ** (1 / (1.996 + 1.266 * s)) for s in (0.05, 0.1, 0.2)]
     np.testing.assert_allclose(number["rut_depth_mm_median"][:3], published, rtol=0.1)

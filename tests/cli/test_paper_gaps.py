@@ -129,7 +129,8 @@ def test_a_diagnosis_with_an_effect_of_ones_own_is_predicted_from_with_it(calib:
     fresh = Path("gaps/plain_bekker/fresh.csv")
     whole = calib("predict", "found", "--at", fresh, "--effects", "mine.py", "--out", "p.csv")
     assert whole.code == 0, whole.err
-    assert whole.err == ""
+    # Nothing but what the data are.
+    assert whole.err.count("\n") == whole.err.count("reconstructed data:") == 1
     rows = Path("p.csv").read_text().splitlines()
     assert len(rows) == len(fresh.read_text().splitlines())
     assert "rut_depth_mm" in rows[0]
@@ -170,8 +171,7 @@ def test_what_comes_of_reconstructed_data_says_so(calib: Calib) -> None:  # noqa
     assert said in Path("found/index.html").read_text()
     assert json.loads(Path("found/diagnosis.json").read_text())["data_label"] == "reconstructed"
     predicted = calib("predict", "found", "--at", "mine/fresh.csv", "--out", "p.csv")
-    assert predicted.out.startswith("7 rows written to p.csv, of reconstructed data")
-    assert said in calib("predict", "found", "--at", "mine/fresh.csv").err
+    assert said in predicted.err
     for file in ("p.csv", "found/fresh_prediction.csv"):
         with Path(file).open(newline="") as text:
             assert {row["data_label"] for row in csv.DictReader(text)} == {"reconstructed"}
