@@ -175,13 +175,15 @@ class _Fingerprint(pickle._Pickler):
         return repr, (self._of_function(value),)
 
     def _of_class(self, value: type) -> tuple[Any, ...]:
-        module = sys.modules.get(value.__module__)
-        if self._note(getattr(module, "__file__", None)):
+        file = getattr(sys.modules.get(value.__module__), "__file__", None)
+        in_file = self._note(file)
+        if in_file and _installed(Path(str(file)).resolve()):
             return value.__module__, value.__qualname__
         bodies = {k: getattr(v, "__func__", getattr(v, "fget", v)) for k, v in vars(value).items()}
         own = {
             name: body for name, body in bodies.items()
-            if isinstance(body, FunctionType) or (_plain(body) and not name.startswith("__"))
+            if (_plain(body) and not name.startswith("__"))
+            or (isinstance(body, FunctionType) and not in_file)
         }  # fmt: skip
         return value.__qualname__, value.__bases__, own
 

@@ -65,6 +65,20 @@ class Wheel:
         return self(t, x)
 
 
+class Rated:
+    """Its state is that of its class."""
+
+    scale: object = 1.0
+
+    def __call__(self, t: np.ndarray, x: dict) -> np.ndarray:
+        return t[:, :1] * np.asarray(self.scale).sum() * x["w"]
+
+
+def rated(scale: object) -> Rated:
+    Rated.scale = scale
+    return Rated()
+
+
 def in_a_cell(scale: object) -> Callable:
     """Return a function that is in no file, of a name that the same notebook has."""
     cell = (
@@ -79,6 +93,7 @@ MAKERS = {
     "closure": closure,
     "default": default,
     "instance": Wheel,
+    "class": rated,
     "method": lambda scale: Wheel(scale).run,
     "partial": lambda scale: functools.partial(Wheel.__call__, Wheel(scale)),
     "keyword": lambda scale: functools.partial(default(0.0), scale=scale),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import calib
@@ -12,7 +13,7 @@ from calib.errors import CalibError
 from calib.models import MODELS
 from calib.models.simulators.files import read_simulator
 from calib.models.simulators.registered import SIMULATED
-from tests.models.simulators.examples import PRIORS, pull, write_program
+from tests.models.simulators.examples import PRIORS, lab, pull, write_program
 from tests.registered import forgotten
 
 
@@ -119,3 +120,29 @@ def test_registering_is_all_or_nothing() -> None:
         calib.register(both)
     assert "both_drawbar_pull" not in MODELS
     assert "both" not in SIMULATED
+
+
+@pytest.mark.parametrize(
+    ("name", "likelihood"),
+    [
+        ("rho", 'correlated_along = "run_order"'),
+        ("nu", 'family = "student_t"'),
+        ("sigma_slope", 'noise_depends_on = "slip"'),
+    ],
+)
+def test_a_noise_that_has_a_parameters_name_is_refused(
+    tmp_path: Path, name: str, likelihood: str
+) -> None:
+    """Under the usual noise the name is free."""
+    priors = PRIORS.replace(".mu]", f".{name}]")
+    calib.register(calib.from_callable(
+        pull, parameters=priors, output="drawbar_pull_kn", name="wheel",
+        conditions=["slip_ratio", "normal_load_kn"],
+    ))  # fmt: skip
+    table = calib.table_from_arrays(lab(np.random.default_rng(1)) | {"run_order": np.arange(18.0)})
+    assert calib.build_problem("wheel", table).bound.model.parameters[0] == name
+    file = tmp_path / "own.toml"
+    file.write_text(f'model = "wheel"\n[likelihood]\n{likelihood}\n{priors}')
+    with pytest.raises(CalibError, match=f"the model has a parameter {name}") as refused:
+        calib.build_problem("wheel", table, file)
+    assert "own.toml, [likelihood]" in str(refused.value)
