@@ -57,6 +57,7 @@ _UNIT_FIRST = (
     "whether neighbouring rows are alike, the scatter even and its tails light is not judged while "
     "a column looks to be in another unit"
 )
+_MEND_PRIOR = "widen the prior (`calib priors`), or look for what is wrong with the data"
 
 
 class Range(NamedTuple):
@@ -264,10 +265,11 @@ def _far_off(calibration: Calibration, best: PointEstimate) -> dict[str, float]:
 
 
 def _contradicted(calibration: Calibration) -> Iterable[Check]:
-    """Whether least squares, which know no prior, fit better than chance has it than the mode.
+    """Whether least squares, which know no prior, say otherwise than chance has it.
 
-    By an F test of the sums of squares, which is too rarely significant where a prior that is
-    right takes the place of data.
+    Of the model's parameters by an F test of the sums of squares at the mode and at their own
+    estimates, which is too rarely significant where a prior that is right takes the place of data;
+    of the noise's scale, where it is one, by the chi-squared test of their own.
     """
     problem, best = calibration.problem, _least_squares(calibration)
     names = set(problem.bound.model.parameters)
@@ -279,27 +281,32 @@ def _contradicted(calibration: Calibration) -> Iterable[Check]:
     natural = np.concatenate([mode, problem.completed(best.theta, mode[0, -1])[None]])
     raw = problem.residuals(natural) / problem.noise.scale(mode, problem.conditions)
     with_prior, without = np.square(raw).sum(axis=1)
-    far = _far_off(calibration, best)
-    if not far or not np.isfinite(without):
+    if not np.isfinite(without):
         return
-    gain = max(with_prior - without, 0.0) / free
-    ratio = gain / max(without / left, 1e-12 * with_prior / left)
-    said = [
-        f"{name} = {plain_number(_estimated(calibration, best, name))} where the posterior has "
-        f"{plain_number(calibration.summary[name].mean)} ± "
-        f"{plain_number(calibration.summary[name].sd)} ({abs(sds):.0f} posterior sds away)"
-        for name, sds in [*far.items()][:2]
-    ]
-    yield Check(
-        float(scipy.stats.f.sf(ratio, free, left)),
-        Remark(
+    if far := _far_off(calibration, best):
+        gain = max(with_prior - without, 0.0) / free
+        ratio = gain / max(without / left, 1e-12 * with_prior / left)
+        said = [
+            f"{name} = {plain_number(_estimated(calibration, best, name))} where the posterior has "
+            f"{plain_number(calibration.summary[name].mean)} ± "
+            f"{plain_number(calibration.summary[name].sd)} ({abs(sds):.0f} posterior sds away)"
+            for name, sds in [*far.items()][:2]
+        ]
+        yield Check(float(scipy.stats.f.sf(ratio, free, left)), Remark(
             f"the data contradict the prior: least squares, which know no prior, give "
             f"{' and '.join(said)} and leave {plain_number(100.0 * without / with_prior)} % of the "
-            "squared residuals; widen the prior (`calib priors`), or look for what is wrong with "
-            "the data",
-            "Prior contradicted", shifts=True,
-        ),
-    )  # fmt: skip
+            f"squared residuals; {_MEND_PRIOR}", "Prior contradicted", shifts=True,
+        ))  # fmt: skip
+    scale = calibration.summary.get("sigma")
+    if scale is not None and problem.noise.usual and problem.bound.model.uncertain is None:
+        squares = min(with_prior, without) * (mode[0, -1] / scale.median) ** 2
+        below = float(scipy.stats.chi2.cdf(squares, left))
+        scatter = scale.median * np.sqrt(squares / left)
+        yield Check(2.0 * min(below, float(scipy.stats.chi2.sf(squares, left))), Remark(
+            f"the data contradict the prior of sigma: about least squares, which know no prior, "
+            f"the rows scatter by {plain_number(scatter)} where the posterior of sigma has "
+            f"{plain_number(scale.median)}; {_MEND_PRIOR}", "Prior contradicted",
+        ))  # fmt: skip
 
 
 def file_remarks(problem: Problem, scatter: float) -> tuple[Remark, ...]:
@@ -451,6 +458,12 @@ def _unused(problem: Problem) -> dict[str, NDArray[np.str_] | Array]:
     own |= {name for name in table if name in QUANTITIES
             and QUANTITIES[name].stem in (choice.depends_on, choice.correlated_along)}  # fmt: skip
     known = {table.header_of(n): values for n, values in table.columns.items() if n not in own}
+    # A label's numbers are codes.
+    for name in (n for n in table if n in QUANTITIES and QUANTITIES[n].kind == "label"):
+        header = table.header_of(name)
+        if header in known and header in table.header and len(table.text) == len(table):
+            at = table.header.index(header)
+            known[header] = np.array([row[at] for row in table.text])
     # Tables that others put together may keep the cells of the rows they came from.
     extra = {h: np.array(cells) for h, cells in table.extra.items() if len(cells) == len(table)}
     return {**known, **extra}

@@ -9,10 +9,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.stats import binom
 
 import calib
-from calib.report.verdict import Evidence, Level, Verdict, Where, gather, judge_evidence
-from calib.validation.assumptions import Check, Range, Remark
+from calib.report.verdict import (
+    Evidence,
+    Level,
+    Verdict,
+    Where,
+    gather,
+    judge_evidence,
+    validated,
+)
+from calib.validation.assumptions import LEVEL, Check, Range, Remark
 from calib.validation.joint import binomial_p
 
 FINE = Evidence(
@@ -270,3 +279,26 @@ def test_verdicts_draw_nothing():
         check=True,
     )  # fmt: skip
     assert found.stdout.strip() == "[]"
+
+
+@pytest.mark.slow
+def test_rows_that_are_as_assumed_stay_green_as_often_as_is_said() -> None:
+    """Fifty campaigns of plates, drawn from the model, with a column that means nothing."""
+    rng = np.random.default_rng(8)
+    at = {"average_ground_pressure_kpa": np.tile([5.0, 10.0, 20.0, 40.0], 9),
+          "plate_width_mm": np.repeat([60.0, 80.0, 100.0], 12)}  # fmt: skip
+    alarms = 0
+    for seed in range(50):
+        share, n, mean = rng.uniform(-0.5, 0.5), rng.uniform(0.8, 1.3), rng.uniform(10.0, 40.0)
+        stiffer = 1.0 - share + share * 77.5 / at["plate_width_mm"]
+        z = mean * (at["average_ground_pressure_kpa"] / 14.1 / stiffer) ** (1.0 / n)
+        z *= np.exp(0.1 * rng.standard_normal(36))
+        table = calib.table_from_arrays(
+            {**at, "rut_depth_mm": z, "bin": rng.choice(["A", "B"], 36)}
+        )
+        problem = calib.build_problem("bekker_plate", table)
+        point = calib.estimate(problem, "least_squares", np.random.default_rng(seed))
+        calibration = calib.calibrate(problem, seed, estimates=(point,))
+        found = calib.verdict(calibration, validated(calibration, None))
+        alarms += found.level is not Level.FINE
+    assert binom.sf(alarms - 1, 50, LEVEL) > 1e-3

@@ -39,7 +39,7 @@ def test_a_prior_that_the_data_contradict_is_named_with_its_numbers() -> None:
     """The slope is 2; its prior has 0 +- 0.05, so that the posterior lies between."""
     pull = 1.0 + 2.0 * SLIP + NOISE
     found = fitted(normal("b", 0.0, 0.05), pull)
-    (check,) = (c for c in checks_of(found) if c.remark.title == "Prior contradicted")
+    (check,) = (c for c in checks_of(found) if "the prior: " in c.remark.text)
     line = np.polyfit(SLIP, pull, 1)
     assert f"b = {line[0]:.3g}" in check.remark.text
     # The F test of the sums of squares at the mode and of least squares.
@@ -55,7 +55,23 @@ def test_a_prior_that_the_data_contradict_is_named_with_its_numbers() -> None:
 @pytest.mark.parametrize("sd", [0.1, 1.0, 100.0])
 def test_a_prior_that_is_right_is_left_alone(sd: float) -> None:
     found = fitted(normal("b", 2.05, sd), 1.0 + 2.0 * SLIP + NOISE)
-    assert not any(c.remark.title == "Prior contradicted" for c in checks_of(found))
+    assert "Prior contradicted" not in {r.title for r in failed(checks_of(found))}
+
+
+@pytest.mark.parametrize(("median", "told"), [(0.01, True), (0.1, False), (1.0, True)])
+def test_a_prior_of_the_noise_that_the_data_contradict(median: float, told: bool) -> None:
+    """The rows scatter by 0.1 about the line."""
+    priors = [normal("a", 0.0, 10.0), normal("b", 0.0, 10.0),
+              normal("sigma", np.log(median), 0.05, log=True)]  # fmt: skip
+    pull = 1.0 + 2.0 * SLIP + NOISE
+    problem = problem_of(lambda a, b, s: a + b * s, priors, SLIP, pull)
+    point = estimate_least_squares(problem, np.random.default_rng(1))
+    found = failed(checks_of(calibrate(problem, 1, estimates=(point,))))
+    said = [r.text for r in found if r.title == "Prior contradicted"]
+    assert bool(said) is told
+    if told:
+        least = np.square(pull - np.polyval(np.polyfit(SLIP, pull, 1), SLIP)).sum()
+        assert f"the rows scatter by {np.sqrt(least / 38.0):.3g} where" in said[0]
 
 
 def test_weak_data_do_not_contradict_a_sharp_prior_that_is_right() -> None:
