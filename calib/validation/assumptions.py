@@ -528,7 +528,7 @@ def _uneven(problem: Problem, residual: Array) -> Iterable[Check]:
     """Whether the scatter of residuals (n,) differs with a condition.
 
     By Levene's test, in Brown and Forsythe's form, where every value has its group of rows;
-    otherwise by Spearman's rank correlation with their sizes.
+    otherwise by Kendall's rank correlation with their sizes, which is exact for few rows.
     """
     there = np.isfinite(residual)
     for name, every in problem.conditions.items():
@@ -555,7 +555,7 @@ def _uneven(problem: Problem, residual: Array) -> Iterable[Check]:
                 where=tuple(Range(name, float(levels[i]), float(levels[i])) for i in (wide, tight)),
             ))  # fmt: skip
             continue
-        found = scipy.stats.spearmanr(np.abs(score), values)
+        found = scipy.stats.kendalltau(np.abs(score), values)
         grows = "grows" if found.statistic > 0.0 else "falls"
         yield Check(float(found.pvalue), remark(
             f"{source_of(problem.table)}: the scatter {grows} with {word} (rank correlation "
