@@ -11,6 +11,7 @@ from calib.data.headers import accepted_headers
 from calib.data.numbers import plain_number
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
+from calib.inference.prior_files import relative_columns
 from calib.inference.random import generator
 
 if TYPE_CHECKING:
@@ -53,7 +54,10 @@ def check_scale(problem: Problem, assumed: Mapping[str, float]) -> None:
         f"the priors of {problem.bound.model.name} expect {written[0]} to {written[1]}{unit}"
     )
     if not assumed:
-        used = [problem.bound.model.output, *problem.bound.model.conditions]
+        relative = relative_columns(problem.priors.text) if problem.priors.text else {}
+        used = dict.fromkeys(
+            [problem.bound.model.output, *relative, *problem.bound.model.conditions]
+        )
         raise CalibError(
             found, where=f"{problem.table.source}, column {column.header!r}",
             allowed="an output of a size that the priors admit",

@@ -72,6 +72,8 @@ def test_outputs_beyond_the_priors_by_an_order_of_magnitude_are_refused(
     with pytest.raises(CalibError, match="column 'drawbar_pull_kn \\(checked\\)'") as caught:
         build_problem("magic_formula", table)
     assert "priors of magic_formula expect" in str(caught.value)
+    # The scale that the priors take from the data may be the one that is wrong.
+    assert "check the units of drawbar_pull_kn (checked), normal_load_kn" in str(caught.value)
 
 
 def test_one_slip_of_the_pen_is_no_wrong_scale() -> None:
