@@ -147,7 +147,7 @@ def _fitted(problem: Problem, t: Array, used: NDArray[np.bool_]) -> Array:
     some = problem.with_table(problem.table.take(used))
     # Nothing is drawn: the one start is given.
     rng = np.random.default_rng(0)
-    return find_modes(some.log_prob, some.priors, rng, starts=t[None], n_screen=0)[0].t
+    return find_modes(some.log_prob, some.priors, rng, starts=t[None], spread=0)[0].t
 
 
 def _probability(sds: Array | float, n: int, left: int) -> Any:

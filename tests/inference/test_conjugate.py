@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-import emcee
 import numpy as np
 import pytest
 from scipy import stats
@@ -23,7 +22,7 @@ from calib.inference.estimators.least_squares import estimate_least_squares
 from calib.inference.problem import Problem
 from calib.inference.sampling.adapt import Guess, adapt
 from calib.inference.sampling.mode import find_modes
-from calib.inference.sampling.moves import PairMove
+from calib.inference.sampling.walkers import fitted_moves, local_moves, run_walkers
 from calib.validation.prediction import predict
 from calib.validation.validate import leave_one_out, validate_held_out
 from tests.custom_problems import fixed, normal, problem_of
@@ -123,27 +122,17 @@ def proposal(problem: Problem):
     return adapt(problem.log_prob, guesses, np.random.default_rng(2))[0]
 
 
-def move(name: str, proposal) -> emcee.moves.Move:
-    if name == "pairs":
-        return PairMove(proposal, np.random.default_rng(3))
-    return emcee.moves.DEMove()
-
-
-@pytest.mark.parametrize("name", ["pairs", "de"])
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # numpy 2 and emcee's own moves
-def test_each_move_alone(name: str, problem: Problem, exact: Exact, proposal) -> None:
-    """Each leaves the posterior as it is, without the others' help."""
-    walkers, steps = 40, 3000
-    sampler = emcee.EnsembleSampler(
-        walkers, 3, problem.log_prob, vectorize=True, moves=move(name, proposal)
-    )
-    sampler.random_state = np.random.RandomState(4).get_state()
+@pytest.mark.parametrize("fitted", [True, False])
+def test_the_moves_leave_the_posterior_as_it_is(
+    fitted: bool, problem: Problem, exact: Exact, proposal
+) -> None:
+    walkers, steps, rng = 40, 3000, np.random.default_rng(3)
+    moves = fitted_moves(proposal, rng) if fitted else local_moves()
     start, _ = proposal.draw(np.random.default_rng(5), walkers)
-    sampler.run_mcmc(start, steps, skip_initial_state_check=True)
-    chains = sampler.get_chain()[steps // 3 :].transpose(1, 0, 2)
+    chain, _, _ = run_walkers(problem.log_prob, start, moves, steps, rng)
     # Walkers exchange positions in these moves; whole ensembles are what is independent, so the
     # effective size is taken of chains along the steps, which it understates if at all.
-    assert_normal(chains, exact.mean, exact.covariance)
+    assert_normal(chain[steps // 3 :].transpose(1, 0, 2), exact.mean, exact.covariance)
 
 
 def test_importance_sampling_from_the_fitted_proposal(

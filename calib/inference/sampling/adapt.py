@@ -16,8 +16,7 @@ from scipy.special import logsumexp
 
 from calib.inference.sampling.expectation import moments
 from calib.inference.sampling.mixture import Mixture, StudentT, log_sum
-from calib.inference.sampling.proposal import Proposal, fit_proposal
-from calib.inference.sampling.straighten import Straightener
+from calib.inference.sampling.proposal import Proposal, first_proposal, fit_proposal
 from calib.models.base import Array
 
 type LogProb = Callable[[Array], Array]
@@ -27,8 +26,6 @@ type LogProb = Callable[[Array], Array]
 _FIRST = ((0.6, 1.2, 6.0), (0.25, 2.0, 4.0), (0.15, 4.0, 3.0))
 # Draws of each round per dimension plus five, and the efficiency beyond which more are no use.
 _ROUNDS, _GOOD = (60, 120, 250, 400), 0.9
-# One more round pays where so many draws of the chains follow.
-_LAST, _MANY = 800, 1_000_000
 
 
 @dataclass(frozen=True)
@@ -52,27 +49,29 @@ class Assessment:
 
 
 def adapt(
-    log_prob: LogProb, guesses: Sequence[Guess], rng: np.random.Generator, planned: int = 0
+    log_prob: LogProb, guesses: Sequence[Guess], rng: np.random.Generator
 ) -> tuple[Proposal, Assessment]:
     """Fit a proposal to an unnormalised density ``(k, d) -> (k,)`` by adaptive importance sampling.
 
     Every round draws from the proposal that all rounds before it made, and ends the work if it
     resembles the density well enough; the assessment is by the last round's draws. There is a guess
-    for each mode that is known; the chains are to have `planned` draws at first.
+    for each mode that is known.
     """
     d = guesses[0].mean.size
-    first = Mixture(
-        np.array([share / len(guesses) for _ in guesses for share, _, _ in _FIRST]),
-        tuple(
-            StudentT(guess.mean, scale * guess.cholesky, dof)
+    proposal = first_proposal(
+        [
+            Mixture(
+                np.array([share for share, _, _ in _FIRST]),
+                tuple(
+                    StudentT(guess.mean, scale * guess.cholesky, dof) for _, scale, dof in _FIRST
+                ),
+            )
             for guess in guesses
-            for _, scale, dof in _FIRST
-        ),
+        ]
     )
-    proposal = Proposal(Straightener.identity(d), first)
     memory = _Memory()
-    for size in (*_ROUNDS, _LAST) if planned >= _MANY else _ROUNDS:
-        draws, log_q = proposal.draw(rng, size * (d + 5))
+    for size in _ROUNDS:
+        draws, log_q = proposal.draw(rng, size * (d + 5) * len(guesses))
         value = log_prob(draws)
         found = _assess(value - log_q)
         if found.efficiency > _GOOD or found.efficiency == 0.0:

@@ -14,10 +14,10 @@ from scipy.special import gammaln
 from calib.inference.sampling.mixture import Mixture, StudentT, log_sum
 from calib.models.base import Array
 
-_MOST_COMPONENTS = 8
+_MOST_COMPONENTS = 16
 # Effective draws per entry of a component's covariance.
-_DRAWS_PER_ENTRY = 20.0
-_STEPS = 10
+_DRAWS_PER_ENTRY = 5.0
+_STEPS = 20
 # Standard deviations up to this part of the mean are no spread.
 _ROUNDING = 1e-12
 # Components are widened a little: tails that are too light cost far more than too heavy ones.

@@ -69,10 +69,6 @@ class Mixture:
         whitened = inverses @ means[:, :, None]
         return inverses.reshape(m * d, d), whitened, constant, dof
 
-    def mean(self) -> Array:
-        """Mean of the components' centres, shape (d,)."""
-        return np.asarray(self.weights @ np.stack([c.mean for c in self.components]))
-
     def sample(self, rng: np.random.Generator, size: int) -> Array:
         """Draw, shape (size, d)."""
         drawn = np.empty((size, self.n_dim))
@@ -80,15 +76,6 @@ class Mixture:
         for start, end, component in zip([0, *ends], ends, self.components, strict=False):
             drawn[start:end] = component.sample(rng, end - start)
         return drawn.take(rng.permutation(size), axis=0)
-
-    def covariance_cholesky(self) -> Array:
-        """Lower factor of the whole mixture's scale: components' scales and between their means."""
-        mean = self.mean()
-        covariance = sum(
-            w * (c.cholesky @ c.cholesky.T + np.outer(c.mean - mean, c.mean - mean))
-            for w, c in zip(self.weights, self.components, strict=True)
-        )
-        return np.linalg.cholesky(covariance)
 
     def squared_distances(self, t: Array) -> Array:
         """Squared Mahalanobis distances from each component, shape (k, d) to (m, k)."""
@@ -108,27 +95,6 @@ class Mixture:
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
         return log_sum(self.log_parts(self.squared_distances(t)))
-
-    def log_prob_symmetric(self, t: Array, centre: Array) -> Array:
-        """Log of the mean density of points t and 2 centre - t, shape (k, d) to (k,).
-
-        The second's distances follow from the first's: 2 centre - t is from a component's mean as
-        far as t is from that mean's own opposite.
-        """
-        whiten, whitened, _, _ = self._stacked
-        m, d = len(self.components), self.n_dim
-        z = (whiten @ t.T).reshape(m, d, -1)
-        z -= whitened
-        apart = 2.0 * (whitened - (whiten @ centre).reshape(m, d, 1))
-        squared = np.empty((2, m, t.shape[0]))
-        near, far = squared
-        np.einsum("mdk,mdk->mk", z, z, out=near)
-        np.matmul(2.0 * apart.swapaxes(1, 2), z, out=far[:, None])
-        far += near
-        far += np.square(apart).sum(axis=1)
-        np.maximum(far, 0.0, out=far)
-        parts = self.log_parts(squared).reshape(2 * m, -1)
-        return np.asarray(log_sum(parts) - np.log(2.0))
 
 
 def log_sum(parts: Array) -> Array:

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import ndtr, ndtri
 
 from calib.inference.even import even_points
 from calib.inference.priors import Priors
@@ -14,11 +15,13 @@ from calib.inference.sampling.curvature import hessian_scale
 from calib.models.base import Array
 
 _WORST = 1e12
-_MOST_POLISHED = 6
 # Where `find_mode` looks, and from how many points it climbs.
 _SCREENED, _CLIMBED = 400, 8
 # Steps, and what gains too little for another (nats), of the last of its ascents.
 _TO_THE_END, _AT_THE_END = 300, 1e-8
+# Times the prior's width, from which half of the search for modes begins; no farther out than this
+# part of the prior.
+_WIDER, _TAIL = 3.0, 1e-12
 # Modes so many nats below the highest hold no mass worth finding; squared standard distances up to
 # this are no distance.
 _NEGLIGIBLE, _NEAR = 15.0, 25.0
@@ -68,57 +71,38 @@ def find_modes(
     rng: np.random.Generator,
     *,
     starts: Array | None = None,
-    n_screen: int = 400,
-    n_climb: int = 16,
+    spread: int = 64,
 ) -> list[Mode]:
     """Return the modes of a posterior ``(k, d) -> (k,)`` that were found, the highest first.
 
-    The given starts (m, d) and the best of each of `n_climb` groups of prior draws climb together,
-    a batch of quasi-Newton ascents; if none are screened, only the given starts climb. The highest
-    is polished by L-BFGS-B, with gradients by central differences; so is each of the others that
-    neither lies in its neighbourhood nor far below it. A sampler that knows one mode only may miss
-    another whatever its own diagnostics say.
+    The given starts (m, d) and `spread` points, half of them drawn evenly from the prior and half
+    from one several times as wide, climb together, each by itself: a mode is found from any point
+    on its slopes, however much higher another is.
     """
-    return _climbed(log_prob, priors, _starts(log_prob, priors, rng, starts, n_screen, n_climb))
-
-
-def _climbed(log_prob: Callable[[Array], Array], priors: Priors, starts: Array) -> list[Mode]:
-    """Modes that are found from some starts, the highest first."""
-    width = prior_widths(priors)
-    ends, values = climb(log_prob, starts, width, *_bounds(priors))
+    width, bounds = prior_widths(priors), _bounds(priors)
+    begun = [np.empty((0, width.size)) if starts is None else np.atleast_2d(starts)]
+    if spread:
+        u = (even_points(spread, width.size) + rng.random(width.size)) % 1.0
+        u[::2] = ndtr(_WIDER * ndtri(u[::2]))
+        begun.append(priors.ppf(np.clip(u, _TAIL, 1.0 - _TAIL)))
+    ends, values = climb(log_prob, np.concatenate(begun), width, *bounds)
     modes: list[Mode] = []
-    polished = 0
     for i in np.argsort(-values):
         t, value = ends[i], float(values[i])
-        if polished == _MOST_POLISHED or (
-            modes
-            and (
-                modes[0].log_prob - value > _NEGLIGIBLE or any(m.explains(t, value) for m in modes)
-            )
+        if modes and (
+            modes[0].log_prob - value > _NEGLIGIBLE or any(m.explains(t, value) for m in modes)
         ):
             continue
-        top, end = _polish(log_prob, t, priors)
-        polished += 1
-        if top <= -_WORST:
+        if value <= -_WORST:
             # Nowhere is the density positive: the caller will see.
-            modes.append(Mode(end, -np.inf, np.diag(width**2)))
-        elif not any(m.explains(end, top) for m in modes):
-            modes.append(Mode(end, top, hessian_scale(log_prob, end, width)))
+            modes.append(Mode(t, -np.inf, np.diag(width**2)))
+            continue
+        top, high = climb(
+            log_prob, t[None], width, *bounds, steps=_TO_THE_END, tolerance=_AT_THE_END
+        )
+        if not any(m.explains(top[0], float(high[0])) for m in modes):
+            modes.append(Mode(top[0], float(high[0]), hessian_scale(log_prob, top[0], width)))
     return sorted(modes, key=lambda mode: -mode.log_prob)
-
-
-def _starts(
-    log_prob: Callable[[Array], Array],
-    priors: Priors,
-    rng: np.random.Generator,
-    starts: Array | None,
-    n_screen: int,
-    n_climb: int,
-) -> Array:
-    if starts is not None and n_screen == 0:
-        return np.atleast_2d(starts)
-    picked = _best_of_each(log_prob, priors.sample(rng, n_screen), n_climb)
-    return picked if starts is None else np.concatenate([np.atleast_2d(starts), picked])
 
 
 def _best_of_each(log_prob: Callable[[Array], Array], pool: Array, count: int) -> Array:
@@ -130,33 +114,3 @@ def _best_of_each(log_prob: Callable[[Array], Array], pool: Array, count: int) -
 
 def _bounds(priors: Priors) -> tuple[Array, Array]:
     return np.array([p.lower for p in priors.free]), np.array([p.upper for p in priors.free])
-
-
-def _polish(
-    log_prob: Callable[[Array], Array], start: Array, priors: Priors
-) -> tuple[float, Array]:
-    from scipy.optimize import minimize  # late: a tenth of a second, and few commands polish
-
-    d, width = start.size, prior_widths(priors)
-    step = 1e-5
-    directions = np.concatenate([np.zeros((1, d)), step * np.eye(d), -step * np.eye(d)])
-    low, high = ((bound - start) / width for bound in _bounds(priors))
-
-    def negative(z: Array) -> tuple[float, Array]:
-        # One-sided at a bound: the outer point is pulled back onto it.
-        points = np.clip(z + directions, low, high)
-        value = -log_prob(start + points * width)
-        value = np.where(np.isfinite(value), value, _WORST)
-        span = np.diagonal(points[1 : d + 1]) - np.diagonal(points[d + 1 :])
-        gradient = (value[1 : d + 1] - value[d + 1 :]) / np.maximum(span, 1e-12)
-        return float(value[0]), gradient
-
-    found = minimize(
-        negative,
-        np.zeros(d),
-        jac=True,
-        method="L-BFGS-B",
-        bounds=list(zip(low, high, strict=True)),
-        options={"maxiter": 300},
-    )
-    return -float(found.fun), start + np.clip(found.x, low, high) * width

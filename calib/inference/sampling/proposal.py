@@ -2,89 +2,127 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 
 from calib.inference.sampling.expectation import fit_mixture, moments
-from calib.inference.sampling.mixture import Mixture, StudentT
+from calib.inference.sampling.mixture import Mixture, StudentT, log_sum
 from calib.inference.sampling.straighten import Straightener
 from calib.models.base import Array
 
 _FITTED_DRAWS = 6000
 _BROAD_SCALE, _BROAD_DOF = 1.3, 4.0
 _LEAST_BROAD, _MOST_BROAD = 0.08, 0.4
+# A mode that seems to have no mass is proposed this often all the same.
+_LEAST_SHARE = 0.01
 
 
 @dataclass(frozen=True)
-class Proposal:
-    """A mixture of Student-t in straightened coordinates.
-
-    Its draws come alone or in opposite pairs. Points t and t' are opposite if their straightened
-    coordinates v and v' = 2 c - v are, about the mixture's mean c; either is the other's. Of a pair
-    the density is the mean of the mixture's at its two points.
-    """
+class Part:
+    """A mixture of Student-t in straightened coordinates: what is proposed about one mode."""
 
     straightener: Straightener
     mixture: Mixture
 
-    @property
-    def n_dim(self) -> int:
-        """Dimension."""
-        return self.mixture.n_dim
-
-    @cached_property
-    def _centre(self) -> Array:
-        return self.mixture.mean()
-
-    def draw(self, rng: np.random.Generator, size: int) -> tuple[Array, Array]:
-        """Draw, and return the log density there, shapes (size, d) and (size,)."""
-        v = self.mixture.sample(rng, size)
-        t, log_jacobian = self.straightener.bend(v)
-        return t, self.mixture.log_prob(v) + log_jacobian
+    def draw(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw, shape (size, d)."""
+        return self.straightener.bend(self.mixture.sample(rng, size))[0]
 
     def log_prob(self, t: Array) -> Array:
         """Log density, shape (k, d) to (k,)."""
         v, log_jacobian = self.straightener.straighten(t)
         return self.mixture.log_prob(v) + log_jacobian
 
-    def draw_pairs(self, rng: np.random.Generator, size: int) -> tuple[Array, Array, Array]:
-        """Draw opposite pairs, shape (2, size, d).
 
-        With the log of |dv/dt| at each, (2, size), and the log density of each pair, (size,), in
-        straightened coordinates.
-        """
-        v = self.mixture.sample(rng, size)
-        both = np.concatenate([v, 2.0 * self._centre - v])
-        t, log_jacobian = self.straightener.bend(both)
-        log_q = self.mixture.log_prob_symmetric(v, self._centre)
-        return t.reshape(2, size, -1), log_jacobian.reshape(2, size), log_q
+@dataclass(frozen=True)
+class Proposal:
+    """Parts (m), one for each mode, and their weights (m,)."""
 
-    def opposite(self, t: Array) -> tuple[Array, Array, Array]:
-        """Find the points opposite to some, (k, d) to (k, d).
+    weights: Array
+    parts: tuple[Part, ...]
 
-        With the log of |dv/dt| at both, (2, k), and the log density of each pair, (k,).
-        """
-        v, here = self.straightener.straighten(t)
-        other, there = self.straightener.bend(2.0 * self._centre - v)
-        return other, np.stack([here, there]), self.mixture.log_prob_symmetric(v, self._centre)
+    @property
+    def n_dim(self) -> int:
+        """Dimension."""
+        return self.parts[0].mixture.n_dim
+
+    def draw(self, rng: np.random.Generator, size: int) -> tuple[Array, Array]:
+        """Draw, and return the log density there, shapes (size, d) and (size,)."""
+        counts = rng.multinomial(size, self.weights)
+        drawn = [part.draw(rng, int(n)) for part, n in zip(self.parts, counts, strict=True)]
+        t = np.concatenate(drawn)[rng.permutation(size)]
+        return t, self.log_prob(t)
+
+    def log_prob(self, t: Array) -> Array:
+        """Log density, shape (k, d) to (k,)."""
+        return np.asarray(log_sum(self._log_parts(t)))
+
+    def shares(self, t: Array) -> Array:
+        """Return how probable it is that each part proposed a point, shape (k, d) to (m, k)."""
+        log_parts = self._log_parts(t)
+        return np.asarray(np.exp(log_parts - log_sum(log_parts)))
+
+    def extended(self, t: Array) -> Proposal:
+        """Return the proposal with one more part, about draws (k, d) that lie beside the others."""
+        found = moments(t, np.full(len(t), 1.0 / len(t)))
+        if found is None:
+            return self
+        straight, one = Straightener.identity(self.n_dim), np.ones(1)
+        part = Part(straight, Mixture(one, (StudentT(*found, _BROAD_DOF),)))
+        share = 1.0 / (len(self.parts) + 1)
+        return Proposal(np.append((1.0 - share) * self.weights, share), (*self.parts, part))
+
+    def _log_parts(self, t: Array) -> Array:
+        logs = [part.log_prob(t) for part in self.parts]
+        return np.log(self.weights)[:, None] + np.stack(logs)
 
 
 def fit_proposal(
-    old: Proposal,
+    old: Proposal, draws: Array, weight: Array, worth: float, trust: float, rng: np.random.Generator
+) -> Proposal:
+    """Fit a proposal to weighted draws (k, d), worth so many independent ones.
+
+    One step of expectation maximisation over the parts: each is fitted to the draws in proportion
+    to the probability that it proposed them, and stays as it is where they are degenerate.
+    """
+    draws, weight = _resampled(draws, weight, rng, _FITTED_DRAWS)
+    by_part = old.shares(draws) * weight
+    mass = by_part.sum(axis=1)
+    parts = [
+        _fit_part(part, draws, own, total, worth, trust, rng)
+        for part, own, total in zip(old.parts, by_part, mass, strict=True)
+    ]
+    weights = np.maximum(mass, _LEAST_SHARE)
+    return Proposal(weights / weights.sum(), tuple(parts))
+
+
+def first_proposal(parts: Sequence[Mixture]) -> Proposal:
+    """Propose each of some mixtures as often, in coordinates that are not straightened."""
+    straight = Straightener.identity(parts[0].n_dim)
+    equal = np.full(len(parts), 1.0 / len(parts))
+    return Proposal(equal, tuple(Part(straight, mixture) for mixture in parts))
+
+
+def _fit_part(
+    old: Part,
     draws: Array,
     weight: Array,
-    effective: float,
+    mass: float,
+    worth: float,
     trust: float,
     rng: np.random.Generator,
-) -> Proposal:
-    """Fit a proposal to weighted draws; return the old one if they are degenerate.
+) -> Part:
+    """Fit a part to draws whose weights sum to `mass`.
 
     A broad component covers what the others miss. The less the proposal that the draws came from
     was to be trusted, the larger is its share.
     """
-    draws, weight = _resampled(draws, weight, rng, _FITTED_DRAWS)
+    effective = worth * mass
+    if effective < 2 * draws.shape[1]:
+        return old
+    weight = weight / mass
     try:
         straightener = Straightener.fit(draws, weight)
     except np.linalg.LinAlgError:
@@ -97,7 +135,7 @@ def fit_proposal(
     share = _LEAST_BROAD + (_MOST_BROAD - _LEAST_BROAD) * (1.0 - trust) ** 2
     fitted = fit_mixture(v, weight, mean, cholesky, effective, rng)
     broad = StudentT(mean, _BROAD_SCALE * cholesky, _BROAD_DOF)
-    return Proposal(
+    return Part(
         straightener,
         Mixture(np.append((1.0 - share) * fitted.weights, share), (*fitted.components, broad)),
     )

@@ -7,15 +7,19 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.batch.threads import one_thread
 from calib.errors import CalibError
 from calib.inference.estimators.identified import representative_rows
 from calib.inference.problem import Problem
 from calib.inference.sampling.adapt import Guess, adapt, refit
+from calib.inference.sampling.anneal import anneal
+from calib.inference.sampling.expectation import moments
 from calib.inference.sampling.gate import Gate, GateReport, judge
 from calib.inference.sampling.mode import Mode, find_modes
 from calib.inference.sampling.proposal import Proposal
+from calib.inference.sampling.walkers import fitted_moves, longest_tau, run_walkers
 from calib.inference.trial import try_simulator
 from calib.models.base import Array
 
@@ -31,8 +35,8 @@ class SamplerSettings:
     ensembles : int
         Independently seeded ensembles.
     walkers : int, optional
-        In each ensemble; by default 320, of long data 20, but at least twice the dimension plus
-        two.
+        In each ensemble; by default 320, 64 of a slow model and 20 of long data, but at least
+        twice the dimension plus two.
     steps : int
         Kept steps of the first attempt; doubled until the gate passes.
     max_steps : int
@@ -40,8 +44,6 @@ class SamplerSettings:
     keep : int
         About so many draws of each ensemble are stored: those of evenly picked walkers at 32 or
         more evenly picked steps.
-    ahead : int
-        Steps whose independent proposals are evaluated in one batch.
     gate : Gate
     """
 
@@ -50,7 +52,6 @@ class SamplerSettings:
     steps: int = 192
     max_steps: int = 25_600
     keep: int = 4096
-    ahead: int = 16
     gate: Gate = field(default_factory=Gate)
 
     def n_walkers(self, n_dim: int) -> int:
@@ -118,21 +119,41 @@ def sample_posterior(
     rng = np.random.default_rng(seeds[0])
     began = time.perf_counter()
     count = _Counter(problem.log_prob)
-    modes = _modes(count, problem, rng, starts)
-    if not np.isfinite(count(modes[0].t[None])[0]):
+    walkers = chosen.n_walkers(problem.n_dim)
+    born = _born(count, problem, walkers, rng)
+    few = born[:_CLIMBED]
+    known = few if starts is None else np.concatenate([np.atleast_2d(starts), few])
+    modes = _modes(count, problem, rng, known)
+    _refuse_exact(problem, modes[0])
+    first = _guesses(modes, born)
+    draws = sample_density(
+        count, first, seeds, problem.names, chosen, rng=rng, born=born[:walkers],
+        progress=progress, began=began,
+    )  # fmt: skip
+    return replace(draws, mode=modes[0].t)
+
+
+def _born(log_prob: _Counter, problem: Problem, walkers: int, rng: np.random.Generator) -> Array:
+    """Draws that come from the prior and have not heard of any optimum, (walkers or more, d)."""
+    rough, prior = representative_rows(problem), problem.priors.log_prob
+    count = _Counter(rough.log_prob)
+    drawn = problem.priors.sample(rng, max(_DRAWN, walkers))
+    found = anneal(prior, count, drawn, rng)
+    log_prob.evaluations += count.evaluations
+    if found is not None and rough is not problem:
+        found = anneal(rough.log_prob, log_prob, found[:walkers], rng)
+    if found is None:
         raise CalibError(
             "no parameter values of positive probability were found",
             where=problem.table.source,
             mend="check that the data's units and the priors' scales fit each other",
         )
-    first = [Guess(m.t, np.linalg.cholesky(m.covariance)) for m in modes]
-    return sample_density(
-        count, first, seeds, problem.names, chosen, rng=rng, progress=progress, began=began
-    )
+    # Resampled draws stand beside their copies.
+    return found[rng.permutation(len(found))]
 
 
 def _modes(
-    count: _Counter, problem: Problem, rng: np.random.Generator, starts: Array | None
+    count: _Counter, problem: Problem, rng: np.random.Generator, starts: Array
 ) -> list[Mode]:
     rough = representative_rows(problem)
     if rough is problem:
@@ -141,18 +162,65 @@ def _modes(
     count_rough = _Counter(rough.log_prob)
     near = [m.t for m in find_modes(count_rough, problem.priors, rng, starts=starts)]
     count.evaluations += count_rough.evaluations
-    given = near if starts is None else [*np.atleast_2d(starts), *near]
-    return find_modes(count, problem.priors, rng, starts=np.array(given), n_screen=0)
+    return find_modes(count, problem.priors, rng, starts=np.array(near), spread=0)
+
+
+def _guesses(modes: Sequence[Mode], born: Array) -> list[Guess]:
+    """Guess what lies about each mode: from the draws (k, d) nearest to it, or its curvature."""
+    choleskys = [np.linalg.cholesky(m.covariance) for m in modes]
+    # Log densities by the curvature at each mode.
+    by_mode = [
+        m.log_prob - 0.5 * np.square(np.linalg.solve(c, (born - m.t).T)).sum(axis=0)
+        for m, c in zip(modes, choleskys, strict=True)
+    ]
+    nearest = np.argmax(by_mode, axis=0)
+    guesses = []
+    for j, (mode, cholesky) in enumerate(zip(modes, choleskys, strict=True)):
+        own = born[nearest == j]
+        found = None
+        if len(own) >= _DRAWS_PER_DIMENSION * born.shape[1]:
+            found = moments(own, np.full(len(own), 1.0 / len(own)))
+        guesses.append(Guess(*found) if found else Guess(mode.t, cholesky))
+    return guesses
+
+
+def _refuse_exact(problem: Problem, mode: Mode) -> None:
+    """Refuse data that the model meets but for rounding: the noise has no scale to be found."""
+    if "sigma" not in problem.names:
+        return
+    left = problem.residuals(problem.theta(mode.t[None]))[0]
+    spread = float(np.std(problem.response))
+    if float(np.sqrt(np.mean(left**2))) < _EXACT * spread:
+        raise CalibError(
+            f"the model meets the data exactly: residuals are {np.sqrt(np.mean(left**2)):.1g} rms, "
+            f"the data spread by {spread:.3g}, so the noise sigma cannot be estimated",
+            where=problem.table.source,
+            allowed="measurements with scatter, and more rows than parameters",
+            mend='fix sigma at the accuracy of the instrument (dist = "fixed" in the prior file), '
+            "or give more rows; data computed from the model itself need noise added",
+        )
 
 
 def _fitting(settings: SamplerSettings, problem: Problem) -> SamplerSettings:
-    """Of long data fewer draws are taken: each is dear, and the posterior all but normal."""
-    if settings.walkers is not None or problem.squares.n_distinct <= _LONG:
+    """Where an evaluation is dear, fewer walkers are run."""
+    if settings.walkers is not None:
         return settings
-    return replace(settings, walkers=max(20, 2 * (problem.n_dim + 1)), ahead=1)
+    d, model = problem.n_dim, problem.bound.model
+    if problem.squares.n_distinct > _LONG:
+        return replace(settings, walkers=max(20, 2 * (d + 1)))
+    if model.uncertain is not None:
+        return replace(settings, walkers=max(64, 2 * (d + 1)))
+    return settings
 
 
+# Distinct rows from which data are long.
 _LONG = 5000
+# Draws from the prior that are carried to the posterior; of them, starts of the search for modes.
+_DRAWN, _CLIMBED = 512, 24
+# Draws from which a covariance is taken, for each dimension.
+_DRAWS_PER_DIMENSION = 10
+# Residuals of this part of the data's spread are rounding.
+_EXACT = 1e-6
 
 
 class _Counter:
@@ -175,6 +243,7 @@ def sample_density(
     settings: SamplerSettings,
     *,
     rng: np.random.Generator,
+    born: Array | None = None,
     progress: Progress | None = None,
     began: float | None = None,
 ) -> Draws:
@@ -184,43 +253,48 @@ def sample_density(
     ----------
     seeds : list of SeedSequence
         One for the adaptation (already used by `rng`) and one for each ensemble.
+    born : ndarray, shape (walkers, d), optional
+        Where the last ensemble starts; like the others, at draws from the proposal by default.
     began : float, optional
         ``time.perf_counter()`` at which the work began.
     """
-    # emcee takes half a second to import, which predicting from a posterior does without.
-    from calib.inference.sampling.ensemble import GOOD, POOR, Ensemble
-
     began = time.perf_counter() if began is None else began
     count = log_prob if isinstance(log_prob, _Counter) else _Counter(log_prob)
     walkers = settings.n_walkers(first[0].mean.size)
-    planned = (len(seeds) - 1) * walkers * min(settings.steps, settings.max_steps)
-    proposal, found = adapt(count, first, rng, planned)
-    ensembles = [
-        Ensemble(count, proposal, seed, walkers=walkers, ahead=settings.ahead) for seed in seeds[1:]
-    ]
+    proposal, found = adapt(count, first, rng)
+    streams = [np.random.default_rng(seed) for seed in seeds[1:]]
+    starts = [_start(count, proposal, walkers, stream) for stream in streams]
+    if born is not None:
+        starts[-1] = born
     target = min(settings.steps, settings.max_steps)
     done = 0
     while True:
-        length = target + target // _DISCARDED
-        if not done and found.efficiency > GOOD:
-            length = min(length, target + _ENOUGH)
-        chain = np.empty((len(ensembles), length, walkers, proposal.n_dim))
-        chain_log_prob = np.empty(chain.shape[:-1])
-        for i, ensemble in enumerate(ensembles):
-            ensemble.run(proposal, found.efficiency, chain[i], chain_log_prob[i])
+        length = target + max(_LEAST_DISCARDED, target // _DISCARDED)
+        chains, values, accepted = [], [], []
+        for i, stream in enumerate(streams):
+            moves = fitted_moves(proposal, stream)
+            chain, value, fraction = run_walkers(count, starts[i], moves, length, stream)
+            starts[i] = chain[-1]
+            chains.append(chain[-target:])
+            values.append(value[-target:])
+            accepted.append(fraction)
             if progress is not None:
-                progress(done + (i + 1) * length, done + len(ensembles) * length)
-        done += len(ensembles) * length
-        tau = np.stack([e.tau(target) for e in ensembles]).max(axis=0)
+                progress(done + (i + 1) * length, done + len(streams) * length)
+        done += len(streams) * length
+        tau = np.stack([longest_tau(chain) for chain in chains]).max(axis=0)
         # Fewer draws, evenly thinned, are worth less: what passes is not in doubt.
-        last = chain[:, -target:], chain_log_prob[:, -target:]
+        last = np.stack(chains), np.stack(values)
         t, log_probs = _drawn(*last, _JUDGED)
         report = judge(t, names, settings.gate, tau=tau, steps=target)
-        if report.passed and found.efficiency > POOR:
-            report = _refuse_neglect(report, proposal, t, log_probs, steps=target)
+        neglected = _neglected(proposal, t, log_probs, target, settings.gate.ess_min)
+        if neglected.any():
+            what = f"{neglected.mean():.1%} of the draws lie where hardly any was proposed"
+            report = replace(report, passed=False, reasons=(*report.reasons, what))
         if report.passed or target * 2 > settings.max_steps:
             break
         target *= 2
+        if neglected.any():
+            proposal = proposal.extended(t[neglected])
         proposal, found = refit(count, proposal, *_pooled(t, report), rng)
     if settings.keep != _JUDGED:
         t, log_probs = _drawn(*last, settings.keep)
@@ -231,10 +305,29 @@ def sample_density(
         mode=first[0].mean,
         log_evidence=found.log_evidence,
         efficiency=found.efficiency,
-        acceptance=float(np.mean([e.acceptance for e in ensembles])),
+        acceptance=float(np.mean(accepted)),
         evaluations=count.evaluations,
         seconds=time.perf_counter() - began,
         walkers=walkers,
+    )
+
+
+def _start(
+    log_prob: Callable[[Array], Array], proposal: Proposal, walkers: int, rng: np.random.Generator
+) -> Array:
+    """Overdispersed starting points, every one of positive probability.
+
+    emcee accepts walkers that start where the density is zero without a word.
+    """
+    coords = np.empty((0, proposal.n_dim))
+    for _ in range(500):
+        drawn, _ = proposal.draw(rng, walkers)
+        coords = np.concatenate([coords, drawn[np.isfinite(log_prob(drawn))]])
+        if len(coords) >= walkers:
+            return coords[:walkers]
+    raise CalibError(
+        "the sampler could not be started: almost no parameters near the mode are allowed",
+        mend="widen the priors' bounds, or check the data's units",
     )
 
 
@@ -256,34 +349,35 @@ def _drawn(t: Array, log_prob: Array, draws: int) -> tuple[Array, Array]:
 # Draws of each ensemble that the gate looks at, and of how many steps at least: of few, effective
 # sizes come out too large (by a tenth of 32).
 _JUDGED, _LEAST_STEPS = 4096, 32
-# One step in so many is run before those that are kept; no more than so many where walkers start
-# at draws from a good proposal.
-_DISCARDED, _ENOUGH = 12, 16
-# A region of at least this part of the draws must have been proposed at least so often.
+# One step in so many is run before those that are kept, and so many at least.
+_DISCARDED, _LEAST_DISCARDED = 12, 16
+# A region of at least this part of the draws must have been proposed so often, or entered.
 _LEAST_REGION, _LEAST_PROPOSED = 0.003, 5.0
 
 
-def _refuse_neglect(
-    report: GateReport, proposal: Proposal, t: Array, log_prob: Array, *, steps: int
-) -> GateReport:
-    """Refuse draws some of which lie where the proposal would not have gone.
+def _neglected(
+    proposal: Proposal, t: Array, log_prob: Array, steps: int, least_ess: float
+) -> NDArray[np.bool_]:
+    """Which draws lie where walkers neither were sent nor came by local moves, as `log_prob`.
 
-    A walker that a local move, or luck, has carried to a tail or a mode of which the proposal
-    knows nothing stays there, and the others never follow: R-hat sees little of it, and what the
-    walkers say of the region is luck. Of draws from pi, those in a region stand for a part of the
-    proposal q that is proportional to the mean of q/pi over them. `steps` is the length of the
-    chain that the draws were taken from.
+    A walker that started in a mode of which the proposal knows nothing stays there, and the others
+    never follow: R-hat sees little of it, and what the walkers say of the region is luck. Of draws
+    from pi, those in a region stand for a part of the proposal q that is proportional to the mean
+    of q/pi over them. `steps` is the length of the chain that the draws were taken from. Walkers
+    must have entered the region so often that its mass is known as well as by `least_ess` draws.
     """
-    log_ratio = proposal.log_prob(t.reshape(-1, t.shape[-1])) - log_prob.ravel()
-    ratio = np.sort(np.exp(log_ratio - log_ratio.max()))
+    log_ratio = proposal.log_prob(t.reshape(-1, t.shape[-1])).reshape(log_prob.shape) - log_prob
+    ratio = np.exp(log_ratio - log_ratio.max())
+    ordered = np.sort(ratio, axis=None)
     n_proposed = log_prob.shape[0] * log_prob.shape[1] * steps
-    proposed = n_proposed * np.cumsum(ratio) / ratio.sum()
-    region = np.arange(1, ratio.size + 1) / ratio.size
-    neglected = region[(region >= _LEAST_REGION) & (proposed < _LEAST_PROPOSED)]
-    if not neglected.size:
-        return report
-    reason = f"{neglected.max():.1%} of the draws lie where hardly any was proposed"
-    return replace(report, passed=False, reasons=(reason,))
+    proposed = n_proposed * np.cumsum(ordered) / ordered.sum()
+    size = int(np.searchsorted(proposed, _LEAST_PROPOSED))
+    inside = ratio < ordered[size]
+    entered = (inside[:, :, 1:] & ~inside[:, :, :-1]).sum()
+    share = size / ratio.size
+    if share < _LEAST_REGION or entered >= max(1.0, least_ess * share / (1.0 - share)):
+        return np.zeros_like(inside)
+    return np.asarray(inside)
 
 
 def _pooled(t: Array, report: GateReport) -> tuple[Array, float]:

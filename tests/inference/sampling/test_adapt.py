@@ -62,8 +62,9 @@ def test_several_components_follow_a_bend() -> None:
         return stats.norm.logpdf(t[:, 0]) + stats.norm.logpdf(bent, 0.0, 0.4)
 
     mixed, log_evidence, efficiency = adapted(log_prob, StudentT(np.zeros(2), np.eye(2), 6.0))
-    assert len(mixed.mixture.components) > 1
-    assert mixed.mixture.weights.sum() == pytest.approx(1.0)
+    (part,) = mixed.parts
+    assert len(part.mixture.components) > 2
+    assert part.mixture.weights.sum() == pytest.approx(1.0)
     # A single Gaussian of the banana's moments has an efficiency near 0.2.
     assert efficiency > 0.35
     assert abs(log_evidence) < error_of(efficiency)
@@ -108,22 +109,9 @@ def test_a_chain_teaches_what_importance_sampling_missed() -> None:
     assert np.median(efficiencies) > 0.4
 
 
-def test_one_more_round_where_many_draws_follow() -> None:
-    """Of 800 draws for each dimension and five more, where the proposal is not good yet."""
-    seen: list[int] = []
-
-    def counted(t: np.ndarray) -> np.ndarray:
-        seen.append(len(t))
-        return np.where((abs(t) < 1.0).all(axis=1), 0.0, -np.inf)  # a box is hard to match
-
-    for planned in (999_999, 1_000_000):
-        adapt(counted, [Guess(np.zeros(2), np.eye(2))], np.random.default_rng(3), planned)
-    assert seen == [7 * n for n in (60, 120, 250, 400)] * 2 + [7 * 800]
-
-
 def test_draws_that_have_no_spread_leave_the_proposal_as_it_is() -> None:
     rng = np.random.default_rng(10)
     target = stats.multivariate_normal(MEAN, SCALE)
     known, _ = adapt(target.logpdf, [Guess(MEAN, np.eye(3))], rng)
     same, _ = refit(target.logpdf, known, np.ones((500, 3)), 500.0, rng)
-    assert same is known
+    assert same.parts == known.parts

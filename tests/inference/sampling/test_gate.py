@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import emcee
 import numpy as np
 import pytest
 
 from calib.inference.diagnostics import convergence, ess, hdi, psis
-from calib.inference.sampling.ensemble import Ensemble
+from calib.inference.sampling import sampler as sampler_module
 from calib.inference.sampling.gate import Gate, GateReport, judge
 from calib.inference.sampling.sampler import SamplerSettings
+from calib.inference.sampling.walkers import longest_tau
 from tests.inference.sampling.closed_form import linear, run
 
 NAMES = ("a", "b")
@@ -133,21 +133,17 @@ def test_the_limits_are_those_of_the_gate() -> None:
 
 
 def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    sampled = Ensemble.run
-    made: list[object] = []
-    init = Ensemble.__init__
+    run_of = sampler_module.run_walkers
+    made: list[int] = []
 
-    def remember(self, *args, **kwargs):
-        init(self, *args, **kwargs)
-        made.append(self)
+    def stuck(*args):
+        chain, log_prob, accepted = run_of(*args)
+        made.append(len(made))
+        if made[-1] == 1:
+            chain[1:], log_prob[1:] = chain[:1], log_prob[:1]
+        return chain, log_prob, accepted
 
-    def stuck(self, proposal, efficiency, t, log_prob):
-        sampled(self, proposal, efficiency, t, log_prob)
-        if self is made[1]:
-            t[1:] = t[:1]
-
-    monkeypatch.setattr(Ensemble, "__init__", remember)
-    monkeypatch.setattr(Ensemble, "run", stuck)
+    monkeypatch.setattr(sampler_module, "run_walkers", stuck)
     settings = SamplerSettings(max_steps=200)
     draws = run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=settings)
     assert len(made) == 4
@@ -157,19 +153,11 @@ def test_one_stuck_ensemble_is_refused_in_a_whole_run(monkeypatch: pytest.Monkey
 @pytest.mark.parametrize("length", [2, 20])
 def test_going_to_and_fro_between_opposite_points_is_no_mixing(length: int) -> None:
     """Walkers that flip at every step and get a new pair after some: that is how long they take."""
-    ensemble = Ensemble.__new__(Ensemble)
     size = np.random.default_rng(1).standard_normal((4000 // length, 64, 2))
     chain = np.repeat(size, length, axis=0)
     chain[1::2] *= -1.0
-
-    class Stub:
-        def get_chain(self) -> np.ndarray:
-            return chain
-
-    ensemble.sampler = Stub()
-    ensemble.state = emcee.State(chain[0])
     # 64 x 4000 steps give an autocorrelation time to a few per cent.
-    np.testing.assert_allclose(ensemble.tau(len(chain)), length, rtol=0.15)
+    np.testing.assert_allclose(longest_tau(chain), length, rtol=0.15)
 
 
 def test_a_run_that_cannot_move_is_refused() -> None:

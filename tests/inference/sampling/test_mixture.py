@@ -59,15 +59,3 @@ def test_draws_of_a_mixture_follow_its_density() -> None:
         assert abs(ratio.mean() - 1.0) < 5.0 * ratio.std() / np.sqrt(n)
     error = np.abs(t.mean(axis=0) - (MEAN + 3.0)) / (t.std(axis=0) / np.sqrt(n))
     assert error.max() < 5.0
-
-
-def test_the_mean_density_of_opposite_points() -> None:
-    t = np.random.default_rng(4).normal(0.0, 3.0, (40, 3))
-    centre = np.array([0.3, -1.0, 2.0])
-    one, other = np.exp(mixture().log_prob(t)), np.exp(mixture().log_prob(2.0 * centre - t))
-    found = mixture().log_prob_symmetric(t, centre)
-    np.testing.assert_allclose(found, np.log(0.5 * (one + other)), rtol=1e-10)
-
-
-def test_the_mean_of_a_mixture_is_that_of_its_components() -> None:
-    np.testing.assert_allclose(mixture().mean(), MEAN + 3.0)

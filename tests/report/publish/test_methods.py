@@ -44,7 +44,6 @@ MANIFEST_LEAVES: list[tuple[tuple[str, ...], Any]] = [
     (("settings", "ensembles"), 7),
     (("settings", "steps"), 777),
     (("settings", "max_steps"), 77_777),
-    (("settings", "ahead"), 77),
     (("settings", "gate", "rhat_max"), 1.07),
     (("settings", "gate", "ess_min"), 777.0),
     (("settings", "gate", "taus_min"), 77.0),
