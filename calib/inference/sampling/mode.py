@@ -97,8 +97,10 @@ def find_modes(
             # Nowhere is the density positive: the caller will see.
             modes.append(Mode(t, -np.inf, np.diag(width**2)))
             continue
+        # A posterior may be a million times narrower than its prior.
+        near = np.sqrt(np.diag(hessian_scale(log_prob, t, width)))
         top, high = climb(
-            log_prob, t[None], width, *bounds, steps=_TO_THE_END, tolerance=_AT_THE_END
+            log_prob, t[None], near, *bounds, steps=_TO_THE_END, tolerance=_AT_THE_END
         )
         if not any(m.explains(top[0], float(high[0])) for m in modes):
             modes.append(Mode(top[0], float(high[0]), hessian_scale(log_prob, top[0], width)))
