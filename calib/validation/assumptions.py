@@ -552,7 +552,7 @@ def _uneven(problem: Problem, residual: Array) -> Iterable[Check]:
                 f"{source_of(problem.table)}: the scatter differs with {word}: one sigma is too "
                 f"narrow at {at[0]}, where the residuals have an sd of {sd[wide]:.2f} sigma, and "
                 f"too wide at {at[1]} ({sd[tight]:.2f} sigma; p = {plain_number(p, 2)}): {remedy}",
-                where=tuple(Range(name, float(levels[i]), float(levels[i])) for i in (wide, tight)),
+                where=tuple(_nearest(name, levels, i) for i in (wide, tight)),
             ))  # fmt: skip
             continue
         found = scipy.stats.kendalltau(np.abs(score), values)
@@ -562,6 +562,12 @@ def _uneven(problem: Problem, residual: Array) -> Iterable[Check]:
             f"{found.statistic:.2f}); one sigma is too wide at one end and too narrow at the "
             f"other: {remedy}",
         ))  # fmt: skip
+
+
+def _nearest(name: str, levels: Array, i: int) -> Range:
+    """Values of a condition that are nearer to one of its levels, in order, than to others."""
+    edges = [-np.inf, *(0.5 * (levels[1:] + levels[:-1])), np.inf]
+    return Range(name, float(edges[i]), float(edges[i + 1]))
 
 
 def _heavy_tailed(problem: Problem, residual: Array) -> Iterable[Check]:

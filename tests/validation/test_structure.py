@@ -168,3 +168,16 @@ def test_part_of_a_table_keeps_its_other_columns() -> None:
     assert table.extra == {"soil bin": tuple(BIN)}
     assert table.take(BIN == "B").extra == {"soil bin": ("B",) * 20}
     assert replace(table, extra={}).ignored == ("soil bin",)
+
+
+def test_scatter_concerns_the_rows_nearest_to_where_it_differs() -> None:
+    """Of three levels of slip the last scatters most, the first least: the middle is as assumed."""
+    slip = np.repeat([0.1, 0.2, 0.5], 15)
+    noise = np.random.default_rng(9).standard_normal(45) * np.repeat([0.02, 0.1, 0.5], 15)
+    problem = line_problem(slip, 1.0 + slip + noise)
+    found = failed(residual_checks(problem, fitted_line(slip, 1.0 + slip + noise)))
+    (uneven,) = (r for r in found if r.title == "Scatter is uneven")
+    concerned = {
+        at: uneven.concerns({"slip_ratio": np.array([at])}) for at in (0.0, 0.1, 0.2, 0.3, 0.4, 0.9)
+    }
+    assert concerned == {0.0: True, 0.1: True, 0.2: False, 0.3: False, 0.4: True, 0.9: True}
