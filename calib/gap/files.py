@@ -176,12 +176,12 @@ def write_diagnosis(found: Diagnosis, folder: Path) -> None:
     }
     if not new.text:
         columns = dict(new.columns)
+    if found.data.case.label:
+        columns["data_label"] = [found.data.case.label] * len(new)
     for name, prediction in found.new_predictions.items():
         column = OUTPUTS[name]
         columns[f"{column}_before"] = prediction.before
         columns[f"{column}_after"] = prediction.after
         columns[f"{column}_after_lower"] = prediction.lower
         columns[f"{column}_after_upper"] = prediction.upper
-    if found.data.case.label:
-        columns["data_label"] = [found.data.case.label] * len(new)
     write_table(folder / "fresh_prediction.csv", columns)

@@ -100,7 +100,9 @@ def _labelled(table: LatexTable, found: Sequence[Output]) -> LatexTable:
 def _csv_tables(found: Sequence[Output]) -> dict[str, list[Row]]:
     labels = {o.key: o.label for o in found}
     return {
-        name: [{**row, "data_label": labels[row["output"]]} for row in rows]
+        name: [
+            {"output": row["output"], "data_label": labels[row["output"]], **row} for row in rows
+        ]
         if any(labels.values())
         else rows
         for name, rows in _rows(found).items()
