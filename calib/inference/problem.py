@@ -161,9 +161,9 @@ class Problem:
         if uncertain is None:
             return self.bound.location(theta, conditions)
         with np.errstate(all="ignore"):
-            location, variances, curves = uncertain(theta, conditions)
-            error = np.sqrt(variances) * rng.standard_normal(variances.shape)
-            return np.asarray(location + error @ curves.T)
+            location, unknown, curves = uncertain(theta, conditions)
+            error = rng.standard_normal((len(theta), curves.shape[1])) @ curves.T
+            return np.asarray(location + np.sqrt(unknown)[:, None] * error)
 
     def log_likelihood(self, t: Array) -> Array:
         """Log likelihood of internal coordinates, shape (k,); ``-inf`` where undefined."""
@@ -172,8 +172,7 @@ class Problem:
         # A prior may admit sigma <= 0 or predictions beyond all bounds: they become -inf below.
         with np.errstate(all="ignore"):
             if self.bound.model.uncertain is not None:
-                residuals, variances, curves = self._predicted(natural)
-                value = log_normal(residuals, sigma, variances, curves)
+                value = log_normal(*self._predicted(natural), sigma)
             elif not self.noise.usual:
                 value = self._log_likelihood_by_row(natural)
             else:
@@ -183,13 +182,13 @@ class Problem:
         return np.where(np.isfinite(value), value, -np.inf)
 
     def _predicted(self, natural: Array) -> tuple[Array, Array, Array]:
-        """Residuals (k, n), and the error of the prediction: variances (k, j), curves (n, j)."""
+        """Residuals (k, n), and the prediction's error: its variance (k,) along curves (n, j)."""
         uncertain = self.bound.model.uncertain
         if uncertain is None:
-            none = np.zeros((len(natural), 0)), np.zeros((self.response.size, 0))
+            none = np.zeros(len(natural)), np.zeros((self.response.size, 0))
             return self.residuals(natural), *none
-        location, variances, curves = uncertain(self.of_model(natural), self.conditions)
-        return self.response - location, variances, curves
+        location, unknown, curves = uncertain(self.of_model(natural), self.conditions)
+        return self.response - location, unknown, curves
 
     def _log_likelihood_by_row(self, natural: Array) -> Array:
         at_once = max(1, _CELLS // self.response.size)
@@ -232,8 +231,8 @@ class Problem:
         if not self.noise.usual:
             density = self.noise.log_density(self.residuals(natural), natural, self.conditions)
             return density + self._ln_jacobian
-        residuals, variances, curves = self._predicted(natural)
-        sigma = np.sqrt(natural[:, -1:] ** 2 + variances @ (curves**2).T)
+        residuals, unknown, curves = self._predicted(natural)
+        sigma = np.sqrt(natural[:, -1:] ** 2 + unknown[:, None] * (curves**2).sum(axis=1))
         z = residuals / sigma
         return np.asarray(-0.5 * z * z - np.log(sigma) - _HALF_LN_2PI + self._ln_jacobian)
 

@@ -245,8 +245,8 @@ class Model:
         Whether its posterior takes minutes: `calib sbc` asks for many, and for this one by name.
     uncertain : callable, optional
         Of a prediction that is known with an error of its own (an emulator's): ``(theta (k, d),
-        conditions (n,)) -> prediction (k, n), variances (k, j), curves (n, j)`` on the scale of
-        the response, the error being the curves times independent normals of these variances.
+        conditions (n,)) -> prediction (k, n), variance (k,), curves (n, j)`` on the scale of the
+        response, the error being the curves times independent normals of that variance.
     """
 
     name: str

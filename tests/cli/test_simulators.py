@@ -25,7 +25,7 @@ def emulation(**other: Any) -> Emulation:
         "problem": None, "emulator": None, "expected": 0.0,
         "between": 0.0, "own_noise": 0.0, "passed": True, "reasons": (), "history": (),
         "runs": (ok, ok, crashed),
-        "held_out": HeldOut(20, 0.0456, np.zeros(20), np.zeros(20), 0.95),
+        "held_out": HeldOut(20, 0.0456, np.zeros(20), np.zeros(20), 0.95, np.zeros((20, 1))),
     }  # fmt: skip
     return Emulation(**{**given, **other})
 

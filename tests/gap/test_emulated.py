@@ -65,7 +65,8 @@ def test_a_crude_emulators_error_is_in_the_likelihood(tmp_path: Path) -> None:
     np.testing.assert_allclose(ours, covariance, atol=(0.02 * NOISE) ** 2 + 0.01 * scale**2)
     observed = data.observed
     residuals = observed - predicted[:1]
-    marginal = log_normal(residuals, np.array([NOISE]), emulator.typical_variances[None], curves)
+    scaled = curves * np.sqrt(emulator.typical_variances)
+    marginal = log_normal(residuals, np.ones(1), scaled, np.array([NOISE]))
     found = np.linalg.slogdet(np.eye(len(observed)) * NOISE**2 + ours)[1]
     weighed = np.linalg.solve(np.eye(len(observed)) * NOISE**2 + ours, residuals[0])
     value = -0.5 * (residuals[0] @ weighed + found + len(observed) * np.log(2.0 * np.pi))

@@ -34,7 +34,8 @@ def choose_nodes(
     ranges : mapping of str to (float, float)
         Bounds that the user gave, which the nodes then span.
     count : int, optional
-        About how many; by default as many as the number of varying conditions asks for.
+        How many, of whole numbers fewer if there are no more; by default as many as the number of
+        varying conditions asks for. Of more rows so many are taken, and spread evenly.
     across_zero : bool
         Whether the margin may change a condition's sign, as a slip's does with another rolling
         radius: many formulas and some simulators end there.
@@ -46,8 +47,9 @@ def choose_nodes(
     varying = high > low
     unit = np.where(varying, high - low, 1.0)
     inside = (rows - low) / unit
-    if len(inside) > _MOST:
-        inside = inside[_spread(inside, np.zeros((0, len(columns))), _MOST)]
+    most = count or _MOST
+    if len(inside) > most:
+        inside = inside[_spread(inside, np.zeros((0, len(columns))), most)]
     wanted = count or _ENOUGH.get(int(varying.sum()), _MANY)
     more = max(wanted - len(inside), 0)
     if more:
@@ -106,8 +108,10 @@ def _between(inside: Array, varying: NDArray[np.bool_], more: int) -> tuple[Arra
         corners[:, varying] = np.stack(np.meshgrid(*[[0.0, 1.0]] * d), axis=-1).reshape(-1, d)
     candidates = np.zeros((512, inside.shape[1]))
     candidates[:, varying] = qmc.Sobol(d, scramble=False).random_base2(9)
+    apart = np.abs(corners[:, None] - inside).max(axis=2).min(axis=1, initial=np.inf)
+    corners = corners[apart > 1e-9][:more]
     there = np.concatenate([inside, corners])
-    rest = max(more - len(corners), 0)
+    rest = more - len(corners)
     picked = _spread(_ranked(candidates, inside), _ranked(there, inside), rest)
     return corners, np.asarray(candidates[picked])
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +14,7 @@ from calib.batch.plugins import load_files
 from calib.data import Table
 from calib.errors import CalibError
 from calib.inference.emulation.sequential import emulate, extend
-from calib.inference.emulation.settings import Emulation, EmulationSettings
+from calib.inference.emulation.settings import Emulation, EmulationSettings, Progress
 from calib.inference.emulation.tabulated import emulate_table
 from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
@@ -28,8 +28,6 @@ from calib.models.simulators.runs import Run, RunKeeper
 from calib.models.simulators.ways import TableWay
 
 _MORE = 100
-
-type Progress = Callable[[str, int, int], None]
 
 
 def emulated(
@@ -63,11 +61,12 @@ def emulated(
     found = _simulated(problem.bound.model.name)
     settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
     if isinstance(found.simulator.way, TableWay):
-        return emulate_table(problem, found.simulator, seed, settings)
+        return emulate_table(problem, found.simulator, seed, settings, progress)
     keeper = _keeper(found, workers, scheduler, progress, settings.runs)
     return emulate(
-        problem, keeper, seed, settings=settings, elsewhere=[t.columns for t in elsewhere]
-    )
+        problem, keeper, seed, settings=settings, elsewhere=[t.columns for t in elsewhere],
+        progress=progress,
+    )  # fmt: skip
 
 
 def _simulated(model: str) -> Simulated:
@@ -175,7 +174,7 @@ def _extended(
 ) -> Emulation:  # fmt: skip
     settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
     keeper = _keeper(found, workers, None, progress, _MORE)
-    return extend(emulator, problem, keeper, seed, settings=settings, more=_MORE)
+    return extend(emulator, problem, keeper, seed, settings=settings, more=_MORE, progress=progress)
 
 
 def reaches(model: str, tables: Sequence[Table]) -> bool:

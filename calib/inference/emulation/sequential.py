@@ -13,6 +13,7 @@ Nowak (2017, doi:10.1137/15M1047659) in the simplest form that does.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -21,9 +22,9 @@ from numpy.typing import NDArray
 
 from calib.batch.threads import one_thread
 from calib.inference.design import prior_design, prior_middle
-from calib.inference.emulation.judge import WORTH, held_out, judged
+from calib.inference.emulation.judge import FORESEEN_FROM, WORTH, foreseen, held_out, judged
 from calib.inference.emulation.nodes import across_zero, choose_nodes
-from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut
+from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut, Progress
 from calib.inference.emulation.state import State, across_too
 from calib.inference.problem import Problem
 from calib.inference.random import generator
@@ -34,9 +35,8 @@ from calib.models.simulators.emulator.kriging import correlation
 from calib.models.simulators.refused import FIRST, FROM_THE_START, fail_alike
 from calib.models.simulators.runs import Run, RunKeeper
 
+_log = logging.getLogger(__name__)
 _CANDIDATES = 400
-# Some of the candidates are so many times as far from the posterior's middle as its draws.
-_WIDER = 1.6
 # How far in posterior sds a run is taken to tell of others when a batch is picked.
 _APART = 2.0
 _LEAST_OK = 0.5
@@ -55,6 +55,7 @@ def emulate(
     *,
     settings: EmulationSettings | None = None,
     elsewhere: Sequence[Mapping[str, Array]] = (),
+    progress: Progress | None = None,
 ) -> Emulation:
     """Emulate the simulator of a problem as well as its posterior needs it.
 
@@ -69,7 +70,9 @@ def emulate(
     chosen = settings or EmulationSettings()
     recorded = [problem.conditions, *(problem.bound.model.select(e) for e in elsewhere)]
     nodes, across, tried = _nodes(problem, keeper, recorded, chosen.nodes)
-    state = State(problem, keeper, nodes, seed, chosen.runs, across=across, tried=tried)
+    state = State(
+        problem, keeper, nodes, seed, chosen.runs, across=across, tried=tried, progress=progress
+    )
     own_noise = _first_design(state, chosen)
     state.rebuild()
     return _improved(state, chosen, chosen.runs, own_noise)
@@ -84,13 +87,14 @@ def extend(
     *,
     settings: EmulationSettings | None = None,
     more: int = 100,
+    progress: Progress | None = None,
 ) -> Emulation:
     """Make runs where another problem of the same simulator needs them, a field campaign's.
 
     It has the same model and priors. Where the emulator, which serves the calibration, is good it
     stays so. The emulation's runs are the new ones, `more` at the most.
     """
-    state = State.beyond(emulator, problem, keeper, seed, more)
+    state = State.beyond(emulator, problem, keeper, seed, more, progress)
     return _improved(state, settings or EmulationSettings(), more, 0.0)
 
 
@@ -109,15 +113,19 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
         # learned from its check.
         ran = 0 if measured is None else measured.runs
         good = ran >= _RAN * checks and (measured is None or measured.rmse <= chosen.tolerance)
+        partly = state.emulator is not None and state.emulator.support is not None
+        if partly and state.holds(z).any():
+            # Where no run was made among those that failed there may seem to be room.
+            z = state.sample(len(history) + 2)
+            good &= state.among_failed(z) <= _AMONG_FAILED
         if good or state.left <= checks:
             break
     if not state.holds(z).any():
         raise state.without_value("no parameters are left for the data")
-    if state.emulator is not None and state.emulator.support is not None:
-        # Where no run was made among those that failed there may seem to be room.
-        z = state.sample(len(history) + 2)
+    if partly:
         if state.among_failed(z) > _AMONG_FAILED:
             raise state.without_value("the posterior lies among runs that failed")
+        state.rebuild()  # the edge is looked at where the posterior has come to lie
     return judged(state, z, chosen, measured, own_noise, history)
 
 
@@ -128,15 +136,23 @@ def _needed(
 
     Return draws of the posterior.
     """
-    batch, all_ran = max(2 * int(state.free.sum()), 4), True
-    began = len(history)
+    all_ran, told = True, None if len(state.runs) < FORESEEN_FROM or not history else ""
     while True:
         state.rebuild()
         z = state.sample(len(history) + 1)
         history.append((len(state.runs), state.error(z)))
         room = state.left - checks
-        if room < 1 or (all_ran and _settled(history[began:], chosen.tolerance)):
+        if room < 1 or (all_ran and history[-1][1] <= WORTH * chosen.tolerance):
             return z
+        if told is None and len(state.runs) >= FORESEEN_FROM:
+            told = foreseen(state, z, chosen, history)
+            _log.warning(
+                "%s: after %d runs the emulator is off by %.2g noise sds (rms), where %g are "
+                "allowed; %s; at most %d are made (emulator.runs)", state.problem.bound.model.name,
+                len(state.runs), history[-1][1], chosen.tolerance, told, state.most,
+            )  # fmt: skip
+        # The more there are the less a few others say.
+        batch = max(2 * int(state.free.sum()), 4, len(state.runs) // 8)
         theta = state.axes.natural(_next(state, z, min(batch, room), len(history)))
         values = state.carry_out(theta)
         all_ran = bool(np.isfinite(values).all())
@@ -160,11 +176,6 @@ def _nodes(
         return inside, None, tried
     across = across_zero({n: v for n, v in wide.items() if n not in ranges}, recorded)
     return wide, across, tried
-
-
-def _settled(history: Sequence[tuple[int, float]], tolerance: float) -> bool:
-    """Whether the error was small enough twice: the first time may be luck of the draws."""
-    return len(history) > 1 and all(error <= WORTH * tolerance for _, error in history[-2:])
 
 
 def _first_design(state: State, chosen: EmulationSettings) -> float:
@@ -211,9 +222,7 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
 def _next(state: State, z: Array, count: int, step: int) -> Array:
     """Pick the runs to make next: where the emulator knows least of what the posterior needs."""
     rng = generator(state.seed, state.label, "next", step)
-    middle, half = z.mean(axis=0), _CANDIDATES // 2
-    inner, wide = (z[rng.permutation(len(z))[:half]] for _ in range(2))
-    candidates = np.concatenate([inner, middle + _WIDER * (wide - middle)])
+    candidates = inner = z[rng.permutation(len(z))[:_CANDIDATES]]
     if state.emulator is None or state.region is None:
         return candidates[:count]
     edge = state.emulator.from_edge(inner)

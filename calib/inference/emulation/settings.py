@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from typing import Any
 
+from calib.errors import CalibError
 from calib.inference.problem import Problem
 from calib.models.base import Array
 from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.runs import Run
+
+# What is being done, how much of it is done, and of how much.
+type Progress = Callable[[str, int, int], None]
+
+_CHECKS = 20
 
 
 @dataclass(frozen=True)
@@ -23,11 +29,12 @@ class EmulationSettings:
         them. A run that is tried again after it failed counts once.
     first : int, optional
         Of the space-filling design over the prior; ten for each parameter by default.
-    checks : int
-        Runs at draws of the posterior that the emulator is checked on before it sees them.
+    checks : int, optional
+        Runs at draws of the posterior that the emulator is checked on before it sees them, a fifth
+        of all at most; 20 by default, or the fifth.
     tolerance : float
-        Largest rms error of the emulator over rows and posterior, in sds of the noise. Runs are
-        made until a third of it is expected. At 0.1 the error adds 1 % to the variance of a
+        Largest rms error of the emulator over rows and posterior, in sds of the noise. It is
+        checked when somewhat less is expected. At 0.1 the error adds 1 % to the variance of a
         reading; it is in the likelihood besides.
     nodes : int, optional
         Conditions at which each run is evaluated, see `calib.inference.emulation.nodes`.
@@ -38,14 +45,28 @@ class EmulationSettings:
 
     runs: int = 200
     first: int | None = None
-    checks: int = 20
+    checks: int | None = None
     tolerance: float = 0.1
     nodes: int | None = None
     sequential: bool = True
 
+    def __post_init__(self) -> None:
+        for key, found, most, why in (
+            ("checks", self.checks, self.runs // 5, "a fifth of the runs"),
+            ("first", self.first, self.runs - self.checks_of(self.runs),
+             "the runs less those that it is checked on"),
+        ):  # fmt: skip
+            if found is not None and found > most:
+                raise CalibError(
+                    f"{key} = {found} is more than runs = {self.runs} leaves room for",
+                    where=f"emulator.{key}", allowed=f"at most {most}, {why}",
+                    mend="lower it, or give more runs",
+                )  # fmt: skip
+
     def checks_of(self, most: int) -> int:
         """How many of so many runs are kept for the check."""
-        return min(self.checks, most // 5) if self.sequential else 0
+        wanted = _CHECKS if self.checks is None else self.checks
+        return min(wanted, most // 5) if self.sequential else 0
 
     def repeats(self, deterministic: bool) -> tuple[int, int]:
         """How many of the first runs are made again, to see whether they differ, and how often."""
@@ -64,7 +85,8 @@ class HeldOut:
 
     The rms error is over runs and rows, in sds of the noise. `z` are errors of the coefficients in
     their predicted sds, `pit` where these lie in their predicted distributions (even from 0 to 1 if
-    the emulator knows its error), `covered` the share within central 90 % intervals.
+    the emulator knows its error), `covered` the share within central 90 % intervals, `errors` are
+    those at the data's rows, (runs, n), on the scale of the response.
     """
 
     runs: int
@@ -72,6 +94,7 @@ class HeldOut:
     z: Array
     pit: Array
     covered: float
+    errors: Array
 
 
 @dataclass(frozen=True)
@@ -101,6 +124,11 @@ class Emulation:
         Runs, and the expected error then.
     extended : bool
         Whether an emulator that was there serves another campaign, to which the runs were added.
+    wider : mapping of str to float
+        How many times as wide the posterior of each parameter is for the emulator's error, which
+        is in the likelihood (to first order).
+    shifted : mapping of str to float
+        By how many of its posterior sds errors as those on runs not seen shift it (rms).
     """
 
     problem: Problem
@@ -114,6 +142,8 @@ class Emulation:
     reasons: tuple[str, ...]
     history: tuple[tuple[int, float], ...]
     extended: bool = False
+    wider: Mapping[str, float] = field(default_factory=dict)
+    shifted: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def failed(self) -> tuple[Run, ...]:
@@ -132,6 +162,8 @@ class Emulation:
             "simulator_noise_sd": self.own_noise,
             "passed": self.passed,
             "reasons": list(self.reasons),
+            "posterior_times_as_wide": dict(self.wider),
+            "posterior_shifted_by_sds": dict(self.shifted),
             "history": [list(entry) for entry in self.history],
             "held_out": None if h is None else {
                 "runs": h.runs, "rmse_in_noise_sds": h.rmse,

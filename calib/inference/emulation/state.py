@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from scipy.spatial.distance import cdist
 
 from calib.errors import CalibError
 from calib.inference.emulation.nodes import across_zero
+from calib.inference.emulation.settings import Progress
 from calib.inference.problem import Problem
 from calib.inference.random import stream
 from calib.inference.sampling.mode import prior_widths
@@ -28,7 +30,7 @@ _DRAWS = 512
 # A first guess of the noise is this part of the spread of the data.
 _FIRST_NOISE = 0.1
 # Errors below this part of the noise sd (per value) need not be looked into.
-_NEGLIGIBLE = 0.003
+_NEGLIGIBLE = 0.01
 # Across zero a formula may grow beyond bounds: values so many times as far from the others as these
 # reach are wild. So many runs near the posterior tell whether there are such.
 _WILD, _FEW = 10.0, 8
@@ -47,10 +49,10 @@ class State:
     def __init__(
         self, problem: Problem, keeper: RunKeeper, nodes: Mapping[str, Array], seed: int,
         most: int = 0, label: str = "emulate", across: NDArray[np.bool_] | None = None,
-        tried: Sequence[Run] = (),
+        tried: Sequence[Run] = (), progress: Progress | None = None,
     ) -> None:  # fmt: skip
         self.problem, self.keeper, self.nodes = problem, keeper, nodes
-        self.seed, self.most, self.label = seed, most, label
+        self.seed, self.most, self.label, self.progress = seed, most, label, progress
         entries = problem.priors.entries[:-1]
         self.axes = _axes(problem)
         self.free = np.array([not p.fixed for p in entries])
@@ -68,11 +70,13 @@ class State:
 
     @classmethod
     def beyond(
-        cls, emulator: Emulator, problem: Problem, keeper: RunKeeper, seed: int, most: int
-    ) -> State:
+        cls, emulator: Emulator, problem: Problem, keeper: RunKeeper, seed: int, most: int,
+        progress: Progress | None = None,
+    ) -> State:  # fmt: skip
         """Return the state in which an emulator begins to serve another problem as well."""
         nodes = emulator.training.nodes
-        state = cls(problem, keeper, nodes, seed, most, "extend", across_zero(nodes))
+        across = across_zero(nodes)
+        state = cls(problem, keeper, nodes, seed, most, "extend", across, progress=progress)
         state.training, state.emulator = emulator.training, emulator
         state.earlier = emulator.regions
         state._emulate(emulator)
@@ -156,15 +160,21 @@ class State:
         """Fit the emulator again to all runs."""
         if self._wild_near():
             self._give_up_across()
-        known = self.emulator
+        known, runs = self.emulator, len(self.training.theta)
+        self._tell("runs in the emulator", 0 if known is None else len(known.training.theta), runs)
         again = self.region is None or known is None or known.mean.size != self.across.size
         self.emulator = build_emulator(
             replace(self.training, values=self.tamed(self.training.values)), self.axes,
             _NEGLIGIBLE * self.sigma, self._regions,
-            scales=None if known is None else [f.scales for f in known.functions],
+            scales=None if known is None else known.functions.scales,
             over=None if again or known is None else known.over,
         )  # fmt: skip
         self._emulate(self.emulator)
+        self._tell("runs in the emulator", runs, runs)
+
+    def _tell(self, what: str, done: int, planned: int) -> None:
+        if self.progress is not None:
+            self.progress(what, done, planned)
 
     @property
     def _regions(self) -> tuple[Region, ...]:
@@ -200,11 +210,13 @@ class State:
 
     def sample(self, step: int) -> Array:
         """Draw from the posterior under the emulator; return z of the draws, shape (k, d)."""
+        self._tell("sampling for the next runs", 0, 1)
         starts = None if self.mode is None else self.mode[None]
         try:
             draws = sample_posterior(
-                self.emulated, stream(self.seed, self.label, step), starts=starts, settings=_ROUGH
-            )
+                self.emulated, stream(self.seed, self.label, step), starts=starts, settings=_ROUGH,
+                progress=partial(self._tell, "sampling for the next runs"),
+            )  # fmt: skip
         except CalibError as error:
             raise self.without_value("no parameters are left for the data") from error
         self.mode = draws.mode
@@ -242,9 +254,9 @@ class State:
         """Sum over the data's rows of the emulator's variance, shape (k,)."""
         if self.emulator is None:
             return np.full(len(z), np.inf)
-        _, variances = self.emulator.with_variance(self.axes.natural(z))
+        _, unknown = self.emulator.with_unknown(self.axes.natural(z))
         curves = self.emulator.curves_at(self.problem.conditions)[:, 1:]
-        return np.asarray(variances @ (curves**2).sum(axis=0))
+        return unknown * float((curves**2 @ self.emulator.variances).sum())
 
 
 def across_too(run: Run) -> Run:

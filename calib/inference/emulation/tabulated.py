@@ -12,11 +12,10 @@ from calib.data.csvfile import open_csv
 from calib.data.headers import parse_header
 from calib.data.values import real_array
 from calib.errors import CalibError
-from calib.inference.emulation.judge import held_out, judged
-from calib.inference.emulation.settings import Emulation, EmulationSettings
+from calib.inference.emulation.judge import judged, left_out
+from calib.inference.emulation.settings import Emulation, EmulationSettings, Progress
 from calib.inference.emulation.state import State
 from calib.inference.problem import Problem
-from calib.inference.random import generator
 from calib.inference.trial import check_scale
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Simulator
@@ -25,17 +24,16 @@ from calib.models.simulators.exchange import columns_of
 from calib.models.simulators.runs import Run, RunKeeper
 from calib.models.simulators.ways import TableWay
 
-# Every so many-th run is kept for the check.
-_EVERY = 5
 _LEAST = 8
 
 
 def emulate_table(
-    problem: Problem, simulator: Simulator, seed: int, settings: EmulationSettings
-) -> Emulation:
-    """Emulate from a table; every fifth run checks the emulator before it is taken in."""
+    problem: Problem, simulator: Simulator, seed: int, settings: EmulationSettings,
+    progress: Progress | None = None,
+) -> Emulation:  # fmt: skip
+    """Emulate from a table; each run where the posterior is checks what the others say of it."""
     training = read_runs(simulator, problem)
-    state = State(problem, RunKeeper(simulator), training.nodes, seed)
+    state = State(problem, RunKeeper(simulator), training.nodes, seed, progress=progress)
     state.runs = [
         Run(t, {problem.bound.model.output: v})
         if np.isfinite(v).all()
@@ -43,18 +41,13 @@ def emulate_table(
         for t, v in zip(training.theta, training.values, strict=True)
     ]
     check_scale(problem, state.outputs(training.values), simulator)
-    order = generator(seed, "emulate", "table").permutation(len(training.theta))
-    checks, kept = order[::_EVERY], np.delete(order, np.s_[::_EVERY])
-    state.learn(training.theta[kept], training.values[kept])
+    state.learn(training.theta, training.values)
     for step in range(2):
         state.rebuild()
         z = state.sample(step)
     state.rebuild()
     history = [(len(training.theta), state.error(z))]
-    measured = held_out(state, training.theta[checks], training.values[checks])
-    state.learn(training.theta[checks], training.values[checks])
-    state.rebuild()
-    return judged(state, z, settings, measured, 0.0, history)
+    return judged(state, z, settings, left_out(state), 0.0, history)
 
 
 def read_runs(simulator: Simulator, problem: Problem) -> Training:

@@ -16,20 +16,11 @@ from calib.data.documents import MEND_TOML, read_text, read_toml
 from calib.errors import CalibError, meant
 from calib.models.simulators.base import Way
 from calib.models.simulators.exchange import check_template
-from calib.models.simulators.registered import SIMULATED, Simulated, declare, written
+from calib.models.simulators.registered import SIMULATED, Budget, Simulated, declare, written
 from calib.models.simulators.umbridge import UmbridgeWay
 from calib.models.simulators.ways import CallableWay, CommandWay, TableWay
 
 _WAYS = ("run", "python", "url", "table")
-
-
-class _Budget(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-    runs: int = Field(default=200, ge=10)
-    first: int | None = Field(default=None, ge=4)
-    checks: int = Field(default=20, ge=0)
-    tolerance: float = Field(default=0.1, gt=0.0)
-    nodes: int | None = Field(default=None, ge=2)
 
 
 def _without_null(text: str) -> str:
@@ -68,7 +59,7 @@ class SimulatorFile(BaseModel):
     outputs: dict[str, str] = Field(min_length=1)
     patterns: dict[str, str] = {}
     ranges: dict[str, tuple[float, float]] = {}
-    emulator: _Budget = _Budget()
+    emulator: Budget = Budget()
     parameters: dict[str, dict[str, Any]] = Field(min_length=1)
 
 
@@ -107,8 +98,9 @@ def read_simulator(path: Path) -> Simulated:
         return declare(
             file.name, _way(file, path), priors, file.conditions, file.outputs,
             folder=path.parent / (file.cache or f"{path.stem}.runs"),
-            budget=file.emulator.model_dump(), title=file.title, source=file.source,
-            limit=file.limit, retries=file.retries, deterministic=file.deterministic,
+            budget=file.emulator.model_dump(exclude_unset=True),
+            title=file.title, source=file.source, limit=file.limit, retries=file.retries,
+            deterministic=file.deterministic,
             emulate=file.emulate, ranges=_ranges(file, path), made_of=_made_of(file, path),
             file=str(path),
         )  # fmt: skip
@@ -125,7 +117,7 @@ def _explain(error: ValidationError, path: Path) -> CalibError:
     # A key that is missing is most often there by a wrong name.
     first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
     key = ".".join(str(part) for part in first["loc"])
-    known = list((_Budget if key.startswith("emulator.") else SimulatorFile).model_fields)
+    known = list((Budget if key.startswith("emulator.") else SimulatorFile).model_fields)
     mend = "correct it"
     if first["type"] == "extra_forbidden":
         mend = meant(str(first["loc"][-1]), known, "correct its name, or leave it out")

@@ -13,6 +13,7 @@ from types import FunctionType
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from calib.data.documents import MEND_TOML
 from calib.data.headers import parse_header
@@ -24,12 +25,23 @@ from calib.models.declared import DIMENSIONS, check_model, check_names, check_wo
 from calib.models.simulators.base import FAILED, Failure, Output, Simulator
 from calib.models.simulators.refused import FROM_THE_START, fail_alike, without_value
 from calib.models.simulators.runs import Run
-from calib.models.simulators.ways import CallableWay
+from calib.models.simulators.ways import CallableWay, TableWay
 
 # So many of the runs that failed are listed, where a sampler asks for thousands.
 _LISTED = 200
 # Keys that TOML has without quotes.
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
+
+
+class Budget(BaseModel):
+    """What a user may say of an emulator (see `calib.inference.emulation.EmulationSettings`)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    runs: int = Field(default=200, ge=10)
+    first: int | None = Field(default=None, ge=4)
+    checks: int | None = Field(default=None, ge=0)
+    tolerance: float = Field(default=0.1, gt=0.0)
+    nodes: int | None = Field(default=None, ge=2)
 
 
 @dataclass(frozen=True)
@@ -283,6 +295,7 @@ def declare(
     Priors are the TOML text of all prior tables, those of the noise among them; conditions and
     outputs map the simulator's own names to headers.
     """
+    _check_budget(name, way, budget or {})
     tables = split_tables(priors, name)
     sigmas = {own: "sigma" if len(outputs) == 1 else f"sigma_{own}" for own in outputs}
     missing = [s for s in sigmas.values() if s not in tables]
@@ -323,6 +336,26 @@ def declare(
     reserved = dict.fromkeys(FAILED, "a column of the list of failed runs")
     check_names(DIMENSIONS | reserved, given, where)
     return Simulated(simulator, folder, budget)
+
+
+def _check_budget(name: str, way: Any, budget: Mapping[str, float]) -> None:
+    """Refuse a setting of an emulator that does not exist, is impossible, or has no effect."""
+    where = f"simulator {name}, emulator"
+    try:
+        Budget.model_validate(budget)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise CalibError(
+            f"{first['msg']} (found {first['input']!r})",
+            where=f"{where}.{'.'.join(map(str, first['loc']))}",
+            allowed=", ".join(Budget.model_fields), mend="correct it, or leave it out",
+        ) from None  # fmt: skip
+    idle = sorted(set(budget) - {"tolerance"}) if isinstance(way, TableWay) else []
+    if idle:
+        raise CalibError(
+            f"{', '.join(idle)} can do nothing for a table, whose runs and rows are made already",
+            where=where, allowed="tolerance", mend="leave it out",
+        )  # fmt: skip
 
 
 def split_tables(priors: str, name: str) -> dict[str, str]:

@@ -101,6 +101,9 @@ def test_a_region_where_it_crashes_is_outside_the_posterior(tmp_path: Path) -> N
     whole = directly().parameters["mu"]
     kept = whole[whole < 0.6]
     nearest = min(run.theta[0] for run in emulation.failed)
+    emulator = emulation.emulator
+    lost = np.array([run.theta for run in emulation.failed])
+    assert not emulator.holds(emulator.axes.of(lost)).any()
     assert found.parameters["mu"].max() < nearest < whole.max()
     assert abs(found.summary["mu"].mean - kept.mean()) < kept.std()
     write_failed(emulation.failed, simulated.simulator.parameters, tmp_path / "failed.csv")

@@ -18,7 +18,7 @@ nodes say the same, in the place of matrices of 200 and of 40.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -118,7 +118,7 @@ class Emulator:
     mean : ndarray, shape (m,)
     curves : ndarray, shape (j, m)
         Orthonormal.
-    functions : tuple of Kriging
+    functions : Kriging
         The coefficients as functions of the parameters, in units of the prior's sds.
     over : Over
     regions : tuple of Region
@@ -133,7 +133,7 @@ class Emulator:
     negligible: float
     mean: Array
     curves: Array
-    functions: tuple[Kriging, ...]
+    functions: Kriging
     over: Over
     regions: tuple[Region, ...]
     support: Support | None
@@ -149,12 +149,27 @@ class Emulator:
 
     def coefficients(self, theta: Array) -> Array:
         """Return the curves' coefficients, shape (k, d) to (k, j); NaN where there is no value."""
-        return self._evaluate(theta, variance=False)[0]
+        z, known = self._known(theta)
+        means = self.functions.mean(z)
+        means[~known] = np.nan
+        return means
+
+    def with_unknown(self, theta: Array) -> tuple[Array, Array]:
+        """Return coefficients (k, j), and which part of `variances` they have, shape (k,)."""
+        z, known = self._known(theta)
+        means, unknown = self.functions.mean_and_unknown(z)
+        means[~known] = np.nan
+        return means, unknown
 
     def with_variance(self, theta: Array) -> tuple[Array, Array]:
         """Return coefficients and their variances, shape (k, j) each."""
-        means, variances = self._evaluate(theta, variance=True)
-        return means, np.zeros_like(means) if variances is None else variances
+        means, unknown = self.with_unknown(theta)
+        return means, unknown[:, None] * self.variances
+
+    @property
+    def variances(self) -> Array:
+        """Variances of the coefficients where no run tells of them, shape (j,)."""
+        return self.functions.variances
 
     @cached_property
     def typical_variances(self) -> Array:
@@ -169,21 +184,13 @@ class Emulator:
         theta = self.axes.natural(np.concatenate(points))
         means, variances = self.with_variance(theta)
         there = variances[np.isfinite(means).all(axis=1)]
-        return np.asarray(there.mean(axis=0)) if len(there) else np.zeros(len(self.functions))
+        return np.asarray(there.mean(axis=0)) if len(there) else np.zeros(len(self.curves))
 
-    def _evaluate(self, theta: Array, *, variance: bool) -> tuple[Array, Array | None]:
+    def _known(self, theta: Array) -> tuple[Array, NDArray[np.bool_]]:
         z = self.axes.of(np.atleast_2d(theta))
         known = np.isfinite(z).all(axis=1)
         z = np.where(known[:, None], z, 0.0)
-        known &= self.holds(z)
-        if variance:
-            both = [f.mean_and_variance(z) for f in self.functions]
-            means = np.stack([mean for mean, _ in both], axis=1)
-            variances = np.stack([v for _, v in both], axis=1)
-        else:
-            means, variances = np.stack([f.mean(z) for f in self.functions], axis=1), None
-        means[~known] = np.nan
-        return means, variances
+        return z, known & self.holds(z)
 
     @cached_property
     def _box(self) -> tuple[Array, Array]:
@@ -240,7 +247,7 @@ def build_emulator(
     negligible: float,
     regions: Sequence[Region] = (),
     *,
-    scales: Sequence[Scales] | None = None,
+    scales: Scales | None = None,
     known: bool = False,
     over: Over | None = None,
 ) -> Emulator:
@@ -255,8 +262,8 @@ def build_emulator(
     regions : sequence of Region
         Where posteriors lie: the basis serves the runs there first, and edges beyond which there
         is no value are looked at more closely.
-    scales : sequence of Scales, optional
-        Of an earlier emulator, for each curve: where to begin.
+    scales : Scales, optional
+        Of an earlier emulator: where to begin.
     known : bool
         Whether they are to be used as they are.
     over : Over, optional
@@ -270,26 +277,15 @@ def build_emulator(
     near = values[inside] if inside.sum() >= _FEW else values
     mean, curves = _basis(near, values, negligible)
     coefficients = (values - mean) @ curves.T
-    tiny = 0.3 * negligible * np.sqrt(mean.size)
-    functions = []
-    for j, y in enumerate(coefficients.T):
-        begin = scales[j] if scales is not None and j < len(scales) else None
-        if begin is None or not known:
-            begin = _scales(z[ok], y, tiny, training.noisy, begin)
-        functions.append(krige(z[ok], y, begin))
+    if scales is None or not known:
+        scales = find_scales(z[ok], coefficients, noisy=training.noisy, start=scales)
     if over is None:
         some = near[np.linspace(0, len(near) - 1, min(_CURVES, len(near))).astype(int)]
         over = over_conditions(training.nodes, some)
     return Emulator(
-        training, axes, negligible, mean, curves, tuple(functions), over, tuple(regions),
-        learn_support(z, ok), _near(z, ok, regions),
+        training, axes, negligible, mean, curves, krige(z[ok], coefficients, scales), over,
+        tuple(regions), learn_support(z, ok), _near(z, ok, regions),
     )  # fmt: skip
-
-
-def _scales(z: Array, y: Array, tiny: float, noisy: bool, begin: Scales | None) -> Scales:
-    if y.std() < tiny:
-        return Scales(np.full(z.shape[1], 3.0), 1e-3)
-    return find_scales(z, y, noisy=noisy, start=begin)
 
 
 def _near(
@@ -297,6 +293,8 @@ def _near(
 ) -> tuple[tuple[Region, Support], ...]:
     found = []
     for region in regions:
+        # An edge cuts the posterior off, so that the runs that failed are beside it.
+        region = replace(region, reach=2.0 * region.reach)
         inside = region.inside(z)
         x = region.coordinates(z[inside])
         support = learn_support(x, ok[inside]) if inside.any() else None

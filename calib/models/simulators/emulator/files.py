@@ -45,8 +45,8 @@ def save_emulator(emulator: Emulator, model: str, path: Path) -> None:
         **{f"centre_{i}": r.centre for i, r in enumerate(emulator.regions)},
         **{f"root_{i}": r.root for i, r in enumerate(emulator.regions)},
     }  # fmt: skip
-    arrays["lengths"] = np.stack([f.scales.lengths for f in emulator.functions])
-    arrays["nuggets"] = np.array([f.scales.nugget for f in emulator.functions])
+    arrays["lengths"] = emulator.functions.scales.lengths
+    arrays["nugget"] = np.array(emulator.functions.scales.nugget)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part.npz")
     # In the archive no time of its making: equal emulators give equal files.
@@ -80,15 +80,14 @@ def _built(meta: dict[str, Any], arrays: dict[str, Any]) -> Emulator:
         Region(arrays[f"centre_{i}"], arrays[f"root_{i}"], reach)
         for i, reach in enumerate(meta["reach"])
     ]
-    scales = [
-        Scales(lengths, float(nugget))
-        for lengths, nugget in zip(arrays["lengths"], arrays["nuggets"], strict=True)
-    ]
+    # Files of earlier versions have scales for each curve: they are found anew from the runs.
+    kept = Scales(arrays["lengths"], float(arrays["nugget"])) if "nugget" in arrays else None
     values = arrays["values"]
     return build_emulator(
         Training(arrays["theta"], values, nodes, bool(meta["noisy"])),
         Axes(arrays["log"], arrays["loc"], arrays["width"]), meta["negligible"], regions,
-        scales=scales, known=True, over=over_conditions(nodes, values[:1], arrays["over"]),
+        scales=kept, known=kept is not None,
+        over=over_conditions(nodes, values[:1], arrays["over"]),
     )  # fmt: skip
 
 

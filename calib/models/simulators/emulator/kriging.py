@@ -1,17 +1,21 @@
-"""One smooth function of a few coordinates from few values: universal kriging.
+"""Several smooth functions of a few coordinates from few values: universal kriging.
 
-    f(x) = b(x)' beta + g(x),   g ~ GP(0, s^2 [r(x, x') + nugget 1(x = x')]),
-    r(x, x') = exp(-1/2 sum_j ((x_j - x'_j) / l_j)^2)
+    f_j(x) = b(x)' beta_j + g_j(x),   g_j ~ GP(0, s_j^2 [r(x, x') + nugget 1(x = x')]),
+    r(x, x') = exp(-1/2 sum_i ((x_i - x'_i) / l_i)^2)
 
 with b the constant and the coordinates, beta flat beforehand (Rasmussen & Williams 2006, *Gaussian
-Processes for Machine Learning*, section 2.7).
+Processes for Machine Learning*, section 2.7). The functions share r: whatever their number, a point
+costs one row of correlations and one product with a matrix of n on a side.
 
-The length scales are those of the greatest marginal likelihood, as scikit-learn's
-`GaussianProcessRegressor` would find them (a test holds one against the other). It has no trend,
-its predictions check and copy their input at each call, and its search, mostly spent on kernel
-objects, takes ten times as long; where a sampler asks a million times and an emulator is built anew
-after every few runs, that matters. GPyTorch, GPflow and tinygp bring torch, TensorFlow or JAX, and
-300 values need none of what those are for.
+The length scales are those of the greatest likelihood of one process, with one variance for all
+functions, so that those that vary most count most. Each s_j^2 is the geometric mean of two
+estimates: the likelihood's, which takes the length scales as known and is too sure, and that of the
+errors of leaving out one value at a time (section 5.4.2), of which those at the edge are large.
+
+scikit-learn's `GaussianProcessRegressor` finds the same length scales (a test holds one against the
+other) in ten times the time, has no trend, and its predictions copy their input at each call; a
+sampler asks a million times, and an emulator is built anew after every few runs. GPyTorch, GPflow
+and tinygp bring torch, TensorFlow or JAX, and 300 values need none of what those are for.
 """
 
 from __future__ import annotations
@@ -20,6 +24,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg.blas import dtrmm
 
 from calib.models.base import Array
 
@@ -28,10 +33,11 @@ __all__ = ["Kriging", "Scales", "find_scales", "krige", "minus_log_likelihood"]
 # Relative to the process: smaller and the matrix has no factor, larger and values are not met.
 _NUGGET, _NOISY = 1e-9, 1.0
 _LENGTHS = (0.2, 100.0)
-_LEVELS = (1e-2, 1e6)  # of the process's variance, in units of the values'
 _STEPS = 40
 # What keeps the matrix of the smallest nugget from having no factor.
 _JITTER = 1e-10
+# Points at once: their correlations with some hundred others stay in a processor's cache.
+AT_ONCE = 512
 
 
 @dataclass(frozen=True)
@@ -50,15 +56,15 @@ class Scales:
 
 @dataclass(frozen=True)
 class Kriging:
-    """A function as its values let it be known.
+    """Functions as their values let them be known.
 
     Parameters
     ----------
     x : ndarray, shape (n, d)
         Where values are known.
     scales : Scales
-    beta : ndarray, shape (q,)
-    gamma : ndarray, shape (n,)
+    beta : ndarray, shape (q, j)
+    gamma : ndarray, shape (n, j)
         What the correlations with the known points multiply.
     root : ndarray, shape (n, n)
         Inverse of the lower factor of the correlations.
@@ -66,8 +72,8 @@ class Kriging:
         With the correlations, what the values take off a trend that is not known.
     trend_root : ndarray, shape (q, q)
         Inverse of the lower factor of the trend's precision.
-    variance : float
-        Of the process.
+    variances : ndarray, shape (j,)
+        Of the processes.
     """
 
     x: Array
@@ -77,23 +83,39 @@ class Kriging:
     root: Array
     trend: Array
     trend_root: Array
-    variance: float
+    variances: Array
 
     def mean(self, at: Array) -> Array:
-        """Return the mean at points, shape (k, d) to (k,)."""
-        return np.asarray(
-            trend_of(at) @ self.beta + correlation(at, self.x, self.scales.lengths) @ self.gamma
-        )
+        """Return the means at points, shape (k, d) to (k, j)."""
+        found = np.empty((len(at), self.beta.shape[1]))
+        for i in range(0, len(at), AT_ONCE):
+            some = slice(i, i + AT_ONCE)
+            r = correlation(at[some], self.x, self.scales.lengths)
+            found[some] = trend_of(at[some]) @ self.beta + r @ self.gamma
+        return found
 
-    def mean_and_variance(self, at: Array) -> tuple[Array, Array]:
-        """Return mean and variance at points, shape (k, d) to (k,) each."""
-        r = correlation(at, self.x, self.scales.lengths)
-        b = trend_of(at)
-        left = r @ self.root.T
-        open_trend = (b - r @ self.trend.T) @ self.trend_root.T
-        part = 1.0 - np.einsum("kn,kn->k", left, left)
-        part += np.einsum("kq,kq->k", open_trend, open_trend)
-        return b @ self.beta + r @ self.gamma, self.variance * np.maximum(part, 0.0)
+    def mean_and_unknown(self, at: Array) -> tuple[Array, Array]:
+        """Return means (k, j), and which part of `variances` is left at points, shape (k,)."""
+        means, unknown = np.empty((len(at), self.beta.shape[1])), np.empty(len(at))
+        for i in range(0, len(at), AT_ONCE):
+            some = slice(i, i + AT_ONCE)
+            r = correlation(at[some], self.x, self.scales.lengths)
+            b = trend_of(at[some])
+            means[some] = b @ self.beta + r @ self.gamma
+            open_trend = (b - r @ self.trend.T) @ self.trend_root.T
+            # A triangle is half of a square; the correlations are not needed any more.
+            left = dtrmm(1.0, self.root, r.T, lower=1, overwrite_b=1).T
+            part = 1.0 - np.einsum("kn,kn->k", left, left)
+            unknown[some] = part + np.einsum("kq,kq->k", open_trend, open_trend)
+        return means, np.maximum(unknown, 0.0)
+
+    def left_out(self) -> tuple[Array, Array]:
+        """Return errors of the values, (n, j), and their parts of `variances`, (n,), if left out.
+
+        Rasmussen & Williams (2006), equations 5.10 to 5.12, the trend estimated without them too.
+        """
+        unknown = 1.0 / _precisions(self.root, self.trend, self.trend_root)
+        return self.gamma * unknown[:, None], unknown
 
 
 def trend_of(x: Array) -> Array:
@@ -113,42 +135,48 @@ def correlation(a: Array, b: Array, lengths: Array) -> Array:
 
 
 def krige(x: Array, y: Array, scales: Scales) -> Kriging:
-    """Fit trend and process for given scales.
+    """Fit trends and processes for given scales.
 
     Parameters
     ----------
     x : ndarray, shape (n, d)
-    y : ndarray, shape (n,)
+    y : ndarray, shape (n, j)
     scales : Scales
     """
     n = len(x)
     b = trend_of(x)
     lower = cholesky(correlation(x, x, scales.lengths) + scales.nugget * np.eye(n), lower=True)
-    within = solve_triangular(lower, b, lower=True)
+    root = np.asfortranarray(solve_triangular(lower, np.eye(n), lower=True))
+    within = root @ b
     # A trend along a coordinate that did not vary is none.
     precision = within.T @ within
     precision += 1e-10 * np.trace(precision) / len(precision) * np.eye(len(precision))
     trend_lower = cholesky(precision, lower=True)
-    beta = cho_solve((trend_lower, True), within.T @ solve_triangular(lower, y, lower=True))
+    beta = cho_solve((trend_lower, True), within.T @ (root @ y))
     rest = y - b @ beta
     gamma = cho_solve((lower, True), rest)
-    variance = float(rest @ gamma) / max(n - b.shape[1], 1)
-    return Kriging(
-        x, scales, beta, gamma,
-        solve_triangular(lower, np.eye(n), lower=True),
-        cho_solve((lower, True), b).T,
-        solve_triangular(trend_lower, np.eye(len(precision)), lower=True),
-        variance,
-    )  # fmt: skip
+    trend = cho_solve((lower, True), b).T
+    trend_root = solve_triangular(trend_lower, np.eye(len(precision)), lower=True)
+    left_out = np.mean(gamma**2 / _precisions(root, trend, trend_root)[:, None], axis=0)
+    likely = np.maximum((rest * gamma).sum(axis=0), 0.0) / max(n - b.shape[1], 1)
+    # Where there are no more values than the trend has coefficients none can be left out.
+    variances = np.sqrt(likely * left_out) if n > b.shape[1] else y.var(axis=0)
+    return Kriging(x, scales, beta, gamma, root, trend, trend_root, variances)
+
+
+def _precisions(root: Array, trend: Array, trend_root: Array) -> Array:
+    """One over what is left unknown of each value by the others, shape (n,)."""
+    found = np.square(root).sum(axis=0) - np.square(trend_root @ trend).sum(axis=0)
+    return np.maximum(found, 1e-12)
 
 
 def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None = None) -> Scales:
-    """Find length scales and nugget by marginal likelihood, the trend taken out before.
+    """Find length scales and nugget by marginal likelihood, the trends taken out before.
 
     Parameters
     ----------
     x : ndarray, shape (n, d)
-    y : ndarray, shape (n,)
+    y : ndarray, shape (n, j)
     noisy : bool
         Whether values at one point may differ: else the nugget stays small.
     start : Scales, optional
@@ -158,39 +186,38 @@ def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None
 
     b = trend_of(x)
     rest = y - b @ np.linalg.lstsq(b, y, rcond=None)[0]
-    spread = float(rest.std())
+    spread = float(np.sqrt(np.square(rest).mean()))
     if spread <= 1e-12 * max(float(np.abs(y).max()), 1e-300):
         return start or Scales(np.full(x.shape[1], 3.0), 1e-6)
     lengths = np.full(x.shape[1], 2.0) if start is None else np.clip(start.lengths, 0.3, 60.0)
     most = _NOISY if noisy else 1e-3
     nugget = 1e-5 if start is None else float(np.clip(start.nugget, 2 * _NUGGET, 0.5 * most))
-    start_at = np.log([1.0, *lengths, nugget])
-    bounds = np.log([_LEVELS, *[_LENGTHS] * x.shape[1], (_NUGGET, most)])
+    bounds = np.log([*[_LENGTHS] * x.shape[1], (_NUGGET, most)])
     # Few steps: the last digit of a length scale changes no prediction.
     found = minimize(
-        minus_log_likelihood, start_at, (np.square(x.T[:, :, None] - x.T[:, None]), rest / spread),
+        minus_log_likelihood, np.log([*lengths, nugget]),
+        (np.square(x.T[:, :, None] - x.T[:, None]), rest / spread),
         method="L-BFGS-B", jac=True, bounds=bounds, options={"maxiter": _STEPS},
     )  # fmt: skip
     scales = np.exp(found.x)
-    return Scales(scales[1:-1], max(float(scales[-1] / scales[0]), _NUGGET))
+    return Scales(scales[:-1], float(scales[-1]))
 
 
 def minus_log_likelihood(logs: Array, squares: Array, y: Array) -> tuple[float, Array]:
-    """Return minus the log marginal likelihood of values without a trend, and its gradient.
+    """Return minus the log likelihood at its best variance, without a trend, and its gradient.
 
-    Rasmussen & Williams (2006), equations 2.30 and 5.9.
+    Rasmussen & Williams (2006), equations 2.30 and 5.9, with one variance for all functions.
 
     Parameters
     ----------
-    logs : ndarray, shape (d + 2,)
-        Logarithms of the process's variance, its length scales and the nugget.
+    logs : ndarray, shape (d + 1,)
+        Logarithms of the length scales and the nugget.
     squares : ndarray, shape (d, n, n)
         Squared distances along each coordinate.
-    y : ndarray, shape (n,)
+    y : ndarray, shape (n, j)
     """
-    level, lengths, nugget = np.exp(logs[0]), np.exp(logs[1:-1]), np.exp(logs[-1])
-    inverse_squares = lengths**-2.0
-    smooth = level * np.exp(-0.5 * np.tensordot(inverse_squares, squares, axes=1))
+    lengths, nugget, n = np.exp(logs[:-1]), np.exp(logs[-1]), y.size
+    smooth = np.exp(-0.5 * np.tensordot(lengths**-2.0, squares, axes=1))
     eye = np.eye(len(y))
     try:
         lower = cholesky(smooth + (nugget + _JITTER) * eye, lower=True)
@@ -198,8 +225,9 @@ def minus_log_likelihood(logs: Array, squares: Array, y: Array) -> tuple[float, 
         return np.inf, np.zeros_like(logs)
     inverse = cho_solve((lower, True), eye)
     gamma = inverse @ y
-    value = 0.5 * y @ gamma + np.log(np.diag(lower)).sum() + 0.5 * len(y) * np.log(2.0 * np.pi)
-    off = 0.5 * (inverse - np.outer(gamma, gamma))
-    along = (off * smooth).ravel()
-    by_length = inverse_squares * (squares.reshape(len(lengths), -1) @ along)
-    return float(value), np.array([along.sum(), *by_length, nugget * np.trace(off)])
+    level = float(np.vdot(y, gamma)) / n
+    log_det = 2.0 * y.shape[1] * np.log(np.diag(lower)).sum()
+    value = 0.5 * (n * (np.log(2.0 * np.pi * level) + 1.0) + log_det)
+    off = 0.5 * (y.shape[1] * inverse - gamma @ gamma.T / level)
+    by_length = squares.reshape(len(lengths), -1) @ (off * smooth).ravel() / lengths**2
+    return float(value), np.array([*by_length, nugget * np.trace(off)])

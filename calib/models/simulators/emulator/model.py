@@ -41,14 +41,15 @@ class _Location:
 
 @dataclass(frozen=True)
 class _Uncertain:
-    """The prediction, the variances of the coefficients and the curves that they multiply."""
+    """The prediction, and its error: how much of what is unknown far away, and its curves."""
 
     emulator: Emulator
 
     def __call__(self, theta: Array, conditions: Conditions) -> tuple[Array, Array, Array]:
-        means, variances = self.emulator.with_variance(theta)
+        means, unknown = self.emulator.with_unknown(theta)
         at = self.emulator.curves_at(conditions)
-        return at[:, 0] + means @ at[:, 1:].T, variances, at[:, 1:]
+        curves = at[:, 1:] * np.sqrt(self.emulator.variances)
+        return at[:, 0] + means @ at[:, 1:].T, unknown, curves
 
 
 def emulated_model(model: Model, emulator: Emulator) -> Model:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.models.base import Array
+from calib.models.simulators.emulator.kriging import AT_ONCE, correlation
 
 __all__ = ["Support", "learn_support"]
 
@@ -36,10 +37,13 @@ class Support:
 
     def latent(self, at: Array) -> Array:
         """Return what is positive where a value is the likelier outcome, (k, d) to (k,)."""
-        a, b = at / self.lengths, self.x / self.lengths
-        squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * (a @ b.T)
+        found = np.empty(len(at))
+        for i in range(0, len(at), AT_ONCE):
+            found[i : i + AT_ONCE] = (
+                correlation(at[i : i + AT_ONCE], self.x, self.lengths) @ self.weights
+            )
         # Far from all runs it is zero: nothing speaks against a value there.
-        return np.asarray(self.amplitude * np.exp(-0.5 * np.maximum(squared, 0.0)) @ self.weights)
+        return self.amplitude * found
 
 
 def learn_support(x: Array, ok: NDArray[np.bool_]) -> Support | None:

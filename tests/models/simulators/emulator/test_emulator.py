@@ -49,19 +49,20 @@ def test_its_drawn_error_covers_the_simulator() -> None:
         conditions=("slip_ratio", "normal_load_kn"), parameters=("mu", "s0"),
         predict=lambda theta, x: theta[:, :1] * x["slip_ratio"],
     )  # fmt: skip
-    bound = emulated_model(model, made(12)).bind(NODES)
     table = calib.table_from_arrays({**NODES, "drawbar_pull_kn": NODES["slip_ratio"]})
-    problem = calib.inference.problem.Problem(bound, table, calib.inference.priors.Priors(()))
     rng = np.random.default_rng(8)
     at = AXES.natural(rng.uniform(-1.5, 1.5, (300, 2)))
-    natural = np.repeat(np.c_[at, np.ones(300)], 200, axis=0)
-    drawn = problem.draw_location(natural, NODES, rng).reshape(300, 200, -1)
-    low, high = np.quantile(drawn, [0.05, 0.95], axis=1)
-    true = pull(at, NODES)
-    assert 0.8 < ((low < true) & (true < high)).mean() < 0.99
-    # Its own prediction alone is off.
-    plain = bound.location(at, NODES)
-    assert np.abs(plain - true).max() > 0.1 * np.abs(high - low).max()
+    true, held = pull(at, NODES), []
+    natural = np.repeat(np.c_[at, np.ones(300)], 100, axis=0)
+    for count in (12, 16, 20, 24, 32, 48):  # of one design alone much is luck
+        bound = emulated_model(model, made(count)).bind(NODES)
+        problem = calib.inference.problem.Problem(bound, table, calib.inference.priors.Priors(()))
+        drawn = problem.draw_location(natural, NODES, rng).reshape(300, 100, -1)
+        low, high = np.quantile(drawn, [0.05, 0.95], axis=1)
+        held.append(((low < true) & (true < high)).mean())
+        # Its own prediction alone is off.
+        assert np.abs(bound.location(at, NODES) - true).max() > 0.1 * np.abs(high - low).max()
+    assert 0.85 < np.mean(held) < 0.95
 
 
 def test_where_there_are_runs_it_is_better() -> None:
