@@ -174,13 +174,12 @@ def _consequences(
     rows = emulator.curves_at(state.problem.conditions)[:, 1:]
     u = z[:, state.free] - z[:, state.free].mean(axis=0)
     slopes = np.linalg.lstsq(u, (means - means.mean(axis=0)) @ rows.T, rcond=None)[0]  # (d, n)
-    noise = state.sigma**2 * np.eye(len(rows))
-    both = noise + float(unknown.mean()) * (rows * emulator.variances) @ rows.T
-    posterior = np.atleast_2d(np.cov(u.T))
+    # In units of the prior's sds, whose own precision is one.
+    prior, noise = np.eye(len(names)), state.sigma**2 * np.eye(len(rows))
+    both = noise + float(np.median(unknown)) * (rows * emulator.variances) @ rows.T
     weighed = np.linalg.solve(both, slopes.T)
-    # Without the error the data would say so much more.
-    more = slopes @ (slopes.T / state.sigma**2 - weighed)
-    alone = np.linalg.inv(np.linalg.inv(posterior) + more)
+    posterior = np.linalg.inv(prior + slopes @ weighed)
+    alone = np.linalg.inv(prior + slopes @ slopes.T / state.sigma**2)
     sd = np.sqrt(np.diag(posterior))
     wider = dict(zip(names, (sd / np.sqrt(np.diag(alone))).tolist(), strict=True))
     if measured is None:

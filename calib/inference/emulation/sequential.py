@@ -37,6 +37,10 @@ from calib.models.simulators.runs import Run, RunKeeper
 
 _log = logging.getLogger(__name__)
 _CANDIDATES = 400
+# As `WORTH`, where some runs fail.
+_SURE = 0.3
+# So many times as far from the posterior's middle as its draws, where some runs fail.
+_WIDER = 1.6
 # How far in posterior sds a run is taken to tell of others when a batch is picked.
 _APART = 2.0
 _LEAST_OK = 0.5
@@ -122,10 +126,8 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
             break
     if not state.holds(z).any():
         raise state.without_value("no parameters are left for the data")
-    if partly:
-        if state.among_failed(z) > _AMONG_FAILED:
-            raise state.without_value("the posterior lies among runs that failed")
-        state.rebuild()  # the edge is looked at where the posterior has come to lie
+    if partly and state.among_failed(z) > _AMONG_FAILED:
+        raise state.without_value("the posterior lies among runs that failed")
     return judged(state, z, chosen, measured, own_noise, history)
 
 
@@ -136,20 +138,27 @@ def _needed(
 
     Return draws of the posterior.
     """
+    began = len(history)
     all_ran, told = True, None if len(state.runs) < FORESEEN_FROM or not history else ""
     while True:
         state.rebuild()
         z = state.sample(len(history) + 1)
         history.append((len(state.runs), state.error(z)))
         room = state.left - checks
-        if room < 1 or (all_ran and history[-1][1] <= WORTH * chosen.tolerance):
+        small = history[-1][1] <= WORTH * chosen.tolerance
+        if state.emulator is not None and state.emulator.support is not None:
+            # An edge has to be found besides: so many more batches as make the error small twice.
+            last = [error for _, error in history[began:]][-2:]
+            small = len(last) > 1 and max(last) <= _SURE * chosen.tolerance
+        if room < 1 or (all_ran and small):
             return z
-        if told is None and len(state.runs) >= FORESEEN_FROM:
+        off = history[-1][1]
+        if told is None and len(state.runs) >= FORESEEN_FROM and off > chosen.tolerance:
             told = foreseen(state, z, chosen, history)
             _log.warning(
                 "%s: after %d runs the emulator is off by %.2g noise sds (rms), where %g are "
                 "allowed; %s; at most %d are made (emulator.runs)", state.problem.bound.model.name,
-                len(state.runs), history[-1][1], chosen.tolerance, told, state.most,
+                len(state.runs), off, chosen.tolerance, told, state.most,
             )  # fmt: skip
         # The more there are the less a few others say.
         batch = max(2 * int(state.free.sum()), 4, len(state.runs) // 8)
@@ -225,6 +234,10 @@ def _next(state: State, z: Array, count: int, step: int) -> Array:
     candidates = inner = z[rng.permutation(len(z))[:_CANDIDATES]]
     if state.emulator is None or state.region is None:
         return candidates[:count]
+    if state.emulator.support is not None:
+        # There may be values beyond where some are known: half are looked for farther out.
+        middle = z.mean(axis=0)
+        candidates = np.concatenate([inner[::2], middle + _WIDER * (inner[1::2] - middle)])
     edge = state.emulator.from_edge(inner)
     # Where there may be no value the edge matters as much as the values do.
     at_edge = inner[np.argsort(edge)[: count // 2]] if state.emulator.support else inner[:0]

@@ -18,7 +18,7 @@ nodes say the same, in the place of matrices of 200 and of 40.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -293,8 +293,6 @@ def _near(
 ) -> tuple[tuple[Region, Support], ...]:
     found = []
     for region in regions:
-        # An edge cuts the posterior off, so that the runs that failed are beside it.
-        region = replace(region, reach=2.0 * region.reach)
         inside = region.inside(z)
         x = region.coordinates(z[inside])
         support = learn_support(x, ok[inside]) if inside.any() else None

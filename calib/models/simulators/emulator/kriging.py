@@ -167,7 +167,7 @@ def krige(x: Array, y: Array, scales: Scales) -> Kriging:
 def _precisions(root: Array, trend: Array, trend_root: Array) -> Array:
     """One over what is left unknown of each value by the others, shape (n,)."""
     found = np.square(root).sum(axis=0) - np.square(trend_root @ trend).sum(axis=0)
-    return np.maximum(found, 1e-12)
+    return np.asarray(np.maximum(found, 1e-12))
 
 
 def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None = None) -> Scales:

@@ -1,0 +1,187 @@
+"""What an emulator has to reach: settings honoured, many parameters, what a poor one is for."""
+
+from __future__ import annotations
+
+import logging
+import time
+import tomllib
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import calib
+from calib.errors import CalibError
+from calib.inference.prior_files import default_priors
+from calib.models import MODELS, get_model
+from calib.models.simulators.registered import SIMULATED, written
+from tests.inference.emulation.test_emulate import CONDITIONS, declared, table
+from tests.models.simulators.examples import PRIORS, pull
+from tests.registered import forgotten
+
+
+@pytest.fixture(autouse=True)
+def as_before(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setenv("CALIB_MODELS", "")
+    with forgotten(MODELS, SIMULATED):
+        yield
+
+
+@pytest.mark.parametrize("nodes", [10, 30])
+def test_the_rows_of_every_run_and_the_checks_are_as_many_as_asked_for(nodes: int) -> None:
+    asked = set()
+
+    def counted(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        asked.add(x["slip_ratio"].size)
+        return pull(theta, x)
+
+    declared(counted, "counted", emulate=True, runs=80, checks=12, nodes=nodes)
+    emulation = calib.emulated(calib.build_problem("counted", table()), seed=1)  # of 18 rows
+    assert asked == {nodes}
+    assert emulation.held_out is not None
+    assert emulation.held_out.runs == 12
+    # Between ten nodes the data have rows of which the emulator knows too little: it says so.
+    told = any("between its nodes" in reason for reason in emulation.reasons)
+    assert told == (nodes == 10 and emulation.between > 0.1)
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"runs": 80, "checks": 17}, "checks = 17 is more than runs = 80"),
+        ({"runs": 40, "first": 39}, "first = 39 is more than runs = 40"),
+        ({"runs": 5}, "greater than or equal to 10"),
+        ({"check": 5}, "emulator.check"),
+        ({"tolerance": 0.0}, "greater than 0"),
+        ({"tolerance": float("nan")}, "emulator.tolerance"),
+        ({"nodes": 1}, "greater than or equal to 2"),
+        ({"nodes": 10.5}, "emulator.nodes"),
+    ],
+)
+def test_a_setting_that_cannot_be_honoured_is_refused(given: dict, words: str) -> None:
+    made = []
+
+    def counted(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        made.append(theta)
+        return pull(theta, x)
+
+    def tried() -> None:
+        declared(counted, "counted", emulate=True, **given)
+        calib.emulated(calib.build_problem("counted", table()), seed=1)
+
+    with pytest.raises(CalibError) as caught:
+        tried()
+    assert words in str(caught.value)
+    assert not made
+
+
+def runs_table(folder: Path, theta: np.ndarray, data: calib.Table, keys: str = "") -> None:
+    x = {name: data[name] for name in CONDITIONS}
+    lines = ["mu,s0,s,w,pull"]
+    for t, values in zip(theta.tolist(), pull(theta, x).tolist(), strict=True):
+        rows = zip(*(c.tolist() for c in x.values()), values, strict=True)
+        lines += [f"{t[0]!r},{t[1]!r},{s!r},{w!r},{v!r}" for s, w, v in rows]
+    (folder / "runs.csv").write_text("\n".join(lines) + "\n")
+    text = f'name = "made"\ntable = "runs.csv"\n{keys}\n[conditions]\ns = "slip_ratio"\n'
+    text += 'w = "normal_load_kn"\n[outputs]\npull = "drawbar_pull_kn"\n' + PRIORS
+    (folder / "made.toml").write_text(text)
+
+
+def test_settings_of_runs_that_are_made_already_are_refused(tmp_path: Path) -> None:
+    theta = np.random.default_rng(5).uniform((0.5, 0.06), (0.7, 0.1), (12, 2))
+    runs_table(tmp_path, theta, table(), "emulator = {checks = 4, tolerance = 0.2}")
+    with pytest.raises(CalibError, match="checks can do nothing for a table"):
+        calib.read_simulator(tmp_path / "made.toml")
+    runs_table(tmp_path, theta, table(), "emulator = {tolerance = 0.2}")
+    assert calib.read_simulator(tmp_path / "made.toml").budget == {"tolerance": 0.2}
+
+
+def test_a_table_is_judged_where_the_posterior_is(tmp_path: Path) -> None:
+    """Twenty runs over a wide prior, sixty about the posterior."""
+    data, rng = table(), np.random.default_rng(5)
+    wide = np.exp(rng.normal(np.log((0.5, 0.1)), (0.4, 0.8), (20, 2)))
+    near = rng.normal((0.6, 0.08), (0.01, 0.004), (60, 2))
+    runs_table(tmp_path, np.concatenate([wide, near]), data)
+    calib.register(calib.read_simulator(tmp_path / "made.toml"))
+    emulation = calib.emulated(calib.build_problem("made", data), seed=1)
+    assert emulation.passed, emulation.reasons
+    assert emulation.held_out is not None
+    assert 10 <= emulation.held_out.runs <= 70
+    # What leaving a run out says is what the emulator is off by at others of the posterior.
+    at = rng.normal((0.6, 0.08), (0.005, 0.002), (200, 2))
+    x = {name: data[name] for name in CONDITIONS}
+    off = emulation.emulator.predict(at, x) - pull(at, x)
+    assert np.sqrt(np.square(off).mean()) / 0.03 < 0.1
+
+
+def test_a_poor_emulator_says_what_it_is_good_for() -> None:
+    declared(pull, "slow", emulate=True, runs=12, first=8, checks=2, tolerance=1e-3)
+    emulation = calib.emulated(calib.build_problem("slow", table()), seed=1)
+    assert not emulation.passed
+    for words in ("Its error is in the likelihood", " % wider", "of their sds", "It is usable for"):
+        assert words in emulation.reasons[0]
+    # How much wider it says the posterior is, against that without the error.
+    sure = replace(emulation.problem.bound.model, uncertain=None)
+    alone = replace(emulation.problem, bound=replace(emulation.problem.bound, model=sure))
+    both = [calib.calibrate(p, seed=1).summary for p in (emulation.problem, alone)]
+    for name, ratio in emulation.wider.items():
+        assert ratio == pytest.approx(both[0][name].sd / both[1][name].sd, rel=0.15)
+    assert set(emulation.shifted) == {"mu", "s0"}
+
+
+def wheel_of_nine() -> tuple[calib.Table, str]:
+    """A rigid wheel on soil of eight parameters, and a resistance: 24 rows and its priors."""
+    model = get_model("wong_reece_pull")
+    slip, load = np.meshgrid([0.03, 0.07, 0.12, 0.2, 0.3, 0.45], [1.5, 2.5, 3.5, 4.5])
+    x = {
+        "slip_ratio": slip.ravel(), "normal_load_kn": load.ravel(),
+        "tyre_width_m": np.where(np.arange(24) % 2, 0.2, 0.3), "tyre_diameter_m": np.full(24, 0.8),
+    }  # fmt: skip
+    priors = tomllib.loads(Path(default_priors(model.name)).read_text())["parameters"]
+    own = {"dist": "lognormal", "median": 0.03, "sd_log": 0.6, "unit": "1"}
+    noise = {"dist": "half_normal", "sd": 0.1, "unit": "kN"}
+    why = {"reason": "for the test", "source": "assumed"}
+    priors |= {"rr": own | why, "sigma": noise | why}
+    text = "\n".join(written(name, priors[name]) for name in (*model.parameters, "rr", "sigma"))
+    true = np.array([[20.0, 1500.0, 1.0, 1.5, 30.0, 14.0, 0.3, 0.32, 0.03]])
+    y = wheel(true, x)[0] + 0.02 * np.random.default_rng(1).standard_normal(24)
+    return calib.table_from_arrays(x | {"drawbar_pull_kn": y}), text
+
+
+def wheel(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+    bound = get_model("wong_reece_pull").bind(x)
+    with np.errstate(all="ignore"):
+        return bound.location(theta[:, :8], x) - theta[:, 8:] * x["normal_load_kn"]
+
+
+@pytest.mark.slow
+def test_nine_parameters_reach_the_gate_within_400_runs_and_what_it_takes_is_foreseen(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    data, priors = wheel_of_nine()
+    simulator = calib.from_callable(
+        wheel, parameters=priors, conditions=list(data.columns)[:4], output="drawbar_pull_kn",
+        name="wheel_of_nine", emulate=True, runs=400,
+    )  # fmt: skip
+    calib.register(simulator)
+    with caplog.at_level(logging.WARNING):
+        emulation = calib.emulated(calib.build_problem("wheel_of_nine", data), seed=1)
+    assert emulation.passed, emulation.reasons
+    assert len(emulation.runs) <= 400
+    assert emulation.held_out is not None
+    assert emulation.held_out.covered > 0.8
+    (told,) = [r.getMessage() for r in caplog.records if "it needs some" in r.getMessage()]
+    needed = float(told.split("it needs some ")[1].split(" runs")[0])
+    assert 0.6 * len(emulation.runs) < needed < 1.7 * len(emulation.runs)
+    assert "rr (" in told
+    # A million evaluations of the posterior in less than a minute.
+    problem = emulation.problem
+    middle = problem.priors.to_internal(
+        problem.completed(emulation.emulator.training.theta[-1], 0.02)[None]
+    )
+    many = middle + 0.01 * np.random.default_rng(1).standard_normal((20_000, middle.size))
+    began = time.process_time()
+    assert np.isfinite(problem.log_prob(many)).mean() > 0.9
+    assert (time.process_time() - began) / len(many) < 60e-6
