@@ -73,7 +73,7 @@ def _told_if_long(simulator: Simulator) -> Iterator[None]:
     timer = Timer(
         _PATIENCE, _log.warning,
         ("still trying the simulator %s, after %g s, at a few points of its prior; with emulate = "
-         "false it is then asked 300,000 times or more, so one that takes seconds is to be emulated",
+         "false it is then asked 300,000 times or more, so one that takes seconds is emulated",
          simulator.name, _PATIENCE),
     )  # fmt: skip
     timer.daemon = True
