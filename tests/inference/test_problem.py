@@ -154,3 +154,10 @@ def test_as_many_rows_as_parameters_are_too_few(rut_tables: tuple[Table, Table])
         build_problem("modified_bekker", rut_tables[0].take([0, 5, 12]))
     assert "at least 4 rows" in str(caught.value)
     assert build_problem("modified_bekker", rut_tables[0].take([0, 5, 12, 15])).n_dim == 4
+
+
+def test_a_problem_without_a_free_parameter_is_refused(rut_tables: tuple[Table, Table]) -> None:
+    values = {"n0": 2.0, "n1": 1.3, "z_ref": 20.0}
+    assert build_problem("modified_bekker", rut_tables[0], fixed=values).names == ("sigma",)
+    with pytest.raises(CalibError, match="all parameters of modified_bekker are held fixed"):
+        build_problem("modified_bekker", rut_tables[0], fixed={**values, "sigma": 0.1})

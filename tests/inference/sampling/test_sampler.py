@@ -284,6 +284,20 @@ def test_no_parameters_of_positive_probability(rut_tables: tuple[Table, Table]) 
     assert "to mend:" in str(caught.value)
 
 
+def test_data_that_the_model_meets_exactly_are_refused() -> None:
+    """Whatever sigma is, a smaller one fits better: nothing is sampled."""
+    slip = np.linspace(0.1, 0.5, 9)
+    priors = (normal("a", 0.0, 3.0), normal("b", 0.0, 3.0), normal("sigma", -2.0, 2.0, log=True))
+    for noise, refused in ((0.0, True), (1e-3, False)):
+        pull = 1.0 + 2.0 * slip + noise * np.sin(50.0 * slip)
+        problem = problem_of(lambda a, b, x: a + b * x, priors, slip, pull)
+        if refused:
+            with pytest.raises(CalibError, match="the model meets the data exactly"):
+                sample_posterior(problem, 1)
+        else:
+            assert sample_posterior(problem, 1).report.passed
+
+
 def test_a_density_that_is_almost_nowhere_positive_cannot_be_started() -> None:
     def log_prob(t):
         return np.where((t == 0.0).all(axis=1), 0.0, -np.inf)
