@@ -8,6 +8,9 @@ from calib.data.numbers import plain_number
 from calib.inference.diagnostics import convergence
 from calib.models.base import Array
 
+# R-hat compares ensembles: of fewer it says little.
+LEAST_ENSEMBLES = 4
+
 
 @dataclass(frozen=True)
 class Gate:
@@ -43,7 +46,7 @@ def judge(
     *,
     tau: Array,
     steps: int | None = None,
-    min_ensembles: int = 4,
+    min_ensembles: int = LEAST_ENSEMBLES,
 ) -> GateReport:
     """Judge draws of independently seeded ensembles, shape (ensembles, walkers, steps, d).
 

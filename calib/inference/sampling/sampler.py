@@ -16,7 +16,7 @@ from calib.inference.problem import Problem
 from calib.inference.sampling.adapt import Guess, adapt, refit
 from calib.inference.sampling.anneal import anneal
 from calib.inference.sampling.expectation import moments
-from calib.inference.sampling.gate import Gate, GateReport, judge
+from calib.inference.sampling.gate import LEAST_ENSEMBLES, Gate, GateReport, judge
 from calib.inference.sampling.mode import Mode, find_modes
 from calib.inference.sampling.proposal import Proposal
 from calib.inference.sampling.walkers import fitted_moves, longest_tau, run_walkers
@@ -106,6 +106,7 @@ def sample_posterior(
     """Sample the posterior of a problem; read ``report.passed`` before use.
 
     `starts` (m, d) are point estimates in internal coordinates that seed the search for the mode.
+    Of four ensembles or more, as many as can be judged, the last comes from the prior.
 
     Raises
     ------
@@ -120,15 +121,18 @@ def sample_posterior(
     began = time.perf_counter()
     count = _Counter(problem.log_prob)
     walkers = chosen.n_walkers(problem.n_dim)
-    born = _born(count, problem, walkers, rng)
-    few = born[:_CLIMBED]
-    known = few if starts is None else np.concatenate([np.atleast_2d(starts), few])
-    modes = _modes(count, problem, rng, known)
+    born = None
+    if chosen.ensembles >= LEAST_ENSEMBLES:
+        born = _born(count, problem, walkers, rng)
+        few = born[:_CLIMBED]
+        starts = few if starts is None else np.concatenate([np.atleast_2d(starts), few])
+    modes = _modes(count, problem, rng, starts)
+    if not np.isfinite(modes[0].log_prob):
+        raise _nowhere(problem)
     _refuse_exact(problem, modes[0])
-    first = _guesses(modes, born)
     draws = sample_density(
-        count, first, seeds, problem.names, chosen, rng=rng, born=born[:walkers],
-        progress=progress, began=began,
+        count, _guesses(modes, born), seeds, problem.names, chosen, rng=rng,
+        born=None if born is None else born[:walkers], progress=progress, began=began,
     )  # fmt: skip
     return replace(draws, mode=modes[0].t)
 
@@ -143,17 +147,21 @@ def _born(log_prob: _Counter, problem: Problem, walkers: int, rng: np.random.Gen
     if found is not None and rough is not problem:
         found = anneal(rough.log_prob, log_prob, found[:walkers], rng)
     if found is None:
-        raise CalibError(
-            "no parameter values of positive probability were found",
-            where=problem.table.source,
-            mend="check that the data's units and the priors' scales fit each other",
-        )
+        raise _nowhere(problem)
     # Resampled draws stand beside their copies.
     return found[rng.permutation(len(found))]
 
 
+def _nowhere(problem: Problem) -> CalibError:
+    return CalibError(
+        "no parameter values of positive probability were found",
+        where=problem.table.source,
+        mend="check that the data's units and the priors' scales fit each other",
+    )
+
+
 def _modes(
-    count: _Counter, problem: Problem, rng: np.random.Generator, starts: Array
+    count: _Counter, problem: Problem, rng: np.random.Generator, starts: Array | None
 ) -> list[Mode]:
     rough = representative_rows(problem)
     if rough is problem:
@@ -165,9 +173,11 @@ def _modes(
     return find_modes(count, problem.priors, rng, starts=np.array(near), spread=0)
 
 
-def _guesses(modes: Sequence[Mode], born: Array) -> list[Guess]:
+def _guesses(modes: Sequence[Mode], born: Array | None) -> list[Guess]:
     """Guess what lies about each mode: from the draws (k, d) nearest to it, or its curvature."""
     choleskys = [np.linalg.cholesky(m.covariance) for m in modes]
+    if born is None:
+        return [Guess(m.t, c) for m, c in zip(modes, choleskys, strict=True)]
     # Log densities by the curvature at each mode.
     by_mode = [
         m.log_prob - 0.5 * np.square(np.linalg.solve(c, (born - m.t).T)).sum(axis=0)
