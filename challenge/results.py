@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from calib.data.documents import read_toml
 from calib.errors import CalibError
 from challenge.seal import sha256
 
@@ -71,7 +71,7 @@ def _recorded(path: Path) -> dict[str, Any] | None:
 def _found(folder: Path) -> dict[str, Any]:
     """Return models and hashes of a case folder, as ``inputs.json`` has them."""
     try:
-        content = read_toml(folder / "case.toml")
+        content = tomllib.loads((folder / "case.toml").read_text(encoding="utf-8-sig"))
     except (OSError, ValueError):
         content = {}
     named = {key: content.get(key) for key in _TABLES}

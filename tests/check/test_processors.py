@@ -14,7 +14,7 @@ import pytest
 from calib.check.check import check
 from calib.gap.forward import Forward
 from calib.inference.problem import Problem
-from calib.inference.sampling import ensemble as ensembles
+from calib.inference.sampling import sampler as sampler_module
 from tests.check.conftest import different
 from tests.check.kernels import ALL, KERNELS, Setting, skip_what_crashes
 
@@ -59,16 +59,16 @@ def test_chains_that_part_ways_are_judged_by_their_monte_carlo_error(
     report: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each density that walkers are moved by is off in its fifth digit, by chance."""
-    rng, moved = np.random.default_rng(1), ensembles.Ensemble
+    rng, moved = np.random.default_rng(1), sampler_module.run_walkers
 
-    def ensemble(log_prob, *args, **kwargs):
+    def perturbed(log_prob, *args):
         def noisy(t: np.ndarray) -> np.ndarray:
             values = log_prob(t)
             return values * (1.0 + 1e-5 * rng.standard_normal(values.shape))
 
-        return moved(noisy, *args, **kwargs)
+        return moved(noisy, *args)
 
-    monkeypatch.setattr(ensembles, "Ensemble", ensemble)
+    monkeypatch.setattr(sampler_module, "run_walkers", perturbed)
     outcome = check(report)
     assert different(outcome) == {}
     assert outcome.draws_differ

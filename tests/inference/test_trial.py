@@ -88,7 +88,8 @@ def test_a_server_says_file_and_key(tmp_path: Path, mood: str, key: str, words: 
         )
         problem = problem_of(file)
         refused(problem, f"wheel.toml, {key}: ", *words)
-    with pytest.raises(CalibError, match=r"wheel.toml, url: the server at .* is not there"):
+    said = r"wheel.toml, url: the run could not be made: the server at .* is not there"
+    with pytest.raises(CalibError, match=said):
         calib.calibrate(problem, seed=1)
 
 

@@ -304,7 +304,7 @@ calib.register(calib.Model(
 def test_a_cell_of_a_notebook_may_be_run_again_and_changed(
     monkeypatch: pytest.MonkeyPatch, text: str
 ) -> None:
-    monkeypatch.delattr(sys.modules["__main__"], "__file__")
+    monkeypatch.delattr(sys.modules["__main__"], "__file__", raising=False)
     cell(text, PRIORS=PRIORS)
     first = MODELS["wheel"]
     theta, x = np.ones((1, 2)), {"slip_ratio": np.ones(1), "normal_load_kn": np.ones(1)}
@@ -319,7 +319,11 @@ def test_a_cell_of_a_notebook_may_be_run_again_and_changed(
         calib.register(replace(first, name="bekker"))
 
 
-def test_in_a_script_the_same_is_registered_twice_and_another_refused() -> None:
+def test_in_a_script_the_same_is_registered_twice_and_another_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", __file__, raising=False)
+
     def register(scale: float) -> None:
         calib.register(calib.from_callable(
             default(scale), parameters=PRIORS, output="drawbar_pull_kn", name="wheel",
