@@ -70,7 +70,7 @@ def run_walkers(
     # emcee's wrapper prints the arguments of whatever ends a call, an interruption as well.
     sampler.log_prob_fn = log_prob
     # emcee ignores a state that it cannot take without a word.
-    state = np.random.RandomState(np.random.MT19937(rng.integers(2**63))).get_state()
+    state: Any = np.random.RandomState(np.random.MT19937(rng.integers(2**63))).get_state()
     sampler.random_state = state
     if not np.array_equal(sampler.random_state[1], state[1]):
         raise RuntimeError("emcee did not take the random state")
