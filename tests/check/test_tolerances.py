@@ -21,7 +21,8 @@ def entries(name: str) -> dict[tuple[str, ...], Any]:
     text = (REPORT / name).read_text()
     if not name.endswith(".json"):
         header, first = (line.split(",") for line in text.splitlines()[:2])
-        return {(name, "0", column): float(v) for column, v in zip(header, first, strict=True)}
+        row = zip(header, first, strict=True)
+        return {(name, "0", c): v if c == "data_label" else float(v) for c, v in row}
     return dict(flatten(json.loads(text), (name,)))
 
 
