@@ -13,6 +13,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import logsumexp
 
+from calib.inference.sampling.proposal import systematic
 from calib.inference.sampling.walkers import local_moves, run_walkers
 from calib.models.base import Array
 
@@ -36,7 +37,7 @@ def anneal(first: LogProb, second: LogProb, draws: Array, rng: np.random.Generat
         done += step
         log_weight = step * gain
         weight = np.exp(log_weight - logsumexp(log_weight))
-        draws = draws[_systematic(weight, rng)]
+        draws = draws[systematic(weight, weight.size, rng)]
 
         def tempered(t: Array, share: float = done) -> Array:
             low, high = first(t), second(t)
@@ -63,8 +64,3 @@ def _step(gain: Array, most: float) -> float:
         middle = 0.5 * (low + high) if low > 0.0 else 0.1 * high
         low, high = (middle, high) if effective(middle) >= 0.5 * gain.size else (low, middle)
     return low or high
-
-
-def _systematic(weight: Array, rng: np.random.Generator) -> Array:
-    levels = (rng.random() + np.arange(weight.size)) / weight.size
-    return np.minimum(np.searchsorted(np.cumsum(weight), levels), weight.size - 1)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.inference.sampling.expectation import fit_mixture, moments
 from calib.inference.sampling.mixture import Mixture, StudentT, log_sum
@@ -87,7 +88,9 @@ def fit_proposal(
     One step of expectation maximisation over the parts: each is fitted to the draws in proportion
     to the probability that it proposed them, and stays as it is where they are degenerate.
     """
-    draws, weight = _resampled(draws, weight, rng, _FITTED_DRAWS)
+    if weight.size > _FITTED_DRAWS:
+        draws = draws[systematic(weight, _FITTED_DRAWS, rng)]
+        weight = np.full(_FITTED_DRAWS, 1.0 / _FITTED_DRAWS)
     by_part = old.shares(draws) * weight
     mass = by_part.sum(axis=1)
     parts = [
@@ -141,12 +144,7 @@ def _fit_part(
     )
 
 
-def _resampled(
-    draws: Array, weight: Array, rng: np.random.Generator, most: int
-) -> tuple[Array, Array]:
-    """Thin weighted draws to a bounded number of equally weighted ones (systematic resampling)."""
-    if weight.size <= most:
-        return draws, weight
-    levels = (rng.random() + np.arange(most)) / most
-    picked = np.minimum(np.searchsorted(np.cumsum(weight), levels), weight.size - 1)
-    return draws[picked], np.full(most, 1.0 / most)
+def systematic(weight: Array, size: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Draw so many indices in proportion to weights of sum 1, by systematic resampling."""
+    levels = (rng.random() + np.arange(size)) / size
+    return np.minimum(np.searchsorted(np.cumsum(weight), levels), weight.size - 1)
