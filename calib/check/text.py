@@ -139,9 +139,11 @@ def _near(old: str, new: str, moved: float) -> bool:
     """Whether the numbers of two lines differ by little more than a unit of their last digit."""
     part = min(_TIMES * moved, _MOST)
     for a, b in zip(*(NUMBER.findall(_TAG.sub(" ", line)) for line in (old, new)), strict=False):
+        if a == b:
+            continue
         (one, unit), (other, other_unit) = parsed(a), parsed(b)
         allowed = 1.001 * max(unit, other_unit) + part * max(abs(one), abs(other))
-        if a != b and not abs(one - other) <= allowed:
+        if not abs(one - other) <= allowed:
             return False
     return True
 
@@ -152,7 +154,8 @@ def parsed(text: str) -> tuple[float, float]:
     mantissa, _, exponent = plain.lower().partition("e")
     decimals, power = len(mantissa.partition(".")[2]), int(exponent or 0)
     try:
-        return float(f"{mantissa}e{power}"), 10.0 ** (power - decimals)
+        # Part of a hash may look like 4e5127: read so, it is infinite; as a power it would raise.
+        return float(f"{mantissa}e{power}"), float(f"1e{power - decimals}")
     except ValueError:  # such as 1.2.3 of a version
         return float("nan"), 0.0
 

@@ -42,6 +42,8 @@ def compared(tmp_path: Path, old: str, new: str, *judgement):
         ("2.5\u00d710\u207b\u00b3", "2.5\u00d710\u207b\u00b2", False),
         ("9.99e5", "1.00e6", True),  # a unit of the last digit of the coarser one
         ("version 1.2.3", "version 1.2.4", False),  # no number
+        ("version 4e5127, 7 kN", "version 4e5127, 8 kN", True),  # a hash
+        ("version 4e5127", "version 4e5128", False),
         ('<td class="n1">7</td>', '<td class="n9">7</td>', True),  # what a browser does not show
         ("rut depth 7", "rut width 7", False),
         ("7", "", False),
