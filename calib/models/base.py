@@ -241,6 +241,9 @@ class Model:
     prepare : callable
         ``(conditions, references) -> rows``: what `location` needs of the conditions, worked out
         once for any number of parameter vectors.
+    joined : (str, str, str), optional
+        Two parameters and a condition by which the second is multiplied: where it varies little,
+        the data know but their sum, and it is sampled with their ratio.
     slow : bool
         Whether its posterior takes minutes: `calib sbc` asks for many, and for this one by name.
     uncertain : callable, optional
@@ -275,6 +278,7 @@ class Model:
     theta_from_reported: Callable[[Mapping[str, float], References], Array] = not_given
     bind_references: Callable[[Conditions], dict[str, float]] = _no_references
     prepare: Callable[[Conditions, References], Rows] = _as_they_are
+    joined: tuple[str, str, str] | None = None
     slow: bool = False
     uncertain: Callable[[Array, Conditions], tuple[Array, Array, Array]] | None = None
 

@@ -53,11 +53,12 @@ _model = partial(
         "c2": "1",
     },
     source="Wong & Reece (1967), J. Terramechanics 4(1), 81-98, doi:10.1016/0022-4898(67)90105-X",
+    joined=("k1", "k2", "tyre_width_m"),
     slow=True,
     applies=(
         "Driven rigid wheels, or tyres so hard that they do not flatten, on one homogeneous soil, "
         "at slips of zero or more and loads that the soil can carry. Eight parameters of which "
-        "one output determines but a few: the others are the prior's. Minutes for a dozen rows."
+        "one output determines but a few: the others are the prior's. A minute for a dozen rows."
     ),
 )  # fmt: skip
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from calib.batch.threads import one_thread
 from calib.errors import CalibError
 from calib.inference.estimators.identified import representative_rows
+from calib.inference.joined import Joined, joined
 from calib.inference.problem import Problem
 from calib.inference.sampling.adapt import Guess, adapt, refit
 from calib.inference.sampling.anneal import anneal
@@ -38,9 +39,9 @@ class SamplerSettings:
         In each ensemble; by default 320, 64 of a slow model and 20 of long data, but at least
         twice the dimension plus two.
     steps : int
-        Kept steps of the first attempt; doubled until the gate passes.
+        Kept steps of the first attempt; of the next ones, as many as the gate then needs.
     max_steps : int
-        Where doubling stops.
+        Of the last attempt.
     keep : int
         About so many draws of each ensemble are stored: those of evenly picked walkers at 32 or
         more evenly picked steps.
@@ -114,6 +115,10 @@ def sample_posterior(
         If no parameters of positive probability can be found.
     """
     try_simulator(problem)
+    problem = joined(problem)
+    priors = problem.priors
+    if isinstance(priors, Joined) and starts is not None:
+        starts = priors.joined(np.atleast_2d(starts))
     chosen = _fitting(settings or SamplerSettings(), problem)
     root = np.random.SeedSequence(seed) if isinstance(seed, int) else seed
     seeds = root.spawn(1 + chosen.ensembles)
@@ -134,7 +139,18 @@ def sample_posterior(
         count, _guesses(modes, born), seeds, problem.names, chosen, rng=rng,
         born=None if born is None else born[:walkers], progress=progress, began=began,
     )  # fmt: skip
-    return replace(draws, mode=modes[0].t)
+    draws = replace(draws, mode=modes[0].t)
+    return _by_parameter(draws, priors, chosen.gate) if isinstance(priors, Joined) else draws
+
+
+def _by_parameter(draws: Draws, priors: Joined, gate: Gate) -> Draws:
+    """Return draws in internal coordinates, and judge them there as well."""
+    t, joint = priors.by_parameter(draws.t), draws.report
+    report = judge(t, priors.names, gate, tau=joint.tau, steps=joint.steps)
+    if not joint.passed:
+        reasons = dict.fromkeys((*joint.reasons, *report.reasons))
+        report = replace(report, passed=False, reasons=tuple(reasons))
+    return replace(draws, t=t, report=report, mode=priors.by_parameter(draws.mode))
 
 
 def _born(log_prob: _Counter, problem: Problem, walkers: int, rng: np.random.Generator) -> Array:
@@ -218,7 +234,7 @@ def _fitting(settings: SamplerSettings, problem: Problem) -> SamplerSettings:
     d, model = problem.n_dim, problem.bound.model
     if problem.squares.n_distinct > _LONG:
         return replace(settings, walkers=max(20, 2 * (d + 1)))
-    if model.uncertain is not None:
+    if model.slow or model.uncertain is not None:
         return replace(settings, walkers=max(64, 2 * (d + 1)))
     return settings
 
@@ -300,9 +316,9 @@ def sample_density(
         if neglected.any():
             what = f"{neglected.mean():.1%} of the draws lie where hardly any was proposed"
             report = replace(report, passed=False, reasons=(*report.reasons, what))
-        if report.passed or target * 2 > settings.max_steps:
+        if report.passed or _LEAST_LONGER * target > settings.max_steps:
             break
-        target *= 2
+        target = min(_longer(target, tau, report, settings.gate), settings.max_steps)
         if neglected.any():
             proposal = proposal.extended(t[neglected])
         proposal, found = refit(count, proposal, *_pooled(t, report), rng)
@@ -320,6 +336,19 @@ def sample_density(
         seconds=time.perf_counter() - began,
         walkers=walkers,
     )
+
+
+# What the next attempt is longer by, at least.
+_LEAST_LONGER = 1.25
+
+
+def _longer(steps: int, tau: Array, report: GateReport, gate: Gate) -> int:
+    """Return the length of the next attempt: what the slowest parameter needs, and a fifth."""
+    ess = np.concatenate([report.ess_bulk, report.ess_tail])
+    short = np.concatenate([gate.taus_min * tau / steps, gate.ess_min / ess])
+    known = short[np.isfinite(short)]
+    needed = 1.2 * float(known.max(initial=0.0))
+    return int(steps * (np.clip(needed, _LEAST_LONGER, 4.0) if needed > 1.2 else 2.0))
 
 
 def _start(

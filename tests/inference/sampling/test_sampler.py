@@ -255,7 +255,7 @@ def test_a_run_extends_itself_until_the_gate_passes() -> None:
     assert draws.walkers == 320
 
 
-@pytest.mark.parametrize(("steps", "most", "done"), [(10, 39, 20), (200, 30, 30)])
+@pytest.mark.parametrize(("steps", "most", "done"), [(10, 39, 39), (200, 30, 30)])
 def test_extension_stops_where_it_is_told_to(steps: int, most: int, done: int) -> None:
     settings = SamplerSettings(steps=steps, max_steps=most)
     draws = run(linear().log_prob_known, np.zeros(3), np.eye(3), settings=settings)
