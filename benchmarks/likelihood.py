@@ -88,7 +88,7 @@ def floor(problem: Problem, t: Array) -> Callable[[], None]:
 
 def coefficients(problem: Problem, t: Array) -> tuple[Array, ...]:
     """B, C, D and E of every vector at every pressure, each (k, 3): what peers are handed."""
-    from calib.models.magic_formula_pressure import coefficients_at
+    from calib.models.magic_formula import coefficients_at
 
     theta = problem.theta(t)[:, :-1]
     found = coefficients_at(theta, PRESSURES_PSI, problem.bound.references)

@@ -24,9 +24,8 @@ from shared.measure import spread
 from shared.peers import pymc_model
 
 from calib.he2019.designs import he2019_tasks
-from calib.inference.diagnostics import ess
+from calib.inference.diagnostics import Gate, ess
 from calib.inference.problem import Problem, build_problem
-from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings, sample_posterior
 from calib.models.base import Array
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import stats
 from shared.measure import spread
 
-from calib.inference.sampling.gate import Gate
+from calib.inference.diagnostics import Gate
 from report.emulated import emulator_lines
 
 __all__ = ["NAMES", "RHAT_MAX", "Row", "largest_z", "rows_of", "sound"]

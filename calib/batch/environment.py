@@ -1,4 +1,6 @@
-"""What numbers depend on besides data, priors and seed: versions, processor, the code itself.
+"""The test bench of the repository, `challenge`: used where it is, named where it is not.
+
+What numbers depend on besides data, priors and seed: versions, processor, the code itself.
 
 Where these differ, numbers may be rounded otherwise; what that may change is stated in
 `calib.check.tolerances`.
@@ -8,11 +10,38 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
+
+from calib.errors import CalibError
+
+_BENCH = "challenge"
+
+
+@contextmanager
+def from_the_bench(what: str) -> Iterator[None]:
+    """Say of an import of `challenge` within the block that a wheel does not have it.
+
+    Raises
+    ------
+    CalibError
+        Naming the command or table that needs it.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] != _BENCH:
+            raise
+        raise CalibError(
+            "the challenge is a test bench of the repository, not of the wheel",
+            where=what, allowed="a checkout of the repository, with its folder `challenge`",
+            mend="run from a checkout: `pip install -e .` in it",
+        ) from None  # fmt: skip
+
 
 _PACKAGES = (
     "terracalib", "numpy", "scipy", "emcee", "arviz", "arviz-base", "arviz-stats", "xarray",

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
-from calib.batch import unfinished
+from calib.batch import foreign as unfinished
 from calib.errors import CalibError
 
 # Files by which a folder is known to be one of ours, and may be replaced.
@@ -95,7 +95,7 @@ def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
 
     What can be known before the work is found here: that it may not be written or replaced, that
     the disk is full, or that another process is about to write it. Room on the disk is reserved.
-    What the work has finished is rescued (`calib.batch.unfinished`) if it is not written.
+    What the work has finished is rescued (`calib.batch.foreign`) if it is not written.
 
     Raises
     ------

@@ -26,11 +26,9 @@ from pathlib import Path
 from threading import Lock, Thread
 from typing import Any, Protocol
 
-from calib.batch import unfinished
+from calib.batch import foreign as unfinished
 from calib.batch.plugins import load_files, loaded_files
 from calib.errors import CalibError
-
-__all__ = ["HERE", "Later", "Pool", "begin_imports", "end_server", "pool", "without_interruptions"]
 
 _LOOK_SECONDS = 2.0
 # Processes that are started before there is work for them.
@@ -40,7 +38,7 @@ _SERVING = Lock()
 # What a report needs, and what its figures and files import when they are first made.
 _REPORT = (
     "calib.report.sections", "calib.report.writer", "calib.report.figures.collect",
-    "calib.gap.diagnose", "calib.inference.sampling.ensemble", "calib.inference.array_stats",
+    "calib.gap.diagnose", "calib.inference.sampling.walkers", "calib.inference.diagnostics",
     "scipy.fft", "h5netcdf", "PIL.Image",
 )  # fmt: skip
 

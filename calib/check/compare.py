@@ -15,23 +15,31 @@ from calib.batch.environment import Environment
 from calib.batch.pool import HERE, Pool
 from calib.check.figures import GROUP as FIGURES
 from calib.check.figures import compare_figure
-from calib.check.montecarlo import MONTE_CARLO
-from calib.check.numbers import NUMBER, SAME_WORDS, compare_entries, flatten
 from calib.check.outcome import ROUNDED, Item, Status, claim
 from calib.check.posteriors import compare_posterior, summary_of
-from calib.check.schema import AUDIT, MANIFEST, SUMMARY
 from calib.check.text import GROUP as TEXT
-from calib.check.text import Judged, Judgement, compare_page, own_pictures, parsed, read_text
-from calib.check.tolerances import ORDER_OF_MAGNITUDE, is_drawn
-from calib.check.verify import INPUTS
-from calib.data import documents
-from calib.data.documents import inside
+from calib.check.text import (
+    NUMBER,
+    SAME_WORDS,
+    Judged,
+    Judgement,
+    compare_entries,
+    compare_page,
+    flatten,
+    own_pictures,
+    parsed,
+    read_text,
+)
+from calib.check.tolerances import MONTE_CARLO, ORDER_OF_MAGNITUDE, is_drawn
+from calib.check.verify import AUDIT, INPUTS, MANIFEST, SUMMARY
+from calib.data import files as documents
+from calib.data.files import inside
 from calib.errors import FAULTS, CalibError
-from calib.inference.netcdf import read_draws
+from calib.inference.io import read_draws
 from calib.inference.record import POSTERIOR, RUN
 from calib.report.comparison import FILE as COMPARISON
 from calib.report.study import Progress
-from calib.validation.montecarlo import Errors, Place
+from calib.validation.validate import Errors, Place
 
 # What a record has about its own folder: durations, and hashes that are verified as such.
 _OWN, _OF_FILES = ("seconds", "files", "left_out", "sha256"), ("sha256", "shipped")

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from calib.check.numbers import NUMBER
 from calib.check.outcome import Item, Status, claim
+from calib.check.text import NUMBER
 from calib.models.base import Array
 
 GROUP = "figures"

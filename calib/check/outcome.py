@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from typing import Any, Literal
 
-from calib.check.montecarlo import MONTE_CARLO
+from calib.check.tolerances import MONTE_CARLO
 
 
 class Status(StrEnum):

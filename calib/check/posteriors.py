@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from calib.check.outcome import Item, Status, claim
-from calib.data.documents import inside
+from calib.data.files import inside
 from calib.errors import FAULTS, CalibError
 from calib.inference.calibration import moments
-from calib.inference.netcdf import DRAWN, DrawsFile, read_draws, read_netcdf
+from calib.inference.io import DRAWN, DrawsFile, read_draws, read_netcdf
 from calib.inference.problem import Problem
 from calib.models.base import Array
 

@@ -51,7 +51,7 @@ def predict(
     from calib.batch.folders import check_room
     from calib.data import read_for_model
     from calib.data.units_check import beyond_notes, check_conditions
-    from calib.models.simulators.emulator.model import emulator_of
+    from calib.models.simulators.emulator.emulator import emulator_of
     from calib.report.comparison import load_stack, verdicts_of
     from calib.validation.prediction import MIN_DEFINED, predict_stacked, prediction_columns
     from calib.validation.prediction import predict as predict_at
@@ -174,7 +174,7 @@ def _predict_corrected(
 
 def _label(columns: dict[str, Any], *tables: Table) -> None:
     """Say in a column what the data of a calibration must be called, if anything."""
-    from calib.data.labels import common_label
+    from calib.data.reader import common_label
 
     if label := common_label(*tables):
         # The last column stays last: by it a prediction is known.

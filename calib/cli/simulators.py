@@ -17,7 +17,7 @@ def say(model: str, emulation: Emulation | None) -> bool:
     """Say what became of an emulation; return whether it is good enough (or was not needed)."""
     if emulation is None:
         return True
-    from calib.data.numbers import plain_number
+    from calib.data.files import plain_number
     from calib.report.sections import coverage_words
 
     h = emulation.held_out
@@ -69,8 +69,8 @@ def say_failed(model: str) -> None:
 def keep_emulators(models: Iterable[str], folder: Path) -> None:
     """Keep the emulators among some models in a folder, to predict from it again."""
     from calib.models import get_model
+    from calib.models.simulators.emulator.emulator import emulator_of
     from calib.models.simulators.emulator.files import save_emulator
-    from calib.models.simulators.emulator.model import emulator_of
 
     for model in models:
         emulator = emulator_of(get_model(model))

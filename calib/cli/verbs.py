@@ -1,9 +1,13 @@
-"""The verbs: thin, each one call into the package, heavy imports only when used."""
+"""An example of every verb, for its help and its page.
+
+The verbs: thin, each one call into the package, heavy imports only when used.
+"""
 
 from __future__ import annotations
 
 import errno
 import sys
+from collections.abc import Iterable
 from copy import copy
 from functools import cache
 from typing import Annotated, Any, Never
@@ -29,16 +33,51 @@ from calib.cli import (
     sbc,
     was_interrupted,
 )
-from calib.cli.examples import add_examples
 
-__all__ = ["app", "command"]
+EXAMPLES = {
+    "report": "calib report my.csv --hold-out inflation_pressure_psi=30 --out report",
+    "fit": "calib fit my.csv --model magic_formula_pressure --out run",
+    "predict": "calib predict run --at conditions.csv --out predicted.csv",
+    "data": "calib data he2019-gaps --out cases",
+    "template": "calib template magic_formula_pressure --out my.csv",
+    "priors": "calib priors magic_formula_pressure --out my.toml",
+    "models": "calib models magic_formula",
+    "effects": "calib effects slip_sinkage",
+    "quantities": "calib quantities rut_depth --json",
+    "compare": "calib compare bekker reece plates.csv --hold-out plate_width_mm=80 --out compared",
+    "diagnose": "calib diagnose --run run --field field.csv --out diagnosis",
+    "check": "calib check run --json > check.json",
+    "audit": "calib audit --out audit",
+    "campaign": "calib campaign plan.toml --out results --workers 2",
+    "sbc": "calib sbc --model bekker --simulations 100 --out sbc",
+    "doctor": "calib doctor --quick",
+    "make": "calib challenge make --out cases --key key.json --seed 1 --cases 20",
+    "run": "calib challenge run cases --out diagnoses",
+    "well-specified": "calib challenge well-specified cases --key key.json --out plain --out-key "
+    "plain.json",
+    "score": "calib challenge score cases --results diagnoses --key key.json",
+}
+
+
+def add_examples(app: typer.Typer) -> None:
+    """Put an example under the help of every verb of an app."""
+    for command in _commands(app):
+        name = command.name or str(getattr(command.callback, "__name__", ""))
+        command.epilog = f"Example: {EXAMPLES[name]}"
+
+
+def _commands(app: typer.Typer) -> Iterable[typer.models.CommandInfo]:
+    yield from app.registered_commands
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            yield from _commands(group.typer_instance)
 
 
 class _Verbs(TyperGroup):
     """All verbs: what the user can mend, or stops, ends with a line and no traceback."""
 
     def invoke(self, ctx: Any) -> Any:
-        from calib.batch import unfinished
+        from calib.batch import foreign as unfinished
         from calib.batch.folders import NO_ROOM
         from calib.errors import CalibError
 
@@ -75,7 +114,7 @@ class _Verbs(TyperGroup):
 
 
 def _stopped() -> str:
-    from calib.batch import unfinished
+    from calib.batch import foreign as unfinished
 
     return "interrupted" if unfinished.saved else STOPPED
 
@@ -83,20 +122,20 @@ def _stopped() -> str:
 def _tell_data() -> None:
     """Say of which known data a command has read: no others tell it that these are no others."""
     for label in _seen():
-        from calib.data.labels import said_of
+        from calib.data.reader import said_of
 
         print(f"calib: {label} data: {said_of(label)}", file=sys.stderr)
 
 
 def _seen() -> dict[str, None]:
     """Labels of the data that were read; nothing is imported where none were."""
-    seen: dict[str, None] = getattr(sys.modules.get("calib.data.labels"), "SEEN", {})
+    seen: dict[str, None] = getattr(sys.modules.get("calib.data.reader"), "SEEN", {})
     return seen
 
 
 def _end(why: str, code: int) -> Never:
     """Say why a command ends, and where what it had finished is, and end it."""
-    from calib.batch import unfinished
+    from calib.batch import foreign as unfinished
 
     print(f"calib: {why}", file=sys.stderr)
     for folder in unfinished.saved:
@@ -155,6 +194,6 @@ def start(
 ) -> None:  # fmt: skip
     """Probabilistic calibration of tyre-soil models."""
     if verbose:
-        from calib.cli.display import told
+        from calib.cli.options import told
 
         ctx.with_resource(told())

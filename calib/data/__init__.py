@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from calib.data.csvfile import write_table
+from calib.data.files import write_table
 from calib.data.reader import has_rows, read_for_model, read_table, table_from_arrays
 from calib.data.table import Table, check_enough, check_settings, check_varies, hold_out
 

@@ -15,8 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.data.quantities import QUANTITIES, UNITS, Quantity
-from calib.data.units import convert
+from calib.data.quantities import QUANTITIES, UNITS, Quantity, convert
 from calib.errors import CalibError
 
 # A column such as drawbar_pull_sd or slip_angle_deg is about a quantity without being it.

@@ -1,4 +1,10 @@
-"""Reading measurements: CSV or arrays in, a checked table in canonical units out."""
+"""Data that are known wherever they turn up, and what to call them.
+
+Every table that is read is labelled here, whatever its file is called; the label goes wherever the
+table goes, and a command says of which such data it has read.
+
+Reading measurements: CSV or arrays in, a checked table in canonical units out.
+"""
 
 from __future__ import annotations
 
@@ -6,27 +12,79 @@ import hashlib
 import logging
 import os
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import batched, islice
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.data.cells import (
-    CellReader,
-    Decimals,
-    Problems,
-    check_codes,
-    check_values,
-    label_codes,
-)
-from calib.data.csvfile import CsvFile, open_csv
+from calib.data.cells import CellReader, Decimals, Problems, check_codes, check_values, label_codes
+from calib.data.files import CsvFile, open_csv
 from calib.data.headers import Column, match_headers, names_quantity
-from calib.data.labels import labelled
 from calib.data.quantities import OUTPUTS, QUANTITIES
+from calib.data.registry import Registry
 from calib.data.table import MAX_TEXT_ROWS, Table
 from calib.errors import CalibError
+
+
+@dataclass(frozen=True)
+class KnownData:
+    """A data set that must be called what it is.
+
+    Parameters
+    ----------
+    words : str
+        What it is, in a sentence.
+    methods : str
+        What a paper must say of it, a sentence with marks (`calib.report.publish.markup`).
+    holds : callable
+        ``table -> bool``: whether all rows of a table are rows of it.
+    """
+
+    label: str
+    words: str
+    methods: str
+    holds: Callable[[Table], bool]
+
+    def register(self) -> None:
+        """Have it recognised."""
+        KNOWN_DATA.add(self)
+
+
+KNOWN_DATA: Registry[KnownData] = Registry("data set", lambda known: known.label)
+
+
+# Labels of what has been read, since a command cleared them.
+SEEN: dict[str, None] = {}
+
+
+def label_of(table: Table) -> str:
+    """Return what a table must be called, from its rows alone; empty if it is nothing known."""
+    if len(table) > MAX_TEXT_ROWS or not any(column in table for column in OUTPUTS.values()):
+        return ""
+    return next((k.label for k in KNOWN_DATA.values() if k.holds(table)), "")
+
+
+def labelled(table: Table) -> Table:
+    """Return a table with the label that it has, or that its rows ask for, else as it is."""
+    label = table.label or label_of(table)
+    if label in KNOWN_DATA:
+        SEEN[label] = None
+    return table if label == table.label else replace(table, label=label)
+
+
+def common_label(*tables: Table | None) -> str:
+    """Return what must be said of what is made of tables; empty if nothing."""
+    return ", ".join(dict.fromkeys(t.label for t in tables if t is not None and t.label))
+
+
+def said_of(label: str) -> str:
+    """Return the sentences that go with labels, without their citations."""
+    known = [KNOWN_DATA[name].methods for name in label.split(", ") if name in KNOWN_DATA]
+    return re.sub(r" ?\[@[^]]*\]", "", " ".join(known))
+
 
 _BATCH = 65_536
 _WITH_COMMA = re.compile(r"\s*[-+]?\d*,\d+(e[-+]?\d+)?\s*", re.IGNORECASE)

@@ -13,11 +13,10 @@ from pathlib import PurePath
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.data.files import plain_number
 from calib.data.headers import CHECKED, accepted_headers, columns_meant
-from calib.data.numbers import plain_number
-from calib.data.quantities import QUANTITIES, Quantity, columns_of
+from calib.data.quantities import QUANTITIES, Quantity, columns_of, convert
 from calib.data.table import Table
-from calib.data.units import convert
 from calib.errors import CalibError
 
 type Array = NDArray[np.float64]

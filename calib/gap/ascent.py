@@ -20,10 +20,6 @@ from calib.gap.noise import Noise
 from calib.gap.residuals import Coordinates, Residuals, diagonal, residuals_of_all, variance_left
 from calib.models.base import Array
 
-__all__ = [
-    "FIRST_STEPS", "Ascent", "Slope", "Stack", "Walk", "climb", "slopes", "stacked", "together",
-]  # fmt: skip
-
 # Asks for problems' residuals at some psi (k, d), is sent them (k, N), until it has a result.
 type Walk[T] = Generator[list[tuple[Residuals, Array]], list[Array], T]
 

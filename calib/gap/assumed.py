@@ -7,8 +7,6 @@ from dataclasses import dataclass, field, fields
 from calib.gap.effects import View
 from calib.gap.fit import Fit
 
-__all__ = ["assumed"]
-
 
 @dataclass(frozen=True)
 class _Asked(View):

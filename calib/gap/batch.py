@@ -19,8 +19,6 @@ from calib.gap.diagnose import Diagnosis, diagnose
 from calib.gap.files import write_diagnosis
 from calib.gap.provenance import INPUTS, check_resumable, inputs_record
 
-__all__ = ["case_folders", "diagnose_cases", "written"]
-
 
 def case_folders(folder: Path) -> list[Path]:
     """Return the case folders in a folder, by name.

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
+from calib.data.files import plain_number
 from calib.data.headers import accepted_headers, renamed
-from calib.data.numbers import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, columns_of, physical_role
 from calib.data.units_check import fits_load
 from calib.errors import CalibError

@@ -11,15 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from calib.data import Table, read_table
-from calib.data.documents import MEND_TOML, read_text, read_toml
-from calib.data.labels import common_label
+from calib.data.files import MEND_TOML, read_text, read_toml
 from calib.data.quantities import OUTPUTS, output_of
+from calib.data.reader import common_label
 from calib.errors import CalibError, meant
 from calib.gap.context import Context, read_context
 from calib.gap.declared import declared_covariates, with_declared
 from calib.inference.prior_files import DeclaredPriors
-
-__all__ = ["Case", "case_files", "case_from_run", "read_case"]
 
 _FILES = ("calibration", "field", "predict")
 _KEYS = (*_FILES, "models", "priors", "covariates", "context")

@@ -8,13 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from calib.data.documents import inside
+from calib.data.files import inside
 from calib.errors import FAULTS, CalibError
 from calib.gap.corrected import load_corrected
 from calib.gap.files import answer
 from calib.gap.where import row_gaps
-
-__all__ = ["mispredicted", "misquoted"]
 
 # Of the sd of a gap; and a gap that is nil, in kN, mm or g/cm^3.
 _OF_SD, _ROUNDING = 0.3, 1e-6

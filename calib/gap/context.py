@@ -19,7 +19,6 @@ from calib.inference.priors import Prior, Priors
 if TYPE_CHECKING:
     from calib.gap.hypothesis import Hypothesis
 
-__all__ = ["Context", "Size", "read_context"]
 
 # A known size that is so many sds (its own and its prior's) off may be in another unit.
 _UNUSUAL = 4.0

@@ -14,7 +14,6 @@ from calib.models.base import Array
 if TYPE_CHECKING:
     from calib.gap.campaigns import Campaigns
 
-__all__ = ["Covariates", "columns_over", "other_conditions"]
 
 # What something may vary with by itself, where it is not just one physical role: the first of them
 # that is recorded and varies.

@@ -22,10 +22,6 @@ from calib.data.table import MAX_TEXT_ROWS
 from calib.errors import CalibError
 from calib.models.base import Array
 
-__all__ = [
-    "NUMBER", "cells", "declared_covariates", "new_values", "with_declared", "words_of",
-]  # fmt: skip
-
 # What stands for the values of a column of numbers.
 NUMBER: tuple[str, ...] = ()
 _MOST_LEVELS = 12

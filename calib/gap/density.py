@@ -28,8 +28,6 @@ from calib.gap.fit import Fit
 from calib.gap.residuals import Residuals
 from calib.models.base import Array
 
-__all__ = ["Density"]
-
 # Draws whose predictions stay in the processor's cache; more at once take twice as long each.
 _AT_ONCE = 512
 # What is not quite linear has longer tails than its normal.

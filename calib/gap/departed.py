@@ -15,7 +15,6 @@ from calib.models.base import Array
 if TYPE_CHECKING:
     from calib.gap.forward import Forward
 
-__all__ = ["Departed", "Idle", "departed_of_all"]
 
 # Effects to leave out, by their place, of those asked for, by their place.
 type Idle = Mapping[int, Collection[int]]

@@ -15,7 +15,14 @@ from calib.data.quantities import OUTPUTS, columns_of, role_of
 from calib.gap.campaigns import MIN_FIELD_ROWS, Campaigns, campaigns
 from calib.gap.case import Case, read_case
 from calib.gap.context import Context
-from calib.gap.corrected import Corrected, conditions_outside
+from calib.gap.corrected import (
+    Corrected,
+    NewPrediction,
+    Shrink,
+    conditions_outside,
+    predict_new,
+    shrink,
+)
 from calib.gap.declared import new_values
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.effects.check import check_effects
@@ -32,16 +39,10 @@ from calib.gap.screening import (
     without_field_outliers,
     without_outputs,
 )
-from calib.gap.shrink import NewPrediction, Shrink, predict_new, shrink
 from calib.gap.where import Region, RowGap, regions, row_gaps, unused_rows
 from calib.gap.which import Lab, Ranking, calibrate_lab, rank
 from calib.inference.random import generator
 from calib.models.base import Array
-
-__all__ = [
-    "Diagnosis", "diagnose", "diagnose_once", "field_parts", "screened_ranking", "verdict",
-    "with_unseen_rows",
-]  # fmt: skip
 
 # A single hypothesis is named when it is at least this probable.
 NAMED = 0.5

@@ -14,8 +14,6 @@ from calib.gap.effects.base import each
 from calib.gap.hypothesis import Hypothesis, Setting
 from calib.models.base import Array
 
-__all__ = ["SETTINGS", "THRESHOLDS", "Bases", "Discrepancy"]
-
 # Where a discrepancy may set in, and how sharply, on a covariate scaled to -1..1.
 THRESHOLDS = (-0.85, 0.9)
 _ONSET_WIDTH = 0.06

@@ -20,8 +20,6 @@ from calib.gap.track_record import BENCH, track_record
 from calib.gap.where import Region, row_gaps
 from calib.models.base import Array
 
-__all__ = ["SCHEMA", "answer", "document", "write_diagnosis"]
-
 SCHEMA = "calib/diagnosis/1"
 
 

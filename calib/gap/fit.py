@@ -23,8 +23,6 @@ from calib.gap.noise import Noise, ln_averaging, ln_prior
 from calib.gap.residuals import Residuals, diagonal, residuals_of_all, variance_left
 from calib.models.base import Array
 
-__all__ = ["Fit", "Start", "finished", "fit", "full_fits", "truncated_fits"]
-
 _MAX_STEPS = 40
 # Steps of a truncated fit at a discrepancy alone, which predictions are linear in: the noise that a
 # large one leaves is told at the second.

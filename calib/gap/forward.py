@@ -28,8 +28,6 @@ from calib.gap.shifts import ShiftMap, shift_map
 from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
 
-__all__ = ["FORM_ERROR", "Forward", "fields_of_all"]
-
 # Relative size by which a formula may misrepresent its effect along one direction: the effect's
 # size, its tilt and bend over slip, its tilt over other conditions. Estimated from the true
 # effects in 690 single-effect cases of `calib challenge make` (seeds 271828, 577215, 314159,

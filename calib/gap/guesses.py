@@ -17,10 +17,8 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
 from calib.gap.odds import Odds, with_prior
 from calib.gap.residuals import Residuals, residuals_of_all
-from calib.inference.even import even_points
+from calib.inference.random import even_points
 from calib.models.base import Array
-
-__all__ = ["Guesses", "Promise"]
 
 _N_SCREEN = 64
 _N_BEGUN = 5

@@ -26,24 +26,6 @@ from calib.inference.prior_files import (
 )  # fmt: skip
 from calib.inference.priors import Priors
 
-__all__ = [
-    "LN_PAIR_TO_SINGLE",
-    "LN_PRIOR",
-    "covered",
-    "dependences",
-    "effect_priors",
-    "inseparable",
-    "joined",
-    "read_effect_priors",
-    "resized",
-    "shifts",
-    "singles",
-    "split_testable",
-    "unknowns",
-    "wider",
-    "with_remainder",
-]
-
 # Prior probabilities of the kinds, but for pairs; singles share theirs equally, and a given pair is
 # a twenty-fifth as probable as a given single effect: effects come independently, each in one of
 # some 25 campaigns. (0.03 to 0.05 do equally well: what easy cases gain the hard ones lose.)

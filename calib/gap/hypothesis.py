@@ -9,8 +9,6 @@ from calib.gap.effects import Effect
 from calib.gap.shifts import ShiftAs
 from calib.inference.priors import Priors
 
-__all__ = ["Hypothesis", "OnsetOver", "Setting", "SmoothOver"]
-
 type Setting = Literal["pressure", "speed", "passes", "water"]
 # Or the physical role of another condition that is recorded.
 type SmoothOver = (

@@ -26,8 +26,6 @@ from calib.gap.which import Ranking
 from calib.inference.random import generator
 from calib.models.base import Array
 
-__all__ = ["UNLISTED", "Included", "Inclusion", "inclusion", "inclusion_probability"]
-
 UNLISTED = "unknown"
 _N_DRAWS = 800
 # What a cause alone is said to do is wrong by so much (relative): what fits the sum of several as

@@ -19,13 +19,10 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import LN_PRIOR
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, noise_conditions
-from calib.gap.relevance import RELEVANT
+from calib.gap.odds import RELEVANT
 from calib.inference.random import generator
-from calib.inference.sampling.curvature import hessian_scale
-from calib.inference.sampling.mode import prior_widths
+from calib.inference.sampling.mode import hessian_scale, prior_widths
 from calib.models.base import Array
-
-__all__ = ["Isolability", "isolability", "smallest_shown"]
 
 # Draws of each effect's prior: for its sizes (which gives the detectable ones to 1 %), and of these
 # for how alike effects look.
@@ -105,7 +102,7 @@ def isolability(
 def smallest_shown(prior: Array, sd: float, ln_odds: float) -> float:
     """Find the size of an effect that is told from noise in 80 % of campaigns.
 
-    An effect counts from `calib.gap.relevance.RELEVANT` on, so its evidence is that of a prior
+    An effect counts from `calib.gap.odds.RELEVANT` on, so its evidence is that of a prior
     without smaller sizes.
 
     Parameters

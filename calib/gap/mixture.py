@@ -15,8 +15,6 @@ from calib.gap.which import Ranking
 from calib.inference.random import generator
 from calib.models.base import Array
 
-__all__ = ["Mixture", "Truth", "mixture"]
-
 N_DRAWS = 1200
 # Hypotheses less probable than this are not drawn from.
 _NEGLIGIBLE = 2e-3

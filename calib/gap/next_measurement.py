@@ -17,8 +17,6 @@ from calib.gap.which import Ranking
 from calib.inference.random import generator
 from calib.models.base import Array
 
-__all__ = ["NextMeasurement", "next_measurements"]
-
 _IN_PLAY = 0.03
 _MOST = 3
 _N_CANDIDATES = 400

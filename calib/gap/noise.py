@@ -16,17 +16,6 @@ from calib.gap.effects import View
 from calib.inference.sampling.mixture import log_sum
 from calib.models.base import Array
 
-__all__ = [
-    "Noise",
-    "NoiseConditions",
-    "ln_averaged",
-    "ln_averaging",
-    "ln_prior",
-    "most_probable",
-    "noise_conditions",
-    "noise_conditions_of_lab",
-]
-
 # Growth of the noise with slip: sigma (1 + rho s), and the prior probability of each.
 RHO = np.array([0.0, 1.0, 2.5, 5.0])
 LN_RHO_PRIOR = np.log(np.array([0.5, 0.2, 0.15, 0.15]))

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping
 import numpy as np
 
 from calib.data import Table
-from calib.data.numbers import plain_number
+from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES, Quantity, columns_of, role_of
 from calib.data.units_check import (
     column_notes,
@@ -19,8 +19,6 @@ from calib.data.units_check import (
 )
 from calib.models import get_model
 from calib.models.base import Array
-
-__all__ = ["identical_rows", "oddities"]
 
 # Typical outputs of two campaigns differ by less than this, whatever acts in the field.
 _ODD_RATIO = 4.0

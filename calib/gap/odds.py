@@ -1,4 +1,16 @@
-"""Probabilities of hypotheses before the data, and after them from their evidence.
+"""An effect that nobody could notice is no effect: hypotheses are about gaps that matter.
+
+Every hypothesis but `none` is the claim that its effect is *relevant*: that in some output its
+root-mean-square size over the field rows is at least `RELEVANT` noise sds (of several causes: that
+each of them is at least `RELEVANT_IN_PAIR`).
+Restricting its prior to relevant sizes multiplies its evidence by
+
+    P(relevant | data, hypothesis) / P(relevant | hypothesis),
+
+both estimated from draws. It keeps the probability of `none` from being shared out among effects
+too small to see, and that of one effect among pairs whose other half is idle.
+
+Probabilities of hypotheses before the data, and after them from their evidence.
 
 No formula is right to the last: besides the form errors that a hypothesis has, some shape of a real
 gap stays that nothing explains. Of a small gap it is a part of its size, lost in the noise; of a
@@ -16,17 +28,173 @@ where there is no gap, 1.1 for one of four noise sds, 1.36 from 7.5 on.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import batched
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from calib.gap.campaigns import Campaigns
 from calib.gap.context import Context
 from calib.gap.fit import Fit
+from calib.gap.forward import Forward, fields_of_all
 from calib.gap.hypotheses import LN_PAIR_TO_SINGLE, LN_PRIOR, REMAINDER
+from calib.gap.noise import Noise, noise_conditions
+from calib.inference.random import generator, latin
+from calib.models.base import Array
 
-__all__ = ["LEFT", "MOST_LEFT", "Odds", "coarsening", "left_of", "probabilities", "with_prior"]
+RELEVANT = 1.5
+RELEVANT_IN_PAIR = 1.0
+# Rows whose predictions stay in the processor's cache.
+_AT_ONCE = 1024
+
+
+def relevance(asked: Sequence[tuple[Fit, int]], seed: int) -> list[float]:
+    """Log of the factor by which restricting hypotheses to relevant sizes changes their evidence.
+
+    Parameters
+    ----------
+    asked : sequence of (Fit, int)
+        On the same campaigns, with the number of draws: of the prior, and of the posterior where it
+        has no sample. Zero for those that are not asked after.
+    seed : int
+    """
+    known = [i for i, (f, n) in enumerate(asked) if n and f.forward.hypothesis.name != "none"]
+    drawn = [psi for i in known for psi in _drawn(*asked[i], seed)]
+    fits = [asked[i][0] for i in known for _ in range(2)]
+    found = [0.0] * len(asked)
+    every = sizes_of_all([
+        (fit.forward, fit.noise, psi) for fit, psi in zip(fits, drawn, strict=True)
+    ])  # fmt: skip
+    for i, (posterior, prior) in zip(known, batched(every, 2), strict=True):
+        found[i] = _log_share(posterior)
+        # What is relevant in no draw of the prior is no likelier for being restricted to that.
+        if _relevant(prior).any():
+            found[i] -= _log_share(prior)
+    return found
+
+
+def _drawn(fit: Fit, draws: int, seed: int) -> tuple[Array, Array]:
+    """Psi of the posterior, and of the prior of the effect about the simulator as it was fitted."""
+    rng = generator(seed, "gap", "relevance", fit.forward.hypothesis.name)
+    # Of a sample each draw once: again it would say nothing new.
+    posterior = fit.draws(rng, draws) if fit.sample is None else fit.sample
+    prior = np.repeat(fit.psi[None], draws, axis=0)
+    first_effect = fit.forward.n_shared
+    drawn = fit.forward.priors.ppf(latin(rng, draws, fit.forward.n_dim))
+    prior[:, first_effect:] = drawn[:, first_effect:]
+    return posterior, prior
+
+
+def _log_share(size: Array) -> float:
+    relevant = _relevant(size)
+    return float(np.log((relevant.sum() + 0.2) / (relevant.size + 0.4)))
+
+
+def _relevant(size: Array) -> NDArray[np.bool_]:
+    """Which draws are relevant, of those for which the model has a value."""
+    # Those for which it has none say nothing either way.
+    size = size[np.isfinite(size).all(axis=1)]
+    threshold = RELEVANT if size.shape[1] == 1 else RELEVANT_IN_PAIR
+    return np.asarray((size >= threshold).all(axis=1))
+
+
+def sizes(forward: Forward, noise: Mapping[str, Noise], psi: Array) -> Array:
+    """Size of each cause in noise sds, rms over an output's field rows, shape (k, n_causes).
+
+    Of several outputs, that in which it is largest: what it does to the pull is no smaller because
+    ruts, which it leaves alone, were measured as well. A parameter shift or a free discrepancy
+    counts as one cause; one of several has the size of what goes when it alone is taken away.
+    A discrepancy of several outputs is as large as in the output where it is smallest: what changes
+    one output only is not one of several.
+    """
+    return sizes_of_all([(forward, noise, psi)])[0]
+
+
+def sizes_of_all(asked: Sequence[tuple[Forward, Mapping[str, Noise], Array]]) -> list[Array]:
+    """Sizes of the causes of hypotheses on the same campaigns, as `sizes` has them.
+
+    Effects are asked once for many: of few rows at a time that takes longer than the arithmetic.
+    """
+    found: list[list[Array]] = [[] for _ in asked]
+    batch: list[tuple[int, Array]] = []
+    room = _AT_ONCE
+
+    def ask() -> None:
+        parts = [(*asked[i][:2], psi) for i, psi in batch]
+        for (i, _), size in zip(batch, _sizes(parts) if parts else (), strict=True):
+            found[i].append(size)
+        batch.clear()
+
+    for i, (forward, _, psi) in enumerate(asked):
+        each = 1 + len(forward.causes)
+        for some in np.array_split(psi, max(1, -(-len(psi) * each // _AT_ONCE))):
+            if len(some) * each > room:
+                ask()
+                room = _AT_ONCE
+            batch.append((i, some))
+            room -= len(some) * each
+    ask()
+    return [np.concatenate(parts) for parts in found]
+
+
+def _sizes(asked: Sequence[tuple[Forward, Mapping[str, Noise], Array]]) -> list[Array]:
+    some, _, _ = asked[0]
+    data, view = some.data, some.data.view
+    # Every hypothesis, and if it has several causes it without each.
+    parts: list[tuple[Forward, Array]] = []
+    idle: dict[int, list[int]] = {}
+    places = []
+    for forward, _, psi in asked:
+        places.append([len(parts)])
+        parts.append((forward, psi))
+        for cause in forward.causes if len(forward.causes) > 1 else ():
+            rest, idle[len(parts)] = forward.left_out(psi, cause)
+            places[-1].append(len(parts))
+            parts.append((forward, rest))
+    plain = some.simulator(np.concatenate([psi[:, : some.n_shared] for _, psi in parts]), view)
+    with np.errstate(all="ignore"):
+        full = fields_of_all(parts, view, plain, idle)
+    ends = np.cumsum([len(psi) for _, psi in parts]).tolist()
+    rows = [slice(end - len(psi), end) for (_, psi), end in zip(parts, ends, strict=True)]
+    found = []
+    for (forward, noise, _), (at, *without) in zip(asked, places, strict=True):
+        others = [{o: v[rows[j]] for o, v in full.items()} for j in without]
+        others = others or [{o: v[rows[at]] for o, v in plain.items()}]
+        columns: list[Array] = []
+        for other in others:
+            change = {o: full[o][rows[at]] - v for o, v in other.items()}
+            each = _rms(data, noise, change)
+            smooth = forward.hypothesis.smooth_outputs
+            if not without and len(smooth) > 1:
+                columns.append(np.stack([each[n] for n in smooth]).min(axis=0))
+            else:
+                columns.append(np.stack(list(each.values())).max(axis=0))
+        found.append(np.stack(columns, axis=1))
+    return found
+
+
+def gap_size(fit: Fit) -> float:
+    """Size of all that a fit adds to its simulators, in noise sds (rms, where it is largest)."""
+    full, plain = fit.forward.field_and_plain(fit.psi[None], fit.forward.data.view)
+    each = _rms(fit.forward.data, fit.noise, {name: full[name] - plain[name] for name in full})
+    return float(np.nanmax([size[0] for size in each.values()]))
+
+
+def _rms(
+    data: Campaigns, noise: Mapping[str, Noise], change: Mapping[str, Array]
+) -> dict[str, Array]:
+    """Rms of changes (k, n) of each output over its field rows, in noise sds, shape (k,)."""
+    at = noise_conditions(data.view)
+    return {
+        o.name: np.sqrt(
+            np.square(change[o.name][:, o.rows] / noise[o.name].sd(at.rows(o.rows))).mean(axis=1)
+        )
+        for o in data.outputs
+    }
+
 
 # Part of a gap that no formula has the shape of, and the most of that in noise sds. Where true
 # single effects of other mechanics, of 5 to 24 noise sds, were fitted free of noise, 0.1 to 1.4

@@ -14,8 +14,6 @@ from calib.gap.case import Case, case_files
 from calib.gap.context import read_context
 from calib.gap.declared import NUMBER
 
-__all__ = ["INPUTS", "case_hashes", "check_resumable", "inputs_record", "recorded_inputs"]
-
 INPUTS = "inputs.json"
 _SHOWN = 5
 

@@ -23,11 +23,9 @@ from scipy.special import logsumexp
 from calib.gap.density import Density
 from calib.gap.fit import Fit
 from calib.inference.random import generator
-from calib.inference.sampling.adapt import tempered_moments
 from calib.inference.sampling.mixture import StudentT, log_sum
+from calib.inference.sampling.proposal import tempered_moments
 from calib.models.base import Array
-
-__all__ = ["PLENTY", "refine"]
 
 _ROUNDS, _SIZE, _FINAL, _KEPT = 7, 2000, 4000, 1500
 # Tails heavy enough for the long ends of sizes that an exponent makes up for.

@@ -13,8 +13,6 @@ from calib.gap.noise import Noise, ln_averaged, most_probable
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 
-__all__ = ["Coordinates", "Residuals", "diagonal", "residuals_of_all", "variance_left"]
-
 # Guesses closer than this (in prior sds) climb to the same mode.
 _APART = 0.7
 # Step of differences, in prior sds.

@@ -8,8 +8,6 @@ from calib.gap.campaigns import Campaigns
 from calib.gap.fit import Fit
 from calib.models.base import Array
 
-__all__ = ["change_over_runs", "follows_runs"]
-
 # What a line or a step has to gain (nats) for a drift or a jump of a reading to be worth a fit:
 # with less, their priors and the freedom of their sizes leave them below a few per cent beside
 # noise alone.

@@ -9,18 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
-from calib.data.numbers import plain_number
+from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS
 from calib.gap.campaigns import Campaigns, OutputData, campaigns
 from calib.gap.case import Case
-from calib.gap.conditions import check_units, without_far_conditions
+from calib.gap.where import check_units, without_far_conditions
 from calib.gap.which import Lab, Ranking, calibrate_lab
 from calib.models.base import Array
-
-__all__ = [
-    "LAB_OUTLIER", "LEFT_OVER", "MOST_ROUNDS", "OUTLIER", "left_over", "screen",
-    "without_field_outliers", "without_outputs",
-]  # fmt: skip
 
 # Standardised residual beyond which a field row is set aside, and how often that is repeated.
 OUTLIER = 5.0

@@ -27,8 +27,6 @@ from calib.gap.odds import Odds, with_prior
 from calib.inference.priors import Priors
 from calib.models.base import Array
 
-__all__ = ["far_out", "sets_and_unlisted"]
-
 # A hypothesis, and fits of parts of it.
 type _Started = tuple[Hypothesis, list[Fit]]
 

@@ -17,11 +17,6 @@ from calib.inference.prior_files import default_priors
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 
-__all__ = [
-    "DIFFERENCE", "RADIUS_ERROR", "ZERO_OF_SLIP", "ShiftAs", "ShiftMap", "alone_sd",
-    "another_soil", "coordinates", "quantities", "shift_map",
-]  # fmt: skip
-
 type ShiftAs = Literal["alone", "soil"]
 
 # Shifts of how a parameter varies with pressure, slip or water, relative to those of its value.

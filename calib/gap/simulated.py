@@ -14,12 +14,11 @@ import numpy as np
 from calib.data.quantities import QUANTITIES, role_of
 from calib.gap.effects import View
 from calib.models.base import Array
-from calib.models.simulators.emulator.model import emulator_of
+from calib.models.simulators.emulator.emulator import emulator_of
 
 if TYPE_CHECKING:
     from calib.gap.campaigns import OutputData
 
-__all__ = ["Simulated"]
 
 # Physical roles of the outputs whose simulators may be bent over their conditions.
 _BENT = ("density",)
@@ -50,7 +49,7 @@ class Simulated:
         Coefficients of the inadequacy.
     n_errors : int
         Coefficients of an emulator's error, standard normal beforehand, which lab and field share.
-        With them the likelihood is that of the calibration (`calib.inference.uncertain`), but
+        With them the likelihood is that of the calibration (`calib.inference.likelihood`), but
         that the error's size is everywhere that where the posteriors lie: worked out for each of
         a million parameter vectors it would cost more than all the rest.
     """

@@ -9,8 +9,6 @@ from importlib.resources import files
 
 from scipy.special import betaincinv
 
-__all__ = ["BENCH", "TrackRecord", "track_record"]
-
 # What the cases are, which is not what a user has.
 BENCH = (
     "simulated campaigns of calib's own bench, whose mechanics share no formula with the "

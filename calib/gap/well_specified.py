@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.data import Table
-from calib.data.documents import read_text
+from calib.data.files import read_text
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.campaigns import Campaigns, campaigns
@@ -26,12 +26,10 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import joined, shifts, singles, split_testable, unknowns
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise, noise_conditions
-from calib.gap.relevance import RELEVANT_IN_PAIR, sizes
+from calib.gap.odds import RELEVANT_IN_PAIR, sizes
 from calib.gap.which import calibrate_lab
 from calib.inference.random import generator
 from calib.models.base import Array
-
-__all__ = ["SIZE_RATIO", "Draw", "draw_from_hypothesis", "well_specified_case"]
 
 # The gap that is drawn is the one asked for within this ratio.
 SIZE_RATIO = 1.25

@@ -26,17 +26,14 @@ from calib.gap.hypotheses import (
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.isolate import Isolability, isolability
 from calib.gap.noise import Noise
-from calib.gap.odds import Odds, coarsening, probabilities, with_prior
+from calib.gap.odds import Odds, coarsening, gap_size, probabilities, relevance, with_prior
 from calib.gap.refine import PLENTY, refine
-from calib.gap.relevance import gap_size, relevance
 from calib.gap.runs import follows_runs
 from calib.gap.sets import far_out, sets_and_unlisted
-from calib.inference.defined import check_defined
 from calib.inference.random import generator
+from calib.inference.record import check_defined
 from calib.inference.sampling.mode import find_mode
 from calib.models.base import Array
-
-__all__ = ["Lab", "Ranking", "calibrate_lab", "rank"]
 
 # Internal parameters of each simulator, and its noise.
 type Lab = tuple[dict[str, Array], dict[str, Noise]]

@@ -10,7 +10,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from calib.data.labels import KnownData
+from calib.data.reader import KnownData
 from calib.data.registry import register
 from calib.inference.estimators import Method
 from calib.report.reference import REFERENCES
@@ -72,7 +72,7 @@ class Plugin:
     def register(self) -> None:
         """Register data, methods, designs, printed results and sections; once."""
         from calib.he2019.designs import DESIGNS as OWN_DESIGNS
-        from calib.he2019.figures.reference import HE2019 as PRINTED
+        from calib.he2019.figures.gaps import HE2019 as PRINTED
 
         if _LABEL in REFERENCES:
             return
@@ -92,14 +92,14 @@ class Plugin:
                 _later("datasets.embedded", "holds_some"),
             ),
             Method(
-                "geometric", _later("estimators.geometric", "estimate_geometric"),
+                "geometric", _later("estimators", "estimate_geometric"),
                 "geometric (Eqs 6-9)", "Geom.",
                 "the geometric method (Eqs 6\N{EN DASH}9 of the source)",
                 ("magic_formula", "magic_formula_pressure"), place=0,
             ),
             Method(
                 "published_regression",
-                _later("estimators.rut_regression", "estimate_published_regression"),
+                _later("estimators", "estimate_published_regression"),
                 "regression as published (Eq 22)", "Regr.",
                 "the regression as published (Eq 22 of the source)",
                 ("bekker", "modified_bekker"), place=40,

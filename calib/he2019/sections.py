@@ -12,8 +12,7 @@ from calib.he2019.audit.convergence import Seeds
 from calib.he2019.audit.run import Audit, begin_audit
 from calib.he2019.gaps.cases import PaperGap, paper_gaps
 from calib.he2019.gaps.find import FoundGap, begin_gaps, summarise_gaps
-from calib.he2019.page.audit import write_audit
-from calib.he2019.page.gaps import begin_gaps_section
+from calib.he2019.page import begin_gaps_section, write_audit
 from calib.report.sections import Written
 from calib.report.study import Progress, Study
 

@@ -15,8 +15,6 @@ from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.inference.record import RunRecord
 
-__all__ = ["estimate_again", "recompute_run"]
-
 
 def estimate_again(record: RunRecord, problem: Problem) -> tuple[PointEstimate, ...]:
     """Return a run's point estimates, by the methods and the seed that it names."""

@@ -10,8 +10,6 @@ from calib.inference.priors import Prior, Priors
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-__all__ = ["Joined", "joined"]
-
 
 @dataclass(frozen=True)
 class Joined(Priors):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from calib.batch.plugins import declared_in
-from calib.data.documents import MEND_TOML, read_text
+from calib.data.files import MEND_TOML, read_text
 from calib.errors import CalibError, meant
 from calib.inference.noise import USUAL, NoiseChoice
 from calib.inference.prior_entries import (

@@ -1,4 +1,7 @@
-"""A simulator is tried before a sampler or an estimator asks it thousands of times."""
+"""Parameters spread over a prior.
+
+A simulator is tried before a sampler or an estimator asks it thousands of times.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,41 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from calib.data.numbers import plain_number
+from calib.data.files import plain_number
 from calib.errors import CalibError
-from calib.inference.design import prior_design, prior_middle
 from calib.inference.problem import Problem
+from calib.inference.random import generator
 from calib.models.base import Array
 
 if TYPE_CHECKING:
     from calib.models.simulators.base import Simulator
+
+_TRIMMED = 0.002
+
+
+def prior_design(problem: Problem, count: int, seed: int, *, latin: bool = False) -> Array:
+    """Return natural parameters of the model spread over the prior, shape (count, d).
+
+    By Sobol's sequence, of which every beginning is even, or a Latin hypercube.
+    """
+    from scipy.stats import qmc  # late: half a second, and few commands emulate
+
+    d = len(problem.priors.free)
+    bits = int(np.ceil(np.log2(max(count, 2))))
+    rng = generator(seed, "emulate", "design")
+    if latin:
+        u = qmc.LatinHypercube(d, rng=rng).random(count)
+    else:
+        u = qmc.Sobol(d, scramble=True, rng=rng).random_base2(bits)[:count]
+    t = problem.priors.ppf(_TRIMMED + (1.0 - 2.0 * _TRIMMED) * u)
+    return problem.of_model(problem.theta(t))
+
+
+def prior_middle(problem: Problem) -> Array:
+    """Return natural parameters of the model at the medians of the prior, shape (1, d)."""
+    t = problem.priors.ppf(np.full((1, len(problem.priors.free)), 0.5))
+    return problem.of_model(problem.theta(t))
+
 
 _log = logging.getLogger(__name__)
 
@@ -48,7 +78,7 @@ def try_simulator(problem: Problem) -> None:
     if direct is None:
         return
     # They take some time to import: only where a function is behind the model.
-    from calib.models.simulators.refused import FIRST
+    from calib.models.simulators.exchange import FIRST
     from calib.models.simulators.registered import Direct
 
     if not isinstance(direct, Direct):

@@ -6,15 +6,10 @@ from calib.data.registry import Registry
 from calib.errors import CalibError, meant
 from calib.models.ayers_perumpral import AYERS_PERUMPRAL, AYERS_PERUMPRAL_VOLUMETRIC
 from calib.models.base import Array, BoundModel, Conditions, Model, References
-from calib.models.bekker import BEKKER, MODIFIED_BEKKER
-from calib.models.elliptic_contact import ELLIPTIC_CONTACT
-from calib.models.janosi_hanamoto import JANOSI_HANAMOTO
+from calib.models.bekker import BEKKER, BEKKER_PLATE, LYASKO, MODIFIED_BEKKER, REECE
 from calib.models.maclaurin import MACLAURIN_RUT
-from calib.models.magic_formula import MAGIC_FORMULA
-from calib.models.magic_formula_pressure import MAGIC_FORMULA_PRESSURE
-from calib.models.mobility import BRIXIUS, WISMER_LUTH
-from calib.models.plate_sinkage import BEKKER_PLATE, LYASKO, REECE
-from calib.models.upadhyaya import UPADHYAYA
+from calib.models.magic_formula import MAGIC_FORMULA, MAGIC_FORMULA_PRESSURE
+from calib.models.traction import BRIXIUS, ELLIPTIC_CONTACT, JANOSI_HANAMOTO, UPADHYAYA, WISMER_LUTH
 from calib.models.wong_reece import WONG_REECE_PULL, WONG_REECE_SINKAGE, WONG_REECE_TORQUE
 
 __all__ = [

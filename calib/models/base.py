@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calib.batch.foreign import call
 from calib.data.quantities import QUANTITIES
-from calib.data.values import real_array
+from calib.data.table import real_array
 from calib.errors import CalibError
 from calib.models.latex import text
 

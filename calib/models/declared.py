@@ -7,16 +7,15 @@ from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
-from calib.data.documents import MEND_TOML
-from calib.data.quantities import OUTPUTS, QUANTITIES
-from calib.data.units import convert
+from calib.data.files import MEND_TOML
+from calib.data.quantities import OUTPUTS, QUANTITIES, convert
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
     from calib.models.base import Model
 
 _ONE = "dimensionless"
-# Those of variables in `calib.inference.netcdf`.
+# Those of variables in `calib.inference.io`.
 DIMENSIONS = dict.fromkeys(("chain", "draw", "row"), "a dimension of the files of draws")
 
 

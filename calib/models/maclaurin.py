@@ -16,7 +16,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from calib.models.base import Array, Columns, Conditions, Model, References, Rows
-from calib.models.mobility import wheel_numeric
+from calib.models.traction import wheel_numeric
 
 _MM_PER_M = 1000.0
 

@@ -13,8 +13,6 @@ from calib.inference.record import RunRecord
 from calib.report.comparison import HELD_OUT, ComparisonRecord, write_comparison
 from calib.validation.comparison import Comparison, compare_problems
 
-__all__ = ["problem_of", "recompute_comparison"]
-
 
 def recompute_comparison(
     record: ComparisonRecord, problems: Mapping[str, Problem], folder: Path, out: Path,

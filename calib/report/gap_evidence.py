@@ -9,13 +9,13 @@ import numpy as np
 
 from calib.data.quantities import OUTPUTS, role_of
 from calib.gap.assumed import assumed
+from calib.gap.corrected import Shrink
 from calib.gap.declared import words_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import EFFECTS
 from calib.gap.fit import Fit
 from calib.gap.inclusion import UNLISTED, Included
 from calib.gap.next_measurement import NextMeasurement
-from calib.gap.shrink import Shrink
 from calib.gap.where import Region
 from calib.models import get_model
 from calib.report.gap_facts import (
@@ -24,11 +24,9 @@ from calib.report.gap_facts import (
     CauseFact,
     GapEvidence,
     NextFact,
+    OutputRows,
     ShrinkFact,
     WhereFact,
-)
-from calib.report.gap_rows import (
-    OutputRows,
     condition_text,
     output_axis,
     output_rows,
@@ -39,9 +37,8 @@ from calib.report.gap_rows import (
     title_of,
     unit_after,
 )
-from calib.report.gap_runs import over_runs
 from calib.report.gap_sizes import ends_text, size_sentences, where_to_look
-from calib.report.gap_verdict import GapVerdict, judge_gap
+from calib.report.gap_verdict import GapVerdict, judge_gap, over_runs
 from calib.report.labels import MINUS, axis_of, joined, odds_text, short
 from calib.report.parameters import parameter_text
 

@@ -18,7 +18,7 @@ from calib.gap.noise import noise_conditions
 from calib.inference.random import generator
 from calib.models import get_model
 from calib.models.base import Array
-from calib.report.gap_rows import (
+from calib.report.gap_facts import (
     EVERYWHERE,
     output_axis,
     output_word,

@@ -1,22 +1,32 @@
-"""Names and units as a reader writes them, for axes (mathtext) and sentences (plain text)."""
+"""Names and units as a reader writes them, for axes (mathtext) and sentences (plain text).
+
+What is registered, told from its declaration: for a terminal, and for pages of documentation.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from calib.data.headers import parse_header
-from calib.data.numbers import plain_number
-from calib.data.quantities import QUANTITIES
-from calib.data.units import convert
-from calib.errors import CalibError
+from calib.data.files import plain_number
+from calib.data.headers import accepted_headers, parse_header
+from calib.data.quantities import QUANTITIES, Quantity, columns_of, convert
+from calib.errors import CalibError, meant
+from calib.gap.effects import EFFECTS, Effect
+from calib.gap.forward import FORM_ERROR
+from calib.gap.hypotheses import read_effect_priors
+from calib.inference.prior_files import default_priors, read_priors
+from calib.inference.priors import Prior
+from calib.models import MODELS, Model
 from calib.models.base import Array
+from calib.models.latex import text
 from calib.report.numbers import NOTHING, format_number
 
 NO_UNIT = NOTHING
@@ -188,3 +198,183 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = ("  ".join(map(str.ljust, row, widths)) for row in rows)
     return [line.rstrip() for line in lines]
+
+
+type Facts = dict[str, Any]
+
+ROLES = {
+    "output": "An output: models predict it.",
+    "condition": "A condition: models predict from it, effects may need it.",
+    "bookkeeping": "Bookkeeping: no model predicts from it.",
+}
+NOISE = {
+    "log": "Noise is normal on the logarithm of the output: `sigma` is a relative scatter.",
+    "identity": "Noise is normal on the output itself, in its unit.",
+}
+_ALONG = {
+    "size": "its size", "slip": "slip", "pressure": "inflation pressure", "cone": "cone index",
+    "water": "water content", "shape": "what it is named for",
+    "extrapolation": "pressures that the simulator was not fitted at",
+}  # fmt: skip
+
+
+def model_priors(model: Model) -> tuple[Prior, ...]:
+    """Return a model's priors; those that are a part of a column's median, of their defaults."""
+    names = (*model.parameters, "sigma")
+    return read_priors(default_priors(model.name), model.name, names, {}).entries
+
+
+def role_columns(roles: Iterable[str], *, output: bool) -> list[str]:
+    """Return the columns of all quantities that have some physical roles, outputs or not."""
+    return [
+        c for role in roles for c in columns_of(role) if (QUANTITIES[c].role == "output") == output
+    ]
+
+
+def how_testable(effect: Effect, link: Callable[[str], str] = str) -> list[str]:
+    """Say what a diagnosis needs to test an effect, a sentence each; columns as `link` has them."""
+
+    def named(roles: Iterable[str], *, output: bool) -> str:
+        return ", ".join(map(link, role_columns(roles, output=output)))
+
+    one_of = "one of " if len(effect.outputs) > 1 else ""
+    found = [f"The case models {one_of}{named(effect.outputs, output=True)}."]
+    if effect.needs:
+        found.append(
+            f"Among them must be {named(effect.needs, output=True)}: its trace in the others could "
+            "be another effect's as well."
+        )
+    if effect.covariates:
+        found.append(f"The field records {named(effect.covariates, output=False)}.")
+        if effect.varies:
+            found.append("This varies in the field, or differs from the laboratory's.")
+    return found
+
+
+def form_words(effect: Effect) -> str:
+    """Say how far an effect may depart from its formula."""
+    if not effect.form:
+        return "The formula is taken as exact."
+    errors = ", ".join(f"{FORM_ERROR[f]:g} along {_ALONG[f]}" for f in effect.form)
+    return (
+        f"No formula is exact: its effect may depart from it (relative sd {errors}), but not "
+        "change its sign."
+    )
+
+
+def known_words(effect: Effect) -> list[str]:
+    """Say what is known of an effect whatever its formula, a sentence for each output."""
+    found = []
+    for known in effect.known:
+        parts = []
+        if known.sign:
+            parts.append(f"is never {'negative' if known.sign > 0 else 'positive'}")
+        parts += [f"is nothing {_zero(condition)}" for condition in known.zero_at]
+        parts += [f"does not shrink as {_word(c)} grows" for c in known.grows_with]
+        parts += [f"takes no more than {known.at_most}"] * bool(known.at_most)
+        found.append(f"What it adds to the {known.output} {joined(parts)}.")
+    return found
+
+
+def _zero(role: str) -> str:
+    return "at no slip" if role == "slip" else f"at the laboratory's {_word(role)}"
+
+
+def _word(role: str) -> str:
+    columns = role_columns([role], output=False)
+    return QUANTITIES[columns[0]].title.lower() if columns else role
+
+
+def users(quantity: Quantity) -> dict[str, list[str]]:
+    """Return the names of the models and effects that a quantity is for; the empty left out."""
+    column, role = quantity.canonical, quantity.physical
+    output = quantity.role == "output"
+    found = {
+        "predicted by models": [n for n, m in MODELS.items() if m.output == column],
+        "used by models": [n for n, m in MODELS.items() if column in m.conditions],
+        "touched by effects": [n for n, e in EFFECTS.items() if output and role in e.outputs],
+        "needed by effects": [n for n, e in EFFECTS.items() if not output and role in e.covariates],
+    }
+    return {how: names for how, names in found.items() if names}
+
+
+def model_facts(model: Model) -> Facts:
+    """Return what a model is, as text, lists and mappings."""
+    return {
+        "title": model.title,
+        "equation": model.equation,
+        "where": re.sub(r"\[\$(\w+)\]", r"\1", model.letters),
+        "after": model.source,
+        "limits": model.applies,
+        "output": model.output,
+        "conditions": list(model.conditions),
+        "columns": {c: _unit_and_range(QUANTITIES[c]) for c in (model.output, *model.conditions)},
+        "noise": NOISE[model.response],
+        "parameters": list(model.parameters),
+        "priors": _priors(model_priors(model)),
+    }
+
+
+def effect_facts(effect: Effect) -> Facts:
+    """Return what an effect is, as text, lists and mappings."""
+    return {
+        "title": effect.title,
+        "equation": ", ".join(text(part) for part in effect.latex),
+        "testable": " ".join(how_testable(effect)),
+        "form": form_words(effect),
+        "known": " ".join(known_words(effect)),
+        "outputs": role_columns(effect.outputs, output=True),
+        "covariates": role_columns(effect.covariates, output=False),
+        "parameters": list(effect.parameters),
+        "priors": _priors(read_effect_priors(effect, {}).entries),
+    }
+
+
+def quantity_facts(quantity: Quantity) -> Facts:
+    """Return what a quantity is, as text, lists and mappings."""
+    return {
+        "title": f"{quantity.title}: {quantity.description}",
+        "role": ROLES[quantity.role],
+        "unit": _unit(quantity.unit),
+        "allowed": quantity.range.describe(quantity.unit, quantity.unit),
+        "known to effects as": quantity.physical,
+        "also called": list(quantity.synonyms),
+        "columns": {
+            header: _unit(column.unit)
+            for header in accepted_headers(quantity)
+            if (column := parse_header(header)) is not None
+        },
+        **users(quantity),
+    }
+
+
+def declared[T](what: str, known: Mapping[str, T], name: str) -> T:
+    """Return a declaration by its name.
+
+    Raises
+    ------
+    CalibError
+        If there is none, with those that there are.
+    """
+    if name not in known:
+        raise CalibError(
+            f"there is no {what} {name!r}", allowed=", ".join(known),
+            mend=f"{meant(name, known, 'correct the name,')} or name the file that declares "
+            f"the {what}",
+        )  # fmt: skip
+    return known[name]
+
+
+def _unit_and_range(quantity: Quantity) -> str:
+    return f"{_unit(quantity.unit)}; {quantity.range.describe(quantity.unit, quantity.unit)}"
+
+
+def _unit(unit: str) -> str:
+    return unit.replace("**", "^")
+
+
+def _priors(entries: Iterable[Prior]) -> dict[str, dict[str, str]]:
+    return {
+        p.name: {"prior": p.text, "unit": p.unit, "why": p.reason, "source": p.source}
+        for p in entries
+    }

@@ -8,8 +8,6 @@ from calib.inference.priors import Prior
 from calib.report.labels import degrees
 from calib.report.numbers import format_number, format_value
 
-__all__ = ["parameter_text", "unit_of"]
-
 # An sd above this part of the prior's says that the data did not narrow the parameter.
 _NOT_NARROWED = 0.9
 

@@ -13,7 +13,7 @@ from calib.data.table import Table
 from calib.inference.calibration import Calibration
 from calib.models.base import Array
 from calib.report.labels import Axis, axis_of
-from calib.validation.residuals import sign_changes
+from calib.validation.scores import sign_changes
 from calib.validation.validate import Validation
 
 MAX_PANELS = 6

@@ -31,9 +31,8 @@ from calib.report.figures.style import (
 )
 from calib.report.labels import MINUS, aligned, short, symbol
 from calib.report.numbers import finite
-from calib.report.page.template import data_uri, template
-from calib.validation.sbc.score import LEVEL, ModelScore, Quantity, SbcScore
-from calib.validation.sbc.uniformity import ecdf_band
+from calib.report.page.tables import data_uri, template
+from calib.validation.sbc.run import LEVEL, ModelScore, Quantity, SbcScore, ecdf_band
 
 # Of the simultaneous band drawn in each panel.
 BAND = 0.95

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from calib.batch.pool import HERE, Later, Pool
-from calib.data.numbers import plain_number
+from calib.data.files import plain_number
 from calib.data.registry import Registry
 from calib.report.numbers import format_number
 
@@ -133,7 +133,7 @@ class FoundEmulators:
 
 
 def _emulators_html(documents: Mapping[str, Document]) -> str:
-    from calib.report.page.template import template
+    from calib.report.page.tables import template
 
     failed = [
         {

@@ -31,10 +31,14 @@ from calib.report.labels import axis_of, joined, percent, plain, short, units_of
 from calib.report.rows import Result, held_table, signs_along, x_column
 from calib.report.study_tasks import MAX_ROWS
 from calib.validation.assumptions import Check, Range, Remark, checks_of, failed, remarks_of
-from calib.validation.joint import binomial_p, coverage_probability, effective_rows, hits
-from calib.validation.prediction import prior_predictive
-from calib.validation.residuals import standardise
-from calib.validation.roles import MOVED, PRIOR, role
+from calib.validation.prediction import (
+    binomial_p,
+    coverage_probability,
+    effective_rows,
+    hits,
+    prior_predictive,
+)
+from calib.validation.scores import MOVED, PRIOR, role, standardise
 from calib.validation.validate import Validation, leave_one_out, validate_held_out
 
 _WEAK_SKILL = 0.5

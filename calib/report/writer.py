@@ -12,17 +12,16 @@ from calib.batch.environment import Environment, sha256
 from calib.batch.folders import fresh_folder
 from calib.batch.pool import HERE, Later, Pool
 from calib.data import Table, write_table
-from calib.data.documents import read_text
+from calib.data.files import read_text
 from calib.inference.estimators import GeneticSettings
-from calib.inference.io import groups_of
-from calib.inference.netcdf import write_netcdf
+from calib.inference.io import groups_of, write_netcdf
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
+from calib.models.simulators.emulator.emulator import emulator_of
 from calib.models.simulators.emulator.files import save_emulator
-from calib.models.simulators.emulator.model import emulator_of
 from calib.report.drawing import Drawn, begin_figures
-from calib.report.figures.plate import Plate
+from calib.report.figures.style import Plate
 from calib.report.page.content import render_page
 from calib.report.publish import publication
 from calib.report.sections import Found

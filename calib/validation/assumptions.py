@@ -18,7 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from calib.data import Table
-from calib.data.numbers import plain_number
+from calib.data.files import plain_number
 from calib.data.quantities import OUTPUTS, QUANTITIES
 from calib.data.units_check import (
     column_notes,
@@ -36,8 +36,8 @@ from calib.inference.estimators.least_squares import estimate_least_squares
 from calib.inference.problem import Problem
 from calib.inference.random import generator
 from calib.models.base import Array
-from calib.validation.outliers import linear, outlying_notes
-from calib.validation.roles import PRIOR_SET
+from calib.validation.noise_preference import linear, outlying_notes
+from calib.validation.scores import PRIOR_SET
 
 # Chance that any test of a family fails on rows and priors that are as assumed.
 LEVEL = 0.05

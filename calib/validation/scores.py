@@ -1,17 +1,25 @@
 """Scores of predictive draws against observations: pure functions of arrays.
 
 `draws` always has shape (n_draws, n): predictive draws of n observations, noise included.
+
+Residuals over the noise scale, and whether their signs run on along a curve.
+
+What set each parameter: the data, the prior, or both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import betaincinv
+from numpy.typing import NDArray
+from scipy.special import betaincinv, ndtri
 
+from calib.inference.calibration import Calibration
+from calib.inference.problem import Problem
 from calib.models.base import Array
+from calib.validation.sensitivity import CONTRACTION_MIN
 
 LEVELS = (0.5, 0.9, 0.95)
 # Relative errors of a pull near zero say nothing: rows below this part of the largest are left out.
@@ -125,3 +133,87 @@ def score(draws: Array, observed: Array, *, heavy: bool = False) -> Scores:
         pit=pit(draws, observed),
         median=median,
     )
+
+
+_N_DRAWS = 1000
+
+
+@dataclass(frozen=True)
+class Standardised:
+    """Residuals over the noise scale, posterior means, and predictions of some rows, each (n,).
+
+    Where the noise is Student's, normal scores: standard normal values of the same quantile.
+    Residuals are on the scale of the response; the prediction is in the output's unit.
+    """
+
+    residual: Array
+    predicted: Array
+
+
+def standardise(calibration: Calibration, problem: Problem) -> Standardised:
+    """Work residuals out at the posterior: of the problem's rows, calibrated on or others."""
+    natural = problem.theta(calibration.subset(_N_DRAWS))
+    location = problem.bound.location(problem.of_model(natural), problem.conditions)
+    residual = np.nanmean(
+        problem.noise.normal_scores(problem.response - location, natural, problem.conditions),
+        axis=0,
+    )
+    return Standardised(residual, problem.bound.from_response(np.nanmedian(location, axis=0)))
+
+
+def sign_changes(x: Array, residual: Array, groups: Iterable[NDArray[np.bool_]]) -> tuple[int, int]:
+    """Count sign changes of residuals (n,) along x within each group, and neighbours in all.
+
+    Independent residuals change sign between half of the neighbours; a curve that misses a pattern
+    leaves long runs of one sign.
+    """
+    changes, pairs = 0, 0
+    for rows in groups:
+        sign = np.sign(residual[rows][np.argsort(x[rows], kind="stable")])
+        changes += int((sign[1:] != sign[:-1]).sum())
+        pairs += max(0, sign.size - 1)
+    return changes, pairs
+
+
+def normal_order(n: int) -> tuple[Array, Array, Array]:
+    """Quantiles that n sorted standard normals have, and where 95 % of each of them lie."""
+    i = np.arange(1.0, n + 1.0)
+    low, high = (betaincinv(i, n + 1.0 - i, p) for p in (0.025, 0.975))
+    middle, low, high = ndtri(np.stack([(i - 0.375) / (n + 0.25), low, high]))
+    return middle, low, high
+
+
+DATA, BOTH = "set by the data", "partly by the prior"
+MOVED, PRIOR = "moved, not narrowed", "set by the prior"
+ROLES = (DATA, BOTH, MOVED, PRIOR)
+
+# The same limit as that of an identified parameter: nine tenths of the prior's sd.
+PRIOR_SET, PARTLY_SET = (1.0 - CONTRACTION_MIN) ** 0.5, 0.5
+MOVED_SDS = 0.5
+
+
+def role_of(sd_ratio: float, moved: float) -> str:
+    """Say what set a parameter.
+
+    From its posterior over prior sd (NaN if derived) and the distance of the means in prior sds.
+    """
+    if np.isnan(sd_ratio):
+        return ""
+    if sd_ratio > PRIOR_SET:
+        return MOVED if moved > MOVED_SDS else PRIOR
+    return BOTH if sd_ratio > PARTLY_SET else DATA
+
+
+def shift(calibration: Calibration, name: str) -> float:
+    """Distance of posterior and prior mean in prior sds, in internal coordinates."""
+    priors = calibration.problem.priors
+    j = priors.names.index(name)
+    drawn = priors.ppf(((np.arange(199) + 0.5) / 199.0)[:, None] * np.ones(len(priors.free)))[:, j]
+    return float(abs(calibration.draws.flat[:, j].mean() - drawn.mean()) / drawn.std())
+
+
+def role(calibration: Calibration, name: str) -> str:
+    """Say what set a parameter of a calibration; empty for one that is derived or fixed."""
+    if name not in calibration.problem.names:
+        return ""
+    return role_of(calibration.summary[name].sd_ratio, shift(calibration, name))

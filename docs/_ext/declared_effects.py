@@ -6,7 +6,7 @@ from declared_text import code, priors_table, quantity_link, role_links, table, 
 
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.hypotheses import read_effect_priors
-from calib.report.declared import form_words, how_testable, known_words
+from calib.report.labels import form_words, how_testable, known_words
 
 TITLE = "Effects"
 LEAD = (

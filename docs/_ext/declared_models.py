@@ -10,8 +10,8 @@ from declared_text import code, priors_table, quantity_link, table, unit, with_s
 from calib.data import read_for_model
 from calib.data.quantities import QUANTITIES
 from calib.models import MODELS, Model
-from calib.report.declared import NOISE, model_priors
-from calib.report.page.template import parametrisation
+from calib.report.labels import NOISE, model_priors
+from calib.report.page.tables import parametrisation
 
 TITLE = "Models"
 LEAD = (

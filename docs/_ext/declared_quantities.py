@@ -5,7 +5,7 @@ from __future__ import annotations
 from declared_text import code, table, unit, words
 
 from calib.data.quantities import QUANTITIES, Quantity
-from calib.report.declared import ROLES, users
+from calib.report.labels import ROLES, users
 
 TITLE = "Quantities and units"
 LEAD = (

@@ -7,7 +7,7 @@ from typing import Any
 from result_schemas import RESULTS
 
 from calib.batch.campaign.kinds import KINDS
-from calib.check.schema import Manifest
+from calib.check.verify import Manifest
 from calib.inference.prior_entries import json_schema
 from calib.inference.record import RunRecord
 from calib.models.simulators.files import SimulatorFile

@@ -6,8 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from calib.inference.priors import Prior
-from calib.report.declared import role_columns
-from calib.report.labels import degrees, symbol
+from calib.report.labels import degrees, role_columns, symbol
 
 _SPECIAL = re.compile(r"([\\*_{}\[\]<>|$~])")
 

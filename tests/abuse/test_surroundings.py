@@ -26,14 +26,14 @@ import pytest
 from typer.testing import CliRunner, Result
 
 import calib
-from calib.batch import unfinished
+from calib.batch import foreign as unfinished
 from calib.batch.folders import claimed, fresh_folder
 from calib.batch.foreign import call, set_apart
 from calib.batch.plugins import run_file
 from calib.batch.pool import pool
 from calib.cli import _readable
 from calib.cli.verbs import app
-from calib.data.documents import decoded, read_json
+from calib.data.files import decoded, read_json
 from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
 from calib.inference.prior_files import default_priors, read_priors
@@ -45,8 +45,7 @@ from calib.models.simulators.files import read_simulator
 from calib.models.simulators.process import run_program
 from calib.models.simulators.registered import SIMULATED
 from calib.models.simulators.runs import RunKeeper
-from calib.models.simulators.umbridge import UmbridgeWay
-from calib.models.simulators.ways import CallableWay, CommandWay
+from calib.models.simulators.ways import CallableWay, CommandWay, UmbridgeWay
 from tests.abuse.test_writing import mounted
 from tests.gap.cases import make_case, write_case
 from tests.models.simulators.examples import PRIORS, lab, write_program
@@ -191,7 +190,7 @@ def test_an_interruption_loses_no_posterior(words: list[str], stage: str, kept: 
 
 def test_an_interrupted_diagnosis_that_was_made_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     write_case(make_case("force_offset", n_lab=15, n_field=12), Path("case"))
-    monkeypatch.setattr("calib.report.page.gap_page.begin_page", interrupt)
+    monkeypatch.setattr("calib.report.page.diagnosis.begin_page", interrupt)
     done = run("diagnose", "case", "--workers", "1", "--out", "found")
     assert (done.exit_code, "what was finished is in found-unfinished" in done.stderr) == (
         130,
@@ -893,7 +892,7 @@ def test_a_run_that_is_doubled_in_a_table_is_named(tmp_path: Path) -> None:
 
 def test_an_interruption_says_what_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
     """After the folder is written, while its numbers are printed."""
-    monkeypatch.setattr("calib.cli.display.posterior_table", interrupt)
+    monkeypatch.setattr("calib.cli.options.posterior_table", interrupt)
     done = run(*FIT)
     assert done.exit_code == 130
     assert "nothing was written" not in done.stderr

@@ -17,12 +17,11 @@ from unittest.mock import patch
 
 import pytest
 
-import calib.check.check_report as check_report_module
-import calib.check.check_run as check_run_module
+import calib.check.check as check_report_module
+import calib.check.check as check_run_module
 from calib.batch.environment import sha256
 from calib.check import compare, montecarlo, posteriors
-from calib.check.check import check
-from calib.check.check_report import recompute_report
+from calib.check.check import check, recompute_report
 from calib.check.outcome import Outcome, Status
 from calib.he2019 import sections
 from calib.he2019.audit.run import begin_audit
@@ -30,7 +29,7 @@ from calib.inference.again import recompute_run
 from calib.inference.calibration import Calibration
 from calib.report.publish import publication
 from calib.report.writer import file_hashes
-from calib.validation.montecarlo import posterior_errors
+from calib.validation.validate import posterior_errors
 from tests.check.kernels import ALL, FEW, Setting
 
 from . import made

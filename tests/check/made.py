@@ -20,18 +20,17 @@ from calib.he2019.designs import he2019_tasks
 from calib.he2019.gaps.cases import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
 from calib.inference.calibration import Calibration, calibrate
+from calib.inference.diagnostics import Gate
 from calib.inference.estimators import estimate
 from calib.inference.io import save_calibration
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
-from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import example_csv
 from calib.report.comparison import write_comparison
 from calib.report.figures.bands import bands_plate
-from calib.report.figures.plate import Plate
 from calib.report.figures.posterior import learned_plate
-from calib.report.figures.style import style
+from calib.report.figures.style import Plate, style
 from calib.report.reference import NOTHING, Reference
 from calib.report.sections import work_out
 from calib.report.study import OutputResult, Study

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pytest
 from scipy.stats import norm
 
-from calib.check.montecarlo import (
+from calib.check.outcome import Status
+from calib.check.text import compare_entries, flatten
+from calib.check.tolerances import (
     drawn_in_output,
     drawn_in_run,
     multiple,
     posterior_errors,
 )
-from calib.check.numbers import compare_entries, flatten
-from calib.check.outcome import Status
 from calib.he2019.designs import he2019_tasks
 from calib.report.sections import work_out
 from calib.report.summary import summarise

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from calib.check.compare import is_document
-from calib.check.numbers import compare_entries, flatten
 from calib.check.outcome import Status
-from calib.check.schema import SUMMARY
+from calib.check.text import compare_entries, flatten
 from calib.check.tolerances import _PATTERNS, TABLE, tolerance_of
+from calib.check.verify import SUMMARY
 
 REPORT = Path(__file__).resolve().parents[2] / "reports" / "he2019"
 

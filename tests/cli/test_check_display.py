@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from calib.check.montecarlo import MONTE_CARLO
 from calib.check.outcome import Item, Outcome, Status
-from calib.cli.check_display import show
+from calib.check.tolerances import MONTE_CARLO
+from calib.cli.check import show
 
 
 def outcome(*items: Item, there: bool = False, allowed: str = "") -> Outcome:

@@ -17,8 +17,7 @@ import pytest
 import typer
 
 import calib as package
-from calib.cli.examples import EXAMPLES
-from calib.cli.verbs import app
+from calib.cli.verbs import EXAMPLES, app
 from calib.models import MODELS, example_csv
 from tests.cli.test_cli import Calib
 from tests.cli.test_cli import calib as calib

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.data.numbers import plain_number
+from calib.data.files import plain_number
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.data.quantities import QUANTITIES
-from calib.data.units import convert
+from calib.data.quantities import QUANTITIES, convert
 from calib.errors import CalibError
 
 REGISTRY = pint.UnitRegistry()

@@ -19,7 +19,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.files import document
 from calib.gap.provenance import case_hashes, inputs_record
 from calib.report.figures.gap_where import conditions_plate
-from calib.report.gap_rows import region_text
+from calib.report.gap_facts import region_text
 from tests.gap.cases import PULL_ONLY, make_case, write_case
 
 FEW = {name: EFFECTS[name] for name in ("force_offset", "sensor_drift", "slip_zero_shift")}

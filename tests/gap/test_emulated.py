@@ -15,8 +15,8 @@ from calib.gap.forward import Forward
 from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
 from calib.inference.emulation.prepared import prepare
-from calib.inference.uncertain import log_normal
-from calib.models.simulators.emulator.model import emulator_of
+from calib.inference.likelihood import log_normal
+from calib.models.simulators.emulator.emulator import emulator_of
 from tests.gap.fits import log_joint
 from tests.inference.emulation.test_emulate import as_before as as_before
 from tests.models.simulators.examples import PRIORS, lab, pull

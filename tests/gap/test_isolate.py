@@ -16,7 +16,7 @@ from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import LN_PRIOR, singles
 from calib.gap.isolate import ALIKE, isolability, smallest_shown
 from calib.gap.noise import Noise
-from calib.gap.relevance import RELEVANT
+from calib.gap.odds import RELEVANT
 from calib.gap.which import rank
 from calib.inference.sampling.mode import prior_widths
 from tests.gap.cases import CHOICE, campaigns_of, make_case, ranking_of

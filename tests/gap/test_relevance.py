@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-import calib.gap.relevance as module
+import calib.gap.odds as module
 from calib.gap.forward import Forward
 from calib.gap.hypotheses import joined, singles, unknowns
 from calib.gap.noise import Noise, noise_conditions
-from calib.gap.relevance import _log_share, sizes, sizes_of_all
+from calib.gap.odds import _log_share, sizes, sizes_of_all
 from tests.gap.cases import CHOICE, campaigns_of, ranking_of
 from tests.gap.fits import SIGMA, fit_at
 

@@ -11,10 +11,10 @@ import pytest
 
 from calib.data import table_from_arrays
 from calib.gap.campaigns import campaigns
+from calib.gap.corrected import predict_new, shrink
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
 from calib.gap.mixture import Truth, mixture
-from calib.gap.shrink import predict_new, shrink
 from calib.gap.which import rank
 from tests.gap.cases import PULL_ONLY, campaigns_of, diagnosis_of, make_case, write_case
 

@@ -19,8 +19,7 @@ from calib.gap.context import Context
 from calib.gap.effects import EFFECTS
 from calib.gap.hypotheses import dependences
 from calib.gap.inclusion import inclusion_probability
-from calib.gap.odds import Odds, coarsening, probabilities
-from calib.gap.relevance import RELEVANT, sizes
+from calib.gap.odds import RELEVANT, Odds, coarsening, probabilities, sizes
 from calib.gap.which import Ranking, _check_names, _scored, _scores, calibrate_lab, rank
 from tests.gap.cases import CHOICE, LARGE, PULL_ONLY, campaigns_of, make_case, ranking_of
 

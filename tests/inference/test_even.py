@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, qmc
 
-from calib.inference.even import even_points, latin
+from calib.inference.random import even_points, latin
 
 
 @pytest.mark.parametrize("dim", [1, 2, 4, 7])

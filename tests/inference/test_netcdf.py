@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from calib.inference.calibration import Calibration
-from calib.inference.io import groups_of, to_datatree
-from calib.inference.netcdf import Groups, read_netcdf, write_netcdf
+from calib.inference.io import Groups, groups_of, read_netcdf, to_datatree, write_netcdf
 
 
 def test_a_file_holds_what_the_tree_holds(rut_calibration: Calibration, tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from calib.gap.case import case_from_run
 from calib.inference.calibration import calibrate
 from calib.inference.estimators import estimate
 from calib.inference.io import load_calibration, save_calibration
+from calib.inference.noise import serial_of
 from calib.inference.problem import Problem, build_problem
-from calib.inference.serial import serial_of
 from calib.validation.noise_preference import noise_words
 from calib.validation.sbc.designs import design_of
 from calib.validation.sbc.simulate import simulate

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import multivariate_normal
 
-from calib.inference.uncertain import log_normal
+from calib.inference.likelihood import log_normal
 
 
 def test_it_is_a_normal_density() -> None:

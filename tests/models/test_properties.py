@@ -10,8 +10,8 @@ from scipy.special import i1, modstruve
 
 from calib.errors import CalibError
 from calib.models import MODELS, Array, BoundModel, Conditions, Model
-from calib.models.elliptic_contact import mobilised
-from calib.models.magic_formula_pressure import coefficients_at
+from calib.models.magic_formula import coefficients_at
+from calib.models.traction import mobilised
 from tests.models.ranges import THETA, draw
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -9,7 +9,7 @@ import pytest
 
 from calib.models import MODELS
 from calib.models.bekker import rut_depth
-from calib.models.magic_formula_pressure import coefficients_at
+from calib.models.magic_formula import coefficients_at
 
 TABLE_4 = {
     18: (0.0794, 1.5619, 1.6480, -0.1026),

@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from calib.models.base import columns
-from calib.models.rigid_wheel import contact, wheels
+from calib.models.wong_reece import contact, wheels
 from tests.models.ranges import draw
 
 NAMES = ("k1", "k2", "n", "c", "phi", "K", "c1", "c2")

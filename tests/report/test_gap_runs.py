@@ -11,7 +11,7 @@ from calib.gap.diagnose import Diagnosis
 from calib.gap.effects import EFFECTS
 from calib.gap.hypothesis import Hypothesis
 from calib.report.gap_facts import NEITHER
-from calib.report.gap_runs import over_runs
+from calib.report.gap_verdict import over_runs
 from tests.gap.cases import diagnosis_of, pull_diagnosis
 
 

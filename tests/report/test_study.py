@@ -13,7 +13,7 @@ import pytest
 import calib.report.study as study_module
 from calib.batch.environment import sha256
 from calib.data import read_table, table_from_arrays, write_table
-from calib.data.labels import label_of
+from calib.data.reader import label_of
 from calib.he2019.datasets import embedded
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import PUBLISHED

@@ -22,7 +22,7 @@ from calib.report.verdict import (
     validated,
 )
 from calib.validation.assumptions import LEVEL, Check, Range, Remark
-from calib.validation.joint import binomial_p
+from calib.validation.prediction import binomial_p
 
 FINE = Evidence(
     converged=True,

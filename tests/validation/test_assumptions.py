@@ -29,7 +29,7 @@ from calib.validation.assumptions import (
     remarks_of,
     residual_checks,
 )
-from calib.validation.outliers import linear
+from calib.validation.noise_preference import linear
 from tests.custom_problems import normal, problem_of
 from tests.validation.test_outliers import fitted_line, line_problem
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstwo
 
-from calib.validation.joint import (
+from calib.validation.prediction import (
     binomial_p,
     coverage_probability,
     effective_rows,

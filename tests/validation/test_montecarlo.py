@@ -14,9 +14,14 @@ from calib.inference.calibration import calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
 from calib.inference.random import generator
-from calib.validation.montecarlo import posterior_errors, validation_errors
 from calib.validation.scores import score
-from calib.validation.validate import Validation, leave_one_out, validate_held_out
+from calib.validation.validate import (
+    Validation,
+    leave_one_out,
+    posterior_errors,
+    validate_held_out,
+    validation_errors,
+)
 
 
 def test_errors_of_a_posterior_are_fractions_of_its_sd(rut_calibration) -> None:

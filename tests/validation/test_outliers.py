@@ -12,7 +12,7 @@ from calib.data.quantities import OUTPUTS
 from calib.he2019.designs import he2019_tasks
 from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.mode import find_mode
-from calib.validation.outliers import LEVEL, linear, outlying_notes, outlying_rows
+from calib.validation.noise_preference import LEVEL, linear, outlying_notes, outlying_rows
 from tests.custom_problems import normal, problem_of
 
 TASKS = {task.output: task for task in he2019_tasks()}

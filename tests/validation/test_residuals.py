@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.validation.residuals import normal_order
+from calib.validation.scores import normal_order
 
 
 def test_sorted_normals_lie_where_they_are_expected() -> None:

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 
 from calib.batch.campaign.kinds import KINDS, Kind, Section, Task
 from calib.batch.campaign.place import Place
-from calib.data.documents import MEND_TOML, decoded
+from calib.data.files import MEND_TOML, decoded
 from calib.errors import CalibError
 from calib.inference.random import stream
 

@@ -4,9 +4,18 @@
 missing when they are called again; `completed` hands results over as they come and writes nothing.
 """
 
-from calib.batch.tasks.landing import alone, check_names, failed_tasks, read_seconds
-from calib.batch.tasks.run import Outcome, run_folder_tasks, run_tasks
-from calib.batch.tasks.stream import Finished, LateItems, completed
+from calib.batch.tasks.run import (
+    Finished,
+    LateItems,
+    Outcome,
+    alone,
+    check_names,
+    completed,
+    failed_tasks,
+    read_seconds,
+    run_folder_tasks,
+    run_tasks,
+)
 
 __all__ = [
     "Finished", "LateItems", "Outcome", "alone", "check_names", "completed",

@@ -22,7 +22,7 @@ from distributed.utils import silence_logging_cmgr
 
 from calib.batch.environment import code_sha256
 from calib.batch.pool import without_interruptions
-from calib.batch.tasks.stream import Finished, attempt, describe
+from calib.batch.tasks.run import Finished, attempt, describe
 from calib.errors import CalibError
 
 # Tasks at the scheduler at a time, and bytes of their items: enough for a large cluster, few enough
@@ -60,7 +60,7 @@ def on_cluster[I, R](
     scheduler: str | None,
     announce: Callable[[str], None],
 ) -> Iterator[Finished[R]]:
-    """Yield tasks as they come to their end (see `calib.batch.tasks.stream.completed`)."""
+    """Yield tasks as they come to their end (see `calib.batch.tasks.run.completed`)."""
     # A cluster of our own need not be larger than the work.
     connected = _local(min(workers, len(names))) if scheduler is None else _existing(scheduler)
     # What goes wrong is told once, as the error of a task or as ours.

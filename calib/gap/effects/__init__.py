@@ -13,12 +13,14 @@ from calib.gap.effects.instruments import (
     SlipZeroShift,
     WaterContentBias,
 )
-from calib.gap.effects.soil import MoistureSoftening, MultipassCompaction, RateEffect
 from calib.gap.effects.wheel import (
     BulldozingResistance,
     LoadTransfer,
     LugThrust,
+    MoistureSoftening,
+    MultipassCompaction,
     PostPeakSoftening,
+    RateEffect,
     RutRebound,
     SlipSinkage,
 )

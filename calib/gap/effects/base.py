@@ -18,8 +18,6 @@ import numpy as np
 from calib.data.quantities import QUANTITIES, columns_of
 from calib.models.base import Array
 
-__all__ = ["Effect", "Known", "View", "each", "saturating"]
-
 
 @dataclass(frozen=True)
 class Known:

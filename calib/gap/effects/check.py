@@ -28,8 +28,6 @@ from calib.inference.random import generator
 from calib.models.base import Array
 from calib.models.declared import check_tuple
 
-__all__ = ["check_declared", "check_effects"]
-
 # Draws of the priors that an effect is evaluated with.
 _TRIALS = 8
 # Relative, of what an effect may add against its known sign.

@@ -24,8 +24,6 @@ from calib.data.quantities import QUANTITIES, columns_of
 from calib.gap.effects.base import Effect, Known, View, each
 from calib.models.base import Array
 
-__all__ = ["PREFIX", "DependsOn", "DiffersBy"]
-
 PREFIX = "depends_on_"
 # Roles of outputs that are forces on the wheel.
 _FORCES = ("pull",)

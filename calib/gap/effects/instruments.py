@@ -9,11 +9,6 @@ import numpy as np
 from calib.gap.effects.base import Effect, View, each, saturating
 from calib.models.base import Array
 
-__all__ = [
-    "ConeIndexBias", "ForceOffset", "PressureGaugeBias", "SensorDrift", "SensorStep",
-    "SlipZeroShift", "WaterContentBias",
-]  # fmt: skip
-
 EARLY = "zero and span, and an early run once more"
 """How a reading that changes over the runs is checked."""
 

@@ -10,8 +10,6 @@ from calib.errors import CalibError
 from calib.gap.effects.base import Effect
 from calib.gap.effects.check import check_declared
 
-__all__ = ["load_effects"]
-
 
 def load_effects(path: Path) -> dict[str, Effect]:
     """Load the effects that a Python file defines.

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from calib.gap.effects.instruments import SensorDrift, SensorStep
 
-__all__ = ["ReadingDrift", "ReadingStep"]
-
 # A size as a part of the typical reading: as large as the drawbar cell's beside a pull of
 # a fifth of the load.
 _SIZE = 0.25

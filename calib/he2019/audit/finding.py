@@ -11,12 +11,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Any
 
-from calib.data.numbers import plain_number
+from calib.data.files import plain_number
 from calib.he2019 import declared
 from calib.he2019.audit.intervals import Interval
-from calib.he2019.datasets.published import PUBLISHED, Figure
+from calib.he2019.datasets.published import PUBLISHED
 from calib.report.numbers import format_number
-from calib.report.page.template import sentences
+from calib.report.page.tables import sentences
+from calib.report.reference import Figure
 
 
 def percent(fraction: float, digits: int = 3) -> str:

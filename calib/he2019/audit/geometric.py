@@ -28,9 +28,10 @@ from calib.he2019.audit.finding import (
 from calib.he2019.audit.intervals import Interval, exact, sin
 from calib.he2019.audit.nearness import ASSUMED_SLIPS, references
 from calib.he2019.audit.pull import coefficients, peak_slip
-from calib.he2019.datasets.published import FittedTable, Published
+from calib.he2019.datasets.published import Published
 from calib.inference.estimators import PointEstimate
 from calib.models.magic_formula import magic_formula
+from calib.report.reference import FittedTable
 
 # A published slope this much nearer to one reading than to the other is taken for it.
 _NEAR = 0.05

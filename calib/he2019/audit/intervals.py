@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.he2019.datasets.published import Figure
 from calib.models.base import Array
+from calib.report.reference import Figure
 
 # NumPy's vectorised functions are within 4 units in the last place.
 _ULPS = 8.0

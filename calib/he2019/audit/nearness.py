@@ -20,10 +20,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from calib.he2019.datasets.drawbar import NOMINAL_SLIPS, SLIP_SHIFT, magic_formula_jacobian
-from calib.he2019.datasets.published import FittedTable, Published
+from calib.he2019.datasets.published import Published
 from calib.he2019.datasets.reconstruct import normalised_basis
 from calib.models.base import Array
 from calib.models.magic_formula import half_sine_in_place, magic_formula
+from calib.report.reference import FittedTable
 
 ASSUMED_SLIPS = 100.0 * (np.array(NOMINAL_SLIPS) + SLIP_SHIFT)
 """Slips in percent at which the 14 tests of each pressure are assumed."""

@@ -14,17 +14,14 @@ from typing import Any
 from calib.batch.pool import HERE, Pool
 from calib.batch.threads import one_thread
 from calib.he2019.audit.convergence import (
+    CurvatureStudy,
     GeneticStudy,
     Seeds,
     begin_convergence,
     convergence_findings,
-)
-from calib.he2019.audit.curvature_signs import (
-    CurvatureStudy,
     curvature_signs,
     study_curvature_signs,
 )
-from calib.he2019.audit.density import density_findings
 from calib.he2019.audit.finding import (
     Basis,
     Finding,
@@ -33,10 +30,16 @@ from calib.he2019.audit.finding import (
     finding,
 )
 from calib.he2019.audit.geometric import geometric_findings
-from calib.he2019.audit.inverse import InverseStudy, inverse_findings, study_inverse
-from calib.he2019.audit.rounding import RoundingStudy, rounding_findings, study_rounding
-from calib.he2019.audit.rut_quality import QualityStudy, rut_quality_findings, study_quality
-from calib.he2019.audit.signs import pressure_unit, signs
+from calib.he2019.audit.pull import QualityStudy, rut_quality_findings, study_quality
+from calib.he2019.audit.rounding import (
+    InverseStudy,
+    RoundingStudy,
+    inverse_findings,
+    rounding_findings,
+    study_inverse,
+    study_rounding,
+)
+from calib.he2019.audit.signs import density_findings, pressure_unit, signs
 from calib.he2019.audit.table5_cost import bounds, cost_findings
 from calib.he2019.datasets.published import DOI, PUBLISHED, Published
 from calib.inference.calibration import Calibration

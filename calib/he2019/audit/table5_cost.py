@@ -30,9 +30,10 @@ from calib.he2019.audit.nearness import (
     references,
 )
 from calib.he2019.audit.pull import coefficients, pull
-from calib.he2019.datasets.published import FittedTable, Published
+from calib.he2019.datasets.published import Published
 from calib.models.base import Array
 from calib.models.magic_formula import magic_formula
+from calib.report.reference import FittedTable
 
 _BINS = 75
 _LARGEST_SLIP = float(_BINS)

@@ -21,8 +21,6 @@ from typing import Any
 from calib.he2019 import declared
 from calib.report.reference import Figure, FittedTable
 
-__all__ = ["DOI", "PUBLISHED", "Figure", "FittedTable", "Published", "Setup"]
-
 DOI = "10.1016/j.jterra.2019.07.003"
 
 

@@ -13,12 +13,10 @@ from matplotlib.ticker import FixedLocator, NullFormatter
 from calib.data import Table
 from calib.he2019.audit import Audit
 from calib.he2019.audit.geometric import features
-from calib.he2019.audit.inverse import InverseStudy, attenuation
-from calib.he2019.datasets.published import FittedTable
+from calib.he2019.audit.rounding import InverseStudy, attenuation
 from calib.models.base import Array
 from calib.models.bekker import rut_depth
 from calib.models.magic_formula import magic_formula
-from calib.report.figures.plate import Plate, draw_all
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -26,11 +24,14 @@ from calib.report.figures.style import (
     GREY,
     ORANGE,
     VERMILION,
+    Plate,
+    draw_all,
     legend_below,
     note,
     panels,
 )
 from calib.report.labels import NO_UNIT, joined, short
+from calib.report.reference import FittedTable
 
 
 def costs_plate(audit: Audit) -> Plate:

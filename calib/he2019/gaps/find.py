@@ -20,8 +20,8 @@ from calib.he2019.datasets.drawbar import SLIP_SHIFT
 from calib.he2019.datasets.published import PUBLISHED
 from calib.he2019.gaps.cases import PaperGap
 from calib.inference.random import generator
-from calib.inference.sampling.adapt import Guess, adapt
 from calib.inference.sampling.mode import find_modes
+from calib.inference.sampling.proposal import Guess, adapt
 from calib.models.base import Array
 from calib.models.bekker import rut_depth as eq_21
 from calib.report.study import Progress

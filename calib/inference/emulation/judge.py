@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.special import ndtr
 
-from calib.data.numbers import plain_number
+from calib.data.files import plain_number
 from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut
 from calib.inference.emulation.state import State
 from calib.models.base import Array

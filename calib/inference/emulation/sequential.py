@@ -21,18 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.batch.threads import one_thread
-from calib.inference.design import prior_design, prior_middle
 from calib.inference.emulation.judge import FORESEEN_FROM, WORTH, foreseen, held_out, judged
 from calib.inference.emulation.nodes import across_zero, choose_nodes
 from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut, Progress
 from calib.inference.emulation.state import State, across_too
 from calib.inference.problem import Problem
 from calib.inference.random import generator
-from calib.inference.trial import check_scale
+from calib.inference.trial import check_scale, prior_design, prior_middle
 from calib.models.base import Array
 from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.emulator.kriging import correlation
-from calib.models.simulators.refused import FIRST, FROM_THE_START, fail_alike
+from calib.models.simulators.exchange import FIRST, FROM_THE_START, fail_alike
 from calib.models.simulators.runs import Run, RunKeeper
 
 _log = logging.getLogger(__name__)

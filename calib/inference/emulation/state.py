@@ -19,9 +19,9 @@ from calib.inference.sampling.mode import prior_widths
 from calib.inference.sampling.sampler import SamplerSettings, sample_posterior
 from calib.models.base import Array
 from calib.models.simulators.emulator import Axes, Emulator, Training, build_emulator
-from calib.models.simulators.emulator.model import emulated_model
-from calib.models.simulators.emulator.region import Region
-from calib.models.simulators.refused import without_value
+from calib.models.simulators.emulator.emulator import emulated_model
+from calib.models.simulators.emulator.kriging import Region
+from calib.models.simulators.exchange import without_value
 from calib.models.simulators.runs import Run, RunKeeper
 
 # Draws on the way to the next runs: for a picture, not for a result.

@@ -7,15 +7,17 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import CalibError
-from calib.inference.defined import check_defined
 from calib.inference.estimators.base import PointEstimate, residuals, sum_of_squares
-from calib.inference.estimators.identified import (
+from calib.inference.estimators.search import (
+    Found,
     central_interval,
+    edge_notes,
+    fit_identified,
     location,
     representative_rows,
 )  # fmt: skip
-from calib.inference.estimators.search import Found, edge_notes, fit_identified
 from calib.inference.problem import Problem
+from calib.inference.record import check_defined
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 

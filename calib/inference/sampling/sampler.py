@@ -11,16 +11,14 @@ from numpy.typing import NDArray
 
 from calib.batch.threads import one_thread
 from calib.errors import CalibError
-from calib.inference.estimators.identified import representative_rows
+from calib.inference.diagnostics import LEAST_ENSEMBLES, Gate, GateReport, judge
+from calib.inference.estimators.search import representative_rows
 from calib.inference.joined import Joined, joined
 from calib.inference.problem import Problem
-from calib.inference.sampling.adapt import Guess, adapt, refit
-from calib.inference.sampling.anneal import anneal
-from calib.inference.sampling.expectation import moments
-from calib.inference.sampling.gate import LEAST_ENSEMBLES, Gate, GateReport, judge
+from calib.inference.sampling.mixture import moments
 from calib.inference.sampling.mode import Mode, find_modes
-from calib.inference.sampling.proposal import Proposal
-from calib.inference.sampling.walkers import fitted_moves, longest_tau, run_walkers
+from calib.inference.sampling.proposal import Guess, Proposal, adapt, refit
+from calib.inference.sampling.walkers import anneal, fitted_moves, longest_tau, run_walkers
 from calib.inference.trial import try_simulator
 from calib.models.base import Array
 

@@ -15,9 +15,8 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from calib.data.headers import parse_header
-from calib.data.quantities import QUANTITIES
-from calib.data.units import convert
-from calib.data.values import real_array
+from calib.data.quantities import QUANTITIES, convert
+from calib.data.table import real_array
 from calib.errors import CalibError
 from calib.models.base import Array
 

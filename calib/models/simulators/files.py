@@ -12,13 +12,12 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from calib.batch.plugins import run_file
-from calib.data.documents import MEND_TOML, read_text, read_toml
+from calib.data.files import MEND_TOML, read_text, read_toml
 from calib.errors import CalibError, meant
 from calib.models.simulators.base import Way
 from calib.models.simulators.exchange import check_template
 from calib.models.simulators.registered import SIMULATED, Budget, Simulated, declare, written
-from calib.models.simulators.umbridge import UmbridgeWay
-from calib.models.simulators.ways import CallableWay, CommandWay, TableWay
+from calib.models.simulators.ways import CallableWay, CommandWay, TableWay, UmbridgeWay
 
 _WAYS = ("run", "python", "url", "table")
 

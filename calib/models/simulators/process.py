@@ -17,7 +17,7 @@ from uuid import uuid4
 
 from calib.batch.folders import check_room
 from calib.batch.plugins import USER_MODULE
-from calib.data.documents import decoded
+from calib.data.files import decoded
 from calib.errors import CalibError
 from calib.models.simulators.base import Failure, not_made, tail
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from calib.data.documents import MEND_TOML
+from calib.data.files import MEND_TOML
 from calib.data.headers import parse_header
 from calib.data.registry import Registry, run_again
 from calib.errors import CalibError
@@ -23,7 +23,7 @@ from calib.models import MODELS
 from calib.models.base import Array, Conditions, Model
 from calib.models.declared import DIMENSIONS, check_model, check_names, check_word
 from calib.models.simulators.base import FAILED, Failure, Output, Simulator
-from calib.models.simulators.refused import FROM_THE_START, fail_alike, without_value
+from calib.models.simulators.exchange import FROM_THE_START, fail_alike, without_value
 from calib.models.simulators.runs import Run
 from calib.models.simulators.ways import CallableWay, TableWay
 

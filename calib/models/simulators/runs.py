@@ -119,7 +119,7 @@ class RunKeeper:
         return self._memory
 
     def _on_disk(self, items: Mapping[str, _Item]) -> Mapping[str, Mapping[str, Any]]:
-        from calib.models.simulators.refused import FIRST  # which imports this
+        from calib.models.simulators.exchange import FIRST  # which imports this
 
         folder = Path(self.folder or ".") / self.simulator.digest[:16]
         _say_unshared(self.simulator.name, getattr(self.simulator.way, "unshared", ""))

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from calib.report.figures.bands import bands_plate, prior_predictive_plate
-from calib.report.figures.corner import corner_plate
-from calib.report.figures.density import cone_and_water, density_plate
+from calib.report.figures.bands import (
+    bands_plate,
+    cone_and_water,
+    density_plate,
+    prior_predictive_plate,
+)
 from calib.report.figures.estimates import by_pressure_plate, estimates_plate
-from calib.report.figures.plate import Plate, draw_all
-from calib.report.figures.posterior import ensembles_plate, learned_plate
+from calib.report.figures.posterior import corner_plate, ensembles_plate, learned_plate
+from calib.report.figures.style import Plate, draw_all
 from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult
-
-__all__ = ["plates"]
 
 type _Draw = Callable[[], Plate | None]
 

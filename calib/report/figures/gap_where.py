@@ -17,7 +17,6 @@ from calib.data.quantities import role_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.where import Region, conditions_to_search
 from calib.models.base import Array
-from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -25,11 +24,12 @@ from calib.report.figures.style import (
     ORANGE,
     SMALLEST_PT,
     VERMILION,
+    Plate,
     legend_below,
     panels,
 )
 from calib.report.gap_evidence import scaled_shrink
-from calib.report.gap_rows import (
+from calib.report.gap_facts import (
     OutputRows,
     output_axis,
     output_rows,

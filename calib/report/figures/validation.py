@@ -8,8 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from calib.models.base import Array
-from calib.report.figures.density import cone_and_water, draw_predicted_observed
-from calib.report.figures.plate import Plate
+from calib.report.figures.bands import cone_and_water, draw_predicted_observed
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -19,6 +18,7 @@ from calib.report.figures.style import (
     MARKERS,
     ORANGE,
     VERMILION,
+    Plate,
     legend_below,
     note,
     panels,
@@ -35,8 +35,8 @@ from calib.report.rows import (
     x_column,
 )
 from calib.report.study import OutputResult
-from calib.validation.joint import effective_rows, ks_distance, pit_half_width
-from calib.validation.residuals import (
+from calib.validation.prediction import effective_rows, ks_distance, pit_half_width
+from calib.validation.scores import (
     Standardised,
     normal_order,
     standardise,

@@ -12,20 +12,19 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from calib.report.publish.markup import bibliography, bibtex, cited, to_latex, to_text
-from calib.report.publish.methods import Paragraph, methods
 from calib.report.publish.records import (
     LatexTable,
     Output,
+    Paragraph,
     Row,
-    outputs,
-    write_csv,
-    write_latex,
-)
-from calib.report.publish.scores import (
     convergence_csv,
     convergence_latex,
+    methods,
+    outputs,
     validation_csv,
     validation_latex,
+    write_csv,
+    write_latex,
 )
 from calib.report.publish.tables import (
     estimates_csv,

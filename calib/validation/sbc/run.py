@@ -1,25 +1,310 @@
-"""Run the replicates of all models, resumable, on this machine or a cluster."""
+"""Whether ranks are uniform: simultaneous bands for their ECDF, and a p value to go with them.
+
+The statistic is the smallest pointwise binomial tail of the ECDF over its evaluation points
+(Saeilynoja, Buerkner & Vehtari 2022). Bands come from ArviZ, which simulates the statistic; the
+p value is exact, so that it can be corrected for many quantities.
+
+References
+----------
+.. [1] Saeilynoja, Buerkner & Vehtari (2022), doi:10.1007/s11222-022-10090-6.
+.. [2] Moscovich & Nadler (2017), doi:10.1016/j.spl.2016.11.027: the Poisson recursion.
+
+From replicates to figures: whether ranks are uniform, and bands cover what they claim.
+
+Run the replicates of all models, resumable, on this machine or a cluster.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from scipy.stats import binom, norm, poisson
+
 from calib.batch.folders import check_room, write_whole, writing
 from calib.batch.tasks import run_tasks
-from calib.data.documents import read_text
+from calib.data.files import read_text
 from calib.errors import CalibError
 from calib.inference.prior_files import DeclaredPriors, prior_file_model
+from calib.inference.random import generator
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS, get_model
+from calib.models.base import Array
 from calib.models.simulators.registered import slow_simulator
 from calib.validation.sbc.designs import design_of
-from calib.validation.sbc.emulated import most_runs
-from calib.validation.sbc.replicate import Item, replicate
-from calib.validation.sbc.score import SbcScore, score
+from calib.validation.sbc.replicate import Item, most_runs, replicate
+from calib.validation.scores import LEVELS
+
+_SIMULATIONS = 4000
+_JUMPS = 60  # a Poisson variable of mean one exceeds it with probability below 1e-80
+
+
+@dataclass(frozen=True)
+class EcdfBand:
+    """ECDF of probability integral transforms, its simultaneous band; arrays of shape (n + 1,)."""
+
+    x: Array
+    ecdf: Array
+    lower: Array
+    upper: Array
+
+
+def pit(ranks: Sequence[Sequence[int]], rng: np.random.Generator) -> Array:
+    """Turn ranks (draws below the truth, and draws) into what is uniform on (0, 1) if all is right.
+
+    Each rank is spread over its share of the interval, so that they are uniform exactly.
+    """
+    below, draws = np.array(ranks, dtype=float).reshape(-1, 2).T
+    return np.asarray((below + rng.uniform(size=below.size)) / (draws + 1.0))
+
+
+def ecdf_band(values: Array, level: float) -> EcdfBand:
+    """ECDF of values (n,) and the band that holds a uniform sample's with a probability."""
+    ecdf_pit: Any = import_module("arviz_stats.ecdf_utils").ecdf_pit
+
+    # The same random numbers every time: the band is a property of n and the level.
+    return EcdfBand(*ecdf_pit(values, level, _SIMULATIONS, rng=np.random.default_rng(1)))
+
+
+def p_value(values: Array) -> float:
+    """Probability that as many uniform values (n,) leave the band by as much, exactly."""
+    n = values.size
+    z = np.arange(1, n) / n
+    counts = np.searchsorted(np.sort(values), z, side="right")
+    tails = np.minimum(binom.cdf(counts, n, z), binom.sf(counts - 1, n, z))
+    return _p_of_tail(n, float(tails.min()))
+
+
+@cache
+def _p_of_tail(n: int, tail: float) -> float:
+    """Probability that the smallest pointwise tail of n uniform values is no larger."""
+    z = np.arange(1, n) / n
+    k = np.arange(n + 1)
+    # The observed tail itself must count, whatever its last bit.
+    limit = tail * (1.0 + 1e-9)
+    inside = (binom.cdf(k, n, z[:, None]) > limit) & (binom.sf(k - 1, n, z[:, None]) > limit)
+    # Counts of n uniform values are those of a Poisson process of rate n, given n in all.
+    jump = poisson.pmf(np.arange(min(_JUMPS, n + 1)), 1.0)
+    mass = np.zeros(n + 1)
+    mass[0] = 1.0
+    for allowed in np.asarray(inside):
+        mass = np.convolve(mass, jump)[: n + 1] * allowed
+    stays = np.convolve(mass, jump)[n] / poisson.pmf(n, n)
+    return float(np.clip(1.0 - stays, 0.0, 1.0))
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjust p values, in their order, for their number, family-wise (Holm 1979, JSTOR 4615733)."""
+    p = np.asarray(p_values, dtype=float)
+    order = np.argsort(p)
+    scaled = np.maximum.accumulate(p[order] * np.arange(p.size, 0, -1))
+    adjusted = np.empty_like(p)
+    adjusted[order] = np.minimum(scaled, 1.0)
+    return [float(v) for v in adjusted]
+
+
+# Chance of a false alarm in all quantities and bands of a run together.
+LEVEL = 0.05
+# Of a single rank there is no distribution.
+_FEWEST = 2
+
+
+@dataclass(frozen=True, eq=False)
+class Quantity:
+    """One quantity whose truth was ranked.
+
+    Parameters
+    ----------
+    name : str
+    pit : ndarray, shape (n,)
+        Probability integral transforms of the truths; uniform if all is right.
+    p : float
+        Of their uniformity, for this quantity alone.
+    p_all : float
+        The same with the replicates that did not converge among them.
+    """
+
+    name: str
+    pit: Array
+    p: float
+    p_all: float
+
+
+@dataclass(frozen=True)
+class BandCoverage:
+    """Coverage of one predictive band on measurements of simulated hold-outs.
+
+    The mean over campaigns of the part of their measurements inside the band, and its standard
+    error between campaigns, whose rows share a posterior; no less than that of as many independent
+    rows of a band that is right, which few campaigns may fall short of.
+    """
+
+    level: float
+    rows: int
+    replicates: int
+    proportion: float
+    se: float
+
+    @property
+    def p(self) -> float:
+        """Probability of a proportion as far from the level, if the band is right."""
+        if not self.rows:
+            return 1.0
+        return float(2.0 * norm.sf(abs(self.proportion - self.level) / self.se))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the proportion."""
+        half = float(norm.ppf(0.975)) * self.se
+        return max(0.0, self.proportion - half), min(1.0, self.proportion + half)
+
+
+@dataclass(frozen=True)
+class ModelScore:
+    """Everything that was found for a model.
+
+    Parameters
+    ----------
+    design : str
+        Where it was measured, in words.
+    unconverged, extended : int
+        Posteriors that did not pass the gate even when extended, and all that were extended. The
+        former are left out of ranks and coverage, as a user is told not to use them: a choice
+        made from data and chains alone, which keeps ranks uniform.
+    attempts : int
+        Draws from the prior that were needed.
+    no_band : int
+        Held-out measurements for which no band was given.
+    failed : mapping of str to str
+        Replicates that ended with an error.
+    """
+
+    model: str
+    design: str
+    replicates: int
+    unconverged: int
+    extended: int
+    attempts: int
+    no_band: int
+    quantities: tuple[Quantity, ...]
+    coverage: tuple[BandCoverage, ...]
+    failed: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class SbcScore:
+    """A whole run, so many simulations of each model."""
+
+    seed: int
+    simulations: int
+    models: tuple[ModelScore, ...]
+
+    @property
+    def adjusted(self) -> dict[tuple[str, str], float]:
+        """Adjusted p values of all quantities and bands, by model and name, family-wise."""
+        raw = {(m.model, q.name): q.p for m in self.models for q in m.quantities}
+        raw |= {
+            (m.model, f"{100 * c.level:g} % band"): c.p for m in self.models for c in m.coverage
+        }
+        return dict(zip(raw, holm(list(raw.values())), strict=True))
+
+    @property
+    def alarms(self) -> dict[tuple[str, str], float]:
+        """Those of `adjusted` below `LEVEL`."""
+        return {key: p for key, p in self.adjusted.items() if p < LEVEL}
+
+
+def score(
+    records: Sequence[Mapping[str, Any]], seed: int, simulations: int,
+    failed: Mapping[str, str] | None = None,
+) -> SbcScore:  # fmt: skip
+    """Score the records of a run, as `calib.validation.sbc.replicate.replicate` returns them.
+
+    Errors are by the name of the replicate, which begins with its model's.
+
+    Raises
+    ------
+    CalibError
+        If there is no record at all, or too few posteriors of a model converged.
+    """
+    models = dict.fromkeys(r["model"] for r in records)
+    errors = failed or {}
+    if not records:
+        why = next(iter(errors.values()), "none was done")
+        raise CalibError(f"no simulated campaign could be calibrated: {why}")
+    return SbcScore(
+        seed, simulations,
+        tuple(
+            score_model(
+                [r for r in records if r["model"] == model],
+                {n: e for n, e in errors.items() if n.rpartition("-")[0] == model},
+            )
+            for model in models
+        ),
+    )  # fmt: skip
+
+
+def score_model(
+    records: Sequence[Mapping[str, Any]], failed: Mapping[str, str] | None = None
+) -> ModelScore:
+    """Score the records of one model."""
+    model, seed = records[0]["model"], records[0]["seed"]
+    good = [r for r in records if r["converged"]]
+    if len(good) < _FEWEST:
+        raise CalibError(
+            f"{len(good)} of {len(records)} posteriors of {model} converged: nothing can be told",
+            allowed=f"{_FEWEST} or more that converged",
+            mend="simulate more campaigns, or leave the model out; those that are done are kept",
+        )
+    names = dict.fromkeys(name for r in records for name in r["ranks"])
+    return ModelScore(
+        model=model,
+        design=records[0].get("design", ""),
+        replicates=len(records),
+        unconverged=len(records) - len(good),
+        extended=sum(r["extended"] for r in records),
+        attempts=sum(r["attempts"] for r in records),
+        no_band=sum(r["no_band"] for r in good),
+        quantities=tuple(_quantity(name, records, good, seed) for name in names),
+        coverage=tuple(_coverage(level, good) for level in LEVELS),
+        failed=dict(failed or {}),
+    )
+
+
+def _quantity(
+    name: str, records: Sequence[Mapping[str, Any]], good: Sequence[Mapping[str, Any]], seed: int
+) -> Quantity:
+    model = records[0]["model"]
+
+    def transforms(some: Sequence[Mapping[str, Any]]) -> Array:
+        ranks = [r["ranks"][name] for r in some if name in r["ranks"]]
+        return pit(ranks, generator(seed, "sbc", model, name))
+
+    values = transforms(good)
+    p_all = p_value(transforms(records)) if len(good) < len(records) else p_value(values)
+    return Quantity(name, values, p_value(values), p_all)
+
+
+def _coverage(level: float, records: Sequence[Mapping[str, Any]]) -> BandCoverage:
+    banded = [r for r in records if r["rows"]]
+    part = np.array([r["covered"][f"{100 * level:g}"] / r["rows"] for r in banded])
+    rows = sum(r["rows"] for r in banded)
+    between = float(part.std(ddof=1) / np.sqrt(part.size)) if part.size > 1 else 0.0
+    independent = np.sqrt(level * (1.0 - level) / rows) if rows else float("nan")
+    return BandCoverage(
+        level=level,
+        rows=rows,
+        replicates=len(banded),
+        proportion=float(part.mean()) if part.size else float("nan"),
+        se=float(max(between, independent)),
+    )
+
 
 # As for a report, but a chain is extended to 3200 steps, not 25,600, before it counts as one that
 # did not converge: simulated campaigns are many, and some tell next to nothing.

@@ -187,7 +187,7 @@ def test_results_of_another_plan_are_not_mixed_in(site, serial, tmp_path, change
 
 
 def test_results_of_other_versions_are_not_mixed_in(site, serial, tmp_path, monkeypatch):
-    from calib.batch.campaign import record
+    from calib.batch.campaign import run as record
 
     shutil.copytree(serial, tmp_path / "out")
     monkeypatch.setattr(record, "versions", lambda: {"numpy": "0"})

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.he2019.audit.curvature_signs import curvature_signs, least_cost, study_curvature_signs
+from calib.he2019.audit.convergence import curvature_signs, least_cost, study_curvature_signs
 from calib.he2019.audit.finding import Verdict
 from calib.he2019.audit.nearness import (
     ASSUMED_SLIPS,

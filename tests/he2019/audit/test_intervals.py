@@ -20,7 +20,7 @@ from calib.he2019.audit.intervals import (
     square,
     tan,
 )
-from calib.he2019.datasets.published import Figure
+from calib.report.reference import Figure
 
 FINITE = st.floats(-1e6, 1e6, allow_nan=False)
 

@@ -9,7 +9,7 @@ import pytest
 
 from calib.data import hold_out
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.inverse import (
+from calib.he2019.audit.rounding import (
     attenuation,
     inverse_by_likelihood,
     inverse_by_print,
@@ -20,7 +20,7 @@ from calib.he2019.audit.inverse import (
 )
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import PUBLISHED
-from calib.he2019.estimators.rut_regression import rut_regression
+from calib.he2019.estimators import rut_regression
 from tests.he2019.audit.altered import altered
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from calib.data import hold_out
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.rut_quality import (
+from calib.he2019.audit.pull import (
     log_pressure_ratio,
     rut_quality_findings,
     study_quality,

@@ -8,7 +8,7 @@ from scipy.optimize import brentq
 
 from calib.data import table_from_arrays
 from calib.errors import CalibError
-from calib.he2019.estimators.geometric import Features, coefficients, read_features
+from calib.he2019.estimators import Features, coefficients, read_features
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
 from calib.models.magic_formula import magic_formula

@@ -7,7 +7,7 @@ import pytest
 
 from calib.data import table_from_arrays
 from calib.errors import CalibError
-from calib.he2019.estimators.rut_regression import rut_regression
+from calib.he2019.estimators import rut_regression
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.he2019.figures.gaps import gap_plate
-from calib.report.gap_rows import output_rows
+from calib.report.gap_facts import output_rows
 
 UNIT = re.compile(r"\(.+\)$")
 

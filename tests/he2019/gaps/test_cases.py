@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from calib.data import table_from_arrays
-from calib.data.csvfile import write_table
+from calib.data.files import write_table
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
 from calib.gap.case import read_case

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from calib.he2019.gaps.find import Check, checks
-from calib.he2019.page.gaps import _withheld, check_text
+from calib.he2019.page import _withheld, check_text
 from calib.he2019.sections import FoundGaps
 from calib.inference.sampling.sampler import SamplerSettings
-from calib.report.gap_rows import short_name
+from calib.report.gap_facts import short_name
 from calib.report.labels import odds_text, short
 from calib.report.study import Study
 from calib.report.writer import file_hashes, write_report

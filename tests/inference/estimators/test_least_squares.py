@@ -7,7 +7,7 @@ import pytest
 
 from calib.errors import CalibError
 from calib.inference.estimators import estimate
-from calib.inference.estimators.identified import hold_unidentified
+from calib.inference.estimators.search import hold_unidentified
 from calib.inference.problem import build_problem
 from tests.inference.estimators.conftest import SLIPS, TRUTH
 

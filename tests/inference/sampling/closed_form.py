@@ -10,7 +10,7 @@ from scipy import stats
 from scipy.special import gammaln
 
 from calib.inference.diagnostics import ess
-from calib.inference.sampling.adapt import Guess
+from calib.inference.sampling.proposal import Guess
 from calib.inference.sampling.sampler import Draws, SamplerSettings, sample_density
 from calib.models.base import Array
 

@@ -8,8 +8,7 @@ from functools import cache
 import numpy as np
 from scipy import stats
 
-from calib.inference.sampling.adapt import Guess, adapt
-from calib.inference.sampling.proposal import Proposal
+from calib.inference.sampling.proposal import Guess, Proposal, adapt
 
 
 def banana(t: np.ndarray) -> np.ndarray:

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.inference.sampling.adapt import Guess, adapt, refit
 from calib.inference.sampling.mixture import StudentT
-from calib.inference.sampling.proposal import Proposal
+from calib.inference.sampling.proposal import Guess, Proposal, adapt, refit
 from tests.inference.sampling.closed_form import linear
 
 MEAN = np.array([1.0, -2.0, 0.5])

@@ -16,7 +16,7 @@ from calib.inference.problem import Problem, build_problem
 from calib.inference.sampling.sampler import sample_posterior
 from calib.models import MODELS
 from calib.validation.sbc.designs import design_of
-from calib.validation.sbc.uniformity import holm
+from calib.validation.sbc.run import holm
 
 RUNS, LIVE = 10, 150
 QUANTILES = (0.05, 0.5, 0.95)

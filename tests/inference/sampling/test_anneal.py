@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.inference.sampling.anneal import anneal
+from calib.inference.sampling.walkers import anneal
 
 
 def wide(t):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.inference.sampling.climb import climb
+from calib.inference.sampling.mode import climb
 
 FAR = np.full(3, np.inf)
 

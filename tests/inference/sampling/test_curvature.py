@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from calib.inference.sampling.curvature import hessian_scale
+from calib.inference.sampling.mode import hessian_scale
 
 MEAN = np.array([1.0, -2.0, 0.5])
 SCALE = np.array([[2.0, 0.6, 0.1], [0.6, 1.0, -0.3], [0.1, -0.3, 0.5]])

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from calib.inference.sampling import expectation
-from calib.inference.sampling.expectation import fit_mixture, moments
+from calib.inference.sampling import mixture as expectation
+from calib.inference.sampling.mixture import fit_mixture, moments
 
 
 def draws(d: int) -> tuple[np.ndarray, np.ndarray]:

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.inference.diagnostics import convergence, ess, hdi, psis
+from calib.inference.diagnostics import Gate, GateReport, convergence, ess, hdi, judge, psis
 from calib.inference.sampling import sampler as sampler_module
-from calib.inference.sampling.gate import Gate, GateReport, judge
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.inference.sampling.walkers import longest_tau
 from tests.inference.sampling.closed_form import linear, run

@@ -13,8 +13,8 @@ from calib.data import Table
 from calib.errors import CalibError
 from calib.inference.diagnostics import ess
 from calib.inference.problem import build_problem
-from calib.inference.sampling.adapt import Guess
 from calib.inference.sampling.mode import find_modes
+from calib.inference.sampling.proposal import Guess
 from calib.inference.sampling.sampler import (
     Draws,
     SamplerSettings,

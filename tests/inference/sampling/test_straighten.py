@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.inference.sampling.straighten import Straightener
+from calib.inference.sampling.mixture import Straightener
 
 
 def funnel(size: int = 4000, seed: int = 1) -> np.ndarray:

@@ -13,7 +13,7 @@ from calib.inference.prior_files import parse_priors
 from calib.models import MODELS
 from calib.models.simulators.files import read_simulator, register_file
 from calib.models.simulators.registered import SIMULATED, from_callable, models_of, simulated_by
-from calib.models.simulators.umbridge import UmbridgeWay
+from calib.models.simulators.ways import UmbridgeWay
 from tests.models.simulators.examples import PRIORS, pull, write_program
 
 

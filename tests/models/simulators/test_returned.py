@@ -13,13 +13,12 @@ import pytest
 
 import calib
 from calib.errors import CalibError
-from calib.inference.emulation.tabulated import read_runs
+from calib.inference.emulation.prepared import read_runs
 from calib.models.base import BoundModel
 from calib.models.simulators.base import Failure, Output
 from calib.models.simulators.files import read_simulator
 from calib.models.simulators.registered import from_callable, models_of
-from calib.models.simulators.umbridge import UmbridgeWay
-from calib.models.simulators.ways import CallableWay
+from calib.models.simulators.ways import CallableWay, UmbridgeWay
 from tests.models.simulators.examples import PRIORS, pull, serving, write_program
 from tests.models.simulators.test_ways import EXACT, THETA, X, failure, in_percent, simulator
 

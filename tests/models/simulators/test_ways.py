@@ -15,8 +15,7 @@ from calib.errors import CalibError
 from calib.models.simulators.base import Failure, Output, Simulator, Way
 from calib.models.simulators.files import read_simulator
 from calib.models.simulators.registered import models_of
-from calib.models.simulators.umbridge import UmbridgeWay
-from calib.models.simulators.ways import CallableWay, CommandWay
+from calib.models.simulators.ways import CallableWay, CommandWay, UmbridgeWay
 from tests.models.simulators.examples import pull, serving, write_program
 
 X = {"slip_ratio": np.array([0.1, 0.3]), "normal_load_kn": np.array([4.0, 5.0])}

@@ -21,7 +21,7 @@ from calib.report.figures.gap import (
     probability_text,
     which_plate,
 )
-from calib.report.gap_rows import (
+from calib.report.gap_facts import (
     EVERYWHERE,
     output_axis,
     output_rows,
@@ -190,7 +190,7 @@ def test_a_tie_is_said_and_hatched(found):
 
 def test_placebos_do_not_depend_on_the_unit_that_is_drawn(found, monkeypatch):
     in_kn = placebos(found)
-    monkeypatch.setattr("calib.report.gap_rows._SMALL_PULL", np.inf)  # as a small wheel's, in N
+    monkeypatch.setattr("calib.report.gap_facts._SMALL_PULL", np.inf)  # as a small wheel's, in N
     assert output_axis(found, "drawbar_pull").unit == "N"
     assert placebos(found).before == pytest.approx(in_kn.before)
 

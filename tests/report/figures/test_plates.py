@@ -13,23 +13,19 @@ from matplotlib.collections import LineCollection
 
 from calib.data import table_from_arrays
 from calib.data.quantities import QUANTITIES
-from calib.he2019.figures.reference import HE2019
+from calib.he2019.figures.gaps import HE2019
 from calib.report.figures import collect
-from calib.report.figures.bands import bands_plate, prior_predictive_plate
+from calib.report.figures.bands import bands_plate, density_plate, prior_predictive_plate
 from calib.report.figures.collect import plates
-from calib.report.figures.corner import corner_plate
-from calib.report.figures.density import density_plate
 from calib.report.figures.estimates import estimates_plate
-from calib.report.figures.plate import Plate
-from calib.report.figures.posterior import ensembles_plate, learned_plate
-from calib.report.figures.style import style
+from calib.report.figures.posterior import corner_plate, ensembles_plate, learned_plate
+from calib.report.figures.style import Plate, style
 from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.labels import axis_of, units_of
 from calib.report.reference import NOTHING
 from calib.report.rows import groups, signs_along
 from calib.report.verdict import judge_evidence
-from calib.validation.residuals import standardise
-from calib.validation.roles import BOTH, DATA, MOVED, PRIOR, role_of
+from calib.validation.scores import BOTH, DATA, MOVED, PRIOR, role_of, standardise
 
 UNIT = re.compile(r"\(.+\)$")
 NAMES = ("bands", "validation", "prior_predictive", "learned", "corner", "ensembles", "residuals",

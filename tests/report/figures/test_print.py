@@ -16,10 +16,9 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from calib.he2019.figures.reference import HE2019
+from calib.he2019.figures.gaps import HE2019
 from calib.report.figures.bands import FILLS
 from calib.report.figures.collect import plates
-from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
     CYCLE,
@@ -31,6 +30,7 @@ from calib.report.figures.style import (
     MIDDLE_MM,
     SINGLE_MM,
     SMALLEST_PT,
+    Plate,
     pdf_bytes,
     png_bytes,
     style,

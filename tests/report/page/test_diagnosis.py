@@ -35,9 +35,9 @@ from calib.report.gap_facts import (
     RunsFact,
     ShrinkFact,
     WhereFact,
+    shrink_place,
     track_record_text,
 )
-from calib.report.gap_rows import shrink_place
 from calib.report.gap_sizes import size_sentences
 from calib.report.gap_verdict import Tone, judge_gap, repeats_needed
 from calib.report.labels import odds_text, short
@@ -47,8 +47,8 @@ from calib.report.page.diagnosis import (
     parameter_rows,
     prior_text,
     render_diagnosis,
+    write_page,
 )
-from calib.report.page.gap_page import write_page
 from calib.report.parameters import parameter_text
 from tests.browser import faults
 from tests.gap.cases import PULL_ONLY, diagnosis_of, make_case, pull_diagnosis, write_case

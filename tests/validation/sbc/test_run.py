@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from calib.cli.verbs import app
 from calib.errors import CalibError
+from calib.inference.diagnostics import Gate
 from calib.inference.prior_files import default_priors
-from calib.inference.sampling.gate import Gate
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.sbc import text_table, verdict
 from calib.validation.sbc.run import run_sbc

@@ -8,10 +8,9 @@ from __future__ import annotations
 from typing import Any
 
 from calib.batch.campaign.kinds.base import Kind, Planned, Section, Task, Work
-from calib.batch.campaign.kinds.challenge import Challenge
+from calib.batch.campaign.kinds.challenge import Challenge, Sbc
 from calib.batch.campaign.kinds.diagnose import Diagnose
 from calib.batch.campaign.kinds.fit import Fit
-from calib.batch.campaign.kinds.sbc import Sbc
 
 __all__ = ["KINDS", "Kind", "Planned", "Section", "Task", "Work"]
 

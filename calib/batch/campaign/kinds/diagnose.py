@@ -32,10 +32,10 @@ from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.load import load_effects
 from calib.inference.emulation.prepared import emulated_for_both
 from calib.models import MODELS
+from calib.models.simulators.emulator.emulator import emulator_of
 from calib.models.simulators.emulator.files import save_emulator
-from calib.models.simulators.emulator.model import emulator_of
 from calib.models.simulators.registered import slow_simulator
-from calib.report.page.gap_page import write_page
+from calib.report.page.diagnosis import write_page
 
 # What is run of a slow simulator does not depend on a task's own stream: it is what
 # `calib diagnose` runs by default, so that neither runs anything twice.

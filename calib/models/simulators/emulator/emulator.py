@@ -1,4 +1,6 @@
-"""An emulator: what a slow simulator would answer, how surely, and where it has no answer.
+"""Where a simulator has a value at all, learned from the runs that failed.
+
+An emulator: what a slow simulator would answer, how surely, and where it has no answer.
 
 Every run gives its output at the same m conditions (the nodes). Runs are a matrix, of which a few
 basis curves hold all that matters (Higdon et al. 2008, doi:10.1198/016214507000000888):
@@ -13,24 +15,91 @@ there (five parameters, 60 to 200 runs). Of the two ways to emulate
 over conditions this is the better conditioned: one process over parameters and conditions would
 have a matrix of runs times nodes on a side (200 times 40: 8,000), nearly singular as neighbouring
 nodes say the same, in the place of matrices of 200 and of 40.
+
+A model whose equation is an emulator.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from calib.models.base import Array
-from calib.models.simulators.emulator.kriging import Kriging, Scales, find_scales, krige
+from calib.models.base import Array, Columns, Conditions, Model, References, Rows, not_given
+from calib.models.simulators.emulator.kriging import (
+    AT_ONCE,
+    Kriging,
+    Region,
+    Scales,
+    correlation,
+    find_scales,
+    krige,
+)
 from calib.models.simulators.emulator.over import Over, over_conditions
-from calib.models.simulators.emulator.region import Region
-from calib.models.simulators.emulator.support import Support, learn_support
 
-__all__ = ["Axes", "Emulator", "Training", "build_emulator"]
+_LENGTHS = (0.2, 10.0)
+
+
+@dataclass(frozen=True)
+class Support:
+    """The probability that a run has a value, by a Gaussian process behind a logistic curve.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n, d)
+    weights : ndarray, shape (n,)
+        At its mode the latent function is the kernel times these (Rasmussen & Williams 2006,
+        Eq 3.21).
+    lengths : ndarray, shape (d,)
+    amplitude : float
+    """
+
+    x: Array
+    weights: Array
+    lengths: Array
+    amplitude: float
+
+    def latent(self, at: Array) -> Array:
+        """Return what is positive where a value is the likelier outcome, (k, d) to (k,)."""
+        found = np.empty(len(at))
+        for i in range(0, len(at), AT_ONCE):
+            found[i : i + AT_ONCE] = (
+                correlation(at[i : i + AT_ONCE], self.x, self.lengths) @ self.weights
+            )
+        # Far from all runs it is zero: nothing speaks against a value there.
+        return self.amplitude * found
+
+
+def learn_support(x: Array, ok: NDArray[np.bool_]) -> Support | None:
+    """Learn from runs; None where none failed.
+
+    Parameters
+    ----------
+    x : ndarray, shape (n, d)
+        Parameters in units of the prior's sds.
+    ok : ndarray of bool, shape (n,)
+    """
+    if ok.all() or not ok.any():
+        return None
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessClassifier
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+
+    kernel = ConstantKernel(10.0, (1.0, 1e3)) * RBF(np.full(x.shape[1], 1.5), _LENGTHS)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fitted = GaussianProcessClassifier(kernel).fit(x, ok).base_estimator_
+    found = fitted.kernel_
+    weights = fitted.y_train_ - fitted.pi_
+    return Support(
+        x, np.asarray(weights), np.atleast_1d(found.k2.length_scale) * np.ones(x.shape[1]),
+        float(found.k1.constant_value),
+    )  # fmt: skip
+
 
 _MOST_CURVES = 14
 # What is left out by the basis, in units of what may be neglected: near the posterior, elsewhere.
@@ -299,3 +368,56 @@ def _near(
         if support is not None:
             found.append((region, support))
     return tuple(found)
+
+
+@dataclass(frozen=True)
+class _Prepare:
+    """The basis curves at conditions: all of them that the emulator needs."""
+
+    emulator: Emulator
+
+    def __call__(self, conditions: Conditions, references: References) -> Rows:
+        found = self.emulator.curves_at(conditions)
+        return {str(j): np.ascontiguousarray(found[..., j]) for j in range(found.shape[-1])}
+
+
+@dataclass(frozen=True)
+class _Location:
+    """Mean curve plus coefficients times curves."""
+
+    emulator: Emulator
+
+    def __call__(self, columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+        theta = np.stack([np.ravel(c) for c in columns], axis=-1)
+        coefficients = self.emulator.coefficients(theta)
+        shape = columns[0].shape
+        found = rows["0"] + np.zeros(shape)
+        for j, c in enumerate(coefficients.T, start=1):
+            found += c.reshape(shape) * rows[str(j)]
+        return np.asarray(found)
+
+
+@dataclass(frozen=True)
+class _Uncertain:
+    """The prediction, and its error: how much of what is unknown far away, and its curves."""
+
+    emulator: Emulator
+
+    def __call__(self, theta: Array, conditions: Conditions) -> tuple[Array, Array, Array]:
+        means, unknown = self.emulator.with_unknown(theta)
+        at = self.emulator.curves_at(conditions)
+        curves = at[:, 1:] * np.sqrt(self.emulator.variances)
+        return at[:, 0] + means @ at[:, 1:].T, unknown, curves
+
+
+def emulated_model(model: Model, emulator: Emulator) -> Model:
+    """Return a model with an emulator in the place of its equation."""
+    return replace(
+        model, predict=None, prepare=_Prepare(emulator), location=_Location(emulator),
+        uncertain=_Uncertain(emulator), report_theta=not_given,
+    )  # fmt: skip
+
+
+def emulator_of(model: Model) -> Emulator | None:
+    """Return the emulator behind a model; None if there is none."""
+    return model.location.emulator if isinstance(model.location, _Location) else None

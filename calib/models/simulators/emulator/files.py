@@ -12,13 +12,15 @@ import numpy as np
 
 from calib.errors import CalibError
 from calib.models import MODELS, get_model
-from calib.models.simulators.emulator.emulator import Axes, Emulator, Training, build_emulator
-from calib.models.simulators.emulator.kriging import Scales
-from calib.models.simulators.emulator.model import emulated_model
+from calib.models.simulators.emulator.emulator import (
+    Axes,
+    Emulator,
+    Training,
+    build_emulator,
+    emulated_model,
+)
+from calib.models.simulators.emulator.kriging import Region, Scales
 from calib.models.simulators.emulator.over import over_conditions
-from calib.models.simulators.emulator.region import Region
-
-__all__ = ["load_emulator", "save_emulator", "use_emulator"]
 
 
 def save_emulator(emulator: Emulator, model: str, path: Path) -> None:

@@ -16,6 +16,8 @@ scikit-learn's `GaussianProcessRegressor` finds the same length scales (a test h
 other) in ten times the time, has no trend, and its predictions copy their input at each call; a
 sampler asks a million times, and an emulator is built anew after every few runs. GPyTorch, GPflow
 and tinygp bring torch, TensorFlow or JAX, and 300 values need none of what those are for.
+
+Where a posterior lies: the runs there matter most.
 """
 
 from __future__ import annotations
@@ -23,12 +25,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import cho_solve, cholesky, solve_triangular
 from scipy.linalg.blas import dtrmm
 
 from calib.models.base import Array
-
-__all__ = ["Kriging", "Scales", "find_scales", "krige", "minus_log_likelihood"]
 
 # Relative to the process: smaller and the matrix has no factor, larger and values are not met.
 _NUGGET, _NOISY = 1e-9, 1.0
@@ -231,3 +232,30 @@ def minus_log_likelihood(logs: Array, squares: Array, y: Array) -> tuple[float, 
     off = 0.5 * (y.shape[1] * inverse - gamma @ gamma.T / level)
     by_length = squares.reshape(len(lengths), -1) @ (off * smooth).ravel() / lengths**2
     return float(value), np.array([*by_length, nugget * np.trace(off)])
+
+
+@dataclass(frozen=True)
+class Region:
+    """A part of parameter space, with coordinates in which it is round.
+
+    Parameters
+    ----------
+    centre : ndarray, shape (d,)
+        In units of the prior's sds.
+    root : ndarray, shape (d, d)
+        Lower factor of the covariance there.
+    reach : float
+        In sds.
+    """
+
+    centre: Array
+    root: Array
+    reach: float
+
+    def coordinates(self, z: Array) -> Array:
+        """Return coordinates in which the region is round, (k, d) to (k, d)."""
+        return np.asarray(np.linalg.solve(self.root, (z - self.centre).T).T)
+
+    def inside(self, z: Array) -> NDArray[np.bool_]:
+        """Whether points lie in it, (k, d) to (k,)."""
+        return np.asarray(np.linalg.norm(self.coordinates(z), axis=1) <= self.reach)

@@ -17,8 +17,6 @@ from scipy.linalg import cho_factor, cho_solve
 
 from calib.models.base import Array
 
-__all__ = ["Over", "over_conditions"]
-
 _NUGGET = 1e-8
 # The smallest with which the matrix has a factor: by it curves miss their nodes.
 _NUGGETS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)

@@ -1,23 +1,30 @@
-"""CSV files as people have them: what separates the cells, how they are encoded, where they end."""
+"""CSV files as people have them: what separates the cells, how they are encoded, where they end.
+
+Texts that somebody else wrote, whatever is in them: how they are encoded, TOML, JSON.
+
+Numbers in a sentence: few digits, and no exponent where a person reads one faster without.
+"""
 
 from __future__ import annotations
 
+import codecs
 import contextlib
 import csv
 import hashlib
 import io
+import json
 import math
 import os
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from calib.data.documents import decoded, writable
-from calib.errors import CalibError
+from calib.errors import FAULTS, CalibError
 
 
 def _no_csv(found: str, where: str, mend: str) -> CalibError:
@@ -175,3 +182,76 @@ def _format(values: ArrayLike | Sequence[str]) -> list[str]:
     if array.dtype.kind != "f":
         return [str(int(value)) for value in array.tolist()]
     return ["" if math.isnan(value) else repr(value) for value in array.tolist()]
+
+
+# By the marks that such texts begin with; UTF-16's is the beginning of UTF-32's.
+_ENCODINGS = {
+    codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32",
+    codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16",
+}  # fmt: skip
+
+
+# Of a file that is not valid TOML.
+MEND_TOML = "correct that line; names with other characters than A-Z a-z 0-9 _ - stand in quotes"
+
+
+def decoded(raw: bytes, errors: str = "strict") -> str:
+    """Return a text without its byte-order mark: in UTF-8, unless the mark says otherwise.
+
+    Raises
+    ------
+    UnicodeDecodeError
+        If it is not so encoded, unless `errors`, as of `bytes.decode`, says what to do then.
+    """
+    marked = (name for mark, name in _ENCODINGS.items() if raw.startswith(mark))
+    return raw.decode(next(marked, "utf-8-sig"), errors)
+
+
+def writable(name: str) -> str:
+    """Return a name of a file that may be in no encoding as one that a text can hold."""
+    return name.encode("utf-8", "backslashreplace").decode()
+
+
+class _Readable(Protocol):
+    def read_bytes(self) -> bytes: ...
+
+
+def read_text(path: _Readable) -> str:
+    """Return the text of a file as `decoded` does, with the line ends of Unix."""
+    return decoded(path.read_bytes()).replace("\r\n", "\n")
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the content of a TOML file; errors of `read_text` and `tomllib` come out as such."""
+    return tomllib.loads(read_text(path))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Return a JSON object; empty where the file is missing or damaged."""
+    try:
+        return inside(json.loads(read_text(path)))
+    except FAULTS:
+        return {}
+
+
+def inside(document: Any, *keys: str) -> dict[str, Any]:
+    """Return the object below some keys of a document; empty where there is none."""
+    for key in keys:
+        document = document.get(key) if isinstance(document, dict) else None
+    return document if isinstance(document, dict) else {}
+
+
+# From here on the digits before a power of ten are fewer than the zeros that it saves.
+_LARGE = 1e5
+
+
+def plain_number(value: float, digits: int = 3) -> str:
+    """Write a number to some significant digits, without zeros that say nothing.
+
+    An exponent is written only where the number, rounded, is 100,000 or more, or below 0.0001.
+    """
+    text = f"{value:.{digits}g}"
+    if "e" not in text or not math.isfinite(value):
+        return text
+    rounded = float(text)
+    return f"{rounded:.0f}" if 1.0 <= abs(rounded) < _LARGE else text
