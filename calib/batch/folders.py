@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from itertools import count
 from pathlib import Path
 
-from calib.batch import foreign as unfinished
+from calib.batch import foreign
 from calib.errors import CalibError
 
 # Files by which a folder is known to be one of ours, and may be replaced.
@@ -75,9 +75,9 @@ def fresh_folder(out: Path, *, overwrite: bool = False) -> Iterator[Path]:
             shutil.rmtree(old)
         else:
             _put(whole, out)
-        unfinished.saved.append(out)
+        foreign.saved.append(out)
         if claim is not None:
-            unfinished.drop()
+            foreign.drop()
     except OSError as error:
         # NumPy says of a full disk itself what the system would, without its number.
         if error.errno not in (*NO_ROOM, None):
@@ -115,13 +115,13 @@ def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
     try:
         with writing(out):
             _reserve(scratch / _RESERVED)
-        with unfinished.working(scratch / _PARTS):
+        with foreign.working(scratch / _PARTS):
             _began_in.append(Path.cwd())
             try:
                 yield
             finally:
                 os.chdir(_began_in.pop())
-                unfinished.rescue(out)
+                foreign.rescue(out)
     finally:
         # Written or not, nothing of it is needed any more.
         shutil.rmtree(scratch, ignore_errors=True)

@@ -26,7 +26,7 @@ from pathlib import Path
 from threading import Lock, Thread
 from typing import Any, Protocol
 
-from calib.batch import foreign as unfinished
+from calib.batch import foreign
 from calib.batch.plugins import load_files, loaded_files
 from calib.errors import CalibError
 
@@ -195,7 +195,7 @@ def pool(
         safe_path = os.environ.get(_SAFE)
     executor = ProcessPoolExecutor(
         workers, mp_context=context, initializer=_begin,
-        initargs=([*loaded_files(), *files], safe_path, unfinished.place()),
+        initargs=([*loaded_files(), *files], safe_path, foreign.place()),
     )  # fmt: skip
     side = Pool(executor)
     # The first processes start now, not when there is work for them, and where they can wait.
@@ -297,7 +297,7 @@ def _begin(files: Sequence[Path], safe_path: str | None, parts: Path | None) -> 
     """Leave an interruption to the process that waits for the pieces; know what it knows."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     _restore(safe_path)
-    unfinished.work_for(parts)
+    foreign.work_for(parts)
     gc.freeze()  # what was imported stays: the garbage collector need not look at it again
     gc.set_threshold(20_000, 20)  # as `calib.cli.main` has it
     Thread(target=_leave_with_parent, daemon=True).start()

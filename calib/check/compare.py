@@ -32,7 +32,7 @@ from calib.check.text import (
 )
 from calib.check.tolerances import MONTE_CARLO, ORDER_OF_MAGNITUDE, is_drawn
 from calib.check.verify import AUDIT, INPUTS, MANIFEST, SUMMARY
-from calib.data import files as documents
+from calib.data import files
 from calib.data.files import inside
 from calib.errors import FAULTS, CalibError
 from calib.inference.io import read_draws
@@ -123,7 +123,7 @@ def part_of(group: str) -> str:
 
 def read_entries(folder: Path, name: str) -> dict[Place, Any]:
     """Return the entries of a document that are compared; with a run's the summary of its draws."""
-    text = documents.read_text(folder / name)
+    text = files.read_text(folder / name)
     if name.endswith(".csv"):
         rows = csv.DictReader(text.splitlines())
         document: Any = [{str(k): _cell(v) for k, v in row.items()} for row in rows]

@@ -20,7 +20,8 @@ from calib.batch.environment import differs_in_lines, sha256, unix_lines
 from calib.check.outcome import LINE_ENDS, Item, Status, claim
 from calib.check.text import GROUP as TEXT
 from calib.check.text import differing_lines, read_text
-from calib.data import Table, documents
+from calib.data import Table
+from calib.data import files as data_files
 from calib.data.files import inside
 from calib.data.quantities import OUTPUTS
 from calib.data.reader import KNOWN_DATA, label_of
@@ -232,7 +233,7 @@ def form(folder: Path) -> list[Item]:
     for path in sorted(folder.rglob("*.json")):
         # What cannot be read is said where its entries are compared.
         with suppress(*FAULTS):
-            text = documents.read_text(path)
+            text = data_files.read_text(path)
             indent = 1 if text.startswith("{\n") else None
             if text != f"{json.dumps(json.loads(text), indent=indent)}\n":
                 found.append(claim(TEXT, path.relative_to(folder).as_posix(), wrong))

@@ -17,13 +17,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from calib.check.outcome import Item, Outcome, Status
 from calib.cli import options as opt
 from calib.cli.machine import Json, finish
-from calib.data.files import plain_number
 from calib.errors import CalibError
 
 if TYPE_CHECKING:
+    from calib.check.outcome import Item, Outcome
     from calib.he2019.audit import Audit
 
 _MOST = 40
@@ -31,6 +30,8 @@ _MOST = 40
 
 def show(outcome: Outcome, *, every: bool) -> None:
     """Print what a check found: every number and file, or only those that are not the same."""
+    from calib.check.outcome import Status
+
     # A pipe has no width of its own: wide enough for whole rows.
     console = Console(width=None if sys.stdout.isatty() else 160, highlight=False, markup=False)
     console.print(outcome.verdict, soft_wrap=True)
@@ -55,6 +56,9 @@ def show(outcome: Outcome, *, every: bool) -> None:
 
 def _groups(outcome: Outcome) -> Table:
     """One row for each group: how many of its entries are what."""
+    from calib.check.outcome import Status
+    from calib.data.files import plain_number
+
     table = Table()
     table.add_column("compared")
     for status in Status:
@@ -72,6 +76,7 @@ def _groups(outcome: Outcome) -> Table:
 
 
 def _print_items(console: Console, title: str, items: Iterable[Item], most: int) -> None:
+
     listed = list(items)
     if not listed:
         return

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from calib.cli import options as opt
 from calib.errors import CalibError
 from calib.report.numbers import centre_text, interval_text
 
@@ -87,7 +86,7 @@ def announce(line: str) -> None:
 def data(
     name: Annotated[str, typer.Argument(help="he2019 or he2019-gaps")],
     out: Annotated[Path | None, typer.Option(help="Folder to write; its name if none.")] = None,
-    overwrite: opt.Overwrite = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Write the embedded, reconstructed data as CSV files, or as cases for `calib diagnose`."""
     writers = {"he2019": _write_he2019, "he2019-gaps": _write_he2019_gaps}
@@ -128,8 +127,8 @@ def _write_he2019_gaps(out: Path, overwrite: bool) -> list[Path]:
 def template(
     model: Annotated[str, typer.Argument(help="See `calib models`.")],
     out: Annotated[Path | None, typer.Option(help="CSV to write; printed if none.")] = None,
-    plugins: opt.Models = None,
-    simulator: opt.Simulators = None,
+    plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Write an example CSV of a model to fill in."""
     from calib.models import get_model, template_csv
@@ -144,8 +143,8 @@ def template(
 def priors(
     model: Annotated[str, typer.Argument(help="See `calib models`.")],
     out: Annotated[Path | None, typer.Option(help="TOML to write; printed if none.")] = None,
-    plugins: opt.Models = None,
-    simulator: opt.Simulators = None,
+    plugins: Models = None,
+    simulator: Simulators = None,
 ) -> None:
     """Write the shipped priors of a model, to copy and edit."""
     from calib.inference.prior_files import default_priors

@@ -18,19 +18,14 @@ from typer.core import TyperGroup
 from calib.cli import (
     INTERRUPTED,
     STOPPED,
-    audit,
     calibration,
     campaign,
-    challenge,
     check,
-    compare,
-    declared,
-    doctor,
     gap,
-    inputs,
     interruptible,
+    machine,
+    options,
     predict,
-    sbc,
     was_interrupted,
 )
 
@@ -77,11 +72,11 @@ class _Verbs(TyperGroup):
     """All verbs: what the user can mend, or stops, ends with a line and no traceback."""
 
     def invoke(self, ctx: Any) -> Any:
-        from calib.batch import foreign as unfinished
+        from calib.batch import foreign
         from calib.batch.folders import NO_ROOM
         from calib.errors import CalibError
 
-        unfinished.saved.clear()
+        foreign.saved.clear()
         _seen().clear()
         try:
             interruptible()
@@ -114,9 +109,9 @@ class _Verbs(TyperGroup):
 
 
 def _stopped() -> str:
-    from calib.batch import foreign as unfinished
+    from calib.batch import foreign
 
-    return "interrupted" if unfinished.saved else STOPPED
+    return "interrupted" if foreign.saved else STOPPED
 
 
 def _tell_data() -> None:
@@ -135,10 +130,10 @@ def _seen() -> dict[str, None]:
 
 def _end(why: str, code: int) -> Never:
     """Say why a command ends, and where what it had finished is, and end it."""
-    from calib.batch import foreign as unfinished
+    from calib.batch import foreign
 
     print(f"calib: {why}", file=sys.stderr)
-    for folder in unfinished.saved:
+    for folder in foreign.saved:
         print(f"calib: what was finished is in {folder}", file=sys.stderr)
     raise typer.Exit(code) from None
 
@@ -153,13 +148,13 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for verb in (
-    calibration.report, calibration.fit, predict.predict, inputs.data, inputs.template,
-    inputs.priors, declared.models, declared.effects,
-    declared.quantities, compare.compare, gap.diagnose, check.check, audit.audit,
-    campaign.campaign, sbc.sbc, doctor.doctor,
+    calibration.report, calibration.fit, predict.predict, options.data, options.template,
+    options.priors, gap.models, gap.effects,
+    gap.quantities, calibration.compare, gap.diagnose, check.check, check.audit,
+    campaign.campaign, campaign.sbc, machine.doctor,
 ):  # fmt: skip
     app.command()(verb)
-app.add_typer(challenge.verbs, name="challenge")
+app.add_typer(campaign.verbs, name="challenge")
 add_examples(app)
 
 

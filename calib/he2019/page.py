@@ -22,13 +22,13 @@ from calib.he2019.audit.run import audit_csv, audit_json
 from calib.he2019.datasets.published import DOI
 from calib.he2019.gaps.find import Check, FoundGap, checks, probability_of
 from calib.models import get_model
-from calib.report.figures.style import Plate
+from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_facts import short_name
 from calib.report.labels import odds_text, percent, percent_range, unbroken
 from calib.report.numbers import NOTHING, format_number
 from calib.report.page.diagnosis import TONE_MARKS, render_diagnosis
-from calib.report.page.tables import data_uri, picture, png_size, sentences, template, unit_html
+from calib.report.page.template import data_uri, picture, png_size, sentences, template, unit_html
 from calib.report.study import Progress
 
 _TITLE = "Audit of the published tables: He, Sandu & Osorio (2019)"
@@ -66,7 +66,7 @@ def write_audit(audit: Audit, folder: Path) -> str:
 
 def write_audit_page(audit: Audit, folder: Path, command: Sequence[str]) -> None:
     """Write what `write_audit` does, and ``index.html``, into an existing folder."""
-    page = template("audit_page.html.j2", "calib.he2019.page").render(
+    page = template("audit_page.html.j2", "calib.he2019").render(
         title=_TITLE,
         section=Markup(write_audit(audit, folder)),
         seed=audit.seed,
@@ -94,7 +94,7 @@ def audit_section(audit: Audit, plates: Sequence[Plate], images: Mapping[str, by
         {"verdict": v.value, "meaning": v.meaning, "mark": AUDIT_MARKS[v], "n": n}
         for v, n in audit.counts.items()
     ]
-    return template("audit.html.j2", "calib.he2019.page").render(
+    return template("audit.html.j2", "calib.he2019").render(
         counts=counts,
         groups=groups,
         free=sum(not f.reconstructed for f in audit.findings),
@@ -154,7 +154,7 @@ def _quantity(q: Quantity) -> dict[str, Any]:
     }
 
 
-_CHECKS = declared("page/checks.toml")
+_CHECKS = declared("checks.toml")
 # Numbers that not every check of a kind has.
 _ABSENT = dict.fromkeys(("rmse_before_mm", "rmse_after_mm", "largest_relative_after"), 0.0)
 _said = sentences(odds=odds_text)
@@ -193,7 +193,7 @@ def begin_gaps_section(
             tell("the paper's own gaps: drawing", i, len(pieces))
             blocks.append(piece.result())
         tell("the paper's own gaps: drawing", len(pieces), len(pieces))
-        return template("gaps.html.j2", "calib.he2019.page").render(gaps=blocks)
+        return template("gaps.html.j2", "calib.he2019").render(gaps=blocks)
 
     return finish
 

@@ -7,6 +7,7 @@ emcee's autocorrelation time is worked out for all walkers at once.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any, Literal
 
 import numpy as np

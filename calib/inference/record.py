@@ -1,7 +1,4 @@
-"""Refuse rows at which a model has no value, whatever its parameters.
-
-What a folder says of itself, read and checked: what all kinds have, and the record of a run.
-"""
+"""What a folder says of itself, read and checked: what all kinds have, and the record of a run."""
 
 from __future__ import annotations
 
@@ -9,8 +6,6 @@ import json
 from pathlib import Path, PurePosixPath
 from typing import Annotated, ClassVar, Literal, get_args
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -25,42 +20,6 @@ from calib.batch.environment import Environment
 from calib.errors import CalibError
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS
-from calib.models.base import Array, BoundModel, Conditions
-
-_SHOWN = 5
-
-
-def check_defined(
-    bound: BoundModel, theta: Array, conditions: Conditions, source: str, lines: NDArray[np.int64]
-) -> None:
-    """Refuse rows at which no parameter vector has a finite prediction.
-
-    Parameters
-    ----------
-    bound : BoundModel
-    theta : ndarray, shape (k, d)
-        Natural parameters of the model, as its prior spreads them.
-    conditions : mapping of str to ndarray, shape (n,)
-    source : str
-        What the rows are from, for the message.
-    lines : ndarray, shape (n,)
-        Where they stand there.
-
-    Raises
-    ------
-    CalibError
-        Naming the lines.
-    """
-    empty = lines[~np.isfinite(bound.location(theta, conditions)).any(axis=0)]
-    if empty.size:
-        raise CalibError(
-            f"the model {bound.model.name} has no value there",
-            where=f"{source}, lines {', '.join(map(str, empty[:_SHOWN]))}"
-            + (f" and {empty.size - _SHOWN} more" if empty.size > _SHOWN else ""),
-            allowed="conditions at which the model is defined (see its page in the documentation)",
-            mend="leave these rows out, or choose another model",
-        )
-
 
 RUN, POSTERIOR, PRIORS, DATA = "run.json", "posterior.nc", "priors.toml", "data.csv"
 

@@ -18,7 +18,7 @@ from calib.inference.problem import build_problem
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
 from calib.report.comparison import document, table, write_comparison
-from calib.report.page.tables import template
+from calib.report.page.template import template
 from calib.report.sections import Written
 from calib.report.study import Progress, Study
 from calib.report.study_tasks import Task, fitted_rows

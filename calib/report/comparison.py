@@ -23,10 +23,11 @@ from calib.inference.io import load_calibration, save_calibration
 from calib.inference.record import Entry, File, Hash, KnownModel, Record, read_record
 from calib.models import get_model
 from calib.models.base import Array
-from calib.report.figures.style import BLACK, BLUE, legend_below, mark, panels, png_bytes, style
+from calib.report.figures.plate import mark
+from calib.report.figures.style import BLACK, BLUE, legend_below, panels, png_bytes, style
 from calib.report.labels import aligned, axis_of, units_of
 from calib.report.numbers import finite, format_number
-from calib.report.page.tables import data_uri, template
+from calib.report.page.template import data_uri, template
 from calib.report.verdict import Verdict, keep_verdict, kept_verdict, verdict
 from calib.report.writer import file_hashes, own_names
 from calib.validation.comparison import Candidate, Comparison, difference, sentence

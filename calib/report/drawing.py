@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from calib.batch.pool import Later, Pool
-from calib.report.figures.style import Plate
+from calib.report.figures.plate import Plate
 from calib.report.labels import units_of
 from calib.report.reference import reference_of
 from calib.report.study import OutputResult, Study
@@ -37,7 +37,8 @@ def begin_figures(study: Study, pool: Pool, *, pdf: bool = False) -> dict[str, L
 def _drawn(key: str, result: OutputResult, pdf: bool) -> Drawn:
     # Late: where the figures are drawn, which as a rule is another process.
     from calib.report.figures.collect import plates
-    from calib.report.figures.style import marked, pdf_bytes, png_bytes
+    from calib.report.figures.plate import marked
+    from calib.report.figures.style import pdf_bytes, png_bytes
 
     with units_of(result.task.table.header):
         label = result.task.table.label

@@ -133,7 +133,7 @@ class FoundEmulators:
 
 
 def _emulators_html(documents: Mapping[str, Document]) -> str:
-    from calib.report.page.tables import template
+    from calib.report.page.template import template
 
     failed = [
         {

@@ -21,7 +21,7 @@ from calib.models import get_model
 from calib.models.simulators.emulator.emulator import emulator_of
 from calib.models.simulators.emulator.files import save_emulator
 from calib.report.drawing import Drawn, begin_figures
-from calib.report.figures.style import Plate
+from calib.report.figures.plate import Plate
 from calib.report.page.content import render_page
 from calib.report.publish import publication
 from calib.report.sections import Found

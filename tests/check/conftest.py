@@ -20,7 +20,7 @@ import pytest
 import calib.check.check as check_report_module
 import calib.check.check as check_run_module
 from calib.batch.environment import sha256
-from calib.check import compare, montecarlo, posteriors
+from calib.check import compare, posteriors, tolerances
 from calib.check.check import check, recompute_report
 from calib.check.outcome import Outcome, Status
 from calib.he2019 import sections
@@ -171,7 +171,7 @@ def computed_once(_made, _read, audited_once, monkeypatch: pytest.MonkeyPatch) -
             cache[key] = calibration, posterior_errors(calibration)
         return dict(cache[key][1])
 
-    monkeypatch.setattr(montecarlo, "posterior_errors", errors_once)
+    monkeypatch.setattr(tolerances, "posterior_errors", errors_once)
     monkeypatch.setattr(check_report_module, "recompute_report", report_again)
     monkeypatch.setattr(check_run_module, "recompute_run", run_again)
     monkeypatch.setattr(posteriors, "_groups", reading_once(posteriors._groups))

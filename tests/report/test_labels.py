@@ -17,7 +17,7 @@ from calib.report.labels import (
     unit_text,
     units_of,
 )
-from calib.report.page.tables import unit_html
+from calib.report.page.template import unit_html
 from calib.report.publish.markup import latex_unit
 
 MINUS = "\N{MINUS SIGN}"

@@ -16,7 +16,7 @@ from calib.he2019 import declared
 from calib.he2019.audit.intervals import Interval
 from calib.he2019.datasets.published import PUBLISHED
 from calib.report.numbers import format_number
-from calib.report.page.tables import sentences
+from calib.report.page.template import sentences
 from calib.report.reference import Figure
 
 

@@ -17,6 +17,7 @@ from calib.he2019.audit.rounding import InverseStudy, attenuation
 from calib.models.base import Array
 from calib.models.bekker import rut_depth
 from calib.models.magic_formula import magic_formula
+from calib.report.figures.plate import Plate, draw_all
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -24,8 +25,6 @@ from calib.report.figures.style import (
     GREY,
     ORANGE,
     VERMILION,
-    Plate,
-    draw_all,
     legend_below,
     note,
     panels,

@@ -22,6 +22,7 @@ from calib.models.base import Array, BoundModel
 from calib.models.bekker import rut_depth
 from calib.models.magic_formula import magic_formula
 from calib.report.figures.gap import probability_text
+from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLUE,
     CYCLE,
@@ -30,7 +31,6 @@ from calib.report.figures.style import (
     MARKERS,
     SKY,
     SMALLEST_PT,
-    Plate,
     legend_below,
     panels,
     style,

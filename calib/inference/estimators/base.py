@@ -6,10 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calib.data.quantities import QUANTITIES
+from calib.errors import CalibError
 from calib.inference.problem import Problem
-from calib.models.base import Array
+from calib.models.base import Array, BoundModel, Conditions
 
 # Rows times vectors evaluated at once: bounds the memory, keeps temporaries in cache.
 _CHUNK_CELLS = 200_000
@@ -124,3 +126,38 @@ def goodness(
         converged=converged,
         note="; ".join(note for note in notes if note),
     )
+
+
+_SHOWN = 5
+
+
+def check_defined(
+    bound: BoundModel, theta: Array, conditions: Conditions, source: str, lines: NDArray[np.int64]
+) -> None:
+    """Refuse rows at which no parameter vector has a finite prediction.
+
+    Parameters
+    ----------
+    bound : BoundModel
+    theta : ndarray, shape (k, d)
+        Natural parameters of the model, as its prior spreads them.
+    conditions : mapping of str to ndarray, shape (n,)
+    source : str
+        What the rows are from, for the message.
+    lines : ndarray, shape (n,)
+        Where they stand there.
+
+    Raises
+    ------
+    CalibError
+        Naming the lines.
+    """
+    empty = lines[~np.isfinite(bound.location(theta, conditions)).any(axis=0)]
+    if empty.size:
+        raise CalibError(
+            f"the model {bound.model.name} has no value there",
+            where=f"{source}, lines {', '.join(map(str, empty[:_SHOWN]))}"
+            + (f" and {empty.size - _SHOWN} more" if empty.size > _SHOWN else ""),
+            allowed="conditions at which the model is defined (see its page in the documentation)",
+            mend="leave these rows out, or choose another model",
+        )

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import CalibError
-from calib.inference.estimators.base import PointEstimate, residuals, sum_of_squares
+from calib.inference.estimators.base import PointEstimate, check_defined, residuals, sum_of_squares
 from calib.inference.estimators.search import (
     Found,
     central_interval,
@@ -17,7 +17,6 @@ from calib.inference.estimators.search import (
     representative_rows,
 )  # fmt: skip
 from calib.inference.problem import Problem
-from calib.inference.record import check_defined
 from calib.inference.sampling.mode import prior_widths
 from calib.models.base import Array
 

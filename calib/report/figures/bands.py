@@ -20,6 +20,7 @@ from calib.data.quantities import role_of
 from calib.data.table import Table
 from calib.errors import CalibError
 from calib.models.base import Array, Model
+from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -30,7 +31,6 @@ from calib.report.figures.style import (
     MIDDLE_MM,
     ORANGE,
     VERMILION,
-    Plate,
     legend_below,
     panels,
 )

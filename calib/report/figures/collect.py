@@ -11,8 +11,8 @@ from calib.report.figures.bands import (
     prior_predictive_plate,
 )
 from calib.report.figures.estimates import by_pressure_plate, estimates_plate
+from calib.report.figures.plate import Plate, draw_all
 from calib.report.figures.posterior import corner_plate, ensembles_plate, learned_plate
-from calib.report.figures.style import Plate, draw_all
 from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.reference import NOTHING, Reference
 from calib.report.study import OutputResult

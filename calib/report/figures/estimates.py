@@ -12,6 +12,7 @@ from calib.inference.diagnostics import distances
 from calib.inference.estimators import PointEstimate, method_name
 from calib.models.base import Array
 from calib.models.magic_formula import coefficients_at
+from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
     CYCLE,
@@ -21,7 +22,6 @@ from calib.report.figures.style import (
     ORANGE,
     SMALLEST_PT,
     SYMBOL_PT,
-    Plate,
     legend_below,
     panels,
 )

@@ -18,6 +18,7 @@ from calib.gap.diagnose import NAMED, Diagnosis
 from calib.gap.isolate import ALIKE, Isolability
 from calib.gap.placebo import Placebo, placebos
 from calib.report.figures.gap_where import conditions_plate, how_far_plate, where_plate
+from calib.report.figures.plate import Plate, draw_all, marked
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -29,10 +30,7 @@ from calib.report.figures.style import (
     SKY,
     SMALLEST_PT,
     VERMILION,
-    Plate,
-    draw_all,
     legend_below,
-    marked,
     note,
     panels,
 )

@@ -17,6 +17,7 @@ from calib.data.quantities import role_of
 from calib.gap.diagnose import Diagnosis
 from calib.gap.where import Region, conditions_to_search
 from calib.models.base import Array
+from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -24,7 +25,6 @@ from calib.report.figures.style import (
     ORANGE,
     SMALLEST_PT,
     VERMILION,
-    Plate,
     legend_below,
     panels,
 )

@@ -20,6 +20,7 @@ from calib.inference.calibration import Calibration
 from calib.inference.diagnostics import N_BINS, rank_histograms, rank_scatter
 from calib.inference.priors import Prior, Priors
 from calib.models.base import Array
+from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -33,7 +34,6 @@ from calib.report.figures.style import (
     SMALLEST_PT,
     SYMBOL_PT,
     WIDE,
-    Plate,
     legend_below,
     panels,
 )

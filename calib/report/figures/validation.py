@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 
 from calib.models.base import Array
 from calib.report.figures.bands import cone_and_water, draw_predicted_observed
+from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
     BLUE,
@@ -18,7 +19,6 @@ from calib.report.figures.style import (
     MARKERS,
     ORANGE,
     VERMILION,
-    Plate,
     legend_below,
     note,
     panels,

@@ -14,20 +14,22 @@ import numpy as np
 from markupsafe import Markup
 
 from calib.models import get_model
-from calib.report.figures.style import Plate
+from calib.report.figures.plate import Plate
 from calib.report.labels import axis_of, percent, short, units_of
 from calib.report.numbers import TIMES, format_number, format_value
 from calib.report.page.tables import (
-    equation,
     estimates_grid,
-    likelihood,
-    parametrisation,
-    picture,
     posterior_rows,
     pressure_grids,
     prior_rows,
-    prose,
     sensitivity_grid,
+)
+from calib.report.page.template import (
+    equation,
+    likelihood,
+    parametrisation,
+    picture,
+    prose,
     template,
 )
 from calib.report.publish import Publication

@@ -37,7 +37,7 @@ from calib.gap.odds import (
 from calib.gap.placebo import placebos
 from calib.gap.where import Region
 from calib.models import get_model
-from calib.report.figures.style import Plate
+from calib.report.figures.plate import Plate
 from calib.report.gap_evidence import (
     conditions_text,
     covered_text,
@@ -57,7 +57,7 @@ from calib.report.gap_facts import (
 from calib.report.gap_verdict import Tone, advice, judge_gap, repeats_needed
 from calib.report.labels import MINUS, odds_text, percent, percent_range, short
 from calib.report.numbers import format_value
-from calib.report.page.tables import equation, parametrisation, picture, prose, template
+from calib.report.page.template import equation, parametrisation, picture, prose, template
 from calib.report.parameters import parameter_text, unit_of
 
 # A hypothesis or a cause that is less probable is ruled out.

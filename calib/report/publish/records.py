@@ -30,7 +30,7 @@ from calib.report.numbers import (
     format_value,
     last_place,
 )
-from calib.report.page.tables import template
+from calib.report.page.template import template
 from calib.report.publish.markup import joined_symbols, to_latex
 from calib.report.reference import Reference, reference_of
 from calib.report.study_tasks import HoldOut

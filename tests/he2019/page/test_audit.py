@@ -9,7 +9,7 @@ import pytest
 
 from calib.he2019.audit import Verdict
 from calib.he2019.page import AUDIT_MARKS, audit_section, write_audit_page
-from calib.report.figures.style import Plate
+from calib.report.figures.plate import Plate
 from calib.report.sections import Written
 from tests.browser import faults
 from tests.report.page.test_page import PNG, Reader, page

@@ -7,7 +7,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 
 from calib.report.figures.style import png_bytes, style
-from calib.report.page.tables import png_size
+from calib.report.page.template import png_size
 
 
 def _figure(title: str) -> Figure:

@@ -18,8 +18,9 @@ from calib.report.figures import collect
 from calib.report.figures.bands import bands_plate, density_plate, prior_predictive_plate
 from calib.report.figures.collect import plates
 from calib.report.figures.estimates import estimates_plate
+from calib.report.figures.plate import Plate
 from calib.report.figures.posterior import corner_plate, ensembles_plate, learned_plate
-from calib.report.figures.style import Plate, style
+from calib.report.figures.style import style
 from calib.report.figures.validation import residuals_plate, validation_plate
 from calib.report.labels import axis_of, units_of
 from calib.report.reference import NOTHING

@@ -19,6 +19,7 @@ from matplotlib.text import Text
 from calib.he2019.figures.gaps import HE2019
 from calib.report.figures.bands import FILLS
 from calib.report.figures.collect import plates
+from calib.report.figures.plate import Plate
 from calib.report.figures.style import (
     BLACK,
     CYCLE,
@@ -30,7 +31,6 @@ from calib.report.figures.style import (
     MIDDLE_MM,
     SINGLE_MM,
     SMALLEST_PT,
-    Plate,
     pdf_bytes,
     png_bytes,
     style,

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.report.page.tables import template
+from calib.report.page.template import template
 from tests.browser import AXE, PHONE, Browser, faults
 
 BODY = """

@@ -14,19 +14,21 @@ from calib.data import read_table
 from calib.he2019.figures.gaps import HE2019
 from calib.inference.noise import Noise, NoiseChoice
 from calib.models import MODELS, example_csv
-from calib.report.figures.style import Plate
+from calib.report.figures.plate import Plate
 from calib.report.labels import units_of
 from calib.report.page.content import failed_section, render_page, repeats_words, validation_facts
 from calib.report.page.tables import (
-    equation,
     estimates_grid,
+    posterior_rows,
+    pressure_grids,
+    sensitivity_grid,
+)
+from calib.report.page.template import (
+    equation,
     likelihood,
     parametrisation,
     png_size,
-    posterior_rows,
-    pressure_grids,
     prose,
-    sensitivity_grid,
     symbol_html,
     unit_html,
 )
