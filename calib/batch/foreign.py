@@ -22,7 +22,6 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from calib.batch.sources import own_files
 from calib.batch.threads import no_floating_point_errors
 from calib.errors import CalibError
 
@@ -103,6 +102,8 @@ def loading(module: str, path: Path) -> Iterator[None]:
 
 def beside(path: Path) -> dict[str, Path]:
     """Return the modules in a file's folder that it imports, or that these import, by name."""
+    from calib.batch.sources import own_files
+
     files = own_files(path, named=False)[1:]
     packages = {f.parent.name: f for f in files if f.name == "__init__.py"}
     found = {f.stem: f for f in files if f.parent == path.parent and f.suffix == ".py"} | packages

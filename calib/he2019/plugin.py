@@ -72,7 +72,7 @@ class Plugin:
     def register(self) -> None:
         """Register data, methods, designs, printed results and sections; once."""
         from calib.he2019.designs import DESIGNS as OWN_DESIGNS
-        from calib.he2019.figures.gaps import HE2019 as PRINTED
+        from calib.he2019.figures.reference import HE2019 as PRINTED
 
         if _LABEL in REFERENCES:
             return
