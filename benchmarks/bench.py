@@ -1,4 +1,4 @@
-"""Run the benchmarks and write reports/benchmarks: tables, a figure, and what they say.
+"""Run the benchmarks and write out/benchmarks: tables, a figure, and what they say.
 
     python benchmarks/bench.py                       # all parts, an hour on two cores
     python benchmarks/bench.py posterior likelihood  # some of them; the others stay as they were
@@ -42,7 +42,7 @@ def main() -> int:
     """Run the parts asked for, then write the report."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(PARTS)}")
-    parser.add_argument("--out", type=Path, default=HERE.parent / "reports" / "benchmarks")
+    parser.add_argument("--out", type=Path, default=HERE.parent / "out" / "benchmarks")
     parser.add_argument(
         "--full", action="store_true", help="campaigns of 200, `make test`: 40 minutes more"
     )

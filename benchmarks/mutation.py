@@ -11,7 +11,7 @@ project, and the tests of its module run there up to the first that fails: it wa
 one that takes five times the tests' processor time: it hangs. With --room those of its room run
 where none of these fails. Not drawn from are messages, annotations, decorators and the guards
 `strict=`, `repr=` and `compare=`, of which no result depends. Each result is a line of
-`out/mutation/SEED.jsonl`; `reports/mutation.md` explains them.
+`out/mutation/SEED.jsonl`.
 """
 
 from __future__ import annotations

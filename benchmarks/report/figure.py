@@ -9,7 +9,17 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from calib.report.figures.style import BLACK, BLUE, GREEN, GREY, ORANGE, VERMILION, legend_below, panels, style  # fmt: skip
+from calib.report.figures.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    VERMILION,
+    legend_below,
+    panels,
+    style,
+)
 from report.rows import NAMES, RHAT_MAX, sound
 
 __all__ = ["draw"]

@@ -227,6 +227,8 @@ def check_report(manifest: Manifest, job: Job) -> list[Item]:
         f"{SUMMARY} and {MANIFEST}": lambda: publication(manifest.document, summary).files,
         **{kind.name: partial(kind.derived, folder, manifest.files) for kind in SECTIONS.values()},
     }
+    if not manifest.views:
+        writers = {}
     return items + verify.derived(folder, manifest.files, writers, sure=same_code)
 
 
@@ -297,7 +299,8 @@ def _numbers(manifest: Manifest, study: Study, summary: Mapping[str, Any], job: 
         other = "the posterior mode in summary.json does not follow from these priors and the data"
         blamed = verify.blame(points, task.data.file, wrong)
         items += blamed or verify.blame(mode, task.priors.file, other)
-    for name in sorted(filter(compare.is_document, verify.files_in(job.made) - {SUMMARY})):
+    made = verify.files_in(job.made) if manifest.views else {*manifest.files, MANIFEST}
+    for name in sorted(filter(compare.is_document, made - {SUMMARY})):
         items += compare.document(name, job)
     return items
 
@@ -318,6 +321,8 @@ def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
         return Judgement(why, size, size <= _LITTLE)
 
     made, items = verify.files_in(job.made), []
+    if not manifest.views:
+        made &= {*manifest.files, *manifest.left_out}
     for name in sorted(n for n in made - verify.derived_files(made) if not compare.is_document(n)):
         if name in manifest.left_out:
             same = sha256((job.made / name).read_bytes()) == manifest.left_out[name]

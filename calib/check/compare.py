@@ -42,7 +42,7 @@ from calib.report.study import Progress
 from calib.validation.validate import Errors, Place
 
 # What a record has about its own folder: durations, and hashes that are verified as such.
-_OWN, _OF_FILES = ("seconds", "files", "left_out", "sha256"), ("sha256", "shipped")
+_OWN, _OF_FILES = ("seconds", "views", "files", "left_out", "sha256"), ("sha256", "shipped")
 _POINTS = ("estimates", "fit", "by_pressure")
 # Posterior, scores and sampling figures come of the same draws.
 _CHAIN = ("posterior", "prior_sensitivity", "validation", "sampling", "gate", "mode",

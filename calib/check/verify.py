@@ -82,6 +82,7 @@ class Manifest(Record):
     command: tuple[str, ...]
     tasks: Annotated[dict[str, TaskRecord], Field(min_length=1)]
     pdf: bool = False
+    views: bool = True
     files: dict[File, Hash]
     left_out: dict[File, Hash]
 

@@ -45,6 +45,10 @@ def report(
     posteriors: Annotated[
         bool, typer.Option(help="Keep the posteriors, megabytes of netCDF, in the folder.")
     ] = True,
+    views: Annotated[
+        bool,
+        typer.Option(help="Keep page, figures and tables; without, numbers and inputs alone."),
+    ] = True,
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,
     simulator: opt.Simulators = None,
@@ -118,8 +122,8 @@ def report(
         study = found.study
         page = write_report(
             study, out, settings=settings, command=opt.command(), title=title, sections=found.found,
-            overwrite=overwrite, posteriors=posteriors, pdf=pdf, drawn=found.drawn, progress=tell,
-            pool=side,
+            overwrite=overwrite, posteriors=posteriors and views, views=views, pdf=pdf,
+            drawn=found.drawn, progress=tell, pool=side,
         )  # fmt: skip
     verdicts = {}
     for key, result in study.successes.items():

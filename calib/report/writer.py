@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,7 @@ def write_report(
     sections: Sequence[Found] = (),
     overwrite: bool = False,
     posteriors: bool = True,
+    views: bool = True,
     environment: Environment | None = None,
     pdf: bool = False,
     drawn: Mapping[str, Later[Drawn]] | None = None,
@@ -111,6 +113,9 @@ def write_report(
     posteriors : bool
         Whether to keep the netCDF files, which are megabytes. Where they are left out, the
         manifest says so and has their hashes.
+    views : bool
+        Whether to keep what follows from the numbers: page, figures, tables, diagnoses of gaps. To
+        keep under version control, numbers and inputs are enough; durations go too.
     environment : Environment, optional
         Where the manifest says the report was made: that of this process by default.
     pdf : bool
@@ -175,12 +180,27 @@ def write_report(
         (folder / "index.html").write_text(page, encoding="utf-8")
         files = file_hashes(folder)
         left_out = [] if posteriors else [f"{key}.nc" for key in successes]
+        manifest["views"] = views
         manifest["left_out"] = {name: files.pop(name) for name in left_out}
-        for name in left_out:
-            (folder / name).unlink()
+        if not views:
+            del manifest["seconds"]
+            files = {name: files[name] for name in files if _is_kept(name)}
+        for made in sorted(folder.rglob("*"), reverse=True):  # what is in a folder before it
+            if made.is_dir():
+                with suppress(OSError):  # not empty
+                    made.rmdir()
+            elif made.relative_to(folder).as_posix() not in files:
+                made.unlink()
         manifest["files"] = files
         (folder / "manifest.json").write_text(json.dumps(manifest, indent=1) + "\n")
-    return Path(out) / "index.html"
+    return Path(out) / ("index.html" if views else "summary.json")
+
+
+def _is_kept(name: str) -> bool:
+    """Whether a file is numbers or input, not a view of them."""
+    return name.startswith(("data/", "priors/", "emulators/")) or (
+        "/" not in name and name.endswith(".json")
+    )
 
 
 def _keep(key: str, result: OutputResult, folder: Path) -> None:

@@ -24,7 +24,7 @@ from challenge.measured.cases import HERE, NONE, UNLISTED, MeasuredCase, read_ca
 from challenge.measured.marks import FAILED, mark, markdown
 
 CASES = read_cases()
-REPORT = Path(__file__).parents[2] / "reports" / "challenge" / "measured.md"
+REPORT = Path(__file__).parents[2] / "reports" / "measured.md"
 
 
 def named(name: str) -> MeasuredCase:

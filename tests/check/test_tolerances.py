@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,12 +12,11 @@ from calib.check.outcome import Status
 from calib.check.text import compare_entries, flatten
 from calib.check.tolerances import _PATTERNS, TABLE, tolerance_of
 from calib.check.verify import SUMMARY
-
-REPORT = Path(__file__).resolve().parents[2] / "reports" / "he2019"
+from tests.main_report import main_report
 
 
 def entries(name: str) -> dict[tuple[str, ...], Any]:
-    text = (REPORT / name).read_text()
+    text = (main_report() / "he2019" / name).read_text()
     if not name.endswith(".json"):
         header, first = (line.split(",") for line in text.splitlines()[:2])
         row = zip(header, first, strict=True)
@@ -27,7 +25,8 @@ def entries(name: str) -> dict[tuple[str, ...], Any]:
 
 
 def documents() -> list[str]:
-    names = [p.relative_to(REPORT).as_posix() for p in REPORT.rglob("*") if p.is_file()]
+    report = main_report() / "he2019"
+    names = [p.relative_to(report).as_posix() for p in report.rglob("*") if p.is_file()]
     return sorted(filter(is_document, names))
 
 

@@ -23,9 +23,9 @@ from calib.inference.record import RunRecord
 from calib.models import example_csv
 from calib.models.simulators.files import SimulatorFile
 from tests.cli.test_cli import Calib
-from tests.docs.pages import DOCS, ROOT
+from tests.docs.pages import DOCS
+from tests.main_report import main_report
 
-REPORTS = ROOT / "reports"
 RESULTS = (DOCS / "formats" / "results.md").read_text(encoding="utf-8")
 EXTEND = (DOCS / "extend.md").read_text(encoding="utf-8")
 # Of the program's own, before any test adds to them.
@@ -60,7 +60,7 @@ def keys(value: Any, names: int = 0) -> Iterator[str]:
     ],
 )  # fmt: skip
 def test_every_key_is_told(file: str) -> None:
-    document = json.loads((REPORTS / file).read_text(encoding="utf-8"))
+    document = json.loads((main_report() / file).read_text(encoding="utf-8"))
     told = set(re.findall(r"`(\w+)`", RESULTS))
     assert {key for key in keys(document) if key not in told} == set()
 
@@ -90,7 +90,7 @@ MODELS_OF = described()
     ],
 )  # fmt: skip
 def test_what_is_written_is_as_its_schema_says(name: str, pattern: str) -> None:
-    files = sorted(REPORTS.glob(pattern))
+    files = sorted(main_report().glob(pattern))
     assert files
     for path in files:
         text = path.read_text(encoding="utf-8")

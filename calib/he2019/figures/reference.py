@@ -1,4 +1,5 @@
 """The published figures that belong beside a result: parameters, curves and stated limits."""
+
 from __future__ import annotations
 
 from collections.abc import Mapping
