@@ -303,7 +303,6 @@ def columns_meant(
 
     Parameters
     ----------
-    headers : iterable of str
     names : iterable of str
         Canonical names of the quantities.
     cutoff : float

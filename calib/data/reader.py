@@ -107,7 +107,6 @@ def read_table(
 
     Parameters
     ----------
-    path : path-like
     required : sequence of str
         Canonical names of the columns that will be used. If none are named, all count as used.
     allow_missing : collection of str

@@ -129,10 +129,6 @@ class Registry[T](Mapping[str, T]):
 def register(*declared: _Declared) -> None:
     """Make quantities, models or effects known by their names.
 
-    Parameters
-    ----------
-    *declared : Quantity, Model or Effect
-
     Raises
     ------
     CalibError

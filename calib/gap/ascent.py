@@ -70,11 +70,9 @@ class Ascent:
 
     Parameters
     ----------
-    problem : Residuals
     psi : ndarray, shape (d,)
     raw : ndarray, shape (N,)
         Residuals at psi.
-    noise : dict of str to Noise
     steps : int
         That it may still take.
     jacobian : ndarray, shape (d, N), optional

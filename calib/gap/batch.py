@@ -51,8 +51,6 @@ def diagnose_cases(
 
     Parameters
     ----------
-    cases : sequence of Path
-    out : Path
     seed : int
         Results do not depend on the number of workers.
     workers, scheduler, progress, announce
@@ -86,7 +84,6 @@ def written(found: Diagnosis, effects: Mapping[str, bytes] | None = None) -> dic
 
     Parameters
     ----------
-    found : Diagnosis
     effects : mapping of str to bytes, optional
         Files of the user's own effects, by name.
     """

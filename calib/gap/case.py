@@ -29,7 +29,6 @@ class Case:
 
     Parameters
     ----------
-    name : str
     lab, field : Table
         The campaign of the calibration, and the one the simulator is used for.
     models : mapping of str to str

@@ -52,7 +52,6 @@ class Corrected:
 
     Parameters
     ----------
-    mixture : Mixture
     lab_mode : mapping of str to ndarray
         Internal parameters of each simulator.
     """
@@ -275,7 +274,6 @@ def conditions_outside(corrected: Corrected, table: Table) -> dict[str, int]:
 
     Parameters
     ----------
-    corrected : Corrected
     table : Table
         New conditions.
 
@@ -312,7 +310,6 @@ def predict_columns(
 
     Parameters
     ----------
-    corrected : Corrected
     table : Table
         With the conditions of all models and the covariates of the effects.
     left_out : collection of str, optional
@@ -418,7 +415,6 @@ def shrink(
 
     Parameters
     ----------
-    data : Campaigns
     truth : Truth
         At conditions that were not fitted.
     before, after : mapping of str to ndarray, shape (n,)

@@ -39,12 +39,7 @@ def other_conditions(view: View) -> tuple[str, ...]:
 
 
 class Covariates:
-    """Covariates of a pair of campaigns on a scale of -1..1.
-
-    Parameters
-    ----------
-    data : Campaigns
-    """
+    """Covariates of a pair of campaigns on a scale of -1..1."""
 
     def __init__(self, data: Campaigns) -> None:
         self.data = data

@@ -39,10 +39,6 @@ _LEAST = 0.2
 class Density:
     """Likelihood times prior of a fit's hypothesis, averaged over the noise.
 
-    Parameters
-    ----------
-    fit : Fit
-
     Attributes
     ----------
     drawn : ndarray of int, shape (u,)
@@ -86,7 +82,6 @@ class Density:
         Parameters
         ----------
         drawn : ndarray, shape (k, u)
-        rng : numpy.random.Generator
 
         Returns
         -------

@@ -36,7 +36,6 @@ def departed_of_all(
     ----------
     asked : sequence of (Forward, ndarray)
         With psi of each, shape (k, d); one below the other they are the rows of `plain`.
-    view : View
     plain : dict of str to ndarray, shape (sum of k, n)
     idle : mapping of int to collection of int
         Effects to leave out of one of those asked, by their place.

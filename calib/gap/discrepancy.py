@@ -32,8 +32,6 @@ class Discrepancy:
 
     Parameters
     ----------
-    data : Campaigns
-    hypothesis : Hypothesis
     lab_mode : mapping of str to ndarray
         Internal parameters of the simulators as the lab calibrated them; for a discrepancy that
         varies with the level of the output.

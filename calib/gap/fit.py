@@ -38,13 +38,10 @@ class Fit:
 
     Parameters
     ----------
-    forward : Forward
     psi : ndarray, shape (d,)
     covariance : ndarray, shape (d, d)
-    noise : mapping of str to Noise
     log_evidence : float
         Laplace's, or that of the draws.
-    log_likelihood : float
     field_residuals : mapping of str to ndarray
         Standardised residuals of the field rows of each output.
     sample : ndarray, shape (draws, d), optional
@@ -82,7 +79,6 @@ class Start:
 
     Parameters
     ----------
-    forward : Forward
     guesses : ndarray, shape (k, d)
     noise : mapping of str to Noise
         First guess.

@@ -51,8 +51,6 @@ class Forward:
 
     Parameters
     ----------
-    data : Campaigns
-    hypothesis : Hypothesis
     noise : mapping of str to float
         Typical noise sd of each output on the scale of the response; the unit of a free
         discrepancy.
@@ -290,7 +288,6 @@ def _shifted_of_all(asked: Sequence[tuple[Forward, Array]], view: View) -> dict[
     ----------
     asked : sequence of (Forward, ndarray)
         On the same campaigns, each with a shift, and psi of each, shape (k, d).
-    view : View
     """
     some, _ = asked[0]
     shared = np.concatenate([psi[:, : some.n_shared] for _, psi in asked])

@@ -36,13 +36,11 @@ class Promise:
 
     Parameters
     ----------
-    forward : Forward
     expected : float
         Log of evidence times prior, by the best guess and one step of the other parameters, if the
         posterior is as broad as that of the set it was made from.
     starts : ndarray, shape (k, d)
         Guesses, the best first.
-    noise : mapping of str to Noise
     first : int
         How many of the guesses are the best of a part that the set was made from.
     """
@@ -81,12 +79,10 @@ class Guesses:
 
     Parameters
     ----------
-    data : Campaigns
     lab_mode : mapping of str to ndarray
         Internal parameters of each simulator as the lab calibrated it.
     noise : mapping of str to Noise
         Of the laboratory.
-    odds : Odds
     """
 
     def __init__(
@@ -142,7 +138,6 @@ class Guesses:
         ----------
         kept : Hypothesis
             Some of the effects that were fitted, or all of them.
-        found : Fit
         added : sequence of Hypothesis
             Single effects.
         size : int

@@ -111,12 +111,7 @@ def read_effect_priors(effect: Effect, references: Mapping[str, float]) -> Prior
 
 
 def dependences(data: Campaigns) -> dict[str, Effect]:
-    """Return what may depend on each recorded condition that a simulator ignores, by name.
-
-    Parameters
-    ----------
-    data : Campaigns
-    """
+    """Return what may depend on each recorded condition that a simulator ignores, by name."""
     found: dict[str, Effect] = {}
     for column, values in data.view.conditions.items():
         quantity = QUANTITIES.get(column)
@@ -138,12 +133,7 @@ def dependences(data: Campaigns) -> dict[str, Effect]:
 
 
 def readings(data: Campaigns) -> dict[str, Effect]:
-    """Return what the reading of each output but the drawbar pull may do over the runs, by name.
-
-    Parameters
-    ----------
-    data : Campaigns
-    """
+    """Return what the reading of each output but the drawbar pull may do over the runs, by name."""
     found: dict[str, Effect] = {}
     if not _varies(data, "order"):
         return found
@@ -298,7 +288,6 @@ def resized(causes: Hypothesis, usual: Mapping[str, Priors], large: Collection[s
 
     Parameters
     ----------
-    causes : Hypothesis
     usual : mapping of str to Priors
         Of each effect, by name.
     large : collection of str

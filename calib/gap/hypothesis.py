@@ -27,7 +27,6 @@ class Hypothesis:
         Contract name, pairs in alphabetical order.
     effects : tuple of Effect
         In alphabetical order, as in its name.
-    effect_priors : tuple of Priors
     shift : float
         Prior sd of parameter shifts in units of the parameters' own prior sds; 0 for none.
     shift_as : {"alone", "soil"}

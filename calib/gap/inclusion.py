@@ -92,7 +92,6 @@ def inclusion(mixed: Mixture, ranking: Ranking) -> Inclusion:
 
     Parameters
     ----------
-    mixed : Mixture
     ranking : Ranking
         That it was made from.
     """

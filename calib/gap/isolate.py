@@ -74,10 +74,8 @@ def isolability(
     ----------
     data : Campaigns
         Of which only conditions and lab outcomes are used.
-    single : list of Hypothesis
     lab_mode, noise : mapping
         Of the simulators, from the lab alone.
-    seed : int
     """
     root = _metric_root(data, lab_mode, noise)
     raw = {h.name: _signatures(data, h, lab_mode, noise, seed) for h in single}

@@ -29,7 +29,6 @@ class NextMeasurement:
 
     Parameters
     ----------
-    separates : tuple of str
     conditions : mapping of str to float
         Canonical columns.
     gain_nats : float
@@ -42,14 +41,7 @@ class NextMeasurement:
 
 
 def next_measurements(data: Campaigns, ranking: Ranking, seed: int) -> tuple[NextMeasurement, ...]:
-    """Search the conditions of both campaigns for the most telling ones.
-
-    Parameters
-    ----------
-    data : Campaigns
-    ranking : Ranking
-    seed : int
-    """
+    """Search the conditions of both campaigns for the most telling ones."""
     in_play = [n for n in ranking.order if ranking.probability[n] >= _IN_PLAY][:_MOST]
     if len(in_play) < 2:
         return ()

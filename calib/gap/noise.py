@@ -124,7 +124,6 @@ def most_probable(squared: Array, at: NoiseConditions) -> list[Noise]:
     ----------
     squared : ndarray, shape (m, n)
         Squares of the residuals, of m guesses.
-    at : NoiseConditions
 
     Returns
     -------
@@ -154,7 +153,6 @@ def ln_averaged(squared: Array, at: NoiseConditions) -> Array:
     ----------
     squared : ndarray, shape (m, n)
         Squares of the residuals.
-    at : NoiseConditions
 
     Returns
     -------
@@ -179,7 +177,6 @@ def ln_averaging(raw: Array, left: Array, at: NoiseConditions) -> Array:
         Residuals.
     left : ndarray, shape (m, n)
         The part of the variance of each that the parameters did not take up.
-    at : NoiseConditions
 
     Returns
     -------

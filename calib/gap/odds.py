@@ -59,7 +59,6 @@ def relevance(asked: Sequence[tuple[Fit, int]], seed: int) -> list[float]:
     asked : sequence of (Fit, int)
         On the same campaigns, with the number of draws: of the prior, and of the posterior where it
         has no sample. Zero for those that are not asked after.
-    seed : int
     """
     known = [i for i, (f, n) in enumerate(asked) if n and f.forward.hypothesis.name != "none"]
     drawn = [psi for i in known for psi in _drawn(*asked[i], seed)]

@@ -25,7 +25,6 @@ def inputs_record(case: Case, seed: int, effects: Mapping[str, bytes] | None = N
     ----------
     case : Case
         As it was diagnosed.
-    seed : int
     effects : mapping of str to bytes, optional
         Files of the user's own effects, by name: code and priors.
     """

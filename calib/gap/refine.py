@@ -43,8 +43,6 @@ def refine(fit: Fit, seed: int, plenty: int = PLENTY) -> Fit:
 
     Parameters
     ----------
-    fit : Fit
-    seed : int
     plenty : int, optional
         Effective draws that end the rounds.
 

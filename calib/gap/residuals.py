@@ -28,7 +28,6 @@ class Coordinates:
     ----------
     loc, precision : ndarray
         Means and inverse sds of normal priors; zeros of uniform ones.
-    width, lower, upper : ndarray
     """
 
     loc: Array
@@ -143,11 +142,6 @@ def diagonal(values: Array) -> Array:
 
 class Residuals(Coordinates):
     """Observed minus predicted of lab then field rows, one output after the other.
-
-    Parameters
-    ----------
-    data : Campaigns
-    forward : Forward
 
     Attributes
     ----------

@@ -41,7 +41,6 @@ def follows_runs(data: Campaigns, none: Fit) -> set[str]:
 
     Parameters
     ----------
-    data : Campaigns
     none : Fit
         Of noise alone.
     """

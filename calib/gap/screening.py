@@ -32,11 +32,6 @@ LEFT_OVER = 3.5
 def screen(case: Case, seed: int) -> tuple[Campaigns, Lab, list[str]]:
     """Set readings aside that a laboratory's calibration must not be made from.
 
-    Parameters
-    ----------
-    case : Case
-    seed : int
-
     Returns
     -------
     Campaigns

@@ -67,7 +67,6 @@ def sets_and_unlisted(
 
     Parameters
     ----------
-    guesses : Guesses
     single : sequence of str
         Effects that sets are made of.
     fits : mapping of str to tuple of Fit

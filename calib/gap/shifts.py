@@ -138,7 +138,6 @@ def shift_map(outputs: Sequence[OutputData], shift_as: ShiftAs) -> tuple[ShiftMa
 
     Parameters
     ----------
-    outputs : sequence of OutputData
     shift_as : {"alone", "soil"}
 
     Returns

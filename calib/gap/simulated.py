@@ -31,7 +31,6 @@ class Simulated:
 
     Parameters
     ----------
-    o : OutputData
     view : View
         Of the field campaign.
     pressures : tuple of float

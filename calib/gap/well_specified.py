@@ -44,7 +44,6 @@ def well_specified_case(
 
     Parameters
     ----------
-    seed : int
     folder : Path
         The other case, with a ``fresh.csv``; its name is part of the seed.
     truth : str
@@ -126,7 +125,6 @@ class Draw:
 
     Parameters
     ----------
-    forward : Forward
     psi : ndarray, shape (1, d)
     gap_over_noise : float
         Rms over field rows and outputs, in noise sds.
@@ -159,7 +157,6 @@ def draw_from_hypothesis(
         Contract name; sets of effects in alphabetical order.
     gap_over_noise : float
         The size wanted, rms in noise sds; met within a ratio of 1.25.
-    rng : Generator
 
     Raises
     ------

@@ -155,7 +155,6 @@ class RowGap:
 
     Parameters
     ----------
-    output : str
     rows : ndarray of int, shape (n,)
     gap, sd : ndarray, shape (n,)
         Posterior mean and sd of truth minus simulator, in the output's unit.
@@ -177,7 +176,6 @@ class Region:
 
     Parameters
     ----------
-    output : str
     conditions : mapping of str to (float, float)
         Its ends; of a category both are the place of one value in its list.
     gap : float

@@ -62,7 +62,6 @@ class Ranking:
         By name; several where prior scales, or ways to shift or to be unlisted, were averaged over.
     scores : mapping of str to tuple of float
         Log evidence of each fit, for effects that matter, times its share in its hypothesis.
-    log_evidence : mapping of str to float
     probability : mapping of str to float
         Sums to one.
     not_testable : mapping of str to str
@@ -120,8 +119,6 @@ def rank(
 
     Parameters
     ----------
-    data : Campaigns
-    seed : int
     effects : mapping of str to Effect, optional
     lab : Lab, optional
         If `calibrate_lab` has been called before.

@@ -48,9 +48,6 @@ class Calibration:
 
     Parameters
     ----------
-    problem : Problem
-    draws : Draws
-    seed : int
     label : str
         Names the random streams that belong to it.
     estimates : tuple of PointEstimate
@@ -195,7 +192,6 @@ def calibrate(
 
     Parameters
     ----------
-    problem : Problem
     seed : int
         Same seed, same numbers.
     label : str

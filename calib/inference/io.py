@@ -291,8 +291,6 @@ def save_calibration(
 
     Parameters
     ----------
-    calibration : Calibration
-    folder : Path
     environment : Environment, optional
         Where it says that it was made: in that of this process by default.
     """

@@ -291,7 +291,6 @@ def serial_of(along: Along, table: Table) -> Serial | None:
     along : {"", "run_order"}
         That column, in each ``run`` by itself where the table has this one. Rows that are missing
         leave a gap.
-    table : Table
 
     Raises
     ------

@@ -250,10 +250,6 @@ def _forces(entry: Array, cells: _Cells, work: Array, nodes: int = _N_NODES) -> 
 def contact(wheel: Wheel) -> Contact:
     """Find where each wheel carries its load, and what it then pulls.
 
-    Parameters
-    ----------
-    wheel : Wheel
-
     Returns
     -------
     Contact

@@ -54,7 +54,6 @@ def ranks_figure(model: ModelScore, adjusted: Mapping[tuple[str, str], float]) -
 
     Parameters
     ----------
-    model : ModelScore
     adjusted : mapping
         Adjusted p values of the run, by model and quantity.
     """

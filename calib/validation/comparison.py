@@ -90,7 +90,6 @@ class Comparison:
         By their expected log predictive densities.
     weights : mapping of str to float
         Stacking weights by model; they sum to 1.
-    seed : int
     """
 
     candidates: tuple[Candidate, ...]
@@ -167,7 +166,6 @@ def compare(
         With the output, and the conditions of every model.
     models : sequence of str
         At least two, of one output.
-    seed : int
     held_out : Table, optional
         Rows of the same campaign that are not fitted.
     priors : mapping of str to Path, optional

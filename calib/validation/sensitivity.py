@@ -70,10 +70,6 @@ class Sensitivity:
 def prior_sensitivity(calibration: Calibration) -> dict[str, Sensitivity]:
     """Work out the sensitivity of every parameter that varies, sampled or published.
 
-    Parameters
-    ----------
-    calibration : Calibration
-
     Notes
     -----
     The distance depends on the scale of a quantity, so it is taken where a long tail does not

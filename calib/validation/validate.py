@@ -44,7 +44,6 @@ class Validation:
     observed : ndarray, shape (n,)
     draws : ndarray, shape (size, n)
         Predictive draws.
-    scores : Scores
     pareto_k : ndarray, shape (n,), optional
         Of leave-one-out.
     refitted : tuple of int
@@ -76,7 +75,6 @@ def validate_held_out(calibration: Calibration, held_out: Table) -> Validation:
 
     Parameters
     ----------
-    calibration : Calibration
     held_out : Table
         With the model's conditions and its output.
 
@@ -119,7 +117,6 @@ def leave_one_out(
 
     Parameters
     ----------
-    calibration : Calibration
     settings : SamplerSettings, optional
         For the refits.
     progress : callable, optional

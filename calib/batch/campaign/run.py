@@ -116,7 +116,6 @@ def run_campaign(
 
     Parameters
     ----------
-    plan : Plan
     out : Path
         Gets ``results/<task>/`` with ``numbers.json``, ``task.json`` (what it was made from) and
         the files of its kind; ``results/failed.json`` and ``results/seconds.csv``; a

@@ -214,7 +214,6 @@ class Effect:
             Physical role of the output about to be predicted.
         conditions : dict
             Conditions of the output's model by physical role, possibly changed by other effects.
-        view : View
         """
         return conditions
 
@@ -228,7 +227,6 @@ class Effect:
             Its physical role.
         location : ndarray, shape (k, n)
             On the scale of the response: kN, ln mm, g/cm^3.
-        view : View
         """
         return location
 
@@ -249,7 +247,6 @@ class Effect:
         left : mapping of str to ndarray, shape (n,)
             By the role of the output, what a fit without the effect leaves of the field's
             readings, on the scale of the response; NaN where there is none.
-        view : View
         """
         return phi
 
@@ -262,7 +259,6 @@ class Effect:
 
         Parameters
         ----------
-        view : View
         outputs : tuple of str
             Physical roles of the outputs that the case models.
         """

@@ -50,7 +50,6 @@ def check_effects(effects: Mapping[str, Effect], case: Case) -> None:
     ----------
     effects : mapping of str to Effect
         All that a diagnosis is to consider.
-    case : Case
 
     Raises
     ------
@@ -70,10 +69,6 @@ def check_effects(effects: Mapping[str, Effect], case: Case) -> None:
 
 def check_declared(effect: Effect) -> None:
     """Check what can be seen without data.
-
-    Parameters
-    ----------
-    effect : Effect
 
     Raises
     ------

@@ -78,10 +78,8 @@ class Quantity:
 
     Parameters
     ----------
-    name, unit : str
     value : float
         NaN where only the interval is meant.
-    lower, upper : float
     interval : str
         What the interval is: "rounding" (exact extremes over the printed digits), "95 % HDI", ...
     published : str

@@ -40,7 +40,6 @@ class Reference:
 
     Parameters
     ----------
-    psi : int
     curve : ndarray, shape (n,)
         Table 4 at the slips, kN.
     span : ndarray, shape (n, 4)

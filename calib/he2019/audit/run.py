@@ -57,12 +57,6 @@ class Audit:
         By verdict, the gravest first; within a verdict in the order of the source.
     published : Published
         What was audited.
-    seed : int
-    rounding : RoundingStudy
-    curvature : CurvatureStudy
-    quality : QualityStudy
-    inverse : InverseStudy
-    genetic : GeneticStudy
     seeds : Seeds
         How often each search was repeated.
     """

@@ -201,11 +201,8 @@ def emulated(
 
     Parameters
     ----------
-    problem : Problem
-    seed : int
     elsewhere : sequence of Table
         Whose conditions will be predicted beside those of the problem.
-    workers : int
     scheduler : str, optional
     progress : callable, optional
         Called with what is done, how much of it, and of how much.

@@ -105,7 +105,6 @@ class Emulation:
     ----------
     problem : Problem
         To be calibrated: its model is the emulator.
-    emulator : Emulator
     runs : tuple of Run
         All that were asked for: probes, repeats and those that failed among them.
     held_out : HeldOut, optional

@@ -31,7 +31,6 @@ class Method:
 
     Parameters
     ----------
-    name : str
     estimate : callable
         ``(problem, rng, **settings) -> PointEstimate``.
     title, short, words : str
@@ -95,7 +94,6 @@ def estimate(
 
     Parameters
     ----------
-    problem : Problem
     method : str
         One of `methods_for` the problem's model.
     rng : Generator
@@ -128,8 +126,6 @@ def compare(
 
     Parameters
     ----------
-    problem : Problem
-    rng : Generator
     methods : sequence of str, optional
         All that apply to the model by default. Of these, one that cannot read the data (no rise
         of the pull, one ground pressure) is left out; methods named here raise their error.

@@ -138,7 +138,6 @@ def check_defined(
 
     Parameters
     ----------
-    bound : BoundModel
     theta : ndarray, shape (k, d)
         Natural parameters of the model, as its prior spreads them.
     conditions : mapping of str to ndarray, shape (n,)

@@ -43,7 +43,6 @@ class SamplerSettings:
     keep : int
         About so many draws of each ensemble are stored: those of evenly picked walkers at 32 or
         more evenly picked steps.
-    gate : Gate
     """
 
     ensembles: int = 4

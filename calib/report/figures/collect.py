@@ -25,7 +25,6 @@ def plates(result: OutputResult, reference: Reference = NOTHING) -> list[Plate]:
 
     Parameters
     ----------
-    result : OutputResult
     reference : Reference, optional
         What the source of the data printed, to be shown beside them.
 

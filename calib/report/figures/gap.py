@@ -378,7 +378,6 @@ def gap_plates(found: Diagnosis, names: Sequence[str] = GAP_FIGURES) -> list[Pla
 
     Parameters
     ----------
-    found : Diagnosis
     names : sequence of str, optional
         Of those to draw; all by default.
 

@@ -113,7 +113,6 @@ def panels(
 
     Parameters
     ----------
-    rows, cols : int
     height : float
         Of one panel.
     width : float

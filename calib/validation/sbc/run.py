@@ -121,7 +121,6 @@ class Quantity:
 
     Parameters
     ----------
-    name : str
     pit : ndarray, shape (n,)
         Probability integral transforms of the truths; uniform if all is right.
     p : float

@@ -55,7 +55,6 @@ class Support:
         At its mode the latent function is the kernel times these (Rasmussen & Williams 2006,
         Eq 3.21).
     lengths : ndarray, shape (d,)
-    amplitude : float
     """
 
     x: Array
@@ -180,8 +179,6 @@ class Emulator:
 
     Parameters
     ----------
-    training : Training
-    axes : Axes
     negligible : float
         Error of the output that need not be looked into.
     mean : ndarray, shape (m,)
@@ -189,8 +186,6 @@ class Emulator:
         Orthonormal.
     functions : Kriging
         The coefficients as functions of the parameters, in units of the prior's sds.
-    over : Over
-    regions : tuple of Region
     support : Support, optional
         Where there is a value at all.
     near : tuple of (Region, Support)
@@ -324,8 +319,6 @@ def build_emulator(
 
     Parameters
     ----------
-    training : Training
-    axes : Axes
     negligible : float
         Error of the output, on the scale of the response, that need not be looked into.
     regions : sequence of Region

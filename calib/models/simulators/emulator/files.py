@@ -28,7 +28,6 @@ def save_emulator(emulator: Emulator, model: str, path: Path) -> None:
 
     Parameters
     ----------
-    emulator : Emulator
     model : str
         The model that it stands for.
     path : Path

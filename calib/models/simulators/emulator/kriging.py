@@ -48,7 +48,6 @@ class Scales:
     Parameters
     ----------
     lengths : ndarray, shape (d,)
-    nugget : float
     """
 
     lengths: Array
@@ -63,7 +62,6 @@ class Kriging:
     ----------
     x : ndarray, shape (n, d)
         Where values are known.
-    scales : Scales
     beta : ndarray, shape (q, j)
     gamma : ndarray, shape (n, j)
         What the correlations with the known points multiply.
@@ -142,7 +140,6 @@ def krige(x: Array, y: Array, scales: Scales) -> Kriging:
     ----------
     x : ndarray, shape (n, d)
     y : ndarray, shape (n, j)
-    scales : Scales
     """
     n = len(x)
     b = trend_of(x)
