@@ -319,6 +319,36 @@ def test_embedded_data_are_recognised_in_other_units_and_rounded(tmp_path: Path)
         assert read_table(path).label == "reconstructed"
 
 
+def test_readings_that_agree_by_chance_are_not_called_reconstructed() -> None:
+    """Tables of 1 to 1000 rows, of 1 to 4 decimals, near the curves of the embedded data."""
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        n, places = int(rng.choice([1, 3, 40, 200, 1000])), int(rng.integers(1, 5))
+        slip = rng.uniform(0.02, 0.5, n)
+        pull = 5.0 * (0.62 * (1.0 - np.exp(-slip / 0.14)) - 0.06) + 0.3 * rng.standard_normal(n)
+        columns = {
+            "slip_ratio": slip, "inflation_pressure_psi": rng.choice([18.0, 30.0, 42.0], n),
+            "drawbar_pull_kn": pull, "rut_depth_mm": rng.uniform(15.0, 60.0, n),
+            "bulk_density_g_cm3": rng.uniform(1.7, 1.9, n),
+        }  # fmt: skip
+        made = {name: np.round(values, places) for name, values in columns.items()}
+        assert table_from_arrays(made).label == "", seed
+
+
+@pytest.mark.parametrize(("output", "copied"), [
+    ("drawbar_pull", 20), ("rut_depth", 14), ("bulk_density", 14),
+])  # fmt: skip
+def test_rounded_copies_among_other_rows_are_recognised(output: str, copied: int) -> None:
+    source, rng = load_he2019(output), np.random.default_rng(5)
+    *_, reading = source
+    rows = rng.permutation(len(source))[:copied]
+    columns = {name: [*source[name][rows], *rng.choice(source[name], 60)] for name in source}
+    four = [float(f"{v:.4g}") for v in source[reading][rows]]
+    ends = source[reading].min(), source[reading].max()
+    columns[reading] = [*four, *np.round(rng.uniform(*ends, 60), 3)]
+    assert table_from_arrays(columns).label == "partly reconstructed"
+
+
 def test_other_readings_at_the_same_conditions_are_no_embedded_data() -> None:
     pull = load_he2019("drawbar_pull")
     noise = 0.03 * np.random.default_rng(1).standard_normal(len(pull))

@@ -19,6 +19,7 @@ from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import bdtrc
 
 from calib.batch.folders import write_whole
 from calib.data import Table, table_from_arrays
@@ -29,8 +30,8 @@ from calib.he2019.datasets.reconstruct import Array
 LABEL = "reconstructed"
 # Relative differences of what was written with all digits, and with four of them.
 _EXACT, _ROUNDED = 1e-9, 5e-4
-# One reading may be the same by chance.
-_CHANCE = 2
+# Probability below which no agreement is taken for chance.
+_CHANCE = 1e-6
 
 # Decimals of every column; they carry the printed digits through the files.
 _DECIMALS: Mapping[str, int] = MappingProxyType(
@@ -95,28 +96,47 @@ def holds(table: Table) -> bool:
     """Whether all readings of an output are those of the embedded data.
 
     To all digits a reading tells by itself, whatever was done with the conditions; to four digits
-    beside its own conditions.
+    as many must agree, beside their own conditions, as chance does not give.
     """
-    return any(same.all() for same in _same(table))
+    return any(
+        exact.all() or (rounded.all() and p < _CHANCE) for exact, rounded, _, p in _same(table)
+    )
 
 
 def holds_some(table: Table) -> bool:
-    """Whether at least two readings are those of the embedded data."""
-    return any(same.sum() >= _CHANCE for same in _same(table))
+    """Whether readings of an output, two at least, are those of the embedded data."""
+    return any(telling >= 2 or p < _CHANCE for *_, telling, p in _same(table))
 
 
-def _same(table: Table) -> Iterator[NDArray[np.bool_]]:
-    """Return which readings are the embedded ones, for every output that a table has."""
+def _same(table: Table) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_], int, float]]:
+    """Return which readings are embedded ones, for every output that a table has.
+
+    That is to all digits and to four, both (n,); how many embedded readings of more than four
+    decimals there are to all digits; and the probability of so many to four, of which as many are
+    expected as agree with the embedded readings moved a little.
+    """
     for known in tables().values():
         output = list(known)[-1]
         there = np.isfinite(table[output]) if output in table else np.zeros(0, dtype=np.bool_)
         if not there.any():
             continue
-        off = np.abs(table[output][there, None] / known[output] - 1.0)
-        rounded = off <= _ROUNDED
+        beside = np.ones((int(there.sum()), known[output].size), dtype=np.bool_)
         for name in set(known) & set(table) - {output, "slip_ratio", "nominal_slip_ratio"}:
-            rounded &= np.isclose(table[name][there, None], known[name], rtol=_ROUNDED, atol=0.0)
-        yield ((off <= _EXACT) | rounded).any(axis=1)
+            beside &= np.isclose(table[name][there, None], known[name], rtol=_ROUNDED, atol=0.0)
+        readings = table[output][there]
+        off = readings[:, None] / known[output] - 1.0
+        # Of those alike one counts.
+        agree = [
+            min(int(same.any(axis=0).sum()), np.unique(readings[same.any(axis=1)]).size)
+            for k in range(-20, 21)
+            for same in [(np.abs(off - 2.0 * k * _ROUNDED) <= _ROUNDED) & beside]
+        ]
+        n, here = known[output].size, agree.pop(20)
+        p = bdtrc(here - 1.0, n, (sum(agree) + 1) / (len(agree) * n + 1)) if here else 1.0
+        exact, rounded = np.abs(off) <= _EXACT, (np.abs(off) <= _ROUNDED) & beside
+        long = np.abs(np.round(known[output], 4) / known[output] - 1.0) > _EXACT
+        telling = int(exact.any(axis=0)[long].sum())
+        yield exact.any(axis=1), rounded.any(axis=1), telling, float(p)
 
 
 def write(out_dir: Path) -> list[Path]:
