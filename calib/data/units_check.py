@@ -271,6 +271,20 @@ def _unusual(table: Table, quantity: Quantity, values: Array) -> Iterable[str]:
         )
 
 
+def stretches(values: Array) -> list[tuple[float, float]]:
+    """Return from where to where values go: a range, or two if a gap is wider than all the rest.
+
+    Of a few levels nothing is expected between them.
+    """
+    levels = np.unique(values)
+    low, high = float(levels[0]), float(levels[-1])
+    if levels.size > _FEW_LEVELS:
+        i = int(np.argmax(np.diff(levels)))
+        if levels[i + 1] - levels[i] > 0.5 * (high - low):
+            return [(low, float(levels[i])), (float(levels[i + 1]), high)]
+    return [(low, high)]
+
+
 def mixed_units(quantity: Quantity, values: Array) -> tuple[NDArray[np.bool_], str]:
     """Return which rows' pressures are others' in another unit, and whether larger or smaller.
 

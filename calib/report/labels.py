@@ -18,6 +18,7 @@ import numpy as np
 from calib.data.files import plain_number
 from calib.data.headers import accepted_headers, parse_header
 from calib.data.quantities import QUANTITIES, Quantity, columns_of, convert
+from calib.data.units_check import stretches
 from calib.errors import CalibError, meant
 from calib.gap.effects import EFFECTS, Effect
 from calib.gap.forward import FORM_ERROR
@@ -84,9 +85,9 @@ class Axis:
         return np.asarray(values) * self.factor
 
     def range_text(self, values: Array) -> str:
-        """Say from where to where values go."""
-        low, high = (self.value_text(float(f(values))) for f in (np.min, np.max))
-        return f"{low} to {high} {self.unit}"
+        """Say from where to where values go, and from where again after a wide gap."""
+        ends = [[self.value_text(end) for end in part] for part in stretches(values)]
+        return joined([f"{' to '.join(dict.fromkeys(part))} {self.unit}" for part in ends])
 
     def value_text(self, value: float) -> str:
         """Write one value, without the unit: whole numbers whole."""

@@ -21,6 +21,7 @@ from scipy.special import bdtr, ndtri
 from calib.batch.threads import one_thread
 from calib.data import Table
 from calib.data.headers import parse_header
+from calib.data.units_check import stretches
 from calib.errors import CalibError
 from calib.inference.random import generator
 from calib.models.base import Array
@@ -279,13 +280,16 @@ def _names(header: str, outputs: Collection[str]) -> bool:
 def outside(
     calibrated: Mapping[str, Array], conditions: Mapping[str, Array]
 ) -> tuple[tuple[str, ...], ...]:
-    """Name, for each row of conditions, those beyond the range of the calibrated ones."""
+    """Name, for each row of conditions, those that the calibrated ones do not cover."""
     n = next(iter(conditions.values())).size
     flags: list[list[str]] = [[] for _ in range(n)]
     for name, values in conditions.items():
-        low, high = calibrated[name].min(), calibrated[name].max()
-        slack = 1e-9 * max(abs(low), abs(high))
-        for i in np.flatnonzero((values < low - slack) | (values > high + slack)):
+        slack = 1e-9 * float(np.abs(calibrated[name]).max())
+        covered = [
+            (values >= low - slack) & (values <= high + slack)
+            for low, high in stretches(calibrated[name])
+        ]
+        for i in np.flatnonzero(~np.any(covered, axis=0)):
             flags[i].append(name)
     return tuple(tuple(row) for row in flags)
 

@@ -92,6 +92,17 @@ def test_slip_is_drawn_in_percent():
     assert axis_of("cone_index_kpa").value_text(1893.4) == "1893"
 
 
+@pytest.mark.parametrize(("values", "said"), [
+    (np.full(9, 0.1), "10 %"),
+    (np.linspace(0.01, 0.6, 8), "1 to 60 %"),
+    (np.repeat([0.1, 0.5], 9), "10 to 50 %"),
+    ([0.01, 0.02, 0.03, 0.04, 0.45, 0.5, 0.55, 0.6], "1 to 4 % and 45 to 60 %"),
+    ([*np.linspace(0.01, 0.04, 8), 0.6], "1 to 4 % and 60 %"),
+])  # fmt: skip
+def test_a_range_has_a_value_wherever_it_is_said_to(values, said):
+    assert axis_of("slip_ratio").range_text(np.asarray(values)) == said
+
+
 def test_a_column_without_an_entry_still_has_a_unit():
     assert axis_of("speed_m_s").label == "Speed (m/s)"
 

@@ -13,6 +13,7 @@ from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators.least_squares import estimate_least_squares
 from calib.inference.priors import Prior
 from calib.inference.problem import Problem
+from calib.report.verdict import verdict
 from calib.validation.assumptions import (
     LEVEL,
     checks_of,
@@ -21,6 +22,8 @@ from calib.validation.assumptions import (
     remarks_of,
     residual_checks,
 )
+from calib.validation.prediction import predict
+from calib.validation.validate import leave_one_out
 from tests.custom_problems import normal, problem_of
 from tests.validation.test_outliers import fitted_line, line_problem
 
@@ -168,6 +171,19 @@ def test_part_of_a_table_keeps_its_other_columns() -> None:
     assert table.extra == {"soil bin": tuple(BIN)}
     assert table.take(BIN == "B").extra == {"soil bin": ("B",) * 20}
     assert replace(table, extra={}).ignored == ("soil bin",)
+
+
+def test_a_wide_gap_in_a_condition_is_outside_the_calibrated_range() -> None:
+    slip = np.tile([*np.linspace(0.01, 0.04, 4), *np.linspace(0.45, 0.6, 4)], 2)
+    noise = 0.01 * np.random.default_rng(8).standard_normal(16)
+    priors = [normal("a", 0.0, 10.0), normal("b", 0.0, 10.0), normal("sigma", -5.0, 2.0, log=True)]
+    problem = problem_of(lambda a, b, s: a + b * s, priors, slip, 1.0 + slip + noise)
+    found = calibrate(problem, 1)
+    trust = verdict(found, leave_one_out(found, refit=False)).trust
+    assert trust.startswith("median and bands for slip 1 to 4 % and 45 to 60 %")
+    asked = table_from_arrays({"slip_ratio": [0.02, 0.1, 0.44, 0.5, 0.7]})
+    assert predict(found, asked).outside == ((), ("slip_ratio",), ("slip_ratio",), (),
+                                             ("slip_ratio",))  # fmt: skip
 
 
 def test_scatter_concerns_the_rows_nearest_to_where_it_differs() -> None:
