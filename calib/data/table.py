@@ -390,7 +390,7 @@ def _distinct(values: NDArray[np.float64], most: int = 12) -> list[str]:
 
 
 def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -> None:
-    """Check that there are more rows than parameters that are fitted, without the noise scale.
+    """Check that there are more rows than parameters to estimate, those of the noise among them.
 
     Raises
     ------
@@ -401,7 +401,8 @@ def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -
         return
     rows = "1 row" if len(table) == 1 else f"{len(table)} rows"
     raise CalibError(
-        f"{rows} cannot calibrate {model}, which has {n_parameters} parameters",
+        f"{rows} cannot calibrate {model}, which has {n_parameters} parameters to "
+        "estimate, those of the noise among them",
         where=table.source,
         allowed=f"at least {n_parameters + 1} rows",
         mend="add measurements, or choose a model with fewer parameters",

@@ -370,9 +370,6 @@ def build_problem(
     """
     model = get_model(model_name)
     table.must_have(*model.conditions, model.output)
-    check_enough(table, len(model.parameters), model=model.name)
-    check_varies(table, model.output)
-    check_settings(table, model.conditions)
     references = prior_references(table.columns)
     priors = read_priors(
         prior_path or default_priors(model.name),
@@ -380,6 +377,9 @@ def build_problem(
         (*model.parameters, "sigma"),
         references,
     )
+    check_enough(table, len(priors.free), model=model.name)
+    check_varies(table, model.output)
+    check_settings(table, model.conditions)
     relative = relative_columns(priors.text)
     check_units(table, (*model.conditions, model.output, *relative))
     try:

@@ -4,8 +4,9 @@ A card is red where there is nothing to trust: the convergence gate was not pass
 could not be scored. It is amber where any assumption fails (`calib.validation.assumptions`: of the
 rows, of the priors, or that the bands cover unseen rows, the curve misses no pattern, the priors
 expect the data, and an emulator is good enough), which it says first; where nothing was left to
-validate on; where the prior, not the data, sets what the prediction of unseen rows hangs on; and
-where the median is hardly better than the mean of the calibrated rows.
+validate on, or too little for any failure to show; where the prior, not the data, sets what the
+prediction of unseen rows hangs on; and where the median is hardly better than the mean of the
+calibrated rows.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from calib.models.base import Array
 from calib.report.labels import axis_of, joined, percent, plain, short, units_of
 from calib.report.rows import Result, held_table, signs_along, x_column
 from calib.report.study_tasks import MAX_ROWS
-from calib.validation.assumptions import Check, Range, Remark, checks_of, failed, remarks_of
+from calib.validation.assumptions import LEVEL, Check, Range, Remark, checks_of, failed, remarks_of
 from calib.validation.prediction import (
     binomial_p,
     coverage_probability,
@@ -267,7 +268,9 @@ def judge_evidence(e: Evidence) -> Verdict:
             "for part of the posterior there", remarks,
         )  # fmt: skip
     fails = [remark for remark in remarks if remark.title]
-    found = replace(_of_assumptions_that_hold(e, error, even=not fails), remarks=remarks)
+    # Were none of them covered, it would not be found.
+    few = binomial_p(0, e.n) > LEVEL / len(tests)
+    found = replace(_of_assumptions_that_hold(e, error, even=not fails, few=few), remarks=remarks)
     if not fails:
         return found
     off = any(remark.shifts for remark in fails)
@@ -292,7 +295,7 @@ _RULES = {
 }
 
 
-def _of_assumptions_that_hold(e: Evidence, error: str, *, even: bool) -> Verdict:
+def _of_assumptions_that_hold(e: Evidence, error: str, *, even: bool, few: bool) -> Verdict:
     names = joined([plain(name) for name in e.prior_set]) if e.prior_set else ""
     if e.two_pressures and e.prior_set:
         return _between_two(e, names, error)
@@ -300,6 +303,12 @@ def _of_assumptions_that_hold(e: Evidence, error: str, *, even: bool) -> Verdict
         return Verdict(
             Level.CARE, "not validated", "Not validated", f"the fit inside {e.inside}",
             "predictions: no row was held out or left out to judge them by",
+        )  # fmt: skip
+    if few:
+        return Verdict(
+            Level.CARE, "few", "Too few unseen rows", f"the fit inside {e.inside}",
+            f"predictions: {e.n} {'row' if e.n == 1 else 'rows'} cannot tell whether they hold; "
+            "hold out more, or none, and each row is left out in turn",
         )  # fmt: skip
     if e.skill < _WEAK_SKILL:
         return Verdict(

@@ -330,7 +330,7 @@ BAD_DATA: dict[str, tuple[str, str | bytes, list[str]]] = {
     "zero rut": ("modified_bekker", edited(RUT, 4, "30.3", "0"), ["line 4", "logarithm"]),
     "ragged row": ("modified_bekker", edited(RUT, 4, "30.3", "30.3,7"), ["line 4", "4 cells"]),
     "one row": ("modified_bekker", f"{HEADER}\n{FIRST}\n",
-        ["1 row cannot calibrate", "at least 4 rows"]),
+        ["1 row cannot calibrate", "at least 5 rows"]),
     "no rows": ("modified_bekker", f"{HEADER}\n", ["no rows"]),
     "empty file": ("modified_bekker", "", ["empty"]),
     "duplicate column": ("modified_bekker", RUT.replace("slip_ratio", "rut_depth_cm"),

@@ -150,10 +150,10 @@ def test_data_that_cannot_calibrate(tmp_path, model: str, changed, words: list[s
 
 
 def test_as_many_rows_as_parameters_are_too_few(rut_tables: tuple[Table, Table]) -> None:
-    with pytest.raises(CalibError, match="3 rows cannot calibrate modified_bekker") as caught:
-        build_problem("modified_bekker", rut_tables[0].take([0, 5, 12]))
-    assert "at least 4 rows" in str(caught.value)
-    assert build_problem("modified_bekker", rut_tables[0].take([0, 5, 12, 15])).n_dim == 4
+    with pytest.raises(CalibError, match="4 rows cannot calibrate modified_bekker") as caught:
+        build_problem("modified_bekker", rut_tables[0].take([0, 5, 12, 15]))
+    assert "at least 5 rows" in str(caught.value)
+    assert build_problem("modified_bekker", rut_tables[0].take([0, 5, 9, 12, 15])).n_dim == 4
 
 
 def test_a_problem_without_a_free_parameter_is_refused(rut_tables: tuple[Table, Table]) -> None:

@@ -19,7 +19,7 @@ def test_a_template_loads_and_can_be_fitted(name: str, tmp_path: Path) -> None:
     # Forces come with the load that gives the priors their scale; it is the same in every row.
     extra = {"normal_load_kn"} if model.output == "drawbar_pull_kn" else set()
     assert set(table) == {*model.conditions, model.output} | extra
-    check_enough(table, len(model.parameters), model=name)
+    check_enough(table, len(model.parameters) + 1, model=name)
     for column in set(table) - extra:
         check_varies(table, column)
     assert np.isfinite(model.bind_references(table.columns).get("p_half_psi", 1.0))

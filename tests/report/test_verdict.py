@@ -55,6 +55,7 @@ RULES = {
     "misfit": {"sign_changes": 4},
     "unexpected": {"prior_hits": 2, "prior_n": 20},
     "extrapolated": {"two_pressures": True, "prior_set": ("K_bend", "D_bend")},
+    "few": {"hits": 1, "n": 1},
     "weak": {"skill": 0.1},
 }
 
