@@ -203,16 +203,16 @@ def fit(
         )  # fmt: skip
     with fresh_folder(out, overwrite=overwrite) as folder:
         save_calibration(calibration, folder)
-    posterior_table(calibration)
+    fails = () if emulation is None else emulation.reasons
+    validation = validated(calibration, held)
+    judged = verdict(calibration, validation, emulator_fails=fails, held_out=str(kept or ""))
+    keep_verdict(judged, out)
+    posterior_table(calibration, judged)
     print(verdict_line(calibration))
     good = say(model, emulation)
     say_failed(model)
     if preference is not None:
         print(preference.sentence)
-    fails = () if emulation is None else emulation.reasons
-    validation = validated(calibration, held)
-    judged = verdict(calibration, validation, emulator_fails=fails, held_out=str(kept or ""))
-    keep_verdict(judged, out)
     for note in problem.notes:
         print(f"note: {note}", file=sys.stderr)
     found: dict[str, Any] = {

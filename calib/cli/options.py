@@ -244,8 +244,8 @@ def _bars() -> Progress:
     )  # fmt: skip
 
 
-def posterior_table(calibration: Calibration) -> None:
-    """Print a calibration's posterior as a table."""
+def posterior_table(calibration: Calibration, judged: Verdict) -> None:
+    """Print a calibration's posterior as a table, in agreement with its verdict."""
     from rich.console import Console
     from rich.table import Table as RichTable
 
@@ -256,7 +256,7 @@ def posterior_table(calibration: Calibration) -> None:
     words, numbers = ("parameter", "unit"), ("mean ± sd or median", "95 % HDI", "ESS bulk/tail")
     for heading in (*words, *numbers, "R-hat", "remark"):
         table.add_column(heading, justify="left" if heading in (*words, "remark") else "right")
-    remarks = parameter_remarks(calibration)
+    remarks = parameter_remarks(calibration, judged.remarks)
     for s in calibration.summary.values():
         table.add_row(
             s.name, s.unit, centre_text(s),

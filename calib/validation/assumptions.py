@@ -57,6 +57,7 @@ _UNIT_FIRST = (
     "whether neighbouring rows are alike, the scatter even and its tails light is not judged while "
     "a column looks to be in another unit"
 )
+_CONTRADICTED = "Prior contradicted"
 _MEND_PRIOR = "widen the prior (`calib priors`), or look for what is wrong with the data"
 
 
@@ -169,8 +170,12 @@ def _cut_off(problem: Problem, draws: Array) -> Iterable[Remark]:
     )  # fmt: skip
 
 
-def parameter_remarks(calibration: Calibration) -> dict[str, str]:
-    """Say of each parameter of a summary what a table has room for; nothing of most."""
+def parameter_remarks(calibration: Calibration, remarks: Sequence[Remark]) -> dict[str, str]:
+    """Say of each parameter of a summary what a table has room for; nothing of most.
+
+    `remarks` are those of the verdict, which says whether least squares far off fit better.
+    """
+    contradicted = any(r.title == _CONTRADICTED and r.shifts for r in remarks)
     best, pressed = _least_squares(calibration), _bounds_pressed(calibration)
     far = {} if best is None else _far_off(calibration, best)
     found = {}
@@ -180,7 +185,10 @@ def parameter_remarks(calibration: Calibration) -> dict[str, str]:
             said.append(f"pressed against its bound {plain_number(pressed[name])}")
         if best is not None and name in far:
             value = plain_number(_estimated(calibration, best, name))
-            said.append(f"{value} by least squares, {abs(far[name]):.0f} sds off")
+            said.append(
+                f"{value} by least squares, {abs(far[name]):.0f} sds off" if contradicted
+                else f"least squares fit as well with {value}"
+            )  # fmt: skip
         found[name] = "; ".join(said)
     return found
 
@@ -295,7 +303,7 @@ def _contradicted(calibration: Calibration) -> Iterable[Check]:
         yield Check(float(scipy.stats.f.sf(ratio, free, left)), Remark(
             f"the data contradict the prior: least squares, which know no prior, give "
             f"{' and '.join(said)} and leave {plain_number(100.0 * without / with_prior)} % of the "
-            f"squared residuals; {_MEND_PRIOR}", "Prior contradicted", shifts=True,
+            f"squared residuals; {_MEND_PRIOR}", _CONTRADICTED, shifts=True,
         ))  # fmt: skip
     scale = calibration.summary.get("sigma")
     if scale is not None and problem.noise.usual and problem.bound.model.uncertain is None:
@@ -305,7 +313,7 @@ def _contradicted(calibration: Calibration) -> Iterable[Check]:
         yield Check(2.0 * min(below, float(scipy.stats.chi2.sf(squares, left))), Remark(
             f"the data contradict the prior of sigma: about least squares, which know no prior, "
             f"the rows scatter by {plain_number(scatter)} where the posterior of sigma has "
-            f"{plain_number(scale.median)}; {_MEND_PRIOR}", "Prior contradicted",
+            f"{plain_number(scale.median)}; {_MEND_PRIOR}", _CONTRADICTED,
         ))  # fmt: skip
 
 

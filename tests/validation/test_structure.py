@@ -52,7 +52,9 @@ def test_a_prior_that_the_data_contradict_is_named_with_its_numbers() -> None:
     p = stats.f.sf((at_mode - least) / 2.0 / (least / 38.0), 2, 38)
     assert check.p == pytest.approx(p, rel=1e-6)
     assert p < 1e-6
-    assert "by least squares" in parameter_remarks(found)["b"]
+    judged = verdict(found)
+    assert check.remark in judged.remarks
+    assert "by least squares" in parameter_remarks(found, judged.remarks)["b"]
 
 
 @pytest.mark.parametrize("sd", [0.1, 1.0, 100.0])
@@ -79,11 +81,16 @@ def test_a_prior_of_the_noise_that_the_data_contradict(median: float, told: bool
 
 def test_weak_data_do_not_contradict_a_sharp_prior_that_is_right() -> None:
     """Least squares are many posterior sds off then: the posterior is as narrow as the prior."""
-    rng, alarms = np.random.default_rng(4), 0
+    rng, alarms, told = np.random.default_rng(4), 0, []
     for _ in range(20):
         pull = 1.0 + 2.0 * SLIP + rng.standard_normal(40)
         found = fitted(normal("b", 2.0, 0.01), pull)
-        alarms += "Prior contradicted" in {r.title for r in failed(checks_of(found))}
+        remarks = verdict(found).remarks
+        alarm = "Prior contradicted" in {r.title for r in remarks}
+        alarms += alarm
+        told.append(parameter_remarks(found, remarks)["b"])
+        assert ("sds off" in told[-1]) is alarm
+    assert sum("least squares fit as well with" in said for said in told) > 10
     assert stats.binom.sf(alarms - 1, 20, LEVEL) > 1e-3
 
 
@@ -100,7 +107,7 @@ def test_a_posterior_pressed_against_a_bound_is_said(slope: float, bound: float 
     assert f"least squares give b = {np.polyfit(SLIP, pull, 1)[0]:.3g}" in said[0].replace(
         "\u2212", "-"
     )
-    assert parameter_remarks(found)["b"] == f"pressed against its bound {bound:g}"
+    assert parameter_remarks(found, ())["b"] == f"pressed against its bound {bound:g}"
 
 
 def test_a_half_normal_prior_may_be_heaped_up_at_zero() -> None:
