@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import re
+import reprlib
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 # What somebody else's file makes the reading of it raise.
 FAULTS = (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueError)
@@ -73,6 +76,30 @@ def meant(name: str, known: Iterable[str], otherwise: str = "correct the name") 
     near = [one for one in known if len(name) > 3 and name in one][:3]
     near = near or difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     return f"did you mean {' or '.join(near)}?" if near else otherwise
+
+
+_PLAIN = {"dictionary": "table", "string": "text", "integer": "whole number", "valid ": "",
+          "a boolean": "true or false"}  # fmt: skip
+
+
+def in_words(error: Mapping[str, Any]) -> str:
+    """Say what pydantic, one of whose `errors` this is, found wrong in a file."""
+    kind, said = error["type"], error["msg"]
+    key = error["loc"][-1] if error["loc"] else "it"
+    if kind == "missing":
+        return f"{key} is missing"
+    if kind.endswith("too_short"):
+        return f"{key} is empty"
+    if kind == "string_pattern_mismatch":
+        said = "Input should be a name: a letter, then letters, digits and _"
+    should = said.removeprefix("Input should be ")
+    if should == said:
+        return f"{said.removeprefix('Value error, ')} (found {reprlib.repr(error['input'])})"
+    if should.startswith("a valid"):
+        should = re.split(", | or ", should)[0]
+        for its, plain in _PLAIN.items():
+            should = should.replace(its, plain)
+    return f"{key} = {reprlib.repr(error['input'])} is not {should}"
 
 
 def _rebuild(message: str, where: str | None, allowed: str | None, mend: str | None) -> CalibError:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calib.data.headers import CHECKED, Column, missing_columns, parse_header, renamed
+from calib.data.headers import CHECKED, Column, columns_meant, missing_columns, parse_header
 from calib.data.quantities import QUANTITIES, convert
 from calib.errors import FAULTS, CalibError
 
@@ -359,11 +359,13 @@ def hold_out(
     """
     column = parse_header(quantity_header)
     if column is None or column.quantity.canonical not in table:
-        guess = renamed([quantity_header], [name for name in table if name in QUANTITIES])
+        guess = columns_meant(
+            [quantity_header], [n for n in table if n in QUANTITIES], shortened=True
+        )
         raise CalibError(
             f"there is no column to hold {quantity_header!r} out by", where=table.source,
             allowed=", ".join(table),
-            mend=f"{guess}name one of these quantities, with a unit",
+            mend=" Or ".join([*guess, "name one of these quantities, with a unit"]),
         )  # fmt: skip
     values = table[column.quantity.canonical]
     wanted = float(column.to_canonical(value))

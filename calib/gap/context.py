@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from calib.errors import CalibError
+from calib.errors import CalibError, in_words
 from calib.inference.priors import Prior, Priors
 
 if TYPE_CHECKING:
@@ -183,7 +183,7 @@ def read_context(content: Any, where: str) -> Context:
         first = error.errors()[0]
         place = ".".join(str(part) for part in first["loc"])
         raise CalibError(
-            f"{first['msg']} (found {first.get('input')!r})", where=f"{where}, context.{place}",
+            in_words(first), where=f"{where}, context.{place}",
             allowed="suspected = {name = probability}, excluded = [names], "
             "sizes = {name = {parameter = {mean = …, sd = …}}}",
             mend="write, for example: suspected = {lug_thrust = 0.5} and, in the next line, "

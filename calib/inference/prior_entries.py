@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from scipy.special import digamma, polygamma
 
 from calib.data.quantities import QUANTITIES
-from calib.errors import CalibError, meant
+from calib.errors import CalibError, in_words, meant
 from calib.inference.noise import DEFAULT_PRIORS, Along, Family
 from calib.inference.priors import Prior
 
@@ -227,12 +227,12 @@ def explain(error: ValidationError, source: str) -> CalibError:
         return _no_such_dist(first["input"], f"{source}, {'.'.join(place)}")
     if first["type"] == "float_type":
         return CalibError(
-            f"{place[-1]} = {first['input']!r} is not a number",
+            in_words(first),
             where=f"{source}, parameters.{place[1]}", allowed=f"a number, as in {place[-1]} = 0.75",
             mend="write a number without quotes",
         )  # fmt: skip
     return CalibError(
-        f"{first['msg']} (found {first.get('input')!r})",
+        in_words(first),
         where=f"{source}, {'.'.join(place)}",
         allowed="dist = normal (mean, sd > 0), lognormal (median > 0, sd_log > 0), half_normal "
         "(sd > 0), uniform (lower < upper) or fixed (value); of nu also gamma (shape > 0, "

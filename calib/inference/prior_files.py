@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from calib.batch.plugins import declared_in
 from calib.data.files import MEND_TOML, read_text
-from calib.errors import CalibError, meant
+from calib.errors import CalibError, in_words, meant
 from calib.inference.noise import USUAL, NoiseChoice
 from calib.inference.prior_entries import (
     NOISE_ENTRIES,
@@ -238,7 +238,7 @@ def _noise_choice(
         if first["type"] == "extra_forbidden":
             raise no_such_key(first["loc"][-1], LikelihoodTable.model_fields, where) from None
         raise CalibError(
-            f"{'.'.join(map(str, first['loc']))}: {first['msg']}", where=where,
+            in_words(first), where=where,
             allowed='family = "normal" or "student_t", noise_depends_on = "slip" or another '
             'condition of the model, correlated_along = "run_order"',
             mend="correct this entry",

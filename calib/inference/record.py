@@ -17,7 +17,7 @@ from pydantic import (
 )
 
 from calib.batch.environment import Environment
-from calib.errors import CalibError
+from calib.errors import CalibError, in_words
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import MODELS
 
@@ -136,7 +136,7 @@ def read_record[R: Record](kind: type[R], folder: Path) -> R:
         said, allowed = f"the schema is {schema!r}", get_args(expected)[0]
         raise CalibError(said, where=str(path), allowed=allowed, mend=mend)
     place = ".".join(map(str, found[0]["loc"]))
-    raise _damaged(kind, path, f"{place or 'in it'}: {found[0]['msg']}")
+    raise _damaged(kind, path, f"{place or 'in it'}: {in_words(found[0])}")
 
 
 def _damaged(kind: type[Record], path: Path, found: str) -> CalibError:

@@ -47,7 +47,13 @@ class HoldOut:
         try:
             if not equals:
                 raise ValueError
+            parse_header(column.strip())
             return cls(column.strip(), float(value))
+        except CalibError as error:
+            raise CalibError(
+                error.message, where=f"--hold-out {text}", allowed=error.allowed,
+                mend="write one of these before the equals sign",
+            ) from None  # fmt: skip
         except ValueError:
             raise CalibError(
                 f"cannot read --hold-out {text!r}",

@@ -232,7 +232,7 @@ def judge_evidence(e: Evidence) -> Verdict:
     unseen = f"{e.hits} of {e.n} {'held-out rows' if e.held_out else 'left-out rows'}"
     error = f"{short(e.rmse)} {e.unit} rms"
     if math.isfinite(e.max_relative_error):
-        error += f", {percent(e.max_relative_error)} at most"
+        error += f", largest error {percent(e.max_relative_error)} of the reading"
     tests = [
         *e.checks,
         Check(e.low_coverage_p, Remark(
@@ -240,7 +240,8 @@ def judge_evidence(e: Evidence) -> Verdict:
             f"{short(e.low_coverage_p)} if it is right", "Bands too narrow",
         )),
         Check(binomial_p(e.sign_changes, e.neighbours, 0.5), Remark(
-            f"residuals change sign {e.sign_changes} times along {e.along}, where about "
+            f"residuals change sign {e.sign_changes} {'time' if e.sign_changes == 1 else 'times'} "
+            f"along {e.along}, where about "
             f"{e.neighbours / 2:.0f} changes would be chance", "Curve misses a pattern", True,
         )),
     ]  # fmt: skip
@@ -319,7 +320,7 @@ def _of_assumptions_that_hold(e: Evidence, error: str, *, even: bool, few: bool)
     doubt = "anything outside that range" if even else f"anything outside {e.inside}"
     if e.prior_set:
         doubt += f"; the values of {names}, which the data did not narrow"
-    trust = f"median and bands for {e.inside}"
+    trust = f"median and bands for {e.inside}, to {error}"
     return Verdict(Level.FINE, "fine", "Holds on unseen rows", trust, doubt)
 
 

@@ -430,7 +430,12 @@ def _unexplained(problem: Problem, residual: Array) -> Iterable[Check]:
         if not category and np.unique(x).size > 1:
             found.append(scipy.stats.spearmanr(score, x).pvalue)
         levels, group, count = np.unique(names, return_inverse=True, return_counts=True)
+        remedy = "fit each of its values by itself, or choose a model that has it as a condition"
         if not category and count.min() < _FEWEST_IN_GROUP:
+            remedy = (
+                "choose a model that has it as a condition or, if the readings drift along the "
+                'runs, write correlated_along = "run_order" (a column) in the prior file'
+            )
             edges = np.quantile(x, [0.25, 0.5, 0.75])
             group = np.searchsorted(edges, x)
             named = [(x[group == i].min(), x[group == i].max()) for i in np.unique(group)]
@@ -453,8 +458,7 @@ def _unexplained(problem: Problem, residual: Array) -> Iterable[Check]:
         ]
         yield Check(p, Remark(
             f"{source_of(problem.table)}: the residuals differ with {header!r}, a column that is "
-            f"not used: on average {' and '.join(said)} (p = {plain_number(p, 2)}); fit each of "
-            "its values by itself, or choose a model that has it as a condition",
+            f"not used: on average {' and '.join(said)} (p = {plain_number(p, 2)}); {remedy}",
             "A column explains the residuals", shifts=True,
         ))  # fmt: skip
 

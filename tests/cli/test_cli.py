@@ -438,7 +438,7 @@ def test_bad_priors(calib: Calib, tmp_path: Path, text: str, words: list[str]) -
         (["fit", "my.csv", "--model", "modified_bekker", "--hold-out", "slip_ratio=0.33"],
          ["my.csv", "no row is at 0.33", "0, 0.1, 0.2"]),
         (["fit", "my.csv", "--model", "modified_bekker", "--hold-out", "slip=0.1"],
-         ["'slip'", "unit"]),
+         ["--hold-out slip=0.1", "'slip'", "unit", "write one of these before the equals sign"]),
         (["fit", "my.csv", "--model", "modified_bekker", "--hold-out", "speed_m_s=1"],
          ["my.csv", "speed_m_s"]),
         (["report", "my.csv", "--hold-out", "slip_ratio=0.33"], ["my.csv", "no row is at 0.33"]),

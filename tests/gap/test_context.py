@@ -62,8 +62,8 @@ def test_a_known_size_takes_the_place_of_the_prior():
     ("table", "words"),
     [
         ("suspected = {lug_thrust = 1.5}", "less than 1"),
-        ('suspected = {lug_thrust = "yes"}', "valid number"),
-        ('excluded = "sensor_drift"', "valid list"),
+        ('suspected = {lug_thrust = "yes"}', "is not a number"),
+        ('excluded = "sensor_drift"', "is not a list"),
         ("suspects = {}", "context.suspects"),
         (
             'suspected = {lug_thrust = 0.5}\nexcluded = ["lug_thrust"]',

@@ -277,12 +277,13 @@ def test_whole_numbers_are_numbers() -> None:
         ('dist = "normal"\nmean = nan\nsd = 1.0', ["mean", "finite", "nan"]),
         ('dist = "normal"\nmean = 0.0\nsd = inf', ["sd", "finite", "inf"]),
         ('dist = "normal"\nmean = "wide"\nsd = 1.0', ["mean", "number", "wide"]),
-        ('dist = "normal"\nmean = 0.0', ["normal.sd", "Field required"]),
+        ('dist = "normal"\nmean = 0.0', ["normal.sd", "sd is missing"]),
         ('dist = "normal"\nmean = 0.0\nsd = 1.0\nsigma = 2', ["no key 'sigma'"]),
+        ('dist = "normal"\nmean = {a = 1}\nsd = 1.0', ["mean = {'a': 1} is not a number"]),
         ('dist = "cauchy"\nmean = 0.0', ["no distribution 'cauchy'", "normal, lognormal, half"]),
         ('dist = "nromal"\nmean = 0.0', ["no distribution 'nromal'", "did you mean normal"]),
         ("mean = 0.0\nsd = 1.0", ["parameters.x", "dist"]),
-        ('dist = "fixed"', ["value", "Field required"]),
+        ('dist = "fixed"', ["fixed.value", "value is missing"]),
         ('dist = "normal"\nmean = 0.0\nsd = 1.0\nrelative_to = "load"', ["relative_to",
          "normal_load_kn", "'load'"]),
     ],
@@ -291,6 +292,23 @@ def test_an_impossible_entry_names_its_place(body: str, words: list[str]) -> Non
     message = refusal(lambda: one(body))
     for word in ["my.toml", "parameters.x", "allowed:", *words]:
         assert word in message
+    assert not set(PYDANTIC) & set(message.split())
+
+
+PYDANTIC = ("Input", "Field", "String", "dictionary", "valid")
+
+
+@pytest.mark.parametrize(("table", "words"), [
+    ("[parameters]\nx = 0.5", "x = 0.5 is not a table"),
+    ("[likelihood]\nfamily = 7", "family = 7 is not 'normal' or 'student_t'"),
+])  # fmt: skip
+def test_what_is_no_table_or_no_text_is_told_in_plain_words(table: str, words: str) -> None:
+    text = f'model = "m"\n{table}\n'
+    message = refusal(
+        lambda: parse_priors(text, "my.toml", "m", ("x",) if "x" in table else ("sigma",), {})
+    )
+    assert words in message
+    assert not set(PYDANTIC) & set(message.split())
 
 
 @pytest.mark.parametrize(
@@ -314,7 +332,7 @@ def test_a_prior_without_a_justification_is_refused(part: str) -> None:
     text = f'model = "m"\n{entry}\ndist = "half_normal"\nsd = 1.0'
     message = refusal(lambda: parse_priors(text, "my.toml", "m", ("x",), {}))
     assert f"half_normal.{part}" in message
-    assert "Field required" in message
+    assert f"{part} is missing" in message
 
 
 @pytest.mark.parametrize("part", ["reason", "source"])

@@ -63,7 +63,9 @@ RULES = {
 def test_fine():
     verdict = judge_evidence(FINE)
     assert (verdict.rule, verdict.level) == ("fine", Level.FINE)
-    assert "slip 0 to 70 %" in verdict.trust
+    assert verdict.trust == (
+        "median and bands for slip 0 to 70 %, to 0.040 kN rms, largest error 8.0 % of the reading"
+    )
     assert "outside" in verdict.doubt
 
 
@@ -205,7 +207,9 @@ def test_parameters_set_by_the_prior_are_named_even_where_all_is_fine():
 
 def test_an_error_that_cannot_be_judged_is_not_printed():
     evidence = replace(FINE, hits=6, low_coverage_p=0.001, max_relative_error=float("nan"))
-    assert "at most" not in judge_evidence(evidence).trust
+    assert "largest error" not in judge_evidence(evidence).trust
+    told = judge_evidence(replace(evidence, max_relative_error=2.0)).trust
+    assert told == "the median, to 0.040 kN rms, largest error 200 % of the reading"
 
 
 def test_evidence_of_the_held_out_pressure(drawbar):

@@ -132,6 +132,7 @@ def told(header: str, values: np.ndarray, effect: np.ndarray, seed: int = 5) -> 
 
 BIN = np.tile(["A", "B"], 20)
 DAY = np.tile([1.0, 2.0, 3.0, 4.0], 10)
+ORDER = np.random.default_rng(8).permutation(40) + 1.0
 HEAT = np.random.default_rng(6).random(40)
 
 
@@ -139,6 +140,8 @@ HEAT = np.random.default_rng(6).random(40)
     ("soil bin", BIN, 0.2 * (BIN == "A"), "where it is A (20 rows)"),
     ("day", DAY, 0.4 * (DAY == 3.0), "where it is 3 (10 rows)"),
     ("heat", HEAT, HEAT, "where it is 0."),
+    ("run_order", ORDER, 0.02 * ORDER, 'correlated_along = "run_order"'),
+    ("day", DAY, 0.4 * (DAY == 3.0), "fit each of its values by itself"),
     ("heat", HEAT, 8.0 * (HEAT - 0.5) ** 2, "where it is 0."),
     ("cone_index_kpa", 400.0 + 200.0 * HEAT, HEAT, "a column that is not used"),
 ])  # fmt: skip

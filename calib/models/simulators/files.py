@@ -13,7 +13,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from calib.batch.plugins import run_file
 from calib.data.files import MEND_TOML, read_text, read_toml
-from calib.errors import CalibError, meant
+from calib.errors import CalibError, in_words, meant
 from calib.models.simulators.base import Way
 from calib.models.simulators.exchange import check_template
 from calib.models.simulators.registered import SIMULATED, Budget, Simulated, declare, written
@@ -123,11 +123,8 @@ def _explain(error: ValidationError, path: Path) -> CalibError:
         return CalibError(
             f"unknown key {key}", where=str(path), allowed=", ".join(known), mend=mend
         )
-    if first["type"] == "missing":
-        return CalibError(f"the key {key} is missing", where=str(path), mend="add it")
-    return CalibError(
-        f"{first['msg']} (found {first.get('input')!r})", where=f"{path}, {key}", mend=mend
-    )
+    missing = first["type"] == "missing"
+    return CalibError(in_words(first), where=f"{path}, {key}", mend="add it" if missing else mend)
 
 
 def _ranges(file: SimulatorFile, path: Path) -> dict[str, tuple[float, float]]:

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from calib.data.files import MEND_TOML
 from calib.data.headers import parse_header
 from calib.data.registry import Registry, run_again
-from calib.errors import CalibError
+from calib.errors import CalibError, in_words
 from calib.models import MODELS
 from calib.models.base import Array, Conditions, Model
 from calib.models.declared import DIMENSIONS, check_model, check_names, check_word
@@ -346,7 +346,7 @@ def _check_budget(name: str, way: Any, budget: Mapping[str, float]) -> None:
     except ValidationError as error:
         first = error.errors()[0]
         raise CalibError(
-            f"{first['msg']} (found {first['input']!r})",
+            in_words(first),
             where=f"{where}.{'.'.join(map(str, first['loc']))}",
             allowed=", ".join(Budget.model_fields), mend="correct it, or leave it out",
         ) from None  # fmt: skip

@@ -176,5 +176,5 @@ def test_a_prior_that_is_no_number_is_named(tmp_path: Path) -> None:
     file = write_program(tmp_path)
     file.write_text(file.read_text().replace("median = 0.5", "median = nan", 1))
     (model,) = models_of(read_simulator(file).simulator)
-    with pytest.raises(CalibError, match=r"parameters\.mu.*median: Input should be a finite"):
+    with pytest.raises(CalibError, match=r"parameters\.mu.*median = nan is not a finite number"):
         parse_priors(model.priors, "wheel", "wheel", (*model.parameters, "sigma"), {})
