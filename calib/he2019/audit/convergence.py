@@ -40,7 +40,7 @@ from calib.he2019.datasets.drawbar import SLIP_SHIFT
 from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.datasets.published import Published
 from calib.inference.estimators import GeneticSettings, PointEstimate, estimate
-from calib.inference.estimators.genetic import minimise_genetic_runs
+from calib.inference.estimators.genetic import minimise_genetic
 from calib.inference.estimators.search import hold_unidentified, search_space
 from calib.inference.problem import Problem, build_problem
 from calib.inference.random import generator
@@ -183,9 +183,12 @@ def _repeat(
 ) -> Search:  # fmt: skip
     optimum = estimate(problem, "least_squares", generator(seed, *labels, "optimum")).cost
     space = search_space(hold_unidentified(problem)[0])
-    streams = [generator(seed, *labels, i) for i in range(n)]
-    runs = minimise_genetic_runs(space.cost, space.lower, space.upper, streams, settings)
-    costs = [run.cost for run in runs]
+    costs = [
+        minimise_genetic(
+            space.cost, space.lower, space.upper, generator(seed, *labels, i), settings
+        ).cost
+        for i in range(n)
+    ]
     return Search(name, min(optimum, *costs), np.array(costs), text)
 
 
@@ -214,8 +217,8 @@ def _in_printed_coordinates(
         apart = pressure_curves(x, pressures, slips) - observed
         return np.asarray(np.einsum("kmn,kmn->k", apart, apart))
 
-    streams = [generator(seed, "audit", "genetic", "printed", i) for i in runs]
-    return np.array([run.cost for run in minimise_genetic_runs(cost, *box, streams, settings)])
+    streams = (generator(seed, "audit", "genetic", "printed", i) for i in runs)
+    return np.array([minimise_genetic(cost, *box, rng, settings).cost for rng in streams])
 
 
 def convergence_findings(study: GeneticStudy) -> list[Finding]:

@@ -24,7 +24,7 @@ Its mutations do not lead out of a local optimum that all of it has converged on
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -168,122 +168,30 @@ def minimise_genetic(
     Cabrera, Ortiz, Carabias & Simon (2004), doi:10.1076/vesd.41.2.109.26496, as Eqs 10-11 and
     Table 2 of He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003.
     """
-    return minimise_genetic_runs(cost, lower, upper, [rng], settings)[0]
-
-
-def minimise_genetic_runs(
-    cost: Callable[[Array], Array],
-    lower: Array,
-    upper: Array,
-    rngs: Sequence[np.random.Generator],
-    settings: GeneticSettings | None = None,
-) -> list[GeneticResult]:
-    """Minimise a cost in several runs at once, each by its own random numbers.
-
-    The model costs little more for all populations than for one. The parameters are those of
-    `minimise_genetic`; a run's result does not depend on the others.
-    """
     s = settings or GeneticSettings()
-    runs = _Runs(lower, upper, rngs, s)
-    runs.begin(cost(runs.population))
+    population = lower + (upper - lower) * rng.random((s.NP, lower.size))
+    costs = np.array(cost(population))
+    there = costs[np.isfinite(costs)]
+    # An exact fit has no lowest cost to compare with: the costs' rounding then ends the run.
+    floor = 1e-24 * float(np.median(there)) if there.size else 0.0
+    history, calm = [costs.min()], 0
     for generation in range(s.max_iterations):
-        children = runs.descend(generation)
-        runs.select(children, cost(children))
-        if not runs.going.size:
+        if generation % _BLOCK == 0:
+            block = draw_generations(rng, _BLOCK, lower.size, s)
+        draws = GeneticDraws(*(part[generation % _BLOCK] for part in block))
+        children = descendants(population, population[costs.argmin()], draws, s.F, lower, upper)
+        child_costs = cost(children)
+        fitter = child_costs < costs
+        population[fitter], costs[fitter] = children[fitter], child_costs[fitter]
+        history.append(costs.min())
+        tolerated = history[-1] * (1.0 + s.tolerance) + floor
+        calm = calm + 1 if costs.max() <= tolerated < np.inf else 0
+        if calm == s.patience:
             break
-    return [r for r in runs.results if r is not None]
-
-
-class _Runs:
-    """Populations on their way, one after the other in one array: shapes (runs NP, d)."""
-
-    def __init__(
-        self,
-        lower: Array,
-        upper: Array,
-        rngs: Sequence[np.random.Generator],
-        settings: GeneticSettings,
-    ) -> None:
-        self._lower, self._upper, self._rngs, self._settings = lower, upper, rngs, settings
-        shape = settings.NP, lower.size
-        self.population = lower + (upper - lower) * np.concatenate([r.random(shape) for r in rngs])
-        self.results: list[GeneticResult | None] = [None] * len(rngs)
-        self.going = np.arange(len(rngs))
-        self._history: list[list[float]] = [[] for _ in rngs]
-        self._calm = np.zeros(len(rngs), dtype=np.intp)
-
-    def begin(self, costs: Array) -> None:
-        """Take over the costs of the first populations."""
-        self._costs = np.array(costs)
-        # An exact fit has no lowest cost to compare with: the costs' rounding then ends the run.
-        each = [own[np.isfinite(own)] for own in self._costs.reshape(self.going.size, -1)]
-        self._floor = np.array([1e-24 * float(np.median(o)) if o.size else 0.0 for o in each])
-        self._note()
-
-    def descend(self, generation: int) -> Array:
-        """Make the descendants of a generation."""
-        row = generation % _BLOCK
-        if row == 0:
-            self._block = self._draw()
-        draws = GeneticDraws(*(part[row] for part in self._block))
-        best, F = self.population[self._lead].repeat(self._settings.NP, axis=0), self._settings.F
-        return descendants(self.population, best, draws, F, self._lower, self._upper)
-
-    def _draw(self) -> GeneticDraws:
-        """Draw a block of generations of all runs, each from its own stream."""
-        each = [
-            draw_generations(self._rngs[i], _BLOCK, self._lower.size, self._settings)
-            for i in self.going.tolist()
-        ]
-        at = range(0, self._costs.size, self._settings.NP)
-        return GeneticDraws(
-            np.concatenate([d.first + start for d, start in zip(each, at, strict=True)], axis=1),
-            np.concatenate([d.second + start for d, start in zip(each, at, strict=True)], axis=1),
-            np.concatenate([d.crossed for d in each], axis=1),
-            np.concatenate([d.mutation for d in each], axis=1),
-        )
-
-    def select(self, children: Array, costs: Array) -> None:
-        """Let descendants replace their parents where they are fitter; end what has converged."""
-        fitter = costs < self._costs
-        self.population[fitter] = children[fitter]
-        self._costs[fitter] = costs[fitter]
-        lowest = self._note()
-        tolerated = lowest * (1.0 + self._settings.tolerance) + self._floor
-        largest = self._costs.reshape(self.going.size, -1).max(axis=1)
-        self._calm = np.where((largest <= tolerated) & (tolerated < np.inf), self._calm + 1, 0)
-        n = len(self._history[self.going[0]])
-        ended = (self._calm >= self._settings.patience) | (n > self._settings.max_iterations)
-        if ended.any():
-            self._end(ended)
-
-    def _note(self) -> Array:
-        """Note the best of each population and its cost."""
-        costs = self._costs.reshape(self.going.size, -1)
-        best = costs.argmin(axis=1)
-        self._lead = best + costs.shape[1] * np.arange(self.going.size)
-        lowest = self._costs[self._lead]
-        for i, cost in zip(self.going, lowest.tolist(), strict=True):
-            self._history[i].append(cost)
-        return np.asarray(lowest)
-
-    def _end(self, ended: NDArray[np.bool_]) -> None:
-        size = self._settings.NP
-        for j in np.flatnonzero(ended):
-            history = np.array(self._history[self.going[j]])
-            self.results[self.going[j]] = GeneticResult(
-                self.population[self._lead[j]].copy(), float(history[-1]), size * history.size,
-                history, bool(self._calm[j] == self._settings.patience),
-            )  # fmt: skip
-        left, rows = ~ended, np.repeat(~ended, size)
-        shift = size * (np.cumsum(ended) - ended)[left].repeat(size)
-        self.population, self._costs = self.population[rows], self._costs[rows]
-        first, second, crossed, mutation = self._block
-        self._block = GeneticDraws(
-            first[:, rows] - shift, second[:, rows] - shift, crossed[:, rows], mutation[:, rows]
-        )
-        self.going, self._calm, self._floor = self.going[left], self._calm[left], self._floor[left]
-        self._lead = self._lead[left] - size * (np.cumsum(ended) - ended)[left]
+    return GeneticResult(
+        population[costs.argmin()], float(history[-1]), s.NP * len(history), np.array(history),
+        calm == s.patience,
+    )  # fmt: skip
 
 
 def estimate_genetic(
