@@ -118,7 +118,7 @@ def peer(problem: Problem, keeper: RunKeeper, runs: int, seed: int) -> Problem:
     z, scores = state.axes.of(theta), pca.transform(values)
     found = [GaussianProcessRegressor(kernel, normalize_y=True).fit(z, s) for s in scores.T]
     model = replace(problem.bound.model, predict=Peer(pca, found, state))
-    model = replace(model, location=calib.models.base.not_given)
+    model = replace(model, mean_response=calib.models.base.not_given)
     return replace(problem, bound=replace(problem.bound, model=model))
 
 

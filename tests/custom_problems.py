@@ -30,15 +30,14 @@ def problem_of(
     The last prior is that of sigma.
     """
 
-    def location(columns, rows, references, work=None):
-        # A new array, which the sum of squares is worked out in.
-        return np.array(function(*columns, rows["slip_ratio"]))
+    def mean_response(columns, rows, references):
+        return np.asarray(function(*columns, rows["slip_ratio"]))
 
     names = tuple(p.name for p in priors)[:-1]
     model = Model(
         name="custom", title="a test", output="drawbar_pull_kn",
         conditions=("slip_ratio",), parameters=names, reported={}, response="identity",
-        location=location, report_theta=lambda theta, references: {},
+        mean_response=mean_response, report_theta=lambda theta, references: {},
         theta_from_reported=lambda reported, references: np.empty(0),
     )  # fmt: skip
     table = table_from_arrays({"slip_ratio": slip, "drawbar_pull_kn": pull})

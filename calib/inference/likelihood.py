@@ -23,18 +23,16 @@ from __future__ import annotations
 
 import os
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from calib.models.base import N_WORK, Array, BoundModel, Conditions, Rows
+from calib.models.base import Array, BoundModel, Conditions, Rows, columns
 
-# Cells (rows times vectors) of a tile: three arrays of doubles in a cache of a megabyte or two.
-# Measured from 8,192 to 131,072: smaller ones pay for NumPy's calls, larger ones for memory.
+# Cells (rows times vectors) of a tile: a few arrays of doubles in a processor's cache.
 _TILE_CELLS = 65_536
-# Up to this many rows vectors run along the contiguous axis, beyond it rows do.
+# Up to this many rows are one tile, in their order.
 _SHORT = 256
 # Cells from which a second thread is worth starting.
 _PARALLEL_CELLS = 4_000_000
@@ -64,7 +62,6 @@ class Squares:
     n_distinct: int
     within: float
     threads: int
-    _spare: list[Array] = field(default_factory=list, repr=False, compare=False)
 
     @classmethod
     def of(
@@ -82,19 +79,12 @@ class Squares:
         )
         return cls(bound, tiles, mean.size, within, threads or _processors())
 
-    def __getstate__(self) -> dict[str, Any]:
-        # The workspace does not travel to other processes.
-        return {**self.__dict__, "_spare": []}
-
     def __call__(self, theta: Array) -> Array:
         """Evaluate natural parameters of the model, (k, d) to (k,); NaN where it has no value."""
         sums = np.empty((len(self.tiles), theta.shape[0]))
 
         def work(i: int) -> None:
-            # One workspace for every thread that is at work, kept for the next call.
-            space = self._spare.pop() if self._spare else np.empty((N_WORK, _TILE_CELLS))
-            _evaluate(self.bound, self.tiles[i], theta, space, sums[i])
-            self._spare.append(space)
+            _evaluate(self.bound, self.tiles[i], theta, sums[i])
 
         if self.threads > 1 and theta.shape[0] * self.n_distinct >= _PARALLEL_CELLS:
             with ThreadPoolExecutor(self.threads) as pool:
@@ -111,36 +101,23 @@ def _processors() -> int:
     return os.cpu_count() or 1
 
 
-def _evaluate(bound: BoundModel, tile: _Tile, theta: Array, space: Array, out: Array) -> None:
+def _evaluate(bound: BoundModel, tile: _Tile, theta: Array, out: Array) -> None:
     """Write each vector's sum of squares over a tile's rows."""
-    n, short = tile.response.size, tile.response.ndim == 2
-    at_once = _TILE_CELLS // n
-    by_column = tuple(np.ascontiguousarray(c) for c in theta.T)
+    at_once = max(1, _TILE_CELLS // tile.response.size)
     # Threads have their own error state. Bad vectors come out as NaN.
     with np.errstate(all="ignore"):
         for i in range(0, theta.shape[0], at_once):
-            some = tuple(c[i : i + at_once] for c in by_column)
-            k = some[0].size
-            shape = (n, k) if short else (k, n)
-            work = space[:, : n * k].reshape(N_WORK, *shape)
-            some = tuple(c[None] if short else c[:, None] for c in some)
-            r = bound.model.location(some, tile.rows, bound.references, work)
-            r -= tile.response
+            some = columns(theta[i : i + at_once])
+            r = bound.model.mean_response(some, tile.rows, bound.references) - tile.response
             r *= r
-            if tile.repeats is not None:
-                r *= tile.repeats
-            r.sum(axis=0 if short else 1, out=out[i : i + at_once])
+            out[i : i + at_once] = r.sum(axis=1) if tile.repeats is None else r @ tile.repeats
 
 
 def _tile(
     bound: BoundModel, distinct: Conditions, mean: Array, repeats: Array | None, rows: slice
 ) -> _Tile:
     prepared = bound.prepare({name: v[rows] for name, v in distinct.items()})
-    response, weight = mean[rows], None if repeats is None else repeats[rows]
-    if mean.size <= _SHORT:
-        prepared = {name: v[:, None] for name, v in prepared.items()}
-        response, weight = response[:, None], None if weight is None else weight[:, None]
-    return _Tile(prepared, response, weight)
+    return _Tile(prepared, mean[rows], None if repeats is None else repeats[rows])
 
 
 def _distinct(

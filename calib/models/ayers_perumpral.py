@@ -55,19 +55,11 @@ def _prepare(conditions: Conditions, references: References) -> Rows:
     return {"ln_index": ln_index, "water": _water(conditions)}
 
 
-def _location(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+def _density(columns: Columns, rows: Rows, references: References) -> Array:
     gamma_ref, C2, C3, C4 = columns
-    # exp{(ln_index + ln(C2 + (water - C3)^2))/C4 + ln gamma_ref - the same at water_ref}, in place.
-    x: Array = work[0]
-    np.subtract(rows["water"], C3, out=x)
-    x *= x
-    x += C2
-    np.log(x, out=x)
-    x += rows["ln_index"]
-    x *= 1.0 / C4
-    x += np.log(gamma_ref) - _ln_water_term(references["water_ref"], C2, C3) / C4
-    np.exp(x, out=x)
-    return x
+    at_references = np.log(gamma_ref) - _ln_water_term(references["water_ref"], C2, C3) / C4
+    ln_term = rows["ln_index"] + _ln_water_term(rows["water"], C2, C3)
+    return np.exp(ln_term / C4 + at_references)
 
 
 def _report(theta: Array, references: References) -> dict[str, Array]:
@@ -95,9 +87,7 @@ def _references(conditions: Conditions) -> dict[str, float]:
     }
 
 
-def _location_volumetric(
-    columns: Columns, rows: Rows, references: References, work: Array
-) -> Array:
+def _density_volumetric(columns: Columns, rows: Rows, references: References) -> Array:
     gamma_ref, A2, A3, A4 = columns
     ln_ref = np.log(gamma_ref)
     target = A2 * ln_ref - _ln_water_term(references["water_ref"] / gamma_ref, A3, A4)
@@ -159,7 +149,7 @@ AYERS_PERUMPRAL = Model(
     parameters=("gamma_ref", "C2", "C3", "C4"),
     reported={"C1": "kPa (g/cm^3)^-C4", "C2": "1", "C3": "g/g", "C4": "1"},
     response="identity",
-    location=_location,
+    mean_response=_density,
     report_theta=_report,
     theta_from_reported=_from_reported,
     bind_references=_references,
@@ -209,7 +199,7 @@ AYERS_PERUMPRAL_VOLUMETRIC = Model(
     parameters=("gamma_ref", "A2", "A3", "A4"),
     reported={"A1": "kPa (g/cm^3)^-A2", "A2": "1", "A3": "1", "A4": "g/g"},
     response="identity",
-    location=_location_volumetric,
+    mean_response=_density_volumetric,
     report_theta=_report_volumetric,
     theta_from_reported=_from_reported_volumetric,
     bind_references=_references,

@@ -23,10 +23,6 @@ from calib.data.table import real_array
 from calib.errors import CalibError
 from calib.models.latex import text
 
-N_WORK = 3
-# Vectors that are evaluated one by one before all are at once.
-_TRIED = 3
-
 type Array = NDArray[np.float64]
 type References = Mapping[str, float]
 type Conditions = Mapping[str, Array]
@@ -50,43 +46,34 @@ def not_given(*_: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class _Plain:
-    """Evaluates `Model.predict` in the layouts in which a location is asked for."""
+class _Predicted:
+    """The mean response of a model that declares `predict`."""
 
     model: Model
 
-    def __call__(self, columns: Columns, rows: Rows, references: References, work: Array) -> Array:
-        theta = np.stack([np.ravel(c) for c in columns], axis=-1)
-        first = next(iter(rows.values()))
-        if first.ndim == 2 and first.shape[1] == 1 and columns[0].shape[0] == 1:
-            # Rows by vectors.
-            return self._of_each(theta, {name: v[:, 0] for name, v in rows.items()}).T.copy()
-        if any(v.ndim == 2 for v in rows.values()):
-            return self._of_own(theta, rows)
-        return self._of_each(theta, rows)
-
-    def _of_own(self, theta: Array, rows: Rows) -> Array:
-        """Evaluate where every vector has conditions of its own, shape (k, n)."""
-        k = max(len(theta), *(len(v) for v in rows.values() if v.ndim == 2))
+    def __call__(self, columns: Columns, rows: Rows, references: References) -> Array:
+        theta = np.concatenate(columns, axis=1)
+        shape = np.broadcast_shapes(*(v.shape for v in rows.values()))
+        if len(shape) == 1:
+            return self._call(theta, rows)
+        # Conditions of each vector's own: many functions broadcast them, which is much faster.
+        k = max(len(theta), shape[0])
         theta = np.broadcast_to(theta, (k, theta.shape[1]))
+        own = {name: np.broadcast_to(v, (k, shape[1])) for name, v in rows.items()}
 
         def one(i: int) -> Array:
-            own = {name: v[i] if v.ndim == 2 else v for name, v in rows.items()}
-            return self._of_each(theta[i : i + 1], own)
+            return self._call(theta[i : i + 1], {name: v[i] for name, v in own.items()})
 
-        first = np.concatenate([one(i) for i in range(min(k, _TRIED))])
-        # A function written with NumPy's broadcasting takes them all at once.
-        n = first.shape[1]
+        first = one(0)
         try:
-            wide = {name: np.broadcast_to(v, (k, n)) for name, v in rows.items()}
-            found = self._of_each(theta, wide, n)
-        except (CalibError, ValueError, IndexError, TypeError):
-            found = np.empty((0, n))
-        if len(found) == k and np.allclose(found[: len(first)], first, 1e-12, 0.0, equal_nan=True):
-            return found
-        return np.concatenate([first, *(one(i) for i in range(len(first), k))])
+            found = self._call(theta, own) if k > 1 else first
+            if np.allclose(found[0], first[0], 1e-12, 0.0, equal_nan=True):
+                return found
+        except CalibError:
+            pass
+        return np.concatenate([first, *(one(i) for i in range(1, k))])
 
-    def _of_each(self, theta: Array, rows: Rows, n: int = 0) -> Array:
+    def _call(self, theta: Array, rows: Rows) -> Array:
         if self.model.predict is None:
             raise CalibError(
                 f"the model {self.model.name} has no predict",
@@ -112,7 +99,7 @@ class _Plain:
             found = real_array(given, QUANTITIES[self.model.output].unit)
         except CalibError as error:
             raise error.within(f"predict of the model {self.model.name}") from None
-        n = n or next(iter(rows.values())).size
+        n = next(iter(rows.values())).shape[-1]
         if found.shape != (theta.shape[0], n):
             raise CalibError(
                 f"predict of the model {self.model.name} returned the shape {found.shape}",
@@ -225,13 +212,10 @@ class Model:
     searched : Searched, optional
     estimates_all_rows : bool
         Whether point estimates are from all rows, those held out among them, as published.
-    location : callable, optional
-        What is evaluated in the place of `predict`, in place and on the scale of the response:
-        ``(columns, rows, references, work) -> prediction``; NaN where the equation has no value.
-        Columns of shape (k, 1) with rows of shape (n,) give (k, n); columns of shape (1, k) with
-        rows of shape (n, 1) give (n, k), for short data much faster. `work`, shape (`N_WORK`, k, n)
-        or (`N_WORK`, n, k), is memory for temporaries and the result: fresh memory would cost more
-        than the arithmetic.
+    mean_response : callable, optional
+        In the place of `predict`, on the scale of the response: ``(columns, rows, references) ->
+        (k, n)``, from a column (k, 1) of each parameter and rows of shape (n,) or (k, n); NaN
+        where the equation has no value.
     report_theta : callable
         ``(theta, references) -> {name: (k,)}``: published parameters from sampled ones.
     theta_from_reported : callable
@@ -239,8 +223,8 @@ class Model:
     bind_references : callable
         ``conditions -> references``.
     prepare : callable
-        ``(conditions, references) -> rows``: what `location` needs of the conditions, worked out
-        once for any number of parameter vectors.
+        ``(conditions, references) -> rows``: what `mean_response` needs of the conditions, worked
+        out once for any number of parameter vectors.
     joined : (str, str, str), optional
         Two parameters and a condition by which the second is multiplied: where it varies little,
         the data know but their sum, and it is sampled with their ratio.
@@ -273,7 +257,7 @@ class Model:
     alone: Alone | None = None
     searched: Searched | None = None
     estimates_all_rows: bool = False
-    location: Callable[[Columns, Rows, References, Array], Array] = not_given
+    mean_response: Callable[[Columns, Rows, References], Array] = not_given
     report_theta: Callable[[Array, References], dict[str, Array]] = not_given
     theta_from_reported: Callable[[Mapping[str, float], References], Array] = not_given
     bind_references: Callable[[Conditions], dict[str, float]] = _no_references
@@ -285,8 +269,8 @@ class Model:
     def __post_init__(self) -> None:
         if not self.reported:
             object.__setattr__(self, "reported", dict.fromkeys(self.parameters, "1"))
-        if self.location is not_given:
-            object.__setattr__(self, "location", _Plain(self))
+        if self.mean_response is not_given:
+            object.__setattr__(self, "mean_response", _Predicted(self))
         if self.report_theta is not_given:
             object.__setattr__(self, "report_theta", _Named(self.parameters))
             object.__setattr__(self, "theta_from_reported", _Vector(self.parameters))
@@ -364,9 +348,8 @@ class BoundModel:
                     theta, *rest = (v[first] for v in each)
                     conditions = {**conditions, **dict(zip(own, rest, strict=True))}
                     return self.location(theta, conditions, None if own else rows)[again]
-            work = np.empty((N_WORK, k, next(iter(conditions.values())).shape[-1]))
             rows = self.model.prepare(conditions, self.references) if rows is None else rows
-            return self.model.location(columns(theta), rows, self.references, work)
+            return self.model.mean_response(columns(theta), rows, self.references)
 
     def prepare(self, conditions: Conditions) -> Rows:
         """Work out what the equation needs of conditions."""

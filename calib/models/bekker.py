@@ -62,16 +62,9 @@ def prepare(conditions: Conditions, references: References) -> Rows:
     return rows | ({"slip": conditions["slip_ratio"]} if "slip_ratio" in conditions else {})
 
 
-def _ln_rut_mm(
-    ln_pressure: Array, exponent: Array, z_ref_mm: Array, n0: Array, work: Array
-) -> Array:
-    ln_z: Array = work[0]
-    np.add(ln_pressure, n0 * (np.log(z_ref_mm) - LN_MM_PER_M), out=ln_z)
-    ln_z /= exponent
-    ln_z += LN_MM_PER_M
-    if not exponent.min() > 0.0:
-        np.copyto(ln_z, np.nan, where=~(exponent > 0.0))
-    return ln_z
+def _ln_rut_mm(ln_pressure: Array, exponent: Array, z_ref_mm: Array, n0: Array) -> Array:
+    exponent = np.where(exponent > 0.0, exponent, np.nan)
+    return (ln_pressure + n0 * (np.log(z_ref_mm) - LN_MM_PER_M)) / exponent + LN_MM_PER_M
 
 
 def bind_references(conditions: Conditions) -> dict[str, float]:
@@ -84,16 +77,14 @@ def bind_references(conditions: Conditions) -> dict[str, float]:
     }
 
 
-def _location_bekker(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+def _location_bekker(columns: Columns, rows: Rows, references: References) -> Array:
     z_ref, n = columns
-    return _ln_rut_mm(rows["ln_pressure"], n, z_ref, n, work)
+    return _ln_rut_mm(rows["ln_pressure"], n, z_ref, n)
 
 
-def _location_modified(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+def _location_modified(columns: Columns, rows: Rows, references: References) -> Array:
     z_ref, n0, n1 = columns
-    exponent = np.multiply(n1, rows["slip"], out=work[1])
-    exponent += n0
-    return _ln_rut_mm(rows["ln_pressure"], exponent, z_ref, n0, work)
+    return _ln_rut_mm(rows["ln_pressure"], n0 + n1 * rows["slip"], z_ref, n0)
 
 
 def modulus(z_ref: Array, n: Array, references: References, width_mm: float = 1000.0) -> Array:
@@ -133,7 +124,7 @@ BEKKER = Model(
     parameters=("z_ref", "n"),
     reported={"n": "1", "k": "kPa/m^n"},
     response="log",
-    location=_location_bekker,
+    mean_response=_location_bekker,
     report_theta=_report_bekker,
     theta_from_reported=_theta_bekker,
     bind_references=bind_references,
@@ -175,7 +166,7 @@ MODIFIED_BEKKER = Model(
     parameters=("z_ref", "n0", "n1"),
     reported={"n0": "1", "n1": "1", "k": "kPa/m^n"},
     response="log",
-    location=_location_modified,
+    mean_response=_location_modified,
     report_theta=_report_modified,
     theta_from_reported=_theta_modified,
     bind_references=bind_references,
@@ -215,19 +206,19 @@ slip_ratio,average_ground_pressure_kpa,rut_depth_mm
 )
 
 
-def _bekker(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+def _bekker(columns: Columns, rows: Rows, references: References) -> Array:
     z_ref, n, share = columns
     stiffer = np.log(1.0 - share + share / rows["wider"])
     return np.asarray(np.log(z_ref) + (rows["ln_pressure"] - stiffer) / n)
 
 
-def _reece(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+def _reece(columns: Columns, rows: Rows, references: References) -> Array:
     z_ref, n, share = columns
     stiffer = np.log(1.0 - share + share * rows["wider"])
     return np.asarray(np.log(z_ref * rows["wider"]) + (rows["ln_pressure"] - stiffer) / n)
 
 
-def _lyasko(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+def _lyasko(columns: Columns, rows: Rows, references: References) -> Array:
     z_ref, n, a = columns
     slip = rows["slip"]
     deeper = np.log((1.0 + slip) / (1.0 - a * slip))
@@ -290,7 +281,7 @@ BEKKER_PLATE = _plate(
     name="bekker_plate",
     title="Bekker under plates of several widths",
     reported={"n": "1", "kc": "kPa/m^(n-1)", "kphi": "kPa/m^n"},
-    location=_bekker,
+    mean_response=_bekker,
     report_theta=_report_plate,
     theta_from_reported=_theta_plate,
     latex=(r"$p = (k_\mathrm{c}/b + k_\phi) z^n$",),
@@ -321,7 +312,7 @@ REECE = _plate(
     name="reece",
     title="Reece pressure-sinkage",
     reported={"n": "1", "k1": "kPa", "k2": "kPa/m"},
-    location=_reece,
+    mean_response=_reece,
     report_theta=_report_reece,
     theta_from_reported=_theta_reece,
     latex=(r"$p = (k_1 + k_2 b)(z/b)^n$",),
@@ -356,7 +347,7 @@ LYASKO = Model(
     parameters=("z_ref", "n", "a"),
     reported={"n": "1", "k": "kPa/m^n", "a": "1"},
     response="log",
-    location=_lyasko,
+    mean_response=_lyasko,
     report_theta=_report_lyasko,
     theta_from_reported=_theta_lyasko,
     bind_references=bind_references,

@@ -39,7 +39,7 @@ def _prepare(conditions: Conditions, references: References) -> Rows:
     return {n: v - np.log(references[f"{n}_ref"]) for n, v in _parts(conditions).items()}
 
 
-def _ln_rut(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+def _ln_rut(columns: Columns, rows: Rows, references: References) -> Array:
     z_ref, m, q = columns
     return np.asarray(
         np.log(z_ref) + rows["diameter"] - m * (rows["numeric"] + q * rows["flattened"])
@@ -73,7 +73,7 @@ MACLAURIN_RUT = Model(
     parameters=("z_ref", "m", "q"),
     reported={"k": "1", "m": "1", "q": "1"},
     response="log",
-    location=_ln_rut,
+    mean_response=_ln_rut,
     report_theta=_report,
     theta_from_reported=_theta,
     bind_references=_references,

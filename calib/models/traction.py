@@ -306,7 +306,7 @@ def _prepare(conditions: Conditions, references: References) -> Rows:
     }
 
 
-def _pull(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
+def _pull(columns: Columns, rows: Rows, references: References) -> Array:
     mu, share, K, rho = columns
     strength = mu * ((1.0 - share) * rows["load"] + share * rows["held"])
     return np.asarray(strength * mobilised(rows["slid"] / K) - rho * rows["load"])
@@ -331,7 +331,7 @@ ELLIPTIC_CONTACT = Model(
     conditions=("slip_ratio", "normal_load_kn", "contact_length_mm", "contact_width_mm"),
     parameters=("mu", "share", "K", "rho"),
     reported={"c": "kPa", "phi": "degree", "K": "mm", "rho": "1"},
-    location=_pull,
+    mean_response=_pull,
     report_theta=_report_elliptic,
     theta_from_reported=_theta_elliptic,
     bind_references=_references,

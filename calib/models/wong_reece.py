@@ -10,145 +10,55 @@ the shear stress is that of Janosi & Hanamoto (1961), tau = (c + sigma tan phi)(
 j = r [theta1 - theta - (1 - s)(sin theta1 - sin theta)], and the entry angle is the one at which
 the stresses carry the load.
 
-Time goes into sines and into memory. Wheels are worked through in blocks that stay in the
-processor's cache, nodes along the first axis, in the same memory; sines are matrix products of
-their series.
+Pull, torque and sinkage are three models of one soil: of its eight parameters each output alone
+determines but a few, so what is known of the soil is best fixed in a prior file. A braked wheel
+(slip below zero, part II of the source) has no value.
 
-Drawbar pull, torque and sinkage of a driven rigid wheel: Wong & Reece (1967), part I.
-
-The stresses and their integration are in `calib.models.wong_reece`. The three models share their
-soil: eight parameters, of which pull, torque or sinkage alone determine but a few. What is known
-of the soil is best fixed in a prior file. A braked wheel (slip below zero) has no value.
+The entry angle is found by the secant method on logarithms. `scipy.optimize.elementwise.find_root`
+needs three times as many integrations.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache, partial
-from math import factorial
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from calib.models.base import Array, Columns, Model, References, Rows
 
-type Indices = NDArray[np.intp]
-
-# In each half of the contact; for a first step from the guess fewer will do.
+# Of each half of the contact; fewer do for the first step.
 _N_NODES, _ROUGH = 8, 3
-# Of sine and cosine: 1e-13 at the largest angle.
-_TERMS = 8
 _LARGEST = 1.5
 _LN_ENTRY = (float(np.log(1e-4)), float(np.log(_LARGEST)))
-# Further steps that nearly all wheels need at most, and all.
+# Steps after which the wheels left are checked for a solution, and the most steps.
 _USUAL, _MAX_ITERATIONS = 3, 60
 # Of the load's relative error times the last step in ln theta1; the next secant step leaves about
 # a tenth of it.
 _TOLERANCE, _ROUNDING = 1e-10, 1e-12
-# Wheels whose arrays of 8 nodes stay in a cache of two megabytes.
-_BLOCK = 3072
-_N_WORK = 10
+# Wheels solved together, which bounds the memory.
+_BLOCK = 8192
+_MM_PER_M = 1000.0
 
 
-@dataclass(frozen=True)
-class Wheel:
-    """Soil and wheel, arrays that broadcast.
-
-    Parameters
-    ----------
-    k1, k2, n, c, tan_phi, K, c1, c2 : ndarray
-        In kPa, kPa/m, 1, kPa, 1, m, 1, 1.
-    radius, width, load, slip : ndarray
-        In m, m, kN, as a fraction.
-    """
-
-    k1: Array
-    k2: Array
-    n: Array
-    c: Array
-    tan_phi: Array
-    K: Array
-    c1: Array
-    c2: Array
-    radius: Array
-    width: Array
-    load: Array
-    slip: Array
-
-
-@dataclass(frozen=True)
-class Contact:
-    """Where a wheel stands: pull (kN), torque (kN m) and sinkage (m), as it broadcasts."""
+class Contact(NamedTuple):
+    """Where a wheel stands: pull (kN), torque (kN m) and sinkage (m), each (k, n)."""
 
     pull: Array
     torque: Array
     sinkage: Array
 
 
-def wheels(columns: Columns, rows: Rows) -> Wheel:
-    """Take parameters k1, k2, n, c, phi (degrees), K (mm), c1, c2, and conditions."""
-    k1, k2, n, c, phi, K, c1, c2 = columns
-    return Wheel(
-        k1, k2, n, c, np.tan(np.radians(phi)), K / 1000.0, c1, c2,
-        rows["tyre_diameter_m"] / 2.0, rows["tyre_width_m"], rows["normal_load_kn"],
-        rows["slip_ratio"],
-    )  # fmt: skip
+class _Cells(NamedTuple):
+    """What the integrals need of wheels and soils, each of shape (cells,).
 
-
-@dataclass(frozen=True)
-class _Rule:
-    """Gauss and Legendre's rule in u^2 on [0, 1], with series of sin(a x) and cos(a x) - 1.
-
-    The stress rises as distance to the power n from either end of the contact: in u, the root of
-    that distance, it is smooth for the exponents of soils.
-
-    Parameters
-    ----------
-    node, weight : ndarray, shape (m, 1)
-        The nodes x.
-    sine, cosine : ndarray, shape (m, terms)
-        Coefficients of a, a^3, ... and of a^2, a^4, ...
-    """
-
-    node: Array
-    weight: Array
-    sine: Array
-    cosine: Array
-
-
-@cache
-def _rule(size: int) -> _Rule:
-    u, weight = np.polynomial.legendre.leggauss(size)
-    u = 0.5 * (u[:, None] + 1.0)
-    node, order = u * u, np.arange(_TERMS)
-    over = [1.0 / factorial(j) for j in range(1, 2 * _TERMS + 1)]
-    sine = (-1.0) ** order * node ** (2 * order + 1) * over[::2]
-    cosine = -((-1.0) ** order) * node ** (2 * order + 2) * over[1::2]
-    return _Rule(node, weight[:, None] * u, sine, cosine)
-
-
-@dataclass(frozen=True)
-class _Cells:
-    """What the integrals need of wheels, each of shape (cells,).
-
-    Parameters
-    ----------
-    n, c, tan_phi, radius, load : ndarray
-        As of a `Wheel`.
-    turn : ndarray
-        theta_m / theta1.
-    scale : ndarray
-        p^(1/n) r/b: sigma is (scale (cos theta - cos theta1))^n.
-    stiff, rest : ndarray
-        r/K, and (1 - s) r/K.
-    area : ndarray
-        r b.
+    `turn` is theta_m/theta1, `scale` p^(1/n) r/b, so that sigma is (scale (cos theta - cos
+    theta1))^n, `stiff` r/K, `rest` (1 - s) r/K and `area` r b.
     """
 
     n: Array
     c: Array
     tan_phi: Array
-    radius: Array
     load: Array
     turn: Array
     scale: Array
@@ -156,27 +66,10 @@ class _Cells:
     rest: Array
     area: Array
 
-    @classmethod
-    def of(cls, w: Wheel) -> _Cells:
-        """Without a value where the slip is below zero."""
-        slip = np.where(w.slip >= 0.0, w.slip, np.nan)
-        stiff = w.radius / w.K
-        parts = (
-            w.n, w.c, w.tan_phi, w.radius, w.load, np.minimum(w.c1 + w.c2 * slip, 0.999),
-            (w.k1 + w.k2 * w.width) ** (1.0 / w.n) * w.radius / w.width, stiff,
-            (1.0 - slip) * stiff, w.radius * w.width,
-        )  # fmt: skip
-        return cls(*(v.ravel() for v in np.broadcast_arrays(*parts)))
-
-    def some(self, which: Indices) -> _Cells:
-        """Some of the cells."""
-        return _Cells(*(v[which] for v in vars(self).values()))
-
     def guess(self) -> tuple[Array, Array]:
-        """Return ln theta1, and the slope of ln load over it, by a formula for small angles.
+        """Return ln theta1 and the slope of ln load over it, by a formula for small angles.
 
-        Nothing depends on its numbers but how many steps follow: they were fitted to soils drawn
-        from the priors.
+        Its numbers, fitted to soils drawn from the priors, only affect how many steps follow.
         """
         power = 2.0 * self.n + 1.0
         spread = (1.0 - self.turn) * (2.0 + self.turn) / 3.0
@@ -186,155 +79,137 @@ class _Cells:
         friction, bent = 0.4 * self.tan_phi * angle, power * angle**2 / 12.0
         cohesion = 0.3 * self.c * self.area * angle / self.load
         x -= (friction - bent + cohesion) / (power + friction - 2.0 * bent)
-        slope = np.maximum(power + friction - 2.0 * bent - cohesion, 0.5)
-        return np.clip(x, *_LN_ENTRY), slope
+        return x, np.maximum(power + friction - 2.0 * bent - cohesion, 0.5)
 
 
-def _forces(entry: Array, cells: _Cells, work: Array, nodes: int = _N_NODES) -> Array:
-    """Integrate the stresses: load, pull and torque over radius (kN) in the first of 4 rows."""
-    rule, size = _rule(nodes), entry.size
-    sin, cos, sin_rear, cos_rear, rise, strength, tau, tau_rear, spare, powers = (
-        part[: rows * size].reshape(rows, size)
-        for part, rows in zip(work, [nodes] * (_N_WORK - 1) + [_TERMS], strict=True)
-    )
+@cache
+def _rule(size: int) -> tuple[Array, Array]:
+    """Return nodes and weights (m, 1) of Gauss and Legendre's rule in the root of [0, 1].
+
+    The stress rises as distance to the power n from either end of the contact: it is smooth in the
+    root of that distance.
+    """
+    u, weight = np.polynomial.legendre.leggauss(size)
+    u = 0.5 * (u[:, None] + 1.0)
+    return u * u, weight[:, None] * u
+
+
+def _sines(angle: Array) -> tuple[Array, Array]:
+    """Return sin and 1 - cos, by the tangent of the half, NumPy's fastest function of the three."""
+    half = np.tan(0.5 * angle)
+    sine = 2.0 * half / (1.0 + half * half)
+    return sine, half * sine
+
+
+def _forces(entry: Array, cells: _Cells, nodes: int = _N_NODES) -> Array:
+    """Integrate the stresses: load, pull and torque over radius (kN), shape (3, cells)."""
+    node, weight = _rule(nodes)
     sin_entry, cos_entry = np.sin(entry), np.cos(entry)
     rear = cells.turn * entry
     front = entry - rear
-    # Of angles from the entry on, and from the vertical on; cosines less one.
-    for length, sines, cosines in ((front, sin, cos), (rear, sin_rear, cos_rear)):
-        square = length * length
-        powers[0] = length
-        for j in range(1, _TERMS):
-            np.multiply(powers[j - 1], square, out=powers[j])
-        np.matmul(rule.sine, powers, out=sines)
-        powers *= length
-        np.matmul(rule.cosine, powers, out=cosines)
-    # In front: rise is cos theta - cos theta1, and fall sin theta1 - sin theta.
-    np.multiply(cos, cos_entry, out=rise)
-    rise += np.multiply(sin, sin_entry, out=spare)
-    sin *= cos_entry
-    cos *= sin_entry
-    fall = np.subtract(sin, cos, out=sin)
-    sigma = np.multiply(rise, cells.scale, out=cos)
-    np.log(sigma, out=sigma)
-    sigma *= cells.n
-    np.exp(sigma, out=sigma)
-    sigma *= rule.weight
-    np.multiply(sigma, cells.tan_phi, out=strength)
-    strength += np.multiply(rule.weight, cells.c, out=spare)
-    # Both tau are the negative of the shear stress.
-    np.multiply(fall, cells.rest, out=tau)
-    tau -= np.multiply(rule.node, front * cells.stiff, out=spare)
-    np.multiply(rule.node, rear * cells.stiff, out=tau_rear)
-    tau_rear -= np.multiply(sin_rear, cells.rest, out=spare)
-    tau_rear += cells.rest * sin_entry - cells.stiff * entry
-    for part in (tau, tau_rear):
-        np.expm1(part, out=part)
-        part *= strength
-
-    def dot(a: Array, b: Array) -> Array:
-        return np.asarray(np.add.reduce(np.multiply(a, b, out=spare), axis=0))
-
-    normal, shear, shear_rear = (np.add.reduce(part, axis=0) for part in (sigma, tau, tau_rear))
-    forces = np.empty((4, size))
-    load = front * (normal * cos_entry + dot(sigma, rise) - shear * sin_entry + dot(tau, fall))
-    load += rear * (normal + dot(sigma, cos_rear) - dot(tau_rear, sin_rear))
-    pull = front * (dot(sigma, fall) - normal * sin_entry - shear * cos_entry - dot(tau, rise))
-    pull -= rear * (shear_rear + dot(tau_rear, cos_rear) + dot(sigma, sin_rear))
-    np.multiply(cells.area, load, out=forces[0])
-    np.multiply(cells.area, pull, out=forces[1])
-    np.multiply(-cells.area, front * shear + rear * shear_rear, out=forces[2])
-    return forces
+    # From the entry on: cos theta - cos theta1, and sin theta1 - sin theta.
+    sine, versine = _sines(node * front)
+    rise = sin_entry * sine - cos_entry * versine
+    fall = cos_entry * sine + sin_entry * versine
+    sin_rear, versine = _sines(node * rear)
+    sigma = weight * np.exp(cells.n * np.log(cells.scale * rise))
+    strength = weight * cells.c + sigma * cells.tan_phi
+    # The negative of the shear stress, from j/K in front of theta_m and behind it.
+    tau = strength * np.expm1(cells.rest * fall - node * (cells.stiff * front))
+    slid = cells.rest * sin_entry - cells.stiff * entry
+    tau_rear = strength * np.expm1(slid + node * (cells.stiff * rear) - cells.rest * sin_rear)
+    normal, shear, shear_rear = (v.sum(axis=0) for v in (sigma, tau, tau_rear))
+    load = front * (normal * cos_entry - shear * sin_entry + (sigma * rise + tau * fall).sum(0))
+    load += rear * (normal - (sigma * versine + tau_rear * sin_rear).sum(0))
+    pull = front * ((sigma * fall - tau * rise).sum(0) - normal * sin_entry - shear * cos_entry)
+    pull -= rear * (shear_rear + (sigma * sin_rear - tau_rear * versine).sum(0))
+    return cells.area * np.stack([load, pull, -front * shear - rear * shear_rear])
 
 
-def contact(wheel: Wheel) -> Contact:
+def _solve(cells: _Cells) -> Array:
+    """Return pull, torque over radius and ln theta1 where the load is carried, shape (3, cells).
+
+    The load grows about as the entry angle to the power 2n + 1: on logarithms the secant method
+    takes few steps, kept inside a shrinking bracket. The last step need not be evaluated: pull and
+    torque are taken along their own secants as far. NaN where the soil cannot carry the wheel.
+    """
+    found = np.full((3, cells.load.size), np.nan)
+    left = np.arange(cells.load.size)
+    x, slope = cells.guess()
+    x = np.clip(x, *_LN_ENTRY)
+    rough = _forces(np.exp(x), cells, _ROUGH)[0]
+    x = np.clip(x - np.log(rough / cells.load) / slope, *_LN_ENTRY)
+    low, high = (np.full_like(x, edge) for edge in _LN_ENTRY)
+    before = np.full((4, x.size), np.nan)
+    for step in range(_MAX_ITERATIONS):
+        load, pull, torque = _forces(np.exp(x), cells)
+        here = np.stack([np.log(load / cells.load), pull, torque, x])
+        moved = here - before
+        off = np.abs(here[0])
+        # Not farther along a secant than it is long, but for rounding.
+        done = off <= np.maximum(np.abs(moved[0]), _ROUNDING)
+        done &= off * np.abs(moved[3]) <= _TOLERANCE
+        on = np.where(moved[0] == 0.0, 0.0, -here[0] / moved[0])
+        found[:, left[done]] = (here[1:] + on * moved[1:])[:, done]
+        stays = ~done
+        if step == _USUAL:
+            stays &= _forces(np.full_like(x, _LARGEST), cells)[0] > cells.load
+        if not stays.all():
+            left, cells = left[stays], _Cells(*(v[stays] for v in cells))
+            low, high, slope = low[stays], high[stays], slope[stays]
+            here, moved = here[:, stays], moved[:, stays]
+        if not left.size:
+            break
+        value, x, before = here[0], here[3], here
+        secant = moved[0] / moved[3]
+        slope = np.where(secant > 0.1, secant, slope)
+        low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
+        x = x - value / slope
+        x = np.where((x > low) & (x < high), x, 0.5 * (low + high))
+    return found
+
+
+def contact(columns: Columns, rows: Rows) -> Contact:
     """Find where each wheel carries its load, and what it then pulls.
 
-    Returns
-    -------
-    Contact
-        NaN for a braked wheel (slip below zero, part II of the source), and where the soil does
-        not carry the wheel although it has sunk to its axle.
+    Parameters k1, k2, n, c, phi (degrees), K (mm), c1 and c2 are columns (k, 1). NaN for a braked
+    wheel, and where the soil does not carry the wheel although it has sunk to its axle.
 
     References
     ----------
     Wong & Reece (1967), J. Terramechanics 4(1), 81-98, doi:10.1016/0022-4898(67)90105-X.
     """
-    shape = np.broadcast_shapes(*(np.shape(v) for v in vars(wheel).values()))
+    k1, k2, n, c, phi, K, c1, c2 = columns
+    radius, width = rows["tyre_diameter_m"] / 2.0, rows["tyre_width_m"]
+    slip = np.where(rows["slip_ratio"] >= 0.0, rows["slip_ratio"], np.nan)
+    turn = np.minimum(c1 + c2 * slip, 0.999)
+    stiff = _MM_PER_M * radius / K
     with np.errstate(all="ignore"):
-        cells = _Cells.of(wheel)
+        parts = np.broadcast_arrays(
+            n, c, np.tan(np.radians(phi)), rows["normal_load_kn"], turn,
+            (k1 + k2 * width) ** (1.0 / n) * radius / width, stiff, (1.0 - slip) * stiff,
+            radius * width,
+        )  # fmt: skip
+        cells = _Cells(*(v.ravel() for v in parts))
         found = np.full((3, cells.load.size), np.nan)
-        work = np.empty((_N_WORK, _N_NODES * min(_BLOCK, cells.load.size)))
-        # The few that take longer are gone on with together; some of them have no solution.
-        left = _solve(np.flatnonzero(np.isfinite(cells.turn)), cells, work, found, _USUAL)
-        most = [_forces(np.full(v.size, _LARGEST), cells.some(v), work)[0] for v in _blocks(left)]
-        bears = np.concatenate([[], *most]) > cells.load[left]
-        _solve(left[bears], cells, work, found, _MAX_ITERATIONS)
-        pull, torque, entry = found.reshape(3, *shape)
-        return Contact(pull, wheel.radius * torque, wheel.radius * (1.0 - np.cos(np.exp(entry))))
+        driven = np.flatnonzero(np.isfinite(cells.turn))
+        for i in range(0, driven.size, _BLOCK):
+            some = driven[i : i + _BLOCK]
+            found[:, some] = _solve(_Cells(*(v[some] for v in cells)))
+        pull, torque, entry = found.reshape(3, *parts[0].shape)
+        return Contact(pull, radius * torque, radius * (1.0 - np.cos(np.exp(entry))))
 
 
-def _blocks(which: Indices) -> list[Indices]:
-    return [which[i : i + _BLOCK] for i in range(0, which.size, _BLOCK)]
+def _pull(columns: Columns, rows: Rows, references: References) -> Array:
+    return contact(columns, rows).pull
 
 
-def _solve(which: Indices, cells: _Cells, work: Array, found: Array, steps: int) -> Indices:
-    """Write pull, torque over radius and ln theta1, (3, cells), and return where there is none yet.
-
-    The load grows about as the entry angle to the power 2n + 1: on logarithms the secant method
-    takes few steps, kept inside a shrinking bracket, and the last one need not be evaluated: pull
-    and torque are taken along their own secants as far.
-    """
-    left = [np.flatnonzero([])]
-    for where in _blocks(which):
-        some = cells.some(where)
-        x, slope = some.guess()
-        rough = _forces(np.exp(x), some, work, _ROUGH)[0]
-        x = np.clip(x - np.log(rough / some.load) / slope, *_LN_ENTRY)
-        low, high = (np.full_like(x, edge) for edge in _LN_ENTRY)
-        before = np.full((4, x.size), np.nan)
-        for _ in range(steps):
-            here = _forces(np.exp(x), some, work)
-            value = np.log(here[0] / some.load)
-            here[0], here[3] = value, x
-            moved = here - before
-            # A secant is to be followed no farther than it is long, but for rounding.
-            gained = np.maximum(np.abs(moved[0]), _ROUNDING)
-            off = np.abs(value)
-            done = np.flatnonzero((off <= gained) & (off * np.abs(moved[3]) <= _TOLERANCE))
-            if done.size:
-                on = np.where(moved[0] == 0.0, 0.0, -value / moved[0])[done]
-                found[:, where[done]] = here[1:, done] + on * moved[1:, done]
-                if done.size == where.size:
-                    where = where[:0]
-                    break
-                stays = np.delete(np.arange(where.size), done)
-                where, some = where[stays], some.some(stays)
-                low, high, x, slope, value = (v[stays] for v in (low, high, x, slope, value))
-                here, moved = here[:, stays], moved[:, stays]
-            secant = moved[0] / moved[3]
-            slope = np.where(secant > 0.1, secant, slope)
-            low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
-            x = x - value / slope
-            x = np.where((x > low) & (x < high), x, 0.5 * (low + high))
-            before = here
-        left.append(where)
-    return np.concatenate(left)
+def _torque(columns: Columns, rows: Rows, references: References) -> Array:
+    return contact(columns, rows).torque
 
 
-_MM_PER_M = 1000.0
-
-
-def _pull(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
-    return contact(wheels(columns, rows)).pull
-
-
-def _torque(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
-    return contact(wheels(columns, rows)).torque
-
-
-def _ln_sinkage(columns: Columns, rows: Rows, references: References, work: Array) -> Array:
-    return np.log(_MM_PER_M * contact(wheels(columns, rows)).sinkage)
+def _ln_sinkage(columns: Columns, rows: Rows, references: References) -> Array:
+    return np.log(_MM_PER_M * contact(columns, rows).sinkage)
 
 
 _LETTERS = (
@@ -372,7 +247,7 @@ WONG_REECE_PULL = _model(
     name="wong_reece_pull",
     title="Wong-Reece rigid wheel: drawbar pull",
     output="drawbar_pull_kn",
-    location=_pull,
+    mean_response=_pull,
     response="identity",
     latex=(r"$P = r b \int (\tau \cos\theta - \sigma_\mathrm{n} \sin\theta) d\theta$", *_STRESS),
     letters="[$P] the pull (kN), " + _LETTERS,
@@ -400,7 +275,7 @@ WONG_REECE_TORQUE = _model(
     name="wong_reece_torque",
     title="Wong-Reece rigid wheel: torque",
     output="driving_torque_knm",
-    location=_torque,
+    mean_response=_torque,
     response="identity",
     latex=(r"$T = r^2 b \int \tau d\theta$", *_STRESS),
     letters="[$T] the torque (kN m), " + _LETTERS,
@@ -428,7 +303,7 @@ WONG_REECE_SINKAGE = _model(
     name="wong_reece_sinkage",
     title="Wong-Reece rigid wheel: sinkage",
     output="rut_depth_mm",
-    location=_ln_sinkage,
+    mean_response=_ln_sinkage,
     response="log",
     latex=(r"$z = r(1 - \cos\theta_1)$", *_STRESS),
     letters="[$z] the sinkage (m), " + _LETTERS,

@@ -80,7 +80,9 @@ def test_a_model_that_has_changed_is_told(
 ) -> None:
     """Its prediction would be another, in silence; rounding on another processor is none."""
     model = MODELS["modified_bekker"]
-    changed = replace(model, location=lambda *args: model.location(*args) + np.log(factor))
+    changed = replace(
+        model, mean_response=lambda *args: model.mean_response(*args) + np.log(factor)
+    )
     monkeypatch.setattr(io, "get_model", lambda name: changed)
     if not told:
         load_calibration(saved)

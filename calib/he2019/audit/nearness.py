@@ -23,7 +23,7 @@ from calib.he2019.datasets.drawbar import NOMINAL_SLIPS, SLIP_SHIFT, magic_formu
 from calib.he2019.datasets.published import Published
 from calib.he2019.datasets.reconstruct import normalised_basis
 from calib.models.base import Array
-from calib.models.magic_formula import half_sine_in_place, magic_formula
+from calib.models.magic_formula import magic_formula, sine_of
 from calib.report.reference import FittedTable
 
 ASSUMED_SLIPS = 100.0 * (np.array(NOMINAL_SLIPS) + SLIP_SHIFT)
@@ -99,9 +99,7 @@ def pressure_curves(coefficients: Array, pressures: Array, slips: Array) -> Arra
     D, K, E = (np.asarray(coefficients[:, j : j + 3] @ powers.T)[:, :, None] for j in (0, 3, 6))
     C = coefficients[:, 9, None, None]
     with np.errstate(all="ignore"):
-        pull: Array = K / (C * D) * slips
-        half_sine_in_place(pull, np.empty_like(pull), C, 1.0 - E)
-        pull *= 2.0 * D
+        pull: Array = D * sine_of(K / (C * D) * slips, C, 1.0 - E)
     # Only a positive K and D have a sense; what is not finite has none either.
     pull[~((D > 0.0) & (K > 0.0) & np.isfinite(pull))] = np.inf
     return pull

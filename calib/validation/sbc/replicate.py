@@ -63,7 +63,7 @@ def run_each(
     keeper = RunKeeper(found.simulator, found.folder, workers, scheduler)
     model = template.bound.model
     # What is evaluated follows from the equation.
-    asking = replace(model, predict=_Runs(keeper, model.output), location=not_given)
+    asking = replace(model, predict=_Runs(keeper, model.output), mean_response=not_given)
     return replace(template, bound=replace(template.bound, model=asking))
 
 

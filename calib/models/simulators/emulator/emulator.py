@@ -375,18 +375,16 @@ class _Prepare:
 
 
 @dataclass(frozen=True)
-class _Location:
+class _MeanResponse:
     """Mean curve plus coefficients times curves."""
 
     emulator: Emulator
 
-    def __call__(self, columns: Columns, rows: Rows, references: References, work: Array) -> Array:
-        theta = np.stack([np.ravel(c) for c in columns], axis=-1)
-        coefficients = self.emulator.coefficients(theta)
-        shape = columns[0].shape
-        found = rows["0"] + np.zeros(shape)
+    def __call__(self, columns: Columns, rows: Rows, references: References) -> Array:
+        coefficients = self.emulator.coefficients(np.concatenate(columns, axis=1))
+        found = rows["0"] + np.zeros_like(columns[0])
         for j, c in enumerate(coefficients.T, start=1):
-            found += c.reshape(shape) * rows[str(j)]
+            found = found + c[:, None] * rows[str(j)]
         return np.asarray(found)
 
 
@@ -406,11 +404,11 @@ class _Uncertain:
 def emulated_model(model: Model, emulator: Emulator) -> Model:
     """Return a model with an emulator in the place of its equation."""
     return replace(
-        model, predict=None, prepare=_Prepare(emulator), location=_Location(emulator),
+        model, predict=None, prepare=_Prepare(emulator), mean_response=_MeanResponse(emulator),
         uncertain=_Uncertain(emulator), report_theta=not_given,
     )  # fmt: skip
 
 
 def emulator_of(model: Model) -> Emulator | None:
     """Return the emulator behind a model; None if there is none."""
-    return model.location.emulator if isinstance(model.location, _Location) else None
+    return model.mean_response.emulator if isinstance(model.mean_response, _MeanResponse) else None
