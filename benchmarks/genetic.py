@@ -21,9 +21,8 @@ from shared.measure import spread
 
 from calib.data import Table, hold_out
 from calib.he2019.designs import he2019_tasks
-from calib.inference.estimators.base import PointEstimate
 from calib.inference.estimators.genetic import estimate_genetic
-from calib.inference.estimators.search import estimate_differential_evolution
+from calib.inference.estimators.search import PointEstimate, estimate_differential_evolution
 from calib.inference.problem import Problem, build_problem
 
 SEEDS = 20

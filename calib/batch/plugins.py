@@ -133,7 +133,7 @@ def _load(path: Path) -> None:
     if path.suffix == ".toml":
         import_module("calib.models.simulators.files").register_file(path)
     elif path.suffix == ".npz":
-        import_module("calib.models.simulators.emulator.files").use_emulator(path)
+        import_module("calib.models.simulators.emulator").use_emulator(path)
     else:
         run_file(path, "models")
 

@@ -51,7 +51,7 @@ def predict(
     from calib.batch.folders import check_room
     from calib.data import read_for_model
     from calib.data.units_check import beyond_notes, check_conditions
-    from calib.models.simulators.emulator.emulator import emulator_of
+    from calib.models.simulators.emulator import emulator_of
     from calib.report.comparison import load_stack, verdicts_of
     from calib.validation.prediction import MIN_DEFINED, predict_stacked, prediction_columns
     from calib.validation.prediction import predict as predict_at

@@ -69,8 +69,7 @@ def say_failed(model: str) -> None:
 def keep_emulators(models: Iterable[str], folder: Path) -> None:
     """Keep the emulators among some models in a folder, to predict from it again."""
     from calib.models import get_model
-    from calib.models.simulators.emulator.emulator import emulator_of
-    from calib.models.simulators.emulator.files import save_emulator
+    from calib.models.simulators.emulator import emulator_of, save_emulator
 
     for model in models:
         emulator = emulator_of(get_model(model))

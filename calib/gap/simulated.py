@@ -14,7 +14,7 @@ import numpy as np
 from calib.data.quantities import QUANTITIES, role_of
 from calib.gap.effects import View
 from calib.models.base import Array
-from calib.models.simulators.emulator.emulator import emulator_of
+from calib.models.simulators.emulator import emulator_of
 
 if TYPE_CHECKING:
     from calib.gap.campaigns import OutputData

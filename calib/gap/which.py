@@ -30,7 +30,7 @@ from calib.gap.odds import Odds, coarsening, gap_size, probabilities, relevance,
 from calib.gap.refine import PLENTY, refine
 from calib.gap.runs import follows_runs
 from calib.gap.sets import far_out, sets_and_unlisted
-from calib.inference.estimators.base import check_defined
+from calib.inference.estimators.search import check_defined
 from calib.inference.random import generator
 from calib.inference.sampling.mode import find_mode
 from calib.models.base import Array

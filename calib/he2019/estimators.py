@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 
 from calib.errors import CalibError
-from calib.inference.estimators.base import PointEstimate, goodness, sum_of_squares
+from calib.inference.estimators.search import PointEstimate, goodness, sum_of_squares
 from calib.inference.problem import Problem
 from calib.models.base import Array
 

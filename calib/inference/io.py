@@ -41,8 +41,12 @@ from calib.inference.record import DATA, POSTERIOR, PRIORS, RunRecord, read_reco
 from calib.inference.sampling.sampler import Draws
 from calib.models import BoundModel, get_model
 from calib.models.base import Array
-from calib.models.simulators.emulator.emulator import emulated_model, emulator_of
-from calib.models.simulators.emulator.files import load_emulator, save_emulator
+from calib.models.simulators.emulator import (
+    emulated_model,
+    emulator_of,
+    load_emulator,
+    save_emulator,
+)
 
 if TYPE_CHECKING:
     import xarray as xr

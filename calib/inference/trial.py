@@ -78,8 +78,8 @@ def try_simulator(problem: Problem) -> None:
     if direct is None:
         return
     # They take some time to import: only where a function is behind the model.
-    from calib.models.simulators.exchange import FIRST
     from calib.models.simulators.registered import Direct
+    from calib.models.simulators.runs import FIRST
 
     if not isinstance(direct, Direct):
         _check_repeats(problem, prior_middle(problem), f"model {problem.bound.model.name}")

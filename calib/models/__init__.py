@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from calib.data.registry import Registry
 from calib.errors import CalibError, meant
 from calib.models.ayers_perumpral import AYERS_PERUMPRAL, AYERS_PERUMPRAL_VOLUMETRIC
 from calib.models.base import Array, BoundModel, Conditions, Model, References
 from calib.models.bekker import BEKKER, BEKKER_PLATE, LYASKO, MODIFIED_BEKKER, REECE
-from calib.models.maclaurin import MACLAURIN_RUT
 from calib.models.magic_formula import MAGIC_FORMULA, MAGIC_FORMULA_PRESSURE
-from calib.models.traction import BRIXIUS, ELLIPTIC_CONTACT, JANOSI_HANAMOTO, UPADHYAYA, WISMER_LUTH
+from calib.models.traction import (
+    BRIXIUS,
+    ELLIPTIC_CONTACT,
+    JANOSI_HANAMOTO,
+    MACLAURIN_RUT,
+    UPADHYAYA,
+    WISMER_LUTH,
+)
 from calib.models.wong_reece import WONG_REECE_PULL, WONG_REECE_SINKAGE, WONG_REECE_TORQUE
 
 __all__ = [
@@ -42,6 +50,12 @@ MODELS: Registry[Model] = Registry(
 )
 
 
+def example_of(model: Model) -> str:
+    """Return a model's own example, or that of the shipped model of its name; empty if none."""
+    path = Path(__file__).parent / "examples" / f"{model.name}.csv"
+    return model.example or (path.read_text(encoding="utf-8") if path.exists() else "")
+
+
 def example_csv(model_name: str) -> str:
     """Return an example of the data a model is calibrated on, as CSV.
 
@@ -49,14 +63,15 @@ def example_csv(model_name: str) -> str:
     place. A CalibError names a model that has no example.
     """
     model = get_model(model_name)
-    if not model.example:
+    example = example_of(model)
+    if not example:
         raise CalibError(
             f"the model {model_name!r} has no example of its data",
             allowed=f"columns {', '.join((*model.conditions, model.output))}",
             mend="write a CSV with these columns, in any of their units (`calib quantities NAME`); "
             'a Model of your own may have an example="..."',
         )
-    return model.example
+    return example
 
 
 def template_csv(model_name: str) -> str:

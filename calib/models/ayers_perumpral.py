@@ -24,17 +24,8 @@ def bulk_density(
     cone_index_kpa: Array, water_g_g: Array, C1: Array | float, C2: Array | float,
     C3: Array | float, C4: Array | float,
 ) -> Array:  # fmt: skip
-    """Evaluate Eq 1 in g/cm^3.
+    """Evaluate Eq 1 in g/cm^3, from cone index (kPa), water content (g/g) and soil coefficients.
 
-    Parameters
-    ----------
-    cone_index_kpa, water_g_g : ndarray
-        Cone index (kPa) and gravimetric water content (g/g).
-    C1, C2, C3, C4 : ndarray or float
-        Soil coefficients.
-
-    References
-    ----------
     Ayers & Perumpral (1982), as Eq 1 of He, Sandu & Osorio (2019),
     doi:10.1016/j.jterra.2019.07.003.
     """
@@ -95,11 +86,7 @@ def _density_volumetric(columns: Columns, rows: Rows, references: References) ->
 
 
 def _solve_ln_density(target: Array, water: Array, A2: Array, A3: Array, A4: Array) -> Array:
-    """Solve A2 x - ln(A3 + (water e^-x - A4)^2) = target for x = ln gamma, shape (k, n).
-
-    Newton's method kept inside a shrinking bracket, all roots at once; NaN where the bracket
-    of 0.1 to 5 g/cm^3 holds no sign change.
-    """
+    """Solve A2 x - ln(A3 + (water e^-x - A4)^2) = target for x = ln gamma; NaN without a root."""
     low = np.full(np.broadcast_shapes(target.shape, water.shape), _LN_DENSITY_BRACKET[0])
     high = np.full_like(low, _LN_DENSITY_BRACKET[1])
 
@@ -178,17 +165,6 @@ AYERS_PERUMPRAL = Model(
         "C1, with which the other coefficients are almost collinear; C1 follows from "
         "it."
     ),
-    example="""\
-cone_index_kpa,gravimetric_water_content,bulk_density_g_cm3
-350,0.030,1.809
-520,0.045,1.853
-680,0.050,1.870
-900,0.040,1.866
-1150,0.060,1.865
-1400,0.070,1.888
-1750,0.055,1.899
-2100,0.085,1.925
-""",
 )
 
 AYERS_PERUMPRAL_VOLUMETRIC = Model(
@@ -229,15 +205,4 @@ AYERS_PERUMPRAL_VOLUMETRIC = Model(
         "A1, with which the other coefficients are almost collinear; A1 follows from "
         "it."
     ),
-    example="""\
-cone_index_kpa,volumetric_water_content,bulk_density_g_cm3
-350,0.054,1.809
-520,0.083,1.853
-680,0.094,1.870
-900,0.075,1.866
-1150,0.112,1.865
-1400,0.132,1.888
-1750,0.104,1.899
-2100,0.164,1.925
-""",
 )

@@ -109,24 +109,14 @@ class _Predicted:
         return np.log(found) if self.model.response == "log" else found
 
 
-@dataclass(frozen=True)
-class _Named:
-    """Reports the sampled parameters as they are."""
-
-    names: tuple[str, ...]
-
-    def __call__(self, theta: Array, references: References) -> dict[str, Array]:
-        return dict(zip(self.names, theta.T, strict=True))
+def _by_name(names: tuple[str, ...], theta: Array, references: References) -> dict[str, Array]:
+    """Report the sampled parameters as they are."""
+    return dict(zip(names, theta.T, strict=True))
 
 
-@dataclass(frozen=True)
-class _Vector:
-    """The inverse of `_Named`, for one vector."""
-
-    names: tuple[str, ...]
-
-    def __call__(self, reported: Mapping[str, float], references: References) -> Array:
-        return np.array([reported[name] for name in self.names])
+def _vector(names: tuple[str, ...], reported: Mapping[str, float], references: References) -> Array:
+    """Return one vector of parameters by name, the inverse of `_by_name`."""
+    return np.array([reported[name] for name in names])
 
 
 def _as_they_are(conditions: Conditions, references: References) -> Rows:
@@ -137,14 +127,9 @@ def _as_they_are(conditions: Conditions, references: References) -> Rows:
 class Searched:
     """Coordinates in which population methods search a model, in the place of its prior's.
 
-    Parameters
-    ----------
-    names : mapping of str to str
-        Sampled parameter to the published one that is searched for it.
-    box : callable
-        ``largest response -> {name: (lower, upper)}``.
-    sampled : callable
-        ``values -> values``: sampled parameters of searched ones, by name.
+    `names` maps sampled parameters to the published ones that are searched for them, `box` is
+    ``largest response -> {name: (lower, upper)}``, and `sampled` turns searched values, by name,
+    into sampled ones.
     """
 
     names: Mapping[str, str]
@@ -203,7 +188,8 @@ class Model:
     parametrisation : str
         Which parameters are sampled and why these, with the reference conditions in braces.
     example : str
-        A CSV of the data it is calibrated on; without one, `calib.models.example_csv` makes it.
+        A CSV of the data it is calibrated on; those of the shipped models are files in
+        `calib/models/examples`.
     priors : str
         Its priors as the TOML text of a prior file, if they are not among the shipped ones.
     parabolic_in : str
@@ -272,8 +258,8 @@ class Model:
         if self.mean_response is not_given:
             object.__setattr__(self, "mean_response", _Predicted(self))
         if self.report_theta is not_given:
-            object.__setattr__(self, "report_theta", _Named(self.parameters))
-            object.__setattr__(self, "theta_from_reported", _Vector(self.parameters))
+            object.__setattr__(self, "report_theta", partial(_by_name, self.parameters))
+            object.__setattr__(self, "theta_from_reported", partial(_vector, self.parameters))
 
     @property
     def equation(self) -> str:
@@ -296,13 +282,7 @@ class Model:
         return partial(Model, **{f.name: getattr(self, f.name) for f in fields(self)}), ()
 
     def register(self) -> None:
-        """Make it known by its name.
-
-        Raises
-        ------
-        CalibError
-            If its declaration does not hold together, or another model has its name.
-        """
+        """Make it known by its name; a CalibError if the declaration does not hold together."""
         from calib.models import MODELS
         from calib.models.declared import check_model
 

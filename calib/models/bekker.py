@@ -36,20 +36,10 @@ def rut_depth(
     pressure_kpa: Array, slip_ratio: Array | float, k: Array | float, n0: Array | float,
     n1: Array | float,
 ) -> Array:  # fmt: skip
-    """Evaluate Eq 21, zt = (pgr/k)^(1/(n0 + n1 s)), in metres.
+    """Evaluate Eq 21, zt = (pgr/k)^(1/(n0 + n1 s)), in metres, as it broadcasts.
 
-    Parameters
-    ----------
-    pressure_kpa, slip_ratio : ndarray
-        Average ground pressure (kPa) and slip (fraction).
-    k : ndarray or float
-        Sinkage modulus, kPa/m^n.
-    n0, n1 : ndarray or float
-        Sinkage exponent and its growth with slip.
-
-    References
-    ----------
-    He, Sandu & Osorio (2019), Eqs 17-21, doi:10.1016/j.jterra.2019.07.003.
+    Pressure in kPa, slip as a fraction, the modulus k in kPa/m^n. He, Sandu & Osorio (2019), Eqs
+    17-21, doi:10.1016/j.jterra.2019.07.003.
     """
     return np.asarray((pressure_kpa / k) ** (1.0 / (n0 + n1 * slip_ratio)))
 
@@ -147,15 +137,6 @@ BEKKER = Model(
         "sampled in the place of k, which is almost collinear with n; k follows from "
         "it."
     ),
-    example="""\
-average_ground_pressure_kpa,rut_depth_mm
-60,13.6
-85,15.9
-107,18.2
-141,19.8
-178,23.0
-220,24.9
-""",
 )
 
 MODIFIED_BEKKER = Model(
@@ -191,18 +172,6 @@ MODIFIED_BEKKER = Model(
         "sampled in the place of k, which is almost collinear with n0; k follows from "
         "it."
     ),
-    example="""\
-slip_ratio,average_ground_pressure_kpa,rut_depth_mm
-0.00,107,17.7
-0.10,107,23.2
-0.20,107,30.3
-0.00,141,20.3
-0.10,141,25.6
-0.20,141,33.0
-0.00,178,22.2
-0.10,178,28.5
-0.20,178,36.5
-""",
 )
 
 
@@ -291,21 +260,6 @@ BEKKER_PLATE = _plate(
         "k_c and k_phi cannot be told apart. The moduli depend on the exponent by their "
         "units, so they carry over to another soil only together with it."
     ),
-    example="""\
-average_ground_pressure_kpa,plate_width_mm,rut_depth_mm
-5,60,3.221
-10,60,6.143
-20,60,9.827
-40,60,24.9
-5,80,2.768
-10,80,6.618
-20,80,11.08
-40,80,19.91
-5,100,3.113
-10,100,5.839
-20,100,11.93
-40,100,21.54
-""",
 )
 
 REECE = _plate(
@@ -322,21 +276,6 @@ REECE = _plate(
         "with width where friction carries the plate and do not where cohesion does. Not "
         "for layered soil or a box whose walls are within a few plate widths."
     ),
-    example="""\
-average_ground_pressure_kpa,plate_width_mm,rut_depth_mm
-5,60,3.955
-10,60,7.716
-20,60,16.79
-40,60,29.09
-5,80,4.155
-10,80,8.894
-20,80,15.89
-40,80,31.75
-5,100,4.548
-10,100,9.902
-20,100,18.59
-40,100,38.85
-""",
 )
 
 LYASKO = Model(
@@ -365,16 +304,4 @@ LYASKO = Model(
         "place of the modulus, which is almost collinear with n; the published constants "
         "follow."
     ),
-    example="""\
-average_ground_pressure_kpa,slip_ratio,rut_depth_mm
-90,0,22.88
-90,0.15,21.82
-90,0.3,31.07
-140,0,30.91
-140,0.15,43.92
-140,0.3,42.86
-190,0,45.35
-190,0.15,58.93
-190,0.3,63.3
-""",
 )

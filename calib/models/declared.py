@@ -20,13 +20,7 @@ DIMENSIONS = dict.fromkeys(("chain", "draw", "row"), "a dimension of the files o
 
 
 def check_tuple(attribute: str, given: object, where: str) -> None:
-    """Check that several texts are declared as such: one would be taken letter by letter.
-
-    Raises
-    ------
-    CalibError
-        If they are plain text, or no texts.
-    """
+    """Refuse plain text in the place of a tuple of texts: it would be taken letter by letter."""
     if isinstance(given, str):
         raise CalibError(
             f"{attribute} is the text {given!r}", where=where, allowed="a tuple of texts",
@@ -45,13 +39,7 @@ def _quoted(given: str) -> str:
 
 
 def check_word(name: object, what: str, where: str) -> None:
-    """Check that the name of a model or a parameter will do wherever it stands.
-
-    Raises
-    ------
-    CalibError
-        If it is no word.
-    """
+    """Check that the name of a model or a parameter will do wherever it stands."""
     if not isinstance(name, str) or not name.isidentifier():
         raise CalibError(
             f"{name!r} is no name for a {what}", where=where,
@@ -66,17 +54,8 @@ def check_names(
 ) -> None:
     """Check that each name is that of one thing: files know things by their names.
 
-    Parameters
-    ----------
-    taken : mapping of str to str
-        Names that are those of something else, and what that is.
-    given : iterable of (str, str, str)
-        Names, what each is the name of, and the key that says so.
-
-    Raises
-    ------
-    CalibError
-        If a name is there twice.
+    `taken` maps names of other things to what these are; `given` are names, what each names, and
+    the key that says so.
     """
     # Letters that look alike and are written in two ways are the same.
     known = {normalize("NFKC", name): what for name, what in taken.items()}
@@ -94,14 +73,7 @@ def check_names(
 
 
 def check_model(model: Model) -> None:
-    """Check a declaration.
-
-    Raises
-    ------
-    CalibError
-        If plain text stands for a tuple, a column is no quantity, the output is none, a name is
-        given twice, or the priors are missing, not of the model's parameters, or in another unit.
-    """
+    """Check a declaration: columns, names, priors and their units; the error says what is off."""
     where = f"model {model.name!r}"
     check_word(model.name, "model", where)
     for parameter in model.parameters if not isinstance(model.parameters, str) else ():
@@ -153,10 +125,7 @@ def check_model(model: Model) -> None:
 
 
 def _check_units(model: Model, given: dict[str, Any], where: str) -> None:
-    """A prior in another unit would silently be taken for one in the parameter's.
-
-    That of sigma follows from the output; those of parameters are known where they are reported.
-    """
+    """Refuse a prior in another unit than its parameter's, as far as that is known."""
     log = model.response == "log"
     wanted = {"sigma": "1" if log else QUANTITIES[model.output].unit}
     # Without `reported` they all have the unit 1, which then says nothing.

@@ -55,25 +55,11 @@ def magic_formula(
     Sh: Array | float = 0.0,
     Sv: Array | float = 0.0,
 ) -> Array:
-    """Evaluate the Magic Formula.
+    """Evaluate the Magic Formula in kN, as it broadcasts.
 
-    Parameters
-    ----------
-    slip_percent : ndarray
-        Slip in percent; broadcast against the parameters.
-    B, C, D, E : ndarray or float
-        Stiffness factor (1/%), shape factor, peak factor (kN), curvature factor.
-    Sh, Sv : ndarray or float
-        Horizontal (%) and vertical (kN) shift.
-
-    Returns
-    -------
-    ndarray
-        Drawbar pull in kN, of the broadcast shape.
-
-    References
-    ----------
-    He, Sandu & Osorio (2019), Eqs 3-5, doi:10.1016/j.jterra.2019.07.003.
+    Slip and horizontal shift Sh in percent, stiffness factor B in 1/%, peak factor D and vertical
+    shift Sv in kN, shape factor C, curvature factor E. He, Sandu & Osorio (2019), Eqs 3-5,
+    doi:10.1016/j.jterra.2019.07.003.
     """
     bx = B * (slip_percent - Sh)
     return np.asarray(Sv + D * np.sin(C * np.arctan(bx - E * (bx - np.arctan(bx)))))
@@ -153,17 +139,6 @@ MAGIC_FORMULA = Model(
         "The initial slope K = BCD is sampled in the place of B, and G = 1 - E in "
         "that of E; B and E follow."
     ),
-    example="""\
-slip_ratio,normal_load_kn,drawbar_pull_kn
-0.00,5.0,0.02
-0.05,5.0,0.55
-0.10,5.0,0.94
-0.15,5.0,0.98
-0.20,5.0,0.90
-0.30,5.0,0.78
-0.45,5.0,0.67
-0.60,5.0,0.66
-""",
     searched=_SEARCHED,
     estimates_all_rows=True,
 )
@@ -278,28 +253,11 @@ MAGIC_FORMULA_PRESSURE = Model(
     output="drawbar_pull_kn",
     conditions=("slip_ratio", "inflation_pressure_psi"),
     parameters=(
-        "K_lo",
-        "K_hi",
-        "K_bend",
-        "D_lo",
-        "D_hi",
-        "D_bend",
-        "G_lo",
-        "G_hi",
-        "G_bend",
-        "C",
+        "K_lo", "K_hi", "K_bend", "D_lo", "D_hi", "D_bend", "G_lo", "G_hi", "G_bend", "C",
     ),
     reported={
-        "c1": "kN",
-        "c2": "kN/psi",
-        "c3": "kN/psi^2",
-        "c4": "kN/%",
-        "c5": "kN/%/psi",
-        "c6": "kN/%/psi^2",
-        "c7": "1",
-        "c8": "1/psi",
-        "c9": "1/psi^2",
-        "b0": "1",
+        "c1": "kN", "c2": "kN/psi", "c3": "kN/psi^2", "c4": "kN/%", "c5": "kN/%/psi",
+        "c6": "kN/%/psi^2", "c7": "1", "c8": "1/psi", "c9": "1/psi^2", "b0": "1",
     },
     response="identity",
     mean_response=_pull_by_pressure,
@@ -333,32 +291,7 @@ MAGIC_FORMULA_PRESSURE = Model(
         "truncates the priors (bends below about 1). The coefficients c1 to c9 of the "
         "source follow."
     ),
-    example="""\
-slip_ratio,inflation_pressure_psi,normal_load_kn,drawbar_pull_kn
-0.00,18,5.0,-0.03
-0.05,18,5.0,1.02
-0.10,18,5.0,1.44
-0.15,18,5.0,1.61
-0.20,18,5.0,1.64
-0.30,18,5.0,1.56
-0.45,18,5.0,1.43
-0.60,18,5.0,1.37
-0.00,30,5.0,0.02
-0.05,30,5.0,0.61
-0.10,30,5.0,0.98
-0.20,30,5.0,0.90
-0.40,30,5.0,0.74
-0.60,30,5.0,0.69
-0.00,42,5.0,0.01
-0.05,42,5.0,0.57
-0.10,42,5.0,0.57
-0.15,42,5.0,0.52
-0.20,42,5.0,0.50
-0.30,42,5.0,0.47
-0.45,42,5.0,0.46
-0.60,42,5.0,0.43
-""",
     alone=Alone("inflation_pressure_psi", "magic_formula", {"Sh": 0.0, "Sv": 0.0}),
     parabolic_in="inflation_pressure_psi",
     estimates_all_rows=True,
-)
+)  # fmt: skip

@@ -251,24 +251,6 @@ WONG_REECE_PULL = _model(
     response="identity",
     latex=(r"$P = r b \int (\tau \cos\theta - \sigma_\mathrm{n} \sin\theta) d\theta$", *_STRESS),
     letters="[$P] the pull (kN), " + _LETTERS,
-    example="""\
-slip_ratio,normal_load_kn,tyre_width_m,tyre_diameter_m,drawbar_pull_kn
-0.05,2,0.2,0.8,0.07713
-0.12,2,0.2,0.8,0.2987
-0.2,2,0.2,0.8,0.3535
-0.35,2,0.2,0.8,0.4524
-0.5,2,0.2,0.8,0.4773
-0.05,4,0.3,1,0.3569
-0.12,4,0.3,1,0.7811
-0.2,4,0.3,1,0.9191
-0.35,4,0.3,1,1.011
-0.5,4,0.3,1,1.116
-0.05,6,0.3,1.2,0.9344
-0.12,6,0.3,1.2,1.062
-0.2,6,0.3,1.2,1.446
-0.35,6,0.3,1.2,1.487
-0.5,6,0.3,1.2,1.585
-""",
 )
 
 WONG_REECE_TORQUE = _model(
@@ -279,24 +261,6 @@ WONG_REECE_TORQUE = _model(
     response="identity",
     latex=(r"$T = r^2 b \int \tau d\theta$", *_STRESS),
     letters="[$T] the torque (kN m), " + _LETTERS,
-    example="""\
-slip_ratio,normal_load_kn,tyre_width_m,tyre_diameter_m,driving_torque_knm
-0.05,2,0.2,0.8,0.2416
-0.12,2,0.2,0.8,0.3144
-0.2,2,0.2,0.8,0.3552
-0.35,2,0.2,0.8,0.3896
-0.5,2,0.2,0.8,0.3966
-0.05,4,0.3,1,0.6503
-0.12,4,0.3,1,0.795
-0.2,4,0.3,1,0.8841
-0.35,4,0.3,1,1.01
-0.5,4,0.3,1,1.002
-0.05,6,0.3,1.2,1.379
-0.12,6,0.3,1.2,1.625
-0.2,6,0.3,1.2,1.632
-0.35,6,0.3,1.2,1.855
-0.5,6,0.3,1.2,1.818
-""",
 )
 
 WONG_REECE_SINKAGE = _model(
@@ -307,22 +271,4 @@ WONG_REECE_SINKAGE = _model(
     response="log",
     latex=(r"$z = r(1 - \cos\theta_1)$", *_STRESS),
     letters="[$z] the sinkage (m), " + _LETTERS,
-    example="""\
-slip_ratio,normal_load_kn,tyre_width_m,tyre_diameter_m,rut_depth_mm
-0.05,2,0.2,0.8,50.75
-0.12,2,0.2,0.8,50.94
-0.2,2,0.2,0.8,43.72
-0.35,2,0.2,0.8,51.84
-0.5,2,0.2,0.8,53.88
-0.05,4,0.3,1,60.41
-0.12,4,0.3,1,51.03
-0.2,4,0.3,1,60.12
-0.35,4,0.3,1,53.54
-0.5,4,0.3,1,59.33
-0.05,6,0.3,1.2,66.07
-0.12,6,0.3,1.2,79.62
-0.2,6,0.3,1.2,75.05
-0.35,6,0.3,1.2,90.03
-0.5,6,0.3,1.2,81.4
-""",
 )

@@ -19,8 +19,7 @@ from calib.inference.io import groups_of, write_netcdf
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.models import get_model
-from calib.models.simulators.emulator.emulator import emulator_of
-from calib.models.simulators.emulator.files import save_emulator
+from calib.models.simulators.emulator import emulator_of, save_emulator
 from calib.report.drawing import Drawn, begin_figures
 from calib.report.figures.plate import Plate
 from calib.report.page.content import render_page

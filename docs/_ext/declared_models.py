@@ -9,7 +9,7 @@ from declared_text import code, priors_table, quantity_link, table, unit, with_s
 
 from calib.data import read_for_model
 from calib.data.quantities import QUANTITIES
-from calib.models import MODELS, Model
+from calib.models import MODELS, Model, example_of
 from calib.report.labels import NOISE, model_priors
 from calib.report.page.tables import parametrisation
 
@@ -99,17 +99,18 @@ def _sampled(model: Model) -> str:
         return f"{words(model.parametrisation)}\n"
     with TemporaryDirectory() as folder:
         path = Path(folder) / "example.csv"
-        path.write_text(model.example, encoding="utf-8")
+        path.write_text(example_of(model), encoding="utf-8")
         table = read_for_model(path, (*model.conditions, model.output))
     said = parametrisation(model.bind(table.columns))
     return f"{words(said)} (The numbers are those of the example below.)\n"
 
 
 def _example(model: Model) -> list[str]:
-    if not model.example:
+    example = example_of(model)
+    if not example:
         return []
     return [
         "## Example of its data\n",
         f"`calib template {model.name}` prints it:\n",
-        f"```text\n{model.example}```\n",
+        f"```text\n{example}```\n",
     ]

@@ -40,12 +40,11 @@ from calib.inference.prior_files import default_priors, read_priors
 from calib.models import MODELS, example_csv
 from calib.models.simulators.base import Failure, Output, Simulator
 from calib.models.simulators.child import of_surroundings
-from calib.models.simulators.exchange import output_of_text
 from calib.models.simulators.files import read_simulator
 from calib.models.simulators.process import run_program
 from calib.models.simulators.registered import SIMULATED
 from calib.models.simulators.runs import RunKeeper
-from calib.models.simulators.ways import CallableWay, CommandWay, UmbridgeWay
+from calib.models.simulators.ways import CallableWay, CommandWay, UmbridgeWay, output_of_text
 from tests.abuse.test_writing import mounted
 from tests.gap.cases import make_case, write_case
 from tests.models.simulators.examples import PRIORS, lab, write_program

@@ -16,7 +16,7 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
 from calib.inference.emulation.prepared import prepare
 from calib.inference.likelihood import log_normal
-from calib.models.simulators.emulator.emulator import emulator_of
+from calib.models.simulators.emulator import emulator_of
 from tests.gap.fits import log_joint
 from tests.inference.emulation.test_emulate import as_before as as_before
 from tests.models.simulators.examples import PRIORS, lab, pull

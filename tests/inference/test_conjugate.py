@@ -17,8 +17,10 @@ from calib.data import table_from_arrays
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.diagnostics import ess
 from calib.inference.estimators.genetic import estimate_genetic
-from calib.inference.estimators.least_squares import estimate_least_squares
-from calib.inference.estimators.search import estimate_differential_evolution
+from calib.inference.estimators.search import (
+    estimate_differential_evolution,
+    estimate_least_squares,
+)
 from calib.inference.problem import Problem
 from calib.inference.sampling.mode import find_modes
 from calib.inference.sampling.proposal import Guess, adapt

@@ -30,13 +30,10 @@ from calib.inference.trial import check_scale
 from calib.models import get_model
 from calib.models.base import Array
 from calib.models.simulators.base import FAILED, Failure, Simulator
-from calib.models.simulators.emulator import Emulator, Training
-from calib.models.simulators.emulator.emulator import emulator_of
-from calib.models.simulators.emulator.files import save_emulator
-from calib.models.simulators.exchange import columns_of
+from calib.models.simulators.emulator import Emulator, Training, emulator_of, save_emulator
 from calib.models.simulators.registered import SIMULATED, Simulated, simulated_by, slow_simulator
 from calib.models.simulators.runs import Run, RunKeeper
-from calib.models.simulators.ways import TableWay
+from calib.models.simulators.ways import TableWay, columns_of
 
 _LEAST = 8
 

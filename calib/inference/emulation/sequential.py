@@ -30,9 +30,8 @@ from calib.inference.random import generator
 from calib.inference.trial import check_scale, prior_design, prior_middle
 from calib.models.base import Array
 from calib.models.simulators.emulator import Emulator
-from calib.models.simulators.emulator.kriging import correlation
-from calib.models.simulators.exchange import FIRST, FROM_THE_START, fail_alike
-from calib.models.simulators.runs import Run, RunKeeper
+from calib.models.simulators.kriging import correlation
+from calib.models.simulators.runs import FIRST, FROM_THE_START, Run, RunKeeper, fail_alike
 
 _log = logging.getLogger(__name__)
 _CANDIDATES = 400

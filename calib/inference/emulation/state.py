@@ -18,11 +18,15 @@ from calib.inference.random import stream
 from calib.inference.sampling.mode import prior_widths
 from calib.inference.sampling.sampler import SamplerSettings, sample_posterior
 from calib.models.base import Array
-from calib.models.simulators.emulator import Axes, Emulator, Training, build_emulator
-from calib.models.simulators.emulator.emulator import emulated_model
-from calib.models.simulators.emulator.kriging import Region
-from calib.models.simulators.exchange import without_value
-from calib.models.simulators.runs import Run, RunKeeper
+from calib.models.simulators.emulator import (
+    Axes,
+    Emulator,
+    Training,
+    build_emulator,
+    emulated_model,
+)
+from calib.models.simulators.kriging import Region
+from calib.models.simulators.runs import Run, RunKeeper, without_value
 
 # Draws on the way to the next runs: for a picture, not for a result.
 _ROUGH = SamplerSettings(ensembles=2, walkers=64, steps=60, max_steps=60, keep=1024)

@@ -11,10 +11,12 @@ import numpy as np
 from calib.batch.threads import one_thread
 from calib.data.registry import Registry
 from calib.errors import CalibError
-from calib.inference.estimators.base import PointEstimate
 from calib.inference.estimators.genetic import GeneticSettings, estimate_genetic, minimise_genetic
-from calib.inference.estimators.least_squares import estimate_least_squares
-from calib.inference.estimators.search import estimate_differential_evolution
+from calib.inference.estimators.search import (
+    PointEstimate,
+    estimate_differential_evolution,
+    estimate_least_squares,
+)
 from calib.inference.problem import Problem
 from calib.inference.trial import try_simulator
 from calib.models import get_model
@@ -29,16 +31,9 @@ __all__ = [
 class Method:
     """A way to estimate the parameters of a model.
 
-    Parameters
-    ----------
-    estimate : callable
-        ``(problem, rng, **settings) -> PointEstimate``.
-    title, short, words : str
-        In a legend, at the head of a narrow column, and in a sentence.
-    models : tuple of str
-        The models it is for; empty for all.
-    place : int
-        Where it stands among the others: the least first.
+    `estimate` is ``(problem, rng, **settings) -> PointEstimate``; `title`, `short` and `words` name
+    it in a legend, at the head of a narrow column, and in a sentence. It is for the named `models`,
+    or for all; the least `place` comes first.
     """
 
     name: str
@@ -74,13 +69,7 @@ def method_name(name: str) -> str:
 
 
 def methods_for(model_name: str) -> tuple[str, ...]:
-    """Return the methods that apply to a model, in their order.
-
-    Raises
-    ------
-    CalibError
-        If there is no model of that name.
-    """
+    """Return the methods that apply to a model, in their order."""
     name = get_model(model_name).name
     known = sorted(METHODS.values(), key=lambda method: method.place)
     return tuple(m.name for m in known if not m.models or name in m.models)
@@ -92,20 +81,9 @@ def estimate(
 ) -> PointEstimate:
     """Estimate the parameters of a problem by one method.
 
-    Parameters
-    ----------
-    method : str
-        One of `methods_for` the problem's model.
-    rng : Generator
-        Of the methods that draw random numbers; the others ignore it.
-    **settings
-        Keyword arguments of the method's function, such as ``settings=GeneticSettings(NP=100)``
-        for ``"genetic"`` or ``max_slip=0.3`` for ``"published_regression"``.
-
-    Raises
-    ------
-    CalibError
-        If there is no such method, it does not apply to the model, or it fails on these data.
+    Settings are keyword arguments of the method's function, such as
+    ``settings=GeneticSettings(NP=100)`` for ``"genetic"``. A CalibError if the method does not
+    exist, does not apply to the model, or fails on these data.
     """
     model = problem.bound.model.name
     if method not in methods_for(model):
@@ -122,18 +100,10 @@ def estimate(
 def compare(
     problem: Problem, rng: np.random.Generator, methods: Sequence[str] | None = None
 ) -> tuple[PointEstimate, ...]:
-    """Estimate by several methods, each on its own random stream.
+    """Estimate by several methods, each on its own random stream, in the order of the methods.
 
-    Parameters
-    ----------
-    methods : sequence of str, optional
-        All that apply to the model by default. Of these, one that cannot read the data (no rise
-        of the pull, one ground pressure) is left out; methods named here raise their error.
-
-    Returns
-    -------
-    tuple of PointEstimate
-        In the order of the methods.
+    By default these are all that apply to the model, without those that cannot read the data (no
+    rise of the pull, one ground pressure); methods that are named raise their error.
     """
     found = []
     chosen = methods_for(problem.bound.model.name) if methods is None else tuple(methods)

@@ -32,8 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.errors import CalibError
-from calib.inference.estimators.base import PointEstimate
-from calib.inference.estimators.search import Box, Found, SearchSpace, search_in_box
+from calib.inference.estimators.search import Box, Found, PointEstimate, SearchSpace, search_in_box
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
@@ -46,22 +45,10 @@ _BLOCK = 32
 class GeneticSettings:
     """Settings of the genetic algorithm; the defaults are Table 2 of the source.
 
-    Parameters
-    ----------
-    F : float
-        Weight of the difference in the disturbing vector.
-    CP, MP : float
-        Probabilities of crossover and of mutation, per gene.
-    mutation_low, mutation_high : float
-        The mutation interval, in units of the width of the search box.
-    NP : int
-        Size of the population.
-    max_iterations : int
-        Generations at most.
-    tolerance : float
-        The run stops early once the costs of the whole population differ by no more than this
-        part of the lowest for `patience` generations running. Any further generation could
-        lower the cost by about as little.
+    `F` weighs the difference in the disturbing vector, `CP` and `MP` are the probabilities of
+    crossover and mutation per gene, the mutation interval is in units of the width of the search
+    box, and `NP` is the size of the population. A run stops early once the costs of the whole
+    population differ by no more than `tolerance` of the lowest for `patience` generations in a row.
     """
 
     F: float = 0.4
@@ -205,15 +192,9 @@ def estimate_genetic(
 ) -> PointEstimate:
     """Minimise the sum of squares by the genetic algorithm of the source, Table 2 by default.
 
-    Parameters
-    ----------
-    box : mapping of str to (lower, upper), optional
-        As for `calib.inference.estimators.search.search_space`.
-    restarts : int
-        Further runs from new populations, the best of all being returned. Not in the source: a
-        population that has converged on a local optimum never leaves it, however long it runs.
-    polish : bool
-        Whether least squares from the result follows. Not in the source.
+    The box is that of `search_space`. Not in the source: `restarts` are further runs from new
+    populations, of which the best counts, as a population never leaves a local optimum on which it
+    has converged; `polish` adds a least-squares descent from the result.
     """
 
     def minimise(space: SearchSpace) -> Found:

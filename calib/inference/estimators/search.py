@@ -1,30 +1,145 @@
-"""Which parameters the data determine at all; the others are held before anything is fitted.
+"""Point estimates by search: goodness of fit, the box, least squares, differential evolution.
 
-Two inflation pressures leave the curvature of a quadratic in pressure free, tests at one ground
-pressure leave the exponent of pressure free. A least-squares cost is flat along such a parameter:
-an optimiser would return wherever it happened to start. The parameter is held at the location of
-its prior instead, and the estimate says so.
-
-The box in which the population methods search, and the estimate made of what they find.
-
-SciPy's differential evolution, the yardstick of the genetic algorithm.
+What the data do not determine is held before anything is fitted. Two inflation pressures leave the
+curvature of a quadratic in pressure free, tests at one ground pressure leave the exponent of
+pressure free: a least-squares cost is flat along such a parameter, and an optimiser would return
+wherever it happened to start. The parameter is held at the location of its prior instead, and the
+estimate says so.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import qr
 
+from calib.data.quantities import QUANTITIES
 from calib.errors import CalibError
-from calib.inference.estimators.base import PointEstimate, goodness, residuals, sum_of_squares
 from calib.inference.problem import Problem
 from calib.inference.sampling.mode import prior_widths
-from calib.models.base import Array
+from calib.models.base import Array, BoundModel, Conditions
+
+# Rows times vectors evaluated at once: bounds the memory, keeps temporaries in cache.
+_CHUNK_CELLS = 200_000
+
+
+@dataclass(frozen=True, eq=False)
+class PointEstimate:
+    """One estimate of a model's parameters.
+
+    `theta`, shape (d_model,), are the sampled parameters in natural units without the noise scale,
+    `reported` the published ones. `cost` is the sum of squared residuals over all rows on the scale
+    of the response, `cost_unit` its unit, and `r_squared` one minus cost over the sum of squares
+    about the mean. `rmse` is ``sqrt(cost/(n - p))`` with p parameters fitted (MATLAB's convention,
+    which the source follows); NaN where n does not exceed p. `n_evaluations` counts parameter
+    vectors, `seconds` is wall-clock time, `converged` says whether the method's own stopping rule
+    was met, and `note` is for the reader.
+    """
+
+    method: str
+    theta: Array
+    reported: dict[str, float]
+    cost: float
+    cost_unit: str
+    rmse: float
+    r_squared: float
+    n_evaluations: int
+    seconds: float
+    converged: bool
+    note: str = ""
+
+    @property
+    def rmse_unit(self) -> str:
+        """Unit of the RMSE."""
+        return self.cost_unit.removesuffix("^2").strip("()")
+
+
+def residuals(problem: Problem, natural: Array) -> Array:
+    """Observed minus predicted on the scale of the response, in chunks, shape (k, d_all) to (k, n).
+
+    Natural parameters have the noise scale last. NaN where the model has no value.
+    """
+    k, n = natural.shape[0], problem.response.size
+    at_once = max(1, _CHUNK_CELLS // n)
+    if k <= at_once:
+        return problem.residuals(natural)
+    out = np.empty((k, n))
+    for i in range(0, k, at_once):
+        out[i : i + at_once] = problem.residuals(natural[i : i + at_once])
+    return out
+
+
+def sum_of_squares(problem: Problem, natural: Array) -> Array:
+    """Sum of squared residuals (Eqs 10 and 16), shape (k,); ``inf`` where there is no value.
+
+    Of natural parameters (k, d_all), the noise scale last.
+    """
+    cost = problem.squares(problem.of_model(natural))
+    cost[np.isnan(cost)] = np.inf
+    return cost
+
+
+def goodness(
+    problem: Problem,
+    method: str,
+    theta: Array,
+    *,
+    n_fitted: int,
+    n_evaluations: int,
+    seconds: float,
+    converged: bool = True,
+    notes: Sequence[str] = (),
+) -> PointEstimate:
+    """Complete an estimate (d_model,) with its cost, RMSE and R².
+
+    Parameters held or fixed do not count as fitted; notes that are empty are left out.
+    """
+    cost = float(sum_of_squares(problem, theta[None])[0])
+    y = problem.response
+    spread = float(np.square(y - y.mean()).sum())
+    freedom = y.size - n_fitted
+    output = QUANTITIES[problem.bound.model.output].unit.replace("**", "^")
+    unit = f"({output})^2" if "/" in output else f"{output}^2"
+    return PointEstimate(
+        method=method,
+        theta=theta,
+        reported={name: float(v[0]) for name, v in problem.bound.report(theta[None]).items()},
+        cost=cost,
+        cost_unit="1" if problem.bound.model.response == "log" else unit,
+        rmse=float(np.sqrt(cost / freedom)) if freedom > 0 else float("nan"),
+        r_squared=1.0 - cost / spread if spread > 0.0 else float("nan"),
+        n_evaluations=n_evaluations,
+        seconds=seconds,
+        converged=converged,
+        note="; ".join(note for note in notes if note),
+    )
+
+
+_SHOWN = 5
+
+
+def check_defined(
+    bound: BoundModel, theta: Array, conditions: Conditions, source: str, lines: NDArray[np.int64]
+) -> None:
+    """Refuse rows at which no parameter vector has a finite prediction; the error names them.
+
+    Parameters are (k, d), conditions and the `lines` of the `source` (n,).
+    """
+    empty = lines[~np.isfinite(bound.location(theta, conditions)).any(axis=0)]
+    if empty.size:
+        raise CalibError(
+            f"the model {bound.model.name} has no value there",
+            where=f"{source}, lines {', '.join(map(str, empty[:_SHOWN]))}"
+            + (f" and {empty.size - _SHOWN} more" if empty.size > _SHOWN else ""),
+            allowed="conditions at which the model is defined (see its page in the documentation)",
+            mend="leave these rows out, or choose another model",
+        )
+
 
 # A parameter is flat if one prior standard deviation of it moves the predictions, as far as the
 # others cannot imitate it, by less than this part of their own scatter.
@@ -64,10 +179,9 @@ def representative_rows(problem: Problem) -> Problem:
 def hold_unidentified(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     """Hold the noise's parameters and every parameter that the data do not determine.
 
-    The rank of the Jacobian of the predictions is taken at the prior's centre and at a few points
-    around it; a parameter is given up only if it is flat, or imitated by the others, at all. Return
-    the problem whose free coordinates are to be fitted, the noise scale fixed at one, and the names
-    of those held at their prior location.
+    By the rank of the Jacobian of the predictions at the prior's centre and a few points around it.
+    Return the problem whose free coordinates are to be fitted, the noise scale fixed at one, and
+    the names of those held at their prior location.
     """
     entries = problem.priors.entries[len(problem.bound.model.parameters) :]
     # Their values do not enter a sum of squares.
@@ -125,14 +239,9 @@ class Found(NamedTuple):
 class SearchSpace:
     """Coordinates, box and cost of a search for the free parameters of a problem.
 
-    Parameters
-    ----------
-    names : tuple of str
-        The coordinates; ``B`` and ``E`` in the place of ``K`` and ``G`` for the Magic Formula at
-        one pressure, as in the source.
-    lower, upper : ndarray, shape (d,)
-        The box: in natural units for the Magic Formula at one pressure, else in the prior's
-        internal coordinates, so that log-normal parameters are searched on their logarithm.
+    The box, (d,) each, is in natural units of ``B`` and ``E`` in the place of ``K`` and ``G`` for
+    the Magic Formula at one pressure, as in the source; else in the prior's internal coordinates,
+    so that log-normal parameters are searched on their logarithm.
     """
 
     problem: Problem
@@ -183,15 +292,9 @@ class SearchSpace:
 def search_space(problem: Problem, box: Box | None = None) -> SearchSpace:
     """Return the space in which a population method searches.
 
-    The problem has the noise scale and undetermined parameters held. A box replaces the bounds, in
-    natural units, of some coordinates: by default B from 0.001 to 0.5 per percent, C from 1 to 2, D
-    from 0 to twice the largest pull and E from -30 to 1 for the Magic Formula at one pressure; for
-    all other parameters the central 99.8 % interval of the prior.
-
-    Raises
-    ------
-    CalibError
-        If the box names no coordinate or has a lower bound that is not below its upper bound.
+    A box replaces the bounds, in natural units, of some coordinates: by default B from 0.001 to 0.5
+    per percent, C from 1 to 2, D from 0 to twice the largest pull and E from -30 to 1 for the Magic
+    Formula at one pressure; for all other parameters the central 99.8 % interval of the prior.
     """
     other = problem.bound.model.searched
     names = tuple(other.names.get(n, n) if other else n for n in problem.names)
@@ -300,11 +403,9 @@ _WORST = 1e100
 def estimate_differential_evolution(
     problem: Problem, rng: np.random.Generator, *, box: Box | None = None, **settings: Any
 ) -> PointEstimate:
-    """Minimise the sum of squares by `scipy.optimize.differential_evolution`.
+    """Minimise the sum of squares by `scipy.optimize.differential_evolution`, batched.
 
-    A generation is one batched model evaluation. The box is as for
-    `calib.inference.estimators.search.search_space`, the other settings are SciPy's, and
-    so are their defaults.
+    The box is that of `search_space`; other settings and their defaults are SciPy's.
     """
     from scipy.optimize import differential_evolution  # late: a tenth of a second
 
@@ -330,3 +431,125 @@ def estimate_differential_evolution(
         return Found(np.asarray(result.x), evaluated, bool(result.success))
 
     return search_in_box(problem, "differential_evolution", box, minimise)
+
+
+# Relative step of the central differences, in prior standard deviations.
+_DIFFERENCE = 1e-5
+_TOLERANCE = 1e-13
+_PRECISE = 1e-9
+
+
+class _Polished(NamedTuple):
+    z: Array
+    cost: float
+    converged: bool
+
+
+class _Descent:
+    """Residuals and their Jacobian in coordinates of prior location and width."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        self.location, self.width = location(problem), prior_widths(problem.priors)
+        self.lower = (np.array([p.lower for p in problem.priors.free]) - self.location) / self.width
+        self.upper = (np.array([p.upper for p in problem.priors.free]) - self.location) / self.width
+        self.n_evaluations = 0
+        # The tolerances below are meant for residuals of the order of one, whatever the unit.
+        scatter = float(np.linalg.norm(problem.response - problem.response.mean()))
+        self.scale = scatter if scatter > 0.0 else 1.0
+
+    def natural(self, z: Array) -> Array:
+        self.n_evaluations += z.shape[0]
+        return self.problem.theta(self.location + z * self.width)
+
+    def residuals(self, z: Array) -> Array:
+        return np.asarray(residuals(self.problem, self.natural(z[None]))[0] / self.scale)
+
+    def jacobian(self, z: Array) -> Array:
+        # All differences in one model evaluation; one-sided on a bound.
+        step = _DIFFERENCE * np.eye(z.size)
+        ahead, behind = np.minimum(z + step, self.upper), np.maximum(z - step, self.lower)
+        span = np.diagonal(ahead) - np.diagonal(behind)
+        r = residuals(self.problem, self.natural(np.concatenate([ahead, behind])))
+        slope = (r[: z.size] - r[z.size :]) / (self.scale * span[:, None])
+        # A step beyond where the model has a value says nothing about that direction.
+        return np.asarray(np.nan_to_num(slope, nan=0.0, posinf=0.0, neginf=0.0).T)
+
+    def polish(self, z: Array) -> _Polished:
+        from scipy.optimize import least_squares  # late: a tenth of a second
+
+        result = least_squares(
+            self.residuals,
+            z,
+            jac=self.jacobian,
+            bounds=(self.lower, self.upper),
+            x_scale="jac",
+            ftol=_TOLERANCE,
+            xtol=_TOLERANCE,
+            gtol=_TOLERANCE,
+            max_nfev=400,
+        )
+        return _Polished(np.asarray(result.x), 2.0 * float(result.cost), bool(result.success))
+
+
+def estimate_least_squares(
+    problem: Problem, rng: np.random.Generator, *, n_screen: int = 1024, n_polish: int = 4
+) -> PointEstimate:
+    """Minimise the sum of squares from many starts within the prior's bounds.
+
+    Prior draws are screened in one batched evaluation, and the best of each of `n_polish` groups is
+    polished by SciPy's trust-region reflective method. Of more than a few thousand rows a
+    representative part is used, and the best result is polished on all of them.
+    """
+
+    def fit(reduced: Problem) -> tuple[Array, Found, str]:
+        rough = _Descent(representative_rows(reduced))
+        polished = [rough.polish(start) for start in _starts(rough, rng, n_screen, n_polish)]
+        best = min(polished, key=lambda p: p.cost)
+        n_agree = sum(p.cost <= best.cost * (1.0 + _PRECISE) + _PRECISE**2 for p in polished)
+        evaluations, fine = rough.n_evaluations, rough
+        if rough.problem is not reduced:
+            fine = _Descent(reduced)
+            best = fine.polish(best.z)
+            evaluations += fine.n_evaluations
+        x = fine.location + best.z * fine.width
+        lower, upper = np.array([(p.lower, p.upper) for p in reduced.priors.free]).T
+        valley = "the cost still falls along a valley without end in sight"
+        said = [f"{n_agree} of {len(polished)} starts end at the lowest cost"]
+        said += [] if best.converged else [valley]
+        edges = edge_notes(reduced.names, x, lower, upper, "the prior's bounds")
+        notes = "; ".join(filter(None, (edges, _far_note(reduced, x))))
+        theta = reduced.of_model(reduced.theta(x[None]))[0]
+        return theta, Found(x, evaluations, best.converged, "; ".join(said)), notes
+
+    return fit_identified(problem, "least_squares", fit)
+
+
+def _far_note(problem: Problem, x: Array) -> str:
+    """Say which estimates the prior thinks all but impossible."""
+    low, high = central_interval(problem)
+    far = [n for n, out in zip(problem.names, (x < low) | (x > high), strict=True) if out]
+    return f"{', '.join(far)} outside the prior's central 99.8 %" if far else ""
+
+
+def _starts(descent: _Descent, rng: np.random.Generator, n_screen: int, n_polish: int) -> Array:
+    drawn = descent.problem.priors.sample(rng, max(n_screen, n_polish))
+    z = (drawn - descent.location) / descent.width
+    cost = sum_of_squares(descent.problem, descent.natural(z))
+    groups = np.array_split(np.arange(z.shape[0]), n_polish)
+    # The best of each group rather than the best of all, which may share one basin.
+    best = np.array([group[cost[group].argmin()] for group in groups])
+    best = best[np.isfinite(cost[best])]
+    if best.size == 0:
+        problem = descent.problem
+        theta = problem.of_model(problem.theta(drawn))
+        check_defined(
+            problem.bound, theta, problem.conditions, problem.table.source, problem.table.lines
+        )
+        raise CalibError(
+            f"{problem.bound.model.name} has no value for some rows, wherever in the "
+            "prior its parameters are drawn",
+            where=problem.table.source,
+            mend="look for impossible conditions in the data, or widen the prior",
+        )
+    return np.asarray(z[best])

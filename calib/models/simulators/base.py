@@ -36,17 +36,10 @@ _KEYS: Mapping[str, str] = {"time": "limit", "short": "outputs", "unreadable": "
 
 @dataclass(frozen=True)
 class Failure:
-    """A run without a value.
+    """A run without a value: its kind, the reason in a sentence, and the tail of what it printed.
 
-    Parameters
-    ----------
-    kind : str
-        ``time`` (limit passed), ``exit`` (code other than zero), ``nan``, ``short`` (fewer values
-        than rows), ``unreadable`` (no output, or none that can be read), ``error`` (an exception).
-    reason : str
-        In a sentence.
-    printed : str
-        The tail of what it printed.
+    ``time`` (limit passed), ``exit`` (code other than zero), ``nan``, ``short`` (fewer values than
+    rows), ``unreadable`` (no output, or none that can be read), ``error`` (an exception).
     """
 
     kind: Kind
@@ -79,7 +72,7 @@ class Way(Protocol):
 
     @property
     def runs(self) -> bool:
-        """Whether new runs can be made at all."""
+        """Whether new runs can be made."""
 
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Return the outputs by the simulator's own names, n values each, or why there are none."""
@@ -89,15 +82,9 @@ class Way(Protocol):
 class Output:
     """An output that is calibrated.
 
-    Parameters
-    ----------
-    header : str
-        A column name of `calib.data.quantities` in the simulator's own unit, such as
-        ``drawbar_pull_n``.
-    column : str
-        What the simulator calls it.
-    sigma : str
-        The prior of its noise, a table of a prior file as TOML text.
+    `header` is a column name of `calib.data.quantities` in the simulator's own unit, such as
+    ``drawbar_pull_n``, `column` the simulator's name for it, and `sigma` the prior of its noise as
+    the TOML text of a table.
     """
 
     header: str
@@ -111,28 +98,24 @@ class Simulator:
 
     Parameters
     ----------
-    name : str
-        Of the simulator, and of its model where there is one output.
     priors : str
         TOML text of their tables ``parameters.NAME``, as in a prior file.
     conditions : mapping of str to str
         The simulator's own name of each condition to a header in the unit it takes.
-    source : str
-        Whom it is after.
     limit : float
         Seconds a run may take.
     retries : int
-        How often a run that failed is tried again.
+        How often a failed run is tried again.
     deterministic : bool
         Whether equal input gives equal output.
     emulate : bool
-        Whether it is too slow to be evaluated by the sampler itself.
+        Whether it is too slow for the sampler to evaluate it.
     ranges : mapping of str to (float, float)
         Bounds within which it may be asked, by canonical condition.
     made_of : tuple of str
-        SHA-256 of what its results depend on beside what it is run by: libraries, tables of soils.
+        SHA-256 of what else its results depend on: libraries, tables of soils.
     file : str
-        That it was read from, if any.
+        The simulator file, if any.
     """
 
     name: str

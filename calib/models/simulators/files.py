@@ -15,9 +15,14 @@ from calib.batch.plugins import run_file
 from calib.data.files import MEND_TOML, read_text, read_toml
 from calib.errors import CalibError, in_words, meant
 from calib.models.simulators.base import Way
-from calib.models.simulators.exchange import check_template
 from calib.models.simulators.registered import SIMULATED, Budget, Simulated, declare, written
-from calib.models.simulators.ways import CallableWay, CommandWay, TableWay, UmbridgeWay
+from calib.models.simulators.ways import (
+    CallableWay,
+    CommandWay,
+    TableWay,
+    UmbridgeWay,
+    check_template,
+)
 
 _WAYS = ("run", "python", "url", "table")
 
@@ -72,11 +77,8 @@ def register_file(path: Path) -> Simulated:
 def read_simulator(path: Path) -> Simulated:
     """Read a simulator file.
 
-    Raises
-    ------
-    CalibError
-        Naming the file and the key: it is not TOML, a key is unknown, missing or impossible, a
-        parameter has no prior, the command does not exist, or a template lacks a place.
+    A CalibError names the file and the key: it is not TOML, a key is unknown, missing or
+    impossible, a parameter has no prior, the command does not exist, or a template lacks a place.
     """
     path = Path(path).resolve()
     try:

@@ -37,18 +37,12 @@ _PAUSE = 0.01
 def run_program(
     arguments: Sequence[str], folder: Path, limit: float, *, whole: bool = True, home: str = ""
 ) -> Failure | str:
-    """Run a program in a folder and wait for it, so many seconds at the most.
+    """Run a program in a folder, and return what it printed (the end of it, if not the `whole`).
 
-    Return what it printed (of which, if not the `whole`, the end), or why it failed. It leads a
-    process group (a session of its own), which is killed when it has come to its end, when the
-    limit has passed, and when this process is interrupted: what it started ends with it. On Linux
-    so does what has left the group, which is known by a variable of its environment. What the
-    kernel cannot end is left after some seconds. Its `home`, if it has one, is in its environment.
-
-    Raises
-    ------
-    CalibError
-        If it cannot be started, or its surroundings and not its input have ended it.
+    It leads a process group, which is killed at its end, at the limit of seconds, and when this
+    process is interrupted; on Linux so is what has left the group, known by a variable of its
+    environment. A CalibError if it cannot be started, or if its surroundings and not its input have
+    ended it.
     """
     path = folder / _PRINTED
     mark = f"{_MARK}={uuid4().hex}"
@@ -141,14 +135,8 @@ def _text(path: Path, *, whole: bool) -> str:
 def call_function(function: Callable[..., Any], arguments: Sequence[Any], limit: float) -> Any:
     """Call a Python function in a process of its own, which is ended when the limit has passed.
 
-    It is handed over with whatever it refers to, as it is now: what it changes is lost. The limit
-    is in seconds, the start of the process (a third of one, and what the function imports)
-    included.
-
-    Raises
-    ------
-    CalibError
-        If it cannot be handed over.
+    It is handed over with whatever it refers to; what it changes is lost. The limit in seconds
+    includes the start of the process. A CalibError if the function cannot be handed over.
     """
     with tempfile.TemporaryDirectory(prefix="calib-run-", ignore_cleanup_errors=True) as name:
         scratch = Path(name)

@@ -23,8 +23,7 @@ from calib.models import MODELS
 from calib.models.base import Array, Conditions, Model
 from calib.models.declared import DIMENSIONS, check_model, check_names, check_word
 from calib.models.simulators.base import FAILED, Failure, Output, Simulator
-from calib.models.simulators.exchange import FROM_THE_START, fail_alike, without_value
-from calib.models.simulators.runs import Run
+from calib.models.simulators.runs import FROM_THE_START, Run, fail_alike, without_value
 from calib.models.simulators.ways import CallableWay, TableWay
 
 # So many of the runs that failed are listed, where a sampler asks for thousands.
@@ -48,12 +47,8 @@ class Budget(BaseModel):
 class Simulated:
     """A simulator that is calibrated as one or several models.
 
-    Parameters
-    ----------
-    folder : Path, optional
-        Where its runs are kept; in memory without.
-    budget : mapping of str to number
-        Fields of `calib.inference.emulation.EmulationSettings` that the user gave.
+    Its runs are kept in a `folder`, or in memory; `budget` are fields of
+    `calib.inference.emulation.EmulationSettings` that the user gave.
     """
 
     simulator: Simulator
@@ -73,10 +68,7 @@ class Simulated:
     def register(self) -> None:
         """Make the simulator and its models known; nothing is done where they are already.
 
-        Raises
-        ------
-        CalibError
-            If a declaration does not hold together, or something else has its name.
+        A CalibError if a declaration does not hold together, or something else has its name.
         """
         models, known = models_of(self.simulator), SIMULATED.get(self.name)
         for model in models:

@@ -1,4 +1,7 @@
-"""Every run kept: on disk by its content, done where it is missing, in parallel where that pays."""
+"""Every run kept: on disk by its content, done where it is missing, in parallel where that pays.
+
+And the message when a simulator is refused because its runs have no value.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +20,10 @@ from numpy.typing import NDArray
 
 from calib.batch.folders import writing
 from calib.batch.tasks import read_seconds, run_tasks
+from calib.data.files import plain_number
 from calib.errors import CalibError
 from calib.models.base import Array
-from calib.models.simulators.base import Failure, Result, Simulator
+from calib.models.simulators.base import Failure, Kind, Result, Simulator
 
 _log = logging.getLogger(__name__)
 
@@ -91,13 +95,9 @@ class RunKeeper:
     ) -> list[Run]:
         """Return runs of parameters (k, d) at canonical conditions (n,), in the order asked for.
 
-        `replicate` tells runs with equal input apart.
-
-        Raises
-        ------
-        CalibError
-            If the folder cannot be written or is in use by another process, or if runs cannot be
-            made at all: the program does not start, the server is not there.
+        `replicate` tells runs with equal input apart. A CalibError if the folder cannot be written
+        or is in use, or if runs cannot be made at all: the program does not start, the server is
+        not there.
         """
         replicates = np.broadcast_to(np.asarray(replicate), (len(thetas),))
         names = [_name(t, conditions, r) for t, r in zip(thetas, replicates, strict=True)]
@@ -119,8 +119,6 @@ class RunKeeper:
         return self._memory
 
     def _on_disk(self, items: Mapping[str, _Item]) -> Mapping[str, Mapping[str, Any]]:
-        from calib.models.simulators.exchange import FIRST  # which imports this
-
         folder = Path(self.folder or ".") / self.simulator.digest[:16]
         _say_unshared(self.simulator.name, getattr(self.simulator.way, "unshared", ""))
         with writing(folder):
@@ -206,3 +204,63 @@ def _run(described: Mapping[str, Any], theta: Array) -> Run:
         name: np.array(values, dtype=np.float64) for name, values in described["outputs"].items()
     }
     return Run(theta, outputs)
+
+
+# Of a simulator with values in half of its prior, so many runs fail all of them once in 32 times at
+# most, and less often as they are spread evenly. A mistake in its file or program fails in every
+# run, and need not be paid for sixty times, or for every draw of a sampler.
+FIRST = 5
+FROM_THE_START = "it fails from the start, and no more runs were made"
+_MEND: dict[Kind, str] = {
+    "time": "give it more time (limit)",
+    "exit": "correct the simulator where it fails: each run is made in a new folder (calib-run-... "
+    "among the temporary files), and finds its own files where the variable CALIB_SIMULATOR says",
+    "short": "have it give a number for each row, or ask for one row at a time (rows)",
+    "unreadable": "have it give what [outputs] names, as output and patterns say, or correct these",
+}
+
+
+def fail_alike(runs: Sequence[Run]) -> bool:
+    """Whether all runs have failed, and in the same way."""
+    kinds = {None if run.failure is None else run.failure.kind for run in runs}
+    return len(kinds) == 1 and None not in kinds
+
+
+def without_value(
+    why: str, simulator: Simulator, runs: Sequence[Run], folder: Path | None
+) -> CalibError:
+    """Return what to say where runs that failed are in the way; the folder is that of the runs."""
+    failures = [run.failure for run in runs if run.failure is not None]
+    if not failures:
+        return CalibError(
+            f"{why}, although every run has a value", where=simulator.place(),
+            mend="check that the data's units and the priors' scales fit each other",
+        )  # fmt: skip
+    first, names = failures[0], simulator.parameters
+    ok = np.array([run.ok for run in runs])
+    theta = np.stack([run.theta for run in runs])
+    at = f", at {_ranges(names, theta[~ok])}"
+    at += f"; those with a value are at {_ranges(names, theta[ok])}" if ok.any() else ""
+    kept = "" if folder is None else (
+        f"; the runs, failed ones too, are kept in {folder}: delete it after a mend outside "
+        "the files that the simulator's own names"
+    )  # fmt: skip
+    printed = f"; it printed: {first.printed.strip()}" if first.printed.strip() else ""
+    mend = _MEND.get(first.kind, "correct the simulator where it fails")
+    mend += "; or give priors that do not reach there" if ok.any() else ""
+    some = f"only {ok.sum()} of the {ok.size} runs have"
+    have = some if ok.any() else f"none of the {ok.size} runs has"
+    return CalibError(
+        f"{why}: {have} a value ({first.kind}: {first.reason}{printed}){at}",
+        where=simulator.place(first.kind),
+        allowed="a simulator with values in at least half of its prior, and where the data are",
+        mend=f"{mend}{kept}",
+    )
+
+
+def _ranges(names: Sequence[str], theta: Array) -> str:
+    low, high = theta.min(axis=0), theta.max(axis=0)
+    return ", ".join(
+        f"{n} {plain_number(a, 4)} to {plain_number(b, 4)}"
+        for n, a, b in zip(names, low, high, strict=True)
+    )  # fmt: skip

@@ -1,23 +1,26 @@
-"""A simulator behind an UM-Bridge server, asked over HTTP.
+"""Ways to carry out a simulator: an UM-Bridge server, a Python function, a program, a table.
 
-Ways to carry out a simulator: a Python function, a command, a table.
+And what is written for a program to read, and read of what it has written.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import os
+import re
 import shutil
 import socket
 import tempfile
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from http.client import HTTPException
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 from urllib.parse import urlsplit
 from uuid import uuid4
 
@@ -27,11 +30,11 @@ from calib.batch.foreign import call
 from calib.batch.plugins import declared_in
 from calib.batch.sources import content_of, fingerprint
 from calib.data.files import read_text
+from calib.data.table import real_array
 from calib.errors import CalibError
 from calib.models.base import Array
 from calib.models.simulators.base import Failure, Given, Printed, no_output, not_made, tail
 from calib.models.simulators.child import of_surroundings
-from calib.models.simulators.exchange import filled, input_csv, input_json, output_of_text
 from calib.models.simulators.process import call_function, run_program
 
 
@@ -39,19 +42,11 @@ from calib.models.simulators.process import call_function, run_program
 class UmbridgeWay:
     """A model behind an UM-Bridge server (protocol 1.0, doi:10.21105/joss.04748).
 
-    The protocol is one POST of JSON. The client of the package `umbridge` has no limit of time and
-    stops at a NaN in a reply, so it is spoken here.
-
-    Parameters
-    ----------
-    columns : tuple of str
-        The outputs, in the order of the server's output vectors.
-    rows : {"each", "config"}
-        ``each``: one call for each row of conditions, parameters then conditions as one input
-        vector, an output vector of one number each. ``config``: one call, the conditions as lists
-        in the call's ``config``, an output vector of n numbers each.
-    limit : float
-        Seconds for each call.
+    The client of the package `umbridge` has no limit of time and stops at a NaN in a reply, so the
+    protocol, one POST of JSON, is spoken here. `columns` are the outputs in the order of the
+    server's output vectors. `rows` is ``each`` (one call for each row of conditions, parameters
+    then conditions as one input vector) or ``config`` (one call, the conditions as lists in its
+    ``config``, output vectors of n numbers). `limit` is in seconds for each call.
     """
 
     url: str
@@ -60,20 +55,13 @@ class UmbridgeWay:
     rows: Literal["each", "config"] = "each"
     limit: float = 600.0
 
+    key: ClassVar[str] = "url"
+    runs: ClassVar[bool] = True
+
     @property
     def identity(self) -> str:
         """Where it is and how it is called."""
         return json.dumps(["umbridge", self.url, self.model, self.columns, self.rows])
-
-    @property
-    def key(self) -> str:
-        """The key of a simulator file."""
-        return "url"
-
-    @property
-    def runs(self) -> bool:
-        """Always."""
-        return True
 
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Call the server."""
@@ -159,26 +147,13 @@ def _body(error: urllib.error.HTTPError) -> str:
 
 @dataclass(frozen=True)
 class CallableWay:
-    """A Python function.
+    """A Python function, ``(theta, conditions) -> output``.
 
-    Parameters
-    ----------
-    function : callable
-        ``(theta, conditions) -> output``: theta of shape (k, d), conditions of shape (n,) by the
-        simulator's own names; returns (k, n), or a mapping of such by output. With `batched`
-        false theta has the shape (d,), the output (n,).
-    columns : tuple of str
-        The outputs.
-    limit : float, optional
-        Seconds for a run, which is then made in a process of its own; without one, in this.
-
-    Attributes
-    ----------
-    identity : str
-        What the function was when this was made, or as others have changed it since; what it
-        counts or remembers itself as it runs is no part of it.
-    unshared : str
-        Why it cannot be told from others, so that its runs are not shared; empty if it can.
+    Theta is (k, d), conditions (n,) by the simulator's own names; it returns (k, n), or a mapping
+    of such by output (`columns`). With `batched` false theta is (d,), the output (n,). With a
+    `limit` in seconds a run is made in a process of its own. `identity` is what the function was
+    when this was made, or as others have changed it since; `unshared` says why it cannot be told
+    from others, so that its runs are not shared.
     """
 
     function: Callable[[Array, Mapping[str, Array]], Any]
@@ -215,15 +190,8 @@ class CallableWay:
         with suppress(ValueError):
             object.__setattr__(self, "_left", fingerprint(self.function))
 
-    @property
-    def key(self) -> str:
-        """The key of a simulator file."""
-        return "python"
-
-    @property
-    def runs(self) -> bool:
-        """Always."""
-        return True
+    key: ClassVar[str] = "python"
+    runs: ClassVar[bool] = True
 
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Call it for one parameter vector."""
@@ -274,21 +242,11 @@ class CallableWay:
 class CommandWay:
     """A program, run without a shell in a scratch folder of its own.
 
-    Parameters
-    ----------
-    arguments : tuple of str
-        With ``{input}`` and ``{output}`` for the paths of the two files; without ``{output}``
-        what it prints is read.
-    folder : Path
-        Of the simulator file: a program named by a relative path is looked for here.
-    takes : {"json", "csv", "template"}
-    template : str
-        The input in the program's own format, ``@name@`` where a value belongs.
-    gives : {"json", "csv", "pattern"}
-    each_row : bool
-        Whether the program is run for each row of conditions by itself.
-    limit : float
-        Seconds for each time it is run.
+    `arguments` have ``{input}`` and ``{output}`` for the paths of the two files; without
+    ``{output}`` what it prints is read. `folder` is that of the simulator file, in which relative
+    paths are looked up; `template` is the input in the program's own format, ``@name@`` where a
+    value belongs. It is run once, or for `each_row` of conditions, within so many seconds each
+    time.
     """
 
     arguments: tuple[str, ...]
@@ -300,6 +258,9 @@ class CommandWay:
     each_row: bool = False
     limit: float = 600.0
 
+    key: ClassVar[str] = "run"
+    runs: ClassVar[bool] = True
+
     @property
     def identity(self) -> str:
         """The command, the formats, and what is in the files that it names and they import."""
@@ -307,16 +268,6 @@ class CommandWay:
         files = [content_of(p) if p else "" for p in named]
         what = [self.arguments, files, self.takes, self.template, self.gives]
         return json.dumps(["command", *what, dict(self.patterns), self.each_row])
-
-    @property
-    def key(self) -> str:
-        """The key of a simulator file."""
-        return "run"
-
-    @property
-    def runs(self) -> bool:
-        """Always."""
-        return True
 
     @property
     def program(self) -> str | None:
@@ -402,35 +353,138 @@ class CommandWay:
 
 @dataclass(frozen=True)
 class TableWay:
-    """Runs that were made already; nothing is carried out.
+    """Runs that were made already: a CSV with a column for each parameter, condition and output.
 
-    Parameters
-    ----------
-    path : Path
-        CSV with a column for each parameter, condition and output, a row for each row of
-        conditions of each run.
-    sha256 : str
-        Of the file.
+    It has a row for each row of conditions of each run; `sha256` is that of the file.
     """
 
     path: Path
     sha256: str
+
+    key: ClassVar[str] = "table"
+    runs: ClassVar[bool] = False
 
     @property
     def identity(self) -> str:
         """The content of the table."""
         return f"table {self.sha256}"
 
-    @property
-    def key(self) -> str:
-        """The key of a simulator file."""
-        return "table"
-
-    @property
-    def runs(self) -> bool:
-        """Never."""
-        return False
-
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
         """Refuse: there is nothing to carry out."""
         return Failure("error", "there are the runs of the table and no others")
+
+
+_PLACE = re.compile(r"@([^\W\d]\w*)@")
+# What follows a number that was cut off: a decimal comma, more digits, an exponent.
+_GOES_ON = re.compile(r"[.,]?\d+|[eEdD][-+]?\d+", re.ASCII)
+
+
+def input_json(parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> str:
+    """Return both as JSON: numbers by parameter, lists by condition."""
+    lists = {name: values.tolist() for name, values in conditions.items()}
+    return json.dumps({"parameters": dict(parameters), "conditions": lists}, indent=1) + "\n"
+
+
+def input_csv(parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> str:
+    """Return both as CSV: a row for each row of conditions, the parameters the same in all."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*parameters, *conditions])
+    fixed = [repr(value) for value in parameters.values()]
+    for row in zip(*conditions.values(), strict=True):
+        writer.writerow([*fixed, *(repr(float(value)) for value in row)])
+    return text.getvalue()
+
+
+def check_template(template: str, names: tuple[str, ...], where: str) -> None:
+    """Check that a template has a place for each name, and no other; a CalibError if not."""
+    marks = set(_PLACE.findall(template))
+    missing = [name for name in names if name not in marks]
+    unknown = sorted(marks - set(names))
+    if missing or unknown:
+        what = [f"no place for {', '.join(missing)}"] * bool(missing)
+        what += [f"unknown {', '.join(f'@{name}@' for name in unknown)}"] * bool(unknown)
+        raise CalibError(
+            f"the template has {'; '.join(what)}", where=where,
+            allowed=", ".join(f"@{name}@" for name in names),
+            mend="write each of these marks where its value belongs, and no other",
+        )  # fmt: skip
+
+
+def filled(template: str, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> str:
+    """Put values in the place of a template's marks, those of a condition apart by spaces."""
+    values = {name: repr(value) for name, value in parameters.items()}
+    values |= {name: " ".join(map(repr, v.tolist())) for name, v in conditions.items()}
+    return _PLACE.sub(lambda mark: values[mark[1]], template)
+
+
+def output_of_text(text: str, how: str, patterns: Mapping[str, str]) -> Given:
+    """Read outputs: of JSON an object of lists or numbers, of CSV a column each.
+
+    A pattern is a regular expression whose first group is the number, found once for each row.
+    """
+    try:
+        match how:
+            case "json":
+                return _of_json(json.loads(text, object_pairs_hook=_once_each))
+            case "csv":
+                return _table(text)
+            case _:
+                return {name: _matches(text, pattern) for name, pattern in patterns.items()}
+    except (ValueError, TypeError, CalibError) as error:
+        reason = error.message if isinstance(error, CalibError) else error
+        return Failure("unreadable", f"its output is not the {how} asked for: {reason}")
+
+
+def _table(text: str) -> dict[str, Any]:
+    rows = [row for row in csv.reader(io.StringIO(text)) if row]
+    if not rows:
+        raise ValueError("it is empty")
+    return columns_of(rows[0], rows[1:])
+
+
+def columns_of(header: Sequence[str], rows: Sequence[Sequence[str]]) -> dict[str, Any]:
+    """Return the columns of a table by name: numbers, NaN where a cell is empty, or else texts.
+
+    A ValueError says what is wrong.
+    """
+    names = [name.strip() for name in header]
+    if any(len(row) < len(names) or any(row[len(names) :]) for row in rows):
+        raise ValueError("its rows have different numbers of cells")
+    named = [(name, [row[i].strip() for row in rows]) for i, name in enumerate(names) if name]
+    found: dict[str, Any] = _once_each(named)
+    for name, column in found.items():
+        with suppress(CalibError):
+            found[name] = real_array([cell or None for cell in column])
+    return found
+
+
+def _once_each(pairs: Sequence[tuple[str, Any]]) -> dict[str, Any]:
+    """Return pairs as a dictionary; a ValueError if a name is there twice."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"{next(n for n in names if names.count(n) > 1)!r} is there twice")
+    return found
+
+
+def _of_json(found: Any) -> dict[str, Any]:
+    if not isinstance(found, dict):
+        raise TypeError("not an object of outputs by name")
+    lists = {k: v if isinstance(v, list) else [v] for k, v in found.items()}
+    lists = {k: v for k, v in lists.items() if not any(isinstance(x, dict) for x in v)}
+    return {
+        k: v if any(isinstance(x, list) for x in v) else real_array(v) for k, v in lists.items()
+    }
+
+
+def _matches(text: str, pattern: str) -> Array:
+    """Return the numbers that a pattern finds, whole ones only."""
+    found = list(re.finditer(pattern, text, re.M))
+    group = 1 if found and found[0].re.groups else 0
+    starts = {one.start(group) for one in found}
+    for one in found:
+        more = _GOES_ON.match(text, one.end(group))
+        if more and starts.isdisjoint(range(one.end(group), more.end() + 1)):
+            raise ValueError(f"{one[group]!r} is the beginning of {one[group] + more[0]!r} only")
+    return real_array([one[group] for one in found])

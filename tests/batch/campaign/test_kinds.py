@@ -27,8 +27,7 @@ from calib.inference.io import load_calibration
 from calib.inference.problem import build_problem
 from calib.inference.random import generator
 from calib.models import MODELS, example_csv, get_model
-from calib.models.simulators.emulator.emulator import emulator_of
-from calib.models.simulators.emulator.files import load_emulator
+from calib.models.simulators.emulator import emulator_of, load_emulator
 from calib.models.simulators.files import register_file
 from calib.models.simulators.registered import SIMULATED
 from calib.validation.sbc.run import run_sbc

@@ -11,7 +11,7 @@ import pytest
 
 from calib.errors import CalibError
 from calib.models.simulators.base import Failure
-from calib.models.simulators.exchange import (
+from calib.models.simulators.ways import (
     check_template,
     filled,
     input_csv,

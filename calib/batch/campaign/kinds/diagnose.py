@@ -32,8 +32,7 @@ from calib.gap.effects import EFFECTS, Effect
 from calib.gap.effects.load import load_effects
 from calib.inference.emulation.prepared import emulated_for_both
 from calib.models import MODELS
-from calib.models.simulators.emulator.emulator import emulator_of
-from calib.models.simulators.emulator.files import save_emulator
+from calib.models.simulators.emulator import emulator_of, save_emulator
 from calib.models.simulators.registered import slow_simulator
 from calib.report.page.diagnosis import write_page
 

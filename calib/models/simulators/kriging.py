@@ -1,4 +1,4 @@
-"""Several smooth functions of a few coordinates from few values: universal kriging.
+"""Smooth functions from few values: of parameters by universal kriging, and of conditions.
 
     f_j(x) = b(x)' beta_j + g_j(x),   g_j ~ GP(0, s_j^2 [r(x, x') + nugget 1(x = x')]),
     r(x, x') = exp(-1/2 sum_i ((x_i - x'_i) / l_i)^2)
@@ -7,26 +7,26 @@ with b the constant and the coordinates, beta flat beforehand (Rasmussen & Willi
 Processes for Machine Learning*, section 2.7). The functions share r: whatever their number, a point
 costs one row of correlations and one product with a matrix of n on a side.
 
-The length scales are those of the greatest likelihood of one process, with one variance for all
-functions, so that those that vary most count most. Each s_j^2 is the geometric mean of two
-estimates: the likelihood's, which takes the length scales as known and is too sure, and that of the
-errors of leaving out one value at a time (section 5.4.2), of which those at the edge are large.
+The length scales maximise the likelihood of one process with one variance for all functions, so
+that those that vary most count most. Each s_j^2 is the geometric mean of two estimates: the
+likelihood's, which takes the length scales as known and is too sure, and that of the leave-one-out
+errors (section 5.4.2), of which those at the edge are large. scikit-learn's
+`GaussianProcessRegressor` finds the same length scales in ten times the time, and has no trend.
 
-scikit-learn's `GaussianProcessRegressor` finds the same length scales (a test holds one against the
-other) in ten times the time, has no trend, and its predictions copy their input at each call; a
-sampler asks a million times, and an emulator is built anew after every few runs. GPyTorch, GPflow
-and tinygp bring torch, TensorFlow or JAX, and 300 values need none of what those are for.
-
-Where a posterior lies: the runs there matter most.
+Over conditions, every run gives its outputs at the same *nodes*, so the covariance over parameters
+and conditions is a product, and one smooth process through the nodes serves all runs.
 """
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_solve, cholesky, solve_triangular
+from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
 from scipy.linalg.blas import dtrmm
 
 from calib.models.base import Array
@@ -43,12 +43,7 @@ AT_ONCE = 512
 
 @dataclass(frozen=True)
 class Scales:
-    """Length scales and nugget, relative to the process's variance.
-
-    Parameters
-    ----------
-    lengths : ndarray, shape (d,)
-    """
+    """Length scales (d,), and the nugget relative to the process's variance."""
 
     lengths: Array
     nugget: float
@@ -58,21 +53,11 @@ class Scales:
 class Kriging:
     """Functions as their values let them be known.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n, d)
-        Where values are known.
-    beta : ndarray, shape (q, j)
-    gamma : ndarray, shape (n, j)
-        What the correlations with the known points multiply.
-    root : ndarray, shape (n, n)
-        Inverse of the lower factor of the correlations.
-    trend : ndarray, shape (q, n)
-        With the correlations, what the values take off a trend that is not known.
-    trend_root : ndarray, shape (q, q)
-        Inverse of the lower factor of the trend's precision.
-    variances : ndarray, shape (j,)
-        Of the processes.
+    Values are known at `x` (n, d); `beta` (q, j) are the trends, `gamma` (n, j) what correlations
+    with the known points multiply, `root` (n, n) the inverse of the lower factor of the
+    correlations, `trend` (q, n) what, with the correlations, the values take off an unknown trend,
+    `trend_root` (q, q) the inverse of the lower factor of its precision, `variances` (j,) those of
+    the processes.
     """
 
     x: Array
@@ -134,13 +119,7 @@ def correlation(a: Array, b: Array, lengths: Array) -> Array:
 
 
 def krige(x: Array, y: Array, scales: Scales) -> Kriging:
-    """Fit trends and processes for given scales.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n, d)
-    y : ndarray, shape (n, j)
-    """
+    """Fit trends and processes for given scales, to values y (n, j) at x (n, d)."""
     n = len(x)
     b = trend_of(x)
     lower = cholesky(correlation(x, x, scales.lengths) + scales.nugget * np.eye(n), lower=True)
@@ -171,14 +150,8 @@ def _precisions(root: Array, trend: Array, trend_root: Array) -> Array:
 def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None = None) -> Scales:
     """Find length scales and nugget by marginal likelihood, the trends taken out before.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n, d)
-    y : ndarray, shape (n, j)
-    noisy : bool
-        Whether values at one point may differ: else the nugget stays small.
-    start : Scales, optional
-        Where to begin.
+    Of values y (n, j) at x (n, d). The nugget stays small unless values at one point may differ
+    (`noisy`); `start` is where to begin.
     """
     from scipy.optimize import minimize  # late: a tenth of a second, and few commands emulate
 
@@ -204,15 +177,9 @@ def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None
 def minus_log_likelihood(logs: Array, squares: Array, y: Array) -> tuple[float, Array]:
     """Return minus the log likelihood at its best variance, without a trend, and its gradient.
 
-    Rasmussen & Williams (2006), equations 2.30 and 5.9, with one variance for all functions.
-
-    Parameters
-    ----------
-    logs : ndarray, shape (d + 1,)
-        Logarithms of the length scales and the nugget.
-    squares : ndarray, shape (d, n, n)
-        Squared distances along each coordinate.
-    y : ndarray, shape (n, j)
+    Rasmussen & Williams (2006), equations 2.30 and 5.9, with one variance for all functions y (n,
+    j). `logs` (d + 1,) are logarithms of the length scales and the nugget, `squares` (d, n, n)
+    squared distances along each coordinate.
     """
     lengths, nugget, n = np.exp(logs[:-1]), np.exp(logs[-1]), y.size
     smooth = np.exp(-0.5 * np.tensordot(lengths**-2.0, squares, axes=1))
@@ -235,14 +202,8 @@ def minus_log_likelihood(logs: Array, squares: Array, y: Array) -> tuple[float, 
 class Region:
     """A part of parameter space, with coordinates in which it is round.
 
-    Parameters
-    ----------
-    centre : ndarray, shape (d,)
-        In units of the prior's sds.
-    root : ndarray, shape (d, d)
-        Lower factor of the covariance there.
-    reach : float
-        In sds.
+    `centre` (d,) is in units of the prior's sds, `root` (d, d) the lower factor of the covariance
+    there, `reach` in sds.
     """
 
     centre: Array
@@ -256,3 +217,119 @@ class Region:
     def inside(self, z: Array) -> NDArray[np.bool_]:
         """Whether points lie in it, (k, d) to (k,)."""
         return np.asarray(np.linalg.norm(self.coordinates(z), axis=1) <= self.reach)
+
+
+_NUGGET_OVER = 1e-8
+# The smallest with which the matrix has a factor: by it curves miss their nodes.
+_NUGGETS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
+# Beyond the nodes' box curves go on straight for so much of its width; farther they have no value.
+BEYOND = 0.15
+_INSIDE = 0.02
+
+
+@dataclass(frozen=True)
+class Over:
+    """Interpolates curves over conditions (Matern 5/2, its length scales by likelihood).
+
+    `columns` are the conditions that vary, `low` and `width` (c,) the nodes' box, `nodes` (m, c)
+    and `lengths` (c,) in units of the box, `fixed` the conditions that do not vary.
+    """
+
+    columns: tuple[str, ...]
+    low: Array
+    width: Array
+    nodes: Array
+    lengths: Array
+    fixed: Mapping[str, float]
+
+    def weights(self, curves: Array) -> Array:
+        """Return what `at` needs of curves at the nodes, shape (j, m) to (m + 1, j)."""
+        mean = curves.mean(axis=1)
+        solved = cho_solve(self._factor(), (curves - mean[:, None]).T)
+        return np.concatenate([solved, mean[None]])
+
+    def at(self, conditions: Mapping[str, Array], weights: Array) -> Array:
+        """Return curves at conditions (n,) or (k, n), shape (..., j); NaN too far outside."""
+        first = next(iter(conditions.values()))
+        shape = np.broadcast_shapes(*(v.shape for v in conditions.values())) or first.shape
+        off = np.zeros(shape, dtype=bool)
+        for name, value in self.fixed.items():
+            off |= np.abs(conditions[name] - value) > 1e-6 * max(1.0, abs(value))
+        if not self.columns:
+            only = weights[-1] + weights[:-1].sum(axis=0)
+            found = np.broadcast_to(only, (*shape, weights.shape[1]))
+        else:
+            raw = [np.broadcast_to(conditions[name], shape).ravel() for name in self.columns]
+            u = (np.stack(raw, axis=1) - self.low) / self.width
+            found = self._straight_on(u, weights).reshape(*shape, -1)
+        return np.where(off[..., None], np.nan, found)
+
+    def _straight_on(self, u: Array, weights: Array) -> Array:
+        inside = np.clip(u, 0.0, 1.0)
+        found = self._smooth(inside, weights)
+        out = u - inside
+        rows = np.flatnonzero(np.abs(out).max(axis=1) > 1e-9)
+        if rows.size:
+            # From a point a little farther in, on the line along which it leaves the box.
+            far = np.abs(out[rows]).max(axis=1, keepdims=True)
+            back = self._smooth(inside[rows] - _INSIDE * out[rows] / far, weights)
+            found[rows] += (found[rows] - back) * (far / _INSIDE)
+            found[rows[far[:, 0] > BEYOND + 1e-9]] = np.nan
+        return found
+
+    def _smooth(self, u: Array, weights: Array) -> Array:
+        return np.asarray(_matern(u, self.nodes, self.lengths) @ weights[:-1] + weights[-1])
+
+    def _factor(self) -> tuple[Array, bool]:
+        if not self.columns:
+            return np.eye(len(self.nodes)), True
+        k = _matern(self.nodes, self.nodes, self.lengths)
+        for nugget in _NUGGETS:
+            with suppress(np.linalg.LinAlgError):
+                return cho_factor(k + nugget * np.eye(len(k)), lower=True)[0], True
+        return cho_factor(k + _NUGGET_OVER * np.eye(len(k)), lower=True)[0], True
+
+    def left_out(self, curves: Array) -> Array:
+        """Return the errors at each node were it not one, shape (j, m) to (j, m)."""
+        if not self.columns or len(self.nodes) < 3:
+            return np.zeros_like(curves)
+        inverse = cho_solve(self._factor(), np.eye(len(self.nodes)))
+        centred = curves - curves.mean(axis=1, keepdims=True)
+        return np.asarray(centred @ inverse / np.diag(inverse))
+
+
+def _matern(a: Array, b: Array, lengths: Array) -> Array:
+    a, b = a / lengths, b / lengths
+    squared = ((a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1)) - 2.0 * (a @ b.T)
+    r = np.sqrt(np.maximum(5.0 * squared, 0.0))
+    return np.asarray((1.0 + r + r * r / 3.0) * np.exp(-r))
+
+
+def over_conditions(
+    nodes: Mapping[str, Array], curves: Array, lengths: Array | None = None
+) -> Over:
+    """Find the length scales over conditions, from curves (j, m) of some runs at nodes (m,)."""
+    varying = tuple(name for name, v in nodes.items() if np.ptp(v) > 1e-9 * np.abs(v).max())
+    fixed = {name: float(v[0]) for name, v in nodes.items() if name not in varying}
+    m = next(iter(nodes.values())).size
+    stacked = np.stack([nodes[n] for n in varying], axis=1) if varying else np.zeros((m, 0))
+    low = stacked.min(axis=0, initial=np.inf) if varying else np.zeros(0)
+    width = np.ptp(stacked, axis=0) if varying else np.zeros(0)
+    u = (stacked - low) / width
+    if lengths is None:
+        lengths = _lengths(u, curves) if varying else np.zeros(0)
+    return Over(varying, low, width, u, lengths, fixed)
+
+
+def _lengths(u: Array, curves: Array) -> Array:
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import ConstantKernel, Matern
+
+    spread = curves.std(axis=1, keepdims=True)
+    scaled = ((curves - curves.mean(axis=1, keepdims=True)) / np.where(spread > 0, spread, 1.0)).T
+    kernel = ConstantKernel(1.0, (1e-1, 1e5)) * Matern(np.full(u.shape[1], 0.5), (0.03, 20.0), 2.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fitted = GaussianProcessRegressor(kernel, alpha=_NUGGET_OVER).fit(u, scaled).kernel_
+    return np.asarray(np.atleast_1d(fitted.k2.length_scale) * np.ones(u.shape[1]))

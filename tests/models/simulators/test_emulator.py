@@ -10,10 +10,17 @@ from scipy.stats import qmc
 
 import calib
 from calib.errors import CalibError
-from calib.models.simulators.emulator import Axes, Emulator, Training, build_emulator
-from calib.models.simulators.emulator.emulator import emulated_model, emulator_of
-from calib.models.simulators.emulator.files import load_emulator, save_emulator
-from calib.models.simulators.emulator.kriging import Region
+from calib.models.simulators.emulator import (
+    Axes,
+    Emulator,
+    Training,
+    build_emulator,
+    emulated_model,
+    emulator_of,
+    load_emulator,
+    save_emulator,
+)
+from calib.models.simulators.kriging import Region
 from tests.models.simulators.examples import lab, pull
 
 AXES = Axes(np.array([True, True]), np.log([0.5, 0.1]), np.array([0.4, 0.8]))

@@ -1,60 +1,55 @@
-"""Where a simulator has a value at all, learned from the runs that failed.
-
-An emulator: what a slow simulator would answer, how surely, and where it has no answer.
+"""An emulator: what a slow simulator would answer, how surely, and where it has no answer.
 
 Every run gives its output at the same m conditions (the nodes). Runs are a matrix, of which a few
 basis curves hold all that matters (Higdon et al. 2008, doi:10.1198/016214507000000888):
 
     y(theta, x) = m(x) + sum_j c_j(theta) b_j(x)
 
-Each c_j is a function of the parameters alone, known at as many points as there are runs
-(`kriging`), the curves are functions of the conditions alone (`over`). One process over the whole
-prior is the best of what was tried: processes of their own near the posterior, in coordinates in
-which it is round, and parabolas in the place of the linear trend had two to four times its error
-there (five parameters, 60 to 200 runs). Of the two ways to emulate
-over conditions this is the better conditioned: one process over parameters and conditions would
-have a matrix of runs times nodes on a side (200 times 40: 8,000), nearly singular as neighbouring
-nodes say the same, in the place of matrices of 200 and of 40.
+Each c_j is a function of the parameters alone, known at as many points as there are runs; the
+curves are functions of the conditions alone (`kriging` has both). One process over parameters and
+conditions would need a nearly singular matrix of runs times nodes on a side.
 
-A model whose equation is an emulator.
+On disk are the runs it stands on and its length scales, to build it again from.
 """
 
 from __future__ import annotations
 
+import json
 import warnings
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from calib.errors import CalibError
+from calib.models import MODELS, get_model
 from calib.models.base import Array, Columns, Conditions, Model, References, Rows, not_given
-from calib.models.simulators.emulator.kriging import (
+from calib.models.simulators.kriging import (
     AT_ONCE,
     Kriging,
+    Over,
     Region,
     Scales,
     correlation,
     find_scales,
     krige,
+    over_conditions,
 )
-from calib.models.simulators.emulator.over import Over, over_conditions
 
-_LENGTHS = (0.2, 10.0)
+_SUPPORT_LENGTHS = (0.2, 10.0)
 
 
 @dataclass(frozen=True)
 class Support:
     """The probability that a run has a value, by a Gaussian process behind a logistic curve.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n, d)
-    weights : ndarray, shape (n,)
-        At its mode the latent function is the kernel times these (Rasmussen & Williams 2006,
-        Eq 3.21).
-    lengths : ndarray, shape (d,)
+    At its mode the latent function is the kernel between points and `x` (n, d) times `weights` (n,)
+    (Rasmussen & Williams 2006, Eq 3.21).
     """
 
     x: Array
@@ -74,13 +69,9 @@ class Support:
 
 
 def learn_support(x: Array, ok: NDArray[np.bool_]) -> Support | None:
-    """Learn from runs; None where none failed.
+    """Learn where there is a value from runs; None where none failed.
 
-    Parameters
-    ----------
-    x : ndarray, shape (n, d)
-        Parameters in units of the prior's sds.
-    ok : ndarray of bool, shape (n,)
+    `x`, (n, d), is in units of the prior's sds, `ok` of shape (n,).
     """
     if ok.all() or not ok.any():
         return None
@@ -88,7 +79,7 @@ def learn_support(x: Array, ok: NDArray[np.bool_]) -> Support | None:
     from sklearn.gaussian_process import GaussianProcessClassifier
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
-    kernel = ConstantKernel(10.0, (1.0, 1e3)) * RBF(np.full(x.shape[1], 1.5), _LENGTHS)
+    kernel = ConstantKernel(10.0, (1.0, 1e3)) * RBF(np.full(x.shape[1], 1.5), _SUPPORT_LENGTHS)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         fitted = GaussianProcessClassifier(kernel).fit(x, ok).base_estimator_
@@ -115,12 +106,8 @@ _FEW = 8
 class Axes:
     """Coordinates in which a prior is round.
 
-    Parameters
-    ----------
-    log : ndarray of bool, shape (d,)
-        Which parameters are taken as logarithms.
-    loc, width : ndarray, shape (d,)
-        Middle and sd of the prior.
+    `log` says which parameters are taken as logarithms; `loc` and `width` are middle and sd of the
+    prior; (d,) each.
     """
 
     log: NDArray[np.bool_]
@@ -143,16 +130,8 @@ class Axes:
 class Training:
     """The runs that an emulator stands on, those that failed among them.
 
-    Parameters
-    ----------
-    theta : ndarray, shape (k, d)
-        Natural parameters.
-    values : ndarray, shape (k, m)
-        Output on the scale of the response; NaN where a run failed.
-    nodes : mapping of str to ndarray, shape (m,)
-        Canonical conditions.
-    noisy : bool
-        Whether the simulator gives other values each time.
+    Natural parameters `theta` (k, d); `values` (k, m) on the scale of the response, NaN where a run
+    failed; `nodes` are canonical conditions (m,). A `noisy` simulator gives other values each time.
     """
 
     theta: Array
@@ -177,19 +156,10 @@ class Training:
 class Emulator:
     """See the module.
 
-    Parameters
-    ----------
-    negligible : float
-        Error of the output that need not be looked into.
-    mean : ndarray, shape (m,)
-    curves : ndarray, shape (j, m)
-        Orthonormal.
-    functions : Kriging
-        The coefficients as functions of the parameters, in units of the prior's sds.
-    support : Support, optional
-        Where there is a value at all.
-    near : tuple of (Region, Support)
-        The same, more finely, in regions in which some runs failed.
+    `negligible` is an error of the output that does not matter, `mean` (m,) and `curves` (j, m) the
+    orthonormal basis, `functions` the coefficients as functions of the parameters in units of the
+    prior's sds. `support` says where there is a value at all, `near` the same more finely in
+    regions in which some runs failed.
     """
 
     training: Training
@@ -317,19 +287,9 @@ def build_emulator(
 ) -> Emulator:
     """Build an emulator on runs.
 
-    Parameters
-    ----------
-    negligible : float
-        Error of the output, on the scale of the response, that need not be looked into.
-    regions : sequence of Region
-        Where posteriors lie: the basis serves the runs there first, and edges beyond which there
-        is no value are looked at more closely.
-    scales : Scales, optional
-        Of an earlier emulator: where to begin.
-    known : bool
-        Whether they are to be used as they are.
-    over : Over, optional
-        Of an earlier emulator on the same nodes.
+    The basis serves first the runs in `regions`, where posteriors lie, and edges beyond which there
+    is no value are resolved more finely there. `scales` of an earlier emulator are where to begin,
+    or `known`; `over` is that of an earlier emulator on the same nodes.
     """
     ok = training.ok
     z, values = axes.of(training.theta), training.values[training.ok]
@@ -412,3 +372,66 @@ def emulated_model(model: Model, emulator: Emulator) -> Model:
 def emulator_of(model: Model) -> Emulator | None:
     """Return the emulator behind a model; None if there is none."""
     return model.mean_response.emulator if isinstance(model.mean_response, _MeanResponse) else None
+
+
+def save_emulator(emulator: Emulator, model: str, path: Path) -> None:
+    """Write an emulator and its model's name to an ``.npz`` path, whole or not at all."""
+    t = emulator.training
+    meta = {
+        "model": model, "nodes": list(t.nodes), "noisy": t.noisy,
+        "negligible": emulator.negligible, "reach": [r.reach for r in emulator.regions],
+    }  # fmt: skip
+    arrays: dict[str, Any] = {
+        "meta": np.array(json.dumps(meta)), "theta": t.theta, "values": t.values,
+        "log": emulator.axes.log, "loc": emulator.axes.loc, "width": emulator.axes.width,
+        "over": emulator.over.lengths,
+        **{f"node_{i}": v for i, v in enumerate(t.nodes.values())},
+        **{f"centre_{i}": r.centre for i, r in enumerate(emulator.regions)},
+        **{f"root_{i}": r.root for i, r in enumerate(emulator.regions)},
+    }  # fmt: skip
+    arrays["lengths"] = emulator.functions.scales.lengths
+    arrays["nugget"] = np.array(emulator.functions.scales.nugget)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_suffix(".part.npz")
+    # In the archive no time of its making: equal emulators give equal files.
+    np.savez(part, **arrays)
+    part.replace(path)
+
+
+def load_emulator(path: Path) -> tuple[str, Emulator]:
+    """Read an emulator and the name of its model; a CalibError if the file is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as found:
+            arrays = {name: found[name] for name in found.files}
+        meta = json.loads(str(arrays["meta"]))
+        return meta["model"], _built(meta, arrays)
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        raise CalibError(
+            f"the emulator cannot be read ({type(error).__name__})", where=str(path),
+            mend="make it again from the simulator's runs: call the same command",
+        ) from None  # fmt: skip
+
+
+def _built(meta: dict[str, Any], arrays: dict[str, Any]) -> Emulator:
+    nodes = {name: arrays[f"node_{i}"] for i, name in enumerate(meta["nodes"])}
+    regions = [
+        Region(arrays[f"centre_{i}"], arrays[f"root_{i}"], reach)
+        for i, reach in enumerate(meta["reach"])
+    ]
+    # Files of earlier versions have scales for each curve: they are found anew from the runs.
+    kept = Scales(arrays["lengths"], float(arrays["nugget"])) if "nugget" in arrays else None
+    values = arrays["values"]
+    return build_emulator(
+        Training(arrays["theta"], values, nodes, bool(meta["noisy"])),
+        Axes(arrays["log"], arrays["loc"], arrays["width"]), meta["negligible"], regions,
+        scales=kept, known=kept is not None,
+        over=over_conditions(nodes, values[:1], arrays["over"]),
+    )  # fmt: skip
+
+
+def use_emulator(path: Path) -> None:
+    """Let the model of an emulator on disk be the emulator, in this process."""
+    name, emulator = load_emulator(path)
+    model = emulated_model(get_model(name), emulator)
+    MODELS.discard(name)
+    MODELS.add(replace(model))
