@@ -102,7 +102,7 @@ def _solve_ln_density(target: Array, water: Array, A2: Array, A3: Array, A4: Arr
         value, slope = excess(x)
         low, high = np.where(value < 0.0, x, low), np.where(value < 0.0, high, x)
         step = x - value / slope
-        # Converged, the step ends on the bracket's edge, where x is.
+        # A converged step ends on the bracket's edge.
         new = np.where((step >= low) & (step <= high), step, 0.5 * (low + high))
         moved = np.abs(new - x)
         x = new

@@ -8,17 +8,20 @@ published coefficients, which are reported beside them.
 
 from __future__ import annotations
 
+import tomllib
 import traceback
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from functools import partial
 from typing import Any, Literal
+from unicodedata import normalize
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calib.batch.foreign import call
-from calib.data.quantities import QUANTITIES
+from calib.data.files import MEND_TOML
+from calib.data.quantities import OUTPUTS, QUANTITIES, convert
 from calib.data.table import real_array
 from calib.errors import CalibError
 from calib.models.latex import text
@@ -27,7 +30,7 @@ type Array = NDArray[np.float64]
 type References = Mapping[str, float]
 type Conditions = Mapping[str, Array]
 type Columns = tuple[Array, ...]
-# What an equation needs of the conditions, whatever the parameters; see `Model.prepare`.
+# The part of an equation that depends on the conditions alone; see `Model.prepare`.
 type Rows = Mapping[str, NDArray[Any]]
 
 
@@ -41,7 +44,7 @@ def _no_references(conditions: Conditions) -> dict[str, float]:
 
 
 def not_given(*_: Any) -> Any:
-    """Stand for a function of a model that is made up when the model is."""
+    """Stand for a function that `Model` fills in."""
     raise NotImplementedError
 
 
@@ -56,7 +59,7 @@ class _Predicted:
         shape = np.broadcast_shapes(*(v.shape for v in rows.values()))
         if len(shape) == 1:
             return self._call(theta, rows)
-        # Conditions of each vector's own: many functions broadcast them, which is much faster.
+        # Each vector has conditions of its own. Most functions broadcast them, which is faster.
         k = max(len(theta), shape[0])
         theta = np.broadcast_to(theta, (k, theta.shape[1]))
         own = {name: np.broadcast_to(v, (k, shape[1])) for name, v in rows.items()}
@@ -80,7 +83,7 @@ class _Predicted:
                 allowed="predict(theta (k, d), conditions) -> (k, n)",
                 mend="declare it with a function that predicts its output",
             )
-        # Copies: what a function does to what it is handed is seen by no other call.
+        # Copies, as a function may change its arguments.
         handed = theta.copy(), {name: v.copy() for name, v in rows.items()}
         try:
             given = call(self.model.predict, *handed)
@@ -139,7 +142,7 @@ class Searched:
 
 @dataclass(frozen=True)
 class Alone:
-    """A simpler model, for each value of a condition by itself, to be seen beside a joint one.
+    """A simpler model, fitted to each value of a condition, to compare with a joint one.
 
     Some of its parameters are held.
     """
@@ -151,7 +154,7 @@ class Alone:
 
 @dataclass(frozen=True)
 class Model:
-    """An equation that predicts an output from conditions: the only place for what is known of it.
+    """An equation that predicts an output from conditions, and all that is known of it.
 
     A model of one's own needs `name`, `title`, `output`, `conditions`, `parameters`, `predict`,
     `priors` and, for a template and simulation-based calibration, an `example`.
@@ -273,8 +276,7 @@ class Model:
         return tuple(self.reported) == self.parameters
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # By its name where it has one: another process knows it too, and what it is made of, a
-        # lambda perhaps, need not travel.
+        # A registered model is pickled by name, as its functions may not be picklable.
         from calib.models import MODELS, get_model
 
         if MODELS.get(self.name) is self:
@@ -284,7 +286,6 @@ class Model:
     def register(self) -> None:
         """Make it known by its name; a CalibError if the declaration does not hold together."""
         from calib.models import MODELS
-        from calib.models.declared import check_model
 
         check_model(self)
         MODELS.add(self)
@@ -318,7 +319,7 @@ class BoundModel:
             theta = np.atleast_2d(theta)
             k = max([len(theta)] + [len(v) for v in conditions.values() if v.ndim > 1])
             if self.model.slow and k > 1:
-                # Differences in turn leave most parameters as they are, those of an effect all.
+                # Finite differences repeat many vectors.
                 own = {name: v for name, v in conditions.items() if v.ndim > 1}
                 each = [np.broadcast_to(v, (k, v.shape[1])) for v in (theta, *own.values())]
                 _, first, again = np.unique(
@@ -351,10 +352,145 @@ class BoundModel:
 
     def report(self, theta: Array) -> dict[str, Array]:
         """Return the published parameters of each vector, each of shape (k,)."""
-        # A published coefficient may be beyond all numbers where the sampled ones are not.
+        # Published coefficients may overflow where the sampled ones do not.
         with np.errstate(all="ignore"):
             return self.model.report_theta(np.atleast_2d(theta), self.references)
 
     def theta(self, reported: Mapping[str, float]) -> Array:
         """Return the sampled parameters of published ones, shape (d,)."""
         return self.model.theta_from_reported(reported, self.references)
+
+
+_ONE = "dimensionless"
+# Dimensions of the variables in `calib.inference.io`.
+DIMENSIONS = dict.fromkeys(("chain", "draw", "row"), "a dimension of the files of draws")
+
+
+def check_tuple(attribute: str, given: object, where: str) -> None:
+    """Refuse plain text in the place of a tuple of texts: it would be taken letter by letter."""
+    if isinstance(given, str):
+        raise CalibError(
+            f"{attribute} is the text {given!r}", where=where, allowed="a tuple of texts",
+            mend=f"write {attribute} = ({_quoted(given)},), with the comma",
+        )  # fmt: skip
+    if not isinstance(given, list | tuple) or not all(isinstance(part, str) for part in given):
+        raise CalibError(
+            f"{attribute} is {given!r}", where=where, allowed="a tuple of texts",
+            mend='write each between quotation marks, with commas: ("a", "b")',
+        )  # fmt: skip
+
+
+def _quoted(given: str) -> str:
+    """Return a text as a Python literal."""
+    return f'r"{given}"' if "\\" in given else f'"{given}"'
+
+
+def check_word(name: object, what: str, where: str) -> None:
+    """Check that the name of a model or a parameter is an identifier."""
+    if not isinstance(name, str) or not name.isidentifier():
+        raise CalibError(
+            f"{name!r} is no name for a {what}", where=where,
+            allowed="letters of any script, digits and underscores, not beginning with a digit: it "
+            "names columns, variables of netCDF and marks of templates too",
+            mend="give it another name",
+        )  # fmt: skip
+
+
+def check_names(
+    taken: Mapping[str, str], given: Iterable[tuple[str, str, str]], where: str
+) -> None:
+    """Check that each name is that of one thing: files know things by their names.
+
+    `taken` maps names of other things to what these are; `given` are names, what each names, and
+    the key that says so.
+    """
+    # Letters with two encodings are the same.
+    known = {normalize("NFKC", name): what for name, what in taken.items()}
+    for name, what, key in given:
+        other = known.get(normalize("NFKC", name))
+        if other is not None:
+            raise CalibError(
+                f"{what} is there twice" if other == what else f"{what} has the name of {other}",
+                where=f"{where}, {key}",
+                allowed="a name for each parameter, condition and output that nothing else has: "
+                f"not {', '.join(taken)}",
+                mend="rename one of them",
+            )  # fmt: skip
+        known[normalize("NFKC", name)] = what
+
+
+def check_model(model: Model) -> None:
+    """Check a declaration: columns, names, priors and their units; the error says what is off."""
+    where = f"model {model.name!r}"
+    check_word(model.name, "model", where)
+    for parameter in model.parameters if not isinstance(model.parameters, str) else ():
+        check_word(parameter, "parameter", where)
+    for attribute in ("conditions", "parameters", "latex"):
+        check_tuple(attribute, getattr(model, attribute), where)
+    for column in (model.output, *model.conditions):
+        if column not in QUANTITIES:
+            raise CalibError(
+                f"there is no quantity {column!r}", where=where, allowed=", ".join(QUANTITIES),
+                mend="register a Quantity for it before the model",
+            )  # fmt: skip
+    if QUANTITIES[model.output].role != "output":
+        raise CalibError(
+            f"{model.output} is no output", where=where, allowed=", ".join(OUTPUTS.values()),
+            mend='register its Quantity with role="output"',
+        )  # fmt: skip
+    if not model.conditions or not model.parameters:
+        raise CalibError(
+            "a model needs conditions and parameters", where=where,
+            mend="name at least one of each",
+        )  # fmt: skip
+    names = (*model.parameters, "sigma")
+    derived = [name for name in model.reported if name not in model.parameters]
+    given = [(name, f"the parameter {name}", "parameters") for name in model.parameters]
+    given += [(name, f"the published parameter {name}", "reported") for name in derived]
+    given += [(name, f"the condition {name}", "conditions") for name in model.conditions]
+    given += [(model.output, f"the output {model.output}", "output")]
+    check_names(DIMENSIONS | {"sigma": "the noise"}, given, where)
+    if not model.priors:
+        raise CalibError(
+            "the model has no priors", where=where,
+            allowed="priors=... with the text of a prior file",
+            mend="write it after the example that `calib priors magic_formula` shows",
+        )  # fmt: skip
+    try:
+        given = tomllib.loads(model.priors).get("parameters", {})
+    except tomllib.TOMLDecodeError as error:
+        raise CalibError(
+            f"its priors are not valid TOML: {error}", where=where, mend=MEND_TOML
+        ) from None
+    apart = sorted(set(names) ^ set(given))
+    if apart:
+        raise CalibError(
+            f"its priors and its parameters differ by {', '.join(apart)}", where=where,
+            allowed=", ".join(names), mend="give a prior for each of these, and for nothing else",
+        )  # fmt: skip
+    _check_units(model, given, where)
+
+
+def _check_units(model: Model, given: dict[str, Any], where: str) -> None:
+    """Refuse a prior in another unit than its parameter's, as far as that is known."""
+    log = model.response == "log"
+    wanted = {"sigma": "1" if log else QUANTITIES[model.output].unit}
+    # Without `reported` all have the unit 1, which says nothing.
+    if set(model.reported.values()) != {"1"}:
+        wanted |= {name: unit for name, unit in model.reported.items() if name in model.parameters}
+    for name, unit in wanted.items():
+        found = given[name].get("unit") if isinstance(given[name], dict) else None
+        if found is not None and not _same_unit(str(found), unit):
+            raise CalibError(
+                f"the unit is {found!r}", where=f"{where}, priors, parameters.{name}.unit",
+                allowed=f'unit = "{unit.replace("**", "^").replace(_ONE, "1")}"',
+                mend="convert the numbers to this unit",
+            )  # fmt: skip
+
+
+def _same_unit(found: str, wanted: str) -> bool:
+    found, wanted = (_ONE if u == "1" else u.replace("^", "**") for u in (found, wanted))
+    try:
+        return found == wanted or float(convert(1.0, found, wanted)) == 1.0
+    except CalibError:
+        return False

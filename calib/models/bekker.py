@@ -45,7 +45,7 @@ def rut_depth(
 
 
 def prepare(conditions: Conditions, references: References) -> Rows:
-    """Return what sinkages need: ln of the relative pressure, and width and slip if there are."""
+    """Return ln of the relative pressure, and relative width and slip if there are any."""
     rows = {"ln_pressure": np.log(conditions[PRESSURE] / references["p_ref_kpa"])}
     if WIDTH in conditions:
         rows["wider"] = conditions[WIDTH] / references["b_ref_mm"]

@@ -173,18 +173,18 @@ def _prepare_by_pressure(conditions: Conditions, references: References) -> Rows
     pressure = conditions["inflation_pressure_psi"]
     rows: dict[str, NDArray[Any]] = {"slip_percent": 100.0 * conditions["slip_ratio"]}
     if pressure.ndim == 1:
-        # Few pressures, many slips: the quadratics are worked out once per distinct pressure.
+        # The quadratics are evaluated once per distinct pressure.
         pressure, level = _levels(pressure.tobytes())
         if pressure.size > 1:
             rows["level"] = level
-    # Otherwise a pressure for every parameter vector and row, as an uncertain gauge gives.
+    # Otherwise every vector and row has a pressure, as with an uncertain gauge.
     rows["u"] = (pressure - references["p_mid_psi"]) / references["p_half_psi"]
     return rows
 
 
 @lru_cache(maxsize=64)
 def _levels(pressure: bytes) -> tuple[Array, NDArray[np.intp]]:
-    """Distinct pressures, and which of them each row has: a fit asks for the same rows again."""
+    """Return distinct pressures and the index of each row's; a fit repeats the same rows."""
     return np.unique(np.frombuffer(pressure), return_inverse=True)
 
 

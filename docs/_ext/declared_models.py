@@ -11,7 +11,7 @@ from calib.data import read_for_model
 from calib.data.quantities import QUANTITIES
 from calib.models import MODELS, Model, example_of
 from calib.report.labels import NOISE, model_priors
-from calib.report.page.tables import parametrisation
+from calib.report.page.template import parametrisation
 
 TITLE = "Models"
 LEAD = (

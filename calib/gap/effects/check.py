@@ -25,8 +25,7 @@ from calib.gap.forward import Forward
 from calib.gap.hypotheses import effect_priors
 from calib.gap.hypothesis import Hypothesis
 from calib.inference.random import generator
-from calib.models.base import Array
-from calib.models.declared import check_tuple
+from calib.models.base import Array, check_tuple
 
 # Draws of the priors that an effect is evaluated with.
 _TRIALS = 8

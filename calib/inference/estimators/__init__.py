@@ -45,7 +45,7 @@ class Method:
     place: int = 100
 
     def register(self) -> None:
-        """Have it applied wherever all methods are."""
+        """Apply it wherever all methods apply."""
         METHODS.add(self)
 
 
@@ -64,7 +64,7 @@ METHODS: Registry[Method] = Registry(
 
 
 def method_name(name: str) -> str:
-    """Return how a method is called in a legend."""
+    """Return the name of a method for a legend."""
     return METHODS[name].title if name in METHODS else name
 
 

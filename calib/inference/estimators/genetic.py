@@ -36,8 +36,7 @@ from calib.inference.estimators.search import Box, Found, PointEstimate, SearchS
 from calib.inference.problem import Problem
 from calib.models.base import Array
 
-# Generations whose random numbers are drawn in one call: the calls would cost more than the
-# numbers. Part of what a seed means; changing it changes the numbers of a run.
+# Generations whose random numbers are drawn in one call. Changing it changes what a seed gives.
 _BLOCK = 32
 
 

@@ -165,7 +165,7 @@ def central_interval(problem: Problem) -> tuple[Array, Array]:
 def representative_rows(problem: Problem) -> Problem:
     """Return the problem on at most about 4000 rows that span every condition.
 
-    Whatever is needed to find the neighbourhood of the optimum, a few thousand rows show.
+    They are enough to find the neighbourhood of the optimum.
     """
     n = len(problem.table)
     if n <= _MOST_ROWS:
@@ -184,7 +184,7 @@ def hold_unidentified(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
     the names of those held at their prior location.
     """
     entries = problem.priors.entries[len(problem.bound.model.parameters) :]
-    # Their values do not enter a sum of squares.
+    # Parameters of the noise do not affect a sum of squares.
     problem = problem.with_fixed({p.name: 1.0 for p in entries if not p.fixed})
     if not problem.names:
         return problem, ()
@@ -199,7 +199,7 @@ def hold_unidentified(problem: Problem) -> tuple[Problem, tuple[str, ...]]:
 
 def _flat_at_points(problem: Problem) -> list[tuple[int, ...]]:
     d, width, centre = problem.n_dim, prior_widths(problem.priors), location(problem)
-    # A low-discrepancy sequence in the middle of the prior: the answer needs no random numbers.
+    # A low-discrepancy sequence in the middle of the prior.
     ratio = (1.0 + np.sqrt(5.0)) / 2.0
     steps = np.mod(np.outer(np.arange(1, _N_POINTS + 1), ratio ** -np.arange(1, d + 1)), 1.0)
     points = np.vstack([centre, problem.priors.ppf(0.2 + 0.6 * steps)])
@@ -271,7 +271,7 @@ class SearchSpace:
 
     def polish(self, x: Array) -> Found:
         """Descend from a point of the box (d,) by least squares; never to a higher cost."""
-        # Late: a tenth of a second, and what knows of the methods seldom uses one.
+        # Imported late: it takes a tenth of a second.
         from scipy.optimize import least_squares
 
         result = least_squares(
@@ -335,14 +335,14 @@ def _check_box(box: Box, names: tuple[str, ...]) -> None:
 
 
 def held_note(held: tuple[str, ...]) -> str:
-    """Say which parameters were held, or nothing."""
+    """Name the parameters that were held."""
     if not held:
         return ""
     return f"the data do not determine {', '.join(held)}: held at the prior's location"
 
 
 def edge_notes(names: tuple[str, ...], x: Array, lower: Array, upper: Array, what: str) -> str:
-    """Say which coordinates ended on an edge, or nothing."""
+    """Name the coordinates that ended on an edge."""
     span = np.where(np.isfinite(upper - lower), upper - lower, 1.0)
     at = (x - lower <= 1e-6 * span) | (upper - x <= 1e-6 * span)
     stuck = [name for name, on_edge in zip(names, at, strict=True) if on_edge]
@@ -378,7 +378,7 @@ def fit_identified(
 def search_in_box(
     problem: Problem, method: str, box: Box | None, minimise: Callable[[SearchSpace], Found]
 ) -> PointEstimate:
-    """Estimate by a search of the box of what the data determine."""
+    """Estimate what the data determine by searching the box."""
 
     def fit(reduced: Problem) -> tuple[Array, Found, str]:
         space = search_space(reduced, box)
@@ -454,7 +454,7 @@ class _Descent:
         self.lower = (np.array([p.lower for p in problem.priors.free]) - self.location) / self.width
         self.upper = (np.array([p.upper for p in problem.priors.free]) - self.location) / self.width
         self.n_evaluations = 0
-        # The tolerances below are meant for residuals of the order of one, whatever the unit.
+        # The tolerances suit residuals of the order of one.
         scatter = float(np.linalg.norm(problem.response - problem.response.mean()))
         self.scale = scatter if scatter > 0.0 else 1.0
 
@@ -526,7 +526,7 @@ def estimate_least_squares(
 
 
 def _far_note(problem: Problem, x: Array) -> str:
-    """Say which estimates the prior thinks all but impossible."""
+    """Name the estimates that the prior deems almost impossible."""
     low, high = central_interval(problem)
     far = [n for n, out in zip(problem.names, (x < low) | (x > high), strict=True) if out]
     return f"{', '.join(far)} outside the prior's central 99.8 %" if far else ""
@@ -537,7 +537,7 @@ def _starts(descent: _Descent, rng: np.random.Generator, n_screen: int, n_polish
     z = (drawn - descent.location) / descent.width
     cost = sum_of_squares(descent.problem, descent.natural(z))
     groups = np.array_split(np.arange(z.shape[0]), n_polish)
-    # The best of each group rather than the best of all, which may share one basin.
+    # Not the best of all, which may share one basin.
     best = np.array([group[cost[group].argmin()] for group in groups])
     best = best[np.isfinite(cost[best])]
     if best.size == 0:

@@ -22,15 +22,14 @@ from calib.models.base import Array
 
 type Kind = Literal["time", "exit", "nan", "short", "unreadable", "error"]
 type Values = Mapping[str, Array]
-# Outputs by the simulator's own names as it gave them, which may be anything.
+# Raw outputs by the simulator's own names.
 type Found = Mapping[str, Any]
 
-# Columns of the list of failed runs beside those of their parameters.
+# Columns of the list of failed runs, next to their parameters.
 FAILED = ("kind", "reason", "printed")
-# Of what a failed run printed, so many characters are kept.
+# Characters kept of what a failed run printed.
 _TAIL = 600
-# The key of a simulator file that a failed run has to do with, if not the one that says how it is
-# run.
+# Keys of a simulator file that kinds of failure point to; others point to how it is run.
 _KEYS: Mapping[str, str] = {"time": "limit", "short": "outputs", "unreadable": "outputs"}
 
 
@@ -52,7 +51,7 @@ type Given = Found | Failure
 
 
 class Printed(dict[str, Any]):
-    """Outputs of a run that printed something besides, for the message if they will not do."""
+    """Outputs of a run with what it printed, for error messages."""
 
     def __init__(self, outputs: Found, printed: str) -> None:
         super().__init__(outputs)
@@ -60,11 +59,11 @@ class Printed(dict[str, Any]):
 
 
 class Way(Protocol):
-    """How a simulator is carried out."""
+    """How a simulator is run."""
 
     @property
     def identity(self) -> str:
-        """What results depend on besides parameters and conditions, as text."""
+        """What else results depend on, as text."""
 
     @property
     def key(self) -> str:
@@ -75,7 +74,7 @@ class Way(Protocol):
         """Whether new runs can be made."""
 
     def run(self, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> Given:
-        """Return the outputs by the simulator's own names, n values each, or why there are none."""
+        """Return the outputs by the simulator's own names, n values each, or a failure."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,7 @@ class Simulator:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of whatever its results depend on besides parameters and conditions."""
+        """SHA-256 of whatever else its results depend on."""
         what = [self.way.identity, list(self.parameters), dict(self.conditions)]
         what += [[o.header, o.column] for o in self.outputs]
         what += [list(self.made_of)] if self.made_of else []
@@ -158,7 +157,7 @@ class Simulator:
         return tuple(dict.fromkeys(map(self.canonical, self.conditions.values())))
 
     def run(self, theta: Array, conditions: Mapping[str, Array]) -> Result:
-        """Carry out one run, tried again where it fails.
+        """Make one run, and try again if it fails.
 
         Parameters (d,) are in the order and units of the priors; conditions and outputs (n,) by
         canonical column, in canonical units.
@@ -168,7 +167,7 @@ class Simulator:
         found: Result = Failure("error", "it was not run")
         try:
             for _ in range(1 + self.retries):
-                # What one try does to what it is handed is seen by no other.
+                # Each try gets copies.
                 found = self._once(dict(parameters), self.asked(conditions), n)
                 if not isinstance(found, Failure):
                     return found
@@ -222,7 +221,7 @@ def _parsed(header: str, name: str) -> tuple[str, str]:
 
 
 def not_made(why: str, mend: str = "mend that") -> CalibError:
-    """Return what to say of a run that its surroundings have prevented: it is not kept."""
+    """Return the error for a run that its surroundings prevented; it is not kept."""
     return CalibError(
         f"the run could not be made: {why}",
         mend=f"{mend}, and call the same command again: the runs that were made are kept",
@@ -230,12 +229,12 @@ def not_made(why: str, mend: str = "mend that") -> CalibError:
 
 
 def no_output(column: str, found: Iterable[str]) -> str:
-    """Say that an output was not given, and which were."""
+    """Name a missing output and those that were given."""
     return f"there is no output {column!r}; it gave {', '.join(map(str, found)) or 'nothing'}"
 
 
 def checked(found: Found, column: str, n: int, unit: str) -> Array | Failure:
-    """Return one output as n numbers in a unit, or why it is not that."""
+    """Return one output as n numbers in a unit, or a failure."""
     printed = found.printed if isinstance(found, Printed) else ""
     if column not in found:
         return Failure("unreadable", no_output(column, found), printed)
@@ -258,6 +257,6 @@ def checked(found: Found, column: str, n: int, unit: str) -> Array | Failure:
 
 
 def tail(printed: str) -> str:
-    """Return the end of what a run printed, without what would steer a terminal."""
+    """Return the end of what a run printed, without control characters."""
     end = printed if len(printed) <= _TAIL else "..." + printed[-_TAIL:]
     return "".join(c if c.isprintable() or c in "\n\t" else "\ufffd" for c in end)

@@ -13,8 +13,7 @@ import sys
 import traceback
 from pathlib import Path
 
-# No memory, no room on the disk, no files or processes left, no connection: whatever the
-# parameters are.
+# Resources that ran out and lost connections, whatever the parameters are.
 _SHORT = {
     getattr(errno, name, 0)  # not every system has them all
     for name in (
@@ -25,7 +24,7 @@ _SHORT = {
 
 
 def of_surroundings(error: BaseException | None) -> bool:
-    """Whether an exception, or one that it came of, says nothing of the parameters of a run."""
+    """Whether an exception or its cause has nothing to do with the parameters of a run."""
     seen: set[int] = set()
     while error is not None and id(error) not in seen:
         seen.add(id(error))
@@ -37,7 +36,7 @@ def of_surroundings(error: BaseException | None) -> bool:
 
 
 def main(given: str, taken: str) -> None:
-    """Read a call, make it, and write the result, what was raised, and if its surroundings did."""
+    """Read a call, make it, and write the result or what was raised."""
     folder, path, call = pickle.loads(Path(given).read_bytes())
     os.chdir(folder)
     sys.path[:] = path

@@ -64,7 +64,7 @@ class Support:
             found[i : i + AT_ONCE] = (
                 correlation(at[i : i + AT_ONCE], self.x, self.lengths) @ self.weights
             )
-        # Far from all runs it is zero: nothing speaks against a value there.
+        # Zero far from all runs.
         return self.amplitude * found
 
 
@@ -92,13 +92,13 @@ def learn_support(x: Array, ok: NDArray[np.bool_]) -> Support | None:
 
 
 _MOST_CURVES = 14
-# What is left out by the basis, in units of what may be neglected: near the posterior, elsewhere.
+# Truncation error of the basis over the negligible error, near the posterior and elsewhere.
 _LEFT_OUT = (1.0, 20.0)
-# Runs whose curves the length scales over conditions are found from.
+# Runs from which the length scales over conditions are estimated.
 _CURVES = 12
-# So many prior sds beyond the runs that have a value the emulator has one as well.
+# Prior sds beyond the successful runs within which the emulator has a value.
 _BEYOND = 1.0
-# Fewer runs in a region do not tell what matters there.
+# Runs in a region from which the basis is built for it.
 _FEW = 8
 
 
@@ -266,7 +266,7 @@ def _basis(near: Array, all_values: Array, negligible: float) -> tuple[Array, Ar
         rest = values - mean
         rest = rest - (rest @ curves.T) @ curves
         _, size, right = np.linalg.svd(rest, full_matrices=False)
-        # Of the rest's mean square per value, what the curves from the i-th on would leave.
+        # Mean square left out if the curves end before the i-th.
         open_ = np.append(np.cumsum((size**2)[::-1])[::-1], 0.0) / values.size
         count = int(np.argmax(open_ <= (left * negligible) ** 2))
         curves = np.concatenate([curves, right[: min(count, _MOST_CURVES - len(curves))]])
@@ -325,7 +325,7 @@ def _near(
 
 @dataclass(frozen=True)
 class _Prepare:
-    """The basis curves at conditions: all of them that the emulator needs."""
+    """The basis curves at conditions."""
 
     emulator: Emulator
 
@@ -350,7 +350,7 @@ class _MeanResponse:
 
 @dataclass(frozen=True)
 class _Uncertain:
-    """The prediction, and its error: how much of what is unknown far away, and its curves."""
+    """The prediction and its error, as `Model.uncertain`."""
 
     emulator: Emulator
 
@@ -393,7 +393,7 @@ def save_emulator(emulator: Emulator, model: str, path: Path) -> None:
     arrays["nugget"] = np.array(emulator.functions.scales.nugget)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part.npz")
-    # In the archive no time of its making: equal emulators give equal files.
+    # The archive holds no time stamp: equal emulators give equal files.
     np.savez(part, **arrays)
     part.replace(path)
 
@@ -418,7 +418,7 @@ def _built(meta: dict[str, Any], arrays: dict[str, Any]) -> Emulator:
         Region(arrays[f"centre_{i}"], arrays[f"root_{i}"], reach)
         for i, reach in enumerate(meta["reach"])
     ]
-    # Files of earlier versions have scales for each curve: they are found anew from the runs.
+    # Files of earlier versions have scales for each curve, which are estimated again.
     kept = Scales(arrays["lengths"], float(arrays["nugget"])) if "nugget" in arrays else None
     values = arrays["values"]
     return build_emulator(
@@ -430,7 +430,7 @@ def _built(meta: dict[str, Any], arrays: dict[str, Any]) -> Emulator:
 
 
 def use_emulator(path: Path) -> None:
-    """Let the model of an emulator on disk be the emulator, in this process."""
+    """Replace a model by its emulator on disk, in this process."""
     name, emulator = load_emulator(path)
     model = emulated_model(get_model(name), emulator)
     MODELS.discard(name)

@@ -115,7 +115,7 @@ def read_simulator(path: Path) -> Simulated:
 
 def _explain(error: ValidationError, path: Path) -> CalibError:
     errors = error.errors()
-    # A key that is missing is most often there by a wrong name.
+    # A missing key is most often a misspelt one.
     first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
     key = ".".join(str(part) for part in first["loc"])
     known = list((Budget if key.startswith("emulator.") else SimulatorFile).model_fields)
@@ -196,7 +196,7 @@ def _command(file: SimulatorFile, path: Path) -> CommandWay:
 
 
 def _made_of(file: SimulatorFile, path: Path) -> tuple[str, ...]:
-    """Return the SHA-256 of each file that the program reads or calls, as far as they are named."""
+    """Return the SHA-256 of each named file that the program reads or calls."""
     found = []
     for name in file.files:
         try:
@@ -234,7 +234,7 @@ def _callable(file: SimulatorFile, path: Path) -> CallableWay:
             f"there is no function {name!r} in {script}", where=f"{path}, python",
             allowed='python = "file.py:function"', mend="correct the name",
         )  # fmt: skip
-    # In a process of its own only where a limit is asked for: starting one takes time.
+    # Only a limit needs a process of its own.
     limit = file.limit if "limit" in file.model_fields_set else None
     return CallableWay(function, tuple(file.outputs), file.batched, limit)
 

@@ -31,13 +31,13 @@ from scipy.linalg.blas import dtrmm
 
 from calib.models.base import Array
 
-# Relative to the process: smaller and the matrix has no factor, larger and values are not met.
+# Bounds of the nugget, relative to the variance of the process.
 _NUGGET, _NOISY = 1e-9, 1.0
 _LENGTHS = (0.2, 100.0)
 _STEPS = 40
-# What keeps the matrix of the smallest nugget from having no factor.
+# Keeps the matrix positive definite at the smallest nugget.
 _JITTER = 1e-10
-# Points at once: their correlations with some hundred others stay in a processor's cache.
+# Points evaluated at once.
 AT_ONCE = 512
 
 
@@ -87,7 +87,7 @@ class Kriging:
             b = trend_of(at[some])
             means[some] = b @ self.beta + r @ self.gamma
             open_trend = (b - r @ self.trend.T) @ self.trend_root.T
-            # A triangle is half of a square; the correlations are not needed any more.
+            # Overwrites the correlations.
             left = dtrmm(1.0, self.root, r.T, lower=1, overwrite_b=1).T
             part = 1.0 - np.einsum("kn,kn->k", left, left)
             unknown[some] = part + np.einsum("kq,kq->k", open_trend, open_trend)
@@ -125,7 +125,7 @@ def krige(x: Array, y: Array, scales: Scales) -> Kriging:
     lower = cholesky(correlation(x, x, scales.lengths) + scales.nugget * np.eye(n), lower=True)
     root = np.asfortranarray(solve_triangular(lower, np.eye(n), lower=True))
     within = root @ b
-    # A trend along a coordinate that did not vary is none.
+    # Allows for coordinates that did not vary.
     precision = within.T @ within
     precision += 1e-10 * np.trace(precision) / len(precision) * np.eye(len(precision))
     trend_lower = cholesky(precision, lower=True)
@@ -136,7 +136,7 @@ def krige(x: Array, y: Array, scales: Scales) -> Kriging:
     trend_root = solve_triangular(trend_lower, np.eye(len(precision)), lower=True)
     left_out = np.mean(gamma**2 / _precisions(root, trend, trend_root)[:, None], axis=0)
     likely = np.maximum((rest * gamma).sum(axis=0), 0.0) / max(n - b.shape[1], 1)
-    # Where there are no more values than the trend has coefficients none can be left out.
+    # With no more values than coefficients of the trend none can be left out.
     variances = np.sqrt(likely * left_out) if n > b.shape[1] else y.var(axis=0)
     return Kriging(x, scales, beta, gamma, root, trend, trend_root, variances)
 
@@ -164,7 +164,7 @@ def find_scales(x: Array, y: Array, *, noisy: bool = False, start: Scales | None
     most = _NOISY if noisy else 1e-3
     nugget = 1e-5 if start is None else float(np.clip(start.nugget, 2 * _NUGGET, 0.5 * most))
     bounds = np.log([*[_LENGTHS] * x.shape[1], (_NUGGET, most)])
-    # Few steps: the last digit of a length scale changes no prediction.
+    # The last digits of a length scale do not matter.
     found = minimize(
         minus_log_likelihood, np.log([*lengths, nugget]),
         (np.square(x.T[:, :, None] - x.T[:, None]), rest / spread),
@@ -220,9 +220,9 @@ class Region:
 
 
 _NUGGET_OVER = 1e-8
-# The smallest with which the matrix has a factor: by it curves miss their nodes.
+# The smallest that gives a factor is taken.
 _NUGGETS = (1e-13, 1e-12, 1e-11, 1e-10, 1e-9)
-# Beyond the nodes' box curves go on straight for so much of its width; farther they have no value.
+# Curves are extrapolated linearly by so much of the width of the nodes' box, and NaN beyond.
 BEYOND = 0.15
 _INSIDE = 0.02
 
@@ -270,7 +270,7 @@ class Over:
         out = u - inside
         rows = np.flatnonzero(np.abs(out).max(axis=1) > 1e-9)
         if rows.size:
-            # From a point a little farther in, on the line along which it leaves the box.
+            # Linearly, from a point a little farther in.
             far = np.abs(out[rows]).max(axis=1, keepdims=True)
             back = self._smooth(inside[rows] - _INSIDE * out[rows] / far, weights)
             found[rows] += (found[rows] - back) * (far / _INSIDE)

@@ -22,14 +22,13 @@ from calib.errors import CalibError
 from calib.models.simulators.base import Failure, not_made, tail
 
 _PRINTED = ".printed"
-# Of what is printed, so many bytes have more characters than are kept.
+# Bytes read of what is printed: enough for the characters that are kept.
 _END = 4096
-# What a program and all that it starts have in their environment.
+# A variable in the environment of a program and all that it starts.
 _MARK = "CALIB_RUN"
-# Where a program finds, in its environment, the folder of its simulator file.
+# The environment variable with the folder of the simulator file.
 HOME = "CALIB_SIMULATOR"
-# How long what was killed is waited for: what hangs in the kernel, on a disk that is gone, may not
-# come to its end.
+# Seconds to wait for a killed process, which may hang in the kernel.
 _GIVE_UP = 5.0
 _PAUSE = 0.01
 
@@ -76,18 +75,18 @@ def run_program(
     return _text(path, whole=whole)
 
 
-# By others than the program: a shell, a scheduler, a system without memory.
+# Signals sent by a shell, a scheduler or a system without memory.
 _KILLED = tuple(
     getattr(signal, name) for name in ("SIGKILL", "SIGTERM", "SIGHUP", "SIGINT", "SIGXFSZ")
     if hasattr(signal, name)
 )  # fmt: skip
-# How a shell ends, and `env`, where what they are to run is not there or cannot be run.
+# Exit codes of a shell or `env` whose program is missing or cannot be run.
 _NOT_RUN = (126, 127)
 _SHELLS = ("sh", "bash", "dash", "ksh", "zsh", "env")
 
 
 def _prevented(code: int, folder: Path) -> str:
-    """Return what has prevented a program that ended with a code, if its parameters did not."""
+    """Return why a program was prevented from running, or an empty text."""
     # A shell that runs it adds 128 to the signal.
     if -code in _KILLED or code - 128 in _KILLED:
         return "something else has ended it; where memory is short, the system does"
@@ -109,7 +108,7 @@ def _where(folder: Path) -> str:
 
 
 def _script(paths: Sequence[str]) -> str:
-    """Say which script is not one for this system, if any, and why."""
+    """Say which script cannot run on this system, and why."""
     for path in filter(os.path.isfile, paths):
         with Path(path).open("rb") as file:
             head = file.readline(_END)
@@ -125,7 +124,7 @@ def _script(paths: Sequence[str]) -> str:
 
 
 def _text(path: Path, *, whole: bool) -> str:
-    """Return what a program printed, or the end of it: that may be more than memory holds."""
+    """Return what a program printed, or the end of it."""
     with path.open("rb") as printed:
         if not whole:
             printed.seek(max(path.stat().st_size - _END, 0))
@@ -158,7 +157,7 @@ def call_function(function: Callable[..., Any], arguments: Sequence[Any], limit:
 def _handed_over(function: Callable[..., Any], arguments: Sequence[Any]) -> bytes:
     import cloudpickle
 
-    # Of a file that was loaded by its path another process knows nothing.
+    # Another process cannot import a file that was loaded by its path.
     module = sys.modules.get(getattr(function, "__module__", ""))
     by_path = module is not None and module.__name__.startswith(USER_MODULE)
     try:
@@ -185,7 +184,7 @@ def _ended(code: int) -> str:
 
 
 def _end(child: subprocess.Popen[bytes], mark: str) -> None:
-    """Kill what is left of the child's group and what left it, and collect the child."""
+    """Kill the child's group and what has left it, and reap the child."""
     with suppress(ProcessLookupError, PermissionError):
         if sys.platform == "win32":
             child.kill()
@@ -193,7 +192,7 @@ def _end(child: subprocess.Popen[bytes], mark: str) -> None:
             os.killpg(child.pid, signal.SIGKILL)
     with suppress(subprocess.TimeoutExpired):
         child.wait(_GIVE_UP)
-    # One that is killed may have started another meanwhile.
+    # A killed process may have started another.
     until = time.monotonic() + _GIVE_UP
     while (left := _marked(mark)) and time.monotonic() < until:
         for pid in left:
@@ -206,7 +205,7 @@ def _marked(mark: str) -> list[int]:
     """Return the processes that have a mark in their environment, on Linux."""
     found = []
     for path in Path("/proc").glob("[0-9]*/environ"):
-        # Those of others cannot be read, those that have ended are gone or have none.
+        # Not readable for other users' processes and those that have ended.
         with suppress(OSError):
             if mark.encode() in path.read_bytes().split(b"\0"):
                 found.append(int(path.parent.name))

@@ -20,15 +20,22 @@ from calib.data.headers import parse_header
 from calib.data.registry import Registry, run_again
 from calib.errors import CalibError, in_words
 from calib.models import MODELS
-from calib.models.base import Array, Conditions, Model
-from calib.models.declared import DIMENSIONS, check_model, check_names, check_word
+from calib.models.base import (
+    DIMENSIONS,
+    Array,
+    Conditions,
+    Model,
+    check_model,
+    check_names,
+    check_word,
+)
 from calib.models.simulators.base import FAILED, Failure, Output, Simulator
 from calib.models.simulators.runs import FROM_THE_START, Run, fail_alike, without_value
 from calib.models.simulators.ways import CallableWay, TableWay
 
-# So many of the runs that failed are listed, where a sampler asks for thousands.
+# Failed runs that are listed at most.
 _LISTED = 200
-# Keys that TOML has without quotes.
+# Keys that need no quotes in TOML.
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 
 
@@ -110,7 +117,7 @@ def slow_simulator(model: str) -> Simulated | None:
 
 @dataclass
 class Tally:
-    """What this process has asked of a simulator: runs, those that failed, the first of these."""
+    """Runs that this process made of a simulator, and those that failed."""
 
     tried: bool = False
     made: int = 0
@@ -127,7 +134,7 @@ class Tally:
 
 @dataclass(frozen=True)
 class Direct:
-    """Asks a simulator for each parameter vector: only where it is quick enough for that."""
+    """Runs a quick simulator for each parameter vector."""
 
     simulator: Simulator
     output: str

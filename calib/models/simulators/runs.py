@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 type Progress = Callable[[int, int], None]
 
-# Processes of their own take some seconds to start: only for batches that take longer here.
+# Seconds of work from which starting processes pays off.
 _WORTH_SECONDS = 8.0
 
 
@@ -58,7 +58,7 @@ class _Item:
 
 @dataclass
 class RunKeeper:
-    """Carries runs out, those that were not made before.
+    """Makes runs that were not made before, and keeps all.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ class RunKeeper:
         with writing(folder):
             self._forget_failures(folder, items)
         if self.workers > 1 and not self.seconds:
-            # The first run tells how long one takes.
+            # Time the first run.
             missing = [name for name in items if not (folder / f"{name}.json").exists()]
             if len(missing) > 1:
                 run_tasks(_carry_out, {missing[0]: items[missing[0]]}, folder)
@@ -147,7 +147,7 @@ class RunKeeper:
         return {name: _read(folder / f"{name}.json") for name in outcome.done}
 
     def _forget_failures(self, folder: Path, names: Iterable[str]) -> None:
-        """Have runs made again that failed when they had less time or fewer tries."""
+        """Forget runs that failed with less time or fewer tries than now."""
         for name in names:
             path = folder / f"{name}.json"
             if path.exists() and "failure" in (kept := _read(path)):
@@ -206,9 +206,8 @@ def _run(described: Mapping[str, Any], theta: Array) -> Run:
     return Run(theta, outputs)
 
 
-# Of a simulator with values in half of its prior, so many runs fail all of them once in 32 times at
-# most, and less often as they are spread evenly. A mistake in its file or program fails in every
-# run, and need not be paid for sixty times, or for every draw of a sampler.
+# If the first runs all fail, the file or the program is wrong: by chance this happens once in 32
+# times at most if the simulator has values in half of its prior.
 FIRST = 5
 FROM_THE_START = "it fails from the start, and no more runs were made"
 _MEND: dict[Kind, str] = {
@@ -221,7 +220,7 @@ _MEND: dict[Kind, str] = {
 
 
 def fail_alike(runs: Sequence[Run]) -> bool:
-    """Whether all runs have failed, and in the same way."""
+    """Whether all runs failed in the same way."""
     kinds = {None if run.failure is None else run.failure.kind for run in runs}
     return len(kinds) == 1 and None not in kinds
 
@@ -229,7 +228,7 @@ def fail_alike(runs: Sequence[Run]) -> bool:
 def without_value(
     why: str, simulator: Simulator, runs: Sequence[Run], folder: Path | None
 ) -> CalibError:
-    """Return what to say where runs that failed are in the way; the folder is that of the runs."""
+    """Return the error for a simulator whose runs failed; the folder is that of the runs."""
     failures = [run.failure for run in runs if run.failure is not None]
     if not failures:
         return CalibError(

@@ -113,7 +113,7 @@ class UmbridgeWay:
                 return Failure("time", f"the server took longer than {self.limit:g} s")
             return Failure("error", f"the server at {self.url} did not answer: {error}")
         try:
-            # Python's reader takes the NaN and Infinity that JSON does not have.
+            # Python's reader accepts NaN and Infinity.
             found = json.loads(answer)
         except ValueError:
             said = tail(answer.decode(errors="replace"))
@@ -126,7 +126,7 @@ class UmbridgeWay:
         return not_made(f"the server at {self.url} is not there ({why})", "start it")
 
     def _listens(self) -> bool:
-        """Whether something is there to answer: a server that died has no faulty parameters."""
+        """Whether something listens: a dead server is not due to the parameters."""
         try:
             place = urlsplit(self.url)
             port = place.port or (443 if place.scheme == "https" else 80)
@@ -136,8 +136,7 @@ class UmbridgeWay:
         return True
 
 
-# What a server answers of itself with (protocol 1.0): a call that its model will not have, a model
-# that failed. With any other code it was not the model that answered.
+# Codes of the protocol for a refused call and a failed model; others are not from the model.
 _OF_THE_MODEL = (400, 500)
 
 
@@ -179,7 +178,7 @@ class CallableWay:
 
     @contextmanager
     def watched(self) -> Iterator[None]:
-        """Have what was changed between such blocks, not within, make another simulator of it."""
+        """Notice changes of the function between such blocks, but not within."""
         if self.unshared:
             yield
             return
@@ -228,7 +227,7 @@ class CallableWay:
             named = {str(column): found[column] for column in found.columns}
         missing = [column for column in self.columns if column not in named]
         if missing:
-            # No fault of the parameters: the next run would not give it either.
+            # Not due to the parameters: other runs would not give it either.
             raise CalibError(
                 no_output(missing[0], named),
                 where=self._place,
@@ -280,7 +279,7 @@ class CommandWay:
         if "{" in argument:
             return None
         try:
-            # As it is named: what a link leads to may be another program by its own name.
+            # Links are not resolved: a program may depend on the name it is called by.
             path = Path(os.path.abspath(self.folder / argument))  # noqa: PTH100
             return path if path.is_file() else None
         except (OSError, RuntimeError):  # a text too long for a name, a link to itself
@@ -375,7 +374,7 @@ class TableWay:
 
 
 _PLACE = re.compile(r"@([^\W\d]\w*)@")
-# What follows a number that was cut off: a decimal comma, more digits, an exponent.
+# The rest of a number that was cut off.
 _GOES_ON = re.compile(r"[.,]?\d+|[eEdD][-+]?\d+", re.ASCII)
 
 
@@ -412,7 +411,7 @@ def check_template(template: str, names: tuple[str, ...], where: str) -> None:
 
 
 def filled(template: str, parameters: Mapping[str, float], conditions: Mapping[str, Array]) -> str:
-    """Put values in the place of a template's marks, those of a condition apart by spaces."""
+    """Fill in a template's marks, values of a condition separated by spaces."""
     values = {name: repr(value) for name, value in parameters.items()}
     values |= {name: " ".join(map(repr, v.tolist())) for name, v in conditions.items()}
     return _PLACE.sub(lambda mark: values[mark[1]], template)
