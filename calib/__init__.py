@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from calib.gap.diagnose import Diagnosis, diagnose
     from calib.gap.effects import Effect
     from calib.he2019.audit import Audit, run_audit
-    from calib.he2019.datasets.embedded import load_he2019
+    from calib.he2019.embedded import load_he2019
     from calib.inference.calibration import Calibration, calibrate
     from calib.inference.emulation import Emulation
     from calib.inference.emulation.prepared import emulated
@@ -50,7 +50,7 @@ _HOME = {
     "hold_out": "calib.data",
     "read_table": "calib.data",
     "table_from_arrays": "calib.data",
-    "load_he2019": "calib.he2019.datasets.embedded",
+    "load_he2019": "calib.he2019.embedded",
     "CalibError": "calib.errors",
     "Emulation": "calib.inference.emulation",
     "emulated": "calib.inference.emulation.prepared",

@@ -10,10 +10,9 @@ from hypothesis import settings
 
 from calib.batch.pool import HERE
 from calib.data import Table, hold_out, table_from_arrays
+from calib.he2019 import embedded
 from calib.he2019.audit import Audit, Seeds, run_audit
-from calib.he2019.datasets import embedded
-from calib.he2019.gaps.cases import paper_gaps
-from calib.he2019.gaps.find import FoundGap, begin_gaps
+from calib.he2019.gaps import FoundGap, begin_gaps, paper_gaps
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem

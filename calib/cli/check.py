@@ -158,7 +158,7 @@ def audit(
     with progress_bars() as tell:
         found = run_audit(seed, progress=tell)
         if out is not None:
-            from calib.he2019.page import write_audit_page
+            from calib.he2019.sections import write_audit_page
 
             tell("drawing figures", 0, 1)
             with fresh_folder(out, overwrite=overwrite) as folder:
@@ -175,7 +175,7 @@ def _print(found: Audit) -> None:
     from rich.table import Table as RichTable
     from rich.text import Text
 
-    from calib.he2019.page import AUDIT_MARKS
+    from calib.he2019.sections import AUDIT_MARKS
 
     table = RichTable(title="Audit of He, Sandu & Osorio (2019)", show_lines=True)
     for heading in ("verdict", "where", "claim or reading", "evidence"):

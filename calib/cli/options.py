@@ -107,7 +107,7 @@ def data(
 
 
 def _write_he2019(out: Path, overwrite: bool) -> list[Path]:
-    from calib.he2019.datasets import embedded
+    from calib.he2019 import embedded
 
     existing = [f"{key}.csv" for key in embedded.tables() if (out / f"{key}.csv").exists()]
     if existing and not overwrite:
@@ -119,7 +119,7 @@ def _write_he2019(out: Path, overwrite: bool) -> list[Path]:
 
 
 def _write_he2019_gaps(out: Path, overwrite: bool) -> list[Path]:
-    from calib.he2019.gaps.cases import paper_gaps, write_cases
+    from calib.he2019.gaps import paper_gaps, write_cases
 
     return write_cases(paper_gaps(), out, overwrite=overwrite)
 

@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 
 from calib.data import hold_out, table_from_arrays
-from calib.he2019.datasets.embedded import load_he2019
+from calib.he2019.embedded import load_he2019
 from calib.models import get_model
 from calib.report.study_tasks import HoldOut, Task
 from calib.validation.sbc.designs import Design, ModelDesign

@@ -30,7 +30,7 @@ def _later(module: str, name: str) -> Callable[..., Any]:
 
 
 def _gaps_again(record: Any) -> Section:
-    from calib.he2019.gaps.cases import paper_gaps
+    from calib.he2019.gaps import paper_gaps
     from calib.he2019.sections import GapsSection
 
     known = {gap.name: gap for gap in paper_gaps()}
@@ -42,7 +42,7 @@ def _gaps_again(record: Any) -> Section:
 
 
 def _audit_again(record: Any) -> Section:
-    from calib.he2019.audit.convergence import Seeds
+    from calib.he2019.audit import Seeds
     from calib.he2019.sections import AuditSection
 
     seeds = record.get("seeds") if isinstance(record, dict) else None
@@ -58,7 +58,7 @@ def _audit_again(record: Any) -> Section:
 def _audit_csv(folder: Path, files: Mapping[str, str]) -> dict[str, str]:
     import json
 
-    from calib.he2019.audit.run import audit_csv, read_findings
+    from calib.he2019.audit import audit_csv, read_findings
 
     if "audit.json" not in files or not (folder / "audit.json").is_file():
         return {}
@@ -72,7 +72,7 @@ class Plugin:
     def register(self) -> None:
         """Register data, methods, designs, printed results and sections; once."""
         from calib.he2019.designs import DESIGNS as OWN_DESIGNS
-        from calib.he2019.figures.reference import HE2019 as PRINTED
+        from calib.he2019.published import HE2019 as PRINTED
 
         if _LABEL in REFERENCES:
             return
@@ -82,14 +82,14 @@ class Plugin:
                 "the embedded data",
                 "The data are reconstructed from published results [@He_2019]; they are not "
                 "measurements.",
-                _later("datasets.embedded", "holds"),
+                _later("embedded", "holds"),
             ),
             KnownData(
                 f"partly {_LABEL}",
                 "the embedded data and others",
                 "Some of the data are reconstructed from published results [@He_2019]; they are "
                 "not measurements.",
-                _later("datasets.embedded", "holds_some"),
+                _later("embedded", "holds_some"),
             ),
             Method(
                 "geometric", _later("estimators", "estimate_geometric"),

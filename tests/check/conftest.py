@@ -24,7 +24,7 @@ from calib.check import compare, posteriors, tolerances
 from calib.check.check import check, recompute_report
 from calib.check.outcome import Outcome, Status
 from calib.he2019 import sections
-from calib.he2019.audit.run import begin_audit
+from calib.he2019.audit import begin_audit
 from calib.inference.again import recompute_run
 from calib.inference.calibration import Calibration
 from calib.report.publish import publication

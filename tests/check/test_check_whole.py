@@ -14,8 +14,7 @@ import pytest
 
 from calib.check.check import check
 from calib.check.outcome import Status
-from calib.he2019.audit import audit_csv
-from calib.he2019.audit.run import read_findings
+from calib.he2019.audit import audit_csv, read_findings
 from tests.check.conftest import different, edit_json, findings, seal
 
 pytestmark = pytest.mark.usefixtures("computed_once")

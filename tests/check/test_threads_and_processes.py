@@ -21,7 +21,7 @@ import pytest
 
 from calib.he2019.audit import Seeds, audit_json
 from calib.he2019.designs import he2019_tasks
-from calib.he2019.gaps.cases import paper_gaps
+from calib.he2019.gaps import paper_gaps
 from calib.he2019.sections import AuditSection, GapsSection
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.sections import work_out

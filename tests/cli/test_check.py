@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from calib.he2019.datasets import embedded
+from calib.he2019 import embedded
 from tests.cli.test_cli import Calib, calib  # noqa: F401
 
 

@@ -62,7 +62,7 @@ def contents(folder: Path) -> set[str]:
 
 @pytest.fixture(scope="module")
 def he2019(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    from calib.he2019.datasets import embedded
+    from calib.he2019 import embedded
 
     folder = tmp_path_factory.mktemp("he2019")
     embedded.write(folder)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from calib.errors import CalibError
-from calib.he2019.datasets import embedded
+from calib.he2019 import embedded
 from calib.models import MODELS
 from tests.cli.test_cli import Calib, calib  # noqa: F401
 

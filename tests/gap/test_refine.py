@@ -17,7 +17,7 @@ from calib.gap.hypothesis import Hypothesis
 from calib.gap.noise import Noise
 from calib.gap.refine import _ln_mean, refine
 from calib.gap.which import rank
-from calib.he2019.gaps.cases import paper_gaps
+from calib.he2019.gaps import paper_gaps
 from tests.gap.cases import make_case
 from tests.gap.fits import averaged_log_joint
 

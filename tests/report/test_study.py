@@ -14,10 +14,10 @@ import calib.report.study as study_module
 from calib.batch.environment import sha256
 from calib.data import read_table, table_from_arrays, write_table
 from calib.data.reader import label_of
-from calib.he2019.datasets import embedded
-from calib.he2019.datasets.embedded import load_he2019
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019 import embedded
 from calib.he2019.designs import he2019_tasks
+from calib.he2019.embedded import load_he2019
+from calib.he2019.published import PUBLISHED
 from calib.inference.prior_files import default_priors
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.sections import work_out

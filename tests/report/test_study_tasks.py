@@ -10,8 +10,8 @@ import pytest
 from calib.data import read_table, table_from_arrays
 from calib.data.quantities import OUTPUTS
 from calib.errors import CalibError
-from calib.he2019.datasets.embedded import load_he2019
 from calib.he2019.designs import he2019_tasks
+from calib.he2019.embedded import load_he2019
 from calib.inference.prior_files import default_priors
 from calib.report.study_tasks import HoldOut, choose_model, plan_tasks
 from tests.user_tables import pulls, table

@@ -13,8 +13,8 @@ from typing import Any
 
 from calib.data.files import plain_number
 from calib.he2019 import declared
-from calib.he2019.audit.intervals import Interval
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.audit.bounds import Interval
+from calib.he2019.published import PUBLISHED
 from calib.report.numbers import format_number
 from calib.report.page.template import sentences
 from calib.report.reference import Figure

@@ -19,7 +19,7 @@ from calib.errors import CalibError
 from calib.gap.batch import diagnose_cases
 from calib.gap.case import read_case
 from calib.gap.diagnose import diagnose
-from calib.he2019.datasets import embedded
+from calib.he2019 import embedded
 from calib.inference.calibration import calibrate
 from calib.inference.emulation.prepared import emulated
 from calib.inference.estimators import estimate

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from types import MappingProxyType
 
-from calib.he2019.datasets.published import PUBLISHED, Published
+from calib.he2019.published import PUBLISHED, Published
 from calib.report.reference import Figure, FittedTable
 
 __all__ = ["altered", "flipped", "printed_figures"]

@@ -9,15 +9,15 @@ import pytest
 from scipy.stats import beta
 
 from calib.batch.pool import HERE
-from calib.he2019.audit.convergence import (
+from calib.he2019.audit.finding import Verdict
+from calib.he2019.audit.searches import (
     Search,
     Seeds,
     begin_convergence,
     convergence_findings,
     printed_settings,
 )
-from calib.he2019.audit.finding import Verdict
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.published import PUBLISHED
 
 
 def searched(seed, seeds, tell=lambda what, done, planned: None):

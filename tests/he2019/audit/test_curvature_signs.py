@@ -7,16 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.he2019.audit.convergence import curvature_signs, least_cost, study_curvature_signs
-from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.nearness import (
+from calib.he2019.audit.bounds import (
     ASSUMED_SLIPS,
     COEFFICIENTS,
     joint_bounds,
     printed_coefficients,
     references,
 )
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.audit.finding import Verdict
+from calib.he2019.audit.searches import curvature_signs, least_cost, study_curvature_signs
+from calib.he2019.published import PUBLISHED
 from tests.he2019.audit.altered import flipped
 
 SEED = 2019

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from calib.he2019.audit.bounds import printed
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.intervals import printed
-from calib.he2019.audit.signs import density_findings, density_range
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.audit.regressions import density_findings, density_range
+from calib.he2019.published import PUBLISHED
 from calib.models.ayers_perumpral import bulk_density
 from tests.he2019.audit.altered import altered
 

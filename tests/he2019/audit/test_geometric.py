@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.geometric import chord_curvature, features, geometric_findings
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.audit.pull import chord_curvature, features, geometric_findings
 from calib.he2019.estimators import Features, coefficients
+from calib.he2019.published import PUBLISHED
 from tests.he2019.audit.altered import altered
 
 

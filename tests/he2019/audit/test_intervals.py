@@ -9,17 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from calib.he2019.audit.intervals import (
-    Interval,
-    arctan,
-    exact,
-    exp,
-    log,
-    printed,
-    sin,
-    square,
-    tan,
-)
+from calib.he2019.audit.bounds import Interval, arctan, exact, exp, log, printed, sin, square, tan
 from calib.report.reference import Figure
 
 FINITE = st.floats(-1e6, 1e6, allow_nan=False)

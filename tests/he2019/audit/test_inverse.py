@@ -9,7 +9,7 @@ import pytest
 
 from calib.data import hold_out
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.rounding import (
+from calib.he2019.audit.regressions import (
     attenuation,
     inverse_by_likelihood,
     inverse_by_print,
@@ -18,9 +18,9 @@ from calib.he2019.audit.rounding import (
     simulate_inverse,
     study_inverse,
 )
-from calib.he2019.datasets.embedded import load_he2019
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.embedded import load_he2019
 from calib.he2019.estimators import rut_regression
+from calib.he2019.published import PUBLISHED
 from tests.he2019.audit.altered import altered
 
 

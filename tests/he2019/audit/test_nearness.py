@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from calib.he2019.audit.nearness import (
+from calib.he2019.audit.bounds import (
     ASSUMED_SLIPS,
     joint_bounds,
     pressure_curves,
     printed_coefficients,
     references,
 )
-from calib.he2019.datasets.embedded import columns
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.embedded import columns
+from calib.he2019.published import PUBLISHED
 from calib.models.magic_formula import magic_formula
 
 

@@ -9,18 +9,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from calib.he2019.audit.intervals import Interval, printed
-from calib.he2019.audit.nearness import COEFFICIENTS, pressure_curves
-from calib.he2019.audit.pull import (
+from calib.he2019.audit.bounds import (
+    COEFFICIENTS,
     Coefficients,
+    Interval,
     coefficients,
     largest_pull,
     peak_slip,
     pressure_box,
+    pressure_curves,
+    printed,
     pull,
     pull_from_slope,
 )
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.published import PUBLISHED
 from tests.he2019.audit.altered import altered
 
 SLIPS = np.array([0.0, 0.5, 2.0, 5.0, 10.0, 20.0, 45.0, 72.0])

@@ -7,8 +7,9 @@ from itertools import product
 import numpy as np
 import pytest
 
-from calib.he2019.audit.signs import NAMES, nearest, nearest_by_signs, targets
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.audit.bounds import NAMES
+from calib.he2019.audit.pull import nearest, nearest_by_signs, targets
+from calib.he2019.published import PUBLISHED
 
 
 @pytest.mark.parametrize("what", NAMES)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from calib.he2019.audit.bounds import NAMES
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.rounding import rounding_findings, study_rounding
-from calib.he2019.audit.signs import NAMES, targets
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.audit.pull import rounding_findings, study_rounding, targets
+from calib.he2019.published import PUBLISHED
 from tests.he2019.audit.altered import altered
 
 

@@ -14,7 +14,7 @@ import pytest
 from calib.he2019 import declared
 from calib.he2019.audit import Basis, Quantity, Seeds, Verdict, audit_csv, audit_json, run_audit
 from calib.he2019.audit.finding import percent
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.published import PUBLISHED
 from tests.he2019.audit.altered import flipped, printed_figures
 
 

@@ -7,14 +7,14 @@ import pytest
 
 from calib.data import hold_out
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.pull import (
+from calib.he2019.audit.regressions import (
     log_pressure_ratio,
     rut_quality_findings,
     study_quality,
     within_pressure_sd,
 )
-from calib.he2019.datasets.embedded import load_he2019
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.embedded import load_he2019
+from calib.he2019.published import PUBLISHED
 from calib.inference.estimators import estimate
 from calib.inference.problem import build_problem
 from tests.he2019.audit.altered import altered

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from calib.he2019.audit.finding import Verdict
-from calib.he2019.audit.signs import sign_of_curvature, signs, signs_of_quadratic, signs_of_rut
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.audit.pull import sign_of_curvature, signs_of_pull, signs_of_quadratic
+from calib.he2019.audit.regressions import signs_of_rut
+from calib.he2019.published import PUBLISHED
 from tests.he2019.audit.altered import altered, flipped
 
 STRONG = [("geometric", 18), ("geometric", 30), ("geometric", 42), ("genetic", 30), ("genetic", 42)]
@@ -72,5 +73,5 @@ def test_signs_of_the_rut_model():
 
 
 def test_every_sign_is_judged_once():
-    keys = [f.key for f in signs(PUBLISHED)]
+    keys = [f.key for f in (*signs_of_pull(PUBLISHED), signs_of_rut(PUBLISHED))]
     assert len(keys) == len(set(keys)) == 9

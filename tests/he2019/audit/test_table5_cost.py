@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from calib.he2019.audit.bounds import ASSUMED_SLIPS
 from calib.he2019.audit.finding import Basis, Verdict
-from calib.he2019.audit.nearness import ASSUMED_SLIPS
-from calib.he2019.audit.table5_cost import (
-    Bounds,
-    assumed_slips_bound,
-    bounds,
-    cost_as_printed,
-    joint_cost,
-)
-from calib.he2019.datasets.drawbar import magic_formula_jacobian
-from calib.he2019.datasets.embedded import columns
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.audit.pull import Bounds, assumed_slips_bound, bounds, cost_as_printed, joint_cost
+from calib.he2019.embedded import columns
+from calib.he2019.published import PUBLISHED
+from calib.he2019.reconstruction import magic_formula_jacobian
 from calib.models.magic_formula import magic_formula
 from tests.he2019.audit.altered import altered
 

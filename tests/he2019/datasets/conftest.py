@@ -16,7 +16,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from calib.he2019.datasets import embedded
+from calib.he2019 import embedded
 
 type Array = NDArray[np.float64]
 type Columns = dict[str, Array]

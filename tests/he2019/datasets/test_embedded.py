@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from calib.he2019.datasets import density, drawbar, embedded, rut
+from calib.he2019 import embedded, reconstruction
 
 type Columns = dict[str, NDArray[np.float64]]
 
@@ -37,7 +37,11 @@ def test_files_headers_and_counts(tmp_path: Path) -> None:
 
 def test_same_bytes_every_time(tmp_path: Path) -> None:
     first = [path.read_bytes() for path in embedded.write(tmp_path / "a")]
-    again = [density.bulk_density(), drawbar.drawbar_pull(), rut.rut_depth()]
+    again = [
+        reconstruction.bulk_density(),
+        reconstruction.drawbar_pull(),
+        reconstruction.rut_depth(),
+    ]
     for fresh, kept in zip(again, embedded.tables().values(), strict=True):
         for name in kept:
             assert np.array_equal(fresh[name], kept[name])
@@ -62,6 +66,6 @@ def test_reconstruction_is_quick() -> None:
     seconds = []
     for _ in range(3):
         start = time.perf_counter()
-        density.bulk_density(), drawbar.drawbar_pull(), rut.rut_depth()
+        reconstruction.bulk_density(), reconstruction.drawbar_pull(), reconstruction.rut_depth()
         seconds.append(time.perf_counter() - start)
     assert min(seconds) < 1.0

@@ -6,7 +6,7 @@ import dataclasses
 
 import pytest
 
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.published import PUBLISHED
 from calib.report.reference import Figure
 from tests.he2019.audit.altered import printed_figures
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calib.he2019.figures.audit import audit_plates
+from calib.he2019.figures import audit_plates
 
 UNIT = re.compile(r"\(.+\)$")
 

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 
-from calib.he2019.figures.gaps import gap_plate
+from calib.he2019.figures import gap_plate
 from calib.report.gap_facts import output_rows
 
 UNIT = re.compile(r"\(.+\)$")

@@ -16,9 +16,9 @@ from calib.errors import CalibError
 from calib.gap.case import read_case
 from calib.gap.diagnose import diagnose
 from calib.gap.files import document
-from calib.he2019.datasets.embedded import load_he2019
-from calib.he2019.datasets.published import PUBLISHED
-from calib.he2019.gaps.cases import PaperGap, paper_gaps, write_cases
+from calib.he2019.embedded import load_he2019
+from calib.he2019.gaps import PaperGap, paper_gaps, write_cases
+from calib.he2019.published import PUBLISHED
 from calib.models import get_model
 from calib.models.bekker import rut_depth as eq_21
 

@@ -11,7 +11,7 @@ from scipy.stats import f as f_distribution
 
 from calib.batch.pool import HERE
 from calib.gap.diagnose import verdict
-from calib.he2019.gaps.find import (
+from calib.he2019.gaps import (
     Check,
     begin_gaps,
     checks,

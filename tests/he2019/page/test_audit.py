@@ -8,7 +8,7 @@ import re
 import pytest
 
 from calib.he2019.audit import Verdict
-from calib.he2019.page import AUDIT_MARKS, audit_section, write_audit_page
+from calib.he2019.sections import AUDIT_MARKS, audit_section, write_audit_page
 from calib.report.figures.plate import Plate
 from calib.report.sections import Written
 from tests.browser import faults

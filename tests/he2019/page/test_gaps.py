@@ -8,9 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from calib.he2019.gaps.find import Check, checks
-from calib.he2019.page import _withheld, check_text
-from calib.he2019.sections import FoundGaps
+from calib.he2019.gaps import Check, checks
+from calib.he2019.sections import FoundGaps, _withheld, check_text
 from calib.inference.sampling.sampler import SamplerSettings
 from calib.report.gap_facts import short_name
 from calib.report.labels import odds_text, short

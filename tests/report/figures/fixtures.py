@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from calib.data import Table, table_from_arrays
-from calib.he2019.figures.reference import HE2019
+from calib.he2019.published import HE2019
 from calib.inference.calibration import Calibration, calibrate
 from calib.inference.problem import build_problem
 from calib.report.figures.collect import plates

@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection
 
 from calib.data import table_from_arrays
 from calib.data.quantities import QUANTITIES
-from calib.he2019.figures.reference import HE2019
+from calib.he2019.published import HE2019
 from calib.report.figures import collect
 from calib.report.figures.bands import bands_plate, density_plate, prior_predictive_plate
 from calib.report.figures.collect import plates

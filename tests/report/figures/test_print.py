@@ -16,7 +16,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from calib.he2019.figures.reference import HE2019
+from calib.he2019.published import HE2019
 from calib.report.figures.bands import FILLS
 from calib.report.figures.collect import plates
 from calib.report.figures.plate import Plate

@@ -11,7 +11,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from calib.data import read_table
-from calib.he2019.figures.reference import HE2019
+from calib.he2019.published import HE2019
 from calib.inference.noise import Noise, NoiseChoice
 from calib.models import MODELS, example_csv
 from calib.report.figures.plate import Plate

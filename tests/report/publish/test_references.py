@@ -8,7 +8,7 @@ from importlib.metadata import metadata, version
 
 import pytest
 
-from calib.he2019.datasets.published import DOI
+from calib.he2019.published import DOI
 from calib.report.publish.markup import bibliography, bibtex, entries, short_citation
 
 DOIS = {

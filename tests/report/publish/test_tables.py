@@ -10,7 +10,7 @@ import subprocess
 
 import pytest
 
-from calib.he2019.datasets.published import PUBLISHED
+from calib.he2019.published import PUBLISHED
 from calib.inference.calibration import ParameterSummary
 from calib.report.numbers import interval_text, last_place
 from calib.report.page.tables import posterior_rows

@@ -7,7 +7,7 @@ more: never take it for a measurement, and show `LABEL` wherever it is shown.
 
 References
 ----------
-doi:10.1016/j.jterra.2019.07.003; the published figures are in `calib.he2019.datasets.published`.
+doi:10.1016/j.jterra.2019.07.003; the published figures are in `calib.he2019.published`.
 """
 
 from __future__ import annotations
@@ -24,38 +24,28 @@ from scipy.special import bdtrc
 from calib.batch.folders import write_whole
 from calib.data import Table, table_from_arrays
 from calib.errors import CalibError
-from calib.he2019.datasets import density, drawbar, rut
-from calib.he2019.datasets.reconstruct import Array
+from calib.he2019 import reconstruction
+from calib.he2019.published import LABEL
+from calib.he2019.reconstruction import Array
 
-LABEL = "reconstructed"
 # Relative differences of what was written with all digits, and with four of them.
 _EXACT, _ROUNDED = 1e-9, 5e-4
 # Probability below which no agreement is taken for chance.
 _CHANCE = 1e-6
 
 # Decimals of every column; they carry the printed digits through the files.
-_DECIMALS: Mapping[str, int] = MappingProxyType(
-    {
-        "cone_index_kpa": 1,
-        "gravimetric_water_content": 4,
-        "bulk_density_g_cm3": density.DECIMALS,
-        "inflation_pressure_psi": 0,
-        "nominal_slip_ratio": 3,
-        "slip_ratio": 3,
-        "drawbar_pull_kn": drawbar.DECIMALS,
-        "average_ground_pressure_kpa": 2,
-        "rut_depth_mm": rut.DECIMALS,
-    }
-)
+_DECIMALS: Mapping[str, int] = MappingProxyType({
+    "cone_index_kpa": 1, "gravimetric_water_content": 4,
+    "bulk_density_g_cm3": reconstruction.DENSITY_DECIMALS,
+    "inflation_pressure_psi": 0, "nominal_slip_ratio": 3, "slip_ratio": 3,
+    "drawbar_pull_kn": reconstruction.PULL_DECIMALS,
+    "average_ground_pressure_kpa": 2, "rut_depth_mm": reconstruction.RUT_DECIMALS,
+})  # fmt: skip
 
-
-_MAKERS: Mapping[str, Callable[[], Mapping[str, Array]]] = MappingProxyType(
-    {
-        "bulk_density": density.bulk_density,
-        "drawbar_pull": drawbar.drawbar_pull,
-        "rut_depth": rut.rut_depth,
-    }
-)
+_MAKERS: Mapping[str, Callable[[], Mapping[str, Array]]] = MappingProxyType({
+    "bulk_density": reconstruction.bulk_density, "drawbar_pull": reconstruction.drawbar_pull,
+    "rut_depth": reconstruction.rut_depth,
+})  # fmt: skip
 
 
 @cache

@@ -1,4 +1,4 @@
-"""Figures of the audit of the published tables; one that fails does not stop the rest."""
+"""Figures of the audit and of the source's gaps; one that fails does not stop the rest."""
 
 from __future__ import annotations
 
@@ -8,29 +8,48 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import FixedLocator, NullFormatter
 
 from calib.data import Table
+from calib.data.quantities import OUTPUTS
 from calib.he2019.audit import Audit
-from calib.he2019.audit.geometric import features
-from calib.he2019.audit.rounding import InverseStudy, attenuation
+from calib.he2019.audit.pull import features
+from calib.he2019.audit.regressions import InverseStudy, attenuation
+from calib.he2019.gaps import FoundGap
 from calib.models.base import Array
 from calib.models.bekker import rut_depth
 from calib.models.magic_formula import magic_formula
+from calib.report.figures.gap import probability_text
 from calib.report.figures.plate import Plate, draw_all
 from calib.report.figures.style import (
     BLACK,
     BLUE,
+    CYCLE,
     DASHES,
+    DOUBLE_MM,
     GREY,
+    MARKERS,
     ORANGE,
+    SKY,
+    SMALLEST_PT,
     VERMILION,
     legend_below,
     note,
     panels,
+    style,
 )
-from calib.report.labels import NO_UNIT, joined, short
+from calib.report.gap_facts import OutputRows, output_rows, output_word, short_name
+from calib.report.labels import NO_UNIT, axis_of, joined, short
 from calib.report.reference import FittedTable
+
+_ALLOWED = "#bcd6ea"
+
+
+def _legend(fig: Figure, handles: dict[str, Any]) -> None:
+    legend_below(fig, list(handles.values()), list(handles), 3)
 
 
 def costs_plate(audit: Audit) -> Plate:
@@ -38,7 +57,7 @@ def costs_plate(audit: Audit) -> Plate:
     fig, axes = panels(1, 2, height=46.0, left=42.0, bottom=21.0, top=7.0, gap_x=43.0)
     handles = _bounds(axes[0, 0], audit)
     handles |= _runs(axes[0, 1], audit)
-    legend_below(fig, list(handles.values()), list(handles), 3)
+    _legend(fig, handles)
     return Plate(
         fig, "audit_costs",
         f"Left: {audit['table5_joint_cost'].evidence} Right, on reconstructed data: "
@@ -137,7 +156,7 @@ def signs_plate(audit: Audit) -> Plate:
         ax.set_xlabel(_SLIP)
     for ax in axes[:, 0]:
         ax.set_ylabel(_PULL)
-    legend_below(fig, list(handles.values()), list(handles), 3)
+    _legend(fig, handles)
     open_ones = [
         f"{f.where.split(', Eqs')[0]}" for f in audit.findings
         if f.key.endswith("sign_of_E") and f.verdict == "consistent"
@@ -163,18 +182,15 @@ def chord_plate(audit: Audit) -> Plate:
         steep = float(features(fitted).slope.middle)
         top = table.values["D"]
         reach = np.array([0.0, 1.12 * top / slope])
-        (handles["Table 4 (genetic algorithm)"],) = ax.plot(
-            slips, _curve(fitted, slips=slips), color=BLACK, lw=1.5
-        )
-        (handles["its initial slope"],) = ax.plot(
-            [0.0, 1.12 * top / steep], [0.0, 1.12 * top], color=BLACK, lw=0.9, ls=DASHES[2]
-        )
-        (handles["Table 3 (geometric)"],) = ax.plot(
-            slips, _curve(table, slips=slips), color=BLUE, lw=1.5, ls=DASHES[1]
-        )
-        (handles["BCD of Table 3, printed as initial slope"],) = ax.plot(
-            reach, slope * reach, color=VERMILION, lw=1.2
-        )
+        lines = (
+            ("Table 4 (genetic algorithm)", slips, _curve(fitted, slips=slips), BLACK, 1.5, "-"),
+            ("its initial slope", [0.0, 1.12 * top / steep], [0.0, 1.12 * top], BLACK, 0.9,
+             DASHES[2]),
+            ("Table 3 (geometric)", slips, _curve(table, slips=slips), BLUE, 1.5, DASHES[1]),
+            ("BCD of Table 3, printed as initial slope", reach, slope * reach, VERMILION, 1.2, "-"),
+        )  # fmt: skip
+        for name, x, y, colour, lw, ls in lines:
+            (handles[name],) = ax.plot(x, y, color=colour, lw=lw, ls=ls)
         if found.x_peak is not None:
             (handles["peak of Table 3"],) = ax.plot(
                 float(found.x_peak.middle), top, "o", ms=6.0, mfc="none", mec=ORANGE, mew=1.4
@@ -184,7 +200,7 @@ def chord_plate(audit: Audit) -> Plate:
         ax.set_title(f"{psi} psi")
         ax.set_xlabel(_SLIP)
     axes[0, 0].set_ylabel(_PULL)
-    legend_below(fig, list(handles.values()), list(handles), 3)
+    _legend(fig, handles)
     return Plate(
         fig, "audit_chord",
         "BCD of Table 3 is the initial slope by Eq 6, but runs through the peak of its own curve: "
@@ -201,7 +217,7 @@ def digits_plate(audit: Audit) -> Plate:
     for ax, psi in zip(axes[0], study.allowed, strict=True):
         allowed, table4 = study.allowed[psi], study.table4[psi]
         handles["all coefficients that print as Table 5"] = ax.fill_between(
-            study.slips, allowed.lower, allowed.upper, color="#bcd6ea", lw=0.0
+            study.slips, allowed.lower, allowed.upper, color=_ALLOWED, lw=0.0
         )
         for edge in (allowed.lower, allowed.upper):
             ax.plot(study.slips, edge, color=BLUE, lw=0.6)
@@ -219,7 +235,7 @@ def digits_plate(audit: Audit) -> Plate:
         ax.set_xlabel(_SLIP)
     axes[0, 0].set_ylim(0.0, None)
     axes[0, 0].set_ylabel(_PULL)
-    legend_below(fig, list(handles.values()), list(handles), 3)
+    _legend(fig, handles)
     caption = (
         f"{audit['table5_digits_of_pull'].evidence} Extremes are exact up to an enclosure that is "
         "a few newtons too wide, never too narrow."
@@ -234,10 +250,9 @@ _AT_SLIP = 0.10
 def rut_plate(audit: Audit) -> Plate:
     """Draw R^2 and RMSE against n, the exponents, and the ruts by pressure and at 30 psi."""
     fig, axes = panels(2, 2, height=50.0, left=15.0, bottom=24.0, gap_x=17.0, gap_y=15.0, top=7.0)
-    handles = _points(axes[0, 0], audit)
-    handles |= _exponents(axes[0, 1], audit)
-    handles |= _by_pressure(axes[1, 0], audit)
-    handles |= _held_out(axes[1, 1], audit)
+    handles: dict[str, Any] = {}
+    for ax, draw in zip(axes.flat, (_points, _exponents, _by_pressure, _held_out), strict=True):
+        handles |= draw(ax, audit)
     titles = (
         "How many points were fitted?", "Exponents: Eq 22 and the likelihood",
         f"Ruts brought to {100 * _AT_SLIP:g} % slip",
@@ -245,7 +260,7 @@ def rut_plate(audit: Audit) -> Plate:
     )  # fmt: skip
     for ax, title in zip(axes.flat, titles, strict=True):
         ax.set_title(title, loc="left")
-    legend_below(fig, list(handles.values()), list(handles), 3)
+    _legend(fig, handles)
     pressure = audit["table6_inverse_regression"].evidence
     return Plate(
         fig, "audit_rut",
@@ -257,7 +272,7 @@ def rut_plate(audit: Audit) -> Plate:
 
 def _points(ax: Axes, audit: Audit) -> dict[str, Any]:
     study = audit.quality
-    band = ax.fill_between(study.n, study.implied.lower, study.implied.upper, color="#bcd6ea", lw=0)
+    band = ax.fill_between(study.n, study.implied.lower, study.implied.upper, color=_ALLOWED, lw=0)
     contact = float(study.from_contact.middle)
     line = ax.axhline(contact, color=BLACK, lw=1.1)
     ax.axvline(study.assumed_n, color=GREY, lw=0.8, ls=DASHES[2])
@@ -313,19 +328,13 @@ def _ellipse(points: Array) -> tuple[Array, Array]:
 def _by_pressure(ax: Axes, audit: Audit) -> dict[str, Any]:
     study, values = audit.inverse, audit.published.rut_depth.values
     pressure = np.geomspace(60.0, 320.0, 60)
-    draws = 1000.0 * rut_depth(
-        pressure,
-        _AT_SLIP,
-        *(v[:: max(1, v.size // 2000), None] for v in (study.k, study.n0, study.n1)),
-    )
+    some = (v[:: max(1, v.size // 2000), None] for v in (study.k, study.n0, study.n1))
+    draws = 1000.0 * rut_depth(pressure, _AT_SLIP, *some)
     low, middle, high = np.quantile(draws, [0.025, 0.5, 0.975], axis=0)
-    band = ax.fill_between(pressure, low, high, color="#bcd6ea", lw=0)
+    band = ax.fill_between(pressure, low, high, color=_ALLOWED, lw=0)
     (median,) = ax.plot(pressure, middle, color=BLUE, lw=1.4)
-    (eq_21,) = ax.plot(
-        pressure,
-        1000.0 * rut_depth(pressure, _AT_SLIP, values["k"], values["n0"], values["n1"]),
-        color=ORANGE, lw=1.6, ls=DASHES[1],
-    )  # fmt: skip
+    printed = 1000.0 * rut_depth(pressure, _AT_SLIP, values["k"], values["n0"], values["n1"])
+    (eq_21,) = ax.plot(pressure, printed, color=ORANGE, lw=1.6, ls=DASHES[1])
     fitted = _at_one_slip(study, study.calibration.problem.table)
     (rows,) = ax.plot(*fitted, "o", color=BLACK, ms=3.2, mec="white", mew=0.4, ls="none")
     ax.plot(*_at_one_slip(study, study.held_out), "o", mfc="white", mec=VERMILION, ms=4.2, mew=1.1,
@@ -353,7 +362,7 @@ def _held_out(ax: Axes, audit: Audit) -> dict[str, Any]:
     study = audit.inverse
     slip = 100.0 * study.held_out["slip_ratio"]
     low, middle, high = np.quantile(study.mean_30, [0.025, 0.5, 0.975], axis=0)
-    ax.fill_between(slip, low, high, color="#bcd6ea", lw=0)
+    ax.fill_between(slip, low, high, color=_ALLOWED, lw=0)
     ax.plot(slip, middle, color=BLUE, lw=1.4)
     ax.plot(slip, study.published_30, color=ORANGE, lw=1.6, ls=DASHES[1])
     (held,) = ax.plot(slip, study.held_out["rut_depth_mm"], "o", mfc="white", mec=VERMILION,
@@ -364,14 +373,168 @@ def _held_out(ax: Axes, audit: Audit) -> dict[str, Any]:
 
 
 _DRAWINGS: dict[str, Callable[[Audit], Plate]] = {
-    "audit_costs": costs_plate,
-    "audit_digits": digits_plate,
-    "audit_rut": rut_plate,
-    "audit_chord": chord_plate,
-    "audit_signs": signs_plate,
-}
+    "audit_costs": costs_plate, "audit_digits": digits_plate, "audit_rut": rut_plate,
+    "audit_chord": chord_plate, "audit_signs": signs_plate,
+}  # fmt: skip
 
 
 def audit_plates(audit: Audit) -> list[Plate]:
     """Draw the figures of an audit; one that failed has a caption saying why instead."""
     return draw_all({name: partial(draw, audit) for name, draw in _DRAWINGS.items()})
+
+
+# The source's gaps
+
+_BAND = "#e6e6e6"
+_Z_90 = 1.645
+_MOST = 5
+_PRESSURES = (18.0, 30.0, 42.0)
+
+
+@style()
+def gap_plate(result: FoundGap) -> Plate:
+    """Draw errors over slip before and after the correction, and the probabilities."""
+    own = output_rows(result.found)[0]
+    rows = 2 if result.gap.unfitted is not None else 1
+    fig, axes = panels(1, 3, height=46.0, top=6.0, bottom=12.0 + 4.0 * rows)
+    # The names of the hypotheses need the room beside the last panel.
+    for ax, left, width in zip(axes[0], (15.0, 70.0, 145.0), (52.0, 39.0, 32.0), strict=True):
+        box = ax.get_position()
+        ax.set_position((left / DOUBLE_MM, box.y0, width / DOUBLE_MM, box.height))
+    before, after, which = axes[0]
+    slip, pressure = (
+        result.found.data.view.conditions[name][own.rows]
+        for name in ("slip_ratio", "inflation_pressure_psi")
+    )
+    x_axis = axis_of("slip_ratio")
+    x = x_axis.scale(slip)
+    for ax in (before, after):
+        _noise_band(ax, x, own)
+        ax.set_xlabel(x_axis.label)
+    _left_open(before, x, pressure, result.open_sd)
+    _errors(before, x, pressure, own.measured - own.before, filled=False)
+    _errors(after, x, pressure, own.measured - own.after, filled=True)
+    kept_out = _neither_campaign(before, after, result)
+    _same_height(before, after)
+    after.tick_params(labelleft=False)
+    before.set_ylabel(f"Measured minus predicted ({own.axis.unit})")
+    before.set_title(f"Before: {output_word(own.name)}", loc="left")
+    after.set_title("After: corrected model", loc="left")
+    _which(which, result)
+    handles, labels = _key(pressure, kept_out=kept_out)
+    legend_below(fig, handles, labels, 3)
+    return Plate(fig, result.gap.name, _caption(own, kept_out=kept_out), result.gap.title)
+
+
+def _noise_band(ax: Axes, x: Array, own: OutputRows) -> None:
+    """Shade 90 % of the noise about zero; a straight line through the rows' own, as it may grow."""
+    ends = np.array([x.min(), x.max()])
+    level = _Z_90 * np.polyval(np.polyfit(x, own.noise, 1), ends)
+    ax.fill_between(ends, -level, level, color=_BAND, lw=0.0, zorder=0)
+    ax.axhline(0.0, color=GREY, lw=0.6, zorder=1)
+
+
+def _left_open(ax: Axes, x: Array, pressure: Array, sd: Array) -> None:
+    """Draw how far the calibrated simulator itself may be off, at each pressure."""
+    for psi in np.unique(pressure):
+        at = pressure == psi
+        order = np.argsort(x[at])
+        for sign in (-1.0, 1.0):
+            ax.plot(
+                x[at][order], sign * _Z_90 * sd[at][order], color=_colour(psi), lw=0.8,
+                ls=(0, (4, 2)), zorder=1,
+            )  # fmt: skip
+
+
+def _errors(ax: Axes, x: Array, pressure: Array, error: Array, *, filled: bool) -> None:
+    for psi in np.unique(pressure):
+        at = pressure == psi
+        ax.plot(
+            x[at], error[at], _marker(psi), mfc=_colour(psi) if filled else "none",
+            mec="white" if filled else _colour(psi), mew=0.4 if filled else 0.9,
+            ms=4.6 if filled else 4.0, zorder=3,
+        )  # fmt: skip
+
+
+def _neither_campaign(before: Axes, after: Axes, result: FoundGap) -> bool:
+    """Draw the errors at rows that stood in neither campaign."""
+    rows = result.gap.unfitted
+    if rows is None:
+        return False
+    predicted = result.found.new_predictions[result.output]
+    x = axis_of("slip_ratio").scale(rows["slip_ratio"])
+    measured = rows[OUTPUTS[result.output]]
+    psi = float(rows["inflation_pressure_psi"][0])
+    factor = axis_of(OUTPUTS[result.output]).factor
+    for ax, values in ((before, predicted.before), (after, predicted.after)):
+        ax.plot(
+            x, factor * (measured - values), _marker(psi), color=_colour(psi), mfc="white",
+            mew=0.9, ms=4.4, zorder=2,
+        )  # fmt: skip
+    return True
+
+
+def _same_height(a: Axes, b: Axes) -> None:
+    ends = np.array([a.get_ylim(), b.get_ylim()])
+    low, high = float(ends.min()), float(ends.max())
+    for ax in (a, b):
+        ax.set_ylim(low, high)
+        ax.ticklabel_format(axis="y", style="plain")
+
+
+def _which(ax: Axes, result: FoundGap) -> None:
+    p, order = result.found.ranking.probability, result.found.ranking.order
+    names = order[:_MOST]
+    y = np.arange(len(names))[::-1]
+    for i, (yi, name) in enumerate(zip(y, names, strict=True)):
+        ax.barh(yi, p[name], color=BLUE if i == 0 else SKY, height=0.62)
+        ax.text(p[name] + 0.03, yi, probability_text(p[name]), va="center", fontsize=SMALLEST_PT)
+    ax.set_yticks(y, [short_name(name).replace(" + ", "\n+ ") for name in names])
+    ax.tick_params(axis="y", length=0.0, labelsize=SMALLEST_PT)
+    ax.set_ylim(-0.6, len(names) - 0.4)
+    ax.set_xlim(0.0, 1.0)
+    ax.set_xticks([0.0, 0.5, 1.0], ["0", "0.5", "1"])
+    ax.set_xlabel(f"Probability ({NO_UNIT})")
+    ax.set_title("Which", loc="left")
+
+
+def _key(pressure: Array, *, kept_out: bool) -> tuple[list[Any], list[str]]:
+    """Return handles and labels; a key beside every colour."""
+    handles: list[Any] = []
+    labels: list[str] = []
+    for psi in np.unique(pressure):
+        handles.append(Line2D([], [], ls="", marker=_marker(psi), color=_colour(psi)))
+        labels.append(f"{psi:g} psi")
+    if kept_out:
+        psi = 30.0
+        handles.append(
+            Line2D([], [], ls="", marker=_marker(psi), color=_colour(psi), mfc="white", mew=0.9)
+        )
+        labels.append(f"{psi:g} psi, in neither campaign")
+    handles += [Patch(color=_BAND), Line2D([], [], color=GREY, lw=0.8, ls=(0, (4, 2)))]
+    labels += ["90 % of the noise", "90 % of what the calibration left open"]
+    return handles, labels
+
+
+def _colour(psi: float) -> str:
+    return CYCLE[_PRESSURES.index(float(psi))]
+
+
+def _marker(psi: float) -> str:
+    return MARKERS[_PRESSURES.index(float(psi))]
+
+
+def _caption(own: OutputRows, *, kept_out: bool) -> str:
+    before, after = (
+        short(float(np.sqrt(np.mean((own.measured - v) ** 2)))) for v in (own.before, own.after)
+    )
+    unit = own.axis.unit
+    text = (
+        f"Left, measured {output_word(own.name)} minus the calibrated simulator at the "
+        f"{own.rows.size} field rows, {before} {unit} rms; a miss inside the dashed lines is no "
+        f"more than the calibration left open. Middle, minus the corrected model, {after} {unit} "
+        f"rms; the noise is {short(float(np.median(own.noise)))} {unit}."
+    )
+    if kept_out:
+        text += " White markers are rows that neither campaign had."
+    return f"{text} Right, the most probable hypotheses."

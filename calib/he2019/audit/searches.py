@@ -1,11 +1,4 @@
-"""Does the genetic algorithm converge with Table 2's settings? Its cost over many seeds.
-
-The true optimum is that of multi-start least squares. Three searches: each pressure by itself, in
-the source's coordinates B, C, D and E; the joint fit in this package's coordinates (values at the
-end pressures); and the joint fit in the coordinates that Table 5 prints, c1 to c9 and b0, whose
-search box is not printed and is taken as 30 times the printed figure, with its sign.
-
-The signs of c7, c8 and c9, by what Table 5 would cost.
+"""What needs searching: the genetic algorithm over seeds, and the signs of c7, c8 and c9.
 
 E(p) of Table 5 is far from Table 4's under every reading, so nearness of E decides nothing: at
 18 psi the pull hardly depends on it. The pull does decide. For each reading, the coefficients that
@@ -26,8 +19,7 @@ from scipy.optimize import minimize
 from calib.batch.pool import Pool
 from calib.batch.threads import one_thread
 from calib.data import Table
-from calib.he2019.audit.finding import Finding, Quantity, Verdict, finding
-from calib.he2019.audit.nearness import (
+from calib.he2019.audit.bounds import (
     ASSUMED_SLIPS,
     COEFFICIENTS,
     joint_bounds,
@@ -35,10 +27,11 @@ from calib.he2019.audit.nearness import (
     printed_coefficients,
     references,
 )
-from calib.he2019.audit.signs import Signs, printed_signs, signs_text
-from calib.he2019.datasets.drawbar import SLIP_SHIFT
-from calib.he2019.datasets.embedded import load_he2019
-from calib.he2019.datasets.published import Published
+from calib.he2019.audit.finding import Finding, Quantity, Verdict, finding
+from calib.he2019.audit.pull import READINGS, Signs, printed_signs, signs_text
+from calib.he2019.embedded import load_he2019
+from calib.he2019.published import Published
+from calib.he2019.reconstruction import SLIP_SHIFT
 from calib.inference.estimators import GeneticSettings, PointEstimate, estimate
 from calib.inference.estimators.genetic import minimise_genetic
 from calib.inference.estimators.search import hold_unidentified, search_space
@@ -119,27 +112,27 @@ def begin_convergence(
     """Ask for the searches over seeds, on the reconstructed data; return what waits for them."""
     settings = printed_settings(published)
     box = _printed_box(published)
-    printed = [
-        pool.submit(_in_printed_coordinates, box, seed, runs, settings)
-        for runs in _parts(seeds.printed_coordinates)
-    ]
+    # These take longest: two halves, side by side.
+    n = seeds.printed_coordinates
+    halves = [range(n // 2), range(n // 2, n)] if n > 1 else [range(n)]
+    printed = [pool.submit(_in_printed_coordinates, box, seed, runs, settings) for runs in halves]
     joint_text = published.pressure.quality["cost"].text
-    joint = pool.submit(_repeat_joint, joint_text, seed, seeds.joint, settings)
+    joint = pool.submit(_repeat, None, joint_text, seed, seeds.joint, settings)
     by_pressure = {
-        psi: pool.submit(_repeat_alone, psi, table.quality["cost"].text, seed, seeds.by_pressure,
+        psi: pool.submit(_repeat, psi, table.quality["cost"].text, seed, seeds.by_pressure,
                          settings)
         for psi, table in published.genetic.items()
     }  # fmt: skip
-    planned = seeds.by_pressure * len(by_pressure) + seeds.joint + seeds.printed_coordinates
+    planned = seeds.by_pressure * len(by_pressure) + seeds.joint + n
 
     def finish(tell: Progress) -> GeneticStudy:
         what = "genetic algorithm over seeds"
         alone = {}
-        for i, (psi, piece) in enumerate(by_pressure.items()):
+        for i, (psi, piece) in enumerate(by_pressure.items(), start=1):
             alone[psi] = piece.result()
-            tell(what, (i + 1) * seeds.by_pressure, planned)
+            tell(what, i * seeds.by_pressure, planned)
         together = joint.result()
-        tell(what, planned - seeds.printed_coordinates, planned)
+        tell(what, planned - n, planned)
         costs = np.concatenate([piece.result() for piece in printed])
         tell(what, planned, planned)
         table = load_he2019("drawbar_pull")
@@ -147,28 +140,10 @@ def begin_convergence(
             psi: estimate(_alone(table, psi), "geometric", generator(seed, "audit", "geometric"))
             for psi in published.genetic
         }
-        return GeneticStudy(
-            settings, alone, together,
-            Search("all pressures, c1 to b0", together.optimum, costs, joint_text), read_off,
-        )  # fmt: skip
+        in_printed = Search("all pressures, c1 to b0", together.optimum, costs, joint_text)
+        return GeneticStudy(settings, alone, together, in_printed, read_off)
 
     return finish
-
-
-def _parts(n: int) -> list[range]:
-    """Halves of some runs, which take longest, to be done side by side."""
-    return [range(n // 2), range(n // 2, n)] if n > 1 else [range(n)]
-
-
-def _repeat_alone(psi: int, text: str, seed: int, n: int, settings: GeneticSettings) -> Search:
-    problem = _alone(load_he2019("drawbar_pull"), psi)
-    return _repeat(problem, f"{psi} psi", text, seed, ("audit", "genetic", f"{psi}"), n, settings)
-
-
-def _repeat_joint(text: str, seed: int, n: int, settings: GeneticSettings) -> Search:
-    problem = build_problem("magic_formula_pressure", load_he2019("drawbar_pull"))
-    labels = ("audit", "genetic", "joint")
-    return _repeat(problem, "all pressures", text, seed, labels, n, settings)
 
 
 def _alone(table: Table, psi: int) -> Problem:
@@ -177,10 +152,14 @@ def _alone(table: Table, psi: int) -> Problem:
 
 
 @one_thread()
-def _repeat(
-    problem: Problem, name: str, text: str, seed: int, labels: tuple[str, ...], n: int,
-    settings: GeneticSettings,
-) -> Search:  # fmt: skip
+def _repeat(psi: int | None, text: str, seed: int, n: int, settings: GeneticSettings) -> Search:
+    """Repeat the search at one pressure, or of all together."""
+    table = load_he2019("drawbar_pull")
+    if psi is None:
+        problem, name = build_problem("magic_formula_pressure", table), "all pressures"
+    else:
+        problem, name = _alone(table, psi), f"{psi} psi"
+    labels = ("audit", "genetic", "joint" if psi is None else f"{psi}")
     optimum = estimate(problem, "least_squares", generator(seed, *labels, "optimum")).cost
     space = search_space(hold_unidentified(problem)[0])
     costs = [
@@ -195,8 +174,7 @@ def _repeat(
 def _printed_box(published: Published) -> tuple[Array, Array]:
     """Return the box of c1 to c9 and b0 that is searched, shapes (10,)."""
     printed = printed_coefficients(published)
-    # The optimum has c9 positive, and so has Table 5 (`calib.he2019.audit.convergence`).
-    printed[8] = abs(printed[8])
+    printed[8] = abs(printed[8])  # c9 is positive at the optimum, and by the audit in Table 5 too
     lower, upper = np.minimum(0.0, _BOX * printed), np.maximum(0.0, _BOX * printed)
     lower[9], upper[9] = _C_RANGE
     return lower, upper
@@ -223,42 +201,31 @@ def _in_printed_coordinates(
 
 def convergence_findings(study: GeneticStudy) -> list[Finding]:
     """Judge the convergence of the algorithm, pressure by pressure and jointly."""
-    return [_by_pressure(study), _joint(study)]
-
-
-def _by_pressure(study: GeneticStudy) -> Finding:
     searches = list(study.by_pressure.values())
     everywhere = all(s.arrived == s.costs.size for s in searches)
-    return finding(
+    by_pressure = finding(
         "genetic_by_pressure", Verdict.CONFIRMED if everywhere else Verdict.CONTRADICTED,
         [s.share for s in searches], hits=sum(s.arrived for s in searches),
         n=sum(s.costs.size for s in searches), low=min(s.share.lower for s in searches),
         excess=max(float((s.costs / s.optimum - 1.0).max()) for s in searches),
     )  # fmt: skip
-
-
-def _joint(study: GeneticStudy) -> Finding:
     ours, printed = study.joint, study.printed_coordinates
     costs, worst = printed.costs, float(printed.costs.max())
     always = ours.arrived == ours.costs.size and printed.arrived == costs.size
-    return finding(
+    joint = finding(
         "genetic_joint", Verdict.CONFIRMED if always else Verdict.CONTRADICTED,
         (ours.share, printed.share,
          Quantity("cost in c1 to b0", float(np.median(costs)), "kN^2", float(costs.min()), worst,
                   "over seeds", printed.published)),
         ours=ours, printed=printed, worst=worst,
     )  # fmt: skip
+    return [by_pressure, joint]
 
+
+# The signs of c7, c8 and c9
 
 _SHIFTS = (0.0, 1.0, 3.0, 4.0)
 _SCREENED, _STARTS, _STEP, _WORST = 400, 4, 1e-5, 1e4
-
-
-def _box(published: Published, signs: Signs) -> tuple[Array, Array]:
-    middle = printed_coefficients(published)
-    middle[6:9] = np.abs(middle[6:9]) * signs
-    figures = published.pressure.estimates
-    return middle, np.array([figures[name].half_unit for name in COEFFICIENTS])
 
 
 def least_cost(
@@ -270,7 +237,9 @@ def least_cost(
     percent; `optimal` takes Table 4 for the optimum of each pressure.
     """
     known = references(published, slips)
-    middle, half = _box(published, signs)
+    middle = printed_coefficients(published)
+    middle[6:9] = np.abs(middle[6:9]) * signs
+    half = np.array([published.pressure.estimates[name].half_unit for name in COEFFICIENTS])
 
     def bound(z: Array) -> Array:
         least, _ = joint_bounds(middle + half * z, known, slips, optimal=optimal)
@@ -311,9 +280,10 @@ class CurvatureStudy:
 @one_thread()
 def study_curvature_signs(published: Published, seed: int) -> CurvatureStudy:
     """Search the least cost of every reading."""
-    readings: list[Signs] = [(a, b, c) for a, b, c in product((1, -1), repeat=3)]
-    least = {s: least_cost(published, s, ASSUMED_SLIPS, seed) for s in readings}
-    free = {s: least_cost(published, s, ASSUMED_SLIPS, seed, optimal=False) for s in readings}
+    least, free = (
+        {s: least_cost(published, s, ASSUMED_SLIPS, seed, optimal=optimal) for s in READINGS}
+        for optimal in (True, False)
+    )
     nominal = ASSUMED_SLIPS - 100.0 * SLIP_SHIFT
     best = sorted(least, key=lambda s: least[s])[:2]
     shifted = {
@@ -332,12 +302,12 @@ def curvature_signs(published: Published, study: CurvatureStudy) -> list[Finding
 def _quantities(study: CurvatureStudy, readings: list[Signs]) -> Iterator[Quantity]:
     for s in readings:
         name, least = f"least cost with {signs_text(s)}", study.least[s]
-        shifts = (*study.by_shift.get(s, ()), least)
-        if len(shifts) == 1:
-            yield Quantity(name, least, "kN^2")
-        else:
+        if s in study.by_shift:
+            shifts = (*study.by_shift[s], least)
             what = "shifts of zero slip from 0 to 4 %"
             yield Quantity(name, least, "kN^2", min(shifts), max(shifts), what)
+        else:
+            yield Quantity(name, least, "kN^2")
 
 
 def _first_two(study: CurvatureStudy, read: Signs, best: Signs) -> Finding:

@@ -1,1 +1,0 @@
-"""The published figures and the data set reconstructed from them."""

@@ -1,1 +1,0 @@
-"""Where the source paper's own models miss: four cases from the embedded data, diagnosed."""
