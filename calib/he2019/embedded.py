@@ -60,17 +60,7 @@ def tables() -> dict[str, Mapping[str, Array]]:
 
 
 def load_he2019(output: str) -> Table:
-    """Return one output's table, labelled reconstructed.
-
-    Parameters
-    ----------
-    output : {"bulk_density", "drawbar_pull", "rut_depth"}
-
-    Raises
-    ------
-    CalibError
-        If there is no such output.
-    """
+    """Return the table of bulk_density, drawbar_pull or rut_depth, labelled reconstructed."""
     if output not in _MAKERS:
         raise CalibError(f"there is no output {output!r}", allowed=", ".join(_MAKERS))
     return table_from_arrays(columns(output), source=f"he2019 {output}", label=LABEL)
@@ -130,10 +120,7 @@ def _same(table: Table) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_], 
 
 
 def write(out_dir: Path) -> list[Path]:
-    """Write one CSV per output over files of the same names, and return their paths.
-
-    The folder is made if it is missing; OSError if it cannot be made or written to.
-    """
+    """Write one CSV per output over files of the same names, and return their paths."""
     # All text is worked out first: a failure there leaves no files behind.
     texts = {out_dir / f"{name}.csv": _csv(table) for name, table in tables().items()}
     out_dir.mkdir(parents=True, exist_ok=True)

@@ -62,10 +62,7 @@ class Coefficients(NamedTuple):
 
 
 def coefficients(features: Features, C_without_peak: float = 1.5) -> Coefficients:
-    """Evaluate Eqs 6-9 of He, Sandu & Osorio (2019), doi:10.1016/j.jterra.2019.07.003.
-
-    Where the range holds no peak the asymptote cannot be seen, and C is given.
-    """
+    """Evaluate Eqs 6-9; without a peak in range the asymptote cannot be seen, and C is given."""
     D = features.peak
     if features.has_peak:
         C = 2.0 - 2.0 / np.pi * np.arcsin(np.clip(features.asymptote / D, -1.0, 1.0))
@@ -78,13 +75,9 @@ def coefficients(features: Features, C_without_peak: float = 1.5) -> Coefficient
 
 
 def read_features(
-    slip_percent: Array,
-    pull: Array,
-    *,
-    slope_slip_percent: float = 5.0,
-    find_zero: bool = False,
+    slip_percent: Array, pull: Array, *, slope_slip_percent: float = 5.0, find_zero: bool = False,
     where: str | None = None,
-) -> Features:
+) -> Features:  # fmt: skip
     """Read the features of a measured curve, slips and pulls of shape (n,).
 
     - Initial slope: the least-squares line through the origin and the rows of slips up to
@@ -96,11 +89,7 @@ def read_features(
       point and its neighbours. If the highest point is the last one, the range holds no peak.
     - Asymptote: the pull at the largest slip.
 
-    Raises
-    ------
-    CalibError
-        If there are fewer than four distinct positive slips or the pull is nowhere positive or
-        does not rise.
+    CalibError if fewer than four positive slips are distinct, or the pull does not rise above zero.
     """
     slope, zero = _initial_line(slip_percent, pull, slope_slip_percent, find_zero, where)
     x, y = _levels(slip_percent - zero, pull)
@@ -161,10 +150,7 @@ _LEAST_G = 0.01
 
 
 def estimate_geometric(
-    problem: Problem,
-    rng: np.random.Generator | None = None,
-    *,
-    slope_slip_percent: float = 5.0,
+    problem: Problem, rng: np.random.Generator | None = None, *, slope_slip_percent: float = 5.0
 ) -> PointEstimate:
     """Read the coefficients of magic_formula or magic_formula_pressure off the data, without `rng`.
 
@@ -184,14 +170,9 @@ def estimate_geometric(
         natural = _inside(problem, values)
         notes = (*notes, "the bends are at the prior's location: the curves cannot be joined")
     return goodness(
-        problem,
-        "geometric",
-        problem.of_model(natural)[0],
-        n_fitted=len(set(values) & set(problem.names)),
-        n_evaluations=1,
-        seconds=time.perf_counter() - clock,
-        notes=notes,
-    )
+        problem, "geometric", problem.of_model(natural)[0], n_evaluations=1, notes=notes,
+        n_fitted=len(set(values) & set(problem.names)), seconds=time.perf_counter() - clock,
+    )  # fmt: skip
 
 
 def _inside(problem: Problem, values: dict[str, float]) -> Array:
@@ -238,13 +219,11 @@ def _several_pressures(problem: Problem, up_to: float) -> tuple[dict[str, float]
     groups = np.split(order, np.flatnonzero(np.diff(u[order]) > 0.05) + 1)
     read = [
         read_features(
-            slip[g],
-            problem.observed[g],
-            slope_slip_percent=up_to,
+            slip[g], problem.observed[g], slope_slip_percent=up_to,
             where=f"{problem.table.source}, rows near {mid + half * u[g].mean():g} psi",
         )
         for g in groups
-    ]
+    ]  # fmt: skip
     found = [coefficients(features, _location(problem, "C")) for features in read]
     centres = np.array([u[g].mean() for g in groups])
     basis = np.column_stack([0.5 * (1.0 - centres), 0.5 * (1.0 + centres), centres**2 - 1.0])
@@ -285,15 +264,7 @@ def rut_regression(problem: Problem, max_slip: float = 0.2) -> RutRegression:
 
     Rows above `max_slip` are left out, where the table has a slip: above 30 % the rut rebounds and
     its depth is no longer the sinkage, and the source used slips up to 20 %.
-
-    Raises
-    ------
-    CalibError
-        If the rows do not determine the coefficients.
-
-    References
-    ----------
-    He, Sandu & Osorio (2019), Eq 22 and Table 6, doi:10.1016/j.jterra.2019.07.003.
+    CalibError if the rows do not determine the coefficients.
     """
     with_slip = problem.bound.model.name == "modified_bekker"
     n_all = len(problem.table)
@@ -319,28 +290,17 @@ def rut_regression(problem: Problem, max_slip: float = 0.2) -> RutRegression:
     sse = float(r @ r)
     values = dict(zip(names, beta.tolist(), strict=True))
     values["k"] = float(np.exp(values["k"]))
-    return RutRegression(
-        reported={name: values[name] for name in problem.bound.model.reported},
-        r_squared=1.0 - sse / float(np.square(y - y.mean()).sum()),
-        rmse=float(np.sqrt(sse / (n - p))),
-        n=n,
-        n_excluded=n_all - n,
-    )
+    reported = {name: values[name] for name in problem.bound.model.reported}
+    r_squared = 1.0 - sse / float(np.square(y - y.mean()).sum())
+    return RutRegression(reported, r_squared, float(np.sqrt(sse / (n - p))), n, n_all - n)
 
 
 def estimate_published_regression(
-    problem: Problem,
-    rng: np.random.Generator | None = None,
-    *,
-    max_slip: float = 0.2,
+    problem: Problem, rng: np.random.Generator | None = None, *, max_slip: float = 0.2
 ) -> PointEstimate:
     """Estimate by `rut_regression`, judged on the likelihood's scale (ln zt, all rows).
 
-    Raises
-    ------
-    CalibError
-        As `rut_regression`; also if a parameter is fixed, or the exponent comes out at or below
-        zero, with which no rut depth can be predicted.
+    CalibError as `rut_regression`, if a parameter is fixed, and if the exponent is not positive.
     """
     clock = time.perf_counter()
     fixed = [p.name for p in problem.priors.entries[:-1] if p.fixed]
@@ -360,15 +320,9 @@ def estimate_published_regression(
             mend="check the columns of rut depth and ground pressure, or use least_squares",
         )
     left_out = f"{fit.n_excluded} rows above {max_slip:g} slip left out" if fit.n_excluded else ""
+    quality = f"R² = {fit.r_squared:.3f}, RMSE = {fit.rmse:.3f} (n = {fit.n})"
     return goodness(
-        problem,
-        "published_regression",
-        problem.bound.theta(fit.reported),
-        n_fitted=len(fit.reported),
-        n_evaluations=0,
-        seconds=time.perf_counter() - clock,
-        notes=(
-            f"regression of ln pgr: R² = {fit.r_squared:.3f}, RMSE = {fit.rmse:.3f} (n = {fit.n})",
-            left_out,
-        ),
-    )
+        problem, "published_regression", problem.bound.theta(fit.reported),
+        n_fitted=len(fit.reported), n_evaluations=0, seconds=time.perf_counter() - clock,
+        notes=(f"regression of ln pgr: {quality}", left_out),
+    )  # fmt: skip

@@ -491,11 +491,7 @@ _OWN: Mapping[str, Callable[[FoundGap], tuple[Check, ...]]] = {
 
 
 def summarise_gaps(results: Sequence[FoundGap]) -> dict[str, Any]:
-    """Return plain dictionaries by the names of the gaps.
-
-    Each holds ``verdict``, ``probability`` by hypothesis, ``parameters`` of the most probable one,
-    ``shrink``, ``rows``, ``withheld``, ``checks`` by name and ``variants`` by name.
-    """
+    """Return verdict, probabilities, rows, checks and variants as plain dictionaries by gap."""
     return {result.gap.name: _one(result) for result in results}
 
 

@@ -76,21 +76,14 @@ class Plugin:
 
         if _LABEL in REFERENCES:
             return
+        some, said = (
+            "Some of the data",
+            "are reconstructed from published results [@He_2019]; they are not measurements.",
+        )
         register(
-            KnownData(
-                _LABEL,
-                "the embedded data",
-                "The data are reconstructed from published results [@He_2019]; they are not "
-                "measurements.",
-                _later("embedded", "holds"),
-            ),
-            KnownData(
-                f"partly {_LABEL}",
-                "the embedded data and others",
-                "Some of the data are reconstructed from published results [@He_2019]; they are "
-                "not measurements.",
-                _later("embedded", "holds_some"),
-            ),
+            KnownData(_LABEL, "the embedded data", f"The data {said}", _later("embedded", "holds")),
+            KnownData(f"partly {_LABEL}", "the embedded data and others", f"{some} {said}",
+                      _later("embedded", "holds_some")),
             Method(
                 "geometric", _later("estimators", "estimate_geometric"),
                 "geometric (Eqs 6-9)", "Geom.",
@@ -98,8 +91,7 @@ class Plugin:
                 ("magic_formula", "magic_formula_pressure"), place=0,
             ),
             Method(
-                "published_regression",
-                _later("estimators", "estimate_published_regression"),
+                "published_regression", _later("estimators", "estimate_published_regression"),
                 "regression as published (Eq 22)", "Regr.",
                 "the regression as published (Eq 22 of the source)",
                 ("bekker", "modified_bekker"), place=40,

@@ -33,10 +33,7 @@ DOI = "10.1016/j.jterra.2019.07.003"
 
 @dataclass(frozen=True)
 class Setup:
-    """The experiment as described, and the settings of the genetic algorithm.
-
-    Pressures are keys in psi; lengths in mm, load in kN, slips as nominal fractions.
-    """
+    """The experiment, by psi, mm, kN and nominal slip fractions, and Table 2's settings."""
 
     inflation_pressures_psi: tuple[int, ...] = (18, 30, 42)
     held_out_psi: int = 30
@@ -130,10 +127,7 @@ class _He2019(Reference):
         return _TABLES.get(model)
 
     def quality(self, model: str) -> Mapping[str, Figure]:
-        """Return the published goodness of fit that can stand beside ours; empty where none can.
-
-        Table 6 gives that of ln pgr, the pressure regressed on the rut; ours is of ln z.
-        """
+        """Return the published goodness of fit; Table 6 gives that of ln pgr, ours is of ln z."""
         return {} if model not in _TABLES or model == "modified_bekker" else _TABLES[model].quality
 
     def curve(self, model: str, conditions: Mapping[str, Array]) -> tuple[Array, str] | None:

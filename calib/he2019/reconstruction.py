@@ -55,10 +55,7 @@ _DEPENDENT = 1e-9
 
 
 def normalised_basis(directions: Array) -> Array:
-    """Return an orthonormal basis of the span of some directions, shape (n, k) to (n, rank).
-
-    In order of importance: those that earlier ones already span are dropped.
-    """
+    """Return an orthonormal basis (n, rank) of the span of directions (n, k), in their order."""
     q, r = np.linalg.qr(directions / np.linalg.norm(directions, axis=0))
     return np.asarray(q[:, np.abs(np.diag(r)) > _DEPENDENT])
 
@@ -159,10 +156,7 @@ def _must_vanish(fitted: Array, water: Array) -> Array:
 
 
 def bulk_density() -> dict[str, Array]:
-    """Return the reconstructed bulk densities of 36 samples.
-
-    By cone_index_kpa, gravimetric_water_content and bulk_density_g_cm3.
-    """
+    """Return the reconstructed bulk densities of 36 samples, with their conditions."""
     table = PUBLISHED.bulk_density
     quality = {name: figure.value for name, figure in table.quality.items()}
     n = _WATER_LEVELS * _INDEX_LEVELS
@@ -226,8 +220,8 @@ _SETTINGS = {
     18: _Setting(
         4,
         ((0.0572, 2.2, 1.643, 0.913), (0.0530, 2.332, 1.648, 0.9725), (0.0458, 2.6, 1.661, 1.078)),
-        (0.10, 0.05, -0.03, -0.06, -0.06),
-        0.45,
+        structure=(0.10, 0.05, -0.03, -0.06, -0.06),
+        noise=0.45,
     ),
     30: _Setting(4, ()),
     42: _Setting(2, ()),
@@ -272,10 +266,7 @@ def _errors(psi: int, slip_percent: Array, drawn: Array) -> Array:
 
 
 def drawbar_pull() -> dict[str, Array]:
-    """Return the reconstructed drawbar pulls, three pressures by fourteen slips.
-
-    By inflation_pressure_psi, nominal_slip_ratio, slip_ratio (shifted) and drawbar_pull_kn.
-    """
+    """Return the reconstructed pulls at three pressures by fourteen slips, nominal and shifted."""
     nominal = np.array(NOMINAL_SLIPS)
     slip = nominal + SLIP_SHIFT
     rng = np.random.default_rng(_PULL_SEED)
@@ -313,13 +304,12 @@ _SECOND_LARGEST = 0.12
 _HELD_OUT_SECOND, _HELD_OUT_OTHERS = 0.074, 0.055
 
 
-def _quality(name: str) -> float:
-    return PUBLISHED.rut_depth.quality[name].value
+_QUALITY = {name: figure.value for name, figure in PUBLISHED.rut_depth.quality.items()}
 
 
 def _sse() -> float:
     degrees_of_freedom = len(_FITTED) * len(SLIPS) - len(PUBLISHED.rut_depth.estimates)
-    return _quality("rmse") ** 2 * degrees_of_freedom
+    return _QUALITY["rmse"] ** 2 * degrees_of_freedom
 
 
 def ground_pressure() -> dict[int, float]:
@@ -332,7 +322,7 @@ def ground_pressure() -> dict[int, float]:
     }
     low, high = (log[psi] for psi in _FITTED)
     # Two pressures, equally often: the total sum of squares is n (difference/2)^2.
-    total = _sse() / (1.0 - _quality("r_squared"))
+    total = _sse() / (1.0 - _QUALITY["r_squared"])
     difference = 2.0 * np.sqrt(total / (len(_FITTED) * len(SLIPS)))
     centre, ratio = 0.5 * (low + high), difference / (high - low)
     return {
@@ -362,7 +352,7 @@ def _fitted_ruts(rng: np.random.Generator, pressure: Array, slip: Array) -> Arra
     # An error e of ln pgr is a relative rut error of exp(e/exponent) - 1.
     lower, upper = exponent * np.log1p(-_SECOND_LARGEST), exponent * np.log1p(_SECOND_LARGEST)
     worst = int(np.argmax(np.abs(drawn / exponent)))
-    extreme = np.sign(drawn[worst]) * _quality("max_relative_error")
+    extreme = np.sign(drawn[worst]) * _QUALITY["max_relative_error"]
     lower[worst] = upper[worst] = exponent[worst] * np.log1p(extreme)
     return np.asarray(np.exp((above - nearest_errors(drawn, equal, lower, upper)) / exponent))
 
@@ -374,16 +364,13 @@ def _held_out_ruts(rng: np.random.Generator, pressure: Array, slip: Array) -> Ar
     relative = _HELD_OUT_OTHERS * rng.standard_normal(slip.size)
     order = np.argsort(-np.abs(relative))
     size = np.minimum(np.abs(relative), _HELD_OUT_OTHERS)
-    size[order[0]] = _quality("held_out_max_relative_error")
+    size[order[0]] = _QUALITY["held_out_max_relative_error"]
     size[order[1]] = _HELD_OUT_SECOND
     return np.asarray(predicted / (1.0 + np.sign(relative) * size))
 
 
 def rut_depth() -> dict[str, Array]:
-    """Return the reconstructed ruts, 27 rows: 18 and 42 psi as fitted, 30 psi as held out.
-
-    By inflation_pressure_psi, average_ground_pressure_kpa, slip_ratio and rut_depth_mm.
-    """
+    """Return the reconstructed ruts, 27 rows: 18 and 42 psi as fitted, 30 psi as held out."""
     rng = np.random.default_rng(_RUT_SEED)
     psi = np.repeat(np.array([float(p) for p in PUBLISHED.setup.contact_length_mm]), len(SLIPS))
     slip = np.tile(np.array(SLIPS), psi.size // len(SLIPS))

@@ -90,10 +90,7 @@ def write_audit_page(audit: Audit, folder: Path, command: Sequence[str]) -> None
 
 
 def audit_section(audit: Audit, plates: Sequence[Plate], images: Mapping[str, bytes]) -> str:
-    """Render the section: verdicts first, then the evidence of each, then the figures.
-
-    Images are PNG files by the name of their plate.
-    """
+    """Render verdicts, evidence and figures; images are PNG files by the name of their plate."""
     groups = [
         {
             "id": verdict.name.lower(), "verdict": verdict.value, "mark": AUDIT_MARKS[verdict],

@@ -56,17 +56,7 @@ __all__ = [
 
 @dataclass(frozen=True, eq=False)
 class Audit:
-    """An audit of the published figures.
-
-    Parameters
-    ----------
-    findings : tuple of Finding
-        By verdict, the gravest first; within a verdict in the order of the source.
-    published : Published
-        What was audited.
-    seeds : Seeds
-        How often each search was repeated.
-    """
+    """An audit of the published figures; findings by verdict, the gravest first."""
 
     findings: tuple[Finding, ...]
     published: Published
@@ -89,13 +79,9 @@ class Audit:
 
 
 def run_audit(
-    seed: int = 2019,
-    *,
-    published: Published = PUBLISHED,
-    seeds: Seeds | None = None,
-    rut_calibration: Calibration | None = None,
-    progress: Progress | None = None,
-) -> Audit:
+    seed: int = 2019, *, published: Published = PUBLISHED, seeds: Seeds | None = None,
+    rut_calibration: Calibration | None = None, progress: Progress | None = None,
+) -> Audit:  # fmt: skip
     """Audit the published figures.
 
     Parameters
@@ -152,9 +138,8 @@ def begin_audit(
         tell("testing printed figures", 2, 2)
         order = list(Verdict)
         ranked = tuple(sorted(findings, key=lambda f: order.index(f.verdict)))
-        return Audit(
-            ranked, published, seed, rounding, curvature, quality, inverse, searched, seeds
-        )
+        studies = rounding, curvature, quality, inverse, searched
+        return Audit(ranked, published, seed, *studies, seeds)
 
     return finish
 

@@ -215,10 +215,7 @@ def _argument(u: Interval, E: Interval) -> Interval:
 
 
 def pull(slip_percent: Array, box: Coefficients) -> Interval:
-    """Return the exact extremes of the pull (kN) where B is printed (Tables 3 and 4).
-
-    For slips (n,) not negative, B and D positive, C from 1 to 2, E at most 1; else a ValueError.
-    """
+    """Return the exact extremes of the pull (kN) at slips (n,) where B is printed."""
     u = box.stiffness * exact(slip_percent)
     return box.D * sin(box.C * arctan(_argument(u, box.E)))
 
@@ -275,10 +272,7 @@ def largest_pull(box: Coefficients) -> Interval:
 
 
 def peak_slip(box: Coefficients) -> Interval | None:
-    """Return the slip (%) of the peak, or None if no coefficients of the box have one.
-
-    ValueError if a part of the box has a peak and another has none.
-    """
+    """Return the slip (%) of the peak; None without one, ValueError if only a part has one."""
     target = peak_argument(box.C)
     low_E, high_E = float(box.E.lower), float(box.E.upper)
     if high_E > 1.0:
@@ -372,10 +366,7 @@ def pressure_curves(coefficients: Array, pressures: Array, slips: Array) -> Arra
 def joint_bounds(
     coefficients: Array, known: tuple[Reference, ...], slips: Array, *, optimal: bool
 ) -> tuple[Array, Array]:
-    """Return the least and largest total cost (Eq 16) of c1 to c9 and b0, shape (k, 10) to (k,).
-
-    Infinite where the formula has no value; `optimal` as for `Reference.bounds`.
-    """
+    """Return least and largest costs (Eq 16), (k,), of c1 to b0, (k, 10); infinite if undefined."""
     pull = pressure_curves(coefficients, np.array([float(r.psi) for r in known]), slips)
     fine = np.isfinite(pull).all(axis=(1, 2))
     least, largest = (np.full(pull.shape[0], np.inf) for _ in range(2))

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Any
+from typing import Any, Self
 
 from calib.data.files import plain_number
 from calib.he2019 import declared
@@ -26,65 +26,52 @@ def percent(fraction: float, digits: int = 3) -> str:
 
 
 class Verdict(StrEnum):
-    """What a test says of a published figure, as it is printed and read."""
+    """What a test says of a published figure, and one sentence on what that means."""
 
-    CONTRADICTED = "contradicted"
-    CORRECTED = "corrected"
-    CONFIRMED = "confirmed"
-    CONSISTENT = "consistent"
-    UNTESTABLE = "cannot be tested"
+    meaning: str
 
-    @property
-    def meaning(self) -> str:
-        """One sentence."""
-        return _MEANINGS[self]
+    def __new__(cls, value: str, meaning: str = "") -> Self:
+        """Make a word that has a meaning."""
+        self = str.__new__(cls, value)
+        self._value_, self.meaning = value, meaning
+        return self
 
-
-_MEANINGS = {
-    Verdict.CONTRADICTED: "cannot hold together with what else is printed",
-    Verdict.CORRECTED: "does not say what it is taken to say; what should stand there is given",
-    Verdict.CONFIRMED: "the figure as read passes a test that its rivals fail",
-    Verdict.CONSISTENT: "passes a test it could have failed, which does not prove it",
-    Verdict.UNTESTABLE: "nothing printed decides; measured data would",
-}
+    CONTRADICTED = "contradicted", "cannot hold together with what else is printed"
+    CORRECTED = (
+        "corrected", "does not say what it is taken to say; what should stand there is given"
+    )  # fmt: skip
+    CONFIRMED = "confirmed", "the figure as read passes a test that its rivals fail"
+    CONSISTENT = "consistent", "passes a test it could have failed, which does not prove it"
+    UNTESTABLE = "cannot be tested", "nothing printed decides; measured data would"
 
 
 class Basis(StrEnum):
-    """What a verdict rests on."""
+    """What a verdict rests on, and what a reader must not conclude from it."""
+
+    caveat: str
+
+    def __new__(cls, value: str, caveat: str = "") -> Self:
+        """Make a word that may have a caveat."""
+        self = str.__new__(cls, value)
+        self._value_, self.caveat = value, caveat
+        return self
 
     PRINTED = "printed figures alone"
-    SLIPS = "printed figures and the assumed slips"
+    SLIPS = (
+        "printed figures and the assumed slips",
+        "The slips are assumed where the source does not print them.",
+    )
     PHYSICS = "printed figures and physical limits"
-    RECONSTRUCTED = "reconstructed data"
-
-    @property
-    def caveat(self) -> str:
-        """What a reader must not conclude; empty where there is nothing to warn of."""
-        return _CAVEATS.get(self, "")
-
-
-_CAVEATS = {
-    Basis.SLIPS: "The slips are assumed where the source does not print them.",
-    Basis.RECONSTRUCTED: (
+    RECONSTRUCTED = (
+        "reconstructed data",
         "The data were reconstructed so that Tables 1, 4 and 6 are their exact optimum: this shows "
-        "what the method does with such data and proves nothing about the measured ones."
-    ),
-}
+        "what the method does with such data and proves nothing about the measured ones.",
+    )
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A figure found, with the interval it lies in.
-
-    Parameters
-    ----------
-    value : float
-        NaN where only the interval is meant.
-    interval : str
-        What the interval is: "rounding" (exact extremes over the printed digits), "95 % HDI", ...
-    published : str
-        The printed figure beside it; empty where there is none.
-    """
+    """A figure found (NaN if only its interval counts), its interval, and the printed figure."""
 
     name: str
     value: float
@@ -114,10 +101,7 @@ def rounded(
     *,
     middle: bool = True,
 ) -> Quantity:
-    """Return a quantity whose interval comes from the printed digits.
-
-    An interval of several numbers counts from the least to the largest; `middle` is shown if asked.
-    """
+    """Return what the printed digits allow, least to largest; `middle` is shown if asked."""
     low, high = float(interval.lower.min()), float(interval.upper.max())
     value = 0.5 * (low + high) if middle else math.nan
     return Quantity(name, value, unit, low, high, "rounding", published.text if published else "")
@@ -132,20 +116,9 @@ def between(
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding: what is claimed, how it was tested, and one sentence of evidence.
+    """One finding: what is claimed, how it was tested, the evidence, and what stays undecided.
 
-    Parameters
-    ----------
-    key : str
-        Identifier, unique in an audit.
-    family : str
-        Heading under which it is shown.
-    where : str
-        Table or equation of the source. Pages are not known: the text reached us without them.
-    figures : tuple of str
-        The printed figures it judges, by where they stand: ``"Table 4, 18 psi: E"``.
-    stays_open : str
-        What the test leaves undecided; empty where nothing is.
+    Its key is unique; `figures` are those it judges, by where they stand: "Table 4, 18 psi: E".
     """
 
     key: str

@@ -214,11 +214,7 @@ _DECLARED = "kPa"
 
 
 class Nearest(NamedTuple):
-    """The best a box of coefficients can do.
-
-    The smallest possible largest relative deviation over the pressures, the coefficients (3,) that
-    reach it, and the quadratic there (m,).
-    """
+    """The least largest relative deviation of a box, its coefficients (3,), the quadratic (m,)."""
 
     deviation: float
     coefficients: Array
@@ -246,10 +242,7 @@ def signs_text(signs: tuple[int, ...]) -> str:
 def nearest(
     published: Published, what: str, *, signs: Signs | None = None, psi_per_unit: float = 1.0
 ) -> Nearest:
-    """Return the best that coefficients of D, BCD or E printed as in Table 5 can do.
-
-    Signs are as they are read by default; pressure enters in units of so many psi.
-    """
+    """Return the best that D, BCD or E of Table 5 can do, pressure in units of so many psi."""
     figures = [published.pressure.estimates[name] for name in NAMES[what]]
     read = signs or printed_signs(published, what)
     middle = [sign * abs(f.value) for sign, f in zip(read, figures, strict=True)]
@@ -365,10 +358,7 @@ _N_C = 9
 
 
 class Bounds(NamedTuple):
-    """Costs (kN^2) that the joint optimum cannot exceed.
-
-    Whatever the slips, at the assumed ones, and there if Table 4 is optimal.
-    """
+    """Costs (kN^2) not exceeded: at any slips, at the assumed ones, there if Table 4 is optimal."""
 
     anywhere: float
     assumed: float
@@ -415,10 +405,7 @@ def _nearest_everywhere(table: FittedTable, C: float, levels: int) -> Array:
 
 
 def _largest_norm(table: FittedTable, C: float, levels: int) -> float:
-    """Return a |d| (kN) that some curve with another C exceeds at no slips.
-
-    It holds for all coefficients that print as Table 4, and between the points of the grid.
-    """
+    """Return a |d| (kN) that some curve with another C exceeds at no slips, rounding included."""
     B, D, E = _nearest_everywhere(table, C, levels)
     allowed = pull(_FINE, coefficients(table))
     curve = magic_formula(_FINE, B, C, D, E)
@@ -428,10 +415,7 @@ def _largest_norm(table: FittedTable, C: float, levels: int) -> float:
 
 
 def any_slips_bound(published: Published) -> float:
-    """Return a cost (kN^2) that the joint optimum cannot exceed, whatever the slips.
-
-    They are up to 75 %, no two of them within 1 %.
-    """
+    """Return a cost (kN^2) the optimum cannot exceed at any slips up to 75 % that are 1 % apart."""
     levels = int(published.setup.slip_levels.value)
 
     def total(C: float) -> float:
@@ -449,10 +433,7 @@ def any_slips_bound(published: Published) -> float:
 
 
 def assumed_slips_bound(published: Published, *, optimal: bool) -> float:
-    """Return a cost (kN^2) that the joint optimum cannot exceed at the assumed slips.
-
-    `optimal` takes Table 4 for the optimum of each pressure.
-    """
+    """Return a cost (kN^2) the optimum cannot exceed; `optimal` takes Table 4 for the optimum."""
     known = references(published)
 
     def cost(reference: Reference, C: float) -> float:
@@ -478,10 +459,7 @@ def cost_findings(
 
 
 def joint_cost(published: Published, reconstructed_optimum: float, at_most: Bounds) -> Finding:
-    """Judge whether the printed cost can be a minimum of Eq 16.
-
-    The joint optimum on the reconstructed data (kN^2) is for comparison.
-    """
+    """Judge whether the printed cost can be a minimum of Eq 16, beside the reconstructed one."""
     figure = published.pressure.quality["cost"]
     separate = [table.quality["cost"] for table in published.genetic.values()]
     floor = sum(f.value - f.half_unit for f in separate)

@@ -244,10 +244,7 @@ def fitted_lengths(published: Published) -> tuple[Interval, Interval]:
 
 
 def log_pressure_ratio(published: Published, n: Array, share: float = 0.5) -> Interval:
-    """Return the ln(pgr42/pgr18) that R^2 and RMSE imply for n points, more than parameters.
-
-    `share` is the part of the points at one of the two pressures.
-    """
+    """Return ln(pgr42/pgr18) by R^2 and RMSE of n points, a `share` of them at one pressure."""
     quality = published.rut_depth.quality
     factor = np.sqrt((n - len(published.rut_depth.estimates)) / (n * share * (1.0 - share)))
     return printed(quality["rmse"]) / _root_of_rest(printed(quality["r_squared"])) * exact(factor)
@@ -417,10 +414,7 @@ def study_inverse(
     published: Published, seed: int, *, calibration: Calibration | None = None,
     progress: Progress | None = None,
 ) -> InverseStudy:  # fmt: skip
-    """Calibrate the rut model by its likelihood, and set Eq 22 beside it.
-
-    A calibration of the modified Bekker model on the 18 and 42 psi rows is used if it is at hand.
-    """
+    """Calibrate the rut model on 18 and 42 psi unless that is at hand; set Eq 22 beside it."""
     held_out_psi = float(published.setup.held_out_psi)
     fitted, held = hold_out(load_he2019("rut_depth"), "inflation_pressure_psi", held_out_psi)
     problem = build_problem("modified_bekker", fitted)

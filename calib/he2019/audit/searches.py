@@ -58,10 +58,7 @@ class Seeds:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """One search, repeated over seeds.
-
-    In kN^2: the least cost known, the final cost by seed, shape (n_seeds,), and the printed one.
-    """
+    """A search over seeds, in kN^2: least cost known, final costs (n_seeds,), the printed one."""
 
     name: str
     optimum: float

@@ -1,4 +1,4 @@
-"""The genetic algorithm over seeds, and the verdict that follows from its costs."""
+"""The genetic algorithm over seeds, and the signs of c7, c8 and c9."""
 
 from __future__ import annotations
 
@@ -9,15 +9,26 @@ import pytest
 from scipy.stats import beta
 
 from calib.batch.pool import HERE
+from calib.he2019.audit.bounds import (
+    ASSUMED_SLIPS,
+    COEFFICIENTS,
+    joint_bounds,
+    printed_coefficients,
+    references,
+)
 from calib.he2019.audit.finding import Verdict
 from calib.he2019.audit.searches import (
     Search,
     Seeds,
     begin_convergence,
     convergence_findings,
+    curvature_signs,
+    least_cost,
     printed_settings,
+    study_curvature_signs,
 )
 from calib.he2019.published import PUBLISHED
+from tests.he2019.altered import flipped
 
 
 def searched(seed, seeds, tell=lambda what, done, planned: None):
@@ -106,3 +117,57 @@ def test_through_the_printed_coefficients_some_runs_stop_short():
     found = searched(2019, Seeds(1, 1, 40)).printed_coordinates
     assert 0 < found.arrived < 40
     assert found.costs.max() > 1.5 * found.optimum
+
+
+SEED = 2019
+
+
+@pytest.fixture(scope="module")
+def curvature():
+    return study_curvature_signs(PUBLISHED, SEED)
+
+
+def verdicts(published, curvature) -> tuple[Verdict, Verdict]:
+    first, last = curvature_signs(published, curvature)
+    return first.verdict, last.verdict
+
+
+def test_c7_and_c8_are_confirmed_and_c9_corrected(curvature):
+    assert verdicts(PUBLISHED, curvature) == (Verdict.CONFIRMED, Verdict.CORRECTED)
+    assert curvature.order[0] == (1, -1, 1)
+    # The figures read as the audit proposes pass; with c7 or c8 read otherwise they do not.
+    assert verdicts(flipped("Table 5: c9"), curvature) == (Verdict.CONFIRMED, Verdict.CONFIRMED)
+    for name in ("c7", "c8"):
+        assert verdicts(flipped(f"Table 5: {name}"), curvature)[0] is Verdict.CORRECTED
+
+
+def test_c9_stays_open_where_the_order_depends_on_the_slips(curvature):
+    mixed = {
+        s: tuple(reversed(v)) if i else v for i, (s, v) in enumerate(curvature.by_shift.items())
+    }
+    best, second = curvature.order[:2]
+    mixed[second] = (mixed[best][0] - 1e-4, *mixed[second][1:])
+    assert verdicts(PUBLISHED, replace(curvature, by_shift=mixed))[1] is Verdict.UNTESTABLE
+
+
+def test_no_random_coefficients_beat_the_search(curvature):
+    rng = np.random.default_rng(3)
+    known = references(PUBLISHED)
+    half = np.array([PUBLISHED.pressure.estimates[n].half_unit for n in COEFFICIENTS])
+    for signs in curvature.order[:4]:
+        middle = printed_coefficients(PUBLISHED)
+        middle[6:9] = np.abs(middle[6:9]) * signs
+        drawn = middle + half * rng.uniform(-1.0, 1.0, (20_000, 10))
+        least, _ = joint_bounds(drawn, known, ASSUMED_SLIPS, optimal=True)
+        assert curvature.least[signs] <= least.min()
+
+
+def test_the_search_does_not_depend_on_its_seed(curvature):
+    for signs in curvature.order[:2]:
+        again = least_cost(PUBLISHED, signs, ASSUMED_SLIPS, 7)
+        assert again == pytest.approx(curvature.least[signs], rel=1e-5)
+
+
+def test_dropping_the_optimum_can_only_lower_the_bound(curvature):
+    for signs in curvature.least:
+        assert curvature.least_free[signs] <= curvature.least[signs] * (1.0 + 1e-6)

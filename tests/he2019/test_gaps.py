@@ -1,0 +1,530 @@
+"""The source's gaps: their cases, what is found, the section and the figures."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import f as f_distribution
+
+from calib.batch.pool import HERE
+from calib.data import table_from_arrays
+from calib.data.files import write_table
+from calib.data.quantities import OUTPUTS
+from calib.errors import CalibError
+from calib.gap.case import read_case
+from calib.gap.diagnose import diagnose, verdict
+from calib.gap.files import document
+from calib.he2019.embedded import load_he2019
+from calib.he2019.figures import gap_plate
+from calib.he2019.gaps import (
+    Check,
+    PaperGap,
+    begin_gaps,
+    checks,
+    paper_gaps,
+    probability_of,
+    simulator_sd,
+    summarise_gaps,
+    unfitted_errors,
+    write_cases,
+)
+from calib.he2019.published import PUBLISHED
+from calib.he2019.sections import FoundGaps, _withheld, check_text
+from calib.inference.calibration import calibrate
+from calib.inference.sampling.sampler import SamplerSettings
+from calib.models import get_model
+from calib.models.bekker import rut_depth as eq_21
+from calib.models.magic_formula import magic_formula
+from calib.report.gap_facts import output_rows, short_name
+from calib.report.labels import odds_text, short
+from calib.report.study import Study
+from calib.report.writer import file_hashes, write_report
+from tests.browser import faults
+from tests.report.page.test_page import Reader
+
+GAPS = {gap.name: gap for gap in paper_gaps()}
+CASES = {case.name: case for gap in GAPS.values() for case in (gap.case, *gap.variants.values())}
+
+
+def test_there_are_the_four_gaps_of_the_issue():
+    assert list(GAPS) == ["plain_bekker", "nominal_slip", "held_out_pull", "post_peak_18_psi"]
+
+
+# Slips of these fields are nominal: 2 percentage points below those of the embedded data.
+NOMINAL = ("nominal_slip", "nominal_slip_swapped")
+
+
+def embedded(case):
+    """Outcome by pressure and (redefined) slip, of the whole data set."""
+    data = load_he2019(next(iter(case.models)))
+    outcome = data[OUTPUTS[next(iter(case.models))]]
+    return dict(zip(rows(data), outcome.tolist(), strict=True))
+
+
+def rows(table, shift=0.0):
+    slip = np.round(table["slip_ratio"] + shift, 6)
+    return list(zip(table["inflation_pressure_psi"].tolist(), slip.tolist(), strict=True))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_row_is_embedded_and_stands_once(name):
+    case, known = CASES[name], embedded(CASES[name])
+    shift = 0.02 if name in NOMINAL else 0.0
+    lab, field = rows(case.lab), rows(case.field, shift)
+    kept_out = [] if case.new_conditions is None else rows(case.new_conditions, shift)
+    # Lab, field and kept-out rows share none, and together are the data set.
+    assert sorted(lab + field + kept_out) == sorted(known)
+    column = OUTPUTS[next(iter(case.models))]
+    for table, keys in ((case.lab, lab), (case.field, field)):
+        np.testing.assert_array_equal(table[column], [known[key] for key in keys])
+
+
+@pytest.mark.parametrize("name", GAPS)
+def test_the_outcomes_of_kept_out_rows_are_not_in_the_case(name):
+    gap = GAPS[name]
+    if gap.unfitted is None:
+        assert gap.case.new_conditions is None
+        return
+    assert not set(gap.case.new_conditions) & set(OUTPUTS.values())
+    for column in gap.case.new_conditions:
+        np.testing.assert_array_equal(gap.case.new_conditions[column], gap.unfitted[column])
+    known, shift = embedded(gap.case), 0.02 if name in NOMINAL else 0.0
+    column = OUTPUTS[next(iter(gap.case.models))]
+    keys = rows(gap.unfitted, shift)
+    np.testing.assert_array_equal(gap.unfitted[column], [known[key] for key in keys])
+
+
+def test_plain_bekker_knows_no_slip_and_was_calibrated_where_there_is_next_to_none():
+    case = GAPS["plain_bekker"].case
+    model = get_model(case.models["rut_depth"])
+    assert "slip_ratio" not in model.conditions
+    assert sorted(set(case.lab["slip_ratio"])) == [0.0, 0.025]
+    assert case.field["slip_ratio"].min() == 0.05
+    assert set(case.field["inflation_pressure_psi"]) == {18.0, 42.0}
+    # At 2.5 % slip, Table 6 deepens the rut by less than its own scatter: next to nothing.
+    k, n0, n1 = (PUBLISHED.rut_depth.values[p] for p in ("k", "n0", "n1"))
+    deepening = eq_21(140.0, 0.025, k, n0, n1) / eq_21(140.0, 0.0, k, n0, n1) - 1.0
+    assert deepening < PUBLISHED.rut_depth.quality["rmse"].value / n0
+
+
+def test_nominal_slips_are_the_embedded_ones_and_given_back_they_are_redefined():
+    """The shift itself is checked where every row is found again."""
+    data = load_he2019("drawbar_pull")
+    nominal, redefined = set(data["nominal_slip_ratio"]), set(data["slip_ratio"])
+    for name in (*NOMINAL, "nominal_slip_given_back"):
+        assert set(CASES[name].lab["slip_ratio"]) <= redefined
+        field = set(CASES[name].field["slip_ratio"])
+        assert field <= (nominal if name in NOMINAL else redefined)
+    assert CASES["nominal_slip"].field["slip_ratio"].min() == 0.0
+
+
+def test_the_halves_of_the_slips_are_swapped():
+    one, other = CASES["nominal_slip"], CASES["nominal_slip_swapped"]
+    assert set(rows(one.field, 0.02)) <= set(rows(other.lab))
+    assert not set(rows(one.lab)) & set(rows(other.lab))
+
+
+def test_30_psi_is_held_out_whole():
+    case = GAPS["held_out_pull"].case
+    assert set(case.lab["inflation_pressure_psi"]) == {18.0, 42.0}
+    assert set(case.field["inflation_pressure_psi"]) == {30.0}
+    assert len(case.field) == PUBLISHED.setup.slip_levels.value
+
+
+@pytest.mark.parametrize(
+    ("name", "later"), [("post_peak_18_psi", 0), ("post_peak_later", 1), ("post_peak_latest", 2)]
+)
+def test_the_field_past_the_peak_is_18_psi_beyond_the_largest_pull(name, later):
+    case = CASES[name]
+    at_18 = case.lab["inflation_pressure_psi"] == 18.0
+    rising = case.lab["slip_ratio"][at_18]
+    pull = case.lab["drawbar_pull_kn"][at_18]
+    assert set(case.field["inflation_pressure_psi"]) == {18.0}
+    assert case.field["slip_ratio"].min() > rising.max()
+    assert case.field["drawbar_pull_kn"].max() < pull.max()
+    assert pull.size - 1 - int(np.argmax(pull)) == later
+    assert (~at_18).sum() == 2 * PUBLISHED.setup.slip_levels.value
+
+
+def test_without_slip_in_the_ruts_slip_sinkage_is_not_found():
+    """The finding hangs on the effect: taken out of the same rows by Eq 21, it is gone."""
+    case = GAPS["plain_bekker"].case
+    k, n0, n1 = (PUBLISHED.rut_depth.values[p] for p in ("k", "n0", "n1"))
+
+    def flat(table):
+        pressure, slip = table["average_ground_pressure_kpa"], table["slip_ratio"]
+        ratio = eq_21(pressure, slip, k, n0, n1) / eq_21(pressure, 0.0, k, n0, n1)
+        return table_from_arrays({**table.columns, "rut_depth_mm": table["rut_depth_mm"] / ratio})
+
+    found = diagnose(replace(case, lab=flat(case.lab), field=flat(case.field)), 1)
+    assert found.ranking.order[0] == "none"
+    assert found.ranking.probability["slip_sinkage"] < 0.05
+
+
+def file_hash(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def test_folders_hold_the_same_cases(tmp_path):
+    folders = write_cases(list(GAPS.values()), tmp_path / "gaps")
+    assert [f.name for f in folders] == list(GAPS)
+    for folder, gap in zip(folders, GAPS.values(), strict=True):
+        read = read_case(folder)
+        assert read.models == gap.case.models
+        for table, own, file in (
+            (read.lab, gap.case.lab, "lab.csv"), (read.field, gap.case.field, "field.csv"),
+            (read.new_conditions, gap.case.new_conditions, "fresh.csv"),
+        ):  # fmt: skip
+            if own is None:
+                assert table is None
+                continue
+            assert set(table) == set(own)
+            for column in own:
+                np.testing.assert_array_equal(table[column], own[column])
+            # What the page of a diagnosis calls the hash of a file is that of the file.
+            assert file_hash(folder / file) == own.sha256 == table.sha256
+            write_table(tmp_path / "again.csv", own.columns)
+            assert file_hash(tmp_path / "again.csv") == own.sha256
+        text = (folder / "case.toml").read_text()
+        assert "reconstructed from published results" in " ".join(text.split("\n# "))
+        assert (folder / "fresh_measured.csv").exists() is (gap.unfitted is not None)
+
+
+def test_a_folder_is_diagnosed_as_the_report_does(tmp_path, found_gaps):
+    gap = GAPS["plain_bekker"]
+    (folder,) = write_cases([gap], tmp_path)
+    own = found_gaps[gap.name].found
+    again = document(diagnose(read_case(folder), own.seed))
+    assert again == document(own)
+
+
+def test_folders_are_replaced_on_request_only(tmp_path):
+    gap: PaperGap = GAPS["held_out_pull"]
+    write_cases([gap], tmp_path)
+    with pytest.raises(CalibError, match="held_out_pull exist there already"):
+        write_cases([gap], tmp_path)
+    (tmp_path / gap.name / "lab.csv").write_text("changed")
+    write_cases([gap], tmp_path, overwrite=True)
+    assert read_case(tmp_path / gap.name).lab.sha256 == gap.case.lab.sha256
+
+
+NAMES = ("plain_bekker", "nominal_slip", "held_out_pull", "post_peak_18_psi")
+
+
+def values(result, name) -> dict[str, float]:
+    found: dict[str, Check] = {check.name: check for check in checks(result)}
+    return dict(found[name].values)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_every_diagnosis_runs_and_its_probabilities_sum_to_one(found_gaps, name):
+    result = found_gaps[name]
+    for found in (result.found, *result.variants.values()):
+        p = found.ranking.probability
+        assert math.isclose(sum(p.values()), 1.0, abs_tol=1e-9)
+        assert found.verdict == verdict(p)
+        assert {"none", "unknown", "parameter_shift"} <= set(p)
+        assert any("reconstructed" in warning for warning in found.warnings)
+    withheld = result.gap.withheld
+    assert withheld is None or withheld in result.found.ranking.probability
+
+
+@pytest.mark.parametrize("name", ["plain_bekker", "nominal_slip"])
+def test_a_withheld_effect_is_the_most_probable_and_shrinks_the_error_of_rows_not_fitted(
+    found_gaps, name
+):
+    result = found_gaps[name]
+    assert result.found.ranking.order[0] == result.gap.withheld
+    # Named: more probable than all others together. Fourteen rows leave room for the unlisted.
+    assert probability_of(result.found, result.gap.withheld) > 0.5
+    errors = unfitted_errors(result.found, result.gap)
+    assert errors.n == 7
+    assert errors.rmse_after < 0.5 * errors.rmse_before
+    # Of seven, fewer than five are within a true 90 % band in 2.6 % of campaigns.
+    assert errors.covered >= 5
+
+
+def test_the_deepening_agrees_with_table_6(found_gaps):
+    v = values(found_gaps["plain_bekker"], "deepening_at_20_percent_slip")
+    assert v["lower_90"] < v["eq_21_with_table_6"] < v["upper_90"]
+    # By hand: pressures of 18 and 42 psi, slips of 20 and 1.25 %.
+    case = found_gaps["plain_bekker"].gap.case.field
+    pressures = np.unique(case["average_ground_pressure_kpa"])
+    k, n0, n1 = 3.306e5, 1.996, 1.266
+    ratio = eq_21(pressures, 0.2, k, n0, n1) / eq_21(pressures, 0.0125, k, n0, n1)
+    assert v["eq_21_with_table_6"] == pytest.approx(ratio.mean(), rel=1e-12)
+
+
+def test_the_shift_is_found_with_its_sign_and_to_within_half_its_size(found_gaps):
+    result = found_gaps["nominal_slip"]
+    v = values(result, "shift_at_zero_slip")
+    assert v["withheld_percent"] == 2.0
+    for name in ("shift_at_zero_slip", "halves_swapped"):
+        assert abs(values(result, name)["mean_percent"] - 2.0) < 1.0
+    # Given back, there is nothing to find.
+    assert result.variants["slips given back"].verdict == "none"
+    assert values(result, "slips_given_back")["probability_none"] > 0.9
+    probability = result.variants["slips given back"].ranking.probability
+    rival = max((n for n in probability if n != "none"), key=lambda n: probability[n])
+    assert rival == "unknown"
+
+
+def test_table_4_alone_says_that_18_psi_is_fitted_worse(found_gaps):
+    v = values(found_gaps["post_peak_18_psi"], "costs_in_table_4")
+    ratio = (0.0485 / 10) / ((0.0091 + 0.0083) / 20)
+    assert v["variance_ratio"] == pytest.approx(ratio)
+    assert v["p_value"] == pytest.approx(1.0 - f_distribution.cdf(ratio, 10, 20), rel=1e-6)
+
+
+def test_the_variance_ratio_is_f_distributed_where_the_formula_is_right():
+    """The p-value counts the formula's four parameters; checked by fits to simulated pulls."""
+    from scipy.optimize import least_squares
+
+    slip = np.array([2, 4.5, 7, 9.5, 12, 14.5, 17, 19.5, 22, 32, 42, 52, 62, 72.0])
+    theta = {18: (0.0794, 1.5619, 1.648, -0.1026), 30: (0.0713, 1.5685, 1.0071, -6.0844),
+             42: (0.1265, 1.4802, 0.5954, -8.1747)}  # fmt: skip
+    rng = np.random.default_rng(4)
+    ratios = []
+    for _ in range(60):
+        cost = {}
+        for psi, start in theta.items():
+            pull = magic_formula(slip, *start) + 0.01 * rng.standard_normal(slip.size)
+            fitted = least_squares(
+                lambda t, pull=pull: magic_formula(slip, *t) - pull, start, x_scale=np.abs(start)
+            )
+            cost[psi] = 2.0 * fitted.cost
+        ratios.append(2.0 * cost[18] / (cost[30] + cost[42]))
+    share = np.mean(f_distribution.cdf(ratios, 10, 20))
+    assert abs(share - 0.5) < 3.0 / np.sqrt(12.0 * len(ratios))
+
+
+def test_what_the_calibration_left_open_is_what_a_sampled_posterior_says(
+    found_gaps, pull_calibration
+):
+    """Two pressures leave 30 psi open: importance sampling against emcee."""
+    result = found_gaps["held_out_pull"]
+    problem = pull_calibration.problem
+    assert sorted(problem.table["drawbar_pull_kn"]) == sorted(
+        result.gap.case.lab["drawbar_pull_kn"]
+    )
+    theta = problem.theta(pull_calibration.subset(2000))[:, :-1]
+    conditions = problem.bound.model.select(result.gap.case.field.columns)
+    sd = problem.bound.predict(theta, conditions).std(axis=0)
+    rms = [float(np.sqrt(np.mean(x**2))) for x in (result.open_sd, sd)]
+    assert rms[0] == pytest.approx(rms[1], rel=0.1)
+
+
+def test_what_a_calibration_of_six_rows_left_open(found_gaps):
+    """The noise is hardly known, and a normal about the mode would be far too narrow."""
+    result = found_gaps["plain_bekker"]
+    problem = result.found.data.outputs[0].problem
+    sampled = calibrate(problem, 3)
+    assert sampled.converged
+    theta = problem.theta(sampled.subset(3000))[:, :-1]
+    conditions = problem.bound.model.select(result.gap.case.field.columns)
+    sd = problem.bound.predict(theta, conditions).std(axis=0)
+    np.testing.assert_allclose(result.open_sd, sd, rtol=0.1)
+
+
+def test_the_summary_is_json_and_holds_every_gap(found_gaps):
+    summary = json.loads(json.dumps(summarise_gaps(list(found_gaps.values())), allow_nan=False))
+    assert tuple(summary) == NAMES
+    for name, one in summary.items():
+        found = found_gaps[name].found
+        assert one["best"] == found.ranking.order[0]
+        assert one["probability"] == dict(found.ranking.probability)
+        assert set(one["variants"]) == set(found_gaps[name].variants)
+        assert set(one["checks"]) == {check.name for check in checks(found_gaps[name])}
+        for output, shrink in found.shrink.items():
+            assert one["shrink"][output]["interval"] == list(shrink.interval)
+
+
+def test_same_seed_same_numbers(found_gaps):
+    first = found_gaps["plain_bekker"]
+    said = []
+    (again,) = begin_gaps(first.found.seed, [first.gap], HERE)(lambda *a: said.append(a[1:]))
+    assert summarise_gaps([again]) == summarise_gaps([first])
+    np.testing.assert_array_equal(simulator_sd(again.found), first.open_sd)
+    assert said == [(1, 1)]
+
+
+NOTHING = Study({}, 2019, 0.0)
+
+
+def written(folder: Path, gaps) -> Path:
+    """Write a report of nothing but gaps."""
+    write_report(
+        NOTHING, folder, settings=SamplerSettings(), command=["calib", "report"],
+        title="Report", sections=[FoundGaps(tuple(gaps))] if gaps else (),
+    )  # fmt: skip
+    return folder
+
+
+@pytest.fixture(scope="module")
+def report(found_gaps, tmp_path_factory) -> Path:
+    return written(tmp_path_factory.mktemp("gaps") / "report", list(found_gaps.values()))
+
+
+@pytest.fixture(scope="module")
+def page(report) -> Reader:
+    reader = Reader()
+    reader.feed((report / "index.html").read_text(encoding="utf-8"))
+    assert not reader.open
+    return reader
+
+
+def test_the_page_holds_in_a_browser(report, browser):
+    assert faults(browser, report / "index.html") == []
+
+
+@pytest.mark.slow  # as that of any diagnosis does
+@pytest.mark.parametrize(
+    "gap", ["plain_bekker", "nominal_slip", "held_out_pull", "post_peak_18_psi"]
+)
+def test_so_do_the_gaps(report, browser, gap):
+    assert faults(browser, report / "gaps" / gap / "index.html") == []
+
+
+def flat(text: str) -> str:
+    return " ".join(text.split())
+
+
+def test_the_page_says_what_the_summary_says(report, page):
+    summary = json.loads((report / "summary.json").read_text())["paper_gaps"]
+    text = flat(page.text)
+    assert list(summary) == ["plain_bekker", "nominal_slip", "held_out_pull", "post_peak_18_psi"]
+    for one in summary.values():
+        best = one["best"]
+        assert f"{short_name(best)} ({odds_text(one['probability'][best])})" in text
+        for shrink in one["shrink"].values():
+            low, high = (f"{100 * v:.0f}".replace("-", "−") for v in shrink["interval"])  # noqa: RUF001
+            assert f"{short(100 * shrink['fraction'])} % ({low} to {high} %)" in text
+        for name, values in one["checks"].items():
+            heading, sentence = check_text(Check(name, values))
+            assert heading in text
+            assert f"{flat(sentence)}." in text
+
+
+def test_every_gap_has_question_figure_limits_and_a_page(report, page, found_gaps):
+    text = flat(page.text)
+    ids = page.ids
+    assert "paper-gaps" in ids
+    assert len(ids) == len(set(ids))
+    assert "#paper-gaps" in page.addresses
+    assert "reconstructed data" in text
+    for name, result in found_gaps.items():
+        gap = result.gap
+        for words in (gap.title, gap.question, gap.limits):
+            assert flat(words) in text
+        assert f"gap-{name}" in ids
+        assert f"gaps/{name}/index.html" in page.addresses
+        assert (report / "figures" / f"gap_{name}.png").stat().st_size > 10_000
+        if gap.withheld is not None:
+            assert f"withheld, {short_name(gap.withheld)}, is " in text
+    assert all(image["alt"] and image["src"].startswith("data:") for image in page.images)
+
+
+def test_each_diagnosis_is_whole_and_calls_its_data_reconstructed(report, found_gaps):
+    for name, result in found_gaps.items():
+        folder = report / "gaps" / name
+        diagnosis = json.loads((folder / "diagnosis.json").read_text())
+        assert diagnosis["verdict"] == result.found.verdict
+        reader = Reader()
+        reader.feed((folder / "index.html").read_text(encoding="utf-8"))
+        assert "they are not measurements" in flat(reader.text)
+        assert result.gap.case.field.sha256 in reader.text
+        assert file_hashes(folder)["case/field.csv"] == result.gap.case.field.sha256
+        assert all(a.startswith(("#", "data:")) for a in reader.addresses)
+
+
+def test_hashes_of_all_files_are_in_the_manifest(report, found_gaps):
+    manifest = json.loads((report / "manifest.json").read_text())
+    assert manifest["files"] == file_hashes(report)
+    assert manifest["paper_gaps"] == {
+        name: {"seed": result.found.seed} for name, result in found_gaps.items()
+    }
+
+
+def test_without_gaps_there_is_no_section(tmp_path):
+    folder = written(tmp_path / "report", ())
+    assert "paper_gaps" not in json.loads((folder / "summary.json").read_text())
+    assert "paper_gaps" not in json.loads((folder / "manifest.json").read_text())
+    assert "paper-gaps" not in (folder / "index.html").read_text()
+    assert not (folder / "gaps").exists()
+
+
+def test_a_report_with_gaps_is_replaced_on_request(tmp_path, found_gaps):
+    folder = written(tmp_path / "report", [found_gaps["plain_bekker"]])
+    write_report(
+        NOTHING, folder, settings=SamplerSettings(), command=["calib", "report"], title="Again",
+        overwrite=True,
+    )  # fmt: skip
+    assert not (folder / "gaps").exists()
+
+
+def test_an_effect_that_is_not_found_is_said_not_to_be(found_gaps):
+    result = found_gaps["held_out_pull"]
+    other = replace(result, gap=replace(result.gap, withheld="slip_zero_shift"))
+    said = _withheld(other)
+    assert "is not the one that is named" in said
+    assert odds_text(result.found.ranking.probability["slip_zero_shift"]).split()[-1] in said
+    assert _withheld(result) == ""
+
+
+def test_every_check_has_a_sentence_with_all_its_main_numbers(found_gaps):
+    for result in found_gaps.values():
+        for check in checks(result):
+            heading, sentence = check_text(check)
+            assert heading[0].isupper() or heading[0].isdigit()
+            assert any(character.isdigit() for character in sentence)
+            assert "nan" not in sentence
+
+
+UNIT = re.compile(r"\(.+\)$")
+
+
+@pytest.mark.parametrize(
+    "name", ["plain_bekker", "nominal_slip", "held_out_pull", "post_peak_18_psi"]
+)
+def test_errors_before_and_after_are_drawn_with_units_and_a_key(found_gaps, name):
+    result = found_gaps[name]
+    plate = gap_plate(result)
+    assert plate.figure is not None
+    before, after, which = plate.figure.axes
+    own = output_rows(result.found)[0]
+    for ax, predicted in ((before, own.before), (after, own.after)):
+        drawn = np.concatenate(
+            [line.get_ydata() for line in ax.lines if line.get_marker() not in ("None", "", None)]
+        )
+        errors = own.measured - predicted
+        assert all(np.isclose(drawn, error).any() for error in errors)
+        kept_out = 0 if result.gap.unfitted is None else len(result.gap.unfitted)
+        assert drawn.size == errors.size + kept_out
+    assert before.get_ylim() == after.get_ylim()
+    assert UNIT.search(before.get_ylabel())
+    assert all(UNIT.search(ax.get_xlabel()) for ax in plate.figure.axes)
+    (legend,) = plate.figure.legends
+    words = [text.get_text() for text in legend.get_texts()]
+    assert "90 % of the noise" in words
+    assert any("psi" in word for word in words)
+    widths = [bar.get_width() for bar in which.patches]
+    p = result.found.ranking.probability
+    assert widths == pytest.approx([p[n] for n in result.found.ranking.order[: len(widths)]])
+    # What is written beside the longest bar stays on the figure.
+    plate.figure.canvas.draw()
+    right = max(text.get_window_extent().x1 for text in which.texts)
+    assert right <= plate.figure.bbox.x1
+
+
+def test_the_caption_tells_the_errors(found_gaps):
+    result = found_gaps["plain_bekker"]
+    own = output_rows(result.found)[0]
+    rms = float(np.sqrt(np.mean((own.measured - own.before) ** 2)))
+    assert f"{rms:.1f} mm rms" in gap_plate(result).caption

@@ -1,0 +1,334 @@
+"""The embedded data: their files, and the published figures returned by independent fits."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from calib.he2019 import embedded, reconstruction
+from calib.he2019.published import PUBLISHED
+from calib.report.reference import Figure
+from tests.he2019.altered import printed_figures
+
+type Array = NDArray[np.float64]
+type Columns = dict[str, Array]
+
+HEADERS = {
+    "bulk_density": ["cone_index_kpa", "gravimetric_water_content", "bulk_density_g_cm3"],
+    "drawbar_pull": [
+        "inflation_pressure_psi", "nominal_slip_ratio", "slip_ratio", "drawbar_pull_kn",
+    ],
+    "rut_depth": [
+        "inflation_pressure_psi", "average_ground_pressure_kpa", "slip_ratio", "rut_depth_mm",
+    ],
+}  # fmt: skip
+
+
+def test_files_headers_and_counts(tmp_path: Path) -> None:
+    paths = embedded.write(tmp_path)
+    assert [path.name for path in paths] == [f"{name}.csv" for name in HEADERS]
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+    for path, rows in zip(paths, (36, 42, 27), strict=True):
+        lines = path.read_bytes().decode("ascii").split("\n")
+        assert lines[0].split(",") == HEADERS[path.stem]
+        assert len(lines) == rows + 2
+        assert lines[-1] == ""
+
+
+def test_same_bytes_every_time(tmp_path: Path) -> None:
+    first = [path.read_bytes() for path in embedded.write(tmp_path / "a")]
+    again = [
+        reconstruction.bulk_density(),
+        reconstruction.drawbar_pull(),
+        reconstruction.rut_depth(),
+    ]
+    for fresh, kept in zip(again, embedded.tables().values(), strict=True):
+        for name in kept:
+            assert np.array_equal(fresh[name], kept[name])
+    assert [path.read_bytes() for path in embedded.write(tmp_path / "b")] == first
+    assert [path.read_bytes() for path in embedded.write(tmp_path / "b")] == first
+
+
+def test_files_hold_what_the_functions_return(files: dict[str, Columns]) -> None:
+    for name, table in embedded.tables().items():
+        assert list(files[name]) == list(table)
+        for column, values in table.items():
+            assert np.array_equal(files[name][column], values), column
+
+
+def test_labelled_and_read_only() -> None:
+    assert embedded.LABEL == "reconstructed"
+    with pytest.raises(ValueError, match="read-only"):
+        embedded.columns("rut_depth")["rut_depth_mm"][0] = 1.0
+
+
+def test_reconstruction_is_quick() -> None:
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        reconstruction.bulk_density(), reconstruction.drawbar_pull(), reconstruction.rut_depth()
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 1.0
+
+
+def test_a_figure_knows_its_printed_digits() -> None:
+    figure = Figure("5.934e-10")
+    assert figure.value == 5.934e-10
+    assert figure.half_unit == pytest.approx(5e-14)
+    assert figure.agrees(5.9344e-10)
+    assert not figure.agrees(5.9346e-10)
+    assert Figure("0.0083").agrees(0.00834)
+    assert Figure("3.306e5").half_unit == pytest.approx(50.0)
+    assert not Figure("2").agrees(3)
+
+
+def test_nothing_can_be_changed() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        PUBLISHED.bulk_density.source = "elsewhere"  # type: ignore[misc]
+    with pytest.raises(TypeError):
+        PUBLISHED.bulk_density.estimates["C1"] = Figure("1")  # type: ignore[index]
+    with pytest.raises(TypeError):
+        PUBLISHED.genetic[18] = PUBLISHED.genetic[30]  # type: ignore[index]
+    with pytest.raises(TypeError):
+        PUBLISHED.setup.genetic_settings["F"] = Figure("1")  # type: ignore[index]
+
+
+def test_every_table_names_its_source() -> None:
+    tables = [PUBLISHED.bulk_density, PUBLISHED.pressure, PUBLISHED.rut_depth]
+    tables += [*PUBLISHED.geometric.values(), *PUBLISHED.genetic.values()]
+    assert {table.source.split(",")[0] for table in tables} == {
+        "Table 1", "Table 3", "Table 4", "Table 5", "Table 6",
+    }  # fmt: skip
+
+
+def test_every_negative_sign_says_what_it_was_inferred_from() -> None:
+    tables = [PUBLISHED.bulk_density, PUBLISHED.pressure, PUBLISHED.rut_depth]
+    tables += [*PUBLISHED.geometric.values(), *PUBLISHED.genetic.values()]
+    for table in tables:
+        for name, figure in table.estimates.items():
+            assert figure.note or "-" not in figure.text, (table.source, name)
+
+
+def test_every_printed_figure_is_listed_once() -> None:
+    found = printed_figures(PUBLISHED)
+    # Tables 1 and 6: 4 + 3 and 3 + 7; Tables 3 and 4: 5 for each pressure; Table 5: 10 + 1.
+    tables = 7 + 10 + 2 * 3 * 5 + 11
+    setup = len(PUBLISHED.setup.genetic_settings) + 3 + 2 + 8
+    assert len(found) == tables + setup
+    assert found["Table 4, 18 psi: E"].text == "-0.1026"
+    assert found["Table 2: NP"].value == 50
+    assert found["Setup: contact length, 42 psi"].unit == "mm"
+
+
+type Fit = Callable[[Callable[[Array], Array], Array, Array], tuple[Array, float]]
+
+
+def fit_density(fit: Fit, table: Columns, start: list[float]) -> tuple[float, list[float]]:
+    """Fit Eq 1 about the centre of the data: the density there takes the place of C1."""
+    ln_index, water = np.log(table["cone_index_kpa"]), table["gravimetric_water_content"]
+
+    def ln_term(t: Array, w: Array | float) -> Array:
+        return np.asarray(np.log(t[1] + (w - t[2]) ** 2))
+
+    def model(t: Array) -> Array:
+        rise = ln_index - ln_index.mean() + ln_term(t, water) - ln_term(t, water.mean())
+        return np.asarray(t[0] * np.exp(rise / t[3]))
+
+    t, sse = fit(model, table["bulk_density_g_cm3"], np.array([1.8, *start]))
+    ln_c1 = ln_index.mean() + float(ln_term(t, water.mean())) - t[3] * np.log(t[0])
+    return sse, [float(np.exp(ln_c1)), *map(float, t[1:])]
+
+
+def test_table_1(files: dict[str, Columns], exact_fit: Fit) -> None:
+    table = files["bulk_density"]
+    sse, (C1, C2, C3, C4) = fit_density(exact_fit, table, [0.1, 0.5, 30.0])
+    assert f"{C1:.3e}" == "5.934e-10"
+    assert [round(C2, 3), round(C3, 3), round(C4, 3)] == [0.022, 0.609, 42.996]
+    density_g = table["bulk_density_g_cm3"]
+    assert round(1.0 - sse / float(np.sum((density_g - density_g.mean()) ** 2)), 3) == 0.731
+    assert round(float(np.sqrt(sse / (density_g.size - 4))), 4) == 0.0282
+    water, index = table["gravimetric_water_content"], table["cone_index_kpa"]
+    predicted = (index / C1 * (C2 + (water - C3) ** 2)) ** (1.0 / C4)
+    worst = 100.0 * float(np.max(np.abs(predicted / density_g - 1.0)))
+    assert f"{worst:.2f}" == "2.94"
+
+
+def test_table_1_from_many_starts(files: dict[str, Columns], exact_fit: Fit) -> None:
+    table = files["bulk_density"]
+    rng = np.random.default_rng(7)
+    n = 40
+    starts = np.column_stack(
+        [
+            np.exp(rng.uniform(np.log(0.003), np.log(0.5), n)),
+            rng.uniform(0.2, 1.2, n),
+            rng.uniform(15.0, 90.0, n),
+        ]
+    )
+    with np.errstate(all="ignore"):
+        fits = [fit_density(exact_fit, table, list(start)) for start in starts]
+    best = min(sse for sse, _ in fits)
+    assert best == pytest.approx(0.0282**2 * 32, rel=1e-6)
+    # Far from the published optimum there is a flat one, without water in it, that costs more.
+    there = [t for sse, t in fits if sse < best * (1.0 + 1e-3)]
+    assert len(there) >= 0.8 * n
+    returned = {f"{t[0]:.3e} {t[1]:.3f} {t[2]:.3f} {t[3]:.3f}" for t in there}
+    assert returned == {"5.934e-10 0.022 0.609 42.996"}
+
+
+def test_density_design_is_plausible(files: dict[str, Columns]) -> None:
+    table = files["bulk_density"]
+    assert table["gravimetric_water_content"].max() <= 0.088
+    assert table["gravimetric_water_content"].min() > 0.0
+    assert 50.0 < table["cone_index_kpa"].min() < table["cone_index_kpa"].max() < 2500.0
+    assert 1.7 < table["bulk_density_g_cm3"].min() < table["bulk_density_g_cm3"].max() < 1.95
+
+
+TABLE_4 = {
+    18: (0.0794, 1.5619, 1.6480, -0.1026, 0.0485),
+    30: (0.0713, 1.5685, 1.0071, -6.0844, 0.0091),
+    42: (0.1265, 1.4802, 0.5954, -8.1747, 0.0083),
+}
+TABLE_3_D = {18: 1.6397, 30: 1.0058, 42: 0.5740}
+
+
+def magic(t: Array, x: Array) -> Array:
+    B, C, D, E = t
+    bx = B * x
+    return np.asarray(D * np.sin(C * np.arctan((1.0 - E) * bx + E * np.arctan(bx))))
+
+
+def at(table: Columns, psi: int) -> Columns:
+    rows = table["inflation_pressure_psi"] == psi
+    return {name: column[rows] for name, column in table.items()}
+
+
+def test_drawbar_design(files: dict[str, Columns]) -> None:
+    table = files["drawbar_pull"]
+    nominal = [0, 2.5, 5, 7.5, 10, 12.5, 15, 17.5, 20, 30, 40, 50, 60, 70]
+    for psi in TABLE_4:
+        assert 100.0 * at(table, psi)["nominal_slip_ratio"] == pytest.approx(nominal)
+    assert table["slip_ratio"] - table["nominal_slip_ratio"] == pytest.approx(0.02)
+
+
+@pytest.mark.parametrize("psi", TABLE_4)
+def test_table_4_is_the_global_optimum(files: dict[str, Columns], exact_fit: Fit, psi: int) -> None:
+    rows = at(files["drawbar_pull"], psi)
+    slip, pull = 100.0 * rows["slip_ratio"], rows["drawbar_pull_kn"]
+    rng = np.random.default_rng(5)
+    n = 60
+    starts = np.column_stack(
+        [
+            np.exp(rng.uniform(np.log(0.01), np.log(0.6), n)),
+            rng.uniform(1.02, 2.8, n),
+            rng.uniform(0.3, 2.2, n),
+            np.where(rng.random(n) < 0.5, rng.uniform(-2.0, 1.3, n), -rng.uniform(1.0, 40.0, n)),
+        ]
+    )
+    *published, cost = TABLE_4[psi]
+    with np.errstate(all="ignore"):
+        fits = [exact_fit(lambda t: magic(t, slip), pull, start) for start in starts]
+    best, least = min(fits, key=lambda found: found[1])
+    assert np.round(best, 4) == pytest.approx(published, abs=1e-12)
+    assert best == pytest.approx(published, abs=1e-5)
+    assert least == pytest.approx(cost, abs=1e-7)
+    found = sum(bool(np.allclose(t, published, atol=1e-4)) for t, _ in fits)
+    assert found >= n // 3
+    # Whatever else a fit may end in costs visibly more.
+    others = [sse for t, sse in fits if abs(t[1] - published[1]) > 0.01]
+    assert min(others, default=np.inf) > 1.004 * cost
+
+
+@pytest.mark.parametrize("psi", TABLE_4)
+def test_largest_pull_is_the_geometric_peak(files: dict[str, Columns], psi: int) -> None:
+    pull = at(files["drawbar_pull"], psi)["drawbar_pull_kn"]
+    assert round(float(pull.max()), 4) == TABLE_3_D[psi]
+
+
+def test_structure_past_the_peak_at_18_psi(files: dict[str, Columns]) -> None:
+    rows = at(files["drawbar_pull"], 18)
+    left = rows["drawbar_pull_kn"] - magic(np.array(TABLE_4[18][:4]), 100.0 * rows["slip_ratio"])
+    holds_up, falls_away, recovers = left[9:11], left[11:13], left[13]
+    assert holds_up.min() > 0.0 > falls_away.max()
+    assert recovers > 0.0
+
+
+def test_joint_model_costs_more_than_its_parts(files: dict[str, Columns], exact_fit: Fit) -> None:
+    # Quadratics in three pressures interpolate: the joint model has B, D, E free and C shared.
+    table = files["drawbar_pull"]
+    slip, pull = 100.0 * table["slip_ratio"].reshape(3, -1), table["drawbar_pull_kn"]
+
+    def joint(t: Array) -> Array:
+        each = [
+            magic(np.array([B, t[0], D, E]), x)
+            for (B, D, E), x in zip(t[1:].reshape(3, 3), slip, strict=True)
+        ]
+        return np.concatenate(each)
+
+    start = [1.55, *(v for B, _, D, E, _ in TABLE_4.values() for v in (B, D, E))]
+    _, cost = exact_fit(joint, pull, np.array(start))
+    assert 0.0659 < cost < 0.1050
+    assert cost == pytest.approx(0.0709, abs=5e-5)
+
+
+PRESSURES_PSI = (18, 30, 42)
+
+
+def log_regression(table: Columns) -> tuple[Array, float, float]:
+    rows = table["inflation_pressure_psi"] != 30
+    ln_p = np.log(table["average_ground_pressure_kpa"][rows])
+    ln_z = np.log(table["rut_depth_mm"][rows] / 1000.0)
+    X = np.column_stack([ln_z, table["slip_ratio"][rows] * ln_z, np.ones(ln_z.size)])
+    beta = np.linalg.lstsq(X, ln_p)[0]
+    sse = float(np.sum((ln_p - X @ beta) ** 2))
+    r_squared = 1.0 - sse / float(np.sum((ln_p - ln_p.mean()) ** 2))
+    return beta, r_squared, float(np.sqrt(sse / (ln_p.size - 3)))
+
+
+def test_rut_design(files: dict[str, Columns]) -> None:
+    table = files["rut_depth"]
+    for psi in PRESSURES_PSI:
+        rows = at(table, psi)
+        assert rows["slip_ratio"] == pytest.approx(np.arange(9) * 0.025)
+        assert np.unique(rows["average_ground_pressure_kpa"]).size == 1
+    low, mid, high = (at(table, p)["average_ground_pressure_kpa"][0] for p in PRESSURES_PSI)
+    assert np.log(high / low) == pytest.approx(0.4772, abs=1e-4)
+    assert np.sqrt(low * high) == pytest.approx(np.sqrt(106.577 * 178.192), rel=1e-4)
+    assert low < mid < high
+    assert 12.0 < table["rut_depth_mm"].min() < table["rut_depth_mm"].max() < 45.0
+
+
+def test_table_6(files: dict[str, Columns]) -> None:
+    (n0, n1, ln_k), r_squared, rmse = log_regression(files["rut_depth"])
+    assert round(n0, 3) == 1.996
+    assert round(n1, 3) == 1.266
+    assert f"{np.exp(ln_k):.3e}" == "3.306e+05"
+    assert np.exp(ln_k) == pytest.approx(3.306e5, abs=10.0)
+    assert round(r_squared, 3) == 0.630
+    assert round(rmse, 3) == 0.159
+
+
+def test_rut_extremes(files: dict[str, Columns]) -> None:
+    table = files["rut_depth"]
+    (n0, n1, ln_k), _, _ = log_regression(table)
+    ln_p = np.log(table["average_ground_pressure_kpa"])
+    predicted = 1000.0 * np.exp((ln_p - ln_k) / (n0 + n1 * table["slip_ratio"]))
+    error = np.abs(predicted / table["rut_depth_mm"] - 1.0)
+    held_out = table["inflation_pressure_psi"] == 30
+    assert f"{100.0 * error[~held_out].max():.0f}" == "13"
+    assert np.mean(error[~held_out] < 0.10) > 0.5
+    assert f"{100.0 * error[held_out].max():.1f}" == "9.7"
+    assert np.sum(error[held_out] > 0.06) == 2
+
+
+def test_rut_grows_with_slip_and_pressure(files: dict[str, Columns]) -> None:
+    table = files["rut_depth"]
+    ruts = [at(table, psi)["rut_depth_mm"] for psi in PRESSURES_PSI]
+    assert ruts[0].mean() < ruts[1].mean() < ruts[2].mean()
+    for rut_mm in ruts:
+        assert np.polyfit(np.arange(9), rut_mm, 1)[0] > 0.0

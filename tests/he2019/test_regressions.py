@@ -1,0 +1,294 @@
+"""Tables 1 and 6: the verdict follows the figure, and would be another for another figure."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib.data import hold_out
+from calib.he2019.audit.bounds import printed
+from calib.he2019.audit.finding import Verdict
+from calib.he2019.audit.regressions import (
+    attenuation,
+    density_findings,
+    density_range,
+    inverse_by_likelihood,
+    inverse_by_print,
+    inverse_findings,
+    log_pressure_ratio,
+    prediction_at_30,
+    rut_quality_findings,
+    simulate_inverse,
+    study_inverse,
+    study_quality,
+    within_pressure_sd,
+)
+from calib.he2019.embedded import load_he2019
+from calib.he2019.estimators import rut_regression
+from calib.he2019.published import PUBLISHED
+from calib.inference.estimators import estimate
+from calib.inference.problem import build_problem
+from calib.models.ayers_perumpral import bulk_density
+from tests.he2019.altered import altered
+
+
+def judged(published):
+    return {f.key: f for f in density_findings(published)}
+
+
+def test_verdicts():
+    assert {key: f.verdict for key, f in judged(PUBLISHED).items()} == {
+        "table1_exponent_of_C1": Verdict.CONFIRMED,
+        "table1_sign_of_C3": Verdict.UNTESTABLE,
+        "table1_unit_of_cone_index": Verdict.UNTESTABLE,
+        "table1_quality": Verdict.CONSISTENT,
+        "table1_values": Verdict.UNTESTABLE,
+    }
+
+
+@given(st.lists(st.floats(0, 1), min_size=6, max_size=6))
+def test_every_density_lies_in_the_range(shares):
+    figures = [printed(PUBLISHED.bulk_density.estimates[n]) for n in ("C1", "C2", "C3", "C4")]
+    c = [float(i.lower + s * (i.upper - i.lower)) for i, s in zip(figures, shares, strict=False)]
+    index, water = np.array(100.0 + 2900.0 * shares[4]), np.array(0.088 * shares[5])
+    assert density_range(PUBLISHED).holds(bulk_density(index, water, *c))
+
+
+def test_the_range_is_reached_at_its_corners():
+    v = PUBLISHED.bulk_density.values
+    found = density_range(PUBLISHED)
+    low = bulk_density(np.array(100.0), np.array(0.088), **v)
+    high = bulk_density(np.array(3000.0), np.array(0.0), **v)
+    assert float(found.lower) == pytest.approx(float(low), rel=2e-3)
+    assert float(found.upper) == pytest.approx(float(high), rel=2e-3)
+
+
+def test_the_other_exponent_is_corrected():
+    found = judged(altered({"Table 1: C1": "5.934e10"}))["table1_exponent_of_C1"]
+    assert found.verdict is Verdict.CORRECTED
+
+
+def test_an_exponent_that_matters_little_stays_open():
+    # With C1 near one both signs of its exponent are alike.
+    found = judged(altered({"Table 1: C1": "5.934e-1", "Table 1: C4": "13.2"}))
+    assert found["table1_exponent_of_C1"].verdict is Verdict.CONSISTENT
+
+
+def test_the_other_exponent_could_hold_for_few_samples_only():
+    # By brute force: errors of equal size are the smallest largest error that an RMSE allows.
+    density, relative, rmse = 0.6621, 0.02945, 0.02815
+    possible = [
+        n for n in range(5, 200)
+        if rmse * np.sqrt((n - 4) / n) <= relative * density / (1.0 - relative)
+    ]  # fmt: skip
+    evidence = judged(PUBLISHED)["table1_exponent_of_C1"].evidence
+    assert f"only with {max(possible)} samples or fewer" in evidence
+
+
+def test_a_steep_relation_would_show_the_sign_of_C3():
+    found = judged(altered({"Table 1: C4": "8.000", "Table 1: C1": "5.934e0"}))
+    assert found["table1_sign_of_C3"].verdict is not Verdict.UNTESTABLE
+
+
+@pytest.mark.parametrize(
+    ("C1", "verdict"),
+    [("5.934e-13", Verdict.CORRECTED), ("5.934e-16", Verdict.CONTRADICTED),
+     ("5.934e0", Verdict.CONSISTENT)],
+)  # fmt: skip
+def test_the_unit_of_cone_index_would_be_decided_by_another_C1(C1, verdict):
+    # A thousand times less: only MPa gives a soil. A thousand times more: only kPa does.
+    found = judged(altered({"Table 1: C1": C1}))["table1_unit_of_cone_index"]
+    assert found.verdict is verdict
+
+
+@pytest.mark.parametrize(
+    "changes", [{"Table 1: max_relative_error": "0.0024"}, {"Table 1: r_squared": "0.981"}]
+)
+def test_quality_that_cannot_belong_to_one_fit(changes):
+    # Errors all below 0.24 % cannot have that RMSE; an R^2 of 0.98 needs cone indices over decades.
+    assert judged(altered(changes))["table1_quality"].verdict is Verdict.CONTRADICTED
+
+
+def judged_rut(published):
+    return {f.key: f for f in rut_quality_findings(published, study_quality(published))}
+
+
+@pytest.fixture(scope="module")
+def study():
+    return study_quality(PUBLISHED)
+
+
+def test_verdicts_of_rut_quality():
+    assert {key: f.verdict for key, f in judged_rut(PUBLISHED).items()} == {
+        "table6_consistency": Verdict.CONTRADICTED,
+        "table6_fitted_errors": Verdict.CONSISTENT,
+        "table6_held_out_errors": Verdict.CONSISTENT,
+        "ground_pressure": Verdict.UNTESTABLE,
+    }
+
+
+@pytest.mark.parametrize(("n", "share"), [(18, 0.5), (28, 0.5), (20, 0.3), (90, 0.5)])
+def test_the_identity_on_regressions(n, share):
+    rng = np.random.default_rng(n)
+    gap = 0.51
+    y = np.where(np.arange(n) < share * n, 4.7, 4.7 + gap)
+    z = 0.4 * y + 0.2 * rng.standard_normal(n)
+    X = np.column_stack([np.ones(n), z, rng.uniform(0.0, 0.2, n) * z])
+    left = y - X @ np.linalg.lstsq(X, y, rcond=None)[0]
+    sse, sst = float(left @ left), float(np.sum((y - y.mean()) ** 2))
+    known = altered(
+        {"Table 6: r_squared": f"{1.0 - sse / sst:.6f}",
+         "Table 6: rmse": f"{np.sqrt(sse / (n - 3)):.6f}"}
+    )  # fmt: skip
+    found = log_pressure_ratio(known, np.array(float(n)), share)
+    assert found.holds(gap)
+    assert float(found.half_width) < 1e-4
+
+
+def test_the_number_of_points_that_reconciles(study):
+    # Independent: solved for n with the digits at their ends.
+    gap = np.log(266.56 / 159.43)
+    ends = [3.0 / (1.0 - gap**2 * (1.0 - r) / (4.0 * s**2))
+            for r, s in ((0.6305, 0.1595), (0.6295, 0.1585))]  # fmt: skip
+    # The contact lengths' own digits move either end by less than one point.
+    assert study.reconciled.min() == pytest.approx(np.ceil(ends[0]), abs=1)
+    assert study.reconciled.max() == pytest.approx(np.floor(ends[1]), abs=1)
+    assert 90 in study.reconciled
+    assert 18 not in study.reconciled
+
+
+def test_figures_that_agree_with_18_points_are_consistent():
+    assert judged_rut(altered({"Table 6: rmse": "0.171"}))["table6_consistency"].verdict is (
+        Verdict.CONSISTENT
+    )
+
+
+def test_the_scatter_within_pressures_is_that_of_the_reconstructed_data():
+    fitted, _ = hold_out(load_he2019("rut_depth"), "inflation_pressure_psi", 30.0)
+    problem = build_problem("modified_bekker", fitted)
+    direct = estimate(problem, "least_squares", np.random.default_rng(1))
+    assert within_pressure_sd(PUBLISHED, 18) == pytest.approx(direct.rmse, rel=0.05)
+
+
+@pytest.mark.parametrize("largest", ["0.01", "0.60"])
+def test_fitted_errors_that_the_rmse_does_not_allow(largest):
+    found = judged_rut(altered({"Table 6: max_relative_error": largest}))
+    assert found["table6_fitted_errors"].verdict is Verdict.CONTRADICTED
+
+
+def test_held_out_errors_too_good_to_be_true():
+    found = judged_rut(altered({"Table 6: held_out_max_relative_error": "0.012"}))
+    assert found["table6_held_out_errors"].verdict is Verdict.CONTRADICTED
+
+
+def test_load_over_area_by_hand():
+    found = judged_rut(PUBLISHED)["ground_pressure"].found
+    for quantity, length in zip(found, (266.56, 201.59, 159.43), strict=True):
+        assert quantity.value == pytest.approx(5e6 / (176.0 * length), rel=1e-5)
+
+
+@pytest.fixture(scope="module")
+def inverse(rut_calibration):
+    return study_inverse(PUBLISHED, 2019, calibration=rut_calibration)
+
+
+def test_verdicts_of_inverse(inverse):
+    assert {f.key: f.verdict for f in inverse_findings(PUBLISHED, inverse)} == {
+        "table6_inverse_regression": Verdict.CORRECTED,
+        "table6_likelihood": Verdict.CORRECTED,
+        "table6_prediction_at_30": Verdict.CORRECTED,
+    }
+
+
+def test_only_the_likelihood_depends_on_the_reconstruction(inverse):
+    found = {f.key: f.reconstructed for f in inverse_findings(PUBLISHED, inverse)}
+    assert found == {
+        "table6_inverse_regression": False, "table6_likelihood": True,
+        "table6_prediction_at_30": False,
+    }  # fmt: skip
+
+
+def test_the_fitted_means_differ_by_R2_of_the_pressures():
+    """The identity behind the correction, on the reconstructed ruts and their own regression."""
+    fitted, _ = hold_out(load_he2019("rut_depth"), "inflation_pressure_psi", 30.0)
+    ln_z = np.log(fitted["rut_depth_mm"] / 1000.0)
+    exponent = 1.996 + 1.266 * fitted["slip_ratio"]
+    low = fitted["inflation_pressure_psi"] == 18.0
+    ln_p = np.log(fitted["average_ground_pressure_kpa"])
+    gap = float(ln_p[~low].mean() - ln_p[low].mean())
+    by_means = float((exponent * ln_z)[~low].mean() - (exponent * ln_z)[low].mean())
+    assert by_means / gap == pytest.approx(0.630, abs=5e-4)
+
+
+def test_corrected_exponents_bring_the_ratio_of_ruts_back():
+    found = {q.name: q for q in inverse_by_print(PUBLISHED).found}
+    assert found["n0, by the means of the ruts"].value == pytest.approx(1.996 / 0.630, rel=1e-5)
+    fitted, _ = hold_out(load_he2019("rut_depth"), "inflation_pressure_psi", 30.0)
+    ln_z, low = np.log(fitted["rut_depth_mm"]), fitted["inflation_pressure_psi"] == 18.0
+    ratio = float(np.exp(ln_z[~low].mean() - ln_z[low].mean()))
+    # The reconstructed pressures are 0.477 apart in logarithm, the contact lengths 0.514.
+    stated = found["rut at 42 psi over rut at 18 psi, by their means"].value
+    assert np.log(stated) * 0.4772 / 0.5140 == pytest.approx(np.log(ratio), rel=0.03)
+
+
+def test_a_good_fit_needs_no_correction(inverse):
+    good = altered({"Table 6: r_squared": "0.990"})
+    assert inverse_by_print(good).verdict is Verdict.CONFIRMED
+    assert prediction_at_30(good, inverse).verdict is Verdict.CONSISTENT
+    assert attenuation(good).holds(1.0 / 0.9903)
+
+
+def test_a_held_out_pressure_far_from_the_middle_would_see_it(inverse):
+    lengths = dict(PUBLISHED.setup.contact_length_mm)
+    lengths[30] = replace(lengths[30], text="60.00")
+    far = replace(PUBLISHED, setup=replace(PUBLISHED.setup, contact_length_mm=lengths))
+    assert prediction_at_30(far, inverse).verdict is Verdict.CONSISTENT
+
+
+def test_where_Eq_22_holds_the_truth_nothing_is_corrected(inverse):
+    scattered = inverse.simulated * [2.0, 1.0, 1.0]
+    lucky = replace(inverse, simulated=np.vstack([inverse.simulated, scattered]))
+    assert inverse_by_likelihood(PUBLISHED, lucky).verdict is Verdict.CONSISTENT
+
+
+def test_simulated_regressions_are_those_of_the_estimator(inverse):
+    problem, truth = inverse.calibration.problem, inverse.direct
+    found = simulate_inverse(problem, truth, np.random.default_rng(3), size=1)
+    # The same campaign, regressed by the package's estimator.
+    v, table = truth.reported, problem.table
+    slip = table["slip_ratio"]
+    mean = np.log(table["average_ground_pressure_kpa"] / v["k"]) / (v["n0"] + v["n1"] * slip)
+    ln_z = mean + truth.rmse * np.random.default_rng(3).standard_normal((1, slip.size))[0]
+    columns = dict(table.columns) | {"rut_depth_mm": 1000.0 * np.exp(ln_z)}
+    again = rut_regression(problem.with_table(replace(table, columns=columns)))
+    assert found[0] == pytest.approx(
+        [again.reported["n0"], again.reported["n1"], again.r_squared], rel=1e-8
+    )
+
+
+def test_without_noise_nothing_is_attenuated(inverse):
+    exact = replace(inverse.direct, rmse=1e-9)
+    rng = np.random.default_rng(1)
+    n0, n1, r_squared = simulate_inverse(inverse.calibration.problem, exact, rng, size=1)[0]
+    assert (n0, n1) == pytest.approx(
+        (exact.reported["n0"], exact.reported["n1"]), rel=1e-5
+    )  # fmt: skip
+    assert r_squared == pytest.approx(1.0)
+
+
+def test_posterior_statements_carry_intervals(inverse):
+    found = inverse_by_likelihood(PUBLISHED, inverse)
+    posterior = [q for q in found.found if "posterior" in q.name]
+    assert len(posterior) == 3
+    assert all(q.lower < q.value < q.upper and q.interval == "95 % HDI" for q in posterior)
+
+
+def test_what_has_not_converged_decides_nothing(inverse):
+    report = replace(inverse.calibration.draws.report, passed=False, reasons=("R-hat",))
+    draws = replace(inverse.calibration.draws, report=report)
+    unfinished = replace(inverse, calibration=replace(inverse.calibration, draws=draws))
+    assert inverse_by_likelihood(PUBLISHED, unfinished).verdict is Verdict.UNTESTABLE
