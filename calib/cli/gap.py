@@ -116,7 +116,7 @@ def diagnose(
     print(track_record_text(found.ranking.probability[found.ranking.order[0]]))
     for output, s in found.shrink.items():
         low, high = s.interval
-        unit = QUANTITIES[OUTPUTS[output]].unit.replace("**", "").replace("*", " ")
+        unit = QUANTITIES[OUTPUTS[output]].unit_word
         print(
             f"{output}: error {format_number(s.rmse_before)} -> {format_number(s.rmse_after)} "
             f"{unit} rms, shrink {100 * s.fraction:.0f} % (90 % interval {100 * low:.0f} to "

@@ -241,6 +241,11 @@ class Quantity:
         """Its name in a sentence."""
         return self.stem.replace("_", " ")
 
+    @property
+    def unit_word(self) -> str:
+        """The canonical unit as messages say it; empty for a plain number."""
+        return self.unit.replace("dimensionless", "").replace("**", "").replace("*", " ")
+
     def register(self) -> None:
         """Make it known.
 

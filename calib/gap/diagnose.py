@@ -24,6 +24,7 @@ from calib.gap.corrected import (
     shrink,
 )
 from calib.gap.declared import new_values
+from calib.gap.doubts import doubts
 from calib.gap.effects import EFFECTS, Effect, View
 from calib.gap.effects.check import check_effects
 from calib.gap.hypotheses import inseparable, singles, with_own
@@ -43,6 +44,7 @@ from calib.gap.where import Region, RowGap, regions, row_gaps, unused_rows
 from calib.gap.which import Lab, Ranking, calibrate_lab, rank
 from calib.inference.random import generator
 from calib.models.base import Array
+from calib.validation.assumptions import Remark
 
 # A single hypothesis is named when it is at least this probable.
 NAMED = 0.5
@@ -84,6 +86,8 @@ class Diagnosis:
         What a reader must know: of the input, what was set aside, what is extrapolated.
     unused : mapping of str to (mapping of int to str)
         Field rows that an output was not judged by, by output and row, with the reason.
+    doubts : tuple of Remark
+        What the most probable explanation leaves in the field, and should not; among the warnings.
     """
 
     data: Campaigns
@@ -101,6 +105,7 @@ class Diagnosis:
     without_context: Mapping[str, float] | None = None
     warnings: tuple[str, ...] = ()
     unused: Mapping[str, Mapping[int, str]] = field(default_factory=dict)
+    doubts: tuple[Remark, ...] = ()
 
     def __repr__(self) -> str:
         """Name the case, the verdict and the most probable hypotheses."""
@@ -163,6 +168,7 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
     far = shrink(data, at_target, before, at_target.means)
     causes = inclusion(mixed, ranking)
     known = with_own(data, effects)
+    remarks = doubts(data, ranking)
     said += [
         *_beyond(corrected, before),
         *_confounded(data, causes, known),
@@ -184,11 +190,13 @@ def diagnose_once(case: Case, seed: int, effects: Mapping[str, Effect] = EFFECTS
         _without_context(case, seed, effects),
         (
             *case.notes,
+            *(remark.text for remark in remarks),
             *oddities(case.lab, case.field, case.models),
             *new_values(case.covariates, case.lab, case.field),
             *said,
         ),
         unused_rows(data, case.field),
+        remarks,
     )
 
 

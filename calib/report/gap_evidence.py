@@ -87,6 +87,7 @@ def gap_evidence(found: Diagnosis) -> GapEvidence:
         without=_without(found),
         excluded=case_context.excluded,
         runs=over_runs(found),
+        doubts=[remark.title for remark in found.doubts],
     )
 
 

@@ -164,6 +164,8 @@ class GapEvidence:
         Effects among what was put in that are known not to act.
     runs : RunsFact, optional
         A change over the order of the runs, of the outputs that most probably do.
+    doubts : sequence of str
+        What the most probable explanation leaves in the field, and should not, each in a clause.
     """
 
     verdict: str
@@ -185,6 +187,7 @@ class GapEvidence:
     without: str = ""
     excluded: Sequence[str] = ()
     runs: RunsFact | None = None
+    doubts: Sequence[str] = ()
 
     @property
     def acting(self) -> list[CauseFact]:

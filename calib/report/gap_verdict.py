@@ -14,6 +14,8 @@ The first rule that applies decides:
 8. recalibrate: the same model with other parameter values closes the gap;
 9. named: one effect, or pair, at a probability of 90 % or more;
 10. likely: one effect, or pair, that is more probable than all others together.
+
+What the best explanation leaves in the field, and should not, is said with any, which is not fine.
 """
 
 from __future__ import annotations
@@ -144,6 +146,10 @@ class GapVerdict:
 def judge_gap(e: GapEvidence) -> GapVerdict:
     """Apply the rules."""
     found = _judge(e)
+    if e.doubts:
+        said = "no gap on average" if e.verdict == "none" else found.headline
+        tone = Tone.CARE if found.tone is Tone.FINE else found.tone
+        found = replace(found, tone=tone, headline=f"{said}, but {joined(list(e.doubts))}")
     headline = found.headline[0].upper() + found.headline[1:]
     return replace(
         found, headline=headline, facts=[(k, v[0].upper() + v[1:]) for k, v in found.facts]

@@ -7,7 +7,7 @@ chance that any of them fails. `docs/statistics/likelihood.md` lists them.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -406,19 +406,23 @@ def residual_checks(problem: Problem, t: Array) -> tuple[Check, ...]:
     judged = leverage < 1.0 - 1e-9
     studentised = np.where(judged, score / np.sqrt(np.where(judged, 1.0 - leverage, 1.0)), np.nan)
     return (
-        *_unexplained(problem, studentised),
+        *unexplained(problem.table, _unused(problem), studentised),
         *(() if problem.serial is not None else _autocorrelated(problem.table, score, design)),
         *_uneven(problem, studentised), *_heavy_tailed(problem, studentised[judged]),
     )  # fmt: skip
 
 
-def _unexplained(problem: Problem, residual: Array) -> Iterable[Check]:
-    """Whether residuals (n,) differ with a column that is not used.
+def unexplained(
+    table: Table, columns: Mapping[str, NDArray[np.str_] | Array], residual: Array, *,
+    title: str = "A column explains the residuals",
+    mend: str = "",
+) -> Iterable[Check]:  # fmt: skip
+    """Whether residuals (n,), in noise sds, differ with a column of a table that is not used.
 
     Numbers by Spearman's rank correlation, and groups (of a category, of a number with few values,
     of quarters of the rows otherwise) by Kruskal and Wallis's (1952) test.
     """
-    for header, cells in _unused(problem).items():
+    for header, cells in columns.items():
         numbers = _numbers(cells)
         there = np.isfinite(residual) & (np.isfinite(numbers) | np.isnan(numbers).all())
         if there.sum() < _FEWEST:
@@ -430,9 +434,11 @@ def _unexplained(problem: Problem, residual: Array) -> Iterable[Check]:
         if not category and np.unique(x).size > 1:
             found.append(scipy.stats.spearmanr(score, x).pvalue)
         levels, group, count = np.unique(names, return_inverse=True, return_counts=True)
-        remedy = "fit each of its values by itself, or choose a model that has it as a condition"
+        remedy = mend or (
+            "fit each of its values by itself, or choose a model that has it as a condition"
+        )
         if not category and count.min() < _FEWEST_IN_GROUP:
-            remedy = (
+            remedy = mend or (
                 "choose a model that has it as a condition or, if the readings drift along the "
                 'runs, write correlated_along = "run_order" (a column) in the prior file'
             )
@@ -457,9 +463,9 @@ def _unexplained(problem: Problem, residual: Array) -> Iterable[Check]:
             for i in (high, low)
         ]
         yield Check(p, Remark(
-            f"{source_of(problem.table)}: the residuals differ with {header!r}, a column that is "
-            f"not used: on average {' and '.join(said)} (p = {plain_number(p, 2)}); {remedy}",
-            "A column explains the residuals", shifts=True,
+            f"{source_of(table)}: the residuals differ with {header!r}, a column that is not used: "
+            f"on average {' and '.join(said)} (p = {plain_number(p, 2)}); {remedy}",
+            title.format(header), shifts=True,
         ))  # fmt: skip
 
 
@@ -469,6 +475,11 @@ def _unused(problem: Problem) -> dict[str, NDArray[np.str_] | Array]:
     own = {*problem.conditions, *OUTPUTS.values(), problem.bound.model.output}
     own |= {name for name in table if name in QUANTITIES
             and QUANTITIES[name].stem in (choice.depends_on, choice.correlated_along)}  # fmt: skip
+    return unused(table, own)
+
+
+def unused(table: Table, own: Collection[str]) -> dict[str, NDArray[np.str_] | Array]:
+    """Columns of a table, by their headers, save those by whose canonical names rows are judged."""
     known = {table.header_of(n): values for n, values in table.columns.items() if n not in own}
     # A label's numbers are codes.
     for name in (n for n in table if n in QUANTITIES and QUANTITIES[n].kind == "label"):

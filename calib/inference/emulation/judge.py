@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from calib.data.files import plain_number
+from calib.data.quantities import QUANTITIES
 from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut
 from calib.inference.emulation.state import State
 from calib.models.base import Array
@@ -203,7 +204,7 @@ def _usable(
     model = state.problem.bound.model
     unit = f"{100.0 * off * state.sigma:.2g} %"
     if model.response != "log":
-        unit = f"{plain_number(off * state.sigma, 2)} in the unit of {model.output}"
+        unit = f"{plain_number(off * state.sigma, 2)} {QUANTITIES[model.output].unit_word}".rstrip()
     return (
         f"{said}; the simulator's own output is known to {unit} (rms). It is usable for what is "
         "coarser than that, not to compare models or to tell smaller gaps"
