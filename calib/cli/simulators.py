@@ -90,14 +90,14 @@ def prepare_case(
     if run is None and not any(map(simulated_by, case.models.values())):
         return []
     # Of which most cases have no need.
+    from calib.gap.campaigns import campaigns
     from calib.inference.emulation.prepared import prepare, prepare_field, reaches
 
+    campaigns(case)  # refuses, before any run is made, what cannot be diagnosed
     said = []
     others = [case.field, *([] if case.new_conditions is None else [case.new_conditions])]
     for output, model in case.models.items():
         column = OUTPUTS[output]
-        if column not in case.lab or column not in case.field:
-            continue  # told when the case is bound
 
         def measured(table: Table, column: str = column) -> Table:
             return table.take(np.isfinite(table[column]))

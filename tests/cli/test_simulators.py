@@ -8,7 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from calib.cli.simulators import say, say_failed
+from calib.cli.simulators import prepare_case, say, say_failed
+from calib.data import table_from_arrays
+from calib.errors import CalibError
+from calib.gap.case import Case
 from calib.inference.emulation import Emulation
 from calib.inference.emulation.settings import HeldOut
 from calib.models import MODELS
@@ -16,7 +19,8 @@ from calib.models.simulators.base import Failure
 from calib.models.simulators.files import read_simulator
 from calib.models.simulators.registered import SIMULATED
 from calib.models.simulators.runs import Run
-from tests.models.simulators.examples import write_program
+from tests.models.simulators.examples import lab, write_program
+from tests.registered import forgotten
 
 
 def emulation(**other: Any) -> Emulation:
@@ -63,6 +67,22 @@ def test_runs_of_a_field_campaign_are_told_as_such(capsys: pytest.CaptureFixture
 def test_of_a_model_that_needs_none_nothing_is_said(capsys: pytest.CaptureFixture[str]) -> None:
     assert say("bekker", None)
     assert capsys.readouterr().out == ""
+
+
+def test_a_case_that_cannot_be_diagnosed_is_refused_before_any_run(tmp_path: Path) -> None:
+    found = read_simulator(write_program(tmp_path))
+    with forgotten(MODELS, SIMULATED):
+        found.register()
+        rows = table_from_arrays(lab(np.random.default_rng(1)))
+        reversed_rows = rows.take(np.arange(len(rows))[::-1])
+        for field, words in (
+            (reversed_rows, "every field row is a row of the calibration"),
+            (rows.take([0, 1, 2]), "3 field rows .* cannot show a gap"),
+        ):
+            case = Case("same", rows, field, {"drawbar_pull": "wheel"})
+            with pytest.raises(CalibError, match=words):
+                prepare_case(case, None, 1, 1, lambda *_: None)
+    assert not list((tmp_path / "wheel.runs").rglob("*.json"))
 
 
 def test_runs_that_fail_under_the_sampler_are_listed(
