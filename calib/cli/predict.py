@@ -99,9 +99,12 @@ def predict(
     outside = sum(bool(flags) for flags in prediction.outside)
     if outside:
         lie = "row lies" if outside == 1 else "rows lie"
-        print(f"calib: {outside} {lie} outside the calibrated range", file=sys.stderr)
+        print(
+            f"warning: {outside} {lie} outside the calibrated range, where the prediction is not "
+            "to be trusted", file=sys.stderr,
+        )  # fmt: skip
         for note in beyond_notes(table, known):
-            print(f"calib: {note}", file=sys.stderr)
+            print(f"warning: {note}", file=sys.stderr)
     undefined = int((prediction.defined < MIN_DEFINED).sum())
     if undefined:
         emulated = any(emulator_of(c.problem.bound.model) is not None for _, c in parts)

@@ -225,7 +225,7 @@ def usual_in(table: Table, name: str, values: Array, low: float, high: float) ->
 
 
 def beyond_notes(table: Table, known: Mapping[str, Array]) -> Iterator[str]:
-    """Say which columns lie beyond known values, and would lie among them in another unit.
+    """Say which values lie beyond known ones, and in which unit they would lie among them.
 
     Parameters
     ----------
@@ -235,15 +235,18 @@ def beyond_notes(table: Table, known: Mapping[str, Array]) -> Iterator[str]:
     """
     for name, values in known.items():
         low, high = float(values.min()), float(values.max())
-        beyond = (table[name] < low) | (table[name] > high)
-        read = usual_in(table, name, table[name], low, high) if beyond.mean() >= _MOST else ""
-        if read:
-            yield (
-                f"{source_of(table)}, {table.header_of(name)}: nearly all values lie beyond the "
-                "calibrated ones, "
-                f"and all would lie among them if the readings are in {read}; check the unit in "
-                "the column name"
-            )
+        off = np.maximum(low - table[name], table[name] - high)
+        beyond = off > 1e-9 * max(abs(low), abs(high))
+        if not beyond.any():
+            continue
+        read = usual_in(table, name, table[name][beyond], low, high)
+        farthest = float(table.column(name).written(table[name][np.argmax(off)]))
+        yield (
+            f"{table.source}, {lines_of(table, beyond)}: {table.header_of(name)}"
+            f"{' up to' if beyond.sum() > 1 else ' ='} {plain_number(farthest, 4)}, calibrated "
+            f"from {_between(table, name, low, high)}"
+        ) + (f"; inside if the readings are in {read}; check the unit in the column name"
+             if read else "")  # fmt: skip
 
 
 def _written(unit: str) -> str:

@@ -79,14 +79,14 @@ def left_over(data: Campaigns, ranking: Ranking) -> list[str]:
     for o in data.outputs:
         z = best.field_residuals[o.name]
         at = ", ".join(
-            f"line {field.lines[o.rows[i]]} ({z[i]:+.1f})"
+            f"line {field.lines[o.rows[i]]} ({z[i]:+.1f} noise sds)"
             for i in np.argsort(-np.abs(z))
             if abs(z[i]) > LEFT_OVER
         )
         if at:
             said.append(
-                f"{field.source}, {at}: {o.name.replace('_', ' ')} so many noise sds off what the "
-                "most probable hypothesis says; something may act there that it does not name"
+                f"{field.source}, {at}: {o.name.replace('_', ' ')} is far from the most probable "
+                "explanation; something may act there that it does not name: check these readings"
             )
     return said
 

@@ -92,6 +92,7 @@ def try_simulator(problem: Problem) -> None:
         direct.try_first(thetas, problem.conditions)
         outputs = problem.bound.predict(thetas, problem.conditions)
     check_scale(problem, outputs, direct.simulator)
+    check_moves(problem, outputs, direct.simulator)
     for i in np.flatnonzero(np.isfinite(outputs).all(axis=1))[:1]:
         _check_repeats(problem, thetas[i : i + 1], direct.simulator.place())
     direct.tally.tried = True
@@ -137,6 +138,28 @@ def _check_repeats(problem: Problem, theta: Array, where: str) -> None:
         mend="fix the seed of its random numbers; or, if a simulator is to scatter, have it "
         "emulated with deterministic = false, which allows for it",
     )
+
+
+def check_moves(problem: Problem, outputs: Array, simulator: Simulator) -> None:
+    """Check that outputs over the prior, (k, n), are not all the same.
+
+    Raises
+    ------
+    CalibError
+        If they are, and there are parameters: the simulator does not read them, or writes what
+        does not depend on them.
+    """
+    values = outputs[np.isfinite(outputs).all(axis=1)]
+    names = [name for name in problem.names if name in problem.bound.model.parameters]
+    if not names or len(values) < 2 or np.ptp(values, axis=0).max() > _SAME * np.abs(values).max():
+        return
+    raise CalibError(
+        f"no parameter changes the output: it is the same in all of {len(values)} runs over the "
+        f"prior of {', '.join(names)}",
+        where=simulator.place("unreadable"), allowed="an output that depends on its parameters",
+        mend="see whether the simulator reads the parameters that it is given, and returns what it "
+        "works out from them",
+    )  # fmt: skip
 
 
 def check_scale(problem: Problem, outputs: Array, simulator: Simulator) -> None:

@@ -166,7 +166,7 @@ def test_a_column_in_another_of_its_units(header: str, values: list[float], unit
     ("inflation_pressure_psi", [124.1, 206.8, 289.6], "kPa"),
     ("inflation_pressure_kpa", [18.0, 30.0, 42.0], "psi"),
     ("inflation_pressure_psi", [10.0, 14.0], ""),
-    ("inflation_pressure_psi", [20.0, 206.8], ""),  # the half of them lies among the others
+    ("inflation_pressure_psi", [20.0, 206.8], "kPa"),  # of the one beyond the others
     ("inflation_pressure_psi", [124.1, 5000.0], ""),
 ])  # fmt: skip
 def test_conditions_beyond_the_calibrated_ones_in_another_unit(

@@ -123,7 +123,10 @@ def test_messages_are_in_the_words_and_units_of_the_file() -> None:
     known = {"inflation_pressure_psi": np.array([18.0, 42.0])}
     far = table_from_arrays({"Inflation pressure [kPa]": np.array([18.0, 42.0])}, source="p")
     (said,) = beyond_notes(far, known)
-    assert said.startswith("p, Inflation pressure [kPa]: nearly all values")
+    assert said == (
+        "p, lines 0, 1: Inflation pressure [kPa] up to 18, calibrated from 124.1 to 289.6 kPa; "
+        "inside if the readings are in psi; check the unit in the column name"
+    )
 
 
 def test_what_was_checked_is_so_for_whoever_reads_the_file_that_is_written(tmp_path: Path) -> None:

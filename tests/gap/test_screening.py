@@ -159,7 +159,7 @@ def test_field_rows_beyond_five_sds_of_the_best_are_set_aside_and_beyond_three_a
     lines = case.field.lines
     assert [told.find(f"line {lines[i]} ") > 0 for i in (9, 11, 20)] == [False, True, True]
     (said,) = left_over(data, ranking)
-    at = [said.find(f"line {lines[i]} ({z[i]:+.1f})") for i in (20, 11, 9, 4)]
+    at = [said.find(f"line {lines[i]} ({z[i]:+.1f} noise sds)") for i in (20, 11, 9, 4)]
     assert at == sorted(at)
     assert at[0] > 0
     assert f"line {lines[2]} " not in said

@@ -10,7 +10,7 @@ from scipy.special import ndtr
 from calib.data.files import plain_number
 from calib.data.quantities import QUANTITIES
 from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut
-from calib.inference.emulation.state import State
+from calib.inference.emulation.state import NEGLIGIBLE, State
 from calib.models.base import Array
 
 _NINETY = 1.645
@@ -23,6 +23,7 @@ _LEAST_THERE = 5
 FORESEEN_FROM = 100
 # The data say little of a parameter whose posterior sd is at least this part of the prior's.
 _LITTLE = 0.7
+_SCATTERS = "its output scatters: write deterministic = false in the simulator file"
 
 
 def held_out(state: State, theta: Array, values: Array) -> HeldOut | None:
@@ -86,7 +87,9 @@ def judged(
     off = measured.rmse if measured is not None else expected
     if off > chosen.tolerance:
         more = "give it more runs, or tighter priors"
-        if state.most:
+        if own_noise and state.keeper.simulator.deterministic:
+            more = _SCATTERS
+        elif state.most:
             more += f" ({foreseen(state, z, chosen, history)})"
         reasons.append(
             f"the emulator is off by {off:.2f} noise sds (rms), where {chosen.tolerance:g} are "
@@ -111,14 +114,16 @@ def foreseen(
     state: State, z: Array, chosen: EmulationSettings, history: Sequence[tuple[int, float]]
 ) -> str:
     """Say how many runs will be needed, by a power of their number, and what would lower it."""
+    if state.own_noise and state.keeper.simulator.deterministic:
+        return _SCATTERS
     runs, errors = np.array(history).T
-    said = "the error does not fall yet"
+    said = "how many cannot be foreseen, for the error does not fall as it should"
     if len(history) > 1:
         slope, level = np.polyfit(np.log(runs), np.log(np.maximum(errors, 1e-300)), 1)
         needed = float(np.exp((np.log(chosen.tolerance) - level) / slope)) if slope < 0 else np.inf
-        if needed < 100 * runs[-1]:
-            needed = max(needed, float(runs[-1]) + 1.0)
-            said = f"as its error falls it needs some {plain_number(needed, 2)} runs"
+        rounded = plain_number(needed, 2)
+        if len(state.runs) < float(rounded) < 100 * runs[-1]:
+            said = f"as its error falls it needs some {rounded} runs"
     names = [p.name for p in state.problem.priors.entries[:-1]]
     ratio = np.where(state.free, z.std(axis=0), 0.0)
     little = [
@@ -131,6 +136,23 @@ def foreseen(
             "prior's)"
         )
     return said
+
+
+def idle(state: State, z: Array) -> list[str]:
+    """Name parameters that move no output by what is looked into, wherever draws have them."""
+    entries, emulator = state.problem.priors.entries[:-1], state.emulator
+    z = z[state.holds(z)]
+    if emulator is None or not len(z):
+        return []
+    at, found = emulator.curves_at(state.problem.conditions)[:, 1:].T, []
+    usual = emulator.coefficients(state.axes.natural(z))
+    for i in np.flatnonzero(state.free):
+        moved = z.copy()
+        moved[:, i] = np.roll(z[:, i], len(z) // 2)
+        off = (emulator.coefficients(state.axes.natural(moved)) - usual) @ at
+        if np.nanmax(np.sqrt(np.square(off).mean(axis=1))) < NEGLIGIBLE * state.sigma:
+            found.append(entries[i].name)
+    return found
 
 
 def _between(state: State, z: Array) -> float:

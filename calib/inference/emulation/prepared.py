@@ -26,7 +26,7 @@ from calib.inference.emulation.settings import Emulation, EmulationSettings, Pro
 from calib.inference.emulation.state import State
 from calib.inference.prior_files import PriorFile
 from calib.inference.problem import Problem, build_problem
-from calib.inference.trial import check_scale
+from calib.inference.trial import check_moves, check_scale
 from calib.models import get_model
 from calib.models.base import Array
 from calib.models.simulators.base import FAILED, Failure, Simulator
@@ -52,6 +52,7 @@ def emulate_table(
         for t, v in zip(training.theta, training.values, strict=True)
     ]
     check_scale(problem, state.outputs(training.values), simulator)
+    check_moves(problem, state.outputs(training.values), simulator)
     state.learn(training.theta, training.values)
     for step in range(2):
         state.rebuild()

@@ -21,13 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calib.batch.threads import one_thread
-from calib.inference.emulation.judge import FORESEEN_FROM, WORTH, foreseen, held_out, judged
+from calib.inference.emulation.judge import (
+    FORESEEN_FROM,
+    WORTH,
+    foreseen,
+    held_out,
+    idle,
+    judged,
+)
 from calib.inference.emulation.nodes import across_zero, choose_nodes
 from calib.inference.emulation.settings import Emulation, EmulationSettings, HeldOut, Progress
 from calib.inference.emulation.state import State, across_too
 from calib.inference.problem import Problem
 from calib.inference.random import generator
-from calib.inference.trial import check_scale, prior_design, prior_middle
+from calib.inference.trial import check_moves, check_scale, prior_design, prior_middle
 from calib.models.base import Array
 from calib.models.simulators.emulator import Emulator
 from calib.models.simulators.kriging import correlation
@@ -126,6 +133,12 @@ def _improved(state: State, chosen: EmulationSettings, most: int, own_noise: flo
         raise state.without_value("no parameters are left for the data")
     if partly and state.among_failed(z) > _AMONG_FAILED:
         raise state.without_value("the posterior lies among runs that failed")
+    for name in idle(state, z):
+        _log.warning(
+            "%s: %s changes no output where the posterior is, so that the data say nothing of it; "
+            'hold it with dist = "fixed", or see whether the simulator reads it',
+            state.problem.bound.model.name, name,
+        )  # fmt: skip
     return judged(state, z, chosen, measured, own_noise, history)
 
 
@@ -209,6 +222,7 @@ def _first_design(state: State, chosen: EmulationSettings) -> float:
     if ok.mean() < _LEAST_OK:
         raise state.without_value("the simulator fails in most of its prior")
     check_scale(state.problem, state.outputs(values), state.keeper.simulator)
+    check_moves(state.problem, state.outputs(values), state.keeper.simulator)
     state.learn(theta, values)
     count, times = chosen.repeats(deterministic)
     repeats = np.flatnonzero(ok)[: min(count, state.left // times)]

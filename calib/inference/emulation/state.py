@@ -34,7 +34,7 @@ _DRAWS = 512
 # A first guess of the noise is this part of the spread of the data.
 _FIRST_NOISE = 0.1
 # Errors below this part of the noise sd (per value) need not be looked into.
-_NEGLIGIBLE = 0.01
+NEGLIGIBLE = 0.01
 # Across zero a formula may grow beyond bounds: values so many times as far from the others as these
 # reach are wild. So many runs near the posterior tell whether there are such.
 _WILD, _FEW = 10.0, 8
@@ -169,7 +169,7 @@ class State:
         again = self.region is None or known is None or known.mean.size != self.across.size
         self.emulator = build_emulator(
             replace(self.training, values=self.tamed(self.training.values)), self.axes,
-            _NEGLIGIBLE * self.sigma, self._regions,
+            NEGLIGIBLE * self.sigma, self._regions,
             scales=None if known is None else known.functions.scales,
             over=None if again or known is None else known.over,
         )  # fmt: skip

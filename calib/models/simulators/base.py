@@ -251,7 +251,7 @@ def checked(found: Found, column: str, n: int, unit: str) -> Array | Failure:
     values = values.ravel()
     bad = np.flatnonzero(~np.isfinite(values))
     if bad.size:
-        what = f"{column} is not finite in {bad.size} of {n} rows, first {bad[0]}"
+        what = f"{column} is not finite in {bad.size} of {n} rows, first in row {bad[0] + 1}"
         return Failure("nan", what, printed)
     return values
 

@@ -13,10 +13,14 @@ import pytest
 import calib
 from calib.errors import CalibError
 from calib.inference.calibration import Calibration
+from calib.inference.emulation.judge import foreseen
 from calib.inference.emulation.prepared import prepare, write_failed
+from calib.inference.emulation.settings import EmulationSettings
+from calib.inference.emulation.state import State
 from calib.models import MODELS
 from calib.models.simulators.base import Failure
 from calib.models.simulators.registered import SIMULATED, Simulated
+from calib.models.simulators.runs import Run, RunKeeper
 from tests.models.simulators.examples import PRIORS, lab, pull
 from tests.registered import forgotten
 
@@ -347,6 +351,48 @@ def test_a_simulator_that_only_seems_deterministic_is_found_out() -> None:
     rng = np.random.default_rng(3)
     declared(lambda t, x: pull(t, x) + 0.02 * rng.standard_normal(), "coy", emulate=True, runs=40)
     assert calib.emulated(calib.build_problem("coy", table()), seed=1).own_noise > 0.0
+
+
+def test_one_that_scatters_too_much_is_to_be_declared_so_before_more_runs_are_made() -> None:
+    rng = np.random.default_rng(3)
+    declared(
+        lambda t, x: pull(t, x) + 0.05 * rng.standard_normal(18), "coy", emulate=True, runs=40,
+        nodes=18,
+    )  # fmt: skip
+    emulation = calib.emulated(calib.build_problem("coy", table()), seed=1)
+    assert "write deterministic = false in the simulator file" in emulation.reasons[0]
+    assert "more runs" not in emulation.reasons[0]
+    assert emulation.reasons[0].count("kN (rms)") == 1
+
+
+def test_a_simulator_that_no_parameter_changes_is_refused() -> None:
+    declared(lambda t, x: pull(0.0 * t + [0.6, 0.08], x), "still", emulate=True)
+    with pytest.raises(CalibError, match="no parameter changes the output") as told:
+        calib.emulated(calib.build_problem("still", table()), seed=1)
+    assert "simulator still" in str(told.value)
+
+
+@pytest.mark.parametrize("idle", [True, False])
+def test_a_parameter_that_changes_nothing_is_named(
+    idle: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    def off(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
+        return pull(np.stack([theta[:, 0], 0.0 * theta[:, 1] + 0.08], axis=1) if idle else theta, x)
+
+    declared(off, "idle", emulate=True)
+    calib.emulated(calib.build_problem("idle", table()), seed=1)
+    assert ("s0 changes no output" in caplog.text) is idle
+    assert "mu changes" not in caplog.text
+
+
+@pytest.mark.parametrize(("made", "words"), [(150, "some 160 runs"), (181, "cannot be foreseen")])
+def test_no_fewer_runs_are_foreseen_than_were_made(made: int, words: str) -> None:
+    problem = calib.build_problem(declared(pull, "slow", emulate=True).name, table())
+    state = State(problem, RunKeeper(SIMULATED["slow"].simulator), problem.conditions, 1, most=200)
+    state.runs = [Run(np.zeros(2), {})] * made
+    said = foreseen(state, np.zeros((9, 2)), EmulationSettings(), [(75, 0.213), (150, 0.107)])
+    assert words in said
+    assert said.count("runs") == ("some" in said)
 
 
 def test_slow_simulators_are_not_called_by_the_sampler() -> None:

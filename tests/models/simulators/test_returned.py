@@ -74,7 +74,7 @@ def test_a_table_of_pandas_is_outputs_by_name() -> None:
 @pytest.mark.parametrize(
     ("gives", "kind", "word"),
     [
-        (masked, "nan", "1 of 2 rows, first 1"),
+        (masked, "nan", "1 of 2 rows, first in row 2"),
         (complex_, "unreadable", "imaginary parts up to 0.001"),
         (nothing, "unreadable", "nothing (None)"),
         (sorted_rows, "unreadable", "labelled 1, 0"),
@@ -139,8 +139,8 @@ PRINTED = "print(json.dumps({{'pull': {value}}})); sys.exit()"
         ("['1,5', '2,5']", "'1,5' is no number"),
         ("[10**400, 1]", "too large"),
         ("[[1.0], [2.0, 3.0]]", "differ in length"),
-        ("[1.0, None]", "not finite in 1 of 2 rows"),
-        ("[1.0, float('inf')]", "not finite in 1 of 2 rows"),
+        ("[1.0, None]", "not finite in 1 of 2 rows, first in row 2"),
+        ("[1.0, float('inf')]", "not finite in 1 of 2 rows, first in row 2"),
         ("[1.0, 2.0, 3.0]", "3 values for 2 rows"),
         ("{'0': 1.0}", "no output 'pull'"),
     ],
