@@ -241,12 +241,13 @@ def beyond_notes(table: Table, known: Mapping[str, Array]) -> Iterator[str]:
             continue
         read = usual_in(table, name, table[name][beyond], low, high)
         farthest = float(table.column(name).written(table[name][np.argmax(off)]))
+        reach = "as far off as" if beyond.sum() > 1 else "="
+        unit = f"; inside if the readings are in {read}; check the unit in the column name"
         yield (
-            f"{table.source}, {lines_of(table, beyond)}: {table.header_of(name)}"
-            f"{' up to' if beyond.sum() > 1 else ' ='} {plain_number(farthest, 4)}, calibrated "
-            f"from {_between(table, name, low, high)}"
-        ) + (f"; inside if the readings are in {read}; check the unit in the column name"
-             if read else "")  # fmt: skip
+            f"{table.source}, {lines_of(table, beyond)}: {table.header_of(name)} {reach} "
+            f"{plain_number(farthest, 4)}, calibrated from {_between(table, name, low, high)}"
+            f"{unit if read else ''}"
+        )
 
 
 def _written(unit: str) -> str:

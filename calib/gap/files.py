@@ -26,10 +26,13 @@ SCHEMA = "calib/diagnosis/1"
 def document(found: Diagnosis) -> dict[str, Any]:
     """Return a diagnosis as the contract's JSON document."""
     ranking = found.ranking
+    # Where the data are from the label says.
+    warnings = [w for w in found.warnings if w not in found.data.case.notes]
     return {
         "schema": SCHEMA,
         **({"data_label": found.data.case.label} if found.data.case.label else {}),
         "verdict": found.verdict,
+        **({"warnings": warnings} if warnings else {}),
         "effects": [
             {
                 "name": name,

@@ -124,8 +124,8 @@ def test_messages_are_in_the_words_and_units_of_the_file() -> None:
     far = table_from_arrays({"Inflation pressure [kPa]": np.array([18.0, 42.0])}, source="p")
     (said,) = beyond_notes(far, known)
     assert said == (
-        "p, lines 0, 1: Inflation pressure [kPa] up to 18, calibrated from 124.1 to 289.6 kPa; "
-        "inside if the readings are in psi; check the unit in the column name"
+        "p, lines 0, 1: Inflation pressure [kPa] as far off as 18, calibrated from 124.1 to "
+        "289.6 kPa; inside if the readings are in psi; check the unit in the column name"
     )
 
 

@@ -10,6 +10,7 @@ from calib.data.quantities import OUTPUTS
 from calib.gap.case import Case
 from calib.gap.diagnose import diagnose
 from calib.gap.effects import EFFECTS
+from calib.gap.files import document
 from calib.report.gap_evidence import gap_verdict
 from calib.report.gap_verdict import Tone
 from tests.gap.cases import PULL_ONLY, make_case
@@ -35,7 +36,7 @@ def test_a_field_far_noisier_than_the_laboratory_is_amber_and_its_column_named()
     assert "times as much as the laboratory's (sd 0.2" in judged.headline
     assert "kN, there 0.01" in judged.headline
     assert "differs with 'operator'" in judged.headline
-    noisier, column = found.warnings[:2]
+    noisier, column = document(found)["warnings"][:2]
     assert "scatters" in noisier
     assert "'operator', a column that is not used" in column
     assert "[covariates]" in column
