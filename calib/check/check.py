@@ -1,11 +1,4 @@
-"""Check a run folder: its hashes, its inputs, and its posterior sampled again from them.
-
-Check a folder of `calib compare`: its hashes, its runs, and the comparison made again.
-
-Check a report folder: its hashes, its inputs, and everything computed again from them.
-
-Check a folder: hashes first, then everything computed again and compared.
-"""
+"""Check a report, a run or a comparison: hashes first, then everything computed again."""
 
 from __future__ import annotations
 
@@ -24,14 +17,18 @@ import numpy as np
 from calib.batch.environment import Environment, sha256
 from calib.batch.pool import HERE, Pool
 from calib.check import compare, verify
-from calib.check.compare import Job, count_drawn
+from calib.check.compare import POSTERIORS, Job, count_drawn, flatten, verify_posterior
 from calib.check.outcome import Item, Outcome, Status, claim
-from calib.check.posteriors import GROUP as POSTERIORS
-from calib.check.posteriors import verify_posterior
-from calib.check.text import GROUP as TEXT
-from calib.check.text import Judgement, flatten, read_text, verify_images
 from calib.check.tolerances import describe, drawn_in_comparison, drawn_in_output, drawn_in_run
-from calib.check.verify import MANIFEST, SUMMARY, Manifest, read_folder
+from calib.check.verify import (
+    MANIFEST,
+    SUMMARY,
+    TEXT,
+    Manifest,
+    read_folder,
+    read_text,
+    verify_images,
+)
 from calib.data import has_rows, read_table
 from calib.data.files import inside, read_json
 from calib.data.quantities import OUTPUTS
@@ -118,8 +115,8 @@ def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
             if run.model != name:
                 found.append(claim(_GROUP, RUN, f"it is of the model {run.model}"))
             items += compare.within(f"runs/{name}", name, found)
-        same = len({path.read_bytes() for path in data.values()}) == 1
-        wrong = "" if same else "the models were fitted to different rows"
+        alike = len({path.read_bytes() for path in data.values()}) == 1
+        wrong = "" if alike else "the models were fitted to different rows"
         right = "the rows of all models are the same"
         items.append(claim(_GROUP, f"runs/*/{DATA}", wrong, right))
         if not job.quick:
@@ -134,7 +131,9 @@ def check_comparison(record: ComparisonRecord, job: Job) -> list[Item]:
             for c in again.candidates:
                 found = compare_run(runs[c.model], c.calibration, inner[c.model])
                 items += compare.within(f"runs/{c.model}", c.model, found)
-            items += compare.file(comparison.FIGURE, job)
+            same = record.environment.same_program(job.here)
+            drawn_of = (i for i in items if i.found is not None)
+            items += compare.file(comparison.FIGURE, job, sure=same, exact=compare.exact(drawn_of))
     return items
 
 
@@ -190,8 +189,6 @@ def check_compared(manifest: Manifest, tasks: Iterable[Task], job: Job) -> list[
 
 _PAGE = "index.html"
 _SEARCHES = (".genetic.", ".differential_evolution.")
-# Where no number moved by more than this part, all that follow from them can be judged.
-_LITTLE = 0.02
 
 
 def check_report(manifest: Manifest, job: Job) -> list[Item]:
@@ -307,19 +304,10 @@ def _numbers(manifest: Manifest, study: Study, summary: Mapping[str, Any], job: 
 
 def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
     """Compare every file but the documents and what follows from them."""
+    numbers = list(numbers)
     same_program = manifest.environment.same_program(job.here)
-    readings, moved = compare.moved_parts(numbers)
-
-    def judged(name: str, section: str) -> Judgement:
-        if name.startswith(("data/", "priors/")) or "/case/" in name:
-            return Judgement()
-        about = partial(_about, manifest, name, section)
-        size = max((by for part, by in moved.items() if about(part)), default=0.0)
-        if not same_program:
-            return Judgement("another version wrote it", size, numbers=False)
-        why = "its numbers moved within their tolerance" if any(map(about, readings)) else None
-        return Judgement(why, size, size <= _LITTLE)
-
+    moved = compare.moved_parts(numbers)
+    exact = compare.exact(numbers)
     made, items = verify.files_in(job.made), []
     if not manifest.views:
         made &= {*manifest.files, *manifest.left_out}
@@ -330,25 +318,21 @@ def _files(manifest: Manifest, numbers: Iterable[Item], job: Job) -> list[Item]:
             right = "left out on purpose; made again, it has the recorded hash"
             items.append(claim(POSTERIORS, name, wrong, right, sure=False))
         else:
-            items += compare.file(name, job, partial(judged, name), sure=same_program)
+            own = name.startswith(("data/", "priors/")) or "/case/" in name
+            shown = {f"gap: {name.split('/')[1]}"} if name.startswith("gaps/") else moved
+            items += compare.file(
+                name,
+                job,
+                sure=own or same_program,
+                same_draws=own or not moved & shown,
+                exact=own or exact,
+            )
     # A comparison is checked as a folder of `calib compare`.
     inner = (f"{FOLDER}/",) if "comparison" in manifest.sections else ()
     strangers = set(manifest.files) - verify.derived_files(manifest.files) - made
     strangers = {name for name in strangers if not name.startswith(inner)}
     note = "this version makes no such file"
     return items + [claim(TEXT, name, note, sure=same_program) for name in sorted(strangers)]
-
-
-def _about(manifest: Manifest, name: str, section: str, part: str) -> bool:
-    """Whether a section of a page is about a part of a report: an output, a gap, or the audit."""
-    if name.startswith("gaps/"):
-        return part == f"gap: {name.split('/')[1]}"
-    if section == "paper-gaps":
-        return part.startswith("gap: ")
-    if section == "audit" or section in manifest.tasks:
-        return part == section
-    # A comparison's words are those of the manifest's own numbers.
-    return part in manifest.tasks and section != "comparison"
 
 
 _CHECKS: Mapping[str, Callable[[Any, Job], list[Item]]] = {

@@ -1,15 +1,18 @@
-"""What a report says of itself, checked; and which kind of folder it is that is to be checked.
+"""Check what a folder says of itself, and which kind it is, without computing anything again.
 
-Check what a folder says of itself without computing anything again.
-
-Files against their hashes; that data and priors are what they are called; that texts, and what a
-summary says of gaps, follow from other files, and a corrected model predicts what is said of it.
+Files against their hashes; that data and priors are what they are called; that texts, pictures of a
+page and what a summary says of gaps follow from other files; that a corrected model predicts what
+the diagnosis says of it.
 """
 
 from __future__ import annotations
 
+import base64
+import binascii
+import difflib
 import json
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -18,11 +21,9 @@ from pydantic import Field, model_validator
 
 from calib.batch.environment import differs_in_lines, sha256, unix_lines
 from calib.check.outcome import LINE_ENDS, Item, Status, claim
-from calib.check.text import GROUP as TEXT
-from calib.check.text import differing_lines, read_text
 from calib.data import Table
 from calib.data import files as data_files
-from calib.data.files import inside
+from calib.data.files import decoded, inside
 from calib.data.quantities import OUTPUTS
 from calib.data.reader import KNOWN_DATA, label_of
 from calib.errors import FAULTS, CalibError
@@ -38,6 +39,7 @@ from calib.inference.record import (
     RunRecord,
     read_record,
 )
+from calib.report.compared import FOLDER as COMPARED
 from calib.report.comparison import ComparisonRecord
 from calib.report.sections import SECTIONS
 from calib.report.study_tasks import HoldOut
@@ -123,6 +125,24 @@ def read_folder(folder: Path) -> Record:
     )  # fmt: skip
 
 
+TEXT = "page and tables"
+_IMAGE = re.compile(r"data:image/png;base64,([A-Za-z0-9+/=]*)")
+_SHOWN, _WIDTH = 6, 120
+
+
+def read_text(path: Path) -> str:
+    """Return a text, whatever somebody made of it."""
+    return decoded(path.read_bytes(), "replace")
+
+
+def differing_lines(old: Sequence[str], new: Sequence[str]) -> str:
+    """Return how many lines two texts do not share, and the first of them."""
+    diff = list(difflib.unified_diff(old, new, n=0, lineterm=""))[2:]  # below the two names
+    changed = [line for line in diff if not line.startswith("@@")]
+    shown = "; ".join(f"{line[0]} {line[1:].strip()[:_WIDTH]}" for line in changed[:_SHOWN])
+    return f"{len(changed)} lines differ: {shown}"
+
+
 INPUTS, FILES = "data and priors", "files and their hashes"
 
 
@@ -163,6 +183,49 @@ def _listed(path: Path, own: str, name: str, expected: str) -> Item:
             return Item(FILES, name, Status.WITHIN, note=LINE_ENDS)
         return Item(FILES, name, Status.DIFFERENT, expected, found, note="changed")
     return Item(FILES, name, Status.IDENTICAL)
+
+
+def verify_images(page: str, folder: Path) -> list[Item]:
+    """Check that every picture in a page is one of the folder's figures, and the other way."""
+    figures = _figures(folder)
+    shown = {sha256(_decoded(text)) for text in _IMAGE.findall(page)}
+    wrong = "it is not the picture that index.html shows"
+    items = [claim(TEXT, n, wrong) for key, n in figures.items() if key not in shown]
+    if strangers := len(shown - set(figures)):
+        wrong = f"{strangers} of its pictures are none of the figures"
+        items.append(claim(TEXT, "index.html", wrong))
+    return items or [claim(TEXT, "pictures in index.html", "", "they are the figures")]
+
+
+def _figures(folder: Path) -> dict[str, str]:
+    """Names of the PNG files of a folder by their hashes; a comparison in it has its own page."""
+    names = (path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*.png")))
+    return {sha256((folder / n).read_bytes()): n for n in names if not n.startswith(f"{COMPARED}/")}
+
+
+def _decoded(encoded: str) -> bytes:
+    try:
+        return base64.b64decode(encoded, validate=True)
+    except binascii.Error:
+        return b""
+
+
+def own_pictures(content: str, folder: Path) -> list[bytes]:
+    """Return the pictures of a page that are none of the folder's figures, in their order."""
+    pictures = [_decoded(encoded) for encoded in _IMAGE.findall(content)]
+    known = _figures(folder) if pictures else {}
+    return [picture for picture in pictures if sha256(picture) not in known]
+
+
+def named_pictures(folder: Path, name: str) -> str:
+    """Return a page with the names of the folder's figures in the place of the pictures."""
+    text = read_text(folder / name)
+    names = _figures(folder) if _IMAGE.search(text) else {}
+
+    def named(match: re.Match[str]) -> str:
+        return f"[picture {names.get(sha256(_decoded(match[1])), 'of its own')}]"
+
+    return _IMAGE.sub(named, text)
 
 
 def label(file: str, table: Table, label: str) -> Item:

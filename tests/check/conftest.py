@@ -17,10 +17,9 @@ from unittest.mock import patch
 
 import pytest
 
-import calib.check.check as check_report_module
-import calib.check.check as check_run_module
+import calib.check.check as check_module
 from calib.batch.environment import sha256
-from calib.check import compare, posteriors, tolerances
+from calib.check import compare, tolerances
 from calib.check.check import check, recompute_report
 from calib.check.outcome import Outcome, Status
 from calib.he2019 import sections
@@ -85,6 +84,17 @@ def whole(originals: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(originals / "whole", tmp_path / "whole"))
 
 
+@pytest.fixture(scope="package")
+def whole_original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    with patch("calib.report.figures.collect.plates", made.two_plates):
+        return made.whole(tmp_path_factory.mktemp("original") / "whole_here")
+
+
+@pytest.fixture
+def whole_here(whole_original_here: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(whole_original_here, tmp_path / "whole_here"))
+
+
 @pytest.fixture
 def run(originals: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(originals / "run", tmp_path / "run"))
@@ -93,6 +103,16 @@ def run(originals: Path, tmp_path: Path) -> Path:
 @pytest.fixture
 def compared(originals: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(originals / "comparison", tmp_path / "compared"))
+
+
+@pytest.fixture(scope="package")
+def compared_original_here(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made.comparison(tmp_path_factory.mktemp("original") / "compared_here")
+
+
+@pytest.fixture
+def compared_here(compared_original_here: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(compared_original_here, tmp_path / "compared_here"))
 
 
 @pytest.fixture(scope="package")
@@ -172,11 +192,10 @@ def computed_once(_made, _read, audited_once, monkeypatch: pytest.MonkeyPatch) -
         return dict(cache[key][1])
 
     monkeypatch.setattr(tolerances, "posterior_errors", errors_once)
-    monkeypatch.setattr(check_report_module, "recompute_report", report_again)
-    monkeypatch.setattr(check_run_module, "recompute_run", run_again)
-    monkeypatch.setattr(posteriors, "_groups", reading_once(posteriors._groups))
-    for module in (posteriors, compare):
-        monkeypatch.setattr(module, "read_draws", reading_once(posteriors.read_draws))
+    monkeypatch.setattr(check_module, "recompute_report", report_again)
+    monkeypatch.setattr(check_module, "recompute_run", run_again)
+    for name in ("_groups", "read_draws"):
+        monkeypatch.setattr(compare, name, reading_once(getattr(compare, name)))
 
 
 def edit_json(path: Path, change: Callable[[dict[str, Any]], object]) -> None:

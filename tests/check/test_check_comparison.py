@@ -36,8 +36,8 @@ def seal(folder: Path) -> None:
         files={n: sha256((folder / n).read_bytes()) for n in m["files"]}))  # fmt: skip
 
 
-def test_an_untouched_comparison_is_the_same_bit_for_bit(tmp_path: Path) -> None:
-    outcome = check(made.comparison(tmp_path / "c"))
+def test_an_untouched_comparison_is_the_same_bit_for_bit(compared_here: Path) -> None:
+    outcome = check(compared_here)
     assert {item.status for item in outcome.items} == {Status.IDENTICAL}
     assert outcome.verdict.startswith("SAME, bit for bit")
     assert outcome.document()["kind"] == "comparison"
@@ -164,7 +164,9 @@ def test_what_a_record_lacks_is_a_difference_and_no_traceback(compared: Path, go
         assert findings(compared, quick=True)
 
 
-def test_what_only_sampling_tells_is_named(compared: Path) -> None:
+def test_what_only_sampling_tells_is_named(compared_here: Path) -> None:
+    compared = compared_here
+
     def change(m: dict[str, Any]) -> None:
         best = next(iter(m["models"].values()))
         best["held_out"]["elpd"] += 1.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 from scipy.stats import norm
 
+from calib.check.compare import compare_entries, flatten
 from calib.check.outcome import Status
-from calib.check.text import compare_entries, flatten
 from calib.check.tolerances import (
     drawn_in_output,
     drawn_in_run,

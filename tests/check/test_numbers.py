@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from calib.check.compare import compare_entries, flatten, without_numbers
 from calib.check.outcome import Item, Status
-from calib.check.text import compare_entries, flatten, without_numbers
 
 FILE = "summary.json"
 POSTERIOR = (FILE, "models", "rut_depth", "posterior", "n1")

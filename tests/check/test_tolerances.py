@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from calib.check.compare import is_document
+from calib.check.compare import compare_entries, flatten, is_document
 from calib.check.outcome import Status
-from calib.check.text import compare_entries, flatten
 from calib.check.tolerances import _PATTERNS, TABLE, tolerance_of
 from calib.check.verify import SUMMARY
 from tests.main_report import main_report
