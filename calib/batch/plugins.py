@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Sequence
@@ -126,6 +127,15 @@ def loaded_files() -> list[Path]:
 def inherit() -> None:
     """Load what the process that started this one had loaded."""
     load_files(loaded_files())
+
+
+def dask_setup(worker: object) -> None:
+    """Prepare a worker process on this machine; Dask calls it there.
+
+    Ctrl-C, which a terminal sends to all processes, is for the one that owns the workers.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    inherit()
 
 
 def _load(path: Path) -> None:

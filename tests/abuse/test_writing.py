@@ -78,7 +78,7 @@ def no_work(monkeypatch: pytest.MonkeyPatch) -> None:
         raise AssertionError("the work has begun")
 
     for name in (
-        "calib.batch.tasks.run.completed", "challenge.make.completed",
+        "calib.batch.tasks.completed", "challenge.make.completed",
         "challenge.redraw.completed", "calib.he2019.audit.run_audit",
         "calib.inference.calibration.calibrate",
     ):  # fmt: skip

@@ -12,7 +12,7 @@ import pytest
 
 import calib
 import challenge
-from calib.batch.campaign.kinds.challenge import ChallengeSection
+from calib.batch.campaign.kinds import ChallengeSection
 from calib.batch.environment import from_the_bench, source_sha256
 from challenge.make import NULL_FRACTION
 from tests.cli.test_cli import Calib

@@ -113,7 +113,7 @@ def test_no_model_is_left_out() -> None:
 def test_slow_models_are_left_out_of_sbc_unless_named(
     calib: Calib, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from calib.batch.campaign.kinds.challenge import SbcSection
+    from calib.batch.campaign.kinds import SbcSection
     from calib.validation.sbc.run import chosen_models
 
     assert [m for m in MODELS if MODELS[m].slow] == SLOW

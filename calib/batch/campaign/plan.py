@@ -10,8 +10,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from calib.batch.campaign.kinds import KINDS, Kind, Section, Task
-from calib.batch.campaign.place import Place
+from calib.batch.campaign.kinds import KINDS, Kind, Place, Section, Task
 from calib.data.files import MEND_TOML, decoded
 from calib.errors import CalibError
 from calib.inference.random import stream

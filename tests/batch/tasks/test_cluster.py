@@ -17,7 +17,8 @@ from threading import Thread
 
 import pytest
 
-from calib.batch.tasks import cluster, run_folder_tasks, run_tasks
+from calib.batch import cluster
+from calib.batch.tasks import run_folder_tasks, run_tasks
 from calib.errors import CalibError
 from tests.batch.tasks import work
 

@@ -22,7 +22,7 @@ from distributed.utils import silence_logging_cmgr
 
 from calib.batch.environment import code_sha256
 from calib.batch.pool import without_interruptions
-from calib.batch.tasks.run import Finished, attempt, describe
+from calib.batch.tasks import Finished, attempt, describe
 from calib.errors import CalibError
 
 # Tasks at the scheduler at a time, and bytes of their items: enough for a large cluster, few enough
@@ -60,7 +60,7 @@ def on_cluster[I, R](
     scheduler: str | None,
     announce: Callable[[str], None],
 ) -> Iterator[Finished[R]]:
-    """Yield tasks as they come to their end (see `calib.batch.tasks.run.completed`)."""
+    """Yield tasks as they come to their end (see `calib.batch.tasks.completed`)."""
     # A cluster of our own need not be larger than the work.
     connected = _local(min(workers, len(names))) if scheduler is None else _existing(scheduler)
     # What goes wrong is told once, as the error of a task or as ours.
@@ -210,7 +210,7 @@ def _start(workers: int, tries: int = START_TRIES) -> LocalCluster:
             LocalCluster,
             n_workers=workers, threads_per_worker=1, processes=True, memory_limit=1.0 / workers,
             dashboard_address="127.0.0.1:0",  # any free port: the usual one may be taken
-            silence_logs=logging.CRITICAL, preload=["calib.batch.tasks.worker"],
+            silence_logs=logging.CRITICAL, preload=["calib.batch.plugins"],
         )  # fmt: skip
         try:
             return coming.result()

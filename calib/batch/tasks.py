@@ -1,8 +1,8 @@
-"""Tasks as they come to their end, in this process or on a cluster: result or error, and time.
+"""Many independent tasks: on one process, on several, or on a Dask cluster, with the same results.
 
-Where results land: a file or a folder for each task, whole or not there at all.
-
-Do what is missing of many tasks, and keep every result as it comes.
+`run_tasks` and `run_folder_tasks` write one file or one folder for each task, whole or not at all,
+and do only what is missing when they are called again; `completed` hands results over as they come
+and writes nothing.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def completed[I, R](
             yield attempt(function, name, lambda name=name: items[name])  # type: ignore[misc]
         return
     # Dask takes a second to import: only where it is used.
-    from calib.batch.tasks.cluster import on_cluster
+    from calib.batch.cluster import on_cluster
 
     yield from on_cluster(
         function, items, todo, workers=workers, scheduler=scheduler,
