@@ -27,7 +27,11 @@ def document(found: Diagnosis) -> dict[str, Any]:
     """Return a diagnosis as the contract's JSON document."""
     ranking = found.ranking
     # Where the data are from the label says.
-    warnings = [w for w in found.warnings if w not in found.data.case.notes]
+    case = found.data.case
+    warnings = [w for w in found.warnings if w not in case.notes]
+    # The same wherever the case lies.
+    for table in filter(None, (case.lab, case.field, case.new_conditions)):
+        warnings = [w.replace(table.source, Path(table.source).name) for w in warnings]
     return {
         "schema": SCHEMA,
         **({"data_label": found.data.case.label} if found.data.case.label else {}),
