@@ -206,6 +206,7 @@ def pool(
     except BaseException:
         side.drop()  # nobody waits for the pieces
         _stop(executor)
+        executor.shutdown(wait=False, cancel_futures=True)
         raise
 
 
@@ -287,11 +288,8 @@ def end_server() -> None:
 
 def _stop(executor: ProcessPoolExecutor) -> None:
     """End processes at once, and what they are forked from."""
-    processes = executor._processes or {}
-    # It waits for the start of a process that is under way, which would outlive what it works for.
-    executor.shutdown(wait=False, cancel_futures=True)
     end_server()
-    for process in list(processes.values()):
+    for process in list((executor._processes or {}).values()):
         process.terminate()
 
 

@@ -66,42 +66,6 @@ def test_an_interruption_ends_the_processes_at_their_work() -> None:
         assert process.exitcode
 
 
-# Preloaded by the server: what it forks is a while on the way.
-_SLOW_FORK = """
-import os, pathlib, time
-usual = os.fork
-def fork():
-    pid = usual()
-    pathlib.Path("forked").touch()
-    time.sleep(0.5 if pid else 1.0)
-    return pid
-os.fork = fork
-"""
-_ENDS_WHILE_ONE_STARTS = """
-import pathlib, time
-from calib.batch.pool import pool
-if __name__ == "__main__":
-    try:
-        with pool(2, ("slow_fork",)):
-            while not pathlib.Path("forked").exists():
-                time.sleep(0.01)
-            raise ValueError
-    except ValueError:
-        raise SystemExit("refused")
-"""
-
-
-def test_an_error_while_a_process_starts_is_all_that_is_said(tmp_path: Path) -> None:
-    (tmp_path / "slow_fork.py").write_text(_SLOW_FORK)
-    (tmp_path / "script.py").write_text(_ENDS_WHILE_ONE_STARTS)
-    path = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])])
-    found = subprocess.run(
-        [sys.executable, "script.py"], capture_output=True, text=True, timeout=60, check=False,
-        cwd=tmp_path, env=os.environ | {"PYTHONPATH": path},
-    )  # fmt: skip
-    assert found.stderr.strip() == "refused"
-
-
 def test_a_server_that_is_gone_hides_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that an earlier pool ended, whose place no other has taken yet."""
     gone = subprocess.Popen(["true"])
