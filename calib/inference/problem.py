@@ -377,7 +377,7 @@ def build_problem(
         (*model.parameters, "sigma"),
         references,
     )
-    check_enough(table, len(priors.free), model=model.name)
+    check_enough(table, len({p.name for p in priors.free} - {*(fixed or ())}), model=model.name)
     check_varies(table, model.output)
     check_settings(table, model.conditions)
     relative = relative_columns(priors.text)

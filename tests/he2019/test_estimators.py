@@ -96,7 +96,7 @@ def test_repeats_are_averaged_and_order_does_not_matter():
 
 
 def test_zero_is_found_where_it_is_asked_for():
-    x = np.array([0.0, 2.5, 5.0, 10.0, 20.0, 30.0, 50.0])
+    x = np.array([0.0, 2.5, 5.0, 10.0, 20.0, 30.0, 40.0, 50.0])
     y = magic_formula(x, 0.1, 1.5, 1.0, -2.0, Sh=-2.0)
     got = read_features(x, y, find_zero=True)
     assert got.zero == pytest.approx(-2.0, abs=1.0)
@@ -171,9 +171,9 @@ def test_pressures_are_joined_exactly(pressures):
 @pytest.mark.parametrize(
     ("slip", "pull"),
     [
-        (np.array([1.0, 2, 3, 5, 10, 20, 30]), -np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.4])),
+        (np.array([1.0, 2, 3, 5, 10, 20, 25, 30]), -np.array([1, 2, 3, 4, 5, 5, 4.5, 4]) / 10),
         (np.repeat([1.0, 5.0, 9.0], 3), np.tile([0.1, 0.5, 0.6], 3)),
-        (-np.array([1.0, 2, 3, 5, 10, 20, 30]), np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.5, 0.4])),
+        (-np.array([1.0, 2, 3, 5, 10, 20, 25, 30]), np.array([1, 2, 3, 4, 5, 5, 4.5, 4]) / 10),
     ],
 )
 def test_unreadable_curves(slip, pull):

@@ -62,7 +62,7 @@ def test_a_callable_of_one_vector() -> None:
     [
         (lambda t, x: 1 / 0, "error", "ZeroDivisionError"),
         (lambda t, x: sys.exit(0), "error", "SystemExit: 0"),
-        (lambda t, x: np.array([1.0, np.nan]), "nan", "1 of 2 rows, first 1"),
+        (lambda t, x: np.array([1.0, np.nan]), "nan", "1 of 2 rows, first in row 2"),
         (lambda t, x: np.array([1.0]), "short", "1 values for 2 rows"),
     ],
 )
