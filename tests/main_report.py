@@ -11,10 +11,13 @@ from pathlib import Path
 PROGRAM = "from calib.cli import main; main()"
 
 
+_SCRATCH = tempfile.TemporaryDirectory(prefix="main-report-")
+
+
 @cache
 def main_report() -> Path:
     """Return the folder of `calib report`, its figures blank, and of `calib sbc` in it."""
-    folder = Path(tempfile.mkdtemp(prefix="main-report-"))
+    folder = Path(_SCRATCH.name)
     blank = Path(__file__).with_name("undrawn.py")
     for words in (
         ["report", "--out", folder / "he2019", "--models", blank],

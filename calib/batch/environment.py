@@ -1,4 +1,4 @@
-"""The test bench of the repository, `challenge`: used where it is, named where it is not.
+"""What numbers depend on besides data, priors and seed: versions, processor, the code itself.
 
 What numbers depend on besides data, priors and seed: versions, processor, the code itself.
 

@@ -1,6 +1,4 @@
-"""Code of a user's own: run so that the program around it stays as it is.
-
-Results that are finished before their command is: written if it does not come to do so itself.
+"""User code run in isolation, and finished results kept until they are written.
 
 A command that is interrupted, or finds no room for its result at the end, has as a rule finished
 something: posteriors of some of its models, say. Each is kept here, in memory, as soon as it is

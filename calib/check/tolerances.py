@@ -1,6 +1,4 @@
-"""How far numbers that follow from posterior draws may be from those of other draws.
-
-What is taken for the same: one table.
+"""The one table of what `calib check` takes for the same.
 
 Every entry of a document has one tolerance, that of the first row whose pattern fits its path. It
 follows from what the entry is, never from how others compare; what no row names is arithmetic, and

@@ -1,7 +1,4 @@
-"""Verbs of calibration: report and fit.
-
-The verb that compares models on the same data.
-"""
+"""The commands `report`, `fit` and `compare`."""
 
 from __future__ import annotations
 
@@ -47,7 +44,7 @@ def report(
     ] = True,
     views: Annotated[
         bool,
-        typer.Option(help="Keep page, figures and tables; without, numbers and inputs alone."),
+        typer.Option(help="Write page, figures and tables beside the numbers."),
     ] = True,
     workers: opt.Workers = opt.CORES,
     plugins: opt.Models = None,

@@ -1,9 +1,4 @@
-"""Verb of campaigns: many tasks of one plan, here or on a Dask cluster.
-
-The verb of simulation-based calibration.
-
-Verbs of the blind test that the diagnosis is held against; most need the repository's bench.
-"""
+"""The commands `campaign`, `sbc` and `challenge`."""
 
 from __future__ import annotations
 

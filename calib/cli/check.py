@@ -1,9 +1,4 @@
-"""A check as a table: the verdict first, then what was compared, then what is not the same.
-
-The verb that checks a folder: everything computed again, and a verdict.
-
-The verb of the audit: test what the source paper prints.
-"""
+"""The commands `check` and `audit`, and the table that shows what a check found."""
 
 from __future__ import annotations
 

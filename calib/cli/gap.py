@@ -1,7 +1,4 @@
-"""Verb of the diagnosis: where a calibrated model misses in the field, and why.
-
-Verbs of what is registered: models, effects, quantities.
-"""
+"""The commands `diagnose`, `models`, `effects` and `quantities`."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The verb that says what is installed, what is optional, and on which processor it runs.
-
-`--json`: one object for programs on the output, and nothing else there.
-"""
+"""The command `doctor`, and `--json` for every command."""
 
 from __future__ import annotations
 

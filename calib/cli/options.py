@@ -1,9 +1,4 @@
-"""Options that several verbs have.
-
-Verbs that write what to begin with: data, templates and priors.
-
-Progress bars and tables on the terminal.
-"""
+"""Shared options, the commands `data`, `template` and `priors`, and progress bars."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""An example of every verb, for its help and its page.
-
-The verbs: thin, each one call into the package, heavy imports only when used.
-"""
+"""The command line: every command with an example, and how an error ends it."""
 
 from __future__ import annotations
 

@@ -1,9 +1,4 @@
-"""CSV files as people have them: what separates the cells, how they are encoded, where they end.
-
-Texts that somebody else wrote, whatever is in them: how they are encoded, TOML, JSON.
-
-Numbers in a sentence: few digits, and no exponent where a person reads one faster without.
-"""
+"""Files and numbers as people write them: CSV dialects, encodings, TOML, JSON, short numbers."""
 
 from __future__ import annotations
 

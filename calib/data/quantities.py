@@ -1,6 +1,4 @@
-"""Unit conversion at the boundary: everything inside works in one unit per quantity.
-
-The dictionary of quantities: names, units, what they physically are, and how they are shown.
+"""Quantities: names, units and their conversion, physical roles, and how they are shown.
 
 It is the only vocabulary: inside the package every quantity has one canonical column in one unit,
 outputs are known by their stems, and effects know quantities by their physical roles. A new one is

@@ -1,9 +1,7 @@
-"""Data that are known wherever they turn up, and what to call them.
+"""Read measurements: CSV or arrays in, a checked and labelled table in canonical units out.
 
 Every table that is read is labelled here, whatever its file is called; the label goes wherever the
 table goes, and a command says of which such data it has read.
-
-Reading measurements: CSV or arrays in, a checked table in canonical units out.
 """
 
 from __future__ import annotations

@@ -1,8 +1,6 @@
-"""What a model or simulator gave, as plain numbers in a unit: converted rightly, or refused.
+"""The table of measurements, and the plain numbers that a model or simulator must return.
 
 Every way in goes through `real_array`: functions, programs, servers and tables of runs.
-
-The table of measurements: immutable columns in canonical units, subsets and checks of them.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""The corrected model: saved with a diagnosis, loaded again to predict at new conditions.
+"""The corrected model: by how much it reduces the error, and its predictions at new conditions.
 
 It is the mixture of hypotheses, each a normal about its mode, with the two campaigns it was fitted
 to. A correction is only as good as the diagnosis: its bands hold the doubt about the cause too.
-
-How far the gap shrinks: judged on conditions that were not fitted.
 """
 
 from __future__ import annotations

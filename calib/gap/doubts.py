@@ -1,4 +1,4 @@
-"""What the most probable explanation leaves in the field, tested: noise, a column's pattern."""
+"""Test what the most probable explanation leaves in the field: its scatter, unused columns."""
 
 from __future__ import annotations
 
@@ -55,27 +55,28 @@ def _noisier(data: Campaigns, o: OutputData, mode: Array, best: Fit) -> Iterable
     sds = [_noise_text(o, sd) for sd in (times * there, there)]
     said = (
         f"the field's {o.name.replace('_', ' ')} scatters {plain_number(times, 2)} times as much "
-        f"as the laboratory's (sd {sds[0]}, there {sds[1]})"
+        f"as the laboratory's (sd {sds[0]} against {sds[1]})"
     )
     yield Check(p if times >= _NOISIER else 1.0, Remark(
         f"{source_of(data.case.field)}: {said} about the most probable explanation "
-        f"(p = {plain_number(p, 2)}), so that something acts there that differs from row to row; "
+        f"(p = {plain_number(p, 2)}), so something that differs from row to row acts there: "
         "record what changed between rows (operator, tyre, place) as a column, declare it under "
         "[covariates] in case.toml, and diagnose again", said,
     ))  # fmt: skip
 
 
 def _patterns(data: Campaigns, o: OutputData, ranking: Ranking, best: Fit) -> Iterable[Check]:
-    """Whether residuals differ with a column that neither a model nor an effect takes."""
+    """Whether residuals differ with a column that no model or effect uses."""
     table = data.case.field.take(o.rows)
     fits = (fit for group in ranking.fits.values() for fit in group)
     roles = {c for fit in fits for e in fit.forward.hypothesis.effects for c in e.covariates}
     roles |= {role_of(c) for m in data.case.models.values() for c in get_model(m).conditions}
     own = {c for c in table.columns if role_of(c) in roles} | {*OUTPUTS.values()}
     columns = {h: v for h, v in unused(table, own).items() if h not in data.case.covariates}
+    output = o.name.replace("_", " ")
     return unexplained(
         table, columns, best.field_residuals[o.name],
-        title=f"the field's {o.name.replace('_', ' ')} differs with {{!r}}, which nothing takes",
+        title=f"the field's {output} differs with {{!r}}, which no model or effect uses",
         mend="declare it under [covariates] in case.toml, and diagnose again",
     )  # fmt: skip
 

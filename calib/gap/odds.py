@@ -1,4 +1,4 @@
-"""An effect that nobody could notice is no effect: hypotheses are about gaps that matter.
+"""Prior odds, relevance and posterior probabilities of hypotheses.
 
 Every hypothesis but `none` is the claim that its effect is *relevant*: that in some output its
 root-mean-square size over the field rows is at least `RELEVANT` noise sds (of several causes: that
@@ -9,8 +9,6 @@ Restricting its prior to relevant sizes multiplies its evidence by
 
 both estimated from draws. It keeps the probability of `none` from being shared out among effects
 too small to see, and that of one effect among pairs whose other half is idle.
-
-Probabilities of hypotheses before the data, and after them from their evidence.
 
 No formula is right to the last: besides the form errors that a hypothesis has, some shape of a real
 gap stays that nothing explains. Of a small gap it is a part of its size, lost in the noise; of a

@@ -1,4 +1,4 @@
-"""Conditions that cannot be right: one row's is set aside, a column's in another unit refused.
+"""Where the gap lies: every row, and contiguous regions of the conditions.
 
 Where the gap lies: every row, and contiguous regions of the conditions.
 """

@@ -1,4 +1,4 @@
-"""Two parameters of which data at about one condition know the sum, sampled as sum and ratio."""
+"""Sample two parameters as sum and ratio where the data determine only their sum."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from calib.models.base import Array
 class Joined(Priors):
     """The same priors in other coordinates: of two logarithms a and b, ln(e^a + c e^b) and b - a.
 
-    The posterior is then nearly normal where that of a and b is a bent ridge. Volumes stay as they
-    are, and so do densities.
+    The posterior is then nearly normal where that of a and b is a bent ridge. The Jacobian
+    is one, so densities are unchanged.
 
     Parameters
     ----------

@@ -1,7 +1,4 @@
-"""Parameters spread over a prior.
-
-A simulator is tried before a sampler or an estimator asks it thousands of times.
-"""
+"""Try a simulator before a sampler or an estimator calls it thousands of times."""
 
 from __future__ import annotations
 

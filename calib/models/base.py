@@ -215,8 +215,8 @@ class Model:
         ``(conditions, references) -> rows``: what `mean_response` needs of the conditions, worked
         out once for any number of parameter vectors.
     joined : (str, str, str), optional
-        Two parameters and a condition by which the second is multiplied: where it varies little,
-        the data know but their sum, and it is sampled with their ratio.
+        Two parameters and a condition that multiplies the second: where it varies little, the data
+        determine only their sum, which is sampled together with their ratio.
     slow : bool
         Whether its posterior takes minutes: `calib sbc` asks for many, and for this one by name.
     uncertain : callable, optional

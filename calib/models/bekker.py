@@ -1,4 +1,6 @@
-"""Rut depth from ground pressure and slip: Bekker and its slip-sinkage extension (Eqs 17-21).
+"""Sinkage by ground pressure, slip and plate width: Bekker, Reece and Lyasko.
+
+Rut depth from ground pressure and slip: Bekker and its slip-sinkage extension (Eqs 17-21).
 
     p = k z^n,  k = kc/b + kphi,  n = n0 + n1 s,   so   ln z = (ln p - ln k)/(n0 + n1 s)
 

@@ -1,4 +1,6 @@
-"""Drawbar pull by the Magic Formula at one inflation pressure (He et al. 2019, Eqs 3-5).
+"""Drawbar pull by the Magic Formula, at one inflation pressure or with pressure as a condition.
+
+Drawbar pull by the Magic Formula at one inflation pressure (He et al. 2019, Eqs 3-5).
 
 With slip x in percent and drawbar pull Y in kN,
 

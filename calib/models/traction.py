@@ -1,4 +1,6 @@
-"""Net traction from a mobility number and slip: Wismer & Luth (1973), Brixius (1987).
+"""Empirical models of traction, shear stress and rut depth.
+
+Net traction from a mobility number and slip: Wismer & Luth (1973), Brixius (1987).
 
 With W the load, CI the cone index, b and d width and diameter of the tyre, delta its deflection
 and h the height of its section,

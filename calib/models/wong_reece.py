@@ -14,8 +14,7 @@ Pull, torque and sinkage are three models of one soil: of its eight parameters e
 determines but a few, so what is known of the soil is best fixed in a prior file. A braked wheel
 (slip below zero, part II of the source) has no value.
 
-The entry angle is found by the secant method on logarithms. `scipy.optimize.elementwise.find_root`
-needs three times as many integrations.
+The entry angle is found by the secant method on logarithms.
 """
 
 from __future__ import annotations
@@ -239,7 +238,7 @@ _model = partial(
     applies=(
         "Driven rigid wheels, or tyres so hard that they do not flatten, on one homogeneous soil, "
         "at slips of zero or more and loads that the soil can carry. Eight parameters of which "
-        "one output determines but a few: the others are the prior's. A minute for a dozen rows."
+        "one output determines only a few: the others are the prior's. A minute for a dozen rows."
     ),
 )  # fmt: skip
 

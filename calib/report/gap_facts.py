@@ -1,7 +1,4 @@
-"""What was found about a gap: the facts that a verdict is made from, and how each is said.
-
-What the pictures of a diagnosis share: field rows with their gaps, groups, names in words.
-"""
+"""Facts about a gap that a verdict and its figures are made from, and how each is worded."""
 
 from __future__ import annotations
 

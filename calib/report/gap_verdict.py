@@ -1,4 +1,4 @@
-"""What a diagnosis says of a change over the order of the runs, in whichever form it may be.
+"""The verdict on a gap, by explicit rules, from a few facts.
 
 The verdict on a gap, by explicit rules, from a few facts.
 

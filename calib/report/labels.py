@@ -1,7 +1,4 @@
-"""Names and units as a reader writes them, for axes (mathtext) and sentences (plain text).
-
-What is registered, told from its declaration: for a terminal, and for pages of documentation.
-"""
+"""Names and units as a reader writes them, and declarations in words."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Rows that a calibration's other rows do not expect, as a mistyped reading is.
-
-Whether the rows prefer the noise that a prior file asks for to normal noise of one sd.
-"""
+"""Outlying rows, and whether the rows prefer another noise to a normal one."""
 
 from __future__ import annotations
 

@@ -1,7 +1,5 @@
 """Predict outputs at new conditions, with bands, from a calibration.
 
-What the predictive draws themselves say of many rows at once.
-
 Held-out rows of one test share the uncertainty of one curve, so they are not independent: when it
 is off, it is off for all of them. Every draw is a set of rows that the model deems possible, so
 treating draws as observations gives the reference that a binomial or Kolmogorov law would give

@@ -1,10 +1,6 @@
-"""Scores of predictive draws against observations: pure functions of arrays.
+"""Scores and residuals of predictive draws, and what set each parameter.
 
 `draws` always has shape (n_draws, n): predictive draws of n observations, noise included.
-
-Residuals over the noise scale, and whether their signs run on along a curve.
-
-What set each parameter: the data, the prior, or both.
 """
 
 from __future__ import annotations

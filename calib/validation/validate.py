@@ -1,6 +1,4 @@
-"""Validate a calibration on what was not fitted: held-out rows, or each row left out in turn.
-
-Monte Carlo standard errors of everything that is computed from posterior draws.
+"""Validate a calibration on rows that were not fitted, with Monte Carlo errors of the scores.
 
 Of a posterior's summary they are the stated ones, of its sd ArviZ's. Scores follow from the errors
 of the predictive distributions they are scores of.

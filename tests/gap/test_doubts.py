@@ -34,7 +34,7 @@ def test_a_field_far_noisier_than_the_laboratory_is_amber_and_its_column_named()
     judged = gap_verdict(found)
     assert judged.tone is not Tone.FINE
     assert "times as much as the laboratory's (sd 0.2" in judged.headline
-    assert "kN, there 0.01" in judged.headline
+    assert "kN against 0.01" in judged.headline
     assert "differs with 'operator'" in judged.headline
     noisier, column = document(found)["warnings"][:2]
     assert "scatters" in noisier

@@ -1,8 +1,8 @@
-"""What the program computes, each number with what it may move by: the net under a redesign.
+"""Numbers that the program computes, each with the largest change that counts as none.
 
-Every number is a pair of its value and the largest move that is none: six Monte Carlo errors of a
-difference where it comes of posterior draws, 0.03 of a probability or an error reduction, a
-hundredth of itself where it comes of a search.
+They are the safety net of a redesign. The tolerance is six Monte Carlo errors of a difference for
+what follows from posterior draws, 0.03 for a probability or an error reduction, and 1 % for what
+follows from a search.
 
 `python -m tests.golden.numbers` writes `golden.json` again, and says what moved.
 """
@@ -107,14 +107,12 @@ def diagnosis(name: str) -> Numbers:
     return numbers
 
 
-@cache
-def _temporary() -> Path:
-    return Path(tempfile.mkdtemp(prefix="golden-"))
+_SCRATCH = tempfile.TemporaryDirectory(prefix="golden-")
 
 
 @cache
 def _measured() -> Path:
-    folder = _temporary() / "measured"
+    folder = Path(_SCRATCH.name) / "measured"
     for case in read_cases():
         case.write(folder / case.name)
     return folder
@@ -122,8 +120,8 @@ def _measured() -> Path:
 
 @cache
 def _bench() -> Path:
-    folder = _temporary() / "bench"
-    make(folder, _temporary() / "sealed" / "key.json", seed=_SEED, n_cases=8)
+    folder = Path(_SCRATCH.name) / "bench"
+    make(folder, Path(_SCRATCH.name) / "sealed" / "key.json", seed=_SEED, n_cases=8)
     return folder
 
 

@@ -10,7 +10,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from calib.batch.campaign.kinds import KINDS, Kind, Place, Section, Task
+from calib.batch.campaign.kind import Kind, Place, Section, Task
+from calib.batch.campaign.kinds import KINDS
 from calib.data.files import MEND_TOML, decoded
 from calib.errors import CalibError
 from calib.inference.random import stream

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from calib.batch.campaign.kinds import KINDS, Task
+from calib.batch.campaign.kind import Task
+from calib.batch.campaign.kinds import KINDS
 from calib.batch.campaign.plan import Plan
 from calib.batch.environment import sha256, versions
 from calib.batch.folders import check_folder, check_room, write_whole, writing

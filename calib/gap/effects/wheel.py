@@ -1,4 +1,4 @@
-"""Effects of soil state: its strength depends on a covariate the simulator does not see.
+"""Effects of soil state and of wheel-soil mechanics that a simulator leaves out.
 
 Stronger soil raises the whole traction curve, steepens it, lowers the motion resistance and makes
 the rut shallower. Each of the three effects does this along its own covariate h, which is zero at
@@ -6,8 +6,6 @@ the laboratory's value:
 
     pull'(s) = exp(a_pull h) pull(s exp(a_slope h)) + a_resistance h W
     ln rut' = ln rut + (a_rut + a_rut_slip s) h
-
-Effects of wheel-soil mechanics that the simulator leaves out.
 """
 
 from __future__ import annotations

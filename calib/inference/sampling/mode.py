@@ -1,11 +1,4 @@
-"""Many ascents at once: quasi-Newton steps for a batch of starts, one density call for all.
-
-It tells basins apart, which needs no accuracy; one ascent at a time costs ten times as much.
-
-The curvature of a density at a mode, as the covariance of a normal.
-
-Find the modes of a posterior from point estimates and prior draws.
-"""
+"""Find the modes of a posterior from point estimates and prior draws, with their curvature."""
 
 from __future__ import annotations
 

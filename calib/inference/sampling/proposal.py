@@ -1,6 +1,4 @@
-"""A proposal that resembles a posterior, fitted to weighted draws of it.
-
-Make the proposal resemble the posterior: adaptive importance sampling, and learning from chains.
+"""Fit a proposal to the posterior by adaptive importance sampling.
 
 Curvature at the posterior's modes gives a first proposal; rounds of adaptive importance sampling
 (Cappe et al. 2008, doi:10.1007/s11222-008-9059-x) fit it to the posterior. Draws from the result

@@ -37,9 +37,9 @@ class SamplerSettings:
         In each ensemble; by default 320, 64 of a slow model and 20 of long data, but at least
         twice the dimension plus two.
     steps : int
-        Kept steps of the first attempt; of the next ones, as many as the gate then needs.
+        Kept steps of the first attempt; later ones are as long as the gate requires.
     max_steps : int
-        Of the last attempt.
+        Upper limit of the kept steps.
     keep : int
         About so many draws of each ensemble are stored: those of evenly picked walkers at 32 or
         more evenly picked steps.
@@ -335,12 +335,12 @@ def sample_density(
     )
 
 
-# What the next attempt is longer by, at least.
+# The next attempt is at least so many times as long.
 _LEAST_LONGER = 1.25
 
 
 def _longer(steps: int, tau: Array, report: GateReport, gate: Gate) -> int:
-    """Return the length of the next attempt: what the slowest parameter needs, and a fifth."""
+    """Return the length of the next attempt: what the slowest parameter needs, plus a fifth."""
     ess = np.concatenate([report.ess_bulk, report.ess_tail])
     short = np.concatenate([gate.taus_min * tau / steps, gate.ess_min / ess])
     known = short[np.isfinite(short)]

@@ -1,6 +1,4 @@
-"""Walkers of emcee, moved by differential evolution and by draws from a fitted proposal.
-
-Carry draws of one density over to another: the sampler's way from the prior to the posterior.
+"""Walkers of emcee, and sequential Monte Carlo from the prior to the posterior.
 
 Sequential Monte Carlo (Del Moral, Doucet & Jasra 2006, doi:10.1111/j.1467-9868.2006.00553.x). The
 target moves from the first density to the second in steps that leave half of the draws effective;

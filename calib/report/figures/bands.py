@@ -1,7 +1,4 @@
-"""Predictive bands with the data in them, of posterior and prior, one panel for each pressure.
-
-The figure of density over cone index and water content, and predicted against observed.
-"""
+"""Figures of predictions: bands with data, density over cone index and water content."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Figures of a diagnosis on hypotheses: which it is, and what each leaves of the gap.
-
-The figure of what a design of experiments can tell apart, before any field data.
-"""
+"""Figures of a diagnosis: what a design can tell apart, which cause it is, and what each leaves."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""The posterior in pairs: every two sampled parameters against each other.
-
-What the data taught, and whether the ensembles agree, for every sampled parameter.
-"""
+"""Figures of a posterior: pairs of parameters, what data taught, whether ensembles agree."""
 
 from __future__ import annotations
 

@@ -3,8 +3,6 @@
 Sizes are for print; colours are those of Okabe & Ito (2008) and survive greyscale; whatever a
 colour says, a marker, a line style or a label says too. Ticks are placed when a figure is drawn,
 so the style holds then as well.
-
-A plate: a figure, the name of its file, and one sentence on what it shows.
 """
 
 from __future__ import annotations

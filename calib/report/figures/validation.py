@@ -43,8 +43,6 @@ from calib.validation.scores import (
 )
 from calib.validation.validate import PARETO_K_MAX
 
-_SIGNIFICANT = 0.05
-
 
 def residuals_plate(result: OutputResult) -> Plate:
     """Draw residuals against prediction and condition, their quantiles, and replicated data."""

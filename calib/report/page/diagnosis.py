@@ -1,10 +1,4 @@
-"""The page of a diagnosis: where, which, how far, for a person who has not read the code.
-
-Write the page of a diagnosis, drawn and rendered by the processes of a pool.
-
-Where there are others this one never imports what that takes: it would, on one core, while they
-wait.
-"""
+"""The page of a diagnosis: where, which, how far, for a person who has not read the code."""
 
 from __future__ import annotations
 

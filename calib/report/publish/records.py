@@ -1,9 +1,4 @@
-"""The methods in words: every number is the manifest's or the summary's. They are `methods.j2`.
-
-What tables and methods read of a manifest and a summary, and a table as CSV and LaTeX.
-
-Tables for print and for programs: scores of the held-out rows, and convergence.
-"""
+"""Methods and tables for print and for programs, from a manifest and a summary."""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
-"""Simulators too slow to be asked by a sampler: truths are runs, posteriors are by emulation.
+"""One replicate of simulation-based calibration: simulate, calibrate, rank the truth.
 
 Each simulated campaign is emulated and calibrated as `calib fit` would. The seed of the emulation
 is that of the whole run, so all campaigns begin with the same runs over the prior, which are kept
 and made once.
-
-One replicate: simulate, calibrate as a user would, rank the truth among the posterior's draws.
 
 A replicate is a pure function of its item, so it can run anywhere and in any order.
 """

@@ -1,4 +1,4 @@
-"""Whether ranks are uniform: simultaneous bands for their ECDF, and a p value to go with them.
+"""Run the replicates of all models, and test whether ranks are uniform and bands cover.
 
 The statistic is the smallest pointwise binomial tail of the ECDF over its evaluation points
 (Saeilynoja, Buerkner & Vehtari 2022). Bands come from ArviZ, which simulates the statistic; the
@@ -8,10 +8,6 @@ References
 ----------
 .. [1] Saeilynoja, Buerkner & Vehtari (2022), doi:10.1007/s11222-022-10090-6.
 .. [2] Moscovich & Nadler (2017), doi:10.1016/j.spl.2016.11.027: the Poisson recursion.
-
-From replicates to figures: whether ranks are uniform, and bands cover what they claim.
-
-Run the replicates of all models, resumable, on this machine or a cluster.
 """
 
 from __future__ import annotations
