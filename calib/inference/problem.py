@@ -377,7 +377,9 @@ def build_problem(
         (*model.parameters, "sigma"),
         references,
     )
-    check_enough(table, len({p.name for p in priors.free} - {*(fixed or ())}), model=model.name)
+    # With some parameters held, a fit still needs more rows than its equation has parameters.
+    estimated = {p.name for p in priors.free} - {*(fixed or ())}
+    check_enough(table, max(len(estimated), len(model.parameters)), model=model.name)
     check_varies(table, model.output)
     check_settings(table, model.conditions)
     relative = relative_columns(priors.text)
