@@ -53,7 +53,7 @@ def problem_of(rows: int, *, distinct: int | None = None, seed: int = 1) -> Prob
     blocks = range(0, rows, _BLOCK)
     pull = np.concatenate(
         [
-            bound.location(theta, {k: v[i : i + _BLOCK] for k, v in columns.items()})[0]
+            bound.mean_response(theta, {k: v[i : i + _BLOCK] for k, v in columns.items()})[0]
             for i in blocks
         ]
     )

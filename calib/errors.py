@@ -1,4 +1,4 @@
-"""The one exception a user sees: what was found, where, what is allowed, how to mend it."""
+"""The one exception a user sees: what was found, where, what is expected, how to fix it."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FAULTS = (AttributeError, LookupError, OSError, RuntimeError, TypeError, ValueEr
 
 
 class CalibError(Exception):
-    """Raised for every problem the user can mend.
+    """Raised for every problem the user can fix.
 
     Parameters
     ----------
@@ -21,7 +21,7 @@ class CalibError(Exception):
         What was found.
     where : str, optional
         File, row, column or parameter at which it was found.
-    allowed : str, optional
+    expected : str, optional
         What would have been accepted there.
     mend : str, optional
         What to do about it.
@@ -32,31 +32,31 @@ class CalibError(Exception):
         message: str,
         *,
         where: str | None = None,
-        allowed: str | None = None,
-        mend: str | None = None,
+        expected: str | None = None,
+        hint: str | None = None,
     ) -> None:
         self.message = message
         self.where = where
-        self.allowed = allowed
-        self.mend = mend
+        self.expected = expected
+        self.hint = hint
         super().__init__(str(self))
 
     def __str__(self) -> str:
         lines = [f"{self.where}: {self.message}" if self.where else self.message]
-        if self.allowed:
-            lines.append(f"  allowed: {self.allowed}")
-        if self.mend:
-            lines.append(f"  to mend: {self.mend}")
+        if self.expected:
+            lines.append(f"  expected: {self.expected}")
+        if self.hint:
+            lines.append(f"  hint: {self.hint}")
         return "\n".join(lines)
 
     def within(self, *places: str | None) -> CalibError:
         """Return the error with what it was found in named before where it was found."""
         where = ", ".join(filter(None, (*places, self.where)))
-        return CalibError(self.message, where=where, allowed=self.allowed, mend=self.mend)
+        return CalibError(self.message, where=where, expected=self.expected, hint=self.hint)
 
     def __reduce__(self) -> tuple[object, ...]:
         # Keyword-only arguments do not survive the default pickling between worker processes.
-        return (_rebuild, (self.message, self.where, self.allowed, self.mend))
+        return (_rebuild, (self.message, self.where, self.expected, self.hint))
 
 
 def meant(name: str, known: Iterable[str], otherwise: str = "correct the name") -> str:
@@ -102,5 +102,5 @@ def in_words(error: Mapping[str, Any]) -> str:
     return f"{key} = {reprlib.repr(error['input'])} is not {should}"
 
 
-def _rebuild(message: str, where: str | None, allowed: str | None, mend: str | None) -> CalibError:
-    return CalibError(message, where=where, allowed=allowed, mend=mend)
+def _rebuild(message: str, where: str | None, expected: str | None, hint: str | None) -> CalibError:
+    return CalibError(message, where=where, expected=expected, hint=hint)

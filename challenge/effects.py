@@ -31,8 +31,8 @@ def kind_of(name: str) -> EffectKind:
     if name not in LISTED:
         raise CalibError(
             f"the challenge has no effect named {name!r}",
-            allowed=", ".join(sorted(LISTED)),
-            mend="use one of these names",
+            expected=", ".join(sorted(LISTED)),
+            hint="use one of these names",
         )
     return LISTED[name]
 

@@ -112,7 +112,7 @@ def make_case(seed: np.random.SeedSequence, tier: Tier, truth: str) -> CaseFiles
         wanted = _draw_like(rng, truth)
     raise CalibError(
         f"no fair {tier} case of {truth} in {_TRIES * _FALLBACKS} draws",
-        mend="use another seed",
+        hint="use another seed",
     )
 
 
@@ -132,11 +132,11 @@ def case_jobs(
         If a number will not do.
     """
     if n_cases < 1:
-        raise CalibError(f"{n_cases} cases were asked for", allowed="1 or more")
+        raise CalibError(f"{n_cases} cases were asked for", expected="1 or more")
     if not tiers or not set(tiers) <= set(TIERS):
-        raise CalibError(f"unknown tiers {tiers}", allowed=", ".join(TIERS))
+        raise CalibError(f"unknown tiers {tiers}", expected=", ".join(TIERS))
     if not 0.0 <= null_fraction <= 0.7:
-        raise CalibError(f"null_fraction is {null_fraction}", allowed="0 to 0.7")
+        raise CalibError(f"null_fraction is {null_fraction}", expected="0 to 0.7")
     planning, *own = np.random.SeedSequence(seed).spawn(n_cases + 1)
     planned = plan(np.random.default_rng(planning), n_cases, tiers, null_fraction)
     jobs = zip(own, planned, strict=True)

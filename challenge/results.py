@@ -34,8 +34,8 @@ def check_results(cases_dir: Path, results_dir: Path, names: Sequence[str]) -> t
     if not there:
         raise CalibError(
             "there is no diagnosis of these cases", where=str(results_dir),
-            allowed="a folder that `calib challenge run` wrote",
-            mend=f"correct --results, or run `calib challenge run {cases_dir} --out {results_dir}`",
+            expected="a folder that `calib challenge run` wrote",
+            hint=f"correct --results, or run `calib challenge run {cases_dir} --out {results_dir}`",
         )  # fmt: skip
     foreign, untold = [], []
     for name in there:
@@ -48,8 +48,8 @@ def check_results(cases_dir: Path, results_dir: Path, names: Sequence[str]) -> t
         raise CalibError(
             f"{len(foreign)} of {len(there)} diagnoses are of other cases, or of these before "
             f"their files were changed: {_listed(foreign)}",
-            where=str(results_dir), allowed=f"diagnoses of the cases in {cases_dir}",
-            mend="point to their diagnoses, or diagnose these cases again, into another folder",
+            where=str(results_dir), expected=f"diagnoses of the cases in {cases_dir}",
+            hint="point to their diagnoses, or diagnose these cases again, into another folder",
         )  # fmt: skip
     if not untold:
         return ()

@@ -349,7 +349,7 @@ def score(
             there = sorted({",".join(sorted(entry["noise_sd"])) for entry in entries.values()})
             raise CalibError(
                 f"no case measures {' and '.join(outputs)} alone", where=str(cases_dir),
-                allowed="; ".join(there), mend="name the outputs of some cases, or leave them out",
+                expected="; ".join(there), hint="name the outputs of some cases, or leave them out",
             )  # fmt: skip
     tiers = {tier: [a for a in answers if a.tier == tier] for tier in TIERS}
     tiers = {tier: part for tier, part in tiers.items() if part}

@@ -44,14 +44,14 @@ def check_new(cases_dir: Path, key_path: Path) -> None:
         raise CalibError(
             "the key must not lie with the cases that it answers",
             where=str(key_path),
-            allowed=f"a path outside {cases_dir}",
-            mend="choose another path for the key",
+            expected=f"a path outside {cases_dir}",
+            hint="choose another path for the key",
         )
     if cases_dir.exists() and any(cases_dir.iterdir()):
         raise CalibError(
             "the folder is not empty",
             where=str(cases_dir),
-            mend="choose a new folder, so that cases of two tests cannot mix",
+            hint="choose a new folder, so that cases of two tests cannot mix",
         )
     for path in (cases_dir, key_path):
         check_room(path)
@@ -59,7 +59,7 @@ def check_new(cases_dir: Path, key_path: Path) -> None:
         raise CalibError(
             "a key is there already",
             where=str(key_path),
-            mend="choose another path; without its key a test cannot be scored",
+            hint="choose another path; without its key a test cannot be scored",
         )
 
 
@@ -119,8 +119,8 @@ def published_hash(cases_dir: Path) -> str:
         raise CalibError(
             f"no published key hash can be read ({type(problem).__name__})",
             where=str(cases_dir / MANIFEST_NAME),
-            allowed="the manifest that was written with the cases",
-            mend="point to the folder that `calib challenge make` wrote",
+            expected="the manifest that was written with the cases",
+            hint="point to the folder that `calib challenge make` wrote",
         ) from problem
 
 
@@ -143,14 +143,14 @@ def open_key(cases_dir: Path, key_path: Path) -> dict[str, Any]:
         raise CalibError(
             f"the key's SHA-256 is {sha256(data)}",
             where=str(key_path),
-            allowed=f"the published {expected}",
-            mend="use the key that was written together with these cases, unchanged",
+            expected=f"the published {expected}",
+            hint="use the key that was written together with these cases, unchanged",
         )
     key: dict[str, Any] = json.loads(data)
     if key.get("schema") != KEY_SCHEMA:
         raise CalibError(
             f"the key has the schema {key.get('schema')!r}",
             where=str(key_path),
-            allowed=KEY_SCHEMA,
+            expected=KEY_SCHEMA,
         )
     return key

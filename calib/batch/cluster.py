@@ -219,7 +219,7 @@ def _start(workers: int, tries: int = START_TRIES) -> LocalCluster:
                 return _start(workers, tries - 1)
             raise CalibError(
                 f"the worker processes do not start ({error})",
-                mend='in a script of yours, put the call below `if __name__ == "__main__":`',
+                hint='in a script of yours, put the call below `if __name__ == "__main__":`',
             ) from error
         except KeyboardInterrupt:
             # Without its workers it fails to start, and closes itself.
@@ -286,8 +286,8 @@ def _existing(address: str) -> Iterator[Client]:
         raise CalibError(
             f"there is no Dask scheduler at this address ({type(error).__name__}: {error})",
             where=address,
-            allowed="tcp://HOST:PORT of a running `dask scheduler`",
-            mend="start one, or leave --scheduler out to work on this machine",
+            expected="tcp://HOST:PORT of a running `dask scheduler`",
+            hint="start one, or leave --scheduler out to work on this machine",
         ) from None
     with client:
         ours = versions()
@@ -313,8 +313,8 @@ def _unlike(worker: str, why: str) -> CalibError:
     return CalibError(
         f"a worker would not give the same numbers: {why}",
         where=worker,
-        allowed="workers with the calib and the libraries of this process",
-        mend="install the same versions there (constraints.txt lists them)",
+        expected="workers with the calib and the libraries of this process",
+        hint="install the same versions there (constraints.txt lists them)",
     )
 
 
@@ -329,7 +329,7 @@ def _connection() -> Iterator[None]:
 def _lost() -> CalibError:
     return CalibError(
         "the connection to the Dask scheduler was lost",
-        mend="start again when it is back: what has been done is kept",
+        hint="start again when it is back: what has been done is kept",
     )
 
 

@@ -38,8 +38,8 @@ def from_the_bench(what: str) -> Iterator[None]:
             raise
         raise CalibError(
             "the challenge is a test bench of the repository, not of the wheel",
-            where=what, allowed="a checkout of the repository, with its folder `challenge`",
-            mend="run from a checkout: `pip install -e .` in it",
+            where=what, expected="a checkout of the repository, with its folder `challenge`",
+            hint="run from a checkout: `pip install -e .` in it",
         ) from None  # fmt: skip
 
 

@@ -109,7 +109,7 @@ def claimed(out: Path, *, overwrite: bool = False) -> Iterator[None]:
         raise CalibError(
             "another process is working on this output folder",
             where=str(out),
-            mend="wait until it ends, stop it, or choose another --out",
+            hint="wait until it ends, stop it, or choose another --out",
         )
     scratch, held = _claimed[out.absolute()] = _scratch(out)
     try:
@@ -147,7 +147,7 @@ def _replaceable(out: Path, *, overwrite: bool) -> Path:
         raise CalibError(
             "the output folder is a mount point, which cannot be replaced",
             where=str(out),
-            mend="choose a new folder inside it as --out",
+            hint="choose a new folder inside it as --out",
         )
     return out
 
@@ -203,7 +203,7 @@ def _put(scratch: Path, out: Path) -> None:
         raise CalibError(
             "another process has written the output folder meanwhile",
             where=str(out),
-            mend=f"look for the result of this one in {beside}",
+            hint=f"look for the result of this one in {beside}",
         ) from error
 
 
@@ -283,7 +283,7 @@ def _unwritable(out: Path, why: str) -> CalibError:
     return CalibError(
         f"the output cannot be written ({why})",
         where=str(out),
-        mend="choose another --out, change its permissions, or make room",
+        hint="choose another --out, change its permissions, or make room",
     )
 
 
@@ -316,13 +316,13 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
         return
     if not out.is_dir():
         raise CalibError(
-            "the output folder is an existing file", where=str(out), mend="choose another --out"
+            "the output folder is an existing file", where=str(out), hint="choose another --out"
         )
     if out.resolve() == Path.cwd():
         raise CalibError(
             "the output folder is the current folder, which cannot be replaced",
             where=str(out),
-            mend="choose another --out, such as a new folder inside it",
+            hint="choose another --out, such as a new folder inside it",
         )
     _check_place(out, _above(out))
     if not any(out.iterdir()):
@@ -331,18 +331,18 @@ def check_folder(out: Path, *, overwrite: bool = False) -> None:
         raise CalibError(
             "the output folder exists and is not empty",
             where=str(out),
-            mend="choose another --out, or pass --overwrite to replace it",
+            hint="choose another --out, or pass --overwrite to replace it",
         )
     if not any((out / name).exists() for name in _OURS):
         raise CalibError(
             "the output folder was not written by calib, so it is not replaced",
             where=str(out),
-            mend="choose another --out, or delete the folder yourself",
+            hint="choose another --out, or delete the folder yourself",
         )
     foreign = sorted(p.name for p in out.iterdir() if not _is_ours(p.name))
     if foreign:
         raise CalibError(
             f"the output folder holds files that calib did not write: {', '.join(foreign[:5])}",
             where=str(out),
-            mend="move them elsewhere, or choose another --out",
+            hint="move them elsewhere, or choose another --out",
         )

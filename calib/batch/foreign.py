@@ -127,8 +127,8 @@ def _check_beside(path: Path) -> None:
             raise CalibError(
                 f"it imports {name}, which is {file.relative_to(path.parent)} beside it, and "
                 f"elsewhere too ({other})",
-                where=str(path), allowed="names of modules that there are once",
-                mend="give the file beside it another name",
+                where=str(path), expected="names of modules that there are once",
+                hint="give the file beside it another name",
             )  # fmt: skip
 
 

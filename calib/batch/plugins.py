@@ -55,8 +55,8 @@ def run_file(path: Path, what: str) -> ModuleType:
     # `Path.is_file` fails where a name is too long for one.
     if not os.path.isfile(path) or spec is None or spec.loader is None:  # noqa: PTH113
         raise CalibError(
-            f"the {what} cannot be read", where=str(path), allowed="a Python file ending in .py",
-            mend="give the path of such a file",
+            f"the {what} cannot be read", where=str(path), expected="a Python file ending in .py",
+            hint="give the path of such a file",
         )  # fmt: skip
     module = importlib.util.module_from_spec(spec)
     # Known by its name, so that what it defines can be handed to other processes.
@@ -77,7 +77,7 @@ def run_file(path: Path, what: str) -> ModuleType:
         lines = [f.lineno for f in frames if Path(f.filename).resolve() == path]
         at = f"{path}, line {lines[-1]}" if lines else str(path)
         raise CalibError(
-            f"the file does not run: {type(error).__name__}: {error}", where=at, mend="correct it"
+            f"the file does not run: {type(error).__name__}: {error}", where=at, hint="correct it"
         ) from error
     return module
 
@@ -180,7 +180,7 @@ def load_installed(group: str) -> None:
             raise CalibError(
                 f"{point.name} of {package} cannot be loaded: {type(error).__name__}: {error}",
                 where=f"entry point {group}",
-                mend="update or remove the package",
+                hint="update or remove the package",
             ) from error
         if hasattr(found, "register") and not isinstance(found, ModuleType):
             found.register()

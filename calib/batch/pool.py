@@ -94,7 +94,7 @@ class _There[R]:
         except BrokenProcessPool:
             raise CalibError(
                 "a process died while it worked: it was killed, or there was no memory left",
-                mend="run it again, with --workers 1 if it happens again",
+                hint="run it again, with --workers 1 if it happens again",
             ) from None
 
 

@@ -104,7 +104,7 @@ def completed[I, R](
         If there is no such cluster, or it is lost.
     """
     if workers < 1:
-        raise CalibError(f"{workers} workers were asked for", allowed="1 or more")
+        raise CalibError(f"{workers} workers were asked for", expected="1 or more")
     todo = list(items if names is None else names)
     if not todo:
         return
@@ -173,9 +173,9 @@ def check_names(names: Iterable[str]) -> None:
         if not _NAME.fullmatch(name) or name in ("failed", SECONDS, FAILED):
             raise CalibError(
                 f"{name!r} cannot be the name of a task",
-                allowed="up to 200 letters, digits and . _ + = -, starting with a letter or "
+                expected="up to 200 letters, digits and . _ + = -, starting with a letter or "
                 "digit; not 'failed'",
-                mend="rename it",
+                hint="rename it",
             )
 
 
@@ -259,7 +259,7 @@ def alone(folder: Path) -> Iterator[None]:
         raise CalibError(
             "another process is writing results to this folder",
             where=str(folder),
-            mend="wait until it ends, or stop it",
+            hint="wait until it ends, or stop it",
         ) from None
     try:
         yield

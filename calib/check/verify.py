@@ -120,8 +120,8 @@ def read_folder(folder: Path) -> Record:
                     raise
     raise CalibError(
         f"this is no folder that can be checked ({why})", where=str(folder),
-        allowed="a folder written by `calib report`, `calib fit` or `calib compare`",
-        mend="give such a folder; of a diagnosis `calib diagnose FOLDER/case` makes the same again",
+        expected="a folder written by `calib report`, `calib fit` or `calib compare`",
+        hint="give such a folder; of a diagnosis `calib diagnose FOLDER/case` makes the same again",
     )  # fmt: skip
 
 

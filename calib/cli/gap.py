@@ -75,8 +75,8 @@ def diagnose(
     else:
         raise CalibError(
             "it is not clear what to diagnose",
-            allowed="a case folder, or --run RUN together with --field CSV",
-            mend="give one of the two",
+            expected="a case folder, or --run RUN together with --field CSV",
+            hint="give one of the two",
         )
     own = {} if effects is None else load_effects(effects)
     files: dict[str, bytes] = {}

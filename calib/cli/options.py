@@ -87,7 +87,7 @@ def data(
     writers = {"he2019": _write_he2019, "he2019-gaps": _write_he2019_gaps}
     if name not in writers:
         raise CalibError(
-            f"there is no data set {name!r}", allowed=", ".join(writers), mend="use one of these"
+            f"there is no data set {name!r}", expected=", ".join(writers), hint="use one of these"
         )  # fmt: skip
     folder = Path(name) if out is None else out
     try:
@@ -95,7 +95,7 @@ def data(
     except OSError as error:
         raise CalibError(
             f"the folder cannot be written ({error.strerror})", where=str(folder),
-            mend="choose another --out",
+            hint="choose another --out",
         ) from None  # fmt: skip
     for path in written:
         print(f"{path} (reconstructed from published results, not measured)")
@@ -108,7 +108,7 @@ def _write_he2019(out: Path, overwrite: bool) -> list[Path]:
     if existing and not overwrite:
         raise CalibError(
             f"{', '.join(existing)} exist there already", where=str(out),
-            mend="choose another --out, or pass --overwrite",
+            hint="choose another --out, or pass --overwrite",
         )  # fmt: skip
     return embedded.write(out)
 
@@ -156,12 +156,12 @@ def _emit(text: str, out: Path | None) -> None:
 
     try:
         if out.exists():
-            raise CalibError("the file exists already", where=str(out), mend="choose another --out")
+            raise CalibError("the file exists already", where=str(out), hint="choose another --out")
         write_whole(out, text)
     except OSError as error:
         raise CalibError(
             f"the file cannot be written ({error.strerror})", where=str(out),
-            mend="choose another --out",
+            hint="choose another --out",
         ) from None  # fmt: skip
     print(out)
 

@@ -64,8 +64,8 @@ def predict(
     if effects is not None or without:
         raise CalibError(
             "there is no diagnosis, which alone has effects", where=str(run),
-            allowed="a folder of `calib diagnose`",
-            mend="correct its name, or leave --effects and --without out",
+            expected="a folder of `calib diagnose`",
+            hint="correct its name, or leave --effects and --without out",
         )  # fmt: skip
     if (run / "comparison.json").exists():
         found, parts = load_stack(run)
@@ -125,12 +125,12 @@ def _must_be_ours(out: Path, at: Path, overwrite: bool) -> None:
     if not overwrite:
         raise CalibError(
             "the file exists already", where=str(out),
-            mend="choose another --out, or pass --overwrite",
+            hint="choose another --out, or pass --overwrite",
         )  # fmt: skip
     if at.exists() and out.samefile(at):
         raise CalibError(
             "it holds the conditions, which --out would replace", where=str(out),
-            mend="choose another --out",
+            hint="choose another --out",
         )  # fmt: skip
     if not out.is_file():
         return
@@ -139,7 +139,7 @@ def _must_be_ours(out: Path, at: Path, overwrite: bool) -> None:
     if header and not header.endswith(_LAST_COLUMNS):
         raise CalibError(
             "the file is no prediction, so it is not replaced", where=str(out),
-            allowed="a CSV that calib predict wrote", mend="choose another --out",
+            expected="a CSV that calib predict wrote", hint="choose another --out",
         )  # fmt: skip
 
 

@@ -43,8 +43,8 @@ class _Problem:
     line: int
     column: str
     found: str
-    allowed: str
-    mend: str
+    expected: str
+    hint: str
 
 
 @dataclass
@@ -59,12 +59,12 @@ class Problems:
     total: int = 0
     _kept: dict[str, list[_Problem]] = field(default_factory=dict)
 
-    def add(self, line: int, column: str, found: str, allowed: str, mend: str) -> None:
+    def add(self, line: int, column: str, found: str, expected: str, hint: str) -> None:
         """Note a problem; the first few of each column are kept, the rest counted."""
         self.total += 1
         kept = self._kept.setdefault(column, [])
         if len(kept) < MAX_SHOWN:
-            kept.append(_Problem(line, column, found, allowed, mend))
+            kept.append(_Problem(line, column, found, expected, hint))
 
     def raise_any(self) -> None:
         """Raise what was noted, up to five problems in the order of the lines, if anything."""
@@ -76,16 +76,16 @@ class Problems:
             raise CalibError(
                 only.found,
                 where=f"{self.source}, {self._at(only)}",
-                allowed=only.allowed,
-                mend=only.mend,
+                expected=only.expected,
+                hint=only.hint,
             )
-        rows = [f"  {self._at(p)}: {p.found}; allowed: {p.allowed}" for p in shown]
+        rows = [f"  {self._at(p)}: {p.found}; expected: {p.expected}" for p in shown]
         if self.total > len(shown):
             rows.append(f"  and {self.total - len(shown)} more")
         raise CalibError(
             "\n".join([f"{self.total} problems in the data", *rows]),
             where=self.source,
-            mend="".join(f"\n    - {mend}" for mend in dict.fromkeys(p.mend for p in shown)),
+            hint="".join(f"\n    - {hint}" for hint in dict.fromkeys(p.hint for p in shown)),
         )
 
     def _at(self, problem: _Problem) -> str:
@@ -176,9 +176,9 @@ class CellReader:
                 values[i] = self._parse(cell, int(lines[i]))
             except ValueError as error:
                 unreadable.add(i)
-                found, mend = error.args
+                found, hint = error.args
                 name = self.column.header
-                self.problems.add(int(lines[i]), name, found, self.column.allowed, mend)
+                self.problems.add(int(lines[i]), name, found, self.column.expected, hint)
         return values
 
     def _parse(self, cell: str, line: int) -> float:
@@ -210,14 +210,14 @@ def check_values(
     column: Column, values: Array, lines: Lines, problems: Problems, *,
     missing_ok: bool, used: bool, cells: Sequence[str] = (), skip: set[int] | None = None,
 ) -> Array:  # fmt: skip
-    """Convert values (n,) to the canonical unit and note those that are not allowed.
+    """Convert values (n,) to the canonical unit and note those that are not expected.
 
     Parameters
     ----------
     lines : sequence of int, shape (n,)
         Where the values are.
     missing_ok : bool
-        Whether NaN is allowed.
+        Whether NaN is expected.
     used : bool
         Whether a logarithmic output must be positive.
     cells : sequence of str
@@ -236,8 +236,8 @@ def check_values(
     bad = np.flatnonzero(~fine)
     for i in bad[:MAX_SHOWN].tolist():
         cell = cells[i] if len(cells) else f"{values[i]:g}"
-        found, mend = _complaint(column, float(values[i]), cell, values)
-        problems.add(int(lines[i]), column.header, found, column.allowed, mend)
+        found, hint = _complaint(column, float(values[i]), cell, values)
+        problems.add(int(lines[i]), column.header, found, column.expected, hint)
     problems.total += max(0, bad.size - MAX_SHOWN)
     return canonical
 
@@ -281,7 +281,7 @@ def _mend_code(column: Column, missing_ok: bool) -> str:
 
 
 def _complaint(column: Column, value: float, cell: str, values: Array) -> tuple[str, str]:
-    """Say what is wrong with a value, one of a column's, and how to mend it."""
+    """Say what is wrong with a value, one of a column's, and how to fix it."""
     if not math.isfinite(value):
         what = f"{cell.strip()!r} is not a finite number" if cell.strip() else "an empty cell"
         return (
@@ -293,19 +293,19 @@ def _complaint(column: Column, value: float, cell: str, values: Array) -> tuple[
         what = f"{cell.strip()!r} is outside the range of {quantity.stem}"
         return what, "if it stands for a missing value, delete the row or leave the cell empty"
     if abs(value) > _LARGEST:
-        return f"{cell.strip()!r} is too large for a reading", quantity.mend
+        return f"{cell.strip()!r} is too large for a reading", quantity.hint
     what = f"{cell.strip()!r} is outside the range of {quantity.stem}"
-    mend = quantity.mend
+    hint = quantity.hint
     if quantity.kind == "slip" and value > 0.0:
-        mend = _OTHER_SLIP
+        hint = _OTHER_SLIP
     if "percent" in quantity.units and column.unit == "dimensionless" and abs(value) <= 100.0:
         # Renamed for the sake of a few, the others would be a hundredth of what they are.
         name = f"{quantity.stem}_percent"
         if float(np.nanmedian(np.abs(values))) > 1.0:
-            mend = f"did you mean {name}? Then rename the column; otherwise: {mend}"
+            hint = f"did you mean {name}? Then rename the column; otherwise: {hint}"
         else:
-            mend += f"; or if all values are percent, rename the column {name}"
-    return what, mend
+            hint += f"; or if all values are percent, rename the column {name}"
+    return what, hint
 
 
 def label_codes(

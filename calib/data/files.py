@@ -22,9 +22,9 @@ from numpy.typing import ArrayLike
 from calib.errors import FAULTS, CalibError
 
 
-def _no_csv(found: str, where: str, mend: str) -> CalibError:
+def _no_csv(found: str, where: str, hint: str) -> CalibError:
     allowed = "a CSV file in UTF-8: a line of column names, then one line per row"
-    return CalibError(found, where=where, allowed=allowed, mend=mend)
+    return CalibError(found, where=where, expected=allowed, hint=hint)
 
 
 @dataclass(frozen=True)
@@ -77,23 +77,23 @@ def _read_bytes(source: str) -> bytes:
         beside = f"; its folder holds {', '.join(near)}" if near else ""
         raise _no_csv("there is no such file", source, f"check the path{beside}") from None
     except IsADirectoryError:
-        mend = "name a CSV file inside it"
-        raise _no_csv("this is a folder, not a file", source, mend) from None
+        hint = "name a CSV file inside it"
+        raise _no_csv("this is a folder, not a file", source, hint) from None
     except (OSError, ValueError) as error:
-        mend = "check the path and the permissions"
-        raise _no_csv(f"the file cannot be read ({error})", source, mend) from None
+        hint = "check the path and the permissions"
+        raise _no_csv(f"the file cannot be read ({error})", source, hint) from None
 
 
 def _decode(raw: bytes, source: str) -> str:
-    mend = "save it again as CSV in UTF-8 (Excel: `CSV UTF-8`)"
+    hint = "save it again as CSV in UTF-8 (Excel: `CSV UTF-8`)"
     try:
         text = decoded(raw)
     except UnicodeDecodeError as error:
         line = raw.count(b"\n", 0, error.start) + 1
         found = f"byte 0x{raw[error.start]:02x} is not {error.encoding.upper()}"
-        raise _no_csv(found, f"{source}, line {line}", mend) from None
+        raise _no_csv(found, f"{source}, line {line}", hint) from None
     if raw.startswith(b"PK\x03\x04") or "\x00" in text:
-        raise _no_csv("this is a binary file, such as a workbook, not text", source, mend)
+        raise _no_csv("this is a binary file, such as a workbook, not text", source, hint)
     return text
 
 
@@ -148,7 +148,7 @@ def write_table(
     if len(set(lengths.values())) > 1:
         raise CalibError(
             f"the columns differ in length: {lengths}", where=os.fspath(path),
-            allowed="columns of one length", mend="pass arrays of shape (n,)",
+            expected="columns of one length", hint="pass arrays of shape (n,)",
         )  # fmt: skip
     target = Path(path)
     # In the folder of the target, so that the final step only renames.
@@ -162,8 +162,8 @@ def write_table(
     except OSError as error:
         raise CalibError(
             f"the file cannot be written ({error.strerror})", where=str(target),
-            allowed="a file in an existing folder that you may write to",
-            mend="make the folder, change its permissions or name another file",
+            expected="a file in an existing folder that you may write to",
+            hint="make the folder, change its permissions or name another file",
         ) from None  # fmt: skip
     finally:
         with contextlib.suppress(OSError):

@@ -67,7 +67,7 @@ class Column:
         return "" if self.unit == "dimensionless" else self.unit.replace("**", "")
 
     @property
-    def allowed(self) -> str:
+    def expected(self) -> str:
         """The allowed values, in this column's unit."""
         return self.quantity.range.describe(self.quantity.unit, self.unit)
 
@@ -163,18 +163,18 @@ def _unit_error(header: str, quantity: Quantity, suffix: str, where: str) -> Cal
     near = difflib.get_close_matches(suffix, quantity.units, n=1, cutoff=0.5)
     factor = _foreign_unit(header, suffix, quantity) if suffix else 0.0
     if factor:
-        mend = f"multiply the readings by {factor:g}, and name the column {quantity.canonical}"
+        hint = f"multiply the readings by {factor:g}, and name the column {quantity.canonical}"
     elif near:
-        mend = f"did you mean {quantity.stem}_{near[0]}?"
+        hint = f"did you mean {quantity.stem}_{near[0]}?"
     else:
-        mend = f"rename the column, for example {quantity.canonical}, with the unit of its readings"
+        hint = f"rename the column, for example {quantity.canonical}, with the unit of its readings"
     if suffix and not factor:
-        mend += "; what is in no such unit must be converted first"
+        hint += "; what is in no such unit must be converted first"
     return CalibError(
         found,
         where=_at(where, header),
-        allowed=", ".join(accepted_headers(quantity)),
-        mend=mend,
+        expected=", ".join(accepted_headers(quantity)),
+        hint=hint,
     )
 
 
@@ -245,8 +245,8 @@ def _side_by_side(given: Mapping[str, list[tuple[int, str]]], where: str) -> Cal
             both = "both" if len(columns) == 2 else "all"
             said.append(f"columns {', '.join(most)} and {last} {both} give {QUANTITIES[name].stem}")
     return CalibError(
-        "; ".join(said), where=_at(where, header), allowed="one column per quantity",
-        mend="of one reading in several units, delete or rename one; of repeats side by side, "
+        "; ".join(said), where=_at(where, header), expected="one column per quantity",
+        hint="of one reading in several units, delete or rename one; of repeats side by side, "
         "write each reading in a row of its own, below one another, with the conditions of its "
         "row copied and the number of the repeat in a column 'repeat'",
     )  # fmt: skip
@@ -257,11 +257,11 @@ def _together(errors: Mapping[str, CalibError], where: str) -> CalibError:
     if len(errors) == 1:
         return next(iter(errors.values())).within(where)
     said = "; ".join(error.message for error in errors.values())
-    allowed = "; ".join(error.allowed or "" for error in errors.values())
-    mend = "; ".join(f"{header!r}: {error.mend}" for header, error in errors.items())
+    allowed = "; ".join(error.expected or "" for error in errors.values())
+    hint = "; ".join(f"{header!r}: {error.hint}" for header, error in errors.items())
     columns = f"columns {', '.join(map(repr, errors))}"
     return CalibError(
-        said, where=f"{where}, {columns}" if where else columns, allowed=allowed, mend=mend
+        said, where=f"{where}, {columns}" if where else columns, expected=allowed, hint=hint
     )
 
 
@@ -284,8 +284,8 @@ def missing_columns(
         f"there is no column for {', '.join(q.stem for q in wanted)}; "
         f"found {', '.join(map(repr, headers))}",
         where=_at(where, names[0]) if len(wanted) == 1 else where,
-        allowed="; ".join(", ".join(accepted_headers(q)) for q in wanted),
-        mend=f"{renamed(ignored, names)}add the {'column' if len(wanted) == 1 else 'columns'} "
+        expected="; ".join(", ".join(accepted_headers(q)) for q in wanted),
+        hint=f"{renamed(ignored, names)}add the {'column' if len(wanted) == 1 else 'columns'} "
         f"{added}{derived}",
     )
 

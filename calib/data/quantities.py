@@ -63,20 +63,20 @@ def _factor(from_unit: str, to_unit: str) -> float:
     except (pint.UndefinedUnitError, pint.DefinitionSyntaxError) as error:
         raise CalibError(
             f"unknown unit in the conversion from {from_unit!r} to {to_unit!r} ({error})",
-            allowed="units known to pint, such as kPa, psi, kN, mm, g/cm**3, percent",
-            mend="correct the spelling of the unit",
+            expected="units known to pint, such as kPa, psi, kN, mm, g/cm**3, percent",
+            hint="correct the spelling of the unit",
         ) from None
     except pint.DimensionalityError as error:
         raise CalibError(
             f"cannot convert {from_unit!r} to {to_unit!r}: {error}",
-            allowed="two units of the same dimension",
-            mend="use a unit that measures the same quantity",
+            expected="two units of the same dimension",
+            hint="use a unit that measures the same quantity",
         ) from None
     if zero != 0.0:
         raise CalibError(
             f"cannot convert {from_unit!r} to {to_unit!r}: their zeros differ",
-            allowed="units that differ by a factor only",
-            mend="use an absolute unit",
+            expected="units that differ by a factor only",
+            hint="use an absolute unit",
         )
     return float(f"{one:.15g}")
 
@@ -216,7 +216,7 @@ class Quantity:
     synonyms: tuple[str, ...] = ()
     bare_unit: str | None = None
     log_scale: bool = False
-    mend: str = "correct the value, its unit in the column name, or delete the row"
+    hint: str = "correct the value, its unit in the column name, or delete the row"
     title: str = ""
     shown: tuple[str, float] | None = None
     physical: str = ""
@@ -260,14 +260,14 @@ class Quantity:
                 raise CalibError(
                     error.message,
                     where=f"the quantity {self.stem}, suffix {suffix!r}",
-                    allowed="units that differ from the canonical one by a factor",
-                    mend=f"leave {suffix!r} out, and convert such columns before they are read",
+                    expected="units that differ from the canonical one by a factor",
+                    hint=f"leave {suffix!r} out, and convert such columns before they are read",
                 ) from None
         if self.unit not in (*self.units.values(), self.bare_unit):
             raise CalibError(
                 f"the quantity {self.stem} has no suffix for its own unit {self.unit!r}",
-                allowed=", ".join(sorted({*self.units.values()})) or "suffixes={suffix: unit}",
-                mend="declare it with suffixes={...} that have the canonical unit among them",
+                expected=", ".join(sorted({*self.units.values()})) or "suffixes={suffix: unit}",
+                hint="declare it with suffixes={...} that have the canonical unit among them",
             )
         ending = self.canonical.removeprefix(f"{self.stem}_")
         if self.units.get(ending) != self.unit and not (
@@ -275,8 +275,8 @@ class Quantity:
         ):
             raise CalibError(
                 f"the column {self.canonical!r} does not name {self.stem} in {self.unit}",
-                allowed=f"{self.stem} and a suffix of the unit: {', '.join(self.units)}",
-                mend="correct the canonical column",
+                expected=f"{self.stem} and a suffix of the unit: {', '.join(self.units)}",
+                hint="correct the canonical column",
             )
         mine = {self.stem, *self.synonyms}
         for other in QUANTITIES.values():
@@ -285,8 +285,8 @@ class Quantity:
                 raise CalibError(
                     f"columns called {min(taken)} are those of {other.stem} already",
                     where=f"the quantity {self.stem}",
-                    allowed="a stem and synonyms that name nothing else",
-                    mend=f"name it otherwise, or use {other.canonical}",
+                    expected="a stem and synonyms that name nothing else",
+                    hint=f"name it otherwise, or use {other.canonical}",
                 )
         QUANTITIES.add(self)
 
@@ -308,7 +308,7 @@ QUANTITIES: Registry[Quantity] = Registry(
     Quantity("rut_depth", "rut_depth_mm", "length", "mm", "output",
              "depth of the rut, or sinkage", _POSITIVE, synonyms=("sinkage",),
              log_scale=True, physical="sinkage", largest=(1.0, 1e3),
-             mend="the models compare the logarithm of the rut depth, which zero and negative "
+             hint="the models compare the logarithm of the rut depth, which zero and negative "
              "depths do not have: correct the zero of the gauge, or delete the row"),
     Quantity("driving_torque", "driving_torque_knm", "torque", "kN*m", "output",
              "torque that the axle gives to the wheel", shown=("kN m", 1.0),

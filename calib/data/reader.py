@@ -119,7 +119,7 @@ def read_table(
     Raises
     ------
     CalibError
-        Naming file, line, column, what was found, what is allowed and how to mend it.
+        Naming file, line, column, what was found, what is expected and how to fix it.
     """
     file = open_csv(path)
     where = f"{file.source}, line {file.header_line}"
@@ -139,7 +139,7 @@ def read_table(
     if not parts.lines:
         raise CalibError(
             "there are column names but no rows", where=file.source,
-            allowed="at least one row below the column names", mend="add the measurements",
+            expected="at least one row below the column names", hint="add the measurements",
         )  # fmt: skip
     _log.debug("%s: %d rows of %s", file.source, len(parts.lines), ", ".join(values))
     return labelled(
@@ -162,8 +162,8 @@ def _check_first_line(file: CsvFile, where: str) -> None:
     if line and named[line] > sum(map(names_quantity, file.header)):
         raise CalibError(
             f"the first line, {first!r}, names fewer quantities than line {line}", where=where,
-            allowed="the line of column names first, then one line per row",
-            mend=f"delete what stands above line {line}",
+            expected="the line of column names first, then one line per row",
+            hint=f"delete what stands above line {line}",
         )  # fmt: skip
 
 
@@ -217,13 +217,13 @@ class _Parts:
         self.text = [*self.text, *(tuple(row) for _, row in whole)] if small else []
 
     def _complain_ragged(self, batch: Sequence[tuple[int, list[str]]]) -> None:
-        mend = "complete the row, or delete the cells too many"
+        hint = "complete the row, or delete the cells too many"
         if self._delimiter == ",":
-            mend += " (a decimal comma splits a number in two: write a decimal point)"
+            hint += " (a decimal comma splits a number in two: write a decimal point)"
         for line, row in batch:
             if len(row) != self._width:
                 found = f"the row has {len(row)} cells, the line of column names {self._width}"
-                self._problems.add(line, "", found, f"{self._width} cells", mend)
+                self._problems.add(line, "", found, f"{self._width} cells", hint)
 
     def finish(self) -> dict[str, NDArray[np.float64]]:
         if self._decimals:
@@ -336,8 +336,8 @@ def _common_length(arrays: Mapping[str, NDArray[Any]], source: str) -> int:
     if len(lengths) != 1 or len(next(iter(lengths))) != 1 or lengths == {(0,)}:
         raise CalibError(
             f"the columns have the shapes {shapes}", where=source,
-            allowed="arrays of one shape (n,) with n of at least 1",
-            mend="flatten the arrays and give each column as many values",
+            expected="arrays of one shape (n,) with n of at least 1",
+            hint="flatten the arrays and give each column as many values",
         )  # fmt: skip
     return int(next(iter(lengths))[0])
 
@@ -347,8 +347,8 @@ def _as_floats(array: NDArray[Any], column: Column, source: str) -> NDArray[np.f
         raise CalibError(
             f"the values are of type {array.dtype}, not numbers",
             where=f"{source}, column {column.header!r}",
-            allowed=column.allowed,
-            mend="pass an array of numbers",
+            expected=column.expected,
+            hint="pass an array of numbers",
         )
     return array.astype(np.float64)
 

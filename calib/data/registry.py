@@ -100,8 +100,8 @@ class Registry[T](Mapping[str, T]):
             elif known is not one and not _says_the_same(known, one):
                 raise CalibError(
                     f"there is a {self._what} {name!r} already",
-                    allowed=f"a name other than {', '.join(self._known)}",
-                    mend=f"give the new {self._what} another name; if it is to take the place of "
+                    expected=f"a name other than {', '.join(self._known)}",
+                    hint=f"give the new {self._what} another name; if it is to take the place of "
                     "the other, start Python again",
                 )
         self._known |= new
@@ -138,7 +138,7 @@ def register(*declared: _Declared) -> None:
         if not hasattr(one, "register"):
             raise CalibError(
                 f"{one!r} cannot be registered",
-                allowed="a Quantity, a Model or an Effect",
-                mend="make one of these of it",
+                expected="a Quantity, a Model or an Effect",
+                hint="make one of these of it",
             )
         one.register()

@@ -174,11 +174,11 @@ def _check_order(found: Any, unit: str) -> None:
         )  # fmt: skip
 
 
-def _refused(what: str, unit: str, mend: str = "") -> CalibError:
+def _refused(what: str, unit: str, hint: str = "") -> CalibError:
     plain = "real numbers" if unit == _ONE else f"real numbers in {unit}"
     return CalibError(
-        what, allowed=f"{plain}, or what has a unit of its own; NaN for no value",
-        mend=mend or f"return {plain} with a decimal point, or NaN where there is no value",
+        what, expected=f"{plain}, or what has a unit of its own; NaN for no value",
+        hint=hint or f"return {plain} with a decimal point, or NaN where there is no value",
     )  # fmt: skip
 
 
@@ -251,7 +251,7 @@ class Table:
         if name not in self.columns:
             raise CalibError(
                 f"there is no column {name!r}", where=self.source,
-                allowed=", ".join(self.columns), mend="add the column to the data",
+                expected=", ".join(self.columns), hint="add the column to the data",
             )  # fmt: skip
         return self.columns[name]
 
@@ -362,8 +362,8 @@ def hold_out(
         )
         raise CalibError(
             f"there is no column to hold {quantity_header!r} out by", where=table.source,
-            allowed=", ".join(table),
-            mend=" Or ".join([*guess, "name one of these quantities, with a unit"]),
+            expected=", ".join(table),
+            hint=" Or ".join([*guess, "name one of these quantities, with a unit"]),
         )  # fmt: skip
     values = table[column.quantity.canonical]
     wanted = float(column.to_canonical(value))
@@ -376,11 +376,11 @@ def hold_out(
     if held.any():
         raise CalibError(
             f"every row is at {value:g}, so nothing would be left to fit", where=where,
-            allowed="a value that only some of the rows have", mend="hold out something else",
+            expected="a value that only some of the rows have", hint="hold out something else",
         )  # fmt: skip
     raise CalibError(
-        f"no row is at {value:g}", where=where, allowed=f"one of the values present: {present}",
-        mend="hold out one of these, or check the unit",
+        f"no row is at {value:g}", where=where, expected=f"one of the values present: {present}",
+        hint="hold out one of these, or check the unit",
     )  # fmt: skip
 
 
@@ -404,8 +404,8 @@ def check_enough(table: Table, n_parameters: int, *, model: str = "the model") -
         f"{rows} cannot calibrate {model}, which has {n_parameters} parameters to "
         "estimate, those of the noise among them",
         where=table.source,
-        allowed=f"at least {n_parameters + 1} rows",
-        mend="add measurements, or choose a model with fewer parameters",
+        expected=f"at least {n_parameters + 1} rows",
+        hint="add measurements, or choose a model with fewer parameters",
     )
 
 
@@ -424,8 +424,8 @@ def check_settings(table: Table, conditions: Sequence[str]) -> None:
     )
     raise CalibError(
         f"all rows are at one setting of the conditions, {at}", where=table.source,
-        allowed="at least two settings: what the model says of any other would be the prior's",
-        mend="add measurements at other values, or check that the right column was written",
+        expected="at least two settings: what the model says of any other would be the prior's",
+        hint="add measurements at other values, or check that the right column was written",
     )  # fmt: skip
 
 
@@ -440,6 +440,6 @@ def check_varies(table: Table, column: str) -> None:
         found = f"all {values.size} values are {value:g}"
     raise CalibError(
         found, where=f"{table.source}, column {table.header_of(column)!r}",
-        allowed="at least two different values: a constant column tells a model nothing",
-        mend="check that the right column was written, or add measurements",
+        expected="at least two different values: a constant column tells a model nothing",
+        hint="check that the right column was written, or add measurements",
     )  # fmt: skip

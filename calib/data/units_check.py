@@ -141,8 +141,8 @@ def _another_unit(table: Table, name: str, found: str) -> CalibError:
         load = ", and add the load of the small wheel that they are of: the column normal_load_kn"
     return CalibError(
         found, where=f"{table.source}, column {header!r}",
-        allowed=f"the unit of the readings in the column name: {', '.join(quantity.units)}",
-        mend="correct the unit in the column name; if the values are right as they are, say so "
+        expected=f"the unit of the readings in the column name: {', '.join(quantity.units)}",
+        hint="correct the unit in the column name; if the values are right as they are, say so "
         f"there: '{header} {CHECKED}'{load}",
     )  # fmt: skip
 

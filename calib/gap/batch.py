@@ -31,8 +31,8 @@ def case_folders(folder: Path) -> list[Path]:
     found = sorted(p.parent for p in Path(folder).glob("*/case.toml"))
     if not found:
         raise CalibError(
-            "there are no cases", where=str(folder), allowed="folders with a case.toml in them",
-            mend="make some with `calib challenge make`",
+            "there are no cases", where=str(folder), expected="folders with a case.toml in them",
+            hint="make some with `calib challenge make`",
         )  # fmt: skip
     return found
 

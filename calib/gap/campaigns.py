@@ -156,7 +156,7 @@ def campaigns(case: Case) -> Campaigns:
     if identical_rows(lab, field) == len(field):
         raise CalibError(
             "every field row is a row of the calibration, value for value", where=field.source,
-            allowed="measurements of another campaign", mend="name the field's own file",
+            expected="measurements of another campaign", hint="name the field's own file",
         )  # fmt: skip
     load = _recorded(lab, "load", _recorded(field, "load", np.array([_LOAD_KN])))
     _check_load(lab, field)
@@ -186,8 +186,8 @@ def _check_load(lab: Table, field: Table) -> None:
             f"there is no column normal_load_kn; a load of {_LOAD_KN:g} kN was assumed, but the "
             f"largest pull is {plain_number(largest)} kN",
             where=f"{lab.source}, {field.source}",
-            allowed=", ".join(accepted_headers(QUANTITIES["normal_load_kn"])),
-            mend="add the column normal_load_kn to the calibration or the field",
+            expected=", ".join(accepted_headers(QUANTITIES["normal_load_kn"])),
+            hint="add the column normal_load_kn to the calibration or the field",
         )  # fmt: skip
 
 
@@ -197,14 +197,14 @@ def _output(case: Case, name: str, model: str) -> OutputData:
         able = [m.name for m in MODELS.values() if m.output == column]
         raise CalibError(
             f"the model {model} does not predict {name}", where=f"[models] of {case.name}",
-            allowed=", ".join(able), mend="name a model of this output in case.toml",
+            expected=", ".join(able), hint="name a model of this output in case.toml",
         )  # fmt: skip
     for table in (case.lab, case.field):
         if column not in table or not np.isfinite(table[column]).any():
             raise CalibError(
                 f"the case models {name}, but there are no values of {table.header_of(column)}",
                 where=table.source,
-                mend=f"{renamed(table.ignored, [column])}add the column, or take the model out of "
+                hint=f"{renamed(table.ignored, [column])}add the column, or take the model out of "
                 "case.toml",
             )  # fmt: skip
         table.must_have(*get_model(model).conditions)
@@ -224,8 +224,8 @@ def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) ->
         raise CalibError(
             f"{rows.size} field rows with {case.field.header_of(column)} cannot show a gap",
             where=case.field.source,
-            allowed=f"at least {MIN_FIELD_ROWS}",
-            mend=f"measure more, or take {name} out of the case",
+            expected=f"at least {MIN_FIELD_ROWS}",
+            hint=f"measure more, or take {name} out of the case",
         )
     lab, field = (float(np.nanmedian(np.abs(t[column]))) for t in (case.lab, case.field))
     unit = QUANTITIES[column].unit
@@ -234,8 +234,8 @@ def _check_field(case: Case, name: str, column: str, rows: NDArray[np.int64]) ->
             f"{QUANTITIES[column].word} is typically {plain_number(field)} {unit} in the field and "
             f"{plain_number(lab)} {unit} in the calibration",
             where=f"{case.field.source}, column {case.field.header_of(column)!r}",
-            allowed=f"campaigns whose outputs differ by less than a factor of {MAX_RATIO:g}",
-            mend="check the units in the column names",
+            expected=f"campaigns whose outputs differ by less than a factor of {MAX_RATIO:g}",
+            hint="check the units in the column names",
         )
 
 

@@ -81,16 +81,16 @@ def read_case(folder: Path) -> Case:
     except OSError as error:
         raise CalibError(
             f"the case cannot be read ({error.strerror})", where=str(path),
-            mend=f"give its folder: {folder.parent}" if folder.is_file()
+            hint=f"give its folder: {folder.parent}" if folder.is_file()
             else "give a folder with a case.toml in it",
         ) from None  # fmt: skip
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CalibError(f"not valid TOML: {error}", where=str(path), mend=MEND_TOML) from None
+        raise CalibError(f"not valid TOML: {error}", where=str(path), hint=MEND_TOML) from None
     unknown = [key for key in content if key not in _KEYS]
     if unknown:
         raise CalibError(
-            f"unknown key {unknown[0]}", where=str(path), allowed=", ".join(_KEYS),
-            mend=meant(unknown[0], _KEYS, "correct its name, or leave it out"),
+            f"unknown key {unknown[0]}", where=str(path), expected=", ".join(_KEYS),
+            hint=meant(unknown[0], _KEYS, "correct its name, or leave it out"),
         )  # fmt: skip
     models = content.get("models")
     files = {key: content.get(key) for key in ("calibration", "field")}
@@ -101,14 +101,14 @@ def read_case(folder: Path) -> Case:
     ):
         raise CalibError(
             "calibration, field or [models] is missing", where=str(path),
-            allowed='calibration = "lab.csv", field = "field.csv", [models] output = "model"',
-            mend="add it",
+            expected='calibration = "lab.csv", field = "field.csv", [models] output = "model"',
+            hint="add it",
         )  # fmt: skip
     unknown = [key for key in models if key not in OUTPUTS]
     if unknown:
         raise CalibError(
             f"unknown output {', '.join(unknown)}", where=f"{path}, [models]",
-            allowed=", ".join(OUTPUTS), mend="correct the name",
+            expected=", ".join(OUTPUTS), hint="correct the name",
         )  # fmt: skip
     missing_ok = tuple(OUTPUTS.values())
     lab = read_table(_inside(folder, "calibration", content), allow_missing=missing_ok)
@@ -131,8 +131,8 @@ def _read_priors(
     if not isinstance(named, dict) or not set(named) <= set(models):
         raise CalibError(
             f"it says {named!r}", where=where,
-            allowed=f'the name of a prior file for any of {", ".join(models)}',
-            mend="correct the name of the output, or leave it out",
+            expected=f'the name of a prior file for any of {", ".join(models)}',
+            hint="correct the name of the output, or leave it out",
         )  # fmt: skip
     found = {}
     for output in named:
@@ -142,7 +142,7 @@ def _read_priors(
         except (OSError, UnicodeDecodeError) as error:
             raise CalibError(
                 f"the prior file cannot be read ({error})", where=f"{where}, {output}",
-                mend="name a readable TOML file of the case's folder",
+                hint="name a readable TOML file of the case's folder",
             ) from None  # fmt: skip
     return found
 
@@ -154,8 +154,8 @@ def _inside(folder: Path, key: str, content: Mapping[str, Any]) -> Path:
     if not isinstance(name, str) or not _is_inside(path, folder):
         raise CalibError(
             f"{key} = {name!r} is not a file of the case", where=str(folder / "case.toml"),
-            allowed="the name of a file in the case's folder, not reached by a link out of it",
-            mend="put the file, or a copy of it, into the folder",
+            expected="the name of a file in the case's folder, not reached by a link out of it",
+            hint="put the file, or a copy of it, into the folder",
         )  # fmt: skip
     return path
 

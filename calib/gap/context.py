@@ -82,7 +82,7 @@ class Context:
         if strange:
             raise CalibError(
                 f"{single.name} has no parameter {min(strange)!r}", where="[context] sizes",
-                allowed=", ".join(p.name for p in priors.free), mend="correct the name",
+                expected=", ".join(p.name for p in priors.free), hint="correct the name",
             )  # fmt: skip
         return replace(single, effect_priors=(_known(single.name, priors, known),))
 
@@ -146,15 +146,15 @@ def _known(effect: str, priors: Priors, known: Mapping[str, Size]) -> Priors:
         if p.log and size.mean <= 0.0:
             raise CalibError(
                 f"{effect}: {p.name} is positive", where="[context] sizes",
-                allowed="a mean above zero", mend="correct it",
+                expected="a mean above zero", hint="correct it",
             )  # fmt: skip
         loc, scale = _on_its_scale(size, p)
         if not p.lower <= loc <= p.upper:
             low, high = (np.exp(end) if p.log else end for end in (p.lower, p.upper))
             raise CalibError(
                 f"{effect}: {p.name} cannot be {size.mean:g}", where="[context] sizes",
-                allowed=f"a mean from {low:g} to {high:g}",
-                mend="correct it, or declare an effect of your own with another prior",
+                expected=f"a mean from {low:g} to {high:g}",
+                hint="correct it, or declare an effect of your own with another prior",
             )  # fmt: skip
         entries.append(replace(p, loc=loc, scale=scale))
     return Priors(tuple(entries), priors.text, priors.source)
@@ -184,15 +184,15 @@ def read_context(content: Any, where: str) -> Context:
         place = ".".join(str(part) for part in first["loc"])
         raise CalibError(
             in_words(first), where=f"{where}, context.{place}",
-            allowed="suspected = {name = probability}, excluded = [names], "
+            expected="suspected = {name = probability}, excluded = [names], "
             "sizes = {name = {parameter = {mean = …, sd = …}}}",
-            mend="write, for example: suspected = {lug_thrust = 0.5} and, in the next line, "
+            hint="write, for example: suspected = {lug_thrust = 0.5} and, in the next line, "
             'excluded = ["sensor_drift"]',
         ) from None  # fmt: skip
     twice = set(written.suspected) & set(written.excluded)
     if twice:
         raise CalibError(
             f"{min(twice)} is both suspected and excluded", where=f"{where}, [context]",
-            mend="leave one of the two out",
+            hint="leave one of the two out",
         )  # fmt: skip
     return Context(written.suspected, tuple(written.excluded), written.sizes)

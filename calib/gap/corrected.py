@@ -214,7 +214,7 @@ def load_corrected(folder: Path, effects: Mapping[str, Effect] = EFFECTS) -> Cor
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise CalibError(
             f"there is no readable corrected model ({type(error).__name__})", where=str(path),
-            allowed="a folder written by `calib diagnose`", mend="run the diagnosis again",
+            expected="a folder written by `calib diagnose`", hint="run the diagnosis again",
         ) from None  # fmt: skip
     return Corrected(Mixture(data, fits, probability, int(content["seed"])), lab_mode)
 
@@ -230,8 +230,8 @@ def _load_fit(
     if unknown:
         raise CalibError(
             f"the corrected model uses the effect {', '.join(unknown)}, which is not known here",
-            allowed=", ".join(effects),
-            mend="pass the Python file that defines it as the diagnosis was given it: "
+            expected=", ".join(effects),
+            hint="pass the Python file that defines it as the diagnosis was given it: "
             "--models FILE if it registers the effect, else --effects FILE",
         )
     hypothesis = Hypothesis(
@@ -259,8 +259,8 @@ def _load_fit(
             raise CalibError(
                 f"the hypothesis {document['name']} no longer predicts the {o} that it was saved "
                 "with: its effects, their priors or a model have changed since",
-                allowed="the code, priors and effects of the diagnosis",
-                mend="run the diagnosis again, or pass the file of effects as it was then",
+                expected="the code, priors and effects of the diagnosis",
+                hint="run the diagnosis again, or pass the file of effects as it was then",
             )
     return fit
 
@@ -323,8 +323,8 @@ def predict_columns(
     if unknown:
         raise CalibError(
             f"the corrected model has no cause {', '.join(unknown)} to leave out",
-            allowed=", ".join(corrected.causes) or "none: it has no cause",
-            mend="name one of these, or leave nothing out",
+            expected=", ".join(corrected.causes) or "none: it has no cause",
+            hint="name one of these, or leave nothing out",
         )
     table = with_declared(table, corrected.data.case.covariates)
     needed = corrected.data.view.conditions
@@ -333,7 +333,7 @@ def predict_columns(
     if missing:
         raise CalibError(
             f"the corrected model needs {', '.join(missing)}", where=table.source,
-            allowed="the conditions and covariates of the field campaign", mend="add the columns",
+            expected="the conditions and covariates of the field campaign", hint="add the columns",
         )  # fmt: skip
     conditions = dict(table.columns)
     if order is not None and order not in conditions:

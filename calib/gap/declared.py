@@ -131,8 +131,8 @@ def _column(table: Table, name: str) -> list[str]:
     if name not in table.header:
         raise CalibError(
             f"there is no column {name!r}", where=table.source,
-            allowed="every column that the case declares in [covariates]",
-            mend="add it; before a diagnosis it can be left out of case.toml as well",
+            expected="every column that the case declares in [covariates]",
+            hint="add it; before a diagnosis it can be left out of case.toml as well",
         )  # fmt: skip
     if not table.text:
         raise _error(
@@ -156,11 +156,11 @@ def _codes(table: Table, name: str, levels: tuple[str, ...]) -> Array:
         except ValueError:
             raise CalibError(
                 f"{name} is {cell!r}", where=f"{table.source}, line {table.lines[i]}",
-                allowed=", ".join(levels) or "a number, with a decimal point",
-                mend="write one of these" if levels else "correct it, or delete the row",
+                expected=", ".join(levels) or "a number, with a decimal point",
+                hint="write one of these" if levels else "correct it, or delete the row",
             ) from None  # fmt: skip
     return values
 
 
-def _error(found: str, allowed: str, mend: str) -> CalibError:
-    return CalibError(found, where=_WHERE, allowed=allowed, mend=mend)
+def _error(found: str, allowed: str, hint: str) -> CalibError:
+    return CalibError(found, where=_WHERE, expected=allowed, hint=hint)

@@ -204,7 +204,7 @@ class Discrepancy:
         o = self._of(output)
         theta = o.priors.to_natural(self.lab_mode[output][None])
         selected = o.problem.bound.model.select(view.conditions)
-        return np.asarray(o.problem.bound.location(theta, selected)[0])
+        return np.asarray(o.problem.bound.mean_response(theta, selected)[0])
 
     def _from_the_run_before(self, view: View, output: str) -> Array:
         """How much more the run before is predicted to give, as a part of its rms in the field."""

@@ -41,7 +41,7 @@ def _noisier(data: Campaigns, o: OutputData, mode: Array, best: Fit) -> Iterable
     noise, left = best.noise[o.name], o.problem.response.size - len(o.priors.free)
     if left < 1:
         return
-    lab = o.problem.response - o.problem.bound.location(
+    lab = o.problem.response - o.problem.bound.mean_response(
         o.priors.to_natural(mode[None]), o.problem.conditions
     )[0]  # fmt: skip
     field = best.field_residuals[o.name] * noise.sigma
@@ -77,7 +77,7 @@ def _patterns(data: Campaigns, o: OutputData, ranking: Ranking, best: Fit) -> It
     return unexplained(
         table, columns, best.field_residuals[o.name],
         title=f"the field's {output} differs with {{!r}}, which no model or effect uses",
-        mend="declare it under [covariates] in case.toml, and diagnose again",
+        hint="declare it under [covariates] in case.toml, and diagnose again",
     )  # fmt: skip
 
 

@@ -191,7 +191,7 @@ def _metric_root(
         step = 1e-4 * width[:-1]
         points = lab_mode[o.name] + np.concatenate([np.diag(step), -np.diag(step)])
         conditions = o.problem.bound.model.select(data.view.conditions)
-        location = o.problem.bound.location(o.priors.to_natural(points), conditions)[:, o.rows]
+        location = o.problem.bound.mean_response(o.priors.to_natural(points), conditions)[:, o.rows]
         d = step.size
         sensitivity = ((location[:d] - location[d:]) / (2.0 * step[:, None])).T
         sensitivity = np.nan_to_num(sensitivity) / noise[o.name].sd(

@@ -110,8 +110,8 @@ def check_resumable(cases: Sequence[Path], out: Path, seed: int) -> None:
         reason, names = next(iter(found.items()))
         raise CalibError(
             f"{len(names)} of the diagnoses that are there {reason}: {_listed(names)}",
-            where=str(out), allowed="an empty folder, or earlier diagnoses of the same cases",
-            mend="choose another --out, or delete this folder",
+            where=str(out), expected="an empty folder, or earlier diagnoses of the same cases",
+            hint="choose another --out, or delete this folder",
         )  # fmt: skip
 
 

@@ -183,7 +183,9 @@ def _without_lab_outliers(data: Campaigns, seed: int) -> tuple[Campaigns, Lab, l
 
 def _lab_residuals(o: OutputData, mode: Array) -> Array:
     """Residuals of the laboratory fit in robust sds, shape (n,)."""
-    location = o.problem.bound.location(o.priors.to_natural(mode[None]), o.problem.conditions)[0]
+    location = o.problem.bound.mean_response(o.priors.to_natural(mode[None]), o.problem.conditions)[
+        0
+    ]
     residual = o.problem.response - location
     robust = 1.4826 * float(np.median(np.abs(residual - np.median(residual))))
     return np.asarray(residual / max(robust, 1e-12))

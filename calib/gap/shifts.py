@@ -81,12 +81,12 @@ def another_soil() -> dict[str, tuple[Array, float]]:
     except (OSError, tomllib.TOMLDecodeError, ValidationError) as error:
         raise CalibError(
             f"the prior of parameter shifts cannot be read ({error})", where=str(path),
-            mend="install the package again",
+            hint="install the package again",
         ) from None  # fmt: skip
     if any(len(row.ways) != len(file.ways) for row in file.parameters.values()):
         raise CalibError(
             "a parameter has not as many loadings as there are ways", where=str(path),
-            allowed=f"{len(file.ways)} numbers each", mend="correct it",
+            expected=f"{len(file.ways)} numbers each", hint="correct it",
         )  # fmt: skip
     return {name: (np.array(row.ways), row.own) for name, row in file.parameters.items()}
 

@@ -89,7 +89,7 @@ class Simulated:
         """
         prepared = (found for known, found in self._known if known is conditions)
         rows, bends = next(prepared, None) or (None, self._bends(conditions))
-        location = self._bound.location(self._priors.to_natural(t), conditions, rows)
+        location = self._bound.mean_response(self._priors.to_natural(t), conditions, rows)
         for column, bend in enumerate(bends):
             location = location + misfit[:, column : column + 1] * bend
         return location

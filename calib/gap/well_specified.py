@@ -180,7 +180,7 @@ def draw_from_hypothesis(
             return Draw(forward, psi[[first]], float(size[first]))
     raise CalibError(
         f"no {truth} of {gap_over_noise:.1f} noise sds in {_DRAWS * _TRIES} draws of its prior",
-        mend="leave this case out",
+        hint="leave this case out",
     )
 
 

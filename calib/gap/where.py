@@ -55,8 +55,8 @@ def check_units(case: Case) -> None:
             f"{QUANTITIES[name].word} is typically {plain_number(field)} {unit} in the field and "
             f"{plain_number(lab)} {unit} in the calibration",
             where=f"{case.field.source}, column {case.field.header_of(name)!r}",
-            allowed=f"campaigns whose conditions differ by less than a factor of {MAX_RATIO:g}",
-            mend="check the units in the column names",
+            expected=f"campaigns whose conditions differ by less than a factor of {MAX_RATIO:g}",
+            hint="check the units in the column names",
         )
 
 

@@ -184,8 +184,8 @@ def _check_names(context: Context, known: set[str]) -> None:
         raise CalibError(
             f"the context speaks of {strange[0]}",
             where="[context] of case.toml",
-            allowed=", ".join(sorted(known)) + "; parameter_shift may be suspected",
-            mend="leave it out"
+            expected=", ".join(sorted(known)) + "; parameter_shift may be suspected",
+            hint="leave it out"
             if strange[0] == "parameter_shift"
             else meant(strange[0], known, "correct the name, or leave it out"),
         )

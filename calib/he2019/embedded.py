@@ -62,7 +62,7 @@ def tables() -> dict[str, Mapping[str, Array]]:
 def load_he2019(output: str) -> Table:
     """Return the table of bulk_density, drawbar_pull or rut_depth, labelled reconstructed."""
     if output not in _MAKERS:
-        raise CalibError(f"there is no output {output!r}", allowed=", ".join(_MAKERS))
+        raise CalibError(f"there is no output {output!r}", expected=", ".join(_MAKERS))
     return table_from_arrays(columns(output), source=f"he2019 {output}", label=LABEL)
 
 

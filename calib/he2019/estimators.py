@@ -99,8 +99,8 @@ def read_features(
             f"{x.size} positive slips, a largest pull of {y.max() if x.size else 0.0:g} kN and an "
             f"initial slope of {slope:g} kN/%",
             where=where,
-            allowed="at least 4 distinct positive slips, with a positive pull that rises from zero",
-            mend="use another method, such as least_squares",
+            expected="at least 4 distinct positive slips, with a pull that rises from zero",
+            hint="use another method, such as least_squares",
         )
     top = int(y.argmax())
     x_peak, peak = float(x[top]), float(y[top])
@@ -119,8 +119,8 @@ def _initial_line(
         raise CalibError(
             f"the geometric method finds {positive.size} positive slips",
             where=where,
-            allowed="at least 4 distinct positive slips",
-            mend="use another method, such as least_squares",
+            expected="at least 4 distinct positive slips",
+            hint="use another method, such as least_squares",
         )
     slope = zero = 0.0
     for limit in (max(up_to, float(positive[1])), float(x[y.argmax()])):
@@ -281,9 +281,9 @@ def rut_regression(problem: Problem, max_slip: float = 0.2) -> RutRegression:
             f"the published regression cannot tell its {p} coefficients apart on {n} rows of slip "
             f"up to {max_slip:g} and {np.unique(y).size} ground pressures",
             where=problem.table.source,
-            allowed=f"more than {p} rows in which ground pressure, rut depth"
+            expected=f"more than {p} rows in which ground pressure, rut depth"
             f"{' and slip vary' if with_slip else ' vary'}",
-            mend="add tests, raise max_slip, or use another method such as least_squares",
+            hint="add tests, raise max_slip, or use another method such as least_squares",
         )
     beta = np.linalg.lstsq(X, y, rcond=None)[0]
     r = y - X @ beta
@@ -307,8 +307,8 @@ def estimate_published_regression(
     if fixed:
         raise CalibError(
             f"the published regression fits all coefficients, but {', '.join(fixed)} is fixed",
-            allowed="no fixed parameter",
-            mend="free it, or use another method such as least_squares",
+            expected="no fixed parameter",
+            hint="free it, or use another method such as least_squares",
         )
     fit = rut_regression(problem, max_slip)
     exponent = fit.reported.get("n0", fit.reported.get("n", np.nan))
@@ -316,8 +316,8 @@ def estimate_published_regression(
         raise CalibError(
             f"the published regression gives an exponent of {exponent:.3g}",
             where=problem.table.source,
-            allowed="rut depths that grow with ground pressure",
-            mend="check the columns of rut depth and ground pressure, or use least_squares",
+            expected="rut depths that grow with ground pressure",
+            hint="check the columns of rut depth and ground pressure, or use least_squares",
         )
     left_out = f"{fit.n_excluded} rows above {max_slip:g} slip left out" if fit.n_excluded else ""
     quality = f"R² = {fit.r_squared:.3f}, RMSE = {fit.rmse:.3f} (n = {fit.n})"

@@ -194,7 +194,7 @@ def write_cases(gaps: Sequence[PaperGap], out: Path, *, overwrite: bool = False)
     if existing and not overwrite:
         raise CalibError(
             f"{', '.join(existing)} exist there already", where=str(out),
-            mend="choose another --out, or pass --overwrite",
+            hint="choose another --out, or pass --overwrite",
         )  # fmt: skip
     for gap, folder in zip(gaps, folders, strict=True):
         folder.mkdir(parents=True, exist_ok=True)

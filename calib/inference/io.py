@@ -201,7 +201,7 @@ def groups_of(calibration: Calibration) -> Groups:
     natural = calibration.natural[:, picked].reshape(-1, calibration.natural.shape[-1])
     internal = draws.t.reshape(chains, steps, -1)[:, picked].reshape(-1, draws.t.shape[-1])
     rng = generator(calibration.seed, calibration.label, "posterior_predictive")
-    location = problem.draw_location(natural, problem.conditions, rng)
+    location = problem.draw_mean_response(natural, problem.conditions, rng)
     noisy = location + problem.draw_noise(natural, rng)
     prior = problem.theta(
         problem.priors.sample(generator(calibration.seed, calibration.label, "prior"), N_PRIOR)
@@ -329,8 +329,8 @@ def _check_hashes(record: RunRecord, folder: Path) -> None:
             raise CalibError(
                 "the file has changed since the run was written",
                 where=str(folder / name),
-                allowed=f"SHA-256 {expected[:16]}..., found {found[:16]}...",
-                mend="restore it, or run `calib fit` again",
+                expected=f"SHA-256 {expected[:16]}..., found {found[:16]}...",
+                hint="restore it, or run `calib fit` again",
             )
 
 
@@ -369,8 +369,8 @@ def _check_model(problem: Problem, t: Array, log_prob: Array, folder: Path) -> N
             f"the model {problem.bound.model.name} no longer gives its draws the densities that "
             "the run was saved with: its formula, or that of its noise, has changed since",
             where=str(folder),
-            allowed="the model as it was when the run was made",
-            mend="pass the model's file as it was then, or run `calib fit` again",
+            expected="the model as it was when the run was made",
+            hint="pass the model's file as it was then, or run `calib fit` again",
         )
 
 
@@ -382,8 +382,8 @@ def _damage(path: Path) -> Iterator[None]:
         raise CalibError(
             f"the file cannot be read ({type(error).__name__})",
             where=str(path),
-            allowed="the file as `calib fit` wrote it",
-            mend="the file is damaged or incomplete: run `calib fit` again",
+            expected="the file as `calib fit` wrote it",
+            hint="the file is damaged or incomplete: run `calib fit` again",
         ) from None
 
 

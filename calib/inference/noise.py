@@ -125,7 +125,7 @@ class Noise:
             raise CalibError(
                 f"{what} takes normal noise of one standard deviation only",
                 where=f"{source}, [likelihood]",
-                mend="take this table out, and fit again what was fitted with it",
+                hint="take this table out, and fit again what was fitted with it",
             )
 
     @property
@@ -209,7 +209,7 @@ def noise_of(choice: NoiseChoice, conditions: Conditions, source: str) -> Noise:
     if column is None:
         raise CalibError(
             f"the noise is to depend on {choice.depends_on!r}, which is no condition of the model",
-            where=where, allowed=", ".join(stems), mend="name one of these",
+            where=where, expected=", ".join(stems), hint="name one of these",
         )  # fmt: skip
     values = conditions[column]
     spread = float(values.std())
@@ -217,7 +217,7 @@ def noise_of(choice: NoiseChoice, conditions: Conditions, source: str) -> Noise:
         raise CalibError(
             f"the noise is to depend on {QUANTITIES[column].word}, which is the same in all rows "
             "that are fitted",
-            where=where, allowed="a condition that varies", mend="leave noise_depends_on out",
+            where=where, expected="a condition that varies", hint="leave noise_depends_on out",
         )  # fmt: skip
     return Noise(choice, column, float(values.mean()), spread)
 
@@ -302,8 +302,8 @@ def serial_of(along: Along, table: Table) -> Serial | None:
     if along not in table:
         raise CalibError(
             f"the noise is to be correlated along {along}, a column that is not there",
-            where=table.source, allowed=f"a column {along}",
-            mend="add the column, with whole numbers in the order of the measurement",
+            where=table.source, expected=f"a column {along}",
+            hint="add the column, with whole numbers in the order of the measurement",
         )  # fmt: skip
     place, n = table[along], len(table)
     run = table["run"] if "run" in table else np.zeros(n)
@@ -320,7 +320,7 @@ def serial_of(along: Along, table: Table) -> Serial | None:
             f"{', '.join(map(str, lines[:_SHOWN]))}"
             f"{' and others' if len(lines) > _SHOWN else ''}",
             where=table.source,
-            allowed="a whole number in every row, another one for each row of a run",
-            mend="number the rows of each run as they were measured, and label the runs (run)",
+            expected="a whole number in every row, another one for each row of a run",
+            hint="number the rows of each run as they were measured, and label the runs (run)",
         )  # fmt: skip
     return Serial(order, gap)

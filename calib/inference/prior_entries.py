@@ -130,23 +130,24 @@ def prior_of(name: str, entry: PriorEntry, source: str, references: Mapping[str,
     if gamma is not None and name != "nu":
         raise CalibError(
             'dist = "gamma" is for the degrees of freedom nu of a Student-t likelihood',
-            where=f"{source}, parameters.{name}", allowed="normal, lognormal, half_normal, uniform "
-            "or fixed", mend="choose one of these",
+            where=f"{source}, parameters.{name}",
+            expected="normal, lognormal, half_normal, uniform or fixed",
+            hint="choose one of these",
         )  # fmt: skip
     if not lower < upper:
         raise CalibError(
             f"lower bound {lower:g} is not below upper bound {upper:g}",
             where=f"{source}, parameters.{name}",
-            mend="give lower < upper",
+            hint="give lower < upper",
         )
     if max(lower - loc, loc - upper) > _MOST_SDS * scale > 0.0:
         raise CalibError(
             f"the bounds lie {max(lower - loc, loc - upper) / scale:.3g} sds from the "
             f"{'median' if isinstance(entry, _OnLogarithm) else 'mean'}",
             where=f"{source}, parameters.{name}",
-            allowed=f"bounds within {_MOST_SDS:g} sds, and better those that hold some of the "
+            expected=f"bounds within {_MOST_SDS:g} sds, and better those that hold some of the "
             "distribution",
-            mend="correct the bounds, or the distribution",
+            hint="correct the bounds, or the distribution",
         )
     return Prior(
         name, entry.unit, entry.reason, entry.source, text, isinstance(entry, _OnLogarithm), loc,
@@ -159,8 +160,8 @@ def _check_relative(name: str, column: str, source: str) -> None:
         raise CalibError(
             f"relative_to names no known column: {column!r}",
             where=f"{source}, parameters.{name}",
-            allowed=", ".join(q.canonical for q in QUANTITIES.values()),
-            mend="name one of these, as the table has it in its own unit",
+            expected=", ".join(q.canonical for q in QUANTITIES.values()),
+            hint="name one of these, as the table has it in its own unit",
         )
 
 
@@ -211,8 +212,8 @@ def likeliest(error: ValidationError) -> Any:
 def no_such_key(key: object, known: Iterable[str], where: str) -> CalibError:
     """Return the refusal of a key that is not `known`."""
     return CalibError(
-        f"there is no key {str(key)!r}", where=where, allowed=", ".join(known),
-        mend=meant(str(key), known, "correct it, or take it out"),
+        f"there is no key {str(key)!r}", where=where, expected=", ".join(known),
+        hint=meant(str(key), known, "correct it, or take it out"),
     )  # fmt: skip
 
 
@@ -228,16 +229,17 @@ def explain(error: ValidationError, source: str) -> CalibError:
     if first["type"] == "float_type":
         return CalibError(
             in_words(first),
-            where=f"{source}, parameters.{place[1]}", allowed=f"a number, as in {place[-1]} = 0.75",
-            mend="write a number without quotes",
+            where=f"{source}, parameters.{place[1]}",
+            expected=f"a number, as in {place[-1]} = 0.75",
+            hint="write a number without quotes",
         )  # fmt: skip
     return CalibError(
         in_words(first),
         where=f"{source}, {'.'.join(place)}",
-        allowed="dist = normal (mean, sd > 0), lognormal (median > 0, sd_log > 0), half_normal "
+        expected="dist = normal (mean, sd > 0), lognormal (median > 0, sd_log > 0), half_normal "
         "(sd > 0), uniform (lower < upper) or fixed (value); of nu also gamma (shape > 0, "
         "rate > 0); each with unit, reason, source",
-        mend="correct this entry",
+        hint="correct this entry",
     )
 
 
@@ -245,6 +247,6 @@ def _no_such_dist(entry: Mapping[str, Any], where: str) -> CalibError:
     dist = entry.get("dist")
     found = "there is no dist" if dist is None else f"there is no distribution {dist!r}"
     return CalibError(
-        found, where=where, allowed=", ".join(_DISTS),
-        mend=meant(str(dist), _DISTS, "choose one of these"),
+        found, where=where, expected=", ".join(_DISTS),
+        hint=meant(str(dist), _DISTS, "choose one of these"),
     )  # fmt: skip

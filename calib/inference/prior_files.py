@@ -96,8 +96,8 @@ def prior_file_model(path: Path) -> str:
         raise CalibError(
             "the prior file does not say which model it is for",
             where=str(path),
-            allowed='model = "NAME"',
-            mend="add this line at its top",
+            expected='model = "NAME"',
+            hint="add this line at its top",
         )
     return model
 
@@ -136,7 +136,7 @@ def _text(path: PriorFile) -> str:
         raise CalibError(
             f"the prior file cannot be read ({error})",
             where=str(path),
-            mend="give the path of a readable TOML file",
+            hint="give the path of a readable TOML file",
         ) from None
 
 
@@ -145,7 +145,7 @@ def _content(text: str, source: str) -> dict[str, Any]:
         return _parsed(text)
     except tomllib.TOMLDecodeError as error:
         raise CalibError(
-            f"the prior file is not valid TOML: {error}", where=source, mend=MEND_TOML
+            f"the prior file is not valid TOML: {error}", where=source, hint=MEND_TOML
         ) from None
 
 
@@ -215,8 +215,8 @@ def _check_noise(prior: Prior, source: str) -> None:
     else:
         return
     raise CalibError(
-        found, where=f"{source}, parameters.{prior.name}", allowed=allowed,
-        mend="correct this entry",
+        found, where=f"{source}, parameters.{prior.name}", expected=allowed,
+        hint="correct this entry",
     )  # fmt: skip
 
 
@@ -229,7 +229,7 @@ def _noise_choice(
     where = f"{source}, [likelihood]"
     if parameters[-1] != "sigma":
         raise CalibError(
-            "an effect has no likelihood of its own", where=where, mend="take the table out"
+            "an effect has no likelihood of its own", where=where, hint="take the table out"
         )
     try:
         chosen = LikelihoodTable.model_validate(content["likelihood"])
@@ -239,21 +239,21 @@ def _noise_choice(
             raise no_such_key(first["loc"][-1], LikelihoodTable.model_fields, where) from None
         raise CalibError(
             in_words(first), where=where,
-            allowed='family = "normal" or "student_t", noise_depends_on = "slip" or another '
+            expected='family = "normal" or "student_t", noise_depends_on = "slip" or another '
             'condition of the model, correlated_along = "run_order"',
-            mend="correct this entry",
+            hint="correct this entry",
         ) from None  # fmt: skip
     noise = NoiseChoice(chosen.family, chosen.noise_depends_on, chosen.correlated_along)
     if noise.correlated_along and noise.family != "normal":
         raise CalibError(
             "noise that is correlated along a run is normal", where=where,
-            allowed='family = "normal"', mend="take one of the two out",
+            expected='family = "normal"', hint="take one of the two out",
         )  # fmt: skip
     taken = [name for name in noise.parameters if name in parameters]
     if taken:
         raise CalibError(
             f"the model has a parameter {taken[0]}, which is the noise's name for one of its own",
-            where=where, mend="rename it in the model, or take the table out",
+            where=where, hint="rename it in the model, or take the table out",
         )  # fmt: skip
     return noise
 
@@ -266,8 +266,8 @@ def _check_names(
         raise CalibError(
             f"the priors are for model {content.get('model')!r}, not {model_name!r}",
             where=source,
-            allowed=f'model = "{model_name}"',
-            mend="pass the prior file of this model",
+            expected=f'model = "{model_name}"',
+            hint="pass the prior file of this model",
         )
     given = content.get("parameters")
     given = given if isinstance(given, Mapping) else {}
@@ -285,8 +285,8 @@ def _check_names(
         raise CalibError(
             found,
             where=f"{source}, [parameters]",
-            allowed=", ".join(parameters),
-            mend=f"{guesses}give exactly these parameters{_example(model_name)}",
+            expected=", ".join(parameters),
+            hint=f"{guesses}give exactly these parameters{_example(model_name)}",
         )
 
 
@@ -310,6 +310,6 @@ def _check_units(file: PriorFileContent, source: str, model_name: str) -> None:
             raise CalibError(
                 f"the unit is {entry.unit!r}",
                 where=f"{source}, parameters.{name}",
-                allowed=f"unit = {units[name]!r}",
-                mend="convert the numbers to this unit",
+                expected=f"unit = {units[name]!r}",
+                hint="convert the numbers to this unit",
             )

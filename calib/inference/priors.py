@@ -204,7 +204,7 @@ class Priors:
             raise CalibError(
                 f"cannot fix {', '.join(sorted(unknown))}",
                 where=self.source,
-                allowed=", ".join(p.name for p in self.entries),
+                expected=", ".join(p.name for p in self.entries),
             )
         return Priors(
             tuple(

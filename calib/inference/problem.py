@@ -85,8 +85,8 @@ def check_scale(problem: Problem, assumed: Mapping[str, float]) -> None:
         )
         raise CalibError(
             found, where=f"{problem.table.source}, column {column.header!r}",
-            allowed="an output of a size that the priors admit",
-            mend=f"check the units of {', '.join(map(problem.table.header_of, used))}; if they are "
+            expected="an output of a size that the priors admit",
+            hint=f"check the units of {', '.join(map(problem.table.header_of, used))}; if they are "
             "right, pass a prior file of your own that admits it (`calib priors "
             f"{problem.bound.model.name}` writes one to edit)",
         )  # fmt: skip
@@ -94,8 +94,8 @@ def check_scale(problem: Problem, assumed: Mapping[str, float]) -> None:
     raise CalibError(
         f"there is no column {', '.join(assumed)}; {taken} was assumed, but {found}",
         where=problem.table.source,
-        allowed="; ".join(", ".join(accepted_headers(QUANTITIES[name])) for name in assumed),
-        mend=f"add the column {', '.join(assumed)}; if its values are not known, pass a prior file "
+        expected="; ".join(", ".join(accepted_headers(QUANTITIES[name])) for name in assumed),
+        hint=f"add the column {', '.join(assumed)}; if its values are not known, pass a prior file "
         "whose entries are not relative to it",
     )
 
@@ -115,7 +115,9 @@ def _expected(problem: Problem) -> tuple[float, float]:
     rng = generator(0, "scale of the priors")
     with np.errstate(all="ignore"):
         natural = some.theta(some.priors.sample(rng, _DRAWS))
-        drawn = some.draw_location(natural, some.conditions, rng) + some.draw_noise(natural, rng)
+        drawn = some.draw_mean_response(natural, some.conditions, rng) + some.draw_noise(
+            natural, rng
+        )
         sizes = np.quantile(np.abs(some.bound.from_response(drawn)), _SIZE, axis=1)
     sizes = sizes[np.isfinite(sizes)]
     if sizes.size < _DRAWS / 2:
@@ -223,9 +225,9 @@ class Problem:
 
     def residuals(self, natural: Array) -> Array:
         """Observed minus predicted on the scale of the response, shape (k, n)."""
-        return self.response - self.bound.location(self.of_model(natural), self.conditions)
+        return self.response - self.bound.mean_response(self.of_model(natural), self.conditions)
 
-    def draw_location(
+    def draw_mean_response(
         self, natural: Array, conditions: Conditions, rng: np.random.Generator
     ) -> Array:
         """Predict on the scale of the response, with a draw of the prediction's own error.
@@ -244,7 +246,7 @@ class Problem:
         """
         theta, uncertain = self.of_model(natural), self.bound.model.uncertain
         if uncertain is None:
-            return self.bound.location(theta, conditions)
+            return self.bound.mean_response(theta, conditions)
         with np.errstate(all="ignore"):
             location, unknown, curves = uncertain(theta, conditions)
             error = rng.standard_normal((len(theta), curves.shape[1])) @ curves.T
@@ -403,8 +405,8 @@ def build_problem(
     if not problem.names:
         raise CalibError(
             f"all parameters of {model.name} are held fixed", where=priors.source,
-            allowed="at least one parameter to estimate; sigma, the scale of the noise, will do",
-            mend='give one another distribution than dist = "fixed"',
+            expected="at least one parameter to estimate; sigma, the scale of the noise, will do",
+            hint='give one another distribution than dist = "fixed"',
         )  # fmt: skip
     # A simulator's runs cost too much to look at what the priors expect.
     if model.uncertain is not None or simulated_by(model.name) is None:

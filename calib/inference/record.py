@@ -41,8 +41,8 @@ def _name(text: str) -> str:
 def _known_model(name: str) -> str:
     if name not in MODELS:
         raise CalibError(
-            f"model: {name} is not one of {', '.join(MODELS)}", allowed="a model known here",
-            mend="pass the file of your own that declares it (--models FILE or --simulator FILE); "
+            f"model: {name} is not one of {', '.join(MODELS)}", expected="a model known here",
+            hint="pass the file of your own that declares it (--models FILE or --simulator FILE); "
             "if there is none, restore the folder's",
         )  # fmt: skip
     return name
@@ -118,8 +118,8 @@ def read_record[R: Record](kind: type[R], folder: Path) -> R:
     if not path.is_file():
         raise CalibError(
             f"this is not a {kind.kind} folder (no readable {kind.FILE} in it)", where=str(folder),
-            allowed=f"a folder written by `{kind.WRITTEN_BY}`",
-            mend=f"give the folder that `{kind.WRITTEN_BY} ... --out` named",
+            expected=f"a folder written by `{kind.WRITTEN_BY}`",
+            hint=f"give the folder that `{kind.WRITTEN_BY} ... --out` named",
         )  # fmt: skip
     try:
         content = json.loads(path.read_bytes())
@@ -132,13 +132,13 @@ def read_record[R: Record](kind: type[R], folder: Path) -> R:
         raise _damaged(kind, path, f"it cannot be read ({type(error).__name__})") from None
     if any(e["loc"] == ("schema",) for e in found):
         schema, expected = content.get("schema"), kind.model_fields["schema_"].annotation
-        mend = f"run `{kind.WRITTEN_BY}` again, or use the version that made the folder"
+        hint = f"run `{kind.WRITTEN_BY}` again, or use the version that made the folder"
         said, allowed = f"the schema is {schema!r}", get_args(expected)[0]
-        raise CalibError(said, where=str(path), allowed=allowed, mend=mend)
+        raise CalibError(said, where=str(path), expected=allowed, hint=hint)
     place = ".".join(map(str, found[0]["loc"]))
     raise _damaged(kind, path, f"{place or 'in it'}: {in_words(found[0])}")
 
 
 def _damaged(kind: type[Record], path: Path, found: str) -> CalibError:
-    mend = f"restore the file, or run `{kind.WRITTEN_BY}` again"
-    return CalibError(found, where=str(path), allowed="the file as it was written", mend=mend)
+    hint = f"restore the file, or run `{kind.WRITTEN_BY}` again"
+    return CalibError(found, where=str(path), expected="the file as it was written", hint=hint)

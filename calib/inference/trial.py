@@ -130,9 +130,9 @@ def _check_repeats(problem: Problem, theta: Array, where: str) -> None:
         "called twice with equal parameters and conditions it gives other outputs (apart by "
         f"{plain_number(100.0 * float(np.nanmax(apart)), 2)} % of the largest)",
         where=where,
-        allowed="equal output for equal input, unless it is emulated: no sampler converges on a "
+        expected="equal output for equal input, unless it is emulated: no sampler converges on a "
         "posterior that changes under it",
-        mend="fix the seed of its random numbers; or, if a simulator is to scatter, have it "
+        hint="fix the seed of its random numbers; or, if a simulator is to scatter, have it "
         "emulated with deterministic = false, which allows for it",
     )
 
@@ -153,8 +153,8 @@ def check_moves(problem: Problem, outputs: Array, simulator: Simulator) -> None:
     raise CalibError(
         f"no parameter changes the output: it is the same in all of {len(values)} runs over the "
         f"prior of {', '.join(names)}",
-        where=simulator.place("unreadable"), allowed="an output that depends on its parameters",
-        mend="see whether the simulator reads the parameters that it is given, and returns what it "
+        where=simulator.place("unreadable"), expected="an output that depends on its parameters",
+        hint="see whether the simulator reads the parameters that it is given, and returns what it "
         "works out from them",
     )  # fmt: skip
 
@@ -181,7 +181,7 @@ def check_scale(problem: Problem, outputs: Array, simulator: Simulator) -> None:
         f"in all of {times.size} runs over the prior the largest output is {least} to {most} times "
         "the largest that was measured",
         where=simulator.place("unreadable"),
-        allowed=f"outputs in the unit of {header}, and priors that reach the data",
-        mend="name the column with the unit that it gives, or correct the priors or the data's "
+        expected=f"outputs in the unit of {header}, and priors that reach the data",
+        hint="name the column with the unit that it gives, or correct the priors or the data's "
         "unit",
     )

@@ -67,8 +67,8 @@ def example_csv(model_name: str) -> str:
     if not example:
         raise CalibError(
             f"the model {model_name!r} has no example of its data",
-            allowed=f"columns {', '.join((*model.conditions, model.output))}",
-            mend="write a CSV with these columns, in any of their units (`calib quantities NAME`); "
+            expected=f"columns {', '.join((*model.conditions, model.output))}",
+            hint="write a CSV with these columns, in any of their units (`calib quantities NAME`); "
             'a Model of your own may have an example="..."',
         )
     return example
@@ -92,8 +92,8 @@ def get_model(name: str) -> Model:
     if name not in MODELS:
         raise CalibError(
             f"there is no model {name!r}",
-            allowed=", ".join(MODELS),
-            mend=f"{meant(name, MODELS, 'use one of these names,')} or name the file of your "
+            expected=", ".join(MODELS),
+            hint=f"{meant(name, MODELS, 'use one of these names,')} or name the file of your "
             "models (--models FILE) or of your simulator (--simulator FILE)",
         )
     return MODELS[name]

@@ -80,8 +80,8 @@ class _Predicted:
         if self.model.predict is None:
             raise CalibError(
                 f"the model {self.model.name} has no predict",
-                allowed="predict(theta (k, d), conditions) -> (k, n)",
-                mend="declare it with a function that predicts its output",
+                expected="predict(theta (k, d), conditions) -> (k, n)",
+                hint="declare it with a function that predicts its output",
             )
         # Copies, as a function may change its arguments.
         handed = theta.copy(), {name: v.copy() for name, v in rows.items()}
@@ -94,9 +94,9 @@ class _Predicted:
             raise CalibError(
                 f"predict of the model {self.model.name} fails: {type(error).__name__}: {error}",
                 where=f"{frame.filename}, line {frame.lineno}",
-                allowed=f"conditions {', '.join(self.model.conditions)}; parameters in columns of "
+                expected=f"conditions {', '.join(self.model.conditions)}; parameters in columns of "
                 f"theta (k, {len(self.model.parameters)})",
-                mend="correct the function",
+                hint="correct the function",
             ) from error
         try:
             found = real_array(given, QUANTITIES[self.model.output].unit)
@@ -106,8 +106,8 @@ class _Predicted:
         if found.shape != (theta.shape[0], n):
             raise CalibError(
                 f"predict of the model {self.model.name} returned the shape {found.shape}",
-                allowed=f"(vectors, rows) = ({theta.shape[0]}, {n})",
-                mend="theta[:, :1] is the first parameter as a column, (vectors, 1)",
+                expected=f"(vectors, rows) = ({theta.shape[0]}, {n})",
+                hint="theta[:, :1] is the first parameter as a column, (vectors, 1)",
             )
         return np.log(found) if self.model.response == "log" else found
 
@@ -300,8 +300,8 @@ class Model:
         if missing:
             raise CalibError(
                 f"model {self.name} needs {', '.join(missing)}, which the data do not have",
-                allowed=f"columns {', '.join(self.conditions)} (in any known unit)",
-                mend=f"add the column, or see `calib template {self.name}` for an example",
+                expected=f"columns {', '.join(self.conditions)} (in any known unit)",
+                hint=f"add the column, or see `calib template {self.name}` for an example",
             )
         return {name: conditions[name] for name in self.conditions}
 
@@ -313,7 +313,9 @@ class BoundModel:
     model: Model
     references: References
 
-    def location(self, theta: Array, conditions: Conditions, rows: Rows | None = None) -> Array:
+    def mean_response(
+        self, theta: Array, conditions: Conditions, rows: Rows | None = None
+    ) -> Array:
         """Predict on the scale of the response, shape (k, n); rows if prepared before."""
         with np.errstate(all="ignore"):
             theta = np.atleast_2d(theta)
@@ -328,7 +330,7 @@ class BoundModel:
                 if first.size < k:
                     theta, *rest = (v[first] for v in each)
                     conditions = {**conditions, **dict(zip(own, rest, strict=True))}
-                    return self.location(theta, conditions, None if own else rows)[again]
+                    return self.mean_response(theta, conditions, None if own else rows)[again]
             rows = self.model.prepare(conditions, self.references) if rows is None else rows
             return self.model.mean_response(columns(theta), rows, self.references)
 
@@ -339,7 +341,7 @@ class BoundModel:
 
     def predict(self, theta: Array, conditions: Conditions) -> Array:
         """Predict the output in its canonical unit, shape (k, n)."""
-        return self.from_response(self.location(theta, conditions))
+        return self.from_response(self.mean_response(theta, conditions))
 
     def to_response(self, output: Array) -> Array:
         """Map outputs to the scale on which the noise is additive."""
@@ -370,13 +372,13 @@ def check_tuple(attribute: str, given: object, where: str) -> None:
     """Refuse plain text in the place of a tuple of texts: it would be taken letter by letter."""
     if isinstance(given, str):
         raise CalibError(
-            f"{attribute} is the text {given!r}", where=where, allowed="a tuple of texts",
-            mend=f"write {attribute} = ({_quoted(given)},), with the comma",
+            f"{attribute} is the text {given!r}", where=where, expected="a tuple of texts",
+            hint=f"write {attribute} = ({_quoted(given)},), with the comma",
         )  # fmt: skip
     if not isinstance(given, list | tuple) or not all(isinstance(part, str) for part in given):
         raise CalibError(
-            f"{attribute} is {given!r}", where=where, allowed="a tuple of texts",
-            mend='write each between quotation marks, with commas: ("a", "b")',
+            f"{attribute} is {given!r}", where=where, expected="a tuple of texts",
+            hint='write each between quotation marks, with commas: ("a", "b")',
         )  # fmt: skip
 
 
@@ -390,9 +392,9 @@ def check_word(name: object, what: str, where: str) -> None:
     if not isinstance(name, str) or not name.isidentifier():
         raise CalibError(
             f"{name!r} is no name for a {what}", where=where,
-            allowed="letters of any script, digits and underscores, not beginning with a digit: it "
-            "names columns, variables of netCDF and marks of templates too",
-            mend="give it another name",
+            expected="letters of any script, digits and underscores, not beginning with a digit: "
+            "it names columns, variables of netCDF and marks of templates too",
+            hint="give it another name",
         )  # fmt: skip
 
 
@@ -412,9 +414,9 @@ def check_names(
             raise CalibError(
                 f"{what} is there twice" if other == what else f"{what} has the name of {other}",
                 where=f"{where}, {key}",
-                allowed="a name for each parameter, condition and output that nothing else has: "
+                expected="a name for each parameter, condition and output that nothing else has: "
                 f"not {', '.join(taken)}",
-                mend="rename one of them",
+                hint="rename one of them",
             )  # fmt: skip
         known[normalize("NFKC", name)] = what
 
@@ -430,18 +432,18 @@ def check_model(model: Model) -> None:
     for column in (model.output, *model.conditions):
         if column not in QUANTITIES:
             raise CalibError(
-                f"there is no quantity {column!r}", where=where, allowed=", ".join(QUANTITIES),
-                mend="register a Quantity for it before the model",
+                f"there is no quantity {column!r}", where=where, expected=", ".join(QUANTITIES),
+                hint="register a Quantity for it before the model",
             )  # fmt: skip
     if QUANTITIES[model.output].role != "output":
         raise CalibError(
-            f"{model.output} is no output", where=where, allowed=", ".join(OUTPUTS.values()),
-            mend='register its Quantity with role="output"',
+            f"{model.output} is no output", where=where, expected=", ".join(OUTPUTS.values()),
+            hint='register its Quantity with role="output"',
         )  # fmt: skip
     if not model.conditions or not model.parameters:
         raise CalibError(
             "a model needs conditions and parameters", where=where,
-            mend="name at least one of each",
+            hint="name at least one of each",
         )  # fmt: skip
     names = (*model.parameters, "sigma")
     derived = [name for name in model.reported if name not in model.parameters]
@@ -453,20 +455,20 @@ def check_model(model: Model) -> None:
     if not model.priors:
         raise CalibError(
             "the model has no priors", where=where,
-            allowed="priors=... with the text of a prior file",
-            mend="write it after the example that `calib priors magic_formula` shows",
+            expected="priors=... with the text of a prior file",
+            hint="write it after the example that `calib priors magic_formula` shows",
         )  # fmt: skip
     try:
         given = tomllib.loads(model.priors).get("parameters", {})
     except tomllib.TOMLDecodeError as error:
         raise CalibError(
-            f"its priors are not valid TOML: {error}", where=where, mend=MEND_TOML
+            f"its priors are not valid TOML: {error}", where=where, hint=MEND_TOML
         ) from None
     apart = sorted(set(names) ^ set(given))
     if apart:
         raise CalibError(
             f"its priors and its parameters differ by {', '.join(apart)}", where=where,
-            allowed=", ".join(names), mend="give a prior for each of these, and for nothing else",
+            expected=", ".join(names), hint="give a prior for each of these, and for nothing else",
         )  # fmt: skip
     _check_units(model, given, where)
 
@@ -483,8 +485,8 @@ def _check_units(model: Model, given: dict[str, Any], where: str) -> None:
         if found is not None and not _same_unit(str(found), unit):
             raise CalibError(
                 f"the unit is {found!r}", where=f"{where}, priors, parameters.{name}.unit",
-                allowed=f'unit = "{unit.replace("**", "^").replace(_ONE, "1")}"',
-                mend="convert the numbers to this unit",
+                expected=f'unit = "{unit.replace("**", "^").replace(_ONE, "1")}"',
+                hint="convert the numbers to this unit",
             )  # fmt: skip
 
 

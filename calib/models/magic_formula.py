@@ -243,8 +243,8 @@ def _references(conditions: Conditions) -> dict[str, float]:
         raise CalibError(
             f"model magic_formula_pressure found one inflation pressure only ({low:g} psi)",
             where="column inflation_pressure",
-            allowed="at least two distinct inflation pressures",
-            mend="add tests at another pressure, or fit the model magic_formula",
+            expected="at least two distinct inflation pressures",
+            hint="add tests at another pressure, or fit the model magic_formula",
         )
     return {"p_mid_psi": 0.5 * (low + high), "p_half_psi": 0.5 * (high - low)}
 

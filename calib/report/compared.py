@@ -69,8 +69,8 @@ def plan_comparison(
     if task is None:
         raise CalibError(
             f"the models to compare predict {output}, which the report does not have",
-            allowed="models of " + ", ".join(OUTPUTS[t.output] for t in tasks),
-            mend="add the file that has it, or compare others",
+            expected="models of " + ", ".join(OUTPUTS[t.output] for t in tasks),
+            hint="add the file that has it, or compare others",
         )
     own = {} if task.prior_path is None else {task.model: task.prior_path}
     given = {**own, **priors}

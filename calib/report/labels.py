@@ -356,8 +356,8 @@ def declared[T](what: str, known: Mapping[str, T], name: str) -> T:
     """
     if name not in known:
         raise CalibError(
-            f"there is no {what} {name!r}", allowed=", ".join(known),
-            mend=f"{meant(name, known, 'correct the name,')} or name the file that declares "
+            f"there is no {what} {name!r}", expected=", ".join(known),
+            hint=f"{meant(name, known, 'correct the name,')} or name the file that declares "
             f"the {what}",
         )  # fmt: skip
     return known[name]

@@ -51,14 +51,14 @@ class HoldOut:
             return cls(column.strip(), float(value))
         except CalibError as error:
             raise CalibError(
-                error.message, where=f"--hold-out {text}", allowed=error.allowed,
-                mend="write one of these before the equals sign",
+                error.message, where=f"--hold-out {text}", expected=error.expected,
+                hint="write one of these before the equals sign",
             ) from None  # fmt: skip
         except ValueError:
             raise CalibError(
                 f"cannot read --hold-out {text!r}",
-                allowed="COLUMN=VALUE, for instance inflation_pressure_psi=30",
-                mend="name a column with its unit, an equals sign and one number",
+                expected="COLUMN=VALUE, for instance inflation_pressure_psi=30",
+                hint="name a column with its unit, an equals sign and one number",
             ) from None
 
     def applies_to(self, table: Table) -> bool:
@@ -122,9 +122,9 @@ def choose_model(output: str, table: Table) -> str:
     raise CalibError(
         f"no model of {output} suits the columns",
         where=table.source,
-        allowed="; ".join(f"{m.name}: {', '.join(m.conditions)}" for m in known)
+        expected="; ".join(f"{m.name}: {', '.join(m.conditions)}" for m in known)
         or "a model that is registered for this output",
-        mend=f"{renamed(table.ignored, conditions)}add the columns of one of these models, "
+        hint=f"{renamed(table.ignored, conditions)}add the columns of one of these models, "
         "declare a model of your own (--models), or report the other outputs (--only)",
     )
 
@@ -155,22 +155,22 @@ def plan_tasks(
         if other != name:
             raise CalibError(
                 f"two models are given for the same output: {other}, {name}",
-                allowed="one model for each output",
-                mend=f"report one of them; `calib compare {other} {name} FILE` tells which of them "
+                expected="one model for each output",
+                hint=f"report one of them; `calib compare {other} {name} FILE` tells which of them "
                 "the data prefer",
             )
     priors = {prior_file_model(path): path for path in prior_paths}
     for name in only:
         if name not in OUTPUTS:
-            raise CalibError(f"there is no output {name!r}", allowed=", ".join(OUTPUTS))
+            raise CalibError(f"there is no output {name!r}", expected=", ".join(OUTPUTS))
     tasks: dict[str, Task] = {}
     for table in tables:
         if len(table) > MAX_ROWS:
             raise CalibError(
                 f"{len(table)} rows are too many for a report",
                 where=table.source,
-                allowed=f"up to {MAX_ROWS} rows",
-                mend="use `calib fit` and `calib predict`, or thin the rows",
+                expected=f"up to {MAX_ROWS} rows",
+                hint="use `calib fit` and `calib predict`, or thin the rows",
             )
         found = [key for key, column in OUTPUTS.items() if column in table]
         found = [key for key in found if not only or key in only]
@@ -178,8 +178,8 @@ def plan_tasks(
             raise CalibError(
                 "there is no output to calibrate",
                 where=table.source,
-                allowed=", ".join(OUTPUTS.values()) + " (in any known unit)",
-                mend=f"{renamed(table.ignored, OUTPUTS.values())}add a column with the measured "
+                expected=", ".join(OUTPUTS.values()) + " (in any known unit)",
+                hint=f"{renamed(table.ignored, OUTPUTS.values())}add a column with the measured "
                 "output",
             )
         for key in found:
@@ -187,7 +187,7 @@ def plan_tasks(
                 raise CalibError(
                     f"two files give the output {key}",
                     where=f"{tasks[key].table.source}, {table.source}",
-                    mend="report one of them, or join them into one file",
+                    hint="report one of them, or join them into one file",
                 )
             rows = table.take(np.isfinite(table[OUTPUTS[key]]))
             usable = held_out if held_out is not None and held_out.applies_to(rows) else None
@@ -199,8 +199,8 @@ def plan_tasks(
             raise CalibError(
                 f"the model {name} is for {column}, which is not reported",
                 where=", ".join(table.source for table in tables),
-                allowed=f"models of {', '.join(task.output for task in planned)}",
-                mend=f"leave it out, or give a file with {column}",
+                expected=f"models of {', '.join(task.output for task in planned)}",
+                hint=f"leave it out, or give a file with {column}",
             )
     if held_out is not None:
         _check_held_out(planned, held_out)

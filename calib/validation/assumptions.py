@@ -415,7 +415,7 @@ def residual_checks(problem: Problem, t: Array) -> tuple[Check, ...]:
 def unexplained(
     table: Table, columns: Mapping[str, NDArray[np.str_] | Array], residual: Array, *,
     title: str = "A column explains the residuals",
-    mend: str = "",
+    hint: str = "",
 ) -> Iterable[Check]:  # fmt: skip
     """Whether residuals (n,), in noise sds, differ with a column of a table that is not used.
 
@@ -434,11 +434,11 @@ def unexplained(
         if not category and np.unique(x).size > 1:
             found.append(scipy.stats.spearmanr(score, x).pvalue)
         levels, group, count = np.unique(names, return_inverse=True, return_counts=True)
-        remedy = mend or (
+        remedy = hint or (
             "fit each of its values by itself, or choose a model that has it as a condition"
         )
         if not category and count.min() < _FEWEST_IN_GROUP:
-            remedy = mend or (
+            remedy = hint or (
                 "choose a model that has it as a condition or, if the readings drift along the "
                 'runs, write correlated_along = "run_order" (a column) in the prior file'
             )

@@ -222,8 +222,8 @@ def _check_possible(found: Candidate) -> None:
         raise CalibError(
             f"{found.model} gives {empty.size} of {len(table)} rows no density",
             where=f"{table.source}, line {empty[0]}",
-            allowed="rows that every model can have, however improbable",
-            mend="leave the model out, or the rows where it is not defined",
+            expected="rows that every model can have, however improbable",
+            hint="leave the model out, or the rows where it is not defined",
         )
 
 
@@ -232,8 +232,8 @@ def check_comparable(models: Sequence[str]) -> None:
     if len(models) < 2 or len(set(models)) < len(models):
         raise CalibError(
             f"there is nothing to compare in {', '.join(models) or 'no model'}",
-            allowed="two or more models, each once",
-            mend="name two or more: calib compare MODEL MODEL my.csv, or calib report my.csv "
+            expected="two or more models, each once",
+            hint="name two or more: calib compare MODEL MODEL my.csv, or calib report my.csv "
             "--compare MODEL --compare MODEL",
         )
     outputs = {name: get_model(name).output for name in models}
@@ -241,8 +241,8 @@ def check_comparable(models: Sequence[str]) -> None:
         raise CalibError(
             "the models predict different outputs",
             where="; ".join(f"{name}: {output}" for name, output in outputs.items()),
-            allowed="models of one output",
-            mend="compare those of one output at a time",
+            expected="models of one output",
+            hint="compare those of one output at a time",
         )
 
 

@@ -83,7 +83,7 @@ def predictive_draws(
     """Draw the mean output and a measurement, both of shape (size, n)."""
     problem = calibration.problem
     natural = problem.theta(calibration.subset(size))
-    location = problem.draw_location(natural, conditions, rng)
+    location = problem.draw_mean_response(natural, conditions, rng)
     noise = problem.noise.draw(natural, conditions, rng, location.shape[1])
     from_response = problem.bound.from_response
     return from_response(location), from_response(location + noise)
@@ -92,7 +92,7 @@ def predictive_draws(
 def prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
     """Return measurements that the priors expect at the calibrated rows, shape (draws, n)."""
     natural = problem.theta(problem.priors.sample(rng, _N_PRIOR_PREDICTIVE))
-    location = problem.draw_location(natural, problem.conditions, rng)
+    location = problem.draw_mean_response(natural, problem.conditions, rng)
     return problem.bound.from_response(location + problem.draw_noise(natural, rng))
 
 
@@ -154,7 +154,7 @@ def predict(calibration: Calibration, table: Table) -> Prediction:
         rows = {name: v[start : start + _ROWS_AT_ONCE] for name, v in conditions.items()}
         # An emulator's error, too.
         error = generator(calibration.seed, calibration.label, "predict", "emulator")
-        location = problem.draw_location(natural, rows, error)
+        location = problem.draw_mean_response(natural, rows, error)
         share = np.isfinite(location).mean(axis=0)
         # Where many plausible parameters give the equation no value (a quadratic in pressure
         # extrapolated below zero), the rest are no sample of anything: no value is better.
@@ -222,7 +222,7 @@ def smooth_bands(
     natural = problem.theta(t)
     size = natural.shape[0]
     z = ndtri((rng.permutation(size) + 0.5) / size)[:, None]
-    location = problem.draw_location(natural, conditions, rng)
+    location = problem.draw_mean_response(natural, conditions, rng)
     noise = problem.noise.of_normal(natural, conditions, z)
     back = problem.bound.from_response
     return bands(back(location)), bands(back(location + noise))

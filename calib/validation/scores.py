@@ -149,7 +149,7 @@ class Standardised:
 def standardise(calibration: Calibration, problem: Problem) -> Standardised:
     """Work residuals out at the posterior: of the problem's rows, calibrated on or others."""
     natural = problem.theta(calibration.subset(_N_DRAWS))
-    location = problem.bound.location(problem.of_model(natural), problem.conditions)
+    location = problem.bound.mean_response(problem.of_model(natural), problem.conditions)
     residual = np.nanmean(
         problem.noise.normal_scores(problem.response - location, natural, problem.conditions),
         axis=0,

@@ -119,7 +119,9 @@ def _prior_draws(calibration: Calibration) -> Mapping[str, Array]:
     at_once = max(1, _CELLS // len(problem.table))
     defined = [
         np.isfinite(
-            problem.bound.location(problem.of_model(natural[i : i + at_once]), problem.conditions)
+            problem.bound.mean_response(
+                problem.of_model(natural[i : i + at_once]), problem.conditions
+            )
         )
         for i in range(0, _N_PRIOR, at_once)
     ]

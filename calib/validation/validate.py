@@ -94,8 +94,8 @@ def validate_held_out(calibration: Calibration, held_out: Table) -> Validation:
         raise CalibError(
             f"the calibrated model {model.name} has no value at the held-out rows",
             where=held_out.source,
-            allowed="conditions to which the equation can be extrapolated",
-            mend="hold out rows inside the range of the others",
+            expected="conditions to which the equation can be extrapolated",
+            hint="hold out rows inside the range of the others",
         )
     observed = held_out[model.output]
     scores = score(draws, observed, heavy=calibration.problem.heavy)
@@ -156,7 +156,7 @@ def leave_one_out(
             sample = sample[np.resize(np.flatnonzero(defined), N_DRAWS)]
         natural = problem.theta(sample)
         here = problem.bound.model.select(row.columns)
-        location = problem.draw_location(natural, here, rng)
+        location = problem.draw_mean_response(natural, here, rng)
         noisy = location + problem.noise.draw(natural, here, rng, 1)
         drawn[:, i] = problem.bound.from_response(noisy)[:, 0]
     if progress is not None and not refits:

@@ -44,13 +44,13 @@ def run(out: Path, *, set_aside: bool = False, seed: int = 1, only: Sequence[str
     if not chosen:
         raise CalibError(
             f"no such case: {', '.join(only)}", where="--only",
-            allowed=", ".join(c.name for c in read_cases() if c.set_aside == set_aside),
-            mend="correct the name",
+            expected=", ".join(c.name for c in read_cases() if c.set_aside == set_aside),
+            hint="correct the name",
         )  # fmt: skip
     if out.exists():
         raise CalibError(
-            "the folder is there already", where=str(out), allowed="a new folder",
-            mend="name another one",
+            "the folder is there already", where=str(out), expected="a new folder",
+            hint="name another one",
         )  # fmt: skip
     for case in chosen:
         case.write(out / "cases" / case.name)

@@ -119,8 +119,8 @@ def _of(table: Rows, series: Sequence[str], path: Path) -> Rows:
     for name in series:
         if name not in there:
             raise CalibError(
-                f"there is no series {name}", where=str(path), allowed=", ".join(sorted(there)),
-                mend="correct the name",
+                f"there is no series {name}", where=str(path), expected=", ".join(sorted(there)),
+                hint="correct the name",
             )  # fmt: skip
     return [row for row in table if row[_SERIES] in series]
 

@@ -16,7 +16,7 @@ def page() -> str:
     parts = [_command(name, command) for name, command in group.commands.items()]
     return "# Commands\n\n" + (
         "What `calib COMMAND --help` says, made from the same declarations. Exit codes: 0 all "
-        "well; 1 something failed or differs; 2 input to mend, said in a line or two; 3 a "
+        "well; 1 something failed or differs; 2 input to fix, said in a line or two; 3 a "
         "posterior that did not converge; 130 interrupted.\n\n" + "\n".join(parts)
     )
 

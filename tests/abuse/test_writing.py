@@ -133,7 +133,7 @@ def refused(words: str, out: Path) -> str:
     assert done.exit_code == 2, (done.output, done.exception)
     lines = done.stderr.splitlines()
     assert lines[0].startswith("calib: "), lines
-    # What is allowed and how to mend it stand below, moved in.
+    # What is allowed and how to fix it stand below, moved in.
     assert all(line.startswith("  ") for line in lines[1:]), lines
     assert done.stdout == ""
     return done.stderr

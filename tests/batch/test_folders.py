@@ -28,7 +28,7 @@ def refusal(out: Path, *, overwrite: bool = False) -> str:
         fresh_folder(out, overwrite=overwrite).__enter__()
     assert str(early.value) == str(late.value)
     assert str(out) in str(early.value)
-    assert "to mend:" in str(early.value)
+    assert "hint:" in str(early.value)
     return str(early.value)
 
 

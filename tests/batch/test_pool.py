@@ -24,7 +24,7 @@ def square(x: int) -> tuple[int, int]:
 
 
 def fail(words: str) -> None:
-    raise CalibError(words, mend="do")
+    raise CalibError(words, hint="do")
 
 
 def die() -> None:

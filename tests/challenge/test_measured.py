@@ -55,7 +55,7 @@ def test_a_case_can_be_calibrated_and_predicted(
         drawn = problem.theta(problem.priors.sample(np.random.default_rng(1), 20))
         for table in (lab, field):
             conditions = problem.bound.model.select(table.columns)
-            predicted = problem.bound.location(problem.of_model(drawn), conditions)
+            predicted = problem.bound.mean_response(problem.of_model(drawn), conditions)
             # A soil may be too soft for the wheel; a row must not be beyond the model.
             assert np.isfinite(predicted).any(axis=0).all()
 

@@ -46,7 +46,7 @@ def test_without_the_bench_it_is_named_and_nothing_is_written(
     ran = run(*words)
     assert ran.code == 2
     assert "a test bench of the repository, not of the wheel" in ran.err
-    assert "to mend: run from a checkout" in ran.err
+    assert "hint: run from a checkout" in ran.err
     assert ("[[challenge]]" if words[0] == "campaign" else f"calib {words[0]} {words[1]}") in (
         ran.err
     )

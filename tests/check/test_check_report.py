@@ -482,7 +482,7 @@ def test_a_manifest_that_makes_no_sense_cannot_be_checked(report: Path, change, 
     with pytest.raises(CalibError) as caught:
         check(report)
     assert words in str(caught.value)
-    assert "to mend:" in str(caught.value)
+    assert "hint:" in str(caught.value)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b"\xff\xfe", b"[" * 100_000])

@@ -83,7 +83,7 @@ def test_what_cannot_be_checked_ends_with_2(calib: Calib, run: Path) -> None:  #
         refused = calib("check", folder, "--json")
         assert refused.code == 2
         assert "no folder that can be checked" in refused.err
-        assert "to mend:" in refused.err
+        assert "hint:" in refused.err
         document = json.loads(refused.out)
         assert (document["verdict"], document["exit_code"]) == ("cannot be checked", 2)
     Path("simulated").mkdir()

@@ -63,4 +63,4 @@ def test_what_there_is_not_is_refused_with_what_there_is(run: Calib, what: str) 
     refused = run(what, "nothing")
     assert refused.code == 2
     assert "there is no" in refused.err
-    assert "allowed: " in refused.err
+    assert "expected: " in refused.err

@@ -46,7 +46,7 @@ def test_a_users_effect_that_does_not_run_is_named(calib: Calib) -> None:  # noq
         'unit = "1"\nreason = "a guess"\nsource = "test"\n'
     )
     refused = calib("diagnose", "gaps/plain_bekker", "--effects", "mine.py", "--out", "found")
-    assert_refused(refused, ["mine.py, effect wind, line 10", "NameError", "gust", "to mend"])
+    assert_refused(refused, ["mine.py, effect wind, line 10", "NameError", "gust", "hint"])
 
 
 def test_the_folder_is_called_by_the_name_of_the_data(calib: Calib, tmp_path: Path) -> None:  # noqa: F811

@@ -44,7 +44,7 @@ def refusal(path: Path | str, **options: object) -> str:
         read_table(path, **options)  # type: ignore[arg-type]
     message = str(caught.value)
     assert str(path) in message
-    assert "to mend:" in message
+    assert "hint:" in message
     return message
 
 
@@ -152,7 +152,7 @@ def test_a_rut_depth_that_is_not_used_may_be_zero(my_csv: Write) -> None:
 )  # fmt: skip
 def test_unreadable_files(my_csv: Write, content: bytes, words: list[str]) -> None:
     message = refusal(my_csv(content))
-    for word in ["allowed:", *words]:
+    for word in ["expected:", *words]:
         assert word in message
 
 
@@ -188,19 +188,19 @@ def test_an_impossible_path_is_refused() -> None:
 )
 def test_wrong_columns(my_csv: Write, header: str, words: list[str]) -> None:
     message = refusal(my_csv(f"{header}\n0.1,2\n"), required=["slip_ratio", "cone_index_kpa"])
-    for word in ["line 1, column", "allowed:", *words]:
+    for word in ["line 1, column", "expected:", *words]:
         assert word in message
 
 
 def test_all_columns_whose_unit_cannot_be_read_are_named_at_once(my_csv: Write) -> None:
     message = refusal(my_csv("slip,Drawbar pull,rut_depth_kn,note\n0.1,2,3,wet\n"))
-    found, allowed, mend = message.splitlines()
+    found, allowed, hint = message.splitlines()
     assert "line 1, columns 'slip', 'Drawbar pull', 'rut_depth_kn': " in found
     assert "the column name 'slip' does not say the unit; the column name 'Drawbar pull'" in found
     assert "'kn' is a unit of force, but rut_depth is a length" in found
     for header, word in (("slip", "slip_ratio"), ("Drawbar pull", "drawbar_pull_kn")):
         assert word in allowed
-        assert f"{header!r}: rename the column, for example {word}" in mend
+        assert f"{header!r}: rename the column, for example {word}" in hint
 
 
 # What is refused: cells
@@ -245,7 +245,7 @@ def test_a_bad_cell(my_csv: Write, header: str, cell: str, words: list[str]) -> 
     good = "1650" if header == "bulk_density_kg_m3" else "1"
     path = my_csv(f"operator,{header}\nA,{good}\nB,{cell}\n")
     message = refusal(path)
-    for word in [f"{path}, line 3, column {header!r}", "allowed:", *words]:
+    for word in [f"{path}, line 3, column {header!r}", "expected:", *words]:
         assert word in message
 
 
@@ -254,12 +254,12 @@ def test_several_bad_cells_come_in_one_message(my_csv: Write) -> None:
     lines = message.splitlines()
     assert lines[0].endswith("4 problems in the data")
     assert lines[1] == (
-        "  line 2, column 'speed_m_s': 'fast' is not a number; allowed: a number of at least 0 m/s"
+        "  line 2, column 'speed_m_s': 'fast' is not a number; expected: a number of at least 0 m/s"
     )
     assert lines[2].startswith("  line 3, column 'slip_ratio': '3' is outside the range of slip")
     assert lines[3].startswith("  line 4, column 'speed_m_s': '-1' is outside the range of speed")
     assert lines[4].startswith("  line 5: the row has 1 cells")
-    assert lines[5].strip() == "to mend:"
+    assert lines[5].strip() == "hint:"
     assert lines[6].startswith("    - write one plain number")
     assert lines[7].startswith("    - slip is s = 1 - v/(ωr) here")
 
@@ -358,7 +358,7 @@ def test_an_absent_column_lists_the_present_ones() -> None:
     assert "speed_m_s" not in pressures()
     with pytest.raises(CalibError, match="no column 'speed_m_s'") as caught:
         pressures()["speed_m_s"]
-    assert "allowed: inflation_pressure_psi, slip_ratio" in str(caught.value)
+    assert "expected: inflation_pressure_psi, slip_ratio" in str(caught.value)
 
 
 @pytest.mark.parametrize(

@@ -81,7 +81,7 @@ def test_other_columns_name_no_quantity(header: str) -> None:
 def test_a_wrong_unit_is_named_with_the_allowed_ones(header: str, words: list[str]) -> None:
     with pytest.raises(CalibError) as caught:
         parse_header(header, where="my.csv, line 1")
-    for word in [f"my.csv, line 1, column {header!r}", "allowed:", "to mend:", *words]:
+    for word in [f"my.csv, line 1, column {header!r}", "expected:", "hint:", *words]:
         assert word in str(caught.value)
 
 

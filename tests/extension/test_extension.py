@@ -178,12 +178,12 @@ source = "Assumed"
     bound = BoundModel(model, {})
     theta = np.array([[0.2, 3.0], [0.1, 2.0], [0.0, 1.0], [1.0, 0.0], [2.0, 0.5]])
     each = np.stack([straight(t[None], {"slip_ratio": slip})[0] for t in theta])
-    np.testing.assert_allclose(bound.location(theta, {"slip_ratio": slip}), each)
+    np.testing.assert_allclose(bound.mean_response(theta, {"slip_ratio": slip}), each)
     own = np.tile(slip, (5, 1)) * np.arange(1.0, 6.0)[:, None]
     apart = np.stack(
         [straight(t[None], {"slip_ratio": s})[0] for t, s in zip(theta, own, strict=True)]
     )
-    np.testing.assert_allclose(bound.location(theta, {"slip_ratio": own}), apart)
+    np.testing.assert_allclose(bound.mean_response(theta, {"slip_ratio": own}), apart)
     sse = np.square(pull - each).sum(axis=1)
     np.testing.assert_allclose(problem.squares(theta), sse)
 
@@ -198,7 +198,7 @@ def test_a_function_that_does_not_broadcast_is_evaluated_vector_by_vector() -> N
         parameters=("a",), predict=looped,
     )  # fmt: skip
     theta, slip = np.arange(1.0, 6.0)[:, None], np.arange(20.0).reshape(5, 4)
-    found = BoundModel(model, {}).location(theta, {"slip_ratio": slip})
+    found = BoundModel(model, {}).mean_response(theta, {"slip_ratio": slip})
     np.testing.assert_allclose(found, theta * slip)
 
 
@@ -232,7 +232,7 @@ def declared(**changes: object) -> calib.Model:
 def test_what_is_declared_wrongly_is_named(changes: dict[str, object], words: list[str]) -> None:
     with pytest.raises(CalibError) as caught:
         calib.register(declared(**changes))
-    for word in [*words, "to mend:"]:
+    for word in [*words, "hint:"]:
         assert word in str(caught.value)
 
 
@@ -343,7 +343,7 @@ def test_a_prior_in_another_unit_than_its_parameter_is_refused(
     own.write_text(text.replace(right, wrong), encoding="utf-8")
     refused = run("models", "--models", own)
     assert refused.code == 2
-    for word in (*words, f"{own.resolve()}, model 'janosi_torque'", "to mend: convert"):
+    for word in (*words, f"{own.resolve()}, model 'janosi_torque'", "hint: convert"):
         assert word in refused.err
 
 

@@ -182,7 +182,7 @@ def test_wrong_input_is_named(run: Calib) -> None:
     file = write_program(Path.cwd(), run='"./none {input}"')
     refused = run("models", "--simulator", file)
     assert refused.code == 2
-    for word in ("wheel.toml, run", "no program './none'", "to mend"):
+    for word in ("wheel.toml, run", "no program './none'", "hint"):
         assert word in refused.err
 
 

@@ -136,8 +136,8 @@ def simulate(
     for o, model in draft.models.items():
         bound = build_problem(model, draft.lab).bound
         theta = np.array([[TRUTH[model][name] for name in bound.model.parameters]])
-        lab[o] = bound.location(theta, bound.model.select(draft.lab.columns))[0]
-        field[o] = bound.location(theta, bound.model.select(view.conditions))[0]
+        lab[o] = bound.mean_response(theta, bound.model.select(draft.lab.columns))[0]
+        field[o] = bound.mean_response(theta, bound.model.select(view.conditions))[0]
         bounds[o], thetas[o] = bound, theta
     if effect is None:
         return lab, field
@@ -150,7 +150,7 @@ def simulate(
         columns = {role_of(c): c for c in bound.model.conditions}
         plain = {role: view.conditions[c] for role, c in columns.items()}
         true = acting.on_conditions(phi, roles[o], plain, view)
-        location = bound.location(thetas[o], {columns[role]: v for role, v in true.items()})
+        location = bound.mean_response(thetas[o], {columns[role]: v for role, v in true.items()})
         field[o] = acting.on_output(phi, roles[o], location, view)[0]
     return lab, field
 

@@ -60,9 +60,9 @@ def test_units_in_column_names_are_converted(tmp_path):
         (
             'calibration = "lab.csv"\nfield = "field.csv"\nprdict = "fresh.csv"\n[models]\n'
             'rut_depth = "bekker"\n',
-            "unknown key prdict\n  allowed: calibration, field, predict, models, priors, "
+            "unknown key prdict\n  expected: calibration, field, predict, models, priors, "
             "covariates, context\n"
-            "  to mend: did you mean predict?",
+            "  hint: did you mean predict?",
         ),
         (
             'calibration = "lab.csv"\nfield = "field.csv"\n[models]\nsinkage = "bekker"\n',

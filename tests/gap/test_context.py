@@ -99,8 +99,8 @@ def test_names_that_nobody_knows_are_refused(context):
 
 def test_of_a_misspelt_cause_the_one_most_like_it_is_named():
     case = make_case("force_offset", models=PULL_ONLY)
-    for name, mend in (("sensr_drift", "did you mean sensor_drift"), ("parameter_shift", "leave")):
-        with pytest.raises(CalibError, match=mend):
+    for name, hint in (("sensr_drift", "did you mean sensor_drift"), ("parameter_shift", "leave")):
+        with pytest.raises(CalibError, match=hint):
             diagnose_once(replace(case, context=Context(excluded=(name,))), 1)
 
 
@@ -223,13 +223,13 @@ def test_a_size_is_within_the_bounds_of_its_prior(mean, allowed):
         return
     with pytest.raises(CalibError, match=r"thrust cannot be -1\.5") as refused:
         digging(known=known)
-    assert refused.value.allowed == "a mean from -1 to inf"
+    assert refused.value.expected == "a mean from -1 to inf"
 
 
 def test_what_is_fixed_has_no_size_to_be_known():
     with pytest.raises(CalibError, match="no parameter 'digging'") as refused:
         digging(known={"digging": Size(mean=0.1, sd=0.1)})
-    assert refused.value.allowed == "thrust, slip_scale"
+    assert refused.value.expected == "thrust, slip_scale"
 
 
 @pytest.mark.parametrize(

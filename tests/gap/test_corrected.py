@@ -474,7 +474,7 @@ def test_what_is_left_out_must_be_a_cause(saved, tmp_path):
     found, folder = saved
     with pytest.raises(CalibError, match="no cause offset to leave out") as refused:
         predict_columns(load_corrected(folder), found.data.case.field, ["offset"])
-    assert "force_offset" in refused.value.allowed
+    assert "force_offset" in refused.value.expected
     conditions = dict(found.data.case.field.columns)
     write_table(tmp_path / "at.csv", conditions)
     given = ["predict", str(folder), "--at", str(tmp_path / "at.csv")]

@@ -130,7 +130,7 @@ def test_an_empty_cell_is_no_value_of_a_category(tmp_path):
     (folder / "field.csv").write_text(text)
     with pytest.raises(CalibError, match="operator is ''") as refused:
         read_case(folder)
-    assert refused.value.allowed == "Berg, Dahl, Lind"
+    assert refused.value.expected == "Berg, Dahl, Lind"
 
 
 def test_values_of_the_field_alone_are_named(tmp_path):

@@ -98,7 +98,7 @@ def test_a_reading_that_keeps_part_of_the_run_before(data):
     o = next(o for o in data.outputs if o.name == "drawbar_pull")
     theta = o.priors.to_natural(found.lab_mode["drawbar_pull"][None])
     selected = o.problem.bound.model.select(data.view.conditions)
-    pull = o.problem.bound.location(theta, selected)[0]
+    pull = o.problem.bound.mean_response(theta, selected)[0]
     as_they_are = found.at(np.array([[0.3]]), np.empty(0), data.view, "drawbar_pull")[0]
     np.testing.assert_allclose(np.sqrt(np.mean(as_they_are**2)), 0.3)
     # The order of the runs counts, not that of the rows.
@@ -152,7 +152,9 @@ def written_again(found: Discrepancy, view, over: str) -> list[tuple[np.ndarray,
         theta = o.priors.to_natural(found.lab_mode[name][None])
 
         def predicted(at) -> np.ndarray:
-            return o.problem.bound.location(theta, o.problem.bound.model.select(at.conditions))[0]
+            return o.problem.bound.mean_response(
+                theta, o.problem.bound.model.select(at.conditions)
+            )[0]
 
         reference = predicted(found.data.view)
         level = 2.0 * (predicted(view) - reference.min()) / np.ptp(reference) - 1.0
@@ -182,7 +184,8 @@ def written_level(found: Discrepancy, view) -> np.ndarray:
     theta = o.priors.to_natural(found.lab_mode["drawbar_pull"][None])
     select = o.problem.bound.model.select
     at, reference = (
-        o.problem.bound.location(theta, select(v.conditions))[0] for v in (view, found.data.view)
+        o.problem.bound.mean_response(theta, select(v.conditions))[0]
+        for v in (view, found.data.view)
     )
     return np.clip(2.0 * (at - reference.min()) / np.ptp(reference) - 1.0, -1.5, 1.5)
 

@@ -507,7 +507,7 @@ def test_a_shift_moves_the_parameters_and_the_zero_of_slip(data, shift_as):
         conditions = o.problem.bound.model.select(data.view.conditions)
         slip = conditions["slip_ratio"]
         truly = conditions | {"slip_ratio": 1.0 - (1.0 - slip) * (1.0 - error)}
-        expected = o.problem.bound.location(o.priors.to_natural(t), truly)
+        expected = o.problem.bound.mean_response(o.priors.to_natural(t), truly)
         np.testing.assert_allclose(found[o.name], expected, rtol=1e-12)
 
 
@@ -553,7 +553,7 @@ def test_form_errors_scale_what_each_effect_adds_to_those_before_it(data):
         theta = o.priors.to_natural(psi[:, forward.theta_slices[o.name]])
 
         def predicted(conditions, bound=bound, theta=theta, columns=columns):
-            return bound.location(theta, {columns[k]: v for k, v in conditions.items()})
+            return bound.mean_response(theta, {columns[k]: v for k, v in conditions.items()})
 
         first = rate.on_conditions(phi[0], role, given, data.view)
         second = zero.on_conditions(phi[1], role, first, data.view)

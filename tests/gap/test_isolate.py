@@ -163,7 +163,7 @@ def test_absorbed_is_what_the_calibrated_parameters_can_take_up():
     conditions = o.problem.bound.model.select(data.view.conditions)
 
     def field(psi):
-        return o.problem.bound.location(o.priors.to_natural(psi[None]), conditions)[0, o.rows]
+        return o.problem.bound.mean_response(o.priors.to_natural(psi[None]), conditions)[0, o.rows]
 
     steps = np.diag(width[:-1])
     jacobian = np.stack([(field(mode + s) - field(mode - s)) / (2.0 * s.sum()) for s in steps])

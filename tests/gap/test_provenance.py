@@ -60,7 +60,7 @@ def test_a_changed_file_another_seed_or_version_are_refused(diagnosed):
     with pytest.raises(CalibError, match="of other cases, or of these before") as caught:
         check_resumable([case], out, 1)
     assert "case-0" in str(caught.value)
-    assert caught.value.mend is not None
+    assert caught.value.hint is not None
 
 
 @pytest.mark.parametrize(("n", "listed"), [

@@ -269,7 +269,7 @@ def test_readings_and_key_of_a_case_are_those_of_its_draw(tmp_path):
         else:
             mode, _ = calibrate_lab(campaigns(read_case(folder)), 3)
             for o in campaigns(read_case(folder)).outputs:
-                at = o.problem.bound.location(
+                at = o.problem.bound.mean_response(
                     o.priors.to_natural(mode[o.name][None]), o.problem.conditions
                 )[0]
                 read = np.array([float(r[OUTPUT_COLUMNS[o.name]]) for r in rows])

@@ -230,7 +230,7 @@ def test_damage_is_told(saved: Path, tmp_path: Path, damage, place: str | None) 
     damage(folder)
     with pytest.raises(CalibError) as caught:
         load_calibration(folder)
-    assert "to mend:" in str(caught.value)
+    assert "hint:" in str(caught.value)
     if place is not None:
         assert str(folder / place) in str(caught.value)
 

@@ -25,12 +25,12 @@ def data(name: str, seed: int, n: int, *, levels: int | None = None):
     rng = np.random.default_rng(seed)
     if levels is not None:
         conditions = {c: rng.choice(v[:levels], n) for c, v in conditions.items()}
-    location = bound.location(theta[:1], conditions)[0]
+    location = bound.mean_response(theta[:1], conditions)[0]
     return bound, theta, conditions, location + 0.1 * rng.standard_normal(n)
 
 
 def plain(bound: BoundModel, theta, conditions, response) -> np.ndarray:
-    return np.square(response - bound.location(theta, conditions)).sum(axis=1)
+    return np.square(response - bound.mean_response(theta, conditions)).sum(axis=1)
 
 
 # Without the rigid wheel, whose integrals cost a thousand times the others.
@@ -77,7 +77,7 @@ def test_a_tile_has_one_value_of_the_condition_of_fewest(column: str) -> None:
 
 def test_repeats_that_agree_leave_nothing_within() -> None:
     bound, theta, conditions, _ = data("modified_bekker", 2, 300, levels=4)
-    exact = bound.location(theta[:1], conditions)[0]
+    exact = bound.mean_response(theta[:1], conditions)[0]
     squares = Squares.of(bound, conditions, exact)
     assert squares.within < 1e-24 * exact.size
     assert squares(theta[:1])[0] < 1e-24 * exact.size

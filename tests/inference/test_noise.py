@@ -63,7 +63,7 @@ def test_densities_are_scipys(tmp_path: Path, model: str, extra: str) -> None:
     z = (slip - slip.mean()) / slip.std()
     scale = value["sigma"] * np.exp(value.get("sigma_slope", 0.0) * z)
     theta = np.stack([value[n][:, 0] for n in problem.bound.model.parameters], axis=1)
-    location = problem.bound.location(theta, problem.conditions)
+    location = problem.bound.mean_response(theta, problem.conditions)
     law = stats.t(value["nu"]) if "nu" in value else stats.norm()
     expected = law.logpdf((problem.response - location) / scale) - np.log(scale)
     if problem.bound.model.response == "log":

@@ -145,7 +145,7 @@ def table_of(model: str, tmp_path, **changed: np.ndarray | None) -> Table:
 def test_data_that_cannot_calibrate(tmp_path, model: str, changed, words: list[str]) -> None:
     with pytest.raises(CalibError) as caught:
         build_problem(model, table_of(model, tmp_path, **changed))
-    for word in [*words, "allowed:", "to mend:"]:
+    for word in [*words, "expected:", "hint:"]:
         assert word in str(caught.value)
 
 

@@ -49,7 +49,7 @@ def refused(
     for ask in asking:
         with pytest.raises(CalibError, match="fails from the start") as caught:
             ask(problem)
-        for word in ("none of the 6 runs has a value", "to mend: ", *words):
+        for word in ("none of the 6 runs has a value", "hint: ", *words):
             assert word in str(caught.value)
 
 
@@ -224,7 +224,7 @@ def test_an_output_in_another_unit_is_named(emulate: bool) -> None:
     problem = of_function(too_small, emulate=emulate)
     with pytest.raises(CalibError, match="times the largest that was measured") as caught:
         (calib.emulated if emulate else calib.calibrate)(problem, seed=1)
-    for word in ("simulator own: ", "in the unit of drawbar_pull_kn", "to mend: name the column"):
+    for word in ("simulator own: ", "in the unit of drawbar_pull_kn", "hint: name the column"):
         assert word in str(caught.value)
     # Before sixty runs of a slow one are paid for.
     assert len(too_small_at) <= 7

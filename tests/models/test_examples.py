@@ -71,4 +71,4 @@ def test_a_mistake_in_ones_own_predict_is_told_by_its_line():
             np.ones((1, 1)), {"slip_ratio": np.array([0.1, 0.2])}
         )
     assert "test_examples.py, line" in told.value.where
-    assert "slip_ratio" in told.value.allowed
+    assert "slip_ratio" in told.value.expected

@@ -93,7 +93,7 @@ def test_a_quadratic_must_be_positive_between_the_end_pressures(
 def test_negative_ends_have_no_value(name: str) -> None:
     bound, theta, conditions = draw(2, "magic_formula_pressure", k=2)
     theta[1, bound.model.parameters.index(name)] = -0.1
-    location = bound.location(theta, conditions)
+    location = bound.mean_response(theta, conditions)
     assert np.isfinite(location[0]).all()
     assert np.isnan(location[1]).all()
 
@@ -103,7 +103,7 @@ def test_extrapolation_to_a_negative_peak_has_no_value() -> None:
     names = bound.model.parameters
     theta[0, [names.index("D_lo"), names.index("D_hi"), names.index("D_bend")]] = 2.0, 0.2, 0.0
     conditions = {"slip_ratio": np.full(2, 0.1), "inflation_pressure_psi": np.array([42.0, 60.0])}
-    location = bound.location(theta, conditions)[0]
+    location = bound.mean_response(theta, conditions)[0]
     assert np.isfinite(location[0])
     assert np.isnan(location[1])
 
@@ -144,7 +144,7 @@ def test_an_exponent_that_is_not_positive_has_no_value() -> None:
     bound, theta, _ = draw(4, "modified_bekker", k=1)
     theta[0] = 20.0, 1.0, -2.0
     slip = np.array([0.0, 0.4, 0.5, 0.6])
-    location = bound.location(
+    location = bound.mean_response(
         theta, {"average_ground_pressure_kpa": np.full(4, 100.0), "slip_ratio": slip}
     )[0]
     np.testing.assert_array_equal(np.isfinite(location), [True, True, False, False])
@@ -210,7 +210,7 @@ def test_a_density_outside_the_bracket_has_no_value() -> None:
         "cone_index_kpa": np.array([700.0, 1e15]),
         "volumetric_water_content": np.array([0.08, 0.08]),
     }
-    location = bound.location(theta, conditions)[0]
+    location = bound.mean_response(theta, conditions)[0]
     assert location[0] == pytest.approx(1.5)
     assert np.isnan(location[1])
 
@@ -343,9 +343,9 @@ def test_a_slow_equation_is_evaluated_once_for_equal_vectors() -> None:
     )  # fmt: skip
     theta, slip = np.array([[3.0], [1.0], [3.0], [2.0], [1.0]]), np.array([0.1, 0.2])
     bound = BoundModel(model, {})
-    np.testing.assert_allclose(bound.location(theta, {"slip_ratio": slip}), theta * slip)
+    np.testing.assert_allclose(bound.mean_response(theta, {"slip_ratio": slip}), theta * slip)
     assert asked == [3]
     # Conditions of each vector's own: the first and third differ now.
     own = slip * np.array([[1.0], [1.0], [2.0], [1.0], [1.0]])
-    np.testing.assert_allclose(bound.location(theta, {"slip_ratio": own}), theta * own)
+    np.testing.assert_allclose(bound.mean_response(theta, {"slip_ratio": own}), theta * own)
     assert max(asked[1:]) == 4

@@ -105,7 +105,7 @@ def test_the_hold_out_goes_to_the_outputs_that_have_the_column() -> None:
 def test_what_cannot_be_planned_is_told_before_the_work(tables, held, words: list[str]) -> None:
     with pytest.raises(CalibError) as caught:
         plan_tasks(tables, held)
-    for word in [*words, "to mend:"]:
+    for word in [*words, "hint:"]:
         assert word in str(caught.value)
 
 

@@ -63,7 +63,7 @@ def emulated(calibration: Calibration, sd: float) -> Calibration:
 
     def uncertain(theta, at):
         curve = 1.0 + at["slip_ratio"]
-        return bound.location(theta, at), np.full(len(theta), sd**2), curve[:, None]
+        return bound.mean_response(theta, at), np.full(len(theta), sd**2), curve[:, None]
 
     model = replace(bound.model, uncertain=uncertain)
     return replace(

@@ -17,7 +17,7 @@ def simulated(template: Problem, rng: np.random.Generator) -> tuple[np.ndarray, 
     """Draw parameters from the prior, and ruts from the parameters."""
     while True:
         natural = template.theta(template.priors.sample(rng, 1))
-        location = template.bound.location(natural[:, :-1], template.conditions)[0]
+        location = template.bound.mean_response(natural[:, :-1], template.conditions)[0]
         ln_rut = location + natural[0, -1] * rng.standard_normal(location.size)
         # A negative exponent has no rut: such parameters have no likelihood either. Ruts of more
         # than e^40 mm are left out with the few parameters that give them.

@@ -49,8 +49,8 @@ class Place:
                 wanted = f"folder with a {holding}" if holding else "file"
                 raise CalibError(
                     f"no {wanted} is called {pattern!r}", where=f"{self.where}, {key}",
-                    allowed=f"names and patterns such as *, relative to {self.folder}",
-                    mend="correct it, or put the data there",
+                    expected=f"names and patterns such as *, relative to {self.folder}",
+                    hint="correct it, or put the data there",
                 )  # fmt: skip
             found |= dict.fromkeys(good)
         return list(found)
@@ -61,7 +61,7 @@ class Place:
         if not path.is_file():
             raise CalibError(
                 f"there is no file {name!r}", where=f"{self.where}, {key}",
-                allowed=f"a file, relative to {self.folder}", mend="correct the name",
+                expected=f"a file, relative to {self.folder}", hint="correct the name",
             )  # fmt: skip
         return path
 

@@ -182,15 +182,15 @@ def _priors(section: FitSection, place: Place) -> dict[str, list[tuple[str, Path
         if model not in found:
             raise CalibError(
                 f"{name} holds priors of {model}, which is not fitted",
-                where=f"{place.where}, priors", allowed=", ".join(found),
-                mend="add the model, or leave the file out",
+                where=f"{place.where}, priors", expected=", ".join(found),
+                hint="add the model, or leave the file out",
             )  # fmt: skip
         found[model].append((place.name(path), path))
     bare = [model for model, files in found.items() if not files]
     if bare:
         raise CalibError(
             f"no prior file is for {', '.join(bare)}", where=f"{place.where}, priors",
-            mend=f"add {SHIPPED!r} to the list, or a file for each model",
+            hint=f"add {SHIPPED!r} to the list, or a file for each model",
         )  # fmt: skip
     return found
 
@@ -411,8 +411,8 @@ class Sbc(Kind[SbcSection, Item]):
                 raise CalibError(
                     f"the simulator behind {model} is emulated for every replicate, which a "
                     "campaign cannot do side by side", where=f"{place.where}, models",
-                    allowed="closed forms, and simulators with emulate = false",
-                    mend=f"use calib sbc --model {model} --data CSV, which spreads the runs "
+                    expected="closed forms, and simulators with emulate = false",
+                    hint=f"use calib sbc --model {model} --data CSV, which spreads the runs "
                     "themselves over --workers",
                 )  # fmt: skip
             for i in range(section.simulations):
@@ -496,8 +496,8 @@ class Challenge(Kind[ChallengeSection, ChallengeItem]):
         if _bench() != bench:
             raise CalibError(
                 "this worker would make other cases", where=_TABLE,
-                allowed=f"the folder `challenge` whose hash is {bench}",
-                mend="give the worker the same checkout",
+                expected=f"the folder `challenge` whose hash is {bench}",
+                hint="give the worker the same checkout",
             )  # fmt: skip
         made = make_case(own, tier, truth)
         with TemporaryDirectory() as scratch:

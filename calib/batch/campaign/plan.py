@@ -48,22 +48,22 @@ def read_plan(path: Path) -> Plan:
     Raises
     ------
     CalibError
-        Naming table and key, what is allowed there and how to mend it.
+        Naming table and key, what is expected there and how to fix it.
     """
     path = Path(path)
     text, content = _read(path)
     seed = content.pop("seed", SEED)
     if not isinstance(seed, int) or isinstance(seed, bool) or seed < 0:
         raise CalibError(
-            f"the seed is {seed!r}", where=f"{path}, seed", allowed="0 or a positive whole number",
-            mend="correct it, or leave it out",
+            f"the seed is {seed!r}", where=f"{path}, seed", expected="0 or a positive whole number",
+            hint="correct it, or leave it out",
         )  # fmt: skip
     unknown = [key for key in content if key not in KINDS]
     if unknown or not content:
         raise CalibError(
             f"unknown table {', '.join(unknown)}" if unknown else "the plan has no tasks",
-            where=str(path), allowed="seed, " + ", ".join(f"[[{kind}]]" for kind in KINDS),
-            mend="correct the name" if unknown else "add a table",
+            where=str(path), expected="seed, " + ", ".join(f"[[{kind}]]" for kind in KINDS),
+            hint="correct the name" if unknown else "add a table",
         )  # fmt: skip
     tasks: dict[str, Task] = {}
     sections: dict[str, str] = {}
@@ -74,7 +74,7 @@ def read_plan(path: Path) -> Plan:
             if section.name in sections:
                 raise CalibError(
                     f"the name {section.name!r} is that of {sections[section.name]} too",
-                    where=where, mend="give each table a name of its own",
+                    where=where, hint="give each table a name of its own",
                 )  # fmt: skip
             sections[section.name] = where
             _add(tasks, kind, section, Place(path.parent, where), seed)
@@ -88,17 +88,17 @@ def _read(path: Path) -> tuple[bytes, dict[str, Any]]:
     except OSError as error:
         raise CalibError(
             f"the plan cannot be read ({error.strerror})", where=str(path),
-            mend="give the path of a TOML file",
+            hint="give the path of a TOML file",
         ) from None  # fmt: skip
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise CalibError(f"not valid TOML: {error}", where=str(path), mend=MEND_TOML) from None
+        raise CalibError(f"not valid TOML: {error}", where=str(path), hint=MEND_TOML) from None
 
 
 def _tables(found: Any, name: str, path: Path) -> list[Any]:
     if not isinstance(found, list) or not all(isinstance(table, dict) for table in found):
         raise CalibError(
-            f"{name} is not a list of tables", where=str(path), allowed=f"[[{name}]]",
-            mend="write two brackets",
+            f"{name} is not a list of tables", where=str(path), expected=f"[[{name}]]",
+            hint="write two brackets",
         )  # fmt: skip
     return found
 
@@ -118,14 +118,14 @@ def _explain(error: ValidationError, kind: Kind[Any, Any], where: str) -> CalibE
     key = str(first["loc"][0])
     if first["type"] == "extra_forbidden":
         return CalibError(
-            f"unknown key {key}", where=where, allowed=", ".join(fields), mend="correct its name"
+            f"unknown key {key}", where=where, expected=", ".join(fields), hint="correct its name"
         )
     allowed = f"{key} = {fields[key].description}"
     if first["type"] == "missing":
-        return CalibError(f"{key} is missing", where=where, allowed=allowed, mend="add it")
+        return CalibError(f"{key} is missing", where=where, expected=allowed, hint="add it")
     found = first["input"]
     return CalibError(
-        f"{found!r} will not do", where=f"{where}, {key}", allowed=allowed, mend="correct it"
+        f"{found!r} will not do", where=f"{where}, {key}", expected=allowed, hint="correct it"
     )
 
 
@@ -138,7 +138,7 @@ def _add(
         if name in tasks:
             raise CalibError(
                 f"two tasks would be called {name}", where=place.where,
-                mend="rename a file, or put its task into a table of another name",
+                hint="rename a file, or put its task into a table of another name",
             )  # fmt: skip
         own = int(stream(seed, "campaign", name).generate_state(1)[0])
         tasks[name] = Task(name, kind.name, own, planned.settings, planned.inputs)

@@ -169,8 +169,8 @@ def discard_changed(
             f"{len(changed)} of the results there {'was' if len(changed) == 1 else 'were'} made "
             f"from something else than the plan now says: {name} differs in {what}",
             where=str(results),
-            allowed="the plan, the data and the versions that the results there were made from",
-            mend="choose another --out, or pass --overwrite to do these tasks again",
+            expected="the plan, the data and the versions that the results there were made from",
+            hint="choose another --out, or pass --overwrite to do these tasks again",
         )
     for name in changed:
         # Without its record, a folder that a kill leaves half removed is not taken for a result.

@@ -81,7 +81,7 @@ def check_declared(effect: Effect) -> None:
         whose = "calib's own" if type(taken).__module__.startswith("calib.") else "another file"
         raise CalibError(
             f"the name is that of an effect of {whose}", where=where,
-            allowed=f"any name but {', '.join(EFFECTS)}", mend="give it another name",
+            expected=f"any name but {', '.join(EFFECTS)}", hint="give it another name",
         )  # fmt: skip
     for attribute in _TUPLES:
         check_tuple(attribute, getattr(effect, attribute), where)
@@ -109,9 +109,9 @@ def _check_known(effect: Effect, fact: object, conditions: Mapping[str, str], wh
     ):
         raise CalibError(
             f"known has {fact!r}", where=where,
-            allowed=f"a tuple of Known(output, sign, ...), output one of "
+            expected=f"a tuple of Known(output, sign, ...), output one of "
             f"{', '.join(effect.outputs)}, sign -1, 0 or 1, at_most words",
-            mend='write known = (Known("pull", -1, zero_at=("slip",)),), with the comma; '
+            hint='write known = (Known("pull", -1, zero_at=("slip",)),), with the comma; '
             'at_most="the pull that there is"',
         )  # fmt: skip
     for attribute in ("zero_at", "grows_with"):
@@ -124,28 +124,28 @@ def _check_name(name: str, attribute: str, known: Collection[str], where: str) -
     if name not in known:
         raise CalibError(
             f"unknown name {name!r} in {attribute}", where=where,
-            allowed=", ".join(known), mend=_role_of_column(name) or meant(name, known),
+            expected=", ".join(known), hint=_role_of_column(name) or meant(name, known),
         )  # fmt: skip
 
 
 def _check_attribute(name: str, value: object, where: str) -> None:
     if name in _METHODS and not callable(value):
         raise CalibError(
-            f"the method {name} is {_described(value)}", where=where, allowed="a function",
-            mend=f"write def {name}(self, ...)",
+            f"the method {name} is {_described(value)}", where=where, expected="a function",
+            hint=f"write def {name}(self, ...)",
         )  # fmt: skip
     if name.startswith("_") or name in _BASE:
         return
     if callable(value):
         raise CalibError(
             f"the method {name} is none of an effect's, so nothing would call it", where=where,
-            allowed=", ".join(_METHODS),
-            mend=f"{meant(name, _METHODS)} (a helper's name starts with an underscore)",
+            expected=", ".join(_METHODS),
+            hint=f"{meant(name, _METHODS)} (a helper's name starts with an underscore)",
         )  # fmt: skip
     if difflib.get_close_matches(name, _BASE, cutoff=_MISSPELT):
         raise CalibError(
-            f"the attribute {name} is none of an effect's", where=where, allowed=", ".join(_BASE),
-            mend=f"{meant(name, _BASE)} (a constant's name starts with an underscore)",
+            f"the attribute {name} is none of an effect's", where=where, expected=", ".join(_BASE),
+            hint=f"{meant(name, _BASE)} (a constant's name starts with an underscore)",
         )  # fmt: skip
 
 
@@ -167,8 +167,8 @@ def _check_testable(effect: Effect, data: Campaigns) -> None:
     if not any(changed):
         raise CalibError(
             "it changes nothing on this case", where=_place(effect),
-            allowed=f"on_conditions or on_output that changes {' or '.join(effect.outputs)}",
-            mend="correct it, or let not_testable say why the case cannot show it",
+            expected=f"on_conditions or on_output that changes {' or '.join(effect.outputs)}",
+            hint="correct it, or let not_testable say why the case cannot show it",
         )  # fmt: skip
 
 
@@ -221,8 +221,8 @@ def _check_most(effect: Effect, phi: Array, o: OutputData, plain: Array, view: V
 def _check_kept(handed: Array, plain: Array, method: str, where: str) -> None:
     if not np.array_equal(handed, plain, equal_nan=True):
         raise CalibError(
-            f"{method} changes the location it is given", where=where, allowed="a new array",
-            mend="write location = location + ... instead of location += ...",
+            f"{method} changes the location it is given", where=where, expected="a new array",
+            hint="write location = location + ... instead of location += ...",
         )  # fmt: skip
 
 
@@ -238,8 +238,8 @@ def _check_numbers(
 
 def _wrong(message: str, where: str, allowed: str) -> CalibError:
     return CalibError(
-        message, where=where, allowed=allowed,
-        mend="correct it; phi[:, :1] is the first parameter as a column, (draws, 1)",
+        message, where=where, expected=allowed,
+        hint="correct it; phi[:, :1] is the first parameter as a column, (draws, 1)",
     )  # fmt: skip
 
 
@@ -264,7 +264,7 @@ def _call[R](function: Callable[..., R], effect: Effect, *args: Any) -> R:
         at = _place(effect) if line is None else f"{_place(effect)}, line {line}"
         raise CalibError(
             f"it does not run: {type(error).__name__}: {error}", where=at,
-            mend="correct it; view.of(role) gives what the data record, such as view.of(\"slip\")",
+            hint="correct it; view.of(role) gives what the data record, such as view.of(\"slip\")",
         ) from error  # fmt: skip
 
 

@@ -38,12 +38,12 @@ def load_effects(path: Path) -> dict[str, Effect]:
             if not effect.priors and not beside.is_file():
                 raise CalibError(
                     f"the effect {effect.name} has no priors", where=str(beside),
-                    mend="write this file after the example of priors/effects/rate_effect.toml",
+                    hint="write this file after the example of priors/effects/rate_effect.toml",
                 )  # fmt: skip
             found[effect.name] = effect
     if not found:
         raise CalibError(
             "the file defines no effect", where=str(path),
-            allowed="a subclass of calib.gap.effects.Effect with a name",
+            expected="a subclass of calib.gap.effects.Effect with a name",
         )  # fmt: skip
     return found

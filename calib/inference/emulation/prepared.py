@@ -83,7 +83,7 @@ def read_runs(simulator: Simulator, problem: Problem) -> Training:
     if missing:
         raise CalibError(
             f"the table of runs has no column {', '.join(missing)}", where=str(way.path),
-            allowed=", ".join(needed), mend="add it, or correct its name in the simulator file",
+            expected=", ".join(needed), hint="add it, or correct its name in the simulator file",
         )  # fmt: skip
     columns = {name: _numbers(found, name, way.path) for name in needed}
     _check_finite(columns, needed[:-1], lines, way.path)
@@ -109,8 +109,8 @@ def _check_doubled(rows: Array, names: Sequence[str], lines: Sequence[int], path
             told = ", ".join(f"{n} = {v:g}" for n, v in zip(names, row, strict=False))
             raise CalibError(
                 f"the row of line {earlier} is there again ({told})", where=f"{path}, line {line}",
-                allowed="each run once at each row of conditions",
-                mend="delete one of the two; of a simulator that scatters a table has one run of "
+                expected="each run once at each row of conditions",
+                hint="delete one of the two; of a simulator that scatters a table has one run of "
                 "each parameter vector",
             )  # fmt: skip
 
@@ -141,8 +141,8 @@ def _by_run(theta: Array, x: Mapping[str, Array], y: Array, path: Path) -> Train
             if not same
             else f"there are {len(vectors)} runs",
             where=str(path),
-            allowed=f"at least {_LEAST} runs, each at the same rows of conditions",
-            mend="make the runs at the same conditions",
+            expected=f"at least {_LEAST} runs, each at the same rows of conditions",
+            hint="make the runs at the same conditions",
         )
     nodes = {name: rows[:m, i].copy() for i, name in enumerate(x)}
     return Training(vectors, y[order].reshape(len(vectors), m), nodes)
@@ -158,8 +158,8 @@ def _columns(path: Path) -> tuple[dict[str, Any], list[int]]:
     except ValueError as error:
         raise CalibError(
             f"the table of runs cannot be read: {error}", where=str(path),
-            allowed="CSV with a header, and a cell for each column in each row; decimal points",
-            mend="correct it",
+            expected="CSV with a header, and a cell for each column in each row; decimal points",
+            hint="correct it",
         ) from None  # fmt: skip
 
 
@@ -178,8 +178,8 @@ def _check_finite(
         if bad.size:
             raise CalibError(
                 "there is no number", where=f"{path}, line {lines[bad[0]]}, column {name}",
-                allowed="a number for each parameter and condition; outputs may be missing",
-                mend="add it, or leave the run out",
+                expected="a number for each parameter and condition; outputs may be missing",
+                hint="add it, or leave the run out",
             )  # fmt: skip
 
 
@@ -226,8 +226,9 @@ def _simulated(model: str) -> Simulated:
     found = simulated_by(model)
     if found is None:
         raise CalibError(
-            f"the model {model} is none of a simulator", allowed=", ".join(SIMULATED) or "none yet",
-            mend="register it first, see calib.from_callable and --simulator",
+            f"the model {model} is none of a simulator",
+            expected=", ".join(SIMULATED) or "none yet",
+            hint="register it first, see calib.from_callable and --simulator",
         )  # fmt: skip
     return found
 

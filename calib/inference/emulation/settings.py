@@ -59,8 +59,8 @@ class EmulationSettings:
             if found is not None and found > most:
                 raise CalibError(
                     f"{key} = {found} is more than runs = {self.runs} leaves room for",
-                    where=f"emulator.{key}", allowed=f"at most {most}, {why}",
-                    mend="lower it, or give more runs",
+                    where=f"emulator.{key}", expected=f"at most {most}, {why}",
+                    hint="lower it, or give more runs",
                 )  # fmt: skip
 
     def checks_of(self, most: int) -> int:

@@ -90,8 +90,8 @@ def estimate(
         found = f"method {method!r} does not apply to model {model}"
         raise CalibError(
             found if method in METHODS else f"there is no method {method!r}",
-            allowed=", ".join(methods_for(model)),
-            mend="use one of these methods",
+            expected=", ".join(methods_for(model)),
+            hint="use one of these methods",
         )
     try_simulator(problem)
     return METHODS[method].estimate(problem, rng, **settings)

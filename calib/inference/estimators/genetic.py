@@ -76,8 +76,8 @@ class GeneticSettings:
                 raise CalibError(
                     f"the genetic algorithm cannot run with {name} = {getattr(self, name)}",
                     where="genetic settings",
-                    allowed=allowed,
-                    mend="Table 2 of the source has F 0.4, CP 0.6, MP 0.1, interval 0 to 1, NP 50",
+                    expected=allowed,
+                    hint="Table 2 of the source has F 0.4, CP 0.6, MP 0.1, interval 0 to 1, NP 50",
                 )
 
 

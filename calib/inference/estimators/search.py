@@ -130,14 +130,14 @@ def check_defined(
 
     Parameters are (k, d), conditions and the `lines` of the `source` (n,).
     """
-    empty = lines[~np.isfinite(bound.location(theta, conditions)).any(axis=0)]
+    empty = lines[~np.isfinite(bound.mean_response(theta, conditions)).any(axis=0)]
     if empty.size:
         raise CalibError(
             f"the model {bound.model.name} has no value there",
             where=f"{source}, lines {', '.join(map(str, empty[:_SHOWN]))}"
             + (f" and {empty.size - _SHOWN} more" if empty.size > _SHOWN else ""),
-            allowed="conditions at which the model is defined (see its page in the documentation)",
-            mend="leave these rows out, or choose another model",
+            expected="conditions at which the model is defined (see its page in the documentation)",
+            hint="leave these rows out, or choose another model",
         )
 
 
@@ -309,8 +309,8 @@ def search_space(problem: Problem, box: Box | None = None) -> SearchSpace:
             if logs[j] and ends[0] <= 0.0:
                 raise CalibError(
                     f"the search box of {name} starts at {ends[0]:g}",
-                    allowed="a lower bound above 0, as its logarithm is searched",
-                    mend="raise the lower bound",
+                    expected="a lower bound above 0, as its logarithm is searched",
+                    hint="raise the lower bound",
                 )
             low[j], high[j] = np.log(ends) if logs[j] else ends
         elif other and problem.priors.free[j].log:  # a user's prior may be log-normal
@@ -323,14 +323,14 @@ def _check_box(box: Box, names: tuple[str, ...]) -> None:
         if name not in names:
             raise CalibError(
                 f"the search box names {name!r}, which is not searched",
-                allowed=", ".join(names),
-                mend="name one of these coordinates",
+                expected=", ".join(names),
+                hint="name one of these coordinates",
             )
         if not -np.inf < low < high < np.inf:
             raise CalibError(
                 f"the search box of {name} goes from {low:g} to {high:g}",
-                allowed="two finite numbers, lower < upper",
-                mend="correct the box",
+                expected="two finite numbers, lower < upper",
+                hint="correct the box",
             )
 
 
@@ -388,7 +388,7 @@ def search_in_box(
                 f"{problem.bound.model.name} has no value for some rows, wherever in the search "
                 "box its parameters lie",
                 where=problem.table.source,
-                mend="look for impossible conditions in the data, or pass another search box",
+                hint="look for impossible conditions in the data, or pass another search box",
             )
         edges = edge_notes(space.names, found.x, space.lower, space.upper, "the search box")
         return problem.of_model(space.natural(found.x[None]))[0], found, edges
@@ -550,6 +550,6 @@ def _starts(descent: _Descent, rng: np.random.Generator, n_screen: int, n_polish
             f"{problem.bound.model.name} has no value for some rows, wherever in the "
             "prior its parameters are drawn",
             where=problem.table.source,
-            mend="look for impossible conditions in the data, or widen the prior",
+            hint="look for impossible conditions in the data, or widen the prior",
         )
     return np.asarray(z[best])

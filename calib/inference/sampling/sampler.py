@@ -169,7 +169,7 @@ def _nowhere(problem: Problem) -> CalibError:
     return CalibError(
         "no parameter values of positive probability were found",
         where=problem.table.source,
-        mend="check that the data's units and the priors' scales fit each other",
+        hint="check that the data's units and the priors' scales fit each other",
     )
 
 
@@ -218,8 +218,8 @@ def _refuse_exact(problem: Problem, mode: Mode) -> None:
             f"the model meets the data exactly: residuals are {np.sqrt(np.mean(left**2)):.1g} rms, "
             f"the data spread by {spread:.3g}, so the noise sigma cannot be estimated",
             where=problem.table.source,
-            allowed="measurements with scatter, and more rows than parameters",
-            mend='fix sigma at the accuracy of the instrument (dist = "fixed" in the prior file), '
+            expected="measurements with scatter, and more rows than parameters",
+            hint='fix sigma at the accuracy of the instrument (dist = "fixed" in the prior file), '
             "or give more rows; data computed from the model itself need noise added",
         )
 
@@ -363,7 +363,7 @@ def _start(
             return coords[:walkers]
     raise CalibError(
         "the sampler could not be started: almost no parameters near the mode are allowed",
-        mend="widen the priors' bounds, or check the data's units",
+        hint="widen the priors' bounds, or check the data's units",
     )
 
 

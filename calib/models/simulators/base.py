@@ -214,17 +214,17 @@ def _parsed(header: str, name: str) -> tuple[str, str]:
     if found is None:
         raise CalibError(
             f"{header!r} is no known quantity with a unit", where=f"simulator {name}",
-            allowed=", ".join(QUANTITIES) + ", or the same in another unit",
-            mend="correct the name, or register a Quantity for it in a file given by --models",
+            expected=", ".join(QUANTITIES) + ", or the same in another unit",
+            hint="correct the name, or register a Quantity for it in a file given by --models",
         )  # fmt: skip
     return found.quantity.canonical, found.unit
 
 
-def not_made(why: str, mend: str = "mend that") -> CalibError:
+def not_made(why: str, hint: str = "mend that") -> CalibError:
     """Return the error for a run that its surroundings prevented; it is not kept."""
     return CalibError(
         f"the run could not be made: {why}",
-        mend=f"{mend}, and call the same command again: the runs that were made are kept",
+        hint=f"{hint}, and call the same command again: the runs that were made are kept",
     )
 
 

@@ -408,7 +408,7 @@ def load_emulator(path: Path) -> tuple[str, Emulator]:
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise CalibError(
             f"the emulator cannot be read ({type(error).__name__})", where=str(path),
-            mend="make it again from the simulator's runs: call the same command",
+            hint="make it again from the simulator's runs: call the same command",
         ) from None  # fmt: skip
 
 

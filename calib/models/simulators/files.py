@@ -86,10 +86,10 @@ def read_simulator(path: Path) -> Simulated:
     except OSError as error:
         raise CalibError(
             f"the simulator file cannot be read ({error.strerror})", where=str(path),
-            mend="give the path of a TOML file",
+            hint="give the path of a TOML file",
         ) from None  # fmt: skip
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise CalibError(f"not valid TOML: {error}", where=str(path), mend=MEND_TOML) from None
+        raise CalibError(f"not valid TOML: {error}", where=str(path), hint=MEND_TOML) from None
     try:
         file = SimulatorFile.model_validate(content)
     except ValidationError as error:
@@ -109,7 +109,7 @@ def read_simulator(path: Path) -> Simulated:
         where = str(path) if error.where is None else f"{path}, {error.where}"
         found = where if str(path) not in (error.where or "") else error.where
         raise CalibError(
-            error.message, where=found, allowed=error.allowed, mend=error.mend
+            error.message, where=found, expected=error.expected, hint=error.hint
         ) from None
 
 
@@ -119,14 +119,14 @@ def _explain(error: ValidationError, path: Path) -> CalibError:
     first = next((e for e in errors if e["type"] == "extra_forbidden"), errors[0])
     key = ".".join(str(part) for part in first["loc"])
     known = list((Budget if key.startswith("emulator.") else SimulatorFile).model_fields)
-    mend = "correct it"
+    hint = "correct it"
     if first["type"] == "extra_forbidden":
-        mend = meant(str(first["loc"][-1]), known, "correct its name, or leave it out")
+        hint = meant(str(first["loc"][-1]), known, "correct its name, or leave it out")
         return CalibError(
-            f"unknown key {key}", where=str(path), allowed=", ".join(known), mend=mend
+            f"unknown key {key}", where=str(path), expected=", ".join(known), hint=hint
         )
     missing = first["type"] == "missing"
-    return CalibError(in_words(first), where=f"{path}, {key}", mend="add it" if missing else mend)
+    return CalibError(in_words(first), where=f"{path}, {key}", hint="add it" if missing else hint)
 
 
 def _ranges(file: SimulatorFile, path: Path) -> dict[str, tuple[float, float]]:
@@ -139,8 +139,8 @@ def _ranges(file: SimulatorFile, path: Path) -> dict[str, tuple[float, float]]:
         if column is None or not low < high:
             raise CalibError(
                 f"the range [{low:g}, {high:g}] is of no condition, or not from low to high",
-                where=f"{path}, ranges.{name}", allowed=", ".join(file.conditions),
-                mend="name a condition, and give [low, high]",
+                where=f"{path}, ranges.{name}", expected=", ".join(file.conditions),
+                hint="name a condition, and give [low, high]",
             )  # fmt: skip
         low, high = (float(column.to_canonical(v)) for v in (low, high))
         found[column.quantity.canonical] = (low, high)
@@ -152,8 +152,8 @@ def _way(file: SimulatorFile, path: Path) -> Way:
     if len(given) != 1:
         raise CalibError(
             f"it is not clear how to run it: {', '.join(given) or 'nothing'} is given",
-            where=str(path), allowed=f"exactly one of {', '.join(_WAYS)}",
-            mend="give one of them",
+            where=str(path), expected=f"exactly one of {', '.join(_WAYS)}",
+            hint="give one of them",
         )  # fmt: skip
     makers: dict[str, Callable[[SimulatorFile, Path], Way]] = {
         "run": _command, "python": _callable, "url": _umbridge, "table": _of_table,
@@ -171,8 +171,8 @@ def _command(file: SimulatorFile, path: Path) -> CommandWay:
     if found:
         raise CalibError(
             f"{file.run!r} is no command ({found})", where=f"{path}, run",
-            allowed='run = "program {input} {output}", in quotes what has spaces in it',
-            mend="correct it",
+            expected='run = "program {input} {output}", in quotes what has spaces in it',
+            hint="correct it",
         )  # fmt: skip
     template = ""
     if file.input == "template" or file.template:
@@ -180,7 +180,7 @@ def _command(file: SimulatorFile, path: Path) -> CommandWay:
     if file.output == "pattern" and set(file.patterns) != set(file.outputs):
         raise CalibError(
             "patterns and outputs differ", where=f"{path}, patterns",
-            allowed=", ".join(file.outputs), mend="give each output a regular expression",
+            expected=", ".join(file.outputs), hint="give each output a regular expression",
         )  # fmt: skip
     way = CommandWay(
         arguments, path.parent, "template" if template else file.input, template, file.output,
@@ -189,8 +189,8 @@ def _command(file: SimulatorFile, path: Path) -> CommandWay:
     if way.program is None:
         raise CalibError(
             f"there is no program {arguments[0]!r}", where=f"{path}, run",
-            allowed=f"a program on the search path, or a path relative to {path.parent.name}/",
-            mend="build or install it, or correct its path",
+            expected=f"a program on the search path, or a path relative to {path.parent.name}/",
+            hint="build or install it, or correct its path",
         )  # fmt: skip
     return way
 
@@ -204,8 +204,8 @@ def _made_of(file: SimulatorFile, path: Path) -> tuple[str, ...]:
         except OSError as error:
             raise CalibError(
                 f"the file {name!r} cannot be read ({error.strerror})", where=f"{path}, files",
-                allowed="files that the simulator is made of, relative to this one",
-                mend="correct the path, or leave it out",
+                expected="files that the simulator is made of, relative to this one",
+                hint="correct the path, or leave it out",
             ) from None  # fmt: skip
         found.append(hashlib.sha256(content).hexdigest())
     return tuple(found)
@@ -218,7 +218,7 @@ def _template(file: SimulatorFile, path: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         raise CalibError(
             f"the template cannot be read ({error})", where=f"{path}, template",
-            mend="give the path of a text file",
+            hint="give the path of a text file",
         ) from None  # fmt: skip
     noise = {"sigma", *(f"sigma_{own}" for own in file.outputs)}
     names = tuple(p for p in file.parameters if p not in noise)
@@ -232,7 +232,7 @@ def _callable(file: SimulatorFile, path: Path) -> CallableWay:
     if not callable(function):
         raise CalibError(
             f"there is no function {name!r} in {script}", where=f"{path}, python",
-            allowed='python = "file.py:function"', mend="correct the name",
+            expected='python = "file.py:function"', hint="correct the name",
         )  # fmt: skip
     # Only a limit needs a process of its own.
     limit = file.limit if "limit" in file.model_fields_set else None
@@ -243,7 +243,7 @@ def _umbridge(file: SimulatorFile, path: Path) -> UmbridgeWay:
     if not file.model:
         raise CalibError(
             "the model of the server is not named", where=f"{path}, model",
-            allowed='model = "NAME"', mend="add it: GET /Info of the server lists them",
+            expected='model = "NAME"', hint="add it: GET /Info of the server lists them",
         )  # fmt: skip
     rows: Literal["each", "config"] = "each" if file.rows == "each" else "config"
     return UmbridgeWay(file.url, file.model, tuple(file.outputs), rows, file.limit)
@@ -254,13 +254,13 @@ def _of_table(file: SimulatorFile, path: Path) -> TableWay:
     if not file.emulate:
         raise CalibError(
             "a table of runs has none where a sampler asks", where=f"{path}, emulate",
-            allowed="emulate = true, which is so by itself", mend="leave emulate out",
+            expected="emulate = true, which is so by itself", hint="leave emulate out",
         )  # fmt: skip
     try:
         content = where.read_bytes()
     except OSError as error:
         raise CalibError(
             f"the table of runs cannot be read ({error.strerror})", where=f"{path}, table",
-            mend="give the path of a CSV file",
+            hint="give the path of a CSV file",
         ) from None  # fmt: skip
     return TableWay(where, hashlib.sha256(content).hexdigest())

@@ -168,7 +168,7 @@ def _handed_over(function: Callable[..., Any], arguments: Sequence[Any]) -> byte
         raise CalibError(
             f"the function cannot be handed to a process of its own ({error})",
             where=getattr(function, "__qualname__", repr(function)),
-            mend="open files and connections inside it, or give no limit of time",
+            hint="open files and connections inside it, or give no limit of time",
         ) from None
     finally:
         if by_path:

@@ -167,8 +167,8 @@ class Direct:
             raise CalibError(
                 f"the simulator {self.simulator.name} is not run for each parameter vector that a "
                 "sampler asks for",
-                allowed="calib.emulate(problem), or a verb that takes --simulator",
-                mend="emulate it first, or declare it with emulate = false",
+                expected="calib.emulate(problem), or a verb that takes --simulator",
+                hint="emulate it first, or declare it with emulate = false",
             )
         way = self.simulator.way
         if isinstance(way, CallableWay) and self._at_once:
@@ -301,8 +301,8 @@ def declare(
     if missing:
         raise CalibError(
             f"there is no prior of the noise: {', '.join(missing)}", where=f"simulator {name}",
-            allowed=f"[parameters.{missing[0]}] with dist, unit, reason and source",
-            mend="add it: how far may readings lie from a perfect simulator's?",
+            expected=f"[parameters.{missing[0]}] with dist, unit, reason and source",
+            hint="add it: how far may readings lie from a perfect simulator's?",
         )  # fmt: skip
     declared = tuple(
         Output(header, own, tables[sigmas[own]].replace(sigmas[own], "sigma", 1))
@@ -325,8 +325,8 @@ def declare(
                 column = simulator.canonical(header)
             except CalibError as error:
                 raise CalibError(
-                    error.message, where=f"{where}, {key}.{own}", allowed=error.allowed,
-                    mend=error.mend,
+                    error.message, where=f"{where}, {key}.{own}", expected=error.expected,
+                    hint=error.hint,
                 ) from None  # fmt: skip
             # A program may take a condition in two units.
             if key == "outputs" or column not in known:
@@ -347,13 +347,13 @@ def _check_budget(name: str, way: Any, budget: Mapping[str, float]) -> None:
         raise CalibError(
             in_words(first),
             where=f"{where}.{'.'.join(map(str, first['loc']))}",
-            allowed=", ".join(Budget.model_fields), mend="correct it, or leave it out",
+            expected=", ".join(Budget.model_fields), hint="correct it, or leave it out",
         ) from None  # fmt: skip
     idle = sorted(set(budget) - {"tolerance"}) if isinstance(way, TableWay) else []
     if idle:
         raise CalibError(
             f"{', '.join(idle)} can do nothing for a table, whose runs and rows are made already",
-            where=where, allowed="tolerance", mend="leave it out",
+            where=where, expected="tolerance", hint="leave it out",
         )  # fmt: skip
 
 
@@ -364,12 +364,12 @@ def split_tables(priors: str, name: str) -> dict[str, str]:
     except tomllib.TOMLDecodeError as error:
         raise CalibError(
             f"the priors are not valid TOML: {error}", where=f"simulator {name}",
-            mend=MEND_TOML,
+            hint=MEND_TOML,
         ) from None  # fmt: skip
     if not isinstance(known, Mapping) or not known:
         raise CalibError(
             "there are no parameters with priors", where=f"simulator {name}",
-            allowed="[parameters.NAME] with dist, unit, reason and source", mend="add them",
+            expected="[parameters.NAME] with dist, unit, reason and source", hint="add them",
         )  # fmt: skip
     for key in known:
         check_word(key, "parameter", f"simulator {name}")

@@ -210,7 +210,7 @@ def _run(described: Mapping[str, Any], theta: Array) -> Run:
 # times at most if the simulator has values in half of its prior.
 FIRST = 5
 FROM_THE_START = "it fails from the start, and no more runs were made"
-_MEND: dict[Kind, str] = {
+_HINT: dict[Kind, str] = {
     "time": "give it more time (limit)",
     "exit": "correct the simulator where it fails: each run is made in a new folder (calib-run-... "
     "among the temporary files), and finds its own files where the variable CALIB_SIMULATOR says",
@@ -233,7 +233,7 @@ def without_value(
     if not failures:
         return CalibError(
             f"{why}, although every run has a value", where=simulator.place(),
-            mend="check that the data's units and the priors' scales fit each other",
+            hint="check that the data's units and the priors' scales fit each other",
         )  # fmt: skip
     first, names = failures[0], simulator.parameters
     ok = np.array([run.ok for run in runs])
@@ -245,15 +245,15 @@ def without_value(
         "the files that the simulator's own names"
     )  # fmt: skip
     printed = f"; it printed: {first.printed.strip()}" if first.printed.strip() else ""
-    mend = _MEND.get(first.kind, "correct the simulator where it fails")
-    mend += "; or give priors that do not reach there" if ok.any() else ""
+    hint = _HINT.get(first.kind, "correct the simulator where it fails")
+    hint += "; or give priors that do not reach there" if ok.any() else ""
     some = f"only {ok.sum()} of the {ok.size} runs have"
     have = some if ok.any() else f"none of the {ok.size} runs has"
     return CalibError(
         f"{why}: {have} a value ({first.kind}: {first.reason}{printed}){at}",
         where=simulator.place(first.kind),
-        allowed="a simulator with values in at least half of its prior, and where the data are",
-        mend=f"{mend}{kept}",
+        expected="a simulator with values in at least half of its prior, and where the data are",
+        hint=f"{hint}{kept}",
     )
 
 

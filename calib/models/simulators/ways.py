@@ -231,8 +231,8 @@ class CallableWay:
             raise CalibError(
                 no_output(missing[0], named),
                 where=self._place,
-                allowed=", ".join(self.columns),
-                mend="return a mapping with these names, or rename the outputs declared",
+                expected=", ".join(self.columns),
+                hint="return a mapping with these names, or rename the outputs declared",
             )
         return named
 
@@ -405,8 +405,8 @@ def check_template(template: str, names: tuple[str, ...], where: str) -> None:
         what += [f"unknown {', '.join(f'@{name}@' for name in unknown)}"] * bool(unknown)
         raise CalibError(
             f"the template has {'; '.join(what)}", where=where,
-            allowed=", ".join(f"@{name}@" for name in names),
-            mend="write each of these marks where its value belongs, and no other",
+            expected=", ".join(f"@{name}@" for name in names),
+            hint="write each of these marks where its value belongs, and no other",
         )  # fmt: skip
 
 

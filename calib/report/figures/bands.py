@@ -304,7 +304,7 @@ def _columns(result: OutputResult) -> tuple[str, str]:
     if found is None:
         raise CalibError(
             "the figure is of density models of cone index and water content",
-            mend="draw `bands_plate` of other models",
+            hint="draw `bands_plate` of other models",
         )
     return found
 

@@ -84,8 +84,8 @@ def most_runs(model: str, found: SlowSimulator, design: Design, simulations: int
     if not found.simulator.way.runs:
         raise CalibError(
             f"{model} is a table of runs already made: there is none at the truths that are drawn",
-            where=f"simulator {found.name}", allowed="a simulator that can be run",
-            mend="declare the program that made the table, or leave the model out",
+            where=f"simulator {found.name}", expected="a simulator that can be run",
+            hint="declare the program that made the table, or leave the model out",
         )  # fmt: skip
     settings = EmulationSettings(**(found.budget or {}))  # type: ignore[arg-type]
     free = len(build_problem(model, design.table).priors.free) - 1

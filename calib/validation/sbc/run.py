@@ -254,8 +254,8 @@ def score_model(
     if len(good) < _FEWEST:
         raise CalibError(
             f"{len(good)} of {len(records)} posteriors of {model} converged: nothing can be told",
-            allowed=f"{_FEWEST} or more that converged",
-            mend="simulate more campaigns, or leave the model out; those that are done are kept",
+            expected=f"{_FEWEST} or more that converged",
+            hint="simulate more campaigns, or leave the model out; those that are done are kept",
         )
     names = dict.fromkeys(name for r in records for name in r["ranks"])
     return ModelScore(
@@ -342,7 +342,7 @@ def run_sbc(
     if unused := [model for model in given if model not in names]:
         raise CalibError(
             f"there are priors of {', '.join(unused)}, which is not among the models",
-            allowed=", ".join(names), mend="name it with --model, or leave its priors out",
+            expected=", ".join(names), hint="name it with --model, or leave its priors out",
         )  # fmt: skip
     said: dict[str, Any] = (
         {"priors": {model: p.text for model, p in given.items()}} if given else {}
@@ -395,14 +395,14 @@ def _claim(out: Path, run: dict[str, Any]) -> None:
                 raise CalibError(
                     "the folder holds replicates of another seed, other sampler settings or priors",
                     where=str(path),
-                    mend="choose another --out, or the seed that is there",
+                    hint="choose another --out, or the seed that is there",
                 )
             return
         if out.exists() and any(p.suffix != ".part" for p in out.iterdir()):
             raise CalibError(
                 "the output folder exists, is not empty and holds no simulation-based calibration",
                 where=str(out),
-                mend="choose another --out",
+                hint="choose another --out",
             )
         out.mkdir(parents=True, exist_ok=True)
         write_whole(path, text)

@@ -73,7 +73,7 @@ def simulate(
     raise CalibError(
         f"the prior of {bound.model.name} gave no data in {attempts} draws",
         where=template.priors.source,
-        mend="look for conditions at which the model has no value",
+        hint="look for conditions at which the model has no value",
     )
 
 
@@ -81,7 +81,7 @@ def _noisy(
     problem: Problem, natural: Array, conditions: Mapping[str, Array], noise: Array
 ) -> tuple[Array, Array]:
     """Output at some conditions and a measurement of it, each of shape (n,)."""
-    location = problem.bound.location(problem.of_model(natural), conditions)[0]
+    location = problem.bound.mean_response(problem.of_model(natural), conditions)[0]
     with np.errstate(over="ignore"):
         back = problem.bound.from_response
         return back(location), back(location + noise[0])

@@ -64,8 +64,8 @@ def test_failed_tasks_are_listed_and_tried_again(tmp_path):
     outcome = run_tasks(work.fail_on_odd, ITEMS, tmp_path)
     assert outcome.done == ("task-0", "task-2")
     assert outcome.failed == {
-        "task-1": "1 is odd\n  to mend: use an even number",
-        "task-3": "3 is odd\n  to mend: use an even number",
+        "task-1": "1 is odd\n  hint: use an even number",
+        "task-3": "3 is odd\n  hint: use an even number",
     }
     assert json.loads((tmp_path / "failed.json").read_text()) == outcome.failed
     again = run_tasks(work.draw, ITEMS, tmp_path)

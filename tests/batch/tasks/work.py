@@ -29,7 +29,7 @@ def outside(item: int) -> dict[str, str]:
 
 def fail_on_odd(item: int) -> dict[str, int]:
     if item % 2:
-        raise CalibError(f"{item} is odd", mend="use an even number")
+        raise CalibError(f"{item} is odd", hint="use an even number")
     return {"item": item}
 
 

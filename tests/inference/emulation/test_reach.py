@@ -152,7 +152,7 @@ def wheel_of_nine() -> tuple[calib.Table, str]:
 def wheel(theta: np.ndarray, x: dict[str, np.ndarray]) -> np.ndarray:
     bound = get_model("wong_reece_pull").bind(x)
     with np.errstate(all="ignore"):
-        return bound.location(theta[:, :8], x) - theta[:, 8:] * x["normal_load_kn"]
+        return bound.mean_response(theta[:, :8], x) - theta[:, 8:] * x["normal_load_kn"]
 
 
 @pytest.mark.slow

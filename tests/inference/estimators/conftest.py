@@ -53,7 +53,7 @@ def make_problem(model: str, *, noise: float = 0.0, fixed=None, rows=None, colum
         cols = {name: values[rows] for name, values in cols.items()}
     bound = get_model(model).bind(cols)
     theta = np.array([TRUTH[model][name] for name in bound.model.parameters])
-    location = bound.location(theta, cols)[0]
+    location = bound.mean_response(theta, cols)[0]
     location = location + noise * np.random.default_rng(7).standard_normal(location.size)
     table = table_from_arrays({**cols, bound.model.output: bound.from_response(location)})
     if model == "magic_formula" and fixed is None:

@@ -45,7 +45,7 @@ def test_all_methods_agree_on_noisy_data(problem_of, model):
 def test_goodness_of_fit(problem_of):
     problem, _ = problem_of("modified_bekker", noise=0.05)
     found = estimate(problem, "least_squares", np.random.default_rng(RNG))
-    r = problem.response - problem.bound.location(found.theta, problem.conditions)[0]
+    r = problem.response - problem.bound.mean_response(found.theta, problem.conditions)[0]
     sse, n = float(r @ r), r.size
     assert found.cost == pytest.approx(sse)
     assert found.cost_unit == "1"
@@ -54,8 +54,8 @@ def test_goodness_of_fit(problem_of):
     assert found.r_squared == pytest.approx(1.0 - sse / np.sum((y - y.mean()) ** 2))
     # The optimum of a sum of squares: residuals orthogonal to every parameter's effect.
     h = 1e-6 * np.diag(found.theta)
-    up = problem.bound.location(found.theta + h, problem.conditions)
-    down = problem.bound.location(found.theta - h, problem.conditions)
+    up = problem.bound.mean_response(found.theta + h, problem.conditions)
+    down = problem.bound.mean_response(found.theta - h, problem.conditions)
     effect = (up - down) / np.linalg.norm(up - down, axis=1, keepdims=True)
     np.testing.assert_allclose(effect @ r / np.linalg.norm(r), 0.0, atol=1e-6)
 

@@ -281,7 +281,7 @@ def test_no_parameters_of_positive_probability(rut_tables: tuple[Table, Table]) 
     with pytest.raises(CalibError, match="no parameter values of positive probability") as caught:
         sample_posterior(problem, 1)
     assert "he2019 rut_depth" in str(caught.value)
-    assert "to mend:" in str(caught.value)
+    assert "hint:" in str(caught.value)
 
 
 def test_data_that_the_model_meets_exactly_are_refused() -> None:

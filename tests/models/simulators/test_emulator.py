@@ -64,11 +64,11 @@ def test_its_drawn_error_covers_the_simulator() -> None:
     for count in (12, 16, 20, 24, 32, 48):  # of one design alone much is luck
         bound = emulated_model(model, made(count)).bind(NODES)
         problem = calib.inference.problem.Problem(bound, table, calib.inference.priors.Priors(()))
-        drawn = problem.draw_location(natural, NODES, rng).reshape(300, 100, -1)
+        drawn = problem.draw_mean_response(natural, NODES, rng).reshape(300, 100, -1)
         low, high = np.quantile(drawn, [0.05, 0.95], axis=1)
         held.append(((low < true) & (true < high)).mean())
         # Its own prediction alone is off.
-        assert np.abs(bound.location(at, NODES) - true).max() > 0.1 * np.abs(high - low).max()
+        assert np.abs(bound.mean_response(at, NODES) - true).max() > 0.1 * np.abs(high - low).max()
     assert 0.85 < np.mean(held) < 0.95
 
 
@@ -106,10 +106,10 @@ def test_the_model_has_every_layout() -> None:
     assert emulator_of(model) is None
     assert emulator_of(bound.model) is emulator
     theta = design(5)
-    flat = bound.location(theta, NODES)
+    flat = bound.mean_response(theta, NODES)
     np.testing.assert_allclose(flat, emulator.predict(theta, NODES))
     own = {name: np.tile(v, (5, 1)) for name, v in NODES.items()}
-    np.testing.assert_allclose(bound.location(theta, own), flat)
+    np.testing.assert_allclose(bound.mean_response(theta, own), flat)
     table = calib.table_from_arrays({**NODES, "drawbar_pull_kn": flat[0] + 0.01})
     squares = calib.inference.problem.Squares.of(bound, NODES, table["drawbar_pull_kn"])
     expected = np.square(table["drawbar_pull_kn"] - flat).sum(axis=1)

@@ -54,7 +54,7 @@ def test_two_things_of_one_name_are_refused(
     file.write_text(text.replace(old, new), encoding="utf-8")
     with pytest.raises(CalibError, match=words) as refused:
         read_simulator(file)
-    for word in (f"wheel.toml, simulator wheel, {key}", "to mend: rename"):
+    for word in (f"wheel.toml, simulator wheel, {key}", "hint: rename"):
         assert word in str(refused.value)
 
 

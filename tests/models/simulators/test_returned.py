@@ -120,11 +120,11 @@ def plain(f: Callable) -> BoundModel:
 @pytest.mark.parametrize("way", [quick, plain])
 def test_a_model_that_is_asked_by_the_sampler_gives_the_same(way: Callable) -> None:
     exact = pull(SOME, X)
-    np.testing.assert_allclose(way(newtons).location(SOME, X), exact)
+    np.testing.assert_allclose(way(newtons).mean_response(SOME, X), exact)
     for unusable in (complex_, transposed, nothing, sorted_rows):
         with pytest.raises(CalibError):
-            way(unusable).location(SOME, X)
-    gaps = way(masked).location(SOME, X)
+            way(unusable).mean_response(SOME, X)
+    gaps = way(masked).mean_response(SOME, X)
     assert np.isnan(gaps[:, 1]).all()
     assert np.isfinite(gaps[:, 0]).all()
 
@@ -280,9 +280,9 @@ def test_a_function_that_changes_what_it_is_handed_changes_nothing_else(way: Cal
     theta, x = SOME.copy(), {name: values.copy() for name, values in X.items()}
     model = way(f)
     for _ in range(2):
-        np.testing.assert_allclose(model.location(theta, x), pull(SOME, X))
+        np.testing.assert_allclose(model.mean_response(theta, x), pull(SOME, X))
     own = {name: np.tile(values, (len(SOME), 1)) for name, values in x.items()}
-    np.testing.assert_allclose(model.location(theta, own), pull(SOME, X))
+    np.testing.assert_allclose(model.mean_response(theta, own), pull(SOME, X))
     np.testing.assert_array_equal(theta, SOME)
     for name, values in X.items():
         np.testing.assert_array_equal(x[name], values)

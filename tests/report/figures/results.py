@@ -33,7 +33,7 @@ def _points(problem: Problem, *methods: str) -> tuple[PointEstimate, ...]:
 
 def _prior_predictive(problem: Problem, rng: np.random.Generator) -> Array:
     natural = problem.theta(problem.priors.sample(rng, 300))
-    location = problem.bound.location(natural[:, :-1], problem.conditions)
+    location = problem.bound.mean_response(natural[:, :-1], problem.conditions)
     noise = natural[:, -1:] * rng.standard_normal(location.shape)
     return problem.bound.from_response(location + noise)
 

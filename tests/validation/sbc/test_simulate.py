@@ -67,7 +67,9 @@ def test_parameters_without_a_value_are_drawn_again() -> None:
     cases = [simulate(template, design, rng) for _ in range(300)]
     drawn = template.priors.sample(np.random.default_rng(4), 20_000)
     natural = template.theta(drawn)
-    defined = np.isfinite(template.bound.location(natural[:, :-1], template.conditions)).all(axis=1)
+    defined = np.isfinite(template.bound.mean_response(natural[:, :-1], template.conditions)).all(
+        axis=1
+    )
     attempts = np.array([c.attempts for c in cases])
     assert abs(1.0 / attempts.mean() - defined.mean()) < 0.02
     j = template.names.index("n1")
